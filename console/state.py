@@ -109,7 +109,7 @@ class CraneState:
             "time_s": r.stamp_ns / 1e9,
             "silent_s": round((now_ns - self._received_ns) / 1e9, 2),
             "mode": Mode(r.mode).name if r.mode in set(Mode) else f"MODE {r.mode}",
-            "reason": _sentence(r.reason),
+            "reason": _sentence(r.reason, r.numbers),
             "position": _numbers(r.position),
             "reference": _numbers(r.reference),
             "opening_pct": _number(r.opening_pct),
@@ -185,8 +185,8 @@ def _rate(window: list[StateReport]) -> float | None:
     return (last.frames_received - first.frames_received) * 1e9 / elapsed_ns if elapsed_ns > 0 else None
 
 
-def _sentence(reason: int) -> str:
+def _sentence(reason: int, numbers: Sequence[float] = ()) -> str:
     try:
-        return faults.describe(reason)
+        return faults.describe(reason, numbers=numbers)
     except ValueError:
         return f"The controller reports the unknown reason {reason & 0xFF}; run controller and console of one release."

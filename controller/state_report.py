@@ -16,6 +16,7 @@ from controller.config import Settings
 from controller.crane.inputs import CraneInputs
 from controller.crane.motion import Crane
 from controller.estimation.joint_estimator import JointEstimator
+from controller.evidence import Evidence
 from controller.requests.setpoint_gate import SetpointGate
 from controller.supervisor import Supervisor
 from machine.status.reasons import pack
@@ -27,8 +28,8 @@ class StateReporter:
     """Builds the reports; ``late_ns`` and ``tick_ns`` are the worst since the last one."""
 
     __slots__ = (
-        "_crane", "_due", "_estimators", "_gate", "_inputs", "_sequence", "_settings", "_supervisor", "late_ns",
-        "tick_ns",
+        "_crane", "_due", "_estimators", "_evidence", "_gate", "_inputs", "_sequence", "_settings", "_supervisor",
+        "late_ns", "tick_ns",
     )  # fmt: skip
 
     def __init__(
@@ -39,9 +40,10 @@ class StateReporter:
         inputs: CraneInputs,
         crane: Crane,
         estimators: Sequence[JointEstimator],
+        evidence: Evidence,
     ) -> None:
         self._settings, self._supervisor, self._gate = settings, supervisor, gate
-        self._inputs, self._crane, self._estimators = inputs, crane, estimators
+        self._inputs, self._crane, self._estimators, self._evidence = inputs, crane, estimators, evidence
         self._due, self._sequence = PeriodicTimer(REPORT_NS), 0
         self.late_ns = self.tick_ns = 0
 
@@ -56,14 +58,14 @@ class StateReporter:
             return None
         supervisor, gate, crane, estimators = self._supervisor, self._gate, self._crane, self._estimators
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
-        # Three by place, and tuples from lists: CPython 3.11 never takes a tuple of 20 (the names of all fields) or one
+        # Five by place, and tuples from lists: CPython 3.11 never takes a tuple of 20 (the names of all fields) or one
         # made from a generator from its free list again, and the heap would grow for half an hour.
         report = StateReport(
             self._sequence,
             self._settings.profile_hash,
             now_ns,
-            mode=supervisor.mode,
-            grapple_state=crane.grapple.state,
+            supervisor.mode,
+            crane.grapple.state,
             reason=pack(supervisor.reason, supervisor.detail),
             setpoint_sequence=gate.sequence,
             refusal=pack(gate.refusal, gate.detail),
@@ -79,6 +81,8 @@ class StateReporter:
             late_ns=self.late_ns,
             missed_ticks=missed_ticks,
             frames_received=frames,
+            since_ns=self._evidence.since_ns,
+            numbers=self._evidence.numbers,
         )
         self.late_ns = self.tick_ns = 0
         return encode(report, self._settings.key)

@@ -29,6 +29,7 @@ from controller.crane.startup import Startup, check_nodes
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.estimation.sensed_joint import SensedJoint
+from controller.evidence import Evidence
 from controller.requests.gate import RequestGate
 from controller.requests.setpoint_gate import RequestRefused
 from controller.state_report import StateReporter
@@ -59,8 +60,8 @@ class Controller:
 
     __slots__ = (
         "_last_ns", "_receive_sdo", "_reporter", "_sensed", "_settings", "carrier_bus", "crane", "crane_bus_monitor",
-        "crane_inputs", "estimators", "gate", "inputs_in_use", "motion_monitors", "outputs", "startup", "supervisor",
-        "vehicle", "writer",
+        "crane_inputs", "estimators", "evidence", "gate", "inputs_in_use", "motion_monitors", "outputs", "startup",
+        "supervisor", "vehicle", "writer",
     )  # fmt: skip
 
     def __init__(
@@ -102,8 +103,11 @@ class Controller:
         states = self.crane_inputs.messages + (self.carrier_bus.inputs.messages if self.carrier_bus else ())
         self.inputs_in_use = tuple((state.codec.name, state) for state in states)
         """Every received message of both buses, by name."""
+        self.evidence = Evidence(
+            settings, self.supervisor, self.crane_inputs, self.estimators, self.crane, self.gate, self.vehicle
+        )
         self._reporter = StateReporter(
-            settings, self.supervisor, self.gate, self.crane_inputs, self.crane, self.estimators
+            settings, self.supervisor, self.gate, self.crane_inputs, self.crane, self.estimators, self.evidence
         )
         self.outputs = Outputs()
         self._last_ns = 0
@@ -253,7 +257,7 @@ class Controller:
     # -- supervise
 
     def supervise(self, inputs: Inputs, now_ns: int) -> None:
-        """Check inputs, leases, a running spool test, the carrier and the joints; update the mode."""
+        """Check inputs, leases, a running spool test, the carrier and the joints; update the mode and its evidence."""
         supervisor, period_ns = self.supervisor, self._settings.period_ns
         supervisor.supervise(inputs.late_ns, period_ns, now_ns)
         if supervisor.mode is _ACTIVE:
@@ -278,6 +282,7 @@ class Controller:
             if reason is not _NONE:
                 supervisor.react_to(reason, j, now_ns)
                 monitored = supervisor.mode in OPERATING
+        self.evidence.update(inputs, now_ns)
 
     def _check_leases(self, now_ns: int) -> None:
         """A lease that ends after its motion is done ends ACTIVE; one that ends before stops the machine."""

@@ -158,6 +158,11 @@ class Supervisor:
         """Whether the machine is still slowing down."""
         return self.mode is _STOP and self.ramp_ns > 0
 
+    @property
+    def echo_ticks(self) -> int:
+        """How many ticks in a row the valve node's echo has been the same."""
+        return self._echo_ticks
+
     def apply(self, event: Event, reason: Reason, detail: int, now_ns: int) -> bool:
         """Change the mode by the table; True when it changed.  ``reason`` is kept as the cause."""
         before = self.mode

@@ -169,6 +169,7 @@ install_all() {
     put "$here/system/modules.conf" "$lib/modules-load.d/timberhand.conf" 0644
     put "$here/system/udev.rules" "$lib/udev/rules.d/60-timberhand.rules" 0644
     put "$here/system/can-up" "$lib/timberhand/can-up" 0755
+    put "$here/system/timberhand.catalog" "$lib/systemd/catalog/timberhand.catalog" 0644
     install_program
     if [ ! -e "$link" ] || [ "$(readlink "$link")" = "$opt/bin/timberhand" ]; then
         run install -d -m 0755 "${link%/*}"
@@ -185,6 +186,7 @@ install_all() {
         live udevadm trigger --sysname-match=cpu_dma_latency
     fi
     live systemctl daemon-reload
+    live journalctl --update-catalog || true # without a journal the texts are of no use
     # shellcheck disable=SC2046 # a list of words
     run systemctl --quiet ${root:+--root="$root"} enable $(enabled)
     say "installed; enabled for the next start of the computer; nothing runs yet and nothing is armed"
@@ -201,7 +203,9 @@ uninstall_all() {
         run rm -f "$conf"
     fi
     run rm -rf "$lib/timberhand" "$lib/sysusers.d/timberhand.conf" "$lib/sysctl.d/60-timberhand.conf" \
-        "$lib/modules-load.d/timberhand.conf" "$lib/udev/rules.d/60-timberhand.rules" "$venv"
+        "$lib/modules-load.d/timberhand.conf" "$lib/udev/rules.d/60-timberhand.rules" \
+        "$lib/systemd/catalog/timberhand.catalog" "$venv"
+    live journalctl --update-catalog || true
     run rm -f "$conf.new"
     if [ "$(readlink "$link")" = "$opt/bin/timberhand" ]; then run rm -f "$link"; fi
     [ ! -d "$etc" ] || run rmdir --ignore-fail-on-non-empty "$etc"

@@ -31,8 +31,10 @@ from can_dbc.frame import Frame
 from can_dbc.messages.record_ring import RingReader, default_path
 from can_dbc.timing.page import Timing, TimingRefused, read_timing
 from machine.loading.profile_file import ProfileError, load_profile
+from recorder import journal
 from recorder.manifest import describe
 from recorder.recorder import Recorder, RecordingRefused
+from recorder.stop import Stop
 
 QUEUE_ITEMS: Final = 50_000
 """About ten seconds of two busy buses."""
@@ -176,6 +178,13 @@ def report(sentence: str) -> None:
     sys.stderr.write(f"recorder: {sentence}\n")
 
 
+def write_to_journal(stop: Stop, file: Path) -> None:
+    """Writes a stop to the journal, or to stderr where there is none."""
+    fields = journal.stop_fields(stop, file)
+    if not journal.send(fields):
+        report(f"{fields['MESSAGE']} {file}")
+
+
 def udp_socket(port: int) -> socket.socket:
     """A non-blocking socket bound on loopback; raises OSError."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -206,6 +215,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--seed", type=int, help="seed of the run, for the manifest")
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
+    parser.add_argument("--stops", type=Path, metavar="DIR", help="directory of the stops' files; default: OUT/stops")
+    parser.add_argument("--journal", action="store_true", help="write every stop to the journal of systemd")
     parser.add_argument("--no-sync", action="store_true", help="do not flush data to the disk (for benches)")
     a = parser.parse_args(arguments)
     addresses = dict(text.partition("=")[::2] for text in a.bus)
@@ -218,7 +229,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ticks, reports = RingReader(a.ticks or default_path()), udp_socket(a.report_port)
         buses = {name: open_bus(address) for name, address in addresses.items()}
         key = a.key_file.read_bytes().strip() if a.key_file else None
-        recorder = Recorder(a.out, profile, describe(profile, tuple(addresses), a.seed, live=True), key, not a.no_sync)
+        manifest = describe(profile, tuple(addresses), a.seed, live=True)
+        on_stop = write_to_journal if a.journal else None
+        recorder = Recorder(a.out, profile, manifest, key, not a.no_sync, a.stops, on_stop)
     except (ProfileError, RecordingRefused) as error:
         report(str(error))
         return 3

@@ -10,6 +10,7 @@ stamp; the recorder has no clock.  Outputs, in one directory:
   ``/timing`` (the controller's timing page) and ``/manifest`` (JSON).
   Publish time is monotonic; log time is UTC if the manifest has it (live), else monotonic, too.
 * ``manifest.json``: see ``recorder.manifest``.
+* ``stops/``: a file for every stop of the machine, see ``recorder.stop_recorder``.
 
 A chunk ends at least every 200 ms of recorded time, and live it is flushed to the disk, so that a killed process or a
 power cut loses at most 250 ms.  A full disk costs records, counted in ``dropped``, and nothing else.
@@ -17,8 +18,8 @@ power cut loses at most 250 ms.  A full disk costs records, counted in ``dropped
 
 from __future__ import annotations
 
-import fcntl
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -35,14 +36,18 @@ from machine.profile import Profile
 from recorder import manifest as manifests
 from recorder.files import CommitFile
 from recorder.manifest import Manifest
-from recorder.mcap_file import McapFile
 from recorder.recover import RUN_NAME, recover, run_files
+from recorder.segment import Segment
 from recorder.signals import BusSignals, json_schema
+from recorder.stop import Stop
+from recorder.stop_files import TICK as TICK
+from recorder.stop_files import StopFiles
+from recorder.stop_recorder import StopRecorder
 from runtime.errors import CodedError
 
+STOPS_NAME: Final = "stops"
 CHUNK_NS: Final = 200_000_000
 SEGMENT_BYTES: Final = 512 * 2**20
-TICK: Final = "/controller/tick"
 REPORT: Final = "/controller/report"
 VEHICLE: Final = "/controller/vehicle"
 TIMING: Final = "/timing"
@@ -60,9 +65,19 @@ class Recorder:
     """One recording (module docstring: contract)."""
 
     def __init__(
-        self, directory: Path, profile: Profile, manifest: Manifest, key: bytes | None = None, sync: bool = True
+        self,
+        directory: Path,
+        profile: Profile,
+        manifest: Manifest,
+        key: bytes | None = None,
+        sync: bool = True,
+        stops: Path | None = None,
+        on_stop: Callable[[Stop, Path], None] | None = None,
     ) -> None:
         """Starts a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
+
+        ``stops`` is the directory of the stops' files, default ``directory/stops``; ``on_stop`` is called with every
+        stop and the path that its file will have.
 
         Raises:
             RecordingRefused: The directory cannot be written or contains a recording.
@@ -82,7 +97,7 @@ class Recorder:
         self._chunk_end_ns: int | None = None
         self._now_ns = manifest.start_monotonic_ns or 0
         self._segments = 0
-        self._segment: _Segment | None = None
+        self._segment: Segment | None = None
         try:
             directory.mkdir(parents=True, exist_ok=True)
             if run_files(directory):
@@ -98,6 +113,7 @@ class Recorder:
                 "recording.cannot-write",
                 f"cannot record in {directory} ({error.strerror}); free space on the disk or give another directory",
             ) from error
+        self._stops = StopRecorder(StopFiles(stops or directory / STOPS_NAME, self._durable), manifest, key, on_stop)
 
     def on_frame(self, bus: str, frame: Frame, sent_by: str = "") -> None:
         """Records a frame on ``bus``; ``sent_by`` names the sender if it is known."""
@@ -114,12 +130,13 @@ class Recorder:
     def on_tick(self, record: bytes) -> None:
         """Records the controller's record of one tick, unchanged."""
         try:
-            stamp_ns = tick_record.decode(record).now_ns
+            tick = tick_record.decode(record)
         except tick_record.RecordRefused:
             self.refused += 1
             return
-        self._at(stamp_ns)
-        self._add(TICK, stamp_ns, record)
+        self._at(tick.now_ns)
+        self._add(TICK, tick.now_ns, record)
+        self._stops.on_tick(tick, record)
 
     def on_report(self, datagram: bytes) -> None:
         """Records the controller's state report or vehicle report."""
@@ -147,6 +164,7 @@ class Recorder:
         """Ends the chunk and writes everything to the files; ``dropped`` counts what cannot be written."""
         self._now_ns = now_ns
         self._chunk_start_ns = self._chunk_end_ns = None
+        self._stops.commit(now_ns)
         for text in self._text.values():
             lines = text.buffer.count(b"\n")
             try:
@@ -165,6 +183,7 @@ class Recorder:
 
     def close(self) -> None:
         """Completes the files."""
+        self._stops.close()
         self.flush(self._now_ns)
         if self._segment:
             try:
@@ -173,7 +192,8 @@ class Recorder:
                 self._abandon()
         for text in self._text.values():
             text.close()
-        complete = msgspec.structs.replace(self._manifest, complete=True, dropped=self.dropped)
+        dropped = self.dropped + self._stops.dropped
+        complete = msgspec.structs.replace(self._manifest, complete=True, dropped=dropped)
         try:
             manifests.write(self._directory, complete)
         except OSError:
@@ -201,7 +221,7 @@ class Recorder:
     def _open_segment(self) -> None:
         """Opens the next file; its first chunk has every channel and the manifest, and is written immediately."""
         name = f"run-{self._segments + 1:04d}.mcap" if self._segments else RUN_NAME
-        segment = _Segment(self._directory / name, self._durable)
+        segment = Segment(self._directory / name, self._durable)
         for bus, signals in self._signals.items():
             segment.channel(f"/{bus}/raw", "socketcan")
             for message in signals.messages():
@@ -228,39 +248,3 @@ class Recorder:
             self.dropped += self._segment.pending
             self._segment.close()
             self._segment = None
-
-
-class _Segment:
-    """One MCAP file; a commit is one chunk."""
-
-    def __init__(self, path: Path, durable: bool) -> None:
-        self.pending = 0
-        """Messages since the last commit."""
-        self._file = CommitFile(path, durable)
-        fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._writer = McapFile(self._file, "timberhand")
-        self._channels: dict[str, int] = {}
-
-    def channel(self, topic: str, encoding: str, schema: str = "", text: bytes = b"") -> None:
-        schema_id = self._writer.register_schema(schema, "jsonschema", text) if schema else 0
-        self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
-
-    def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes) -> None:
-        self._writer.add_message(self._channels[topic], log_ns, data, publish_ns)
-        self.pending += 1
-
-    def commit(self) -> int:
-        """Ends the chunk and writes it; returns the size of the file [bytes]; raises OSError."""
-        self._writer.flush()
-        self._file.commit()
-        self.pending = 0
-        return self._file.tell()
-
-    def finish(self) -> None:
-        """Writes the index and closes the file; raises OSError."""
-        self._writer.finish()
-        self._file.commit()
-        self._file.close()
-
-    def close(self) -> None:
-        self._file.close()

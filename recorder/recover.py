@@ -47,7 +47,7 @@ def recover(directory: Path) -> list[Recovered]:
             except BlockingIOError:
                 return recovered
             if not is_complete(path):
-                recovered.append(_rewrite(path))
+                recovered.append(rewrite(path))
     for log in directory.glob("*.log"):
         _trim_line(log)
     return recovered
@@ -63,7 +63,8 @@ def _trim_line(path: Path) -> None:
             file.truncate(size - tail + end)
 
 
-def _rewrite(path: Path) -> Recovered:
+def rewrite(path: Path) -> Recovered:
+    """Rewrites an unfinished MCAP file with an index, up to its last complete chunk; raises OSError."""
     new = path.with_suffix(".recovering")
     messages = 0
     with new.open("wb") as file:

@@ -5,7 +5,7 @@ The only module of this package that needs more than the standard library (matpl
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -58,3 +58,22 @@ def limit_band(axis: Any, least: float | None, most: float | None) -> None:
     if most is not None:
         axis.axhspan(most, max(high, most), color=RUST, alpha=0.08, lw=0)
         axis.axhline(most, color=RUST, lw=0.8, ls="--")
+
+
+@contextmanager
+def stack(path: Path, heights: Sequence[float], width: float = 8.0, height: float = 6.0) -> Iterator[Any]:
+    """Yields axes one below the other with a common x axis and saves them to ``path`` at the end.
+
+    ``heights`` are the axes' shares of the figure; ``width`` and ``height`` are in inches.
+    """
+    with pyplot.rc_context(STYLE):
+        figure, axes = pyplot.subplots(
+            len(heights), 1, figsize=(width, height), sharex=True, height_ratios=list(heights), squeeze=False
+        )
+        try:
+            yield axes[:, 0]
+            figure.align_ylabels(axes)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, metadata={"Software": None})
+        finally:
+            pyplot.close(figure)

@@ -36,6 +36,7 @@ from timberhand.commands import (
     sim,
     survey_camera,
     train,
+    why,
 )
 from timberhand.deprecated import current_spelling
 
@@ -74,6 +75,7 @@ app.command("survey-camera")(survey_camera.survey_camera)
 app.command("experiment")(experiment.experiment)
 app.command("report")(report.report)
 app.command("replay")(replay.replay)
+app.command("why")(why.why)
 app.command("record")(record.record)
 app.command("console")(console.console)
 app.command("doctor")(doctor.doctor)

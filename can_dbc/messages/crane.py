@@ -22,6 +22,8 @@ _OPERATOR: Final = struct.Struct("<I")
 _SPOOL: Final = struct.Struct("<IBB")
 _SPOOL_KNOT: Final = struct.Struct("<Id")
 _REPORT: Final = struct.Struct(f"<BBHIHHH{3 * N_AXES + 3}d4I")
+_EVIDENCE: Final = struct.Struct("<Q3d")
+"""Behind a report whose reason slowed or stopped the machine."""
 
 
 class GrappleCommand(IntEnum):
@@ -114,6 +116,9 @@ class StateReport:
     a ``machine.status.modes.Mode``, ``reason`` the supervisor's number; ``refused`` counts setpoints refused since
     start, ``refusal`` is the last reason.  ``tick_ns`` is the longest tick, ``late_ns`` the worst lateness
     since the last report.
+
+    While the reason is one that slows or stops the machine, ``since_ns`` is when it began, else 0, and ``numbers`` is
+    its evidence: measured value, limit and one more (`machine.status.evidence`), NaN where there is none.
     """
 
     sequence: int
@@ -136,6 +141,8 @@ class StateReport:
     late_ns: int
     missed_ticks: int
     frames_received: int
+    since_ns: int = 0
+    numbers: tuple[float, ...] = ()
 
 
 def crane_body(m: CraneSetpoint) -> bytes:
@@ -157,11 +164,12 @@ def operator_body(m: OperatorCommand) -> bytes:
 
 def report_body(m: StateReport) -> bytes:
     """The body of a state report; counters wrap at their width."""
-    return _REPORT.pack(
+    body = _REPORT.pack(
         m.mode, m.grapple_state, m.reason, m.setpoint_sequence, m.refusal, m.refused & 0xFFFF, m.stale_mask,
         *m.position, *m.velocity, *m.reference, m.opening_pct, m.clamp_bar, m.load_kg,
         m.tick_ns & 0xFFFFFFFF, m.late_ns & 0xFFFFFFFF, m.missed_ticks & 0xFFFFFFFF, m.frames_received & 0xFFFFFFFF,
     )  # fmt: skip
+    return body + _EVIDENCE.pack(m.since_ns, *m.numbers) if m.since_ns else body
 
 
 def crane_from(common: Common, body: bytes) -> CraneSetpoint:
@@ -208,8 +216,14 @@ def operator_from(common: Common, body: bytes) -> OperatorCommand:
 
 
 def report_from(common: Common, body: bytes) -> StateReport:
-    values = _REPORT.unpack(body)
+    """The report in a body, with or without evidence; raises struct.error for a wrong length."""
+    values = _REPORT.unpack(body[: _REPORT.size])
+    since_ns = 0
+    numbers: tuple[float, ...] = ()
+    if len(body) > _REPORT.size:
+        since_ns, *found = _EVIDENCE.unpack(body[_REPORT.size :])
+        numbers = tuple(found)
     joints = values[7 : 7 + 3 * N_AXES]
     fields: list[Any] = [*common, *values[:7]]
     fields += [joints[:N_AXES], joints[N_AXES : 2 * N_AXES], joints[2 * N_AXES :]]
-    return StateReport(*fields, *values[7 + 3 * N_AXES :])
+    return StateReport(*fields, *values[7 + 3 * N_AXES :], since_ns, numbers)

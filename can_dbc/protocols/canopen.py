@@ -168,6 +168,10 @@ class HeartbeatMonitor:
             return Presence.WAITING if now_ns < self._boot_deadline_ns else Presence.NEVER_SEEN
         return Presence.ALIVE if now_ns - seen_ns <= self._timeouts_ns[node] else Presence.LOST
 
+    def age_ns(self, node: int, now_ns: int) -> int:
+        """Time since the last heartbeat of a node; since the clock's zero for a node that sent none."""
+        return now_ns - self._seen_ns.get(node, 0)
+
     def operational(self, node: int, now_ns: int) -> bool:
         """Whether a node is alive and OPERATIONAL."""
         return self.states.get(node) == NodeState.OPERATIONAL and self.presence(node, now_ns) is Presence.ALIVE

@@ -29,13 +29,15 @@ _COMMUNICATION_WINDOW_NS: Final = 10_000_000_000
 class NodeHealth:
     """State of a node besides its heartbeat."""
 
-    __slots__ = ("booted", "boots", "emergency", "warning")
+    __slots__ = ("booted", "boots", "code", "emergency", "warning")
 
     def __init__(self) -> None:
         self.boots = 0
         self.booted = False
         """A boot-up frame came in this tick."""
         self.emergency = self.warning = False
+        self.code = 0
+        """The last error code that it sent (CiA 301), 0 before the first."""
 
 
 class NodeMonitor:
@@ -94,6 +96,14 @@ class NodeMonitor:
         """Whether a node is alive and OPERATIONAL."""
         return self._heartbeats.operational(number, now_ns)
 
+    def heartbeat_age_ns(self, number: int, now_ns: int) -> int:
+        """Time since the last heartbeat of a node; since the clock's zero for a node that sent none."""
+        return self._heartbeats.age_ns(number, now_ns)
+
+    def nmt_state(self, number: int) -> int:
+        """State of a node in its last heartbeat; -1 without one."""
+        return self._heartbeats.states.get(number, -1)
+
     def not_ready(self, now_ns: int) -> int:
         """A required node that is not operational; 0 when all are."""
         for number in self.by_number:
@@ -141,6 +151,7 @@ class NodeMonitor:
         machine, the rest warns.
         """
         code = message.code
+        node.code = code or node.code
         if code == 0:
             node.emergency = node.warning = False
         elif code >> 8 == 0x81:

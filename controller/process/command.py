@@ -238,6 +238,7 @@ def main(arguments: list[str] | None = None) -> int:
     sys.stdout.write(summary(loop) + "\n")
     supervisor = controller.supervisor
     if supervisor.mode is Mode.FAULT:
-        sys.stderr.write(f"controller: {describe(supervisor.reason, supervisor.detail)}\n")
+        why = describe(supervisor.reason, supervisor.detail, controller.evidence.numbers)
+        sys.stderr.write(f"controller: {why}\n")
         return 5
     return 130 if signal.SIGINT in ended else 0

@@ -135,7 +135,7 @@ class Loop:
     def status_text(self) -> str:
         """State in one line: mode, reason, buses that are not OK, missed ticks."""
         supervisor = self.controller.supervisor
-        reason = describe(supervisor.reason, supervisor.detail)
+        reason = describe(supervisor.reason, supervisor.detail, self.controller.evidence.numbers)
         buses = "".join(f"{bus.name} is {bus.stats.state.name}. " for bus in self.buses if bus.stats.state)
         return f"{supervisor.mode.name}. {reason} {buses}Missed ticks: {self.missed} of {self.ticks + self.missed}."
 

@@ -59,6 +59,11 @@ class SetpointGate:
         """Sequence number of the last accepted setpoint, 0 before the first."""
         return max(self._sequence, 0)
 
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last accepted setpoint, 0 before the first."""
+        return max(self._stamp_ns, 0)
+
     def start_session(self) -> None:
         """An operator armed: a planner may count from the beginning again.  Stamps must still grow."""
         self._sequence = -1

@@ -127,11 +127,10 @@ class _Job:
         if report.mode != self._mode:
             self._mode = report.mode
             mode = Mode(report.mode)
-            stopped = mode in (Mode.STOP, Mode.FAULT)
-            self._display.event(
-                f"{mode.name}: {describe(report.reason)}" if stopped else f"controller {mode.name}",
-                "yellow" if stopped else "",
-            )
+            if mode in (Mode.STOP, Mode.FAULT):
+                self._display.event(f"{mode.name}: {describe(report.reason, numbers=report.numbers)}", "yellow")
+            else:
+                self._display.event(f"controller {mode.name}")
         self._display.report(report)
 
     def _on_press(self, action: OperatorAction, _: StateReport) -> None:

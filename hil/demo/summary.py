@@ -50,6 +50,8 @@ class Summary:
             soft_wrap=True,
         )
         console.print(f"  recording: {self.directory}", highlight=False, soft_wrap=True)
+        if self.stops:
+            console.print(f"  why it stopped: timberhand why {self.directory}", highlight=False, soft_wrap=True)
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""

@@ -287,7 +287,7 @@ class LiveRun(ABC, Generic[Outcome]):
     def _show_mode(self, report: StateReport) -> None:
         mode = Mode(report.mode)
         if mode in (Mode.STOP, Mode.FAULT):
-            self._display.event(f"{mode.name}: {describe(report.reason)}", "yellow")
+            self._display.event(f"{mode.name}: {describe(report.reason, numbers=report.numbers)}", "yellow")
         else:
             self._display.event(f"controller {mode.name}")
 

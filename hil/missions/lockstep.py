@@ -190,7 +190,9 @@ class MissionRun:
         if report.mode != self._mode:
             self._mode = report.mode
             if report.mode in (Mode.STOP, Mode.FAULT):
-                self._display.event(f"{Mode(report.mode).name}: {describe(report.reason)}", "yellow")
+                self._display.event(
+                    f"{Mode(report.mode).name}: {describe(report.reason, numbers=report.numbers)}", "yellow"
+                )
         self._display.report(report)
 
     def _on_press(self, action: OperatorAction, _: StateReport) -> None:

@@ -47,6 +47,8 @@ class MissionSummary:
             highlight=False,
         )
         console.print(f"  recording: {self.directory}", highlight=False, soft_wrap=True)
+        if self.stops:
+            console.print(f"  why it stopped: timberhand why {self.directory}", highlight=False, soft_wrap=True)
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""

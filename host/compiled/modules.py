@@ -52,6 +52,7 @@ MODULES: Final = (
     "controller.estimation.load_estimator",
     "controller.estimation.motion_monitor",
     "controller.estimation.sensed_joint",
+    "controller.evidence",
     "controller.laws.crane",
     "controller.laws.drive",
     "controller.laws.end_positioning",

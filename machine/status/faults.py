@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from machine.crane_nodes import NODE_NAMES
 from machine.joints import ARTICULATION, JOINTS
 from machine.status.driving_faults import DRIVING
+from machine.status.evidence import numbers_text
 from machine.status.reasons import DetailKind, Fault, Reaction, Reason
 from machine.status.refusals import PLANNER, REFUSALS
 
@@ -269,23 +271,37 @@ _BUS_NAMES: Final = ("the crane bus", "the machine bus")
 _ARM_NAMES: Final = ("front left", "front right", "rear left", "rear right")
 
 
-def describe(reason: int, detail: int = 0) -> str:
-    """The operator's sentence and advice; ``reason`` may carry its detail in bits 8 to 15."""
+def describe(reason: int, detail: int = 0, numbers: Sequence[float | None] = ()) -> str:
+    """The one text of a reason: sentence, numbers of its evidence, advice, and in brackets its code.
+
+    ``reason`` may carry its detail in bits 8 to 15; ``numbers`` are those of `machine.status.evidence`.
+    """
     known = Reason(reason & 0xFF)
     detail = detail or reason >> 8
-    fault = FAULTS[known]
-    if known is Reason.NONE:
-        return f"{fault.sentence} {fault.advice}"
-    subject = ""
-    if fault.about is DetailKind.JOINT:
-        subject = "the articulation" if detail == ARTICULATION else f"joint {detail}"
-        if detail < len(JOINTS):
-            subject = f"joint {JOINTS[detail].name.lower()}"
-    elif fault.about is DetailKind.NODE:
-        subject = NODE_NAMES.get(detail, f"node {detail}")
-    elif fault.about is DetailKind.BUS:
-        subject = _BUS_NAMES[detail] if detail < len(_BUS_NAMES) else f"bus {detail}"
-    elif fault.about is DetailKind.ARM:
-        subject = _ARM_NAMES[detail] if detail < len(_ARM_NAMES) else f"swing {detail}"
-    sentence = fault.sentence.format(subject)
-    return f"{sentence[0].upper()}{sentence[1:]}. {fault.advice}"
+    measured = numbers_text(known, detail, numbers)
+    code = f" [{known.name}]" if known else ""
+    return f"{sentence_of(known, detail)}{f' ({measured})' if measured else ''}. {FAULTS[known].advice}{code}"
+
+
+def sentence_of(reason: Reason, detail: int = 0) -> str:
+    """The operator's sentence without its full stop."""
+    fault = FAULTS[reason]
+    sentence = fault.sentence.format(part_of(fault.about, detail)).rstrip(".")
+    return f"{sentence[0].upper()}{sentence[1:]}"
+
+
+def part_of(about: DetailKind, detail: int) -> str:
+    """The part that a detail names; empty when it names none."""
+    match about:
+        case DetailKind.JOINT:
+            if detail < len(JOINTS):
+                return f"joint {JOINTS[detail].name.lower()}"
+            return "the articulation" if detail == ARTICULATION else f"joint {detail}"
+        case DetailKind.NODE:
+            return NODE_NAMES.get(detail, f"node {detail}")
+        case DetailKind.BUS:
+            return _BUS_NAMES[detail] if detail < len(_BUS_NAMES) else f"bus {detail}"
+        case DetailKind.ARM:
+            return _ARM_NAMES[detail] if detail < len(_ARM_NAMES) else f"swing {detail}"
+        case _:
+            return ""

@@ -318,3 +318,17 @@ def test_an_invalid_spool_test_is_refused(change: dict[str, object], fault: Data
 def test_a_spool_test_of_a_wrong_length_is_refused() -> None:
     raw = encode(SpoolTest(1, 2, 3, 200_000_000, 0, (SpoolKnot(0, 0.0), SpoolKnot(5_000_000, 12.0))))
     assert fault_of(sealed(raw[:-5])) is DatagramFault.LENGTH
+
+
+def test_a_report_carries_the_evidence_of_its_reason_only_while_there_is_one() -> None:
+    known = (1.0,) * 5
+    plain = StateReport(1, 2, 3, 2, 0, 0, 0, 0, 0, 0, known, known, known, 0.0, 0.0, 0.0, 1, 2, 3, 4)
+    stopped = dataclasses.replace(plain, since_ns=77, numbers=(20.0, 15.0, 4.0))
+    assert decode(encode(plain)) == plain and decode(encode(stopped)) == stopped
+    assert len(encode(stopped)) == len(encode(plain)) + 32
+    body = encode(stopped)[:-4]
+    for cut in (1, 8, 31):
+        data = body[:-cut]
+        with pytest.raises(DatagramRefused) as refused:
+            decode(data + struct.pack("<I", zlib.crc32(data)))
+        assert refused.value.fault is DatagramFault.LENGTH

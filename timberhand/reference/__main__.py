@@ -1,4 +1,6 @@
-"""Writes the generated reference pages and the README's table of results, or with ``--check`` says which are stale.
+"""Writes the generated reference pages, the README's table of results and the journal's catalog.
+
+With ``--check`` it only says which are stale.
 
 Exit codes: 0 fine, 2 usage, 6 a page is stale (``--check``).
 """
@@ -10,7 +12,15 @@ import sys
 from pathlib import Path
 
 from host.exit_codes import ExitCode
-from timberhand.reference import cli_page, errors_page, faults_page, frames_page, results_table, transitions_page
+from timberhand.reference import (
+    cli_page,
+    errors_page,
+    faults_page,
+    frames_page,
+    journal_catalog,
+    results_table,
+    transitions_page,
+)
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -25,7 +35,8 @@ def pages(repository: Path = REPOSITORY) -> dict[Path, str]:
         "transitions": transitions_page.page(),
     }
     reference = {repository / "docs" / "reference" / f"{name}.md": text for name, text in made.items()}
-    return reference | {repository / "README.md": results_table.readme(repository)}
+    catalog = repository / "deploy" / "system" / "timberhand.catalog"
+    return reference | {repository / "README.md": results_table.readme(repository), catalog: journal_catalog.page()}
 
 
 def stale(repository: Path = REPOSITORY) -> list[Path]:

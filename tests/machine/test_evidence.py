@@ -1,0 +1,80 @@
+"""The numbers of a reason in words, the one text of a reason, and its identity in the journal."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from machine.joints import Joint
+from machine.status.evidence import EVIDENCE, numbers_text, quantities
+from machine.status.explanation import explain, message_id, priority
+from machine.status.faults import FAULTS, describe
+from machine.status.reasons import DetailKind, Reaction, Reason, pack
+
+
+def test_numbers_have_their_names_and_units() -> None:
+    text = numbers_text(Reason.ENCODER_LOST, Joint.LIFT, (20.04, 15.0, 4.0))
+    assert text == "age of its last good sample 20.0 ms, limit 15.0 ms, frames refused since the start 4"
+
+
+@pytest.mark.parametrize(
+    ("detail", "text"),
+    [
+        (Joint.LIFT, "position 90.00°, limit 80.00°"),
+        (Joint.EXT, "position 1.571 m, limit 1.396 m"),
+    ],
+)
+def test_the_unit_of_a_joint_is_degrees_or_metres(detail: int, text: str) -> None:
+    assert numbers_text(Reason.POSITION_OUTSIDE, detail, (math.pi / 2, math.radians(80), math.nan)) == text
+
+
+def test_unknown_numbers_are_left_out() -> None:
+    assert numbers_text(Reason.GUARD_LOST, 0, (math.nan, 50.0, None)) == "limit 50.0 ms"
+    assert numbers_text(Reason.GUARD_LOST, 0, ()) == ""
+    assert numbers_text(Reason.OPERATOR_STOP, 0, (1.0, 2.0, 3.0)) == ""
+
+
+def test_bits_and_reasons_are_readable() -> None:
+    assert numbers_text(Reason.PLC_FAULT, 0, (0x21, math.nan, math.nan)) == "fault bits 0021h"
+    text = numbers_text(Reason.SETPOINTS_REFUSED, 0, (7.0, math.nan, float(pack(Reason.JOINT_SPEED, 2))))
+    assert text == "setpoints refused since the start 7, the last one for JOINT_SPEED"
+
+
+def test_values_stay_in_si_units_for_programs() -> None:
+    first, second, third = quantities(Reason.JOINT_RUNAWAY, Joint.EXT, (0.3, 0.5, 0.0))
+    assert (first.value, first.unit, second.unit, third.name) == (0.3, "m/s", "m/s", "commanded")
+
+
+def test_the_one_text_has_sentence_numbers_advice_and_code() -> None:
+    reason = pack(Reason.ENCODER_LOST, Joint.LIFT)
+    assert describe(reason, numbers=(20.0, 15.0, 0.0)) == (
+        "The encoder of joint lift is no longer received (age of its last good sample 20.0 ms, limit 15.0 ms, frames "
+        "refused since the start 0). Check its cable, then reset and arm. [ENCODER_LOST]"
+    )
+    assert describe(Reason.NONE) == "All is well. Nothing to do."
+    found = explain(reason, (20.0, 15.0, 0.0))
+    assert found.text == describe(reason, numbers=(20.0, 15.0, 0.0))
+    assert (found.code, found.sentence) == ("ENCODER_LOST", "The encoder of joint lift is no longer received.")
+
+
+def test_every_text_is_made_for_every_reason_and_detail() -> None:
+    for reason in FAULTS:
+        for detail in (0, 3, 5, 17, 255):
+            text = describe(pack(reason, detail), numbers=(1.0, math.nan, math.inf))
+            assert "{" not in text and text.endswith(f"[{reason.name}]") is (reason is not Reason.NONE)
+
+
+def test_only_a_reason_about_a_joint_has_the_unit_of_a_joint() -> None:
+    about_joints = {reason for reason, fault in FAULTS.items() if fault.about is DetailKind.JOINT}
+    for reason, measured in EVIDENCE.items():
+        if "joint" in (measured.unit.partition("/")[0], measured.other_unit.partition("/")[0]):
+            assert reason in about_joints, reason
+        assert FAULTS[reason].reaction >= Reaction.DEGRADE, f"nobody takes the evidence of {reason.name}"
+
+
+def test_the_journal_knows_a_reason_by_a_number_that_never_changes() -> None:
+    numbers = {message_id(reason) for reason in Reason}
+    assert len(numbers) == len(Reason)
+    assert message_id(Reason.ENCODER_LOST) == "627996cecfa7575e9754666b55c67cfe"
+    assert (priority(Reason.ENCODER_LOST), priority(Reason.LEASE_LOST), priority(Reason.OPERATOR_STOP)) == (3, 4, 5)

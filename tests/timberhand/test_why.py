@@ -1,0 +1,192 @@
+"""`timberhand why`: the stop in words, as JSON and as a plot, from stop files and from recordings without them."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from can_dbc.messages.crane import OperatorAction
+from controller.process.tick_recording import record
+from host.exit_codes import CommandFailed, ExitCode
+from recorder.stop_files import files_in
+from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
+from timberhand.cli import app
+from timberhand.why.stops import find_stops
+from timberhand.why.timeline import events_of
+
+KEPT = Path(__file__).parents[1] / "recordings"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A crane that moves, is refused a datagram, loses an encoder, and later the guard."""
+    directory = tmp_path_factory.mktemp("why") / "run"
+    recorder = recorder_in(directory)
+    bench = RecordedBench([recorder])
+    bench.active(ticks=600)
+    bench.tick([b"rubbish"])
+    bench.drive(0, 0.08, 40)
+    bench.tick([bench.moving(0, 0.08)], late_ns=12_000_000)
+    bench.drive(0, 0.08, 10)
+    bench.lose("EncLift", 1200)
+    bench.arm_again()
+    bench.lose("GuardStat", 300)
+    recorder.close()
+    return directory
+
+
+def invoke(*words: object) -> str:
+    done = CliRunner().invoke(app, ["why", *map(str, words)], env={"COLUMNS": "120"}, catch_exceptions=False)
+    assert done.exit_code == ExitCode.OK, done.output
+    return done.stdout
+
+
+def refused(*words: object) -> CommandFailed:
+    done = CliRunner().invoke(app, ["why", *map(str, words)])
+    assert isinstance(done.exception, CommandFailed), done.output
+    return done.exception
+
+
+def test_the_newest_stop_is_explained(run: Path) -> None:
+    text = invoke(run)
+    assert "GUARD_LOST" in text and "ENCODER_LOST" not in text
+    assert "The guard is no longer received." in text and "Start the guard, then reset." in text
+    assert "limit 50.0 ms" in text and "ACTIVE before" in text
+    assert "GuardStat: the last one for more than 50 ms" in text
+    assert str(files_in(run / "stops")[-1]) in text
+
+
+def test_all_stops_are_shown_with_what_happened_before_them(run: Path) -> None:
+    text = invoke(run, "--all")
+    first, second = text.index("ENCODER_LOST"), text.index("GUARD_LOST")
+    assert first < second
+    for line in (
+        "request refused: A datagram of wrong length was refused",
+        "the tick began 12.0 ms late",
+        "EncLift: the last one for more than 15 ms",
+        "mode ACTIVE → STOP: ENCODER_LOST",
+        "mode STOP → FAULT",
+        "age of its last good sample",
+        "operator: RESET",
+    ):
+        assert line in text, line
+
+
+def test_json_has_values_in_si_units(run: Path) -> None:
+    told = json.loads(invoke(run, "--all", "--json"))
+    first, second = told["stops"]
+    assert (first["code"], first["detail"], first["mode_before"], first["mode"]) == (
+        "ENCODER_LOST",
+        1,
+        "ACTIVE",
+        "STOP",
+    )
+    age, limit, refused_frames = first["measured"]
+    assert age["unit"] == "ms" and age["value"] > limit["value"] == 15.0 and refused_frames["value"] == 0.0
+    assert first["text"].endswith("[ENCODER_LOST]") and second["number"] == 2
+    assert {"at_s", "text"} == set(first["events"][0])
+
+
+def test_a_stop_file_alone_is_enough(run: Path, tmp_path: Path) -> None:
+    first = shutil.copy(files_in(run / "stops")[0], tmp_path / "copy.mcap")
+    assert "ENCODER_LOST" in invoke(first)
+    assert "GUARD_LOST" in invoke(run / "stops")
+
+
+def test_a_recording_without_stop_files_tells_the_same(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "run.mcap", tmp_path / "run.mcap")
+    with_files, without = json.loads(invoke(run, "--all", "--json")), json.loads(invoke(tmp_path, "--all", "--json"))
+    assert len(without["stops"]) == 2
+    for a, b in zip(with_files["stops"], without["stops"], strict=True):
+        a.pop("recording"), b.pop("recording")
+        assert a == b
+
+
+@pytest.mark.parametrize("name", ["palms", "aoro"])
+def test_an_old_recording_is_read(name: str, tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(lzma.decompress((KEPT / f"{name}.mcap.xz").read_bytes()))
+    assert "did not stop" in invoke(tmp_path)
+    assert json.loads(invoke(tmp_path, "--json")) == {"stops": [], "plot": None}
+
+
+def test_without_a_run_the_newest_stop_of_all_runs_is_taken(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("timberhand.why.stops.SERVICE_STOPS", tmp_path / "service")
+    assert refused().code == "why.no-stop"
+    shutil.copytree(run, tmp_path / "runs" / "a")
+    run_with_a_stop(tmp_path / "runs" / "b", after=20)
+    for path in files_in(tmp_path / "runs" / "a" / "stops"):
+        os.utime(path, (1, 1))
+    assert "ENCODER_LOST" in invoke()
+    shutil.copytree(run / "stops", tmp_path / "service")
+    for path in files_in(tmp_path / "service"):
+        os.utime(path)
+    assert "GUARD_LOST" in invoke()
+
+
+def test_a_place_without_a_record_is_refused_in_words(tmp_path: Path) -> None:
+    for place in (tmp_path, tmp_path / "none"):
+        error = refused(place)
+        assert error.code == "why.no-record" and error.exit_code is ExitCode.CONFIGURATION
+    (tmp_path / "text.mcap").write_text("this is no recording")
+    assert refused(tmp_path / "text.mcap").code == "recording.not-mcap"
+
+
+def test_the_plot_is_a_picture_of_the_newest_stop(run: Path, tmp_path: Path) -> None:
+    from matplotlib import pyplot
+
+    path = tmp_path / "why.png"
+    assert str(path) in invoke(run, "--plot", path)
+    pixels = pyplot.imread(path)
+    assert pixels.shape[0] > 800 and pixels.shape[1] > 800
+    rows = pixels[..., :3].min(axis=(1, 2)) < 0.9
+    assert rows.mean() > 0.6, "five panels with something in them"
+
+
+def test_an_operator_and_a_pressed_stop_are_events(tmp_path: Path) -> None:
+    recorder = recorder_in(tmp_path)
+    bench = RecordedBench([recorder])
+    bench.active(ticks=100)
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.changed["GuardStat"] = {"Enable": 0, "Verdict": 7}
+    bench.run(20, bus_errors=12)
+    bench.tick([bench.operator(OperatorAction.RESET)], bus_errors=12)
+    bench.run(100, bus_errors=12, bus_state=2)
+    recorder.close()
+    (found,) = find_stops(tmp_path)
+    texts = [event.text for event in events_of(found.ticks, found.stop.at_ns)]
+    assert "EstopStat: ChannelA Released → Pressed, ChannelB Released → Pressed" in texts
+    assert "GuardStat: Enable Enabled → Disabled, Verdict GOOD → ESTOP" in texts
+    assert "operator: RESET" in texts and "crane0: 12 error frames" in texts and "crane0: ACTIVE → PASSIVE" in texts
+    assert found.stop.code == "ESTOP_PRESSED"
+
+
+def test_a_run_with_a_key_needs_it_for_a_recording_only(tmp_path: Path) -> None:
+    error = refused(keyed_run(tmp_path))
+    assert error.code == "recording.reports-unreadable"
+    (tmp_path / "key").write_bytes(b"0123456789abcdef")
+    assert "did not stop" in invoke(tmp_path / "run", "--key-file", tmp_path / "key")
+    assert refused(tmp_path / "run", "--key-file", tmp_path / "none").code == "why.key-unreadable"
+
+
+def keyed_run(tmp_path: Path) -> Path:
+    """A recording of a controller whose datagrams are authenticated."""
+    from dataclasses import replace
+
+    from tests.controller.bench import SETTINGS, Bench
+
+    recorder = recorder_in(tmp_path / "run")
+    bench = Bench(replace(SETTINGS, key=b"0123456789abcdef"))
+    for _ in range(20):
+        outputs = bench.tick()
+        recorder.on_tick(record(bench.inputs, outputs, bench.now_ns))
+    recorder.close()
+    return tmp_path / "run"

@@ -1,0 +1,78 @@
+"""A stop for a person, and as a dictionary for JSON."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from typing import Any, Final
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from recorder.stop import Stop
+from timberhand.why.stops import FoundStop
+from timberhand.why.timeline import Event
+
+MAX_EVENTS: Final = 24
+"""Lines of the timeline; the ones nearest to the stop are kept."""
+_STYLES: Final = {"FAULT": "bold red", "STOP": "bold yellow"}
+
+
+def when(stop: Stop) -> str:
+    """Time of the stop: UTC, or the run's own clock in lockstep."""
+    if stop.utc_ns is None:
+        return f"at {stop.at_ns / 1e9:.3f} s of the run's clock"
+    at = datetime.datetime.fromtimestamp(stop.utc_ns // 10**9, datetime.UTC)
+    return f"at {at:%Y-%m-%d %H:%M:%S}.{stop.utc_ns // 10**6 % 1000:03d} UTC"
+
+
+def show(console: Console, found: FoundStop, events: Sequence[Event]) -> None:
+    """Prints time, mode, reason, numbers, advice, timeline and file."""
+    stop, explained = found.stop, found.stop.explanation
+    style = _STYLES.get(stop.mode, "bold")
+    head = f"[{style}]{stop.mode}[/] {when(stop)}, {stop.mode_before} before, {escape(found.manifest.profile)}"
+    _line(console, head)
+    facts = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    facts.add_column(style="dim", no_wrap=True)
+    facts.add_column()
+    measured = "\n".join(quantity.text for quantity in explained.quantities) or "no number belongs to this reason"
+    rows = {"code": explained.code, "what": explained.sentence, "measured": measured, "what to do": explained.advice}
+    for name, text in rows.items():
+        facts.add_row(f"  {name}", escape(text))
+    console.print(facts)
+    _line(console, "[dim]  what happened[/]")
+    kept = sorted(sorted(events, key=lambda event: abs(event.at_s))[:MAX_EVENTS])
+    for event in kept:
+        _line(console, f"  {event.at_s:+9.3f} s  {escape(event.text)}")
+    if not kept:
+        _line(console, "  nothing else in the two seconds before it")
+    if len(kept) < len(events):
+        _line(console, f"  {len(events) - len(kept)} more events are in --json")
+    _line(console, f"[dim]  recorded in[/]  {escape(str(found.source))}")
+
+
+def _line(console: Console, markup: str) -> None:
+    console.print(markup, highlight=False, soft_wrap=True)
+
+
+def as_dict(found: FoundStop, events: Sequence[Event]) -> dict[str, Any]:
+    """The same for JSON, with values in SI units (times in ms where the unit says so)."""
+    stop, explained = found.stop, found.stop.explanation
+    return {
+        "number": stop.number,
+        "utc_ns": stop.utc_ns,
+        "monotonic_ns": stop.at_ns,
+        "profile": found.manifest.profile,
+        "mode_before": stop.mode_before,
+        "mode": stop.mode,
+        "code": explained.code,
+        "reason": stop.reason & 0xFF,
+        "detail": stop.reason >> 8,
+        "sentence": explained.sentence,
+        "measured": [quantity._asdict() for quantity in explained.quantities],
+        "advice": explained.advice,
+        "text": explained.text,
+        "events": [event._asdict() for event in events],
+        "recording": str(found.source),
+    }

@@ -1,0 +1,150 @@
+"""Finds stops: the files of the stop recorder, or the stops in a recording that has none.
+
+A stop file, a directory of them, a run's directory, or one ``run.mcap``; without a place the newest stop on this
+computer, of the runs below ``runs/`` and of the service.  Nothing is repaired or changed: a file that is still being
+written, or whose writer was killed, is read up to its last complete chunk.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from can_dbc.messages import datagrams, tick_record
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.tick_record import RecordRefused, TickRecord
+from hil.replay.recording import files_of, manifest_of, messages
+from hil.replay.replay import recorded_ticks
+from host.exit_codes import CommandFailed, ExitCode
+from recorder.manifest import Manifest
+from recorder.recorder import STOPS_NAME, TICK
+from recorder.stop import TOPIC, Stop, StopDetector, stop_from
+from recorder.stop_files import files_in, parts_in
+from recorder.stop_recorder import AFTER_NS, BEFORE_NS
+
+SERVICE_STOPS: Final = Path("/var/lib/timberhand") / STOPS_NAME
+
+
+@dataclass(frozen=True, slots=True)
+class FoundStop:
+    """A stop with the ticks around it; ``source`` is the file or recording that has it."""
+
+    stop: Stop
+    manifest: Manifest
+    ticks: tuple[TickRecord, ...]
+    source: Path
+
+
+def find_stops(run: Path | None, key: bytes | None = None, newest: bool = False) -> Iterator[FoundStop]:
+    """The stops of ``run``, oldest first; with ``newest`` the last of them only.  None found: an empty iterator.
+
+    Raises:
+        CommandFailed: there is no recording, or it cannot be read.
+    """
+    paths = _newest_directory() if run is None else _stop_files(run)
+    if paths:
+        for path in paths[-1:] if newest else paths:
+            yield from read_stop(path)
+    elif run is not None:
+        found = stops_in_recording(_recording(run), key)
+        yield from deque(found, maxlen=1) if newest else found
+
+
+def read_stop(path: Path) -> Iterator[FoundStop]:
+    """The stop in a file of the stop recorder; none if its writer was killed before the first chunk was complete."""
+    stop = next(messages([path], TOPIC), None)
+    if stop is not None:
+        ticks = tuple(recorded_ticks([path]))
+        yield FoundStop(msgspec.json.decode(stop, type=Stop), manifest_of([path]), ticks, path)
+
+
+def stops_in_recording(files: list[Path], key: bytes | None) -> Iterator[FoundStop]:
+    """The stops of a whole recording, found in the controller's reports."""
+    manifest = manifest_of(files)
+    offset_ns = manifest.utc_offset_ns if manifest.live else None
+    detector, number = StopDetector(), 0
+    recent: deque[tuple[int, bytes]] = deque()
+    open_: list[tuple[Stop, list[bytes]]] = []
+
+    def found(stop: Stop, records: list[bytes]) -> FoundStop:
+        return FoundStop(stop, manifest, tuple(map(tick_record.decode, records)), files[0].parent)
+
+    for data in messages(files, TICK):
+        tick = _decoded(data, files[0])
+        recent.append((tick.now_ns, data))
+        for _, records in open_:
+            records.append(data)
+        while recent[0][0] < tick.now_ns - BEFORE_NS:
+            recent.popleft()
+        report = _report_of(tick, key)
+        before = detector.step(report) if report is not None else None
+        if report is not None and before is not None:
+            number += 1
+            open_.append((stop_from(report, before, number, offset_ns), [record for _, record in recent]))
+        while open_ and tick.now_ns >= open_[0][0].at_ns + AFTER_NS:
+            yield found(*open_.pop(0))
+    for stop, records in open_:
+        yield found(stop, records)
+
+
+def _decoded(data: bytes, file: Path) -> TickRecord:
+    try:
+        return tick_record.decode(data)
+    except RecordRefused as error:
+        raise CommandFailed(
+            "recording.other-version",
+            f"{file.parent}: {error}; read it with the release that recorded it",
+            ExitCode.CONFIGURATION,
+        ) from error
+
+
+def _report_of(tick: TickRecord, key: bytes | None) -> StateReport | None:
+    if not tick.report:
+        return None
+    try:
+        report = datagrams.decode(tick.report, key)
+    except DatagramRefused as error:
+        raise CommandFailed(
+            "recording.reports-unreadable",
+            f"the recorded reports cannot be read ({error}); give the run's key with --key-file",
+            ExitCode.CONFIGURATION,
+        ) from error
+    return report if isinstance(report, StateReport) else None
+
+
+def _newest_directory() -> list[Path]:
+    """The stop files of the directory, of all on this computer, that has the newest one."""
+    places = [*Path("runs").glob(f"*/{STOPS_NAME}"), SERVICE_STOPS]
+    found = [paths for place in places if (paths := _in_directory(place))]
+    return max(found, key=lambda paths: paths[-1].stat().st_mtime_ns, default=[])
+
+
+def _stop_files(run: Path) -> list[Path]:
+    if run.is_dir():
+        return _in_directory(run / STOPS_NAME) or _in_directory(run)
+    if run.is_file() and next(messages([run], TOPIC), None) is not None:
+        return [run]
+    return []
+
+
+def _in_directory(directory: Path) -> list[Path]:
+    return sorted([*files_in(directory), *parts_in(directory)])
+
+
+def _recording(run: Path) -> list[Path]:
+    """The MCAP files of a run; raises CommandFailed with a sentence about what was looked for."""
+    try:
+        return files_of(run)
+    except CommandFailed as error:
+        raise CommandFailed(
+            "why.no-record",
+            f"{run} holds neither stops nor a recording; give a run's directory, a stop file, or nothing for the "
+            "newest stop",
+            ExitCode.CONFIGURATION,
+        ) from error
