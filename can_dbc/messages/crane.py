@@ -218,12 +218,11 @@ def operator_from(common: Common, body: bytes) -> OperatorCommand:
 def report_from(common: Common, body: bytes) -> StateReport:
     """The report in a body, with or without evidence; raises struct.error for a wrong length."""
     values = _REPORT.unpack(body[: _REPORT.size])
-    since_ns = 0
-    numbers: tuple[float, ...] = ()
+    evidence: tuple[Any, ...] = ()
     if len(body) > _REPORT.size:
-        since_ns, *found = _EVIDENCE.unpack(body[_REPORT.size :])
-        numbers = tuple(found)
+        since_ns, *numbers = _EVIDENCE.unpack(body[_REPORT.size :])
+        evidence = since_ns, tuple(numbers)
     joints = values[7 : 7 + 3 * N_AXES]
     fields: list[Any] = [*common, *values[:7]]
     fields += [joints[:N_AXES], joints[N_AXES : 2 * N_AXES], joints[2 * N_AXES :]]
-    return StateReport(*fields, *values[7 + 3 * N_AXES :], since_ns, numbers)
+    return StateReport(*fields, *values[7 + 3 * N_AXES :], *evidence)
