@@ -26,6 +26,10 @@ from runtime.errors import CodedError
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _FOOTER_BYTES = _RECORD.size + 20
+_MAX_CHUNK_BYTES = 256 << 20
+"""A chunk that says it is longer is damaged; the recorder's have a few megabytes."""
+_DAMAGED = (ValueError, struct.error, McapError, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
+"""What the libraries raise for damaged records and chunks."""
 
 
 class NotMcap(CodedError, ValueError):
@@ -61,7 +65,7 @@ def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema |
         magic = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(magic):
             raise NotMcap("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
-        skipped: set[int] = set()
+        wanted: set[int] = set()
         while True:
             head = file.read(_RECORD.size)
             if len(head) < _RECORD.size:
@@ -72,31 +76,41 @@ def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema |
             if length > path.stat().st_size - file.tell():
                 return
             body = file.read(length)
-            if opcode == Opcode.CHUNK:
-                try:
-                    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-                    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-                except (ValueError, struct.error, McapError, zstandard.ZstdError):
-                    return
-                yield from _records(stream.read(size), topics, skipped)
-            else:
-                yield from _records(head + body, topics, skipped)
+            try:
+                records = _chunk(body) if opcode == Opcode.CHUNK else head + body
+                found = list(_records(records, topics, wanted))
+            except _DAMAGED:
+                return
+            yield from found
 
 
-def _records(data: bytes, topics: Collection[str] | None, skipped: set[int]) -> Iterator[Schema | Channel | Stored]:
+def _chunk(body: bytes) -> bytes:
+    """The records in a chunk; raises one of `_DAMAGED`."""
+    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+    if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
+        raise ValueError("the chunk is too long")
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    return stream.read(size) if size else b""
+
+
+def _records(data: bytes, topics: Collection[str] | None, wanted: set[int]) -> Iterator[Schema | Channel | Stored]:
+    """The records in ``data``; ``wanted`` collects the channels to yield messages of.  Raises one of `_DAMAGED`."""
     at = 0
     while at < len(data):
         opcode, length = _RECORD.unpack_from(data, at)
         at += _RECORD.size
+        if at + length > len(data):
+            raise ValueError("a record is longer than its chunk")
         if opcode == Opcode.MESSAGE:
+            if length < _MESSAGE.size:
+                raise ValueError("a message without its header")
             channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
-            if channel_id not in skipped:
+            if channel_id in wanted:
                 yield Stored(channel_id, log_ns, publish_ns, data[at + _MESSAGE.size : at + length])
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(data[at : at + length])))
-            if topics is not None and channel.topic not in topics:
-                skipped.add(channel.id)
-            else:
+            if topics is None or channel.topic in topics:
+                wanted.add(channel.id)
                 yield channel
         elif opcode == Opcode.SCHEMA:
             yield Schema.read(ReadDataStream(BytesIO(data[at : at + length])))

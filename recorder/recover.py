@@ -77,7 +77,7 @@ def rewrite(path: Path) -> Recovered:
                 schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
             elif isinstance(record, Channel):
                 channels[record.id] = writer.register_channel(
-                    record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                    record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata
                 )
             else:
                 writer.add_message(channels[record.channel_id], record.log_ns, record.data, record.publish_ns)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from can_dbc.dbc.codec import DbcError, FrameRefused, MessageCodec, Policy, SignalInfo, compile_one, parse, resolve
+from can_dbc.dbc.codec import DbcError, FrameRefused, MessageCodec, Policy, SignalInfo, parse, resolve, usable
 from can_dbc.dbc.signals import ERROR, NOT_AVAILABLE, EncodeRefused
 from can_dbc.frame import describe
 
@@ -55,7 +55,7 @@ def check(name_or_path: str, frames: int, seed: int) -> Report:
         return Report(str(name_or_path), str(error), 0, 0, 0, 0, 0, (), ())
     try:
         database = parse(path)
-        pairs = [(message, compile_one(message, path)) for message in database.messages]
+        pairs = [(message, usable(message, path)) for message in database.messages]
     except DbcError as error:
         try:
             found = lint(parse(path, strict=False))

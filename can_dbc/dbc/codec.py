@@ -31,7 +31,7 @@ from runtime.errors import CodedError
 
 __all__ = [
     "SHIPPED", "Database", "DbcError", "EncodeRefused", "FrameRefused", "MessageCodec", "Policy", "Refusal",
-    "SignalInfo", "compile_one", "load", "pgn_key", "resolve",
+    "SignalInfo", "compile_one", "load", "parse", "pgn_key", "resolve", "usable",
 ]  # fmt: skip
 SHIPPED: Final = ("crane", "machine", "gnss")
 PDU2_MASK: Final = EXTENDED | 0x03FF_FF00
@@ -110,7 +110,7 @@ def resolve(name_or_path: str | Path) -> Path:
 def load(name_or_path: str | Path) -> Database:
     """Reads and compiles a database: one of ``SHIPPED`` or a path to a DBC or KCD file; raises DbcError."""
     path = resolve(name_or_path)
-    messages = [compile_one(message, path) for message in parse(path).messages]
+    messages = [usable(message, path) for message in parse(path).messages]
     for what, counts in (
         ("name", Counter(m.name for m in messages)),
         ("identifier", Counter(describe(m.key) for m in messages)),
@@ -128,6 +128,14 @@ def load(name_or_path: str | Path) -> Database:
     )
 
 
+def usable(message: Any, path: Path) -> MessageCodec:
+    """`compile_one`, also for numbers that cantools accepts and no codec can use, such as an infinite scale."""
+    try:
+        return compile_one(message, path)
+    except (ArithmeticError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
+        raise DbcError("dbc.invalid", f"{path}: message {message.name} cannot be used: {error}") from error
+
+
 def parse(path: Path, *, strict: bool = True) -> Any:
     """The cantools database of a file; raises DbcError, with the line if known."""
     import cantools
@@ -141,7 +149,10 @@ def parse(path: Path, *, strict: bool = True) -> Any:
         return cantools.database.load_string(text, database_format=kind, strict=strict)
     except (OSError, UnicodeError) as error:
         raise DbcError("dbc.unreadable", f"{path}: cannot be read: {error}") from error
-    except (Error, ValueError, KeyError, IndexError, TypeError, SyntaxError) as error:
+    except (
+        Error, ValueError, LookupError, TypeError, SyntaxError, AttributeError, ArithmeticError, AssertionError,
+        MemoryError, RecursionError,
+    ) as error:  # fmt: skip
         reason = re.sub(r"^(DBC|KCD): ", "", str(error)).strip('"') or type(error).__name__
         raise DbcError("dbc.invalid", f"{path}{_line_of(reason, text)}: {reason}") from error
 

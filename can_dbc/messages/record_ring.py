@@ -118,16 +118,21 @@ class RingReader:
         """The record at the tail; None if there is none, or it was overwritten meanwhile."""
         assert self._map is not None
         at = self._tail % self._capacity
-        size, number = _RECORD.unpack_from(self._map, HEAD_BYTES + at)
+        room = self._capacity - at
+        size, number = _RECORD.unpack_from(self._map, HEAD_BYTES + at) if room >= _RECORD.size else (SKIP, 0)
         begin = HEAD_BYTES + at + _RECORD.size
+        step = room if size == SKIP else _RECORD.size + (size + 7 & -8)
+        written = self._word(_WRITTEN)
+        if not size or step > room or self._tail + step > written:  # a length that the writer cannot have written
+            self._tail = written
+            return None
         data = self._map[begin : begin + size] if size != SKIP else b""
-        if self._word(_RESERVED) - self._tail > self._capacity:
+        if max(self._word(_RESERVED), written) - self._tail > self._capacity:
             self._tail = self._word(_WRITTEN)  # the writer is ahead by a whole round: go on with what comes next
             return None
+        self._tail += step
         if size == SKIP:
-            self._tail += self._capacity - at
             return None
-        self._tail += _RECORD.size + (size + 7 & -8)
         self.lost += 0 if self._next is None else number - self._next & 0xFFFF_FFFF
         self._next = number + 1
         return data
@@ -141,7 +146,7 @@ class RingReader:
         """Map the ring from its beginning; False if it is not there, or not complete yet."""
         with contextlib.suppress(OSError, ValueError), self._path.open("rb", buffering=0) as file:
             made = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ)
-            magic, capacity = struct.unpack_from("<QQ", made)
+            magic, capacity = struct.unpack_from("<QQ", made) if len(made) > HEAD_BYTES else (0, 0)
             if magic != MAGIC or capacity != len(made) - HEAD_BYTES:
                 made.close()
                 return False

@@ -184,7 +184,7 @@ def read_timing(path: Path | None = None) -> Timing:
                     if sequence and not sequence & 1:
                         return _timing(data, size)
                 time.sleep(0.002)
-    except (OSError, msgspec.MsgspecError) as error:
+    except (OSError, ValueError, msgspec.MsgspecError) as error:
         reason = getattr(error, "strerror", None) or error
         raise TimingRefused(
             "timing.no-page",

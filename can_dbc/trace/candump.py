@@ -59,6 +59,13 @@ def _text(lines: list[str]) -> Iterator[Frame | MalformedRecord]:
 
 def parse_line(line: str) -> Frame | None:
     """The frame in one line of any of the text formats; None if the line is of another format or damaged."""
+    try:
+        return _parsed(line)
+    except ValueError:  # a number too long to convert, or blanks that are none to `bytes.fromhex`
+        return None
+
+
+def _parsed(line: str) -> Frame | None:
     if found := CANDUMP.match(line):
         return _candump(found[1], found[3], found[4])
     if found := CANDUMP_SCREEN.match(line):

@@ -75,7 +75,7 @@ def manifest_of(files: list[Path]) -> Manifest:
     """The manifest inside the recording.
 
     Raises:
-        CommandFailed: there is none.
+        CommandFailed: there is none, or it is damaged.
     """
     first = next(messages(files[:1], "/manifest"), None)
     if first is None:
@@ -84,4 +84,11 @@ def manifest_of(files: list[Path]) -> Manifest:
             f"{files[0]} has no manifest, so timberhand did not make this recording",
             ExitCode.CONFIGURATION,
         )
-    return msgspec.json.decode(first, type=Manifest)
+    try:
+        return msgspec.json.decode(first, type=Manifest)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise CommandFailed(
+            "recording.damaged-manifest",
+            f"{files[0]}: its manifest is damaged or of another release ({error}); give another recording",
+            ExitCode.CONFIGURATION,
+        ) from error

@@ -1,0 +1,280 @@
+"""Datagrams and records: those of planner, operator, controller, mission, camera, recorder and timing page."""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+
+from autonomy.process.operator_commands import CommandReceiver, CommandRefused
+from can_dbc.messages import rgbd, tick_record
+from can_dbc.messages.crane import (
+    CraneSetpoint,
+    GrappleCommand,
+    Knot,
+    OperatorAction,
+    OperatorCommand,
+    SpoolKnot,
+    SpoolTest,
+)
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.envelope import DatagramRefused, is_operator_command
+from can_dbc.messages.mission import (
+    MissionAction,
+    MissionCommand,
+    decode_mission,
+    decode_mission_command,
+    encode_mission,
+    encode_mission_command,
+)
+from can_dbc.messages.record_ring import MAGIC as RING_MAGIC
+from can_dbc.messages.record_ring import RecordRing, RingReader
+from can_dbc.messages.rgbd import RgbdError
+from can_dbc.messages.tick_record import RecordRefused
+from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
+from can_dbc.timing.page import TimingRefused, TimingWriter, read_timing
+from controller.config import load
+from controller.requests.gate import RequestGate
+from controller.requests.setpoint_gate import RequestRefused
+from tests.can_dbc.example_mission_report import MISSION_REPORT
+from tests.conftest import a_timing
+from tests.fuzz.engine import Run, Target
+from tests.fuzz.sentences import coded_sentence
+from tests.recorder import recordings
+
+MS = 1_000_000
+NOW_NS = 10**9
+ZERO = (0.0,) * 5
+SETTINGS = load("aoro_fc8")
+HASH = SETTINGS.profile_hash
+
+
+def with_crc(data: bytes) -> bytes:
+    """The datagram with a CRC-32 that fits."""
+    return data[:-4] + struct.pack("<I", zlib.crc32(data[:-4])) if len(data) >= 4 else data
+
+
+def datagrams() -> list[bytes]:
+    """One of each kind, all valid at `NOW_NS`."""
+    common = (5, HASH, NOW_NS)
+    knots = tuple(Knot(k * 100 * MS, (0.0, 0.5, -1.2, 0.6, 0.0), ZERO) for k in range(3))
+    drive = (200 * MS, Steering.WAYPOINT, 63.66, 19.9, 0.0, 0.0, 0.5, (0.3,) * 4, False, False)
+    made = [
+        CraneSetpoint(*common, 200 * MS, GrappleCommand.HOLD, True, knots),
+        SpoolTest(*common, 200 * MS, 2, (SpoolKnot(0, 0.0), SpoolKnot(100 * MS, 20.0))),
+        DriveSetpoint(*common, *drive),
+        OperatorCommand(*common, OperatorAction.ARM),
+        OperatorCommand(*common, OperatorAction.STOP),
+        VehicleReport(*common, 1, 1, 0, 0, 5, 63.0, 19.0, 100.0, 4, 12, 0.02, 6, 1.0, 0.0, 7, 0.5, 0.1, 0.0, 0.0,
+                      (0.3,) * 4, 0),
+    ]  # fmt: skip
+    return [*map(encode, made), recordings.report(1)]
+
+
+def missions() -> list[bytes]:
+    """Mission report and commands."""
+    commands = [MissionCommand(3, HASH, NOW_NS, action) for action in MissionAction]
+    return [encode_mission(MISSION_REPORT, 1, HASH, NOW_NS), *map(encode_mission_command, commands)]
+
+
+def start_decode() -> Run:
+    def run(data: bytes) -> tuple[int, Hashable]:
+        is_operator_command(data)
+        outcome: list[Hashable] = []
+        for what in (decode, decode_mission, decode_mission_command):
+            try:
+                message = what(data)
+                outcome.append(type(message).__name__)
+                if what is decode:
+                    assert encode(message)  # what is accepted can be said again
+            except DatagramRefused as refused:
+                assert str(refused)
+                outcome.append(refused.fault)
+        return 1, tuple(outcome)
+
+    return run
+
+
+def start_gate() -> Run:
+    """A gate keeps what it accepted, so its order and leases are tried as well."""
+    gate = RequestGate(SETTINGS.profile, HASH, None)
+    missions_gate = CommandReceiver(HASH)
+    now_ns = NOW_NS
+
+    def run(data: bytes) -> tuple[int, Hashable]:
+        nonlocal now_ns
+        now_ns += 5 * MS
+        found: list[Hashable] = []
+        for operator in (False, True):
+            try:
+                message = gate.accept(data, now_ns, 0, operator)
+                found.append(type(message).__name__)
+                if isinstance(message, CraneSetpoint | SpoolTest):
+                    gate.mark_accepted(message)
+            except RequestRefused as refused:
+                gate.count_refusal(refused.reason, refused.detail, now_ns)
+                found.append(refused.reason)
+        try:
+            found.append(missions_gate.accept(data, now_ns).action)
+        except CommandRefused as refused:
+            coded_sentence(refused)
+            found.append(refused.code)
+        return 1, tuple(found)
+
+    return run
+
+
+def keyed() -> Run:
+    """With a key nothing passes that was not made with it."""
+    key = b"0123456789abcdef"
+
+    def run(data: bytes) -> tuple[int, Hashable]:
+        try:
+            decode(data, key)
+        except DatagramRefused as refused:
+            return 1, refused.fault
+        raise AssertionError("a datagram passed without the key")
+
+    return run
+
+
+def start_record() -> Run:
+    def run(data: bytes) -> tuple[int, Hashable]:
+        try:
+            tick = tick_record.decode(data)
+        except RecordRefused as refused:
+            coded_sentence(refused)
+            return 1, refused.code
+        return 1, (len(tick.frames_in), len(tick.datagrams))
+
+    return run
+
+
+def start_picture() -> Run:
+    """Both sides read the fixed part first, with its exact length."""
+    parts = ((rgbd.decode, None), (rgbd.decode_header, rgbd.HEADER_BYTES),
+             (rgbd.request_name_bytes, rgbd.REQUEST_HEADER.size))  # fmt: skip
+
+    def run(data: bytes) -> tuple[int, Hashable]:
+        found: list[Hashable] = []
+        for what, size in parts:
+            if size is not None and len(data) < size:
+                continue
+            try:
+                what(data[:size])  # type: ignore[operator]
+                found.append("good")
+            except RgbdError as refused:
+                coded_sentence(refused)
+                found.append(refused.code)
+        return 1, tuple(found)
+
+    return run
+
+
+def pictures() -> list[bytes]:
+    picture = rgbd.RgbdMessage("mast", NOW_NS, 6, 4, 5.0, 5.0, 3.0, 2.0, bytes(6 * 4 * 3), bytes(6 * 4 * 2))
+    return [rgbd.encode_request("mast"), rgbd.encode_refusal("mast", "There is no such camera."), rgbd.encode(picture)]
+
+
+def in_file(name: str) -> Path:
+    """A file in a folder of this process, in memory where the system has one."""
+    folder = Path(tempfile.mkdtemp(prefix="timberhand-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    return folder / name
+
+
+RING_BYTES = 1 << 14
+
+
+def ring_seeds() -> list[bytes]:
+    """Three records as the writer leaves them, at the beginning of a ring and around its end."""
+    path = in_file("seed.ring")
+    ring = RecordRing(path)
+    try:
+        for k in range(3):
+            ring.append(recordings.tick(k))
+        whole = path.read_bytes()
+    finally:
+        ring.close()
+    return [whole[:4000], whole[:24] + struct.pack("<Q", 1 << 40) + whole[32:4000]]
+
+
+def start_ring() -> Run:
+    """A reader of a file that another process writes: whatever it finds there, it ends and keeps nothing."""
+    path = in_file("read.ring")
+
+    def run(data: bytes) -> tuple[int, Hashable]:
+        begun = bytearray(data[: 64 + RING_BYTES].ljust(64 + RING_BYTES, b"\0"))
+        struct.pack_into("<QQ", begun, 0, RING_MAGIC, RING_BYTES)
+        struct.pack_into("<Q", begun, 24, 0)
+        path.write_bytes(begun)
+        reader = RingReader(path)
+        try:
+            with path.open("r+b") as file:  # not rewritten: a file that is mapped must not become shorter
+                file.seek(24)
+                file.write(data[24:32].ljust(8, b"\0"))
+            found = reader.read()
+            for record in found:
+                try:
+                    tick_record.decode(record)
+                except RecordRefused as refused:
+                    coded_sentence(refused)
+        finally:
+            reader.close()
+        path.write_bytes(data)
+        RingReader(path).close()
+        return 1, (min(len(found), 4), reader.lost > 0)
+
+    return run
+
+
+FACTS_BYTES = 1 << 14
+"""Of the page's beginning, with the facts; the histograms behind it are counts, any of which is valid."""
+
+
+def timing_page() -> bytes:
+    path = in_file("seed.timing")
+    writer = TimingWriter(path)
+    try:
+        timing = a_timing()
+        writer.publish(timing.facts, timing.durations)
+        return path.read_bytes()
+    finally:
+        writer.close()
+
+
+def start_timing() -> Run:
+    path, whole = in_file("read.timing"), timing_page()
+
+    def run(data: bytes) -> tuple[int, Hashable]:
+        data = data[:FACTS_BYTES] + whole[len(data[:FACTS_BYTES]) :]
+        if data[8:16] == bytes(8) or data[8] & 1:
+            return 1, "not written"  # the reader waits for the writer, 0.1 s each time
+        path.write_bytes(data)
+        try:
+            timing = read_timing(path)
+        except TimingRefused as refused:
+            coded_sentence(refused)
+            return 1, refused.code
+        return 1, timing.facts.mode
+
+    return run
+
+
+def _target(
+    name: str, start: Callable[[], Run], seeds: Callable[[], Sequence[bytes]], mend: bool = True,
+    unit: str = "datagrams", **more: object,
+) -> Target:  # fmt: skip
+    return Target(name, unit, start, seeds, mend=with_crc if mend else None, **more)  # type: ignore[arg-type]
+
+
+MESSAGES = (
+    _target("datagrams", start_decode, lambda: [*datagrams(), *missions()]),
+    _target("request-gate", start_gate, lambda: [*datagrams(), *missions()], runs_per_state=2000),
+    _target("datagrams-keyed", keyed, datagrams),
+    _target("tick-record", start_record, lambda: [recordings.tick(k) for k in range(3)], unit="records"),
+    _target("record-ring", start_ring, ring_seeds, mend=False, unit="rings", max_bytes=1 << 13),
+    _target("timing-page", start_timing, lambda: [timing_page()[:FACTS_BYTES].rstrip(b"\0")], mend=False, unit="pages"),
+    _target("camera-stream", start_picture, pictures, unit="messages", max_bytes=1 << 13),
+)

@@ -1,0 +1,97 @@
+"""A short run of every target, the inputs that once broke one, and the fuzzer itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from can_dbc.messages.envelope import DatagramRefused, unsealed
+from tests.fuzz.engine import REGRESSIONS, Broken, Target, fuzz, judged, packed, replay, smallest, unpacked
+from tests.fuzz.targets import TARGETS
+
+RUNS = {"controller-loader": 120, "controller-forwarder": 80, "guard": 300, "dbc": 60, "profile": 60, "trace-asc": 300,
+        "recording": 600, "mission-file": 1000, "timing-page": 1500}  # fmt: skip
+GUARD = "the guard's readers raise what Python raises for numbers and characters that they cannot use"
+REPORTED = dict.fromkeys(("guard-dbc", "guard-profile"), GUARD)
+SAVED = [(path.parent.name, path) for path in sorted(REGRESSIONS.glob("*/*.inputs"))]
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_short_run_holds_the_contract(name: str) -> None:
+    result = fuzz(TARGETS[name], seed=2, runs=RUNS.get(name, 3000))
+    if result.failure and name in REPORTED:
+        pytest.xfail(f"{REPORTED[name]}: {result.failure}")
+    assert not result.failure, f"{result.failure}; inputs: {packed(result.inputs)[-400:]!r}"
+    assert result.units > 0 and result.outcomes > 1
+
+
+@pytest.mark.parametrize(("name", "path"), SAVED, ids=[f"{name}-{path.stem}" for name, path in SAVED])
+def test_an_input_that_once_broke_a_contract(name: str, path: object) -> None:
+    replay(TARGETS[name], unpacked(path.read_bytes()))  # type: ignore[attr-defined]
+
+
+def _fragile(limit: int = 1 << 62) -> Target:
+    def start():
+        count = 0
+
+        def run(data: bytes) -> tuple[int, object]:
+            nonlocal count
+            count += 1
+            if b"\xff\xff" in data and count > 1:
+                raise KeyError("an undocumented exception")
+            try:
+                unsealed(data, None)
+            except DatagramRefused as refused:
+                return 1, refused.fault
+            return 1, "good"
+
+        return run
+
+    return Target("fragile", "inputs", start, lambda: [b"TRHD" + bytes(40)], runs_per_state=limit)
+
+
+def test_the_fuzzer_finds_an_undocumented_exception_and_makes_its_inputs_small() -> None:
+    target = _fragile(500)
+    result = fuzz(target, runs=50_000)
+    assert "KeyError" in result.failure
+    small = smallest(target, result.inputs)
+    assert len(small) == 2 and small[-1] == b"\xff\xff"
+    with pytest.raises(Broken, match="KeyError"):
+        replay(target, unpacked(packed(small)))
+
+
+def test_the_same_seed_gives_the_same_run_and_another_one_does_not() -> None:
+    def failing(seed: int) -> list[bytes]:
+        return fuzz(_fragile(500), seed, runs=50_000).inputs
+
+    assert failing(1) == failing(1) != failing(3)
+
+
+def test_a_hang_is_a_broken_contract(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.fuzz.engine.HANG_S", 0.05)
+
+    def start():
+        def run(data: bytes) -> tuple[int, object]:
+            while True:
+                pass
+
+        return run
+
+    target = Target("hangs", "inputs", start, lambda: [b""])
+    result = fuzz(target, runs=1)
+    assert "processor time" in result.failure
+    assert judged(lambda data: (1, data), b"x") == (1, b"x")
+
+
+def test_a_result_that_grows_memory_is_a_broken_contract(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.fuzz.engine.GROWTH_BYTES", 1 << 20)
+    kept: list[bytearray] = []
+
+    def start():
+        def run(data: bytes) -> tuple[int, object]:
+            kept.append(bytearray(2000))
+            return 1, 0
+
+        return run
+
+    target = Target("grows", "inputs", start, lambda: [b"x"])
+    assert "memory grew" in fuzz(target, runs=20_000).failure
