@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Kept bytecode halves pytest's collection (25 s to 13 s of CPU per worker); an environment may forbid it, this one does not.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup wheel wheel-arm64 demo test check lint docs bench soak lab-kernel clean
+.PHONY: help setup wheel wheel-arm64 demo test check lint docs coverage mutants fuzz bench soak lab-kernel clean
 
 help:  ## show this list
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,7 +29,7 @@ wheel-arm64: setup  ## the same for arm64, cross-compiled
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)
 
-test: lint docs  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
+test: lint docs coverage  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
 	@$(BIN)/pytest -m "not slow" -n 2 --dist worksteal $(ARGS) || [ $$? -eq 5 ]
 	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
@@ -47,6 +47,15 @@ lint: setup  ## style, types and the three floors
 docs: setup  ## build the site into docs/_build; broken links and stale reference pages are errors
 	@$(BIN)/python -m timberhand.reference --check
 	@$(BIN)/sphinx-build -W --keep-going -q docs docs/_build && echo "docs/_build/index.html"
+
+coverage: setup  ## branch coverage of supervisor and guard by their own tests; below 100 % is an error
+	@$(BIN)/python -m tests.branch_coverage
+
+mutants: setup  ## change supervisor and guard a thousand times, see their tests fail, write docs/results/mutants.json
+	@$(BIN)/python -m tests.mutation $(ARGS)
+
+fuzz: setup  ## random frames, datagrams, answers and files for 20 s each; ARGS="--units 1000000", "--target NAME"
+	@$(BIN)/python -m tests.fuzz $(ARGS)
 
 bench: setup  ## measure: codecs beside cantools, the tick compiled and not, the bus beside python-can, the plant against real time
 	@$(BIN)/timberhand bench codec $(ARGS)

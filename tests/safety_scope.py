@@ -1,0 +1,59 @@
+"""The modules whose tests are themselves tested, and the tests that concern them.
+
+`tests.mutation` and `tests.branch_coverage` read this; both run only these tests, so a change of a rule needs its test
+in one of these files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """A part of the safety layer: its modules and the globs of its test files, the quickest first."""
+
+    name: str
+    modules: tuple[str, ...]
+    test_globs: tuple[str, ...]
+
+    def sources(self) -> dict[str, Path]:
+        """Path of every module, by dotted name."""
+        found: dict[str, Path] = {}
+        for glob in self.modules:
+            for path in sorted(ROOT.glob(glob)):
+                name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+                if path.name != "__init__.py":
+                    found[name] = path
+        return found
+
+    def tests(self) -> list[Path]:
+        """The test files."""
+        found: list[Path] = []
+        for glob in self.test_globs:
+            found += [path for path in sorted(ROOT.glob(glob)) if path not in found]
+        return found
+
+
+SCOPES = (
+    Scope(
+        "supervisor",
+        ("controller/supervisor.py", "controller/transitions.py"),
+        (
+            "tests/controller/test_transition_table.py",
+            "tests/controller/test_mode_model.py",
+            "tests/controller/test_supervisor*.py",
+            "tests/controller/test_faults.py",
+            "tests/controller/test_vehicle_faults.py",
+            "tests/controller/test_bus_faults.py",
+        ),
+    ),
+    Scope(
+        "guard",
+        ("controller/guard/*.py",),
+        ("tests/controller/test_guard*.py",),
+    ),
+)
