@@ -1,0 +1,153 @@
+"""The guard's process around its core: command line, buses, deadlines, signals and exit codes."""
+
+from __future__ import annotations
+
+import signal
+from types import SimpleNamespace
+
+import pytest
+
+from can_dbc.bus.base import BusError
+from controller.guard import __main__ as process
+from controller.guard.__main__ import main, profile_path
+from hil.wire.core import WireCore
+from hil.wire.inprocess import InProcessBus
+from tests.controller.bench import DATABASE, MS
+
+T = process.PERIOD_NS
+
+
+class World:
+    """Clock and buses of one guard process; ``until`` ticks pass before ``number`` ends it."""
+
+    def __init__(self, until: int, number: int = signal.SIGTERM, late_ticks: dict[int, int] | None = None) -> None:
+        self.now_ns, self.ticks = 10**9, 0
+        self._until, self._number, self._late = until, number, late_ticks or {}
+        self.cores: dict[str, WireCore] = {}
+        self.heard: dict[str, InProcessBus] = {}
+        self.deadlines: list[int] = []
+
+    def open_bus(self, address: str, **options) -> InProcessBus:
+        core = self.cores.setdefault(address, WireCore(1_000_000, address))
+        core.advance(self.now_ns)
+        self.heard.setdefault(address, InProcessBus(core, "listener"))
+        return InProcessBus(core, "guard", **options)
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        self.deadlines.append(deadline_ns)
+        self.ticks += 1
+        self.now_ns = max(self.now_ns, deadline_ns) + self._late.get(self.ticks, 0)
+        for core in self.cores.values():
+            core.advance(self.now_ns)
+        if self.ticks == self._until:
+            signal.raise_signal(self._number)
+
+    def frames(self, address: str) -> list:
+        found: list = []
+        for core in self.cores.values():
+            core.advance(core.now_ns + 10 * MS)
+        self.heard[address].drain(found)
+        return found
+
+
+@pytest.fixture
+def handlers():
+    """The process sets its own handlers; the tests get theirs back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def run_guard(monkeypatch, world: World, *arguments: str) -> int:
+    monkeypatch.setattr(process, "open_bus", world.open_bus)
+    monkeypatch.setattr(process, "sleep_until", world.sleep_until)
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: world.now_ns))
+    monkeypatch.setattr(process, "prepare", lambda priority: [f"FIFO {priority}"])
+    for name in ("stop_garbage_collection", "keep_memory"):
+        monkeypatch.setattr(process, name, lambda: None)
+    return main(["--profile", "palms_471", "--bus", "crane0=here", *arguments])
+
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_it_sends_its_status_every_10_ms_until_it_is_ended(monkeypatch, capsys, number, code):
+    world = World(100, number)
+    assert run_guard(monkeypatch, world) == code
+    sent = [frame.key for frame in world.frames("here")]
+    status = DATABASE.message("GuardStat").key
+    assert 48 <= sent.count(status) <= 52
+    assert sent.count(0x77D) == 5
+    assert "not granted: FIFO" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("handlers")
+def test_without_real_time_it_asks_for_nothing(monkeypatch, capsys):
+    assert run_guard(monkeypatch, World(3), "--no-realtime") == 0
+    assert "not granted" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_late_guard_skips_periods_and_never_catches_up(monkeypatch):
+    world = World(12, late_ticks={5: 3 * T + 1 * MS, 8: T - 1})
+    assert run_guard(monkeypatch, world) == 0
+    gaps = [b - a for a, b in zip(world.deadlines, world.deadlines[1:], strict=False)]
+    assert gaps == [T] * 4 + [4 * T] + [T] * 6
+
+
+@pytest.mark.usefixtures("handlers")
+def test_its_status_text_names_verdict_and_bus(monkeypatch):
+    seen = []
+
+    class Notifier:
+        def __init__(self, text) -> None:
+            self._text = text
+
+        def tick_done(self, now_ns, punctual) -> None:
+            seen.append((self._text(), punctual))
+
+        def stopping(self) -> None:
+            seen.append(("stopping", True))
+
+    monkeypatch.setattr(process, "Notifier", Notifier)
+    assert run_guard(monkeypatch, World(4, late_ticks={2: 2 * T})) == 0
+    assert seen[0] == ("Valves not enabled: NO_COMMAND. The bus is ACTIVE.", True) or "not enabled" in seen[0][0]
+    assert [punctual for _, punctual in seen] == [True, False, True, True, True]
+    assert seen[-1][0] == "stopping"
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_bus_that_cannot_be_opened_ends_it(monkeypatch, capsys):
+    def refuses(address, **_options):
+        raise BusError("bus.no-such", f"{address} is not there; plug it in.")
+
+    world = World(1)
+    monkeypatch.setattr(world, "open_bus", refuses)
+    assert run_guard(monkeypatch, world) == 4
+    assert "plug it in" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", ["crane1=x", "crane0=", "crane0"])
+def test_a_bus_without_name_or_address_is_a_usage_error(capsys, given):
+    with pytest.raises(SystemExit) as ended:
+        main(["--profile", "palms_471", "--bus", given])
+    assert ended.value.code == 2
+    assert "crane0=ADDRESS" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("handlers")
+def test_without_an_address_it_uses_the_usual_one(monkeypatch):
+    world = World(2)
+    monkeypatch.setattr(process, "default_address", lambda name: f"usual {name}")
+    monkeypatch.setattr(process, "open_bus", world.open_bus)
+    monkeypatch.setattr(process, "sleep_until", world.sleep_until)
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: world.now_ns))
+    for name in ("stop_garbage_collection", "keep_memory"):
+        monkeypatch.setattr(process, name, lambda: None)
+    assert main(["--profile", "palms_471", "--no-realtime"]) == 0
+    assert "usual crane0" in world.cores
+
+
+def test_a_profile_is_found_by_its_name_or_its_path(tmp_path):
+    assert profile_path("palms_471").is_file()
+    assert profile_path(str(tmp_path / "x.toml")) == tmp_path / "x.toml"
