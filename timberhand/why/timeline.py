@@ -17,7 +17,7 @@ from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import BusReading, TickRecord
 from can_dbc.messages.vehicle import DriveSetpoint
 from can_dbc.protocols.canopen import parse_emergency
-from controller.guard.guard import Verdict
+from controller.guard.verdicts import Verdict
 from controller.supervisor import LATE_NS
 from machine.crane_nodes import NODE_NAMES
 from machine.status.explanation import explain
