@@ -1,8 +1,8 @@
 """Limits of a machine for the guard, from a file of its own that is sealed with a digest and that calibration leaves.
 
 The envelope file has ranges, speeds, geometry and forbidden boxes.  From the profile the guard takes only what
-calibration finds: dead-bands, full speeds and zero counts of the encoders, and the names of the signals.  A profile
-whose ranges or speeds exceed the envelope stops the start.
+calibration finds (dead-bands, full speeds and delays of the valves, zero counts of the encoders) and the names of the
+signals.  A profile whose ranges or speeds exceed the envelope stops the start.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from controller.guard.layout import GuardConfigError
 JOINT_NAMES: Final = ("slew", "lift", "tilt", "ext", "rot")
 RATE_FACTOR: Final = 6.0
 """A command may change this many times faster than the acceleration limit; the controller stays below (4)."""
+DELAY_FACTOR, LAGS = 1.5, 3.0
+"""A spool has closed into its dead-band this many dead times and lags of the valve after its command ended."""
 SEAL: Final = b"# sha256: "
 """The last line of an envelope file: this, and the digest of everything before it."""
 SHIPPED: Final = Path(__file__).parents[2] / "machine"
@@ -24,7 +26,7 @@ Corner = tuple[float, float, float]
 
 
 class Axis(NamedTuple):
-    """One joint: command, encoder (message name empty without one) and limits [rad or m, per second; % and %/s]."""
+    """One joint: command, valve, encoder (message name empty without one), limits [rad or m, per second; %, %/s]."""
 
     number: int
     signal: str
@@ -32,6 +34,7 @@ class Axis(NamedTuple):
     deadband_pct: float
     full_speed: float
     rate_pct_s: float
+    closing_ns: int
     lower: float
     upper: float
     speed_limit: float
@@ -144,6 +147,7 @@ def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
         deadband_pct=float(min(valve["deadband_plus_pct"], valve["deadband_minus_pct"])),
         full_speed=float(max(valve["full_speed_plus"], valve["full_speed_minus"])),
         rate_pct_s=100.0 * RATE_FACTOR * limits["acceleration_limit"] / float(slowest),
+        closing_ns=int((DELAY_FACTOR * valve["delay_s"] + LAGS * valve["lag_s"]) * 1e9),
         lower=limits["lower"],
         upper=limits["upper"],
         speed_limit=limits["speed_limit"],

@@ -24,16 +24,7 @@ from controller.guard.layout import GuardConfigError, Layout
 from controller.guard.motion import MotionWatch
 from controller.guard.reach import Reach
 from controller.guard.stream import FrameEffect, Punctuality, SentMessage, WatchedMessage
-from controller.guard.verdicts import (
-    AUX_AXIS,
-    DRIVE_AXIS,
-    FINE,
-    GRAPPLE_AXIS,
-    LATCHING,
-    NO_AXIS,
-    Finding,
-    Verdict,
-)  # fmt: skip
+from controller.guard.verdicts import AUX_AXIS, DRIVE_AXIS, FINE, GRAPPLE_AXIS, LATCHING, NO_AXIS, Finding, Verdict
 
 GUARD_NODE: Final = 0x7D
 HEARTBEAT_KEY: Final = 0x700 + GUARD_NODE
@@ -54,6 +45,7 @@ HELD_PCT: Final = 30.0
 RANGE_MARGIN_UNITS: Final = 0.08
 """How far outside its range [rad, m] a joint may still be driven outward."""
 GRAPPLE_DEADBAND_PCT: Final = 10.0
+GRAPPLE_CLOSING_NS: Final = 250_000_000
 _NEUTRAL, _SPOOL = 0, 2
 _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
 _GRAPPLE_SIDE: Final = (0.0, 1.0, -1.0, -1.0)
@@ -104,11 +96,12 @@ class Guard:
             self._b: [c for c in self._commands if c.axis.signal in fields_b],
         }
         self._motion: list[tuple[WatchedMessage, MotionWatch]] = []
-        spools = [(axis.number, axis.signal, axis.deadband_pct) for axis in axes]
-        for number, signal, deadband_pct in (*spools, (GRAPPLE_AXIS, "Grapple", GRAPPLE_DEADBAND_PCT)):
+        spools = [(axis.number, axis.signal, axis.deadband_pct, axis.closing_ns) for axis in axes]
+        spools.append((GRAPPLE_AXIS, "Grapple", GRAPPLE_DEADBAND_PCT, GRAPPLE_CLOSING_NS))
+        for number, signal, deadband_pct, closing_ns in spools:
             feedback = next(m for m in self._feedback if f"Spool{signal}" in m.layout.fields)
             field = feedback.layout.fields[f"Spool{signal}"]
-            self._motion.append((feedback, MotionWatch(number, field, deadband_pct, sensed.get(number))))
+            self._motion.append((feedback, MotionWatch(number, field, deadband_pct, closing_ns, sensed.get(number))))
         self._reach = Reach(envelope)
         self._grapple_field = fields_b["Grapple"]
         self.verdict, self.axis = Verdict.NO_COMMAND, NO_AXIS

@@ -1,7 +1,7 @@
 """Motion that nobody commands: a spool that is open, or a joint that moves, in every mode and at every speed.
 
-A spool counts as open beyond its dead-band, where oil begins to flow, on a side that was not commanded for
-`SPOOL_NS`.  A joint whose command has been neutral for `REST_NS` may not leave its place by more than
+A spool counts as open beyond its dead-band, where oil begins to flow, on a side that was not commanded for as long as
+it takes to close.  A joint whose command has been neutral for `REST_NS` may not leave its place by more than
 `MOVED_UNITS`: about 40 times an encoder's noise (3.5e-4 to 5e-4 rad), and more than the oil's springiness under a
 swinging load.  The place follows the joint by `CREEP_SHARE` of its speed limit, since cylinders leak.
 """
@@ -14,9 +14,6 @@ from controller.guard.joints import MeasuredJoint
 from controller.guard.layout import Field
 from controller.guard.verdicts import FINE, Finding, Verdict
 
-SPOOL_NS: Final = 250_000_000
-"""A spool closes within this time of its command: 120 ms of dead time at most, and from full opening into the
-dead-band two lags of 40 ms."""
 REST_NS: Final = 500_000_000
 MOVED_UNITS: Final = 0.02
 """[rad, m]"""
@@ -28,11 +25,13 @@ MOVED_STEPS: Final = 3
 class MotionWatch:
     """One function: its spool's feedback ``field``, and its joint if an encoder measures it."""
 
-    __slots__ = ("_away", "_creep_s", "_deadband", "_field", "_joint", "_opened_ns", "_place", "number")
+    __slots__ = ("_away", "_closing_ns", "_creep_s", "_field", "_joint", "_opened_ns", "_place", "_shut_pct", "number")
 
-    def __init__(self, number: int, field: Field, deadband_pct: float, joint: MeasuredJoint | None = None) -> None:
+    def __init__(
+        self, number: int, field: Field, shut_pct: float, closing_ns: int, joint: MeasuredJoint | None = None
+    ) -> None:
         self.number = number
-        self._field, self._deadband, self._joint = field, deadband_pct, joint
+        self._field, self._shut_pct, self._closing_ns, self._joint = field, shut_pct, closing_ns, joint
         self._creep_s = CREEP_SHARE * joint.axis.speed_limit if joint is not None else 0.0
         self._opened_ns = [0, 0]  # when it was last commanded to the minus and to the plus side
         self._place: float | None = None  # not known yet
@@ -46,8 +45,8 @@ class MotionWatch:
         if feedback_word is not None:
             raw = self._field.raw(feedback_word)
             spool_pct = raw * self._field.scale
-            uncommanded = now_ns - opened_ns[spool_pct > 0.0] > SPOOL_NS
-            if uncommanded and abs(spool_pct) > self._deadband and self._field.inside(raw):
+            uncommanded = now_ns - opened_ns[spool_pct > 0.0] > self._closing_ns
+            if uncommanded and abs(spool_pct) > self._shut_pct and self._field.inside(raw):
                 return Verdict.SPOOL, self.number
         joint = self._joint
         if joint is None:
