@@ -5,7 +5,7 @@ import pytest
 from controller.guard.envelope import read_envelope
 from controller.guard.reach import Reach
 from controller.guard.verdicts import Verdict
-from machine.geometry.kinematics import pin_position
+from machine.geometry.kinematics import pin_position, solve
 from machine.loading.profile_file import load_profile
 from tests.controller.bench import MS, T, count_until
 from tests.controller.guard_traffic import CENTRE, MOVING, PROFILE, Traffic, press_reset
@@ -158,16 +158,14 @@ def test_the_pin_may_leave_a_forbidden_place_and_not_go_deeper():
 
 
 def test_the_pin_may_not_enter_a_box():
-    """Folded above the column, and lowered on to it: the depth counts along the nearest face."""
-    reach = Reach(read_envelope(PROFILE))
-    outside = [0.0, 1.3, -3.05, 0.13]
-    r = (reach.pin(*outside)[0] ** 2 + reach.pin(*outside)[1] ** 2) ** 0.5
-    assert reach.depth_m(outside) == pytest.approx(-1.0, abs=1.5) and r > 0.0
-    inside = next(
-        [0.0, lift / 100.0, tilt / 100.0, 0.13]
-        for lift in range(130, -38, -4)
-        for tilt in range(-305, 0, 4)
-        if reach.depth_m([0.0, lift / 100.0, tilt / 100.0, 0.13]) > 0.05
-    )
-    x, y, z = reach.pin(*inside)
-    assert (abs(x) < 0.4 and abs(y) < 0.4 and z < 1.2) or z < -1.39
+    """One centimetre beside the column: of two directions the one that enters it is refused."""
+    reach, profile = Reach(read_envelope(PROFILE)), load_profile("palms_471")
+    q = list(solve(profile, 0.0, 0.41, 0.5))
+    assert -0.02 < reach.depth_m(q) < 0.0
+    verdicts = {}
+    for lift_rad_s in (-0.15, 0.15):
+        x, y, z = reach.pin(q[0], q[1] + lift_rad_s * 0.1, *q[2:])
+        verdicts[lift_rad_s] = reach.deeper(q, [0.0, lift_rad_s, 0.0, 0.0])
+        assert verdicts[lift_rad_s] == (abs(x) < 0.4 and abs(y) < 0.4 and -1.39 < z < 1.2)
+    assert sorted(verdicts.values()) == [False, True]
+    assert not reach.deeper(q, [0.0] * 4)
