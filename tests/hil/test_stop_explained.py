@@ -41,14 +41,14 @@ def test_the_stop_of_a_demo_is_explained_and_the_operator_goes_on(
     assert LOST_NS[0] < stop["monotonic_ns"] < LOST_NS[0] + 40_000_000
     texts = [event["text"] for event in stop["events"]]
     for expected in (
-        "EncLift: the last one for more than 15 ms",
+        "EncLift silent from here for more than 15 ms",
         "mode ACTIVE → STOP: ENCODER_LOST",
         "mode STOP → FAULT",
         "operator: RESET",
         "operator: ARM",
     ):
         assert expected in texts, texts
-    assert any(text.startswith("EncLift is back after") for text in texts)
+    assert any(text.startswith("EncLift back after") for text in texts)
     shown = screen.file.getvalue()  # type: ignore[attr-defined]
     assert f"STOP: {stop['text']}" in shown, "the terminal shows the same text"
     assert f"timberhand why {tmp_path / 'run'}" in shown

@@ -58,7 +58,7 @@ def test_the_newest_stop_is_explained(run: Path) -> None:
     assert "GUARD_LOST" in text and "ENCODER_LOST" not in text
     assert "The guard is no longer received." in text and "Start the guard, then reset." in text
     assert "limit 50.0 ms" in text and "ACTIVE before" in text
-    assert "GuardStat: the last one for more than 50 ms" in text
+    assert "GuardStat silent from here for more than 50 ms" in text
     assert str(files_in(run / "stops")[-1]) in text
 
 
@@ -69,7 +69,7 @@ def test_all_stops_are_shown_with_what_happened_before_them(run: Path) -> None:
     for line in (
         "request refused: A datagram of wrong length was refused",
         "the tick began 12.0 ms late",
-        "EncLift: the last one for more than 15 ms",
+        "EncLift silent from here for more than 15 ms",
         "mode ACTIVE → STOP: ENCODER_LOST",
         "mode STOP → FAULT",
         "age of its last good sample",

@@ -37,10 +37,12 @@ def draw(found: FoundStop, path: Path, key: bytes | None = None) -> None:
         _draw_joints(velocities, times, [_scaled(report.velocity) for report in reports], "velocity\n[°/s, ext cm/s]")
         _draw_joints(positions, times, [_scaled(report.position) for report in reports], "position\n[°, ext cm]")
         _draw_joints(positions, times, [_scaled(report.reference) for report in reports], "", dashed=True)
-        late_ms = [tick.late_ns / 1e6 for tick in found.ticks]
-        lateness.plot([(tick.now_ns - at_ns) / 1e9 for tick in found.ticks], late_ms, color=STEEL, lw=0.8)
-        if max(late_ms, default=0.0) > LATE_NS / 2e6:  # else the limit would flatten the curve
+        late_ms = [tick.late_ns / 1e6 for tick in found.ticks] or [0.0]
+        tick_times = [(tick.now_ns - at_ns) / 1e9 for tick in found.ticks] or [0.0]
+        lateness.plot(tick_times, late_ms, color=STEEL, lw=0.8)
+        if max(late_ms) > LATE_NS / 2e6:  # else the limit would flatten the curve
             lateness.axhline(LATE_NS / 1e6, color=RUST, lw=0.8, ls="--")
+        lateness.set_ylim(min(0.0, *late_ms), max(1.0, 1.1 * max(late_ms)))
         lateness.set_ylabel("lateness\n[ms]")
         lateness.set_xlabel("time from the stop [s]")
         lateness.set_xlim(min(times, default=-1.0), max(times, default=1.0))

@@ -20,9 +20,9 @@ _STYLES: Final = {"FAULT": "bold red", "STOP": "bold yellow"}
 
 
 def when(stop: Stop) -> str:
-    """Time of the stop: UTC, or the run's own clock in lockstep."""
+    """Time of the stop: UTC, or in lockstep the virtual time, which the candump files have too."""
     if stop.utc_ns is None:
-        return f"at {stop.at_ns / 1e9:.3f} s of the run's clock"
+        return f"at {stop.at_ns / 1e9:.3f} s of virtual time"
     at = datetime.datetime.fromtimestamp(stop.utc_ns // 10**9, datetime.UTC)
     return f"at {at:%Y-%m-%d %H:%M:%S}.{stop.utc_ns // 10**6 % 1000:03d} UTC"
 

@@ -175,7 +175,7 @@ class _Silences(_Watcher):
         """A message came."""
         if name in self._silent:
             self._silent.remove(name)
-            yield stamp_ns, f"{name} is back after {(stamp_ns - self._last_ns[name]) / 1e6:.0f} ms"
+            yield stamp_ns, f"{name} back after {(stamp_ns - self._last_ns[name]) / 1e6:.0f} ms"
         self._last_ns[name], self._timeouts_ns[name] = stamp_ns, timeout_ns
 
     def pass_time(self, now_ns: int) -> Iterator[tuple[int, str]]:
@@ -183,7 +183,7 @@ class _Silences(_Watcher):
         for name, last_ns in self._last_ns.items():
             if name not in self._silent and now_ns - last_ns > self._timeouts_ns[name]:
                 self._silent.add(name)
-                yield last_ns, f"{name}: the last one for more than {self._timeouts_ns[name] / 1e6:.0f} ms"
+                yield last_ns, f"{name} silent from here for more than {self._timeouts_ns[name] / 1e6:.0f} ms"
 
 
 class _Requests(_Watcher):
@@ -202,7 +202,7 @@ class _Requests(_Watcher):
             if isinstance(message, OperatorCommand):
                 yield tick.now_ns, f"operator: {message.action.name}"
             elif isinstance(message, CraneSetpoint | DriveSetpoint | SpoolTest):
-                yield from self._setpoints.came("the planner's setpoint", tick.now_ns, SETPOINT_SILENCE_NS)
+                yield from self._setpoints.came("setpoints of the planner", tick.now_ns, SETPOINT_SILENCE_NS)
         yield from self._setpoints.pass_time(tick.now_ns)
 
 
