@@ -66,6 +66,7 @@ def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -
     units = [unit.name for unit in (DEPLOY / "units").iterdir()]
     there = files(root)
     assert {f"usr/lib/systemd/system/{unit}" for unit in units} <= there
+    assert "usr/lib/systemd/catalog/timberhand.catalog" in there
     wants = {unit for unit in units if unit.endswith(".service") and "@" not in unit}
     assert {f"etc/systemd/system/timberhand.target.wants/{unit}" for unit in wants} <= there
     assert "etc/systemd/system/multi-user.target.wants/timberhand.target" in there
@@ -112,6 +113,7 @@ def test_a_dry_run_prints_every_step_and_executes_none(tmp_path: Path, wheel: Pa
     assert list(root.iterdir()) == []
     for unit in (DEPLOY / "units").iterdir():
         assert f"install -D -m 0644 {unit} {root}/usr/lib/systemd/system/{unit.name}" in done.stdout
+    assert f"{root}/usr/lib/systemd/catalog/timberhand.catalog" in done.stdout
     assert f"systemctl --quiet --root={root} enable" in done.stdout
     gone = install("--dry-run", "--root", root, "--uninstall")
     assert gone.returncode == 0 and f"{root}/opt/timberhand" in gone.stdout

@@ -48,7 +48,7 @@ def test_the_stop_of_a_demo_is_explained_and_the_operator_goes_on(
         "operator: ARM",
     ):
         assert expected in texts, texts
-    assert any(text.startswith("EncLift back after") for text in texts)
+    assert sum(text.startswith("EncLift back after") for text in texts) == 1
     shown = screen.file.getvalue()  # type: ignore[attr-defined]
     assert f"STOP: {stop['text']}" in shown, "the terminal shows the same text"
     assert f"timberhand why {tmp_path / 'run'}" in shown
