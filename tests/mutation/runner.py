@@ -37,7 +37,7 @@ from tests.safety_scope import Scope
 
 PYTEST = ["-q", "-x", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "-o", "timeout=0", "-m", "not slow"]
 CPU_FACTOR, CPU_EXTRA_S = 10.0, 20.0
-WALL_FACTOR = 20.0
+WALL_FACTOR, WALL_EXTRA_S = 20.0, 120.0
 MEMORY_BYTES = 4 << 30
 PURGED = ("controller", "tests", "hil", "sim", "recorder")
 """Packages that may hold objects of a mutated module; a mutant of a module's own statements imports them anew."""
@@ -94,7 +94,7 @@ class Forks:
             os.close(read)
             _run_child(write, cpu_s, work)
         os.close(write)
-        self._running[child] = (what, read, time.monotonic() + WALL_FACTOR * cpu_s)
+        self._running[child] = (what, read, time.monotonic() + WALL_FACTOR * cpu_s + WALL_EXTRA_S)
 
     def finish(self) -> Iterator[tuple[Any, int | None, str]]:
         """Wait for all of them."""
