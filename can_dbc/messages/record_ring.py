@@ -123,7 +123,7 @@ class RingReader:
         begin = HEAD_BYTES + at + _RECORD.size
         step = room if size == SKIP else _RECORD.size + (size + 7 & -8)
         written = self._word(_WRITTEN)
-        if not size or step > room or self._tail + step > written:  # a length that the writer cannot have written
+        if step > room or self._tail + step > written:  # a length that the writer cannot have written
             self._tail = written
             return None
         data = self._map[begin : begin + size] if size != SKIP else b""

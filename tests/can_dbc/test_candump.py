@@ -39,6 +39,8 @@ LINES = [
     ("1)         2.7  Rx     09F8027F  8  00 FC FF", None),
     ("(1.5) can0 210#" + "00" * 65, None),
     ("hello", None),
+    ("can0  210  [1]  AA\u2003", None),  # a blank to the pattern, and none to bytes.fromhex
+    (f"({'9' * 5000}) can0 210#00", None),  # more digits than Python converts
 ]
 
 

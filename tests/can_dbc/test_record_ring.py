@@ -113,3 +113,28 @@ def test_two_processes_at_full_speed_agree_on_every_record_that_arrives(tmp_path
     assert numbers == sorted(set(numbers))
     assert len(numbers) + reader.lost == 200_001
     reader.close()
+
+
+@pytest.mark.parametrize("length", [SMALL, 0xFFFF_FFF0, 40])
+def test_a_damaged_length_ends_the_reading_and_the_next_record_is_read(small, tmp_path, length):
+    """A length that reaches beyond what is written; a reader that believed it would never end."""
+    path = tmp_path / "ticks"
+    reader, ring = RingReader(path), RecordRing(path)
+    ring.append(b"first record")
+    with path.open("r+b") as file:
+        file.seek(HEAD_BYTES)
+        file.write(length.to_bytes(4, "little"))
+    assert reader.read() == []
+    ring.append(b"next")
+    assert reader.read() == [b"next"]
+    reader.close()
+    ring.close()
+
+
+@pytest.mark.parametrize("size", [0, 3, HEAD_BYTES])
+def test_a_file_that_is_too_short_is_no_ring(tmp_path, size):
+    path = tmp_path / "ticks"
+    path.write_bytes(record_ring.MAGIC.to_bytes(8, "little")[:size] + bytes(max(0, size - 8)))
+    reader = RingReader(path)
+    assert reader.read() == []
+    reader.close()

@@ -5,6 +5,7 @@ import stat
 import struct
 import threading
 
+import msgspec
 import pytest
 
 from can_dbc.timing.durations import Durations
@@ -134,3 +135,12 @@ def test_the_path_is_that_of_the_service_or_the_user(monkeypatch):
     assert str(default_path()) == "/run/timberhand/controller.timing"
     monkeypatch.delenv("RUNTIME_DIRECTORY")
     assert str(default_path()) == f"/dev/shm/timberhand-{os.getuid()}/controller.timing"
+
+
+def test_a_page_with_missing_stages_is_refused(tmp_path):
+    path = tmp_path / "timing"
+    writer = TimingWriter(path)
+    writer.publish(msgspec.structs.replace(facts(), longest_ns=(1, 2)), histograms())
+    with pytest.raises(TimingRefused):
+        read_timing(path)
+    writer.close()

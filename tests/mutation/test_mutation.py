@@ -8,8 +8,10 @@ from types import ModuleType
 
 import pytest
 
+from tests.mutation.__main__ import equivalents
 from tests.mutation.mutators import Module
 from tests.mutation.runner import Forks, code_within, function_of
+from tests.safety_scope import SCOPES
 
 SOURCE = '''
 """A module."""
@@ -116,3 +118,11 @@ def test_a_fork_without_end_is_a_time_out() -> None:
 
     forks = Forks(1)
     assert [status for _, status, _ in [*forks.start("mutant", 0.0, work), *forks.finish()]] == [None]
+
+
+def test_every_excused_mutant_exists_and_has_a_reason() -> None:
+    """An excuse for a mutant that no longer exists must go."""
+    keys = {m.key for scope in SCOPES for name, path in scope.sources().items() for m in Module(name, path).mutants}
+    excused = equivalents()
+    assert set(excused) <= keys, set(excused) - keys
+    assert all(len(why) > 20 for why in excused.values())

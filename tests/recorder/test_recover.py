@@ -9,6 +9,7 @@ import random
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -77,6 +78,26 @@ def test_a_flipped_byte_ends_the_valid_part(whole, tmp_path):
     (tmp_path / "run.mcap").write_bytes(data)
     kept = [r.data for r in scan(tmp_path / "run.mcap", {"/controller/tick"}) if isinstance(r, Stored)]
     assert 0 < len(kept) < TICKS and kept == [tick(k) for k in range(len(kept))]
+
+
+@pytest.mark.parametrize(
+    "damage", ["message without its header", "longer than its chunk", "unknown channel", "huge"]
+)
+def test_damaged_records_with_good_checksums_end_the_valid_part(tmp_path, damage):
+    """A chunk may hold anything under a checksum that fits."""
+    message = struct.pack("<HIQQ", 7, 0, 1, 1) + b"data"
+    inner = {
+        "message without its header": struct.pack("<BQ", 5, 3) + b"abc",
+        "longer than its chunk": struct.pack("<BQ", 5, 1000) + message,
+        "unknown channel": struct.pack("<BQ", 5, len(message)) + message,
+        "huge": b"",
+    }[damage]
+    size = 1 << 50 if damage == "huge" else len(inner)
+    chunk = struct.pack("<QQQII", 0, 0, size, 0, 0) + struct.pack("<Q", len(inner)) + inner
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk)
+    assert list(scan(path)) == []
+    assert [r.messages for r in recover(tmp_path)] == [0] and is_complete(path)
 
 
 def test_a_complete_recording_is_not_changed(whole, tmp_path):
