@@ -87,7 +87,8 @@ class Controller:
         self.carrier_bus = self.vehicle.bus if self.vehicle else None
         self.startup = Startup(profile)
         self._receive_sdo = self.startup.receive
-        self.estimators = [JointEstimator(s, period_s) for s in specs]
+        sample_s = period_s if profile.plc is None else max(period_s, profile.plc.sample_ms * 1e-3)
+        self.estimators = [JointEstimator(s, sample_s) for s in specs]
         self._sensed = [
             SensedJoint(state, s.encoder, estimator)
             for state, s, estimator in zip(self.crane_inputs.encoders, specs, self.estimators, strict=True)

@@ -266,9 +266,11 @@ class Plc(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A machine PLC on Ethernet in place of the nodes on crane0 (docs/reference/can-bus.md section 10).
 
     ``role``: the PLC closes the joint loops on the controller's references, or passes on its valve commands.
+    ``sample_ms``: period in which it reads the encoders; the bridge adds no samples between.
     """
 
     role: Literal["references", "valves"]
+    sample_ms: float = 10.0
 
 
 class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -96,7 +96,8 @@ class EmulatedMachine(ABC):
     def _place_crane_nodes(self, facts: Truth, seed: int, cycle_ns: int) -> None:
         database, out = load("crane"), self._crane_out
         self.estop = EstopBox(database, out)
-        self.valve = ValveNode(database, out, self._pilot_on, self._sense_valves, cycle_ns)
+        command_ns = max(cycle_ns, 1_000_000_000 // self.profile.rate_hz)
+        self.valve = ValveNode(database, out, self._pilot_on, self._sense_valves, cycle_ns, command_ns)
         spec = self.profile.imu
         self.imu = None if spec is None else ImuNode(spec, database, out, self._step_ns, seed)
         self._devices: tuple[Device, ...] = (

@@ -74,7 +74,7 @@ class BusStats:
     sent: int = 0
     """Frames accepted for sending."""
     refused: int = 0
-    """Frames that `Bus.send` and `Bus.send_all` did not accept."""
+    """Frames that `Bus.send` and `Bus.send_all` did not accept, and those that `Bus.discard` cancelled."""
     dropped: int = 0
     """Received frames lost because the reader was too slow."""
     error_frames: int = 0
@@ -138,6 +138,13 @@ class Bus(Protocol):
         The first frame that is not accepted and all frames behind it are refused.
         """
 
+    def discard(self) -> int:
+        """Cancels own frames whose transmission has not begun, if the backend can; they count in `BusStats.refused`.
+
+        Returns how many it cancelled, a few more while the backend does not know yet which have gone out; 0 if it
+        cannot: SocketCAN has no way to empty the queue of an interface.
+        """
+
     def flush(self) -> None:
         """Discards the frames received so far (error frames still change the state) and, if the backend can, own frames
         that are not on the bus yet."""
@@ -197,6 +204,9 @@ class BaseBus:
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
         raise NotImplementedError
+
+    def discard(self) -> int:
+        return 0
 
     def flush(self) -> None:
         self._flushed_ns = time.monotonic_ns()

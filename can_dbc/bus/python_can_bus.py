@@ -59,9 +59,13 @@ class PythonCanBus(BaseBus):
         stats.refused += len(frames) - sent
         return sent
 
-    def flush(self) -> None:
+    def discard(self) -> int:
         with contextlib.suppress(can.CanError, OSError, NotImplementedError):  # not every adapter can
             self._can.flush_tx_buffer()
+        return 0  # it does not say how many
+
+    def flush(self) -> None:
+        self.discard()
         super().flush()
 
     def _receive(self, frames: list[Frame]) -> None:

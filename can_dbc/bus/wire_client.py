@@ -80,7 +80,7 @@ class WireClient(BaseBus):
         self._batch = Batch(RECORD.size * MAX_BATCH_RECORDS, count=_MAX_PACKETS)
         self._backlog: list[Frame] = []  # received while waiting for room in the transmit queue
         self._opening: socket.socket | None = None  # a new connection whose hello is not answered yet
-        self._accepted = self._done = self._dropped = 0
+        self._accepted = self._done = self._dropped = self._cancelled = 0
         self._sock, reply = _connect(name, self._hello)
         self._sock.setblocking(False)
         self.bitrate: int = reply["bitrate"]
@@ -109,10 +109,13 @@ class WireClient(BaseBus):
         self.discard()
         super().flush()
 
-    def discard(self) -> None:
-        """Cancels the own frames whose transmission has not begun."""
-        if self.stats.state is not BusState.DOWN:
-            self._post(RECORD.pack(0, 0, b"", 0, DISCARD, 0, 0))
+    def discard(self) -> int:
+        waiting = min(self.pending, self._accepted - self._cancelled)
+        if not waiting or self.stats.state is _DOWN or not self._post(RECORD.pack(0, 0, b"", 0, DISCARD, 0, 0)):
+            return 0
+        self._cancelled = self._accepted
+        self.stats.refused += waiting
+        return waiting
 
     @property
     def pending(self) -> int:
@@ -172,7 +175,7 @@ class WireClient(BaseBus):
         self._sock.close()
         self._sock, self._opening = self._opening, None
         self._backlog.clear()
-        self._accepted = self._done = self._dropped = 0
+        self._accepted = self._done = self._dropped = self._cancelled = 0
         self.bitrate = reply["bitrate"]
         return True
 

@@ -9,6 +9,7 @@ not fit, and never clamps.  Source: docs/reference/can-bus.md section 10.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -21,9 +22,10 @@ N_AXES: Final = 7
 N_JOINTS: Final = 5
 N_PRESSURES: Final = 8
 """Lift A and B, tilt A and B, extension A and B, grapple closing and opening side."""
+ESTOP_BYTES: Final = 8
 
 MAGIC: Final = 0x4352
-MAP_VERSION: Final = 1
+MAP_VERSION: Final = 2
 WORD_TEST: Final = 0x0102_0304
 ARM_KEY: Final = 0x5AA5
 
@@ -136,7 +138,10 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """Feedback of the PLC: positions [rad, m], velocities per second, pressures [bar], opening 0..1, load [kg]."""
+    """Feedback of the PLC: positions [rad, m], velocities per second, pressures [bar], opening 0..1, load [kg].
+
+    ``estop`` are the PLC's own contacts, for whoever reads the registers; controller and guard judge ``estop_frame``.
+    """
 
     heartbeat: int = 0
     state: State = State.INIT
@@ -151,6 +156,10 @@ class Feedback:
     pressure_bar: tuple[float, ...] = (0.0,) * N_PRESSURES
     opening: float = 0.0
     load_kg: int = 0
+    estop_frame: bytes = bytes(ESTOP_BYTES)
+    """The newest EstopStat as the safety module sent it, with its checksum and counter; zeros before the first."""
+    sampled_us: int = 0
+    """When the positions were read, by the PLC's clock modulo 2**16."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,6 +292,13 @@ def read_command(registers: Sequence[int], order: WordOrder) -> Command:
     )
 
 
+def estop_words(frame: bytes) -> tuple[int, ...]:
+    """EstopStat as four registers, its first byte the high half of the first; raises MapError."""
+    if len(frame) != ESTOP_BYTES:
+        raise MapError("plc.estop-frame", f"EstopStat has {ESTOP_BYTES} bytes, not {len(frame)}")
+    return struct.unpack(">4H", frame)
+
+
 def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> list[int]:
     """The status block, registers 0 to 47; raises MapError."""
     f = feedback
@@ -294,7 +310,8 @@ def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> 
     words += [signed16(v, _MILLI, f"velocity of axis {i}") & _U16 for i, v in enumerate(f.velocity)]
     words += [signed16(p, 10.0, f"pressure {i}") & _U16 for i, p in enumerate(f.pressure_bar)]
     words += [whole(f.opening, _MILLI, 0, 1000, "the opening"), whole(f.load_kg, 1, 0, _U16, "the load")]
-    return words + [0] * (STATUS_COUNT - len(words))
+    words += [*estop_words(f.estop_frame), f.sampled_us & _U16]
+    return words
 
 
 def check_identity(registers: Sequence[int], order: WordOrder) -> None:
@@ -344,10 +361,12 @@ def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, i
         pressure_bar=tuple(_short(registers[33 + i]) / 10.0 for i in range(N_PRESSURES)),
         opening=registers[41] / _MILLI,
         load_kg=registers[42],
+        estop_frame=struct.pack(">4H", *registers[43:47]),
+        sampled_us=registers[47],
     )
     return feedback, registers[WATCHDOG_AT]
 
 
-def advances(sequence: int, last: int, bits: int = 16) -> bool:
-    """Whether a sequence number lies ahead of the last one, in a ring of ``bits``."""
-    return 0 < (sequence - last) & (1 << bits) - 1 < 1 << bits - 1
+def advances(sequence: int, last: int) -> bool:
+    """Whether a 16-bit sequence number lies ahead of the last one."""
+    return 0 < (sequence - last) & _U16 < 1 << 15

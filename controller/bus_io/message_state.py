@@ -43,9 +43,12 @@ class MessageState:
         "stamp_ns", "timeout_ns", "values",
     )  # fmt: skip
 
-    def __init__(self, codec: MessageCodec, bit: int, *, watched: bool = True, machine: bool = False) -> None:
+    def __init__(
+        self, codec: MessageCodec, bit: int, *, watched: bool = True, machine: bool = False, timeout_ns: int = 0
+    ) -> None:
         """``bit`` is its place in the mask of stale inputs; the time-out of a ``watched`` message is bounded by
-        `NEUTRAL_WITHIN_NS`; ``machine``: it comes on mach0, not on crane0.
+        `NEUTRAL_WITHIN_NS`; ``machine``: it comes on mach0, not on crane0; ``timeout_ns``: instead of the DBC's, for a
+        source with another period.
 
         Raises:
             ConfigError: the DBC gives no time-out for it.
@@ -61,7 +64,8 @@ class MessageState:
         self._checker = Checker(codec.data_ids) if codec.data_ids else None
         self._alive = codec.index.get("TimeStamp", -1)
         self.bit = bit
-        self.timeout_ns = min(codec.timeout_ns, _MAX_TIMEOUT_NS) if watched else codec.timeout_ns
+        timeout_ns = timeout_ns or codec.timeout_ns
+        self.timeout_ns = min(timeout_ns, _MAX_TIMEOUT_NS) if watched else timeout_ns
         self._last_alive: Any = None
         self.stamp_ns = 0
         self.refused = 0

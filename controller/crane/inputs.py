@@ -18,6 +18,8 @@ from machine.joints import ARTICULATION, JOINTS
 from machine.profile import Profile, encoders
 from machine.status.stale_inputs import CRANE_INPUT_BITS, ENCODER_BIT
 
+LOST_SAMPLES: Final = 3
+"""An encoder behind a PLC is lost after this many of the PLC's samples, as one on the bus after as many periods."""
 _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "HeartbeatCtrl")
 
 
@@ -27,16 +29,17 @@ class CraneInputs:
     def __init__(self, database: Database, profile: Profile) -> None:
         self._by_key: dict[int, MessageState] = {}
 
-        def state(name: str, bit: int) -> MessageState:
+        def state(name: str, bit: int, timeout_ns: int = 0) -> MessageState:
             codec = database.message(name)
-            return self._by_key.setdefault(codec.key, MessageState(codec, bit))
+            return self._by_key.setdefault(codec.key, MessageState(codec, bit, timeout_ns=timeout_ns))
 
         self.estop, self.guard, self.valve_a, self.valve_b, self.plc, *helpful = (
             state(name, bit) for name, bit in CRANE_INPUT_BITS.items()
         )
         self.pressures, self.grapple = helpful[:3], helpful[3]
         specs = encoders(profile)
-        sensed = {place: state(spec.message, ENCODER_BIT + place) for place, spec in specs.items()}
+        sampled_ns = 0 if profile.plc is None else LOST_SAMPLES * round(profile.plc.sample_ms * 1e6)
+        sensed = {place: state(spec.message, ENCODER_BIT + place, sampled_ns) for place, spec in specs.items()}
         self.encoders = [sensed.get(j) for j in JOINTS]
         """By joint; None where the machine has none."""
         self.articulation = sensed.get(ARTICULATION)

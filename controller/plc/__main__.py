@@ -2,8 +2,9 @@
 
 Emulates the machine's nodes on crane0 from the answers of a PLC on Ethernet, and passes the supervised commands on.
 One asyncio loop, one thread.  Prints ``ready`` on stdout when it is on the bus, and one JSON line on stderr at its
-end.  Nothing is authenticated, so it connects to loopback addresses only unless ``--allow-network`` is given.  Exit
-codes: 0 ended by SIGTERM, 2 usage, 3 configuration, 4 no bus or address at the start, 130 SIGINT.
+end.  It connects to loopback addresses only unless ``--allow-network`` is given; datagrams on a network need a key, or
+``--no-key``, and Modbus has none.  Exit codes: 0 ended by SIGTERM, 2 usage, 3 configuration, 4 no bus or address at the
+start, 130 SIGINT.
 """
 
 from __future__ import annotations
@@ -11,23 +12,27 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import secrets
 import signal
 import sys
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.factory import default_address, open_bus
-from can_dbc.bus.reconnector import Reconnector
 from can_dbc.dbc.codec import DbcError, load
 from can_dbc.frame import Frame
+from can_dbc.messages.key_file import KeyFileError, read_key
 from can_dbc.messages.udp_address import address_argument
 from can_dbc.plc.map import WordOrder
 from can_dbc.plc.modbus import is_loopback
 from controller.config import ConfigError
 from controller.plc.bridge import Bridge
+from controller.plc.handshake import Handshake
 from controller.plc.links import ModbusLink, UdpLink
+from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, prepare, stop_garbage_collection
 from machine.loading.profile_file import ProfileError, load_profile
 from runtime.allocator import keep_memory
@@ -53,6 +58,8 @@ def parser() -> argparse.ArgumentParser:
     link.add_argument("--udp", type=address_argument, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
     made.add_argument("--word-order", choices=("high", "low"), default="high", help="which half of 32 bits comes first")
     made.add_argument("--allow-network", action="store_true", help="the PLC may be on another host")
+    made.add_argument("--key-file", type=Path, help="file with the key that authenticates the datagrams")
+    made.add_argument("--no-key", action="store_true", help="send datagrams to another host without a key")
     made.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     return made
 
@@ -62,7 +69,7 @@ class Process:
 
     def __init__(self, bridge: Bridge, bus: Bus) -> None:
         self._bridge, self._bus = bridge, bus
-        self._watch = Reconnector(bus).watch
+        self._link = BusLink(bus)
         self._notifier = Notifier(self.status_text)
         self._frames: list[Frame] = []
 
@@ -71,13 +78,14 @@ class Process:
         frames = self._frames
         frames.clear()
         self._bus.drain(frames)
-        self._bus.send_all(self._bridge.step(time.monotonic_ns(), frames))
+        self._link.send(self._bridge.step(time.monotonic_ns(), frames))
 
     def status_text(self) -> str:
         """State in one line."""
         shake, bus = self._bridge.handshake, self._bus
         answers = shake.problem or f"The PLC has answered {shake.answers} times."
-        return f"{answers} The bus is {bus.stats.state.name}."
+        refused = f" {shake.replayed} old datagrams were refused." if shake.replayed else ""
+        return f"{answers}{refused} The bus is {bus.stats.state.name}."
 
     async def run(self, link: ModbusLink | UdpLink) -> None:
         """Run until cancelled."""
@@ -96,7 +104,7 @@ class Process:
                     listening = descriptor
                 self.step()
                 now_ns = time.monotonic_ns()
-                self._watch(now_ns)
+                self._link.watch(now_ns)
                 self._notifier.tick_done(now_ns, True)
                 due = max(due + STEP_S, loop.time())
                 await asyncio.sleep(due - loop.time())
@@ -113,6 +121,7 @@ def summary(bridge: Bridge) -> str:
     return json.dumps(
         {
             "sent": shake.sent, "answers": shake.answers, "refused": shake.refused, "dropped": shake.dropped,
+            "replayed": shake.replayed, "sessions": shake.sessions,
             "refused_here": bridge.gate.refused, "round_trip": shake.round_trip.summary(), "problem": shake.problem,
             "feedback": None if shake.feedback is None else asdict(shake.feedback),
         }
@@ -137,6 +146,18 @@ async def _until_ended(process: Process, link: ModbusLink | UdpLink, ended: list
             raise
 
 
+def _check_network(parser: argparse.ArgumentParser, options: argparse.Namespace, host: str) -> None:
+    """End with a usage error unless a PLC on another host is wanted; warn of what is not authenticated."""
+    if not options.allow_network:
+        parser.error(f"{host} is on the network; use a network of its own for the PLC and give --allow-network")
+    if options.modbus:
+        sys.stderr.write(f"plc: warning: Modbus has no authentication; whoever reaches {host} can command the PLC\n")
+    elif options.no_key:
+        sys.stderr.write(f"plc: warning: whoever reaches {host} can send datagrams to it; --key-file prevents that\n")
+    elif options.key_file is None:
+        parser.error(f"{host} is on the network; give --key-file FILE with the PLC's key, or --no-key")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the bridge; returns the exit code."""
     made = parser()
@@ -145,14 +166,17 @@ def main(arguments: list[str] | None = None) -> int:
     if options.bus and (name != "crane0" or not where):
         made.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
     host, port = options.modbus or options.udp
-    if not options.allow_network and not is_loopback(host):
-        made.error(f"{host} is on the network, and neither Modbus nor the datagrams are authenticated; "
-                   "use a network of their own and give --allow-network")  # fmt: skip
+    if options.modbus and options.key_file is not None:
+        made.error("--key-file: Modbus has no authentication; give --udp, or no key")
+    if not is_loopback(host):
+        _check_network(made, options, host)
     keep_memory()
     ended: list[int] = []
     try:
         order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
-        bridge = Bridge(load_profile(options.profile), load("crane"), order)
+        key = None if options.key_file is None else read_key(options.key_file)
+        shake = Handshake(order, key=key, first_sequence=secrets.randbits(31))
+        bridge = Bridge(load_profile(options.profile), load("crane"), shake)
         with open_bus(where or default_address("crane0"), tx_queue=TX_QUEUE, participant="plc") as bus:
             if not options.no_realtime:
                 for refusal in prepare(PRIORITY):
@@ -161,7 +185,7 @@ def main(arguments: list[str] | None = None) -> int:
             stop_garbage_collection()
             asyncio.run(_until_ended(Process(bridge, bus), link, ended))
         sys.stderr.write(f"plc: {summary(bridge)}\n")
-    except (ConfigError, DbcError, ProfileError) as error:
+    except (ConfigError, DbcError, KeyFileError, ProfileError) as error:
         sys.stderr.write(f"plc: {error}\n")
         return 3
     except (BusError, OSError) as error:

@@ -4,6 +4,10 @@
 every 5 ms and whenever frames arrive.  `Bridge.command` is the next command for the PLC.  Unless a good answer of the
 PLC is at most 50 ms old, nothing is sent on crane0, and the controller stops by the same time-outs that monitor real
 nodes.  Values that a PLC does not measure (spools, pump and slew pressures) are marked not available.
+
+Nothing is invented between two answers.  EstopStat is the safety module's own frame, with its checksum and counter, and
+is passed on once.  A sample of the encoders is sent once, at the next SYNC, with the PLC's time stamp, and pressures
+once per PLC cycle: where the PLC repeats a sample, controller and guard see none.
 """
 
 from __future__ import annotations
@@ -13,12 +17,12 @@ from typing import Final
 
 from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame, RawFrame
-from can_dbc.plc.map import Command, Estop, Feedback, Grapple, Role, State, WordOrder
+from can_dbc.plc.map import ESTOP_BYTES, Command, Feedback, Grapple, Role, State
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
 from controller.bus_io.messages import PeriodicTimer, ProtectedMessage
 from controller.config import ConfigError
-from controller.plc.emulated_nodes import EmulatedEncoder, EmulatedNode, LinearInterpolator
-from controller.plc.handshake import FRESH_NS, Handshake
+from controller.plc.emulated_nodes import EmulatedEncoder, EmulatedNode
+from controller.plc.handshake import Handshake
 from controller.plc.valve_gate import ValveGate, fault_bits, state_of
 from machine.crane_nodes import PRESSURE_NODES, CraneNode
 from machine.joints import JOINTS, Joint
@@ -56,9 +60,9 @@ def role_of(profile: Profile) -> Role:
 class Bridge:
     """All state of the bridge; ``handshake`` exchanges with the PLC, ``gate`` receives from controller and guard."""
 
-    def __init__(self, profile: Profile, database: Database, order: WordOrder = WordOrder.HIGH_FIRST) -> None:
+    def __init__(self, profile: Profile, database: Database, handshake: Handshake | None = None) -> None:
         role = role_of(profile)
-        self.handshake = Handshake(order)
+        self.handshake = handshake or Handshake()
         self.gate = ValveGate(profile, role, database)
         specs = {j: spec for j in JOINTS if (spec := joint(profile, j).encoder) is not None}
         self._encoders = {j: EmulatedEncoder(spec, database.message(spec.message)) for j, spec in specs.items()}
@@ -66,11 +70,12 @@ class Bridge:
         helpers = [EmulatedNode(n, {}, starts=True) for n in numbers]
         self._nodes: list[EmulatedNode] = [*helpers, *self._encoders.values()]
         self._by_number = {node.node: node for node in self._nodes}
-        self._positions = {j: LinearInterpolator() for j in self._encoders}
-        names = ("EstopStat", "ValveFbA", "ValveFbB", "PressA", "PressB", "PressC", "GrappleStat", "PlcStatus")
+        names = ("ValveFbA", "ValveFbB", "PressA", "PressB", "PressC", "GrappleStat", "PlcStatus")
         self._messages = {name: ProtectedMessage(database.message(name)) for name in names}
-        self._fast, self._estop_due, self._slow = PeriodicTimer(5 * MS), PeriodicTimer(10 * MS), PeriodicTimer(20 * MS)
-        self._estop_bits, self._estop_events = -1, 0
+        self._fast, self._slow = PeriodicTimer(5 * MS), PeriodicTimer(20 * MS)
+        self._estop_key, self._estop_frame = database.message("EstopStat").key, bytes(ESTOP_BYTES)
+        self._new_cycle = self._new_sample = False  # not sent yet
+        self._sessions = 0
         self._counter = 0
         self._feedback: Feedback | None = None
         self._sent_ns = -REBOOT_AFTER_NS
@@ -78,7 +83,11 @@ class Bridge:
 
     def command(self, now_ns: int) -> Command:
         """The command for the PLC now."""
-        feedback = self.handshake.feedback if self.handshake.fresh(now_ns) else None
+        shake = self.handshake
+        if shake.sessions != self._sessions:
+            self._sessions = shake.sessions
+            self.gate.require_disarm()
+        feedback = shake.feedback if shake.fresh(now_ns) else None
         self._last = self.gate.command(now_ns, feedback)
         return self._last
 
@@ -90,7 +99,7 @@ class Bridge:
             self._boot_nodes()
         out: list[RawFrame] = []
         if feedback is not None and feedback is not self._feedback:
-            self._use_feedback(feedback, now_ns)
+            self._use_feedback(feedback)
         for frame in frames:
             self._receive(frame, now_ns, out if answering else None)
         if answering and feedback is not None:
@@ -101,23 +110,20 @@ class Bridge:
     def _boot_nodes(self) -> None:
         for node in self._nodes:
             node.boot()
-        for position in self._positions.values():
-            position.forget()
 
-    def _use_feedback(self, feedback: Feedback, now_ns: int) -> None:
-        """Use a new answer; its positions count only when the PLC has completed a cycle since."""
+    def _use_feedback(self, feedback: Feedback) -> None:
+        """Use a new answer; what the PLC only repeats does not count again."""
         before, self._feedback = self._feedback, feedback
-        if before is None or before.heartbeat != feedback.heartbeat:
-            for j, position in self._positions.items():
-                position.sample(feedback.position[j], now_ns, FRESH_NS)
+        self._new_cycle = self._new_cycle or before is None or before.heartbeat != feedback.heartbeat
+        self._new_sample = self._new_sample or before is None or before.sampled_us != feedback.sampled_us
 
     def _receive(self, frame: Frame, now_ns: int, out: list[RawFrame] | None) -> None:
         """``out`` is None while nothing may be sent; then only the gate uses the frame."""
         key = frame.key
         if key == SYNC_ID:
             self.gate.sync(now_ns)
-            if out is not None and self._feedback is not None:
-                self._sample(self._feedback, now_ns, out)
+            if out is not None and self._feedback is not None and self._new_sample:
+                self._sample(self._feedback, out)
         elif key == NMT_ID and out is not None:
             for node in self._nodes:
                 node.receive_nmt(frame.data)
@@ -129,9 +135,10 @@ class Bridge:
         else:
             self.gate.receive(frame, now_ns)
 
-    def _sample(self, feedback: Feedback, now_ns: int, out: list[RawFrame]) -> None:
+    def _sample(self, feedback: Feedback, out: list[RawFrame]) -> None:
+        self._new_sample = False
         for j, encoder in self._encoders.items():
-            answer = encoder.answer(self._positions[j].at(now_ns), feedback.velocity[j], now_ns)
+            answer = encoder.answer(feedback.position[j], feedback.velocity[j], feedback.sampled_us)
             if answer is not None:
                 out.append(answer)
 
@@ -140,31 +147,25 @@ class Bridge:
         for node in self._nodes:
             node.step(now_ns, out)
         running = {number: node.operational for number, node in self._by_number.items()}
-        if feedback.estop != self._estop_bits:
-            self._estop_events = (self._estop_events + 1) & 0xFF
-        changed, self._estop_bits = feedback.estop != self._estop_bits, feedback.estop
-        if (self._estop_due.due(now_ns) or changed) and running[CraneNode.SAFETY_MODULE]:
-            out.append(self._estop(feedback))
-        fast, slow = self._fast.due(now_ns), self._slow.due(now_ns)
-        if running[CraneNode.VALVES]:
-            if fast:
-                out += self._valves(feedback, now_ns)
-            if slow:
-                out += (self._grapple(feedback), self._status(feedback))
+        if feedback.estop_frame != self._estop_frame:
+            self._estop_frame = feedback.estop_frame
+            if running[CraneNode.SAFETY_MODULE]:
+                out.append((self._estop_key, feedback.estop_frame))
+        if self._fast.due(now_ns) and running[CraneNode.VALVES]:
+            out += self._valves(feedback, now_ns)
+        if not self._new_cycle:
+            return
+        self._new_cycle = False
+        slow = self._slow.due(now_ns)
         p, wire = feedback.pressure_bar, self._messages
-        if fast and running[PRESSURE_NODES[0]]:
+        if slow and running[CraneNode.VALVES]:
+            out += (self._grapple(feedback), self._status(feedback))
+        if running[PRESSURE_NODES[0]]:
             out.append(wire["PressA"].frame_with(0, *p[0:4]))
-        if fast and running[PRESSURE_NODES[1]]:
+        if running[PRESSURE_NODES[1]]:
             out.append(wire["PressB"].frame_with(0, *p[4:6], None, None))
         if slow and running[PRESSURE_NODES[2]]:
             out.append(wire["PressC"].frame_with(0, None, None, *p[6:8]))
-
-    def _estop(self, feedback: Feedback) -> RawFrame:
-        bits = feedback.estop
-        channels = (int(bool(bits & Estop.CHANNEL_A)), int(bool(bits & Estop.CHANNEL_B)))
-        reset, pilot = int(bool(bits & Estop.RESET_PRESSED)), int(bool(bits & Estop.PILOT_ON))
-        person = int(bool(bits & Estop.PERSON))
-        return self._messages["EstopStat"].frame_with(*channels, 0, reset, pilot, person, None, self._estop_events)
 
     def _valves(self, feedback: Feedback, now_ns: int) -> tuple[RawFrame, RawFrame]:
         """Echo the counter of the last command only while the PLC accepts commands."""

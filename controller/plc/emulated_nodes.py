@@ -73,14 +73,16 @@ class EmulatedEncoder(EmulatedNode):
         )  # fmt: skip
         self._mapping = TPDO1_MAPPINGS[spec.kind]
 
-    def answer(self, position: float, velocity: float, now_ns: int) -> RawFrame | None:
-        """TPDO1 in answer to SYNC; None unless it is configured as in crane.dbc."""
+    def answer(self, position: float, velocity: float, sampled_us: int) -> RawFrame | None:
+        """TPDO1 of a sample that the PLC read at ``sampled_us`` by its own clock; None unless it is configured as in
+        crane.dbc.
+        """
         if not self.operational or not self._mapped():
             return None
         spec = self._spec
         counts = counts_from_position(spec, position)
         if spec.kind == "rotary":
-            return self._codec.key, self._codec.encode(counts, now_ns // 1000 & 0xFFFF, 0)
+            return self._codec.key, self._codec.encode(counts, sampled_us, 0)
         steps = round(spec.direction * velocity / spec.unit_per_count)
         return self._codec.key, self._codec.encode(counts, min(max(steps, -32768), 32767), 0, 0)
 
@@ -92,28 +94,3 @@ class EmulatedEncoder(EmulatedNode):
             and o[0x1A00, 0][0] == len(mapping)
             and all(int.from_bytes(o[0x1A00, i], "little") == word for i, word in enumerate(mapping, 1))
         )
-
-
-class LinearInterpolator:
-    """Interpolates a sampled value: linear from one sample to the next, one sample late."""
-
-    def __init__(self) -> None:
-        self._from = self._to = 0.0
-        self._begin_ns = self._span_ns = 0
-        self._known = False
-
-    def forget(self) -> None:
-        """The next sample is used without interpolation."""
-        self._known = False
-
-    def sample(self, value: float, now_ns: int, longest_ns: int) -> None:
-        """Add a sample; it is reached after the time since the previous sample, at most ``longest_ns``."""
-        since_ns = now_ns - self._begin_ns
-        self._from = self.at(now_ns) if self._known else value
-        self._to, self._begin_ns, self._span_ns = value, now_ns, max(1, min(since_ns, longest_ns))
-        self._known = True
-
-    def at(self, now_ns: int) -> float:
-        """The interpolated value."""
-        share = min(1.0, max(0.0, (now_ns - self._begin_ns) / self._span_ns)) if self._span_ns else 1.0
-        return self._from + share * (self._to - self._from)

@@ -50,6 +50,7 @@ class ModbusLink:
             try:
                 await self._client.connect()
                 check_identity(await self._client.status(), self._bridge.handshake.order)
+                self._bridge.handshake.connected()
                 pause = PAUSE_S
                 await self._exchange_cyclic()
             except LinkError as error:

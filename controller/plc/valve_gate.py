@@ -1,8 +1,9 @@
 """The controller's commands and the guard's enable, received from crane0 and turned into a command for the PLC.
 
 Pure, and safe by absence like every valve node: a command that moves needs ValveCmdA and B with the arm key, the
-guard's enable, and SYNC, all fresh; in role REFERENCES also the three reference frames.  After a loss while armed it
-stays neutral until the controller disarms.  A command beyond the PLC's limits is refused, never clamped.
+guard's enable, and SYNC, all fresh, and no command late by its number; in role REFERENCES also the three reference
+frames.  After a loss while armed, and when a conversation with the PLC begins, it stays neutral until the controller
+has disarmed.  A command beyond the PLC's limits is refused, never clamped.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
 from can_dbc.plc import map as plc
 from can_dbc.plc.map import N_AXES, N_JOINTS, Bounds, Command, Feedback, Grapple, MapError, Mode, Role, State
+from can_dbc.protocols.punctuality import Punctuality
 from controller.bus_io.message_state import MessageState, age_out
 from controller.bus_io.messages import ARM_KEY
 from machine.joints import JOINTS
@@ -50,11 +52,13 @@ class ValveGate:
         self._a, self._b, self._guard, self._status, *self._references = states
         self._states = tuple(states)
         self._by_key = {state.codec.key: state for state in states}
+        period_ns = 1_000_000_000 // profile.rate_hz
+        self._punctuality = {s.codec.key: Punctuality(period_ns, s.timeout_ns) for s in (self._a, self._b)}
         self._axes = [self._place(s.valve.signal) for s in specs]
         self._places = [self._reference(j.name.capitalize()) for j in JOINTS] if self._references else []
         self._sync_ns = -SYNC_NS
         self._armed = False
-        self._locked = 0
+        self._locked: int = ExitCode.NOT_ARMED
         self._reset_until_ns = 0
         self.refused = 0
         self.exit = ExitCode.NOT_ARMED
@@ -66,12 +70,23 @@ class ValveGate:
         return next(state for state in self._references if name in state.codec.index), name
 
     def receive(self, frame: Frame, now_ns: int) -> None:
-        """Use a frame of crane0; other messages are ignored."""
+        """Use a frame of crane0; other messages are ignored, and a command that comes too late ends its stream."""
         state = self._by_key.get(frame.key)
-        if state is not None:
-            state.receive(frame, now_ns)
-            if state is self._b and state.fresh and state.get("ArmKey") != ARM_KEY:
-                self._locked = 0
+        if state is None:
+            return
+        refused = state.refused
+        state.receive(frame, now_ns)
+        if state.refused != refused:
+            return
+        stream = self._punctuality.get(frame.key)
+        if stream is not None and stream.late(frame.data[1] & 0x0F, frame.stamp_ns):
+            state.forget()
+        elif state is self._b and state.get("ArmKey") != ARM_KEY:
+            self._locked = 0
+
+    def require_disarm(self) -> None:
+        """Stay neutral until the controller has disarmed: a conversation with the PLC begins."""
+        self._locked = self._locked or ExitCode.NOT_ARMED
 
     def sync(self, now_ns: int) -> None:
         """Note a SYNC."""
@@ -79,7 +94,7 @@ class ValveGate:
 
     @property
     def locked(self) -> bool:
-        """Whether an input was lost while armed, and the controller has not disarmed since."""
+        """Whether the controller must disarm first: an input was lost while armed, or a conversation began."""
         return self._locked != 0
 
     @property

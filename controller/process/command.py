@@ -29,6 +29,7 @@ from controller.config import ConfigError, Settings, load
 from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
 from controller.process.timing import LoopTiming
+from controller.process.tx_queue import MIN_QUEUE_FRAMES, crane_queue_frames
 from controller.process.warm_up import warm_up
 from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
@@ -39,8 +40,6 @@ from runtime.compiled import running
 from runtime.huge_pages import collapse_heap
 
 PRIORITY: Final = 80
-TX_QUEUE_FRAMES: Final = 32
-"""Own frames that may wait for a bus; more are refused."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -134,15 +133,16 @@ def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
     return {name: given.get(name) or default_address(name) for name in wanted}
 
 
-def open_buses(where: dict[str, str], controller: Controller) -> list[Bus]:
+def open_buses(where: dict[str, str], controller: Controller, settings: Settings) -> list[Bus]:
     """Open all buses or none, each with the filter of the controller's inputs; raises BusError."""
     wanted: list[list[FilterItem]] = [[*controller.crane_inputs.filters()]]
     if controller.carrier_bus is not None:
         wanted.append(controller.carrier_bus.inputs.filters())
+    queues = (crane_queue_frames(settings), MIN_QUEUE_FRAMES)
     opened: list[Bus] = []
     try:
-        for address, filters in zip(where.values(), wanted, strict=True):
-            opened.append(open_bus(address, filters=filters, tx_queue=TX_QUEUE_FRAMES))
+        for address, filters, queue in zip(where.values(), wanted, queues, strict=False):
+            opened.append(open_bus(address, filters=filters, tx_queue=queue))
     except BusError:
         for bus in opened:
             bus.close()
@@ -199,7 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
                 "config.sync-lead", f"--sync-lead-us {options.sync_lead_us}: the lead must be shorter than the period."
             )
         where = addresses(settings, dict(options.bus))
-        buses = open_buses(where, controller)
+        buses = open_buses(where, controller, settings)
         setpoints = listen(options.setpoint_port)
         operator = operator_socket(options.operator or operator_path())
         timing = LoopTiming(controller, timing_writer(options.timing))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from can_dbc.timing.page import Facts
-from controller.process.command import TX_QUEUE_FRAMES
+from controller.process.tx_queue import TX_QUEUE_NS
 from machine.status.reasons import Reason
 
 STALL_NS: Final = 10_000_000
@@ -61,16 +61,11 @@ class Loss:
     bus: str
     refused: int
     dropped: int
-    sent: int = 0
-    """Frames that the bus accepted in this time."""
 
     @property
     def least_stall_ns(self) -> int:
-        """The shortest stall that loses frames: until the transmit queue is full, at the rate of this time."""
-        if not self.refused:
-            return LOSING_STALL_NS
-        offered = self.sent + self.refused
-        return min(LOSING_STALL_NS, TX_QUEUE_FRAMES * (self.to_ns - self.from_ns) // offered)
+        """The shortest stall that loses frames: refused ones until the transmit queue is full, at any rate."""
+        return TX_QUEUE_NS if self.refused else LOSING_STALL_NS
 
     @property
     def frames(self) -> int:
@@ -84,8 +79,7 @@ def losses_between(before: Facts, after: Facts) -> list[Loss]:
     for old, new in zip(before.buses, after.buses, strict=True):
         refused, dropped = new.refused - old.refused, new.dropped - old.dropped
         if refused or dropped:
-            sent = new.sent - old.sent
-            found.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped, sent))
+            found.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped))
     return found
 
 

@@ -7,12 +7,13 @@ arrives another slice later, as on a quiet Ethernet.
 
 from __future__ import annotations
 
+from random import Random
 from typing import Final, Literal
 
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.plc import map as plc
-from can_dbc.plc.datagram import Header, encode_reply
+from can_dbc.plc.datagram import encode_reply
 from can_dbc.plc.modbus import RegisterRefused
 from controller.plc.bridge import EXCHANGE_NS, Bridge, role_of
 from machine.profile import Profile
@@ -28,14 +29,14 @@ class BridgedPlant(PlcPlant):
     def __init__(
         self, profile: Profile, seed: int = 0, truth: str = "nominal", logs: int = 1, transport: Transport = "modbus"
     ) -> None:
-        super().__init__(profile, seed, truth, logs, role=role_of(profile))
+        numbers = Random(f"plc session {seed}")
+        super().__init__(profile, seed, truth, logs, role=role_of(profile), draw=lambda: numbers.getrandbits(32))
         self.bridge = Bridge(profile, load("crane"))
         self.cut = False
         self._transport = transport
         self._exchange_ns = 0
         self._command: list[int] | bytes | None = None
         self._answer: list[int] | bytes | None = None
-        self._replies = 0
 
     def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
         """Advance to ``now_ns`` like a plant; input and output are the bridge's frames."""
@@ -74,6 +75,7 @@ class BridgedPlant(PlcPlant):
                 self.bridge.handshake.command_refused(refused.code)
                 return None
             return self.plc.status()
-        gate.datagram(_CLIENT, command, now_ns)
-        self._replies += 1
-        return encode_reply(Header(self._replies, now_ns // 1000, gate.sequence), feedback)
+        offer = gate.datagram(_CLIENT, command, now_ns)
+        if offer is None and not gate.session.number:
+            return None
+        return encode_reply(offer or gate.session.reply_header(now_ns), feedback)

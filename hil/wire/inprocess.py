@@ -44,8 +44,15 @@ class InProcessBus(BaseBus):
         stats.refused += len(frames) - sent
         return sent
 
-    def flush(self) -> None:
+    def discard(self) -> int:
+        before = len(self.node.queue)
         self.node.discard()
+        cancelled = before - len(self.node.queue)
+        self.stats.refused += cancelled
+        return cancelled
+
+    def flush(self) -> None:
+        self.discard()
         self._receive([])
 
     def _receive(self, frames: list[Frame]) -> None:

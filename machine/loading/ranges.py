@@ -25,6 +25,7 @@ from machine.profile import (
     JawTable,
     Kinematics,
     Law,
+    Plc,
     Profile,
     Sag,
     Timeouts,
@@ -115,6 +116,7 @@ _RANGES: Final[dict[type[msgspec.Struct], dict[str, Range]]] = {
         "floor_z_m": _HEIGHT_RANGE,
         "stake_height_m": (0.0, 4.0, "m"),
     },
+    Plc: {"sample_ms": (1.0, 10.0, "ms")},
     Workspace: {"ground_z_m": _HEIGHT_RANGE, "pick_center_m": _PLACE_RANGE, "pick_half_size_m": (0.1, 10.0, "m")},
     Camera: {
         "position_m": _PLACE_RANGE,

@@ -1,9 +1,10 @@
 """The swing-arm controller (source address 30h): spool commands of the four arms and the two float valves.
 
 The spools follow ArmCmdA and the float valves ArmCmdB while both (E2E valid, ArmKey 0xA) and GuardAlive (Enable 0xA)
-are at most 100 ms old and the emergency stop is released.  Otherwise the arms hold: spools neutral, float valves
-closed.  A loss while active, and a command that opens both float valves (which would let the machine roll), are a
-fault until fresh frames disarm.  The node reports the heights on which the controller closes its loop.
+are at most 100 ms old, the commands are not late by their number (`can_dbc.protocols.punctuality`), and the emergency
+stop is released.  Otherwise the arms hold: spools neutral, float valves closed.  A loss while active, and a command
+that opens both float valves (which would let the machine roll), are a fault until fresh frames disarm.  The node
+reports the heights on which the controller closes its loop.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from can_dbc.dbc.codec import Database
+from can_dbc.protocols.punctuality import Punctuality
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
 from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, ProtectedMessage
@@ -40,7 +42,9 @@ class ArmNode(J1939Node):
     def __init__(self, machine: Database, outbox: Outbox, pilot_on: Callable[[], bool]) -> None:
         super().__init__(ADDRESS, SUSPENSION_FUNCTION, machine, outbox)
         self._pilot_on = pilot_on
-        self._a, self._b = ProtectedInput(machine, "ArmCmdA"), ProtectedInput(machine, "ArmCmdB")
+        self._a, self._b = (
+            ProtectedInput(machine, name, Punctuality(CYCLE_NS, COMMAND_NS)) for name in ("ArmCmdA", "ArmCmdB")
+        )
         self._guard = ProtectedInput(machine, "GuardAlive")
         self._inputs = {i.key: i for i in (self._a, self._b, self._guard)}
         self._height_a, self._height_b = (
@@ -68,7 +72,7 @@ class ArmNode(J1939Node):
         """Set the outputs for this physics step."""
         a, b = self._a, self._b
         guarded = self._guard.fresh(now_ns, GUARD_NS) and self._guard.get("Enable") == ARM_KEY
-        commanded = a.fresh(now_ns, COMMAND_NS) and b.fresh(now_ns, COMMAND_NS)
+        commanded = a.fresh(now_ns, COMMAND_NS) and b.fresh(now_ns, COMMAND_NS) and not (a.late or b.late)
         ready = commanded and guarded and self._pilot_on() and not self.address_lost
         armed = a.get("ArmKey") == b.get("ArmKey") == ARM_KEY
         front, rear = b.get("FloatFront") == 1, b.get("FloatRear") == 1

@@ -6,6 +6,7 @@ from typing import Any
 
 from can_dbc.dbc.codec import Database, FrameRefused
 from can_dbc.protocols.e2e import Checker, Sender
+from can_dbc.protocols.punctuality import Punctuality
 from sim.errors import PlantError
 
 MS = 1_000_000
@@ -47,33 +48,44 @@ class ProtectedMessage:
 class ProtectedInput:
     """The newest valid frame of one received E2E message of the DBC; ``counter`` is its counter.
 
+    With ``punctuality`` it is a stream of commands: one that comes too late is not accepted, and sets ``late`` until a
+    punctual one comes.
+
     Raises:
         PlantError: the message has no E2E Data IDs.
     """
 
-    def __init__(self, database: Database, name: str) -> None:
+    def __init__(self, database: Database, name: str, punctuality: Punctuality | None = None) -> None:
         codec = database.message(name)
         if codec.data_ids is None:
             raise PlantError("plant.message-without-e2e", f"{name} in the DBC has no E2E Data IDs; add them")
         self.key, self._receive, self._index = codec.key, codec.receive, codec.index
         self._checker = Checker(codec.data_ids)
+        self._punctuality = punctuality
         self.reset()
 
     def reset(self) -> None:
         """Discard all state, as after a restart."""
         self._checker.reset()
+        if self._punctuality is not None:
+            self._punctuality.reset()
         self.values: tuple[Any, ...] | None = None
         self.stamp_ns = self.counter = 0
+        self.late = False
 
     def accept(self, data: bytes, now_ns: int) -> bool:
         """Whether the frame was valid and accepted."""
         if not self._checker.check(data).usable:
             return False
         try:
-            self.values = self._receive(data)
+            values = self._receive(data)
         except FrameRefused:
             return False
-        self.stamp_ns, self.counter = now_ns, data[1] & 0x0F
+        counter = data[1] & 0x0F
+        self.late = self._punctuality is not None and self._punctuality.late(counter, now_ns)
+        if self.late:
+            return False
+        self.values, self.stamp_ns, self.counter = values, now_ns, counter
         return True
 
     def fresh(self, now_ns: int, limit_ns: int) -> bool:

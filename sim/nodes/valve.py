@@ -1,9 +1,9 @@
 """The valve node (PLC, 10h): receives ValveCmdA/B and sets spool commands; without valid commands it is neutral.
 
 The spools follow only while ValveCmdA, ValveCmdB (E2E valid, ArmKey 0xA) and GuardStat (Enable 0xA) are at most
-50 ms old, SYNC at most three cycles old and the pilot supply is on.  Lost while active: ramp to neutral in 60 ms,
-state FAULT until a fresh frame disarms; 300 ms without commands: pilot off.  The grapple never opens on a loss.  A
-disarm is neutral at once.
+50 ms old, no command is late by its number (`can_dbc.protocols.punctuality`), SYNC is at most three cycles old and the
+pilot supply is on.  Lost while active: ramp to neutral in 60 ms, state FAULT until a fresh frame disarms; 300 ms
+without commands: pilot off.  The grapple never opens on a loss.  A disarm is neutral at once.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from can_dbc.dbc.codec import Database
+from can_dbc.protocols.punctuality import Punctuality
 from machine.crane_nodes import CraneNode
 from sim.nodes import Outbox
 from sim.nodes.device import Device
@@ -81,7 +82,10 @@ class ValveInputs:
 
 
 class ValveNode(Device):
-    """``outputs_pct`` are the present spool commands, in FUNCTIONS order; ``sense`` reads the node's inputs."""
+    """``outputs_pct`` are the present spool commands, in FUNCTIONS order; ``sense`` reads the node's inputs.
+
+    ``command_ns`` is the period of the commands.
+    """
 
     def __init__(
         self,
@@ -90,10 +94,14 @@ class ValveNode(Device):
         pilot_on: Callable[[], bool],
         sense: Callable[[], ValveInputs],
         cycle_ns: int = CYCLE_NS,
+        command_ns: int = CYCLE_NS,
     ) -> None:
         super().__init__(CraneNode.VALVES, outbox)
         self._pilot_on, self._sense = pilot_on, sense
-        self._a, self._b, self._guard = (ProtectedInput(database, n) for n in ("ValveCmdA", "ValveCmdB", "GuardStat"))
+        self._a, self._b = (
+            ProtectedInput(database, name, Punctuality(command_ns, COMMAND_NS)) for name in ("ValveCmdA", "ValveCmdB")
+        )
+        self._guard = ProtectedInput(database, "GuardStat")
         self._inputs = {i.key: i for i in (self._a, self._b, self._guard)}
         self._fb_a, self._fb_b, self._grapple_stat, self._plc = (
             ProtectedMessage(database, n) for n in ("ValveFbA", "ValveFbB", "GrappleStat", "PlcStatus")
@@ -155,7 +163,8 @@ class ValveNode(Device):
         if not self._pilot_on():
             return ExitCode.SAFETY_STOP
         synchronous = self._sync_ns is not None and now_ns - self._sync_ns <= SYNC_NS
-        if not self._commands_fresh(now_ns, COMMAND_NS) or not synchronous:
+        punctual = not (self._a.late or self._b.late)
+        if not self._commands_fresh(now_ns, COMMAND_NS) or not synchronous or not punctual:
             return ExitCode.COMMAND_TIMEOUT
         if not self._guard.fresh(now_ns, GUARD_NS) or self._guard.get("Enable") != ARM_KEY:
             return ExitCode.GUARD_MISSING

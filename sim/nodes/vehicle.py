@@ -1,9 +1,9 @@
 """The vehicle controller (source address 03h): receives VehCmd, drives, steers and brakes; without it the brake is on.
 
 It follows only while VehCmd (E2E valid, ArmKey 0xA, every value available) and GuardAlive (Enable 0xA) are at most
-100 ms old and the emergency stop is released.  Otherwise the brake is on and the steering spool neutral, at once; a
-loss while driving remains a fault until a fresh frame disarms.  The node's own dead-band map turns the articulation
-rate into a spool command.
+100 ms old, VehCmd is not late by its number (`can_dbc.protocols.punctuality`), and the emergency stop is released.
+Otherwise the brake is on and the steering spool neutral, at once; a loss while driving remains a fault until a fresh
+frame disarms.  The node's own dead-band map turns the articulation rate into a spool command.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from can_dbc.dbc.codec import Database
+from can_dbc.protocols.punctuality import Punctuality
 from machine.profile import Carrier, CarrierValve
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
@@ -61,7 +62,7 @@ class VehicleNode(J1939Node):
     def __init__(self, machine: Database, outbox: Outbox, carrier: Carrier, pilot_on: Callable[[], bool]) -> None:
         super().__init__(ADDRESS, DRIVE_FUNCTION, machine, outbox)
         self._carrier, self._pilot_on = carrier, pilot_on
-        self._command = ProtectedInput(machine, "VehCmd")
+        self._command = ProtectedInput(machine, "VehCmd", Punctuality(CYCLE_NS, COMMAND_NS))
         self._guard = ProtectedInput(machine, "GuardAlive")
         self._stat = ProtectedMessage(machine, "VehStat")
         self._period = PeriodicTimer(CYCLE_NS)
@@ -84,7 +85,7 @@ class VehicleNode(J1939Node):
     def decide(self, now_ns: int) -> None:
         """Set the outputs for this physics step."""
         command = self._command
-        fresh = command.fresh(now_ns, COMMAND_NS)
+        fresh = command.fresh(now_ns, COMMAND_NS) and not command.late
         guarded = self._guard.fresh(now_ns, GUARD_NS) and self._guard.get("Enable") == ARM_KEY
         pilot = self._pilot_on()
         if self.active and not pilot:

@@ -2,8 +2,9 @@
 
 Like ``python -m sim``, but without CAN: the emulated PLC reads the sensors and drives the valves; clients command it
 over Modbus/TCP or cyclic UDP, in the role that the profile's [plc] defines.  ``--port`` answers the same JSON requests.
-It prints ``ready`` with the ports in use on stdout.  Loopback only unless ``--allow-network`` is given.  Exit codes: 0
-stopped, 2 usage, 3 profile or truth, 4 an address that cannot be used.
+It prints ``ready`` with the ports in use on stdout.  Loopback only unless ``--allow-network`` is given; datagrams from
+a network need a key, or ``--no-key``, and Modbus has none.  Exit codes: 0 stopped, 2 usage, 3 profile or truth, 4 an
+address that cannot be used.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ import gc
 import signal
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import msgspec
 
+from can_dbc.messages.key_file import read_key
 from can_dbc.messages.udp_address import address_argument, udp_address
 from can_dbc.plc.map import Role, WordOrder
 from can_dbc.plc.modbus import LinkError, ModbusServer, is_loopback
@@ -70,7 +73,10 @@ class LivePlc(LivePlant):
     def report(self) -> dict[str, float]:
         """Also the counts of the network."""
         arbiter = self._program.arbiter
-        counts = {"accepted": arbiter.accepted, "refused": arbiter.refused, "dropped": arbiter.dropped}
+        counts = {
+            "accepted": arbiter.accepted, "refused": arbiter.refused, "dropped": arbiter.dropped,
+            "replayed": arbiter.replayed,
+        }  # fmt: skip
         return super().report() | counts | (asdict(self.modbus.counts) if self.modbus else {})
 
     def close(self) -> None:
@@ -97,13 +103,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--udp", type=_listening, metavar="HOST:PORT", help="cyclic datagrams; port 0 takes a free one")
     parser.add_argument("--word-order", choices=("high", "low"), default="high", help="first half of 32 bits")
     parser.add_argument("--allow-network", action="store_true", help="listen on an address that others can reach")
+    parser.add_argument("--key-file", type=Path, help="file with the key that authenticates the datagrams")
+    parser.add_argument("--no-key", action="store_true", help="accept datagrams of other hosts without a key")
     parser.add_argument("--port", type=int, help="UDP port on the loopback interface for JSON requests")
     options = parser.parse_args(arguments)
     if options.modbus is None and options.udp is None:
         parser.error("give --modbus HOST:PORT, --udp HOST:PORT or both")
     for address in (options.modbus, options.udp):
         if address and not options.allow_network and not is_loopback(address[0]):
-            parser.error(f"{address[0]} can be reached by others, and nothing is authenticated; give --allow-network")
+            parser.error(f"{address[0]} can be reached by others; give --allow-network if they may command the PLC")
+    if options.udp and not (is_loopback(options.udp[0]) or options.key_file or options.no_key):
+        parser.error(f"{options.udp[0]} can be reached by others; give --key-file FILE, or --no-key")
     loop = asyncio.new_event_loop()
     try:
         profile = load_profile(options.profile)
@@ -113,7 +123,8 @@ def main(arguments: list[str] | None = None) -> int:
             )
         role = Role.REFERENCES if profile.plc.role == "references" else Role.VALVES
         order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
-        plant = PlcPlant(profile, options.seed, options.truth, options.logs, role=role, order=order)
+        key = None if options.key_file is None else read_key(options.key_file)
+        plant = PlcPlant(profile, options.seed, options.truth, options.logs, role=role, order=order, key=key)
         live = LivePlc(plant, options.port, loop)
         ports = live.open(options.modbus, options.udp)
         signal.signal(signal.SIGTERM, live.stop)

@@ -8,27 +8,37 @@ value out of range is refused, latched as a fault, and changes nothing; nothing 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+import secrets
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import DatagramRefused, Header, decode_command
 from can_dbc.plc.map import Bounds, Command, Fault, MapError, WordOrder
 from can_dbc.plc.modbus import RegisterRefused
+from sim.plc.session import Session
 
 MS = 1_000_000
 MAX_DRAFT_COUNT = 16  # clients whose uncommitted drafts are stored
 
 
 class CommandArbiter:
-    """The commanding side of the PLC.  ``command`` is the newest accepted one; times are in ns."""
+    """The commanding side of the PLC.  ``command`` is the newest accepted one; times are in ns.  ``replayed`` counts
+    datagrams that were good and not new.
+    """
 
-    def __init__(self, bounds: Bounds, order: WordOrder) -> None:
+    def __init__(
+        self, bounds: Bounds, order: WordOrder, draw: Callable[[], int] | None = None, key: bytes | None = None
+    ) -> None:
+        """``draw`` gives the numbers of sessions over UDP, random by default; ``key`` authenticates the datagrams."""
         self._bounds, self.order = bounds, order
         self.watchdog_ms = plc.WATCHDOG_DEFAULT_MS
         self.command = Command()
         self.sequence = 0
         self.fault, self.fault_axis = Fault.NONE, plc.NO_AXIS
-        self.accepted = self.refused = self.dropped = 0
+        self.accepted = self.refused = self.dropped = self.replayed = 0
+        self.session = Session(draw or partial(secrets.randbits, 32))
+        self.key = key
         self._neutral = plc.command_registers(self.command, 0, 0, order)
         self._block = self._neutral
         self._drafts: dict[Hashable, list[int]] = {}
@@ -60,9 +70,10 @@ class CommandArbiter:
         return now_ns - self._accepted_ns
 
     def release(self) -> None:
-        """End the command; the next command may come from any client and with any number."""
+        """End the command and the session; the next command may come from any client."""
         self._commander = None
         self.command = Command()
+        self.session.close()
 
     def latch_fault(self, fault: Fault, axis: int = plc.NO_AXIS) -> None:
         """Keep the first fault until a reset."""
@@ -110,34 +121,41 @@ class CommandArbiter:
 
     def _commit(self, client: Hashable, draft: list[int], now_ns: int) -> None:
         sequence = draft[plc.SEQUENCE_AT - plc.COMMAND_AT]
-        if self._accept(client, sequence, plc.read_command(draft, self.order), now_ns, 16):
+        command = plc.read_command(draft, self.order)
+        if client != self.commander(now_ns) or plc.advances(sequence, self.sequence):
+            self._accept(client, sequence, command, now_ns)
             self._block = list(draft)
 
     def datagram(self, client: Hashable, data: bytes, now_ns: int) -> Header | None:
-        """A UDP command; returns its header when accepted.  A damaged, old or malformed one is dropped and counted."""
+        """A UDP command.  A damaged or old one, and one of a stranger, is dropped and counted.
+
+        Returns the header of the answer to a hello, which is due at once, and None for every other datagram.
+        """
         try:
-            header, command = decode_command(data)
-            if self._may_command(client, now_ns) and self._accept(client, header.sequence, command, now_ns, 32):
-                return header
+            header, command = decode_command(data, self.key)
+            if not self._may_command(client, now_ns):
+                self.dropped += 1
+            elif not header.session:
+                return self.session.greet(client, header, now_ns)
+            elif self.session.admits(client, header, command, now_ns):
+                self._accept(client, header.sequence, command, now_ns)
+            else:
+                self.replayed += 1
         except DatagramRefused:
-            pass
+            self.dropped += 1
         except MapError as error:
             if self._may_command(client, now_ns):
                 self.latch_fault(Fault.ILLEGAL_VALUE, error.axis)
             self.refused += 1
-            return None
-        self.dropped += 1
         return None
 
-    def _accept(self, client: Hashable, sequence: int, command: Command, now_ns: int, bits: int) -> bool:
-        if client == self.commander(now_ns) and not plc.advances(sequence, self.sequence, bits):
-            return False
+    def _accept(self, client: Hashable, sequence: int, command: Command, now_ns: int) -> None:
+        """Take a new command; raises MapError."""
         self._bounds.check(command)
         self.command, self.sequence, self._commander = command, sequence, client
         self._accepted_ns = self._alive_ns = now_ns
         self._commander_disconnected = False
         self.accepted += 1
-        return True
 
     def _may_command(self, client: Hashable, now_ns: int) -> bool:
         """Whether this client may command."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from can_dbc.plc.map import Estop, Role, State, WordOrder
+from can_dbc.plc.map import ESTOP_BYTES, Estop, Role, State, WordOrder
 from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.errors import PlantError
@@ -17,6 +18,8 @@ from sim.wood.log_shape import LogSpec
 
 class PlcPlant(Plant):
     """A machine on a fixed base behind a PLC, without any CAN bus; ``plc`` is its program.
+
+    ``draw`` and ``key`` as in `sim.plc.command_arbiter.CommandArbiter`.
 
     Raises:
         PlantError: the machine drives, or as `sim.plant.Plant`.
@@ -31,6 +34,8 @@ class PlcPlant(Plant):
         *,
         role: Role,
         order: WordOrder = WordOrder.HIGH_FIRST,
+        draw: Callable[[], int] | None = None,
+        key: bytes | None = None,
         scene: str | Sequence[LogSpec] | None = None,
     ) -> None:
         if profile.carrier is not None:
@@ -38,7 +43,8 @@ class PlcPlant(Plant):
                 "plc.mobile-machine",
                 f"{profile.name} drives; the emulated PLC needs a crane on a fixed base, such as palms_471",
             )
-        self.plc = Program(profile, role, self._inputs, order)
+        self.plc = Program(profile, role, self._inputs, order, draw, key)
+        self._estop_key, self._estop_frame = load("crane").message("EstopStat").key, bytes(ESTOP_BYTES)
         super().__init__(profile, seed, truth, logs, scene=scene)
 
     def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
@@ -50,7 +56,11 @@ class PlcPlant(Plant):
         return list(self.plc.scan(now_ns))
 
     def _tick(self, now_ns: int) -> None:
-        self.estop.tick(now_ns)
+        self.estop.tick(now_ns)  # the safety module is wired to the PLC, which passes its frames on
+        for key, data in self._crane_out:
+            if key == self._estop_key:
+                self._estop_frame = data
+        self._crane_out.clear()
 
     def _commanded(self) -> bool:
         return self.plc.state is State.EXECUTE
@@ -70,4 +80,5 @@ class PlcPlant(Plant):
             opening=self.world.opening,
             load_kg=self.world.load_kg(),
             estop=estop,
+            estop_frame=self._estop_frame,
         )

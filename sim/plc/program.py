@@ -11,7 +11,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from can_dbc.plc import map as plc
-from can_dbc.plc.map import N_JOINTS, Bounds, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
+from can_dbc.plc.map import (
+    ESTOP_BYTES,
+    N_JOINTS,
+    Bounds,
+    Estop,
+    Fault,
+    Feedback,
+    Grapple,
+    Mode,
+    Role,
+    State,
+    WordOrder,
+)
 from machine.joints import JOINTS
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import Profile, joint
@@ -28,13 +40,17 @@ MOTION_ALLOWED = Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON
 
 @dataclass(slots=True)
 class Inputs:
-    """Readings of the PLC's input cards: joint positions (None without encoder), pressures, grapple, emergency stop."""
+    """Readings of the PLC's input cards: joint positions (None without encoder), pressures, grapple, emergency stop.
+
+    ``estop`` are the contacts that the PLC itself obeys; ``estop_frame`` is the safety module's newest EstopStat.
+    """
 
     positions: tuple[float | None, ...]
     pressure_bar: tuple[float, ...]
     opening: float
     load_kg: float
     estop: int
+    estop_frame: bytes = bytes(ESTOP_BYTES)
 
 
 def bounds_of(profile: Profile, role: Role) -> Bounds:
@@ -49,9 +65,15 @@ class Program:
     """The PLC: ``arbiter`` accepts commands, ``outputs`` are the valves' openings -1..1 (five joints, grapple)."""
 
     def __init__(
-        self, profile: Profile, role: Role, inputs: Callable[[int], Inputs], order: WordOrder = WordOrder.HIGH_FIRST
+        self,
+        profile: Profile,
+        role: Role,
+        inputs: Callable[[int], Inputs],
+        order: WordOrder = WordOrder.HIGH_FIRST,
+        draw: Callable[[], int] | None = None,
+        key: bytes | None = None,
     ) -> None:
-        self.arbiter = CommandArbiter(bounds_of(profile, role), order)
+        self.arbiter = CommandArbiter(bounds_of(profile, role), order, draw, key)
         self.state = State.INIT
         self.outputs = [0.0] * (N_JOINTS + 1)
         self.feedback = Feedback()
@@ -92,7 +114,7 @@ class Program:
             self.outputs = [max(0.0, left) * u for u in self._from]
         else:
             self.outputs = [0.0] * len(self.outputs)
-        self.feedback = self._make_feedback(inputs)
+        self.feedback = self._make_feedback(inputs, now_ns)
 
     def _decide(self, estop: int, now_ns: int) -> None:
         """The state of this cycle."""
@@ -151,7 +173,7 @@ class Program:
                 out[-1] = HOLD_SHARE
         return out
 
-    def _make_feedback(self, inputs: Inputs) -> Feedback:
+    def _make_feedback(self, inputs: Inputs, now_ns: int) -> Feedback:
         arbiter, spare = self.arbiter, (0.0,) * (plc.N_AXES - N_JOINTS)
         return Feedback(
             heartbeat=self._cycles & 0xFFFF,
@@ -166,4 +188,6 @@ class Program:
             pressure_bar=inputs.pressure_bar,
             opening=min(max(inputs.opening, 0.0), 1.0),
             load_kg=min(max(round(inputs.load_kg), 0), 4093),
+            estop_frame=inputs.estop_frame,
+            sampled_us=now_ns // 1000 & 0xFFFF,
         )

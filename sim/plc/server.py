@@ -13,6 +13,7 @@ from typing import cast
 
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import Header, encode_reply
+from can_dbc.plc.map import Feedback
 from can_dbc.plc.modbus import LinkError, ModbusServer, RegisterRefused
 from sim.plc.program import Program
 
@@ -47,13 +48,12 @@ class PlcRegisters:
 
 
 class Datagrams(asyncio.DatagramProtocol):
-    """The UDP side: commands in; one reply per PLC cycle to the commander, or to the last valid sender."""
+    """The UDP side: commands in, an answer at once to every hello, and one reply per PLC cycle in an open session."""
 
     def __init__(self, program: Program, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._program, self._clock_ns = program, clock_ns
         self._transport: asyncio.DatagramTransport | None = None
-        self._peer: Address | None = None
-        self._sequence = self._beat = 0
+        self._beat = 0
         self.port = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -61,19 +61,22 @@ class Datagrams(asyncio.DatagramProtocol):
         self.port = transport.get_extra_info("sockname")[1]
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        if self._program.arbiter.datagram(addr, data, self._clock_ns()) is not None:
-            self._peer = addr
+        offer = self._program.arbiter.datagram(addr, data, self._clock_ns())
+        if offer is not None:
+            self._reply(offer, self._program.feedback, addr)
 
     def cycle(self) -> None:
         """Send the reply of a PLC cycle that has not been sent yet."""
-        feedback = self._program.feedback
-        if self._transport is None or self._peer is None or feedback.heartbeat == self._beat:
+        feedback, session = self._program.feedback, self._program.arbiter.session
+        if not session.number or feedback.heartbeat == self._beat:
             return
         self._beat = feedback.heartbeat
-        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
-        header = Header(self._sequence, self._clock_ns() // 1000, self._program.arbiter.sequence)
-        with contextlib.suppress(OSError):
-            self._transport.sendto(encode_reply(header, feedback), self._peer)
+        self._reply(session.reply_header(self._clock_ns()), feedback, cast(Address, session.client))
+
+    def _reply(self, header: Header, feedback: Feedback, to: Address) -> None:
+        if self._transport is not None:
+            with contextlib.suppress(OSError):
+                self._transport.sendto(encode_reply(header, feedback, self._program.arbiter.key), to)
 
     def close(self) -> None:
         if self._transport is not None:

@@ -59,6 +59,8 @@ FEEDBACKS = st.builds(
     pressure_bar=st.tuples(*[st.integers(-(1 << 15), (1 << 15) - 1).map(lambda n: n / 10.0)] * N_PRESSURES),
     opening=st.integers(0, 1000).map(lambda n: n / 1e3),
     load_kg=U16,
+    estop_frame=st.binary(min_size=8, max_size=8),
+    sampled_us=U16,
 )
 
 
@@ -85,12 +87,13 @@ def test_the_addresses_are_those_of_the_map() -> None:
         heartbeat=11, state=State.EXECUTE, fault=1, fault_axis=3, estop=7, accepted=21, longest_cycle_us=31,
         position=(0.065537, -0.000001, 0.0, 0.0, 0.0, 0.0, 0.0), velocity=(0.001, -0.001, 0.0, 0.0, 0.0, 0.0, 0.007),
         pressure_bar=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), opening=0.5, load_kg=77,
+        estop_frame=bytes(range(1, 9)), sampled_us=0xABCD,
     )  # fmt: skip
     status = status_registers(feedback, 300, WordOrder.HIGH_FIRST)
-    assert status[:12] == [0x4352, 1, 0x0102, 0x0304, 11, 2, 1, 3, 7, 21, 31, 300]
+    assert status[:12] == [0x4352, 2, 0x0102, 0x0304, 11, 2, 1, 3, 7, 21, 31, 300]
     assert status[12:16] == [1, 1, 0xFFFF, 0xFFFF]
     assert (status[26], status[27], status[32]) == (1, 0xFFFF, 7)
-    assert status[33:48] == [1, 2, 3, 4, 5, 6, 7, 8, 500, 77, 0, 0, 0, 0, 0]
+    assert status[33:48] == [1, 2, 3, 4, 5, 6, 7, 8, 500, 77, 0x0102, 0x0304, 0x0506, 0x0708, 0xABCD]
     low = status_registers(feedback, 300, WordOrder.LOW_FIRST)
     assert (low[2:4], low[12:14]) == ([0x0304, 0x0102], [1, 1])
     command = Command(
@@ -120,7 +123,7 @@ def test_the_word_order_test_names_the_problem(
     assert named in str(refused.value)
 
 
-@pytest.mark.parametrize(("register", "value"), [(0, 0x5243), (1, 2), (5, 3), (5, 9)])
+@pytest.mark.parametrize(("register", "value"), [(0, 0x5243), (1, 1), (5, 3), (5, 9)])
 def test_a_status_of_another_map_is_refused(register: int, value: int) -> None:
     status = status_registers(Feedback(), 300, WordOrder.HIGH_FIRST)
     status[register] = value

@@ -12,13 +12,12 @@ from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import Header, encode_reply
-from can_dbc.plc.map import Command, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
+from can_dbc.plc.map import Command, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
 from can_dbc.protocols.canopen import parse_heartbeat
-from can_dbc.protocols.e2e import Sender
+from can_dbc.protocols.e2e import Checker, Sender, Status
 from controller.config import ConfigError
 from controller.crane.startup import Startup
 from controller.plc.bridge import Bridge, role_of
-from controller.plc.emulated_nodes import LinearInterpolator
 from controller.plc.handshake import Handshake
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
@@ -27,7 +26,6 @@ from tests.codes import coded
 
 MS = 1_000_000
 DATABASE = load("crane")
-MAY_MOVE = int(Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON)
 HOME = (0.1, 0.7, -1.6, 0.3, 0.2, 0.0, 0.0)
 ARMED, MOVES = 0xA, 2
 
@@ -41,7 +39,7 @@ class Rig:
 
     def __init__(self, role: str = "valves") -> None:
         self.bridge = Bridge(profile(role), DATABASE)
-        self.feedback = Feedback(state=State.HOLD, fault_axis=15, estop=MAY_MOVE, position=HOME, opening=0.5)
+        self.feedback = Feedback(state=State.HOLD, fault_axis=15, position=HOME, opening=0.5)
         self.now_ns = 1_000 * MS
         self.answers = True
         self.acknowledges = True
@@ -49,6 +47,11 @@ class Rig:
         self.command = Command()
         self.mode = ControllerMode.ACTIVE
         self._senders: dict[str, Sender] = {}
+        self.channel_b = 1
+        self.estop_alive = self.samples = True
+        for _ in range(2):
+            for frame in self.control(arm=0, mode=0):  # the controller has been there before
+                self.bridge.gate.receive(frame, self.now_ns)
 
     def frame(self, name: str, **values: Any) -> Frame:
         """A good protected frame; what is not given is 0."""
@@ -81,6 +84,11 @@ class Rig:
                 accepted = block[1] if self.acknowledges else self.feedback.accepted
                 beat = (self.feedback.heartbeat + 1) & 0xFFFF
                 self.feedback = replace(self.feedback, heartbeat=beat, accepted=accepted)
+                if self.samples:
+                    self.feedback = replace(self.feedback, sampled_us=self.now_ns // 1000 & 0xFFFF)
+                if self.estop_alive:
+                    values = {"ChannelA": 1, "ChannelB": self.channel_b, "PilotSupply": 1}
+                    self.feedback = replace(self.feedback, estop_frame=self.frame("EstopStat", **values).data)
                 status = plc.status_registers(self.feedback, 300, WordOrder.HIGH_FIRST)
                 assert bridge.handshake.accept_registers(status, self.now_ns)
         self.sent = out
@@ -111,7 +119,7 @@ def test_bridge_is_silent_until_the_plc_has_initialised() -> None:
     rig.answers = False
     rig.run(300)
     assert not rig.sent
-    rig.answers, rig.feedback = True, replace(rig.feedback, state=State.INIT, estop=0)
+    rig.answers, rig.feedback = True, replace(rig.feedback, state=State.INIT)
     rig.run(100)
     assert not rig.sent
 
@@ -273,13 +281,14 @@ def test_plc_values_are_on_the_bus_and_others_not_available() -> None:
     rig = Rig()
     rig.feedback = replace(
         rig.feedback, state=State.EXECUTE, pressure_bar=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), load_kg=80,
-        longest_cycle_us=11_000, fault=Fault.ILLEGAL_VALUE, fault_axis=2, estop=MAY_MOVE & ~Estop.CHANNEL_B,
+        longest_cycle_us=11_000, fault=Fault.ILLEGAL_VALUE, fault_axis=2,
     )  # fmt: skip
+    rig.channel_b = 0
     rig.run(100)
     valve_a, valve_b = await_frame(rig, "ValveFbA"), await_frame(rig, "ValveFbB")
     assert valve_a["State"] == 1 and valve_a["SpoolSlew"] is None and valve_b["FaultAxis"] == 2
     estop, status = await_frame(rig, "EstopStat"), await_frame(rig, "PlcStatus")
-    assert (estop["ChannelA"], estop["ChannelB"], estop["PilotPress"]) == (1, 0, None)
+    assert (estop["ChannelA"], estop["ChannelB"], estop["PilotSupply"]) == (1, 0, 1)
     assert (status["Mode"], status["LongestCycle"], status["FaultBits"]) == (2, 11_000, 1)
     assert [await_frame(rig, "PressA")[n] for n in ("LiftA", "LiftB", "TiltA", "TiltB")] == [1.0, 2.0, 3.0, 4.0]
     press = await_frame(rig, "PressB")
@@ -308,14 +317,143 @@ def test_reset_needs_an_operators_reset_and_never_an_armed_controller() -> None:
     assert edges == 2, "a pulse of 200 ms, again after as long"
 
 
-def test_positions_are_interpolated() -> None:
-    between = LinearInterpolator()
-    between.sample(1.0, 10 * MS, 50 * MS)
-    assert between.at(10 * MS) == 1.0
-    between.sample(2.0, 20 * MS, 50 * MS)
-    assert [between.at(t * MS) for t in (20, 25, 30, 40)] == [1.0, 1.5, 2.0, 2.0]
-    between.sample(4.0, 200 * MS, 50 * MS)
-    assert [between.at(t * MS) for t in (200, 225, 250)] == [2.0, 3.0, 4.0], "a gap is bridged over 50 ms at most"
+def frames_of(rig: Rig, name: str, ms: int, sync: bool = True) -> list[bytes]:
+    """All frames of that name that the bridge sends in ``ms``."""
+    key, found = DATABASE.message(name).key, []
+    for _ in range(ms // 5):
+        frames = rig.control()
+        found += [data for k, data in rig.step(frames if sync else frames[1:]) if k == key]
+    return found
+
+
+def start_encoders(rig: Rig) -> None:
+    startup, ours = Startup(profile("valves")), list[Frame]()
+    for _ in range(400):
+        for key, data in rig.step(ours):
+            startup.receive(key, data)
+        asked: list[RawFrame] = []
+        startup.step(rig.now_ns, asked)
+        ours = [Frame(rig.now_ns, key, data) for key, data in asked]
+    assert startup.complete
+
+
+def test_the_emergency_stop_is_the_safety_modules_own_frame_and_is_sent_once() -> None:
+    rig = Rig()
+    rig.run(100)
+    checker, codec = Checker(DATABASE.message("EstopStat").data_ids or b""), DATABASE.message("EstopStat")
+    seen = []
+    for _ in range(40):
+        before = rig.feedback.estop_frame
+        for key, data in rig.step(rig.control()):
+            if key == codec.key:
+                assert data == before
+                seen.append(checker.check(data))
+    assert len(seen) == 20 and set(seen[1:]) <= {Status.OK, Status.INITIAL}
+
+
+def test_a_safety_module_that_falls_silent_behind_the_plc_is_silent_on_the_bus() -> None:
+    """The PLC goes on with the last state it has seen, and the bridge sends none of its own."""
+    rig = Rig()
+    rig.run(100)
+    assert frames_of(rig, "EstopStat", 50)
+    rig.estop_alive = False
+    rig.run(10)
+    assert not frames_of(rig, "EstopStat", 300)
+
+
+def test_a_sample_is_sent_once_with_the_plcs_time() -> None:
+    rig = Rig()
+    start_encoders(rig)
+    key, codec = DATABASE.message("EncSlew").key, DATABASE.message("EncSlew")
+    stamps = []
+    for _ in range(40):
+        sampled_us = rig.feedback.sampled_us
+        for k, data in rig.step(rig.control()):
+            if k == key:
+                assert codec.receive(data)[codec.index["TimeStamp"]] == sampled_us
+                stamps.append(sampled_us)
+    assert len(stamps) == len(set(stamps)) == 20, "one in 10 ms, although SYNC asks every 5 ms"
+    rig.feedback = replace(rig.feedback, position=tuple(p + 0.05 for p in HOME))
+    rig.run(10)
+    positions = [codec.receive(data)[codec.index["Position"]] for data in frames_of(rig, "EncSlew", 50)]
+    assert len(set(positions)) == 1, "nothing between two samples"
+
+
+@pytest.mark.parametrize("name", ["EncSlew", "EncExt"])
+def test_a_plc_that_repeats_its_samples_is_silence_on_the_bus(name: str) -> None:
+    """Its cycle runs on, so its heartbeat changes; the linear encoder has no time stamp of its own."""
+    rig = Rig()
+    start_encoders(rig)
+    assert frames_of(rig, name, 50)
+    rig.samples = False
+    rig.run(10)
+    assert not frames_of(rig, name, 200)
+    assert frames_of(rig, "PressA", 50), "the rest goes on"
+
+
+def test_pressures_are_sent_once_per_cycle_of_the_plc() -> None:
+    rig = Rig()
+    rig.run(100)
+    assert len(frames_of(rig, "PressA", 100)) == 10
+    rig.answers = False
+    rig.run(5)
+    assert not frames_of(rig, "PressA", 35) and rig.sent, "it still answers, with nothing new"
+
+
+def test_an_answer_that_took_longer_than_50_ms_is_not_used() -> None:
+    shake = Handshake()
+    status = plc.status_registers(Feedback(state=State.HOLD, heartbeat=1), 300, WordOrder.HIGH_FIRST)
+    shake.registers(Command(), 100 * MS)
+    assert not shake.accept_registers(status, 151 * MS) and shake.dropped == 1
+    assert shake.accept_registers(status, 149 * MS)
+
+
+def test_bridge_starts_neutral_under_an_armed_controller_and_waits_for_a_disarm() -> None:
+    """A bridge that is started again does not go on where another one ended."""
+    rig = Rig()
+    rig.bridge = Bridge(profile("valves"), DATABASE)
+    rig.run(300, Slew=50.0)
+    assert rig.command == Command() and rig.bridge.gate.locked
+    rig.run(20, arm=0, mode=0)
+    rig.run(20, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+
+
+def test_a_new_conversation_with_the_plc_needs_a_disarm() -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+    rig.bridge.handshake.connected()
+    rig.run(100, Slew=50.0)
+    assert rig.command == Command()
+
+
+def test_commands_that_come_60_ms_late_in_order_are_not_passed_on() -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    travelling: list[tuple[int, list[Frame]]] = []
+    delay_ns = 0
+    for n in range(200):
+        delay_ns = min(60 * MS, n * MS)
+        sync, *commands = rig.control(Slew=50.0)
+        travelling.append((rig.now_ns + delay_ns, commands))
+        arrived = [sync]
+        while travelling and travelling[0][0] <= rig.now_ns:
+            arrived += travelling.pop(0)[1]
+        rig.step([Frame(rig.now_ns, *frame[1:]) for frame in arrived])
+        assert delay_ns > 40 * MS or n < 2 or rig.command.mode is Mode.VALVES
+    assert rig.command == Command() and rig.bridge.gate.exit == 5
+
+
+def test_corrupt_commands_do_not_end_the_lock() -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    rig.run(20, Slew=50.0, enable=0)
+    assert rig.bridge.gate.locked
+    key = DATABASE.message("ValveCmdB").key
+    for _ in range(6):
+        rig.step([f if f.key != key else Frame(f.stamp_ns, key, bytes(8)) for f in rig.control(Slew=50.0)])
+    assert rig.bridge.gate.locked
 
 
 def test_handshake_measures_the_round_trip_by_the_echo() -> None:
@@ -323,13 +461,14 @@ def test_handshake_measures_the_round_trip_by_the_echo() -> None:
     for n in range(1, 11):
         shake.datagram(Command(), n * 10 * MS)
     reply = Feedback(state=State.HOLD)
-    assert shake.accept_datagram(encode_reply(Header(1, 0, 4), reply), 104 * MS)
-    assert (shake.round_trip.count, shake.round_trip.longest_ns) == (1, 64 * MS)
+    assert shake.accept_datagram(encode_reply(Header(7, 1, 0, 8), reply), 104 * MS)
+    assert (shake.round_trip.count, shake.round_trip.longest_ns) == (1, 24 * MS)
     assert shake.acknowledged(154 * MS) and not shake.acknowledged(155 * MS)
-    assert not shake.accept_datagram(encode_reply(Header(1, 0, 5), reply), 105 * MS), "old"
-    assert not shake.accept_datagram(encode_reply(Header(2, 0, 6), reply)[:-1], 106 * MS), "cut"
-    assert shake.accept_datagram(encode_reply(Header(3, 0, 99), reply), 107 * MS)
-    assert (shake.round_trip.count, shake.dropped) == (1, 2), "a number that was never sent proves nothing"
+    assert not shake.accept_datagram(encode_reply(Header(7, 1, 0, 9), reply), 105 * MS), "old"
+    assert not shake.accept_datagram(encode_reply(Header(7, 2, 0, 9), reply)[:-1], 106 * MS), "cut"
+    assert not shake.accept_datagram(encode_reply(Header(7, 3, 0, 99), reply), 107 * MS), "never sent"
+    assert shake.accept_datagram(encode_reply(Header(7, 3, 0, 9), reply), 107 * MS)
+    assert (shake.round_trip.count, shake.dropped, shake.replayed) == (2, 1, 2)
 
 
 def test_plc_of_another_word_order_is_refused() -> None:

@@ -25,7 +25,7 @@ from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
 from tests.codes import coded
 from tests.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
 
-IDENTITY = [0x4352, 1, 0x0102, 0x0304]
+IDENTITY = [0x4352, 2, 0x0102, 0x0304]
 
 pytestmark = pytest.mark.slow
 

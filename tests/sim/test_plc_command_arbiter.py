@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.plc.datagram import Header, encode_command
 from can_dbc.plc.map import Bounds, Command, Fault, Grapple, Mode, WordOrder, command_registers
 from can_dbc.plc.modbus import RegisterRefused
 from sim.plc.command_arbiter import MAX_DRAFT_COUNT, MS, CommandArbiter
@@ -163,23 +162,3 @@ def test_drafts_of_many_clients_use_bounded_memory() -> None:
     for client in range(1000):
         g.write(client, 127, [50], 0)
     assert len(g._drafts) == MAX_DRAFT_COUNT
-
-
-def datagram(sequence: int, command: Command = MOVE) -> bytes:
-    return encode_command(Header(sequence, 0, 0), command)
-
-
-def test_invalid_datagrams_are_dropped_and_illegal_values_are_a_fault() -> None:
-    g, us, them = arbiter(), ("127.0.0.1", 5), ("127.0.0.1", 6)
-    assert g.datagram(us, datagram(9), 0) == Header(9, 0, 0)
-    assert g.datagram(us, datagram(9, Command()), 1) is None
-    assert g.datagram(us, datagram(8, Command()), 2) is None
-    assert g.datagram(us, datagram(10)[:-1], 3) is None
-    assert g.datagram(us, bytes((*datagram(10)[:-1], datagram(10)[-1] ^ 1)), 3) is None
-    assert g.datagram(them, datagram(11, Command()), 4) is None
-    assert (g.command, g.accepted, g.dropped, g.fault) == (MOVE, 1, 5, Fault.NONE)
-    bad = Command(Mode.REFERENCES, True)
-    assert g.datagram(them, datagram(12, bad), 5) is None and g.fault is Fault.NONE
-    assert g.datagram(us, datagram(12, bad), 5) is None and g.fault is Fault.ILLEGAL_VALUE
-    assert g.datagram(us, datagram(12), 6) is not None
-    assert g.datagram(us, datagram(13 + (1 << 31)), 7) is None

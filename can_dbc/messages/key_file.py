@@ -1,0 +1,27 @@
+"""The file with the key that authenticates datagrams."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from runtime.errors import CodedError
+
+MIN_KEY_BYTES: Final = 16
+
+
+class KeyFileError(CodedError, ValueError):
+    """The key cannot be used; the sentence tells what is wrong and what to do."""
+
+
+def read_key(path: Path) -> bytes:
+    """The key in a file, without white space around it; raises KeyFileError."""
+    try:
+        key = path.read_bytes().strip()
+    except OSError as error:
+        raise KeyFileError("key.unreadable", f"{path}: the key cannot be read: {error.strerror}.") from error
+    if len(key) < MIN_KEY_BYTES:
+        raise KeyFileError(
+            "key.short", f"{path}: a key of {len(key)} bytes is too short; use at least {MIN_KEY_BYTES}."
+        )
+    return key

@@ -1,0 +1,208 @@
+"""Whole machines in lockstep behind a bus that holds their commands up: nothing old is executed, and they stop in time.
+
+Catalogue entries 7, 12 and 15 of docs/reference/safety.md section 5, as the nodes see them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from autonomy.crane_job.activity import Activity
+from can_dbc.dbc.codec import load as load_dbc
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import DriveSetpoint, Steering
+from can_dbc.protocols.punctuality import MAX_DELAY_NS
+from controller.config import Settings, load
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.wire.faults import Fault, Kind
+from machine.status.modes import Mode
+from sim.kinematic.machine import KinematicMachine
+from sim.plant import Plant
+
+pytestmark = [pytest.mark.slow, pytest.mark.computed]
+
+MS = 1_000_000
+S = 1_000 * MS
+PROMISE_NS = 100 * MS
+ABOVE_ALL, BELOW_SENSORS = 0x000, 0x201
+"""Priorities of a babbling node: over every frame, and between those of the sensors and the valve commands."""
+
+
+class Crane:
+    """A crane at work; every ValveCmdA that the valve node accepts is known with its age."""
+
+    def __init__(self) -> None:
+        settings = load("palms_471")
+        self.plant = Plant(settings.profile, 3)
+        self.system = Lockstep(
+            settings, build_guard(profile_path("palms_471")), self.plant,
+            Activity(settings.profile, settings.profile_hash), Operator(settings.profile_hash, lambda *_: None, 0),
+            Observer(),
+        )  # fmt: skip
+        self.executed: list[tuple[int, int]] = []
+        """When a command was accepted, and its age then [ns]."""
+        self._sent: list[tuple[int, bytes]] = []
+        self._key = load_dbc("crane").message("ValveCmdA").key
+        self._watch_controller()
+        self._watch_node()
+
+    def _watch_controller(self) -> None:
+        bus = self.system._crane.bus
+        send_all = bus.send_all
+
+        def noting(frames):  # type: ignore[no-untyped-def]
+            self._sent += [(self.system.now_ns, data) for key, data in frames if key == self._key]
+            return send_all(frames)
+
+        bus.send_all = noting  # type: ignore[method-assign]
+
+    def _watch_node(self) -> None:
+        commands = self.plant.valve._a
+        accept = commands.accept
+
+        def noting(data: bytes, now_ns: int) -> bool:
+            accepted = accept(data, now_ns)
+            while self._sent and self._sent[0][1] != data:  # they arrive in the order in which they were sent
+                self._sent.pop(0)
+            if accepted and self._sent:
+                self.executed.append((now_ns, now_ns - self._sent[0][0]))
+            return accepted
+
+        commands.accept = noting  # type: ignore[method-assign]
+
+    @property
+    def moving(self) -> bool:
+        return any(self.plant.valve.outputs_pct)
+
+    def start(self) -> None:
+        """Until the crane has moved for a second."""
+        while not self.moving:
+            self.system.advance()
+            assert self.system.now_ns < START_NS + 30 * S
+        self.wait(S)
+        assert self.moving
+
+    def wait(self, ns: int) -> None:
+        until_ns = self.system.now_ns + ns
+        while self.system.now_ns < until_ns:
+            self.system.advance()
+
+    def neutral_after_ns(self, limit_ns: int) -> int:
+        """How long the valves take to be neutral from now on."""
+        began_ns = self.system.now_ns
+        while self.moving and self.system.now_ns < began_ns + limit_ns:
+            self.system.advance()
+        return self.system.now_ns - began_ns
+
+
+@pytest.fixture
+def crane() -> Iterator[Crane]:
+    made = Crane()
+    yield made
+    made.plant.close()
+
+
+@pytest.mark.parametrize("key", [ABOVE_ALL, BELOW_SENSORS])
+def test_valves_are_neutral_within_100_ms_when_a_babbling_node_takes_the_whole_bus(crane: Crane, key: int) -> None:
+    crane.start()
+    now_ns = crane.system.now_ns
+    crane.system.core.inject(Fault(Kind.BABBLE, now_ns, now_ns + 600 * MS, key=key))
+    assert crane.neutral_after_ns(S) <= PROMISE_NS
+    crane.executed.clear()
+    crane.wait(2 * S)  # the bus is free again after 0.6 s
+    assert not crane.moving and crane.system.report is not None
+    assert crane.system.report.mode in (Mode.STOP, Mode.FAULT)
+    assert max(age_ns for _, age_ns in crane.executed) <= 30 * MS, "nothing old has left the queue"
+
+
+@pytest.mark.parametrize("pause_us", [150, 200, 250, 300, 400])
+def test_commands_that_a_busy_bus_lets_through_slowly_are_never_executed_late(crane: Crane, pause_us: int) -> None:
+    """Between two of its frames the babbling node lets others pass: the queue fills slowly, and no time-out expires."""
+    crane.start()
+    crane.executed.clear()
+    now_ns = crane.system.now_ns
+    crane.system.core.inject(Fault(Kind.BABBLE, now_ns, now_ns + 2 * S, key=BELOW_SENSORS, shift_ns=1000 * pause_us))
+    late_ns = None
+    for _ in range(1600):
+        crane.system.advance()
+        if late_ns is None and crane.executed and crane.executed[-1][1] > MAX_DELAY_NS:
+            late_ns = crane.system.now_ns
+        if late_ns is not None and crane.system.now_ns > late_ns + PROMISE_NS:
+            assert not crane.moving
+    assert max(age_ns for _, age_ns in crane.executed) <= MAX_DELAY_NS + 5 * MS
+
+
+def test_an_open_cable_to_the_controller_stops_the_valves_within_100_ms_for_good(crane: Crane) -> None:
+    crane.start()
+    now_ns = crane.system.now_ns
+    crane.system.core.inject(Fault(Kind.CUT, now_ns, now_ns + 300 * MS, node="controller"))
+    assert crane.neutral_after_ns(S) <= PROMISE_NS
+    crane.executed.clear()
+    crane.wait(2 * S)
+    assert not crane.moving
+    assert max(age_ns for _, age_ns in crane.executed) <= 30 * MS, "nothing old has left the queue"
+
+
+class Drives:
+    """A planner that drives ahead."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings, self._sequence, self._sent_ns = settings, 0, 0
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[object, ...]) -> bytes | None:
+        armed = report is not None and report.mode in (Mode.ARMED, Mode.ACTIVE)
+        if not armed or now_ns - self._sent_ns < 50 * MS:
+            return None
+        self._sequence, self._sent_ns = self._sequence + 1, now_ns
+        carrier = self._settings.profile.carrier
+        assert carrier is not None
+        return encode(
+            DriveSetpoint(
+                sequence=self._sequence, profile_hash=self._settings.profile_hash, stamp_ns=now_ns, lease_ns=200 * MS,
+                steering=Steering.ARTICULATION, latitude_deg=carrier.site_lat_deg,
+                longitude_deg=carrier.site_lon_deg, articulation_rad=0.0, articulation_rate_rad_s=0.0,
+                speed_m_s=0.5, heights_m=(carrier.arm_transport_m,) * 4, float_front=False, float_rear=False,
+            )
+        )  # fmt: skip
+
+
+class Blind:
+    """Eyes that see no logs."""
+
+    def detect(self, q: object, now_ns: int) -> None:
+        return None
+
+
+def test_the_carrier_brakes_when_its_commands_come_60_ms_late_in_order() -> None:
+    settings = load("aoro_fc8")
+    plant = KinematicMachine(settings.profile, 3, step_ns=2_500_000)
+    operator = Operator(settings.profile_hash, lambda *_: None, 0)
+    system = Lockstep(
+        settings,
+        build_guard(profile_path("aoro_fc8")),
+        plant,
+        Drives(settings),
+        operator,
+        Observer(),
+        Blind(),  # type: ignore[arg-type]
+    )
+    node, arms = plant.vehicle_node, plant.arms
+    assert node is not None and arms is not None
+    while node.drive_m_s == 0.0:
+        system.advance()
+        assert system.now_ns < START_NS + 30 * S
+    began_ns = system.now_ns
+    system._cores[1].inject(Fault(Kind.DELAY, began_ns, node="controller", shift_ns=60 * MS))
+    while not node.brake and system.now_ns < began_ns + S:
+        system.advance()
+    assert system.now_ns - began_ns <= PROMISE_NS
+    until_ns = system.now_ns + S
+    while system.now_ns < until_ns:
+        system.advance()
+        assert node.brake and node.drive_m_s == 0.0 and not any(arms.spools)

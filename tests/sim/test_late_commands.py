@@ -1,0 +1,155 @@
+"""Commands that come late, in order and with good checksums: no node executes them, and each needs a new arming."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from can_dbc.dbc.codec import Database, load
+from can_dbc.protocols.e2e import Sender
+from machine.loading.profile_file import load_profile
+from sim.nodes.arms import ArmNode, ArmState
+from sim.nodes.valve import ExitCode, ValveInputs, ValveNode, ValveState
+from sim.nodes.vehicle import VehicleFault, VehicleNode
+
+MS = 1_000_000
+STEP_NS = 2_500_000
+ARMED = 0xA
+CRANE, MACHINE = load("crane"), load("machine")
+CARRIER = load_profile("aoro_fc8").carrier
+assert CARRIER is not None
+Message = tuple[str, tuple[float, ...]]
+
+
+class Line:
+    """A node behind a line that delays the frames of its commander; frames keep their order."""
+
+    def __init__(
+        self, node, database: Database, period_ns: int, commands: list[Message], punctual: list[Message]
+    ) -> None:
+        self.node = node
+        self.now_ns = 1_000 * MS
+        self.delay_ns = self.age_ns = 0  # of a command sent now; of the newest one received
+        self.disarmed = False
+        self._database, self._period_ns = database, period_ns
+        self._commands, self._punctual = commands, punctual
+        self._senders: dict[str, Sender] = {}
+        self._travelling: list[tuple[int, int, int, bytes]] = []  # arrival, sent, key, data
+        self._due_ns = self.now_ns
+
+    def _frame(self, name: str, values: tuple[float, ...]) -> tuple[int, bytes]:
+        codec = self._database.message(name)
+        sender = self._senders.setdefault(name, Sender(codec.data_ids or bytes(16)))
+        key_at = codec.index.get("ArmKey", -1) - 2
+        shown = tuple(0 if self.disarmed and i == key_at else value for i, value in enumerate(values))
+        return codec.key, sender.protect(codec.encode(0, 0, *shown))
+
+    def step(self) -> None:
+        self.now_ns += STEP_NS
+        if self.now_ns >= self._due_ns:
+            self._due_ns += self._period_ns
+            for name, values in self._punctual:
+                self.node.receive(*self._frame(name, values), self.now_ns)
+            for name, values in self._commands:
+                self._travelling.append((self.now_ns + self.delay_ns, self.now_ns, *self._frame(name, values)))
+        while self._travelling and self._travelling[0][0] <= self.now_ns:
+            _, sent_ns, key, data = self._travelling.pop(0)
+            self.age_ns = self.now_ns - sent_ns
+            self.node.receive(key, data, self.now_ns)
+        if isinstance(self.node, ValveNode):
+            self.node.sync(self.now_ns)
+        self.node.decide(self.now_ns)
+
+    def run(self, ms: float, per_ms: float = 0.0) -> None:
+        """``per_ms``: by how much the delay grows meanwhile."""
+        for _ in range(round(ms * MS / STEP_NS)):
+            self.delay_ns += round(per_ms * STEP_NS)
+            self.step()
+
+
+def valve() -> Line:
+    node = ValveNode(CRANE, [], lambda: True, ValveInputs)
+    commands = [("ValveCmdA", (2, 60.0, 0.0, 0.0, 0.0)), ("ValveCmdB", (ARMED, 0.0, 0.0, 0.0, 0, 1, 100.0))]
+    return Line(node, CRANE, 5 * MS, commands, [("GuardStat", (ARMED, 0, 15, 0, 0))])
+
+
+def vehicle() -> Line:
+    return Line(
+        VehicleNode(MACHINE, [], CARRIER, lambda: True), MACHINE, 20 * MS, [("VehCmd", (ARMED, 0.0, 0.6, 0.0))], []
+    )
+
+
+def arms() -> Line:
+    commands = [("ArmCmdA", (ARMED, 50.0, 0.0, 0.0, 0.0)), ("ArmCmdB", (ARMED, 0, 0))]
+    return Line(ArmNode(MACHINE, [], lambda: True), MACHINE, 20 * MS, commands, [])
+
+
+def moves(line: Line) -> bool:
+    node = line.node
+    if isinstance(node, ValveNode):
+        return any(node.outputs_pct)
+    return node.drive_m_s != 0.0 if isinstance(node, VehicleNode) else any(node.spools)
+
+
+NODES: list[Callable[[], Line]] = [valve, vehicle, arms]
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_commands_that_are_delayed_by_60_ms_in_order_are_not_executed(make: Callable[[], Line]) -> None:
+    """The delay grows slowly, as behind a queue that fills; no gap is long enough to be a time-out."""
+    line = make()
+    line.run(200)
+    assert moves(line)
+    line.run(300, per_ms=0.2)
+    line.run(100)
+    assert line.delay_ns == 60 * MS and not moves(line)
+    line.run(500)
+    assert not moves(line)
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_a_node_is_neutral_within_100_ms_of_the_command_that_came_too_late(make: Callable[[], Line]) -> None:
+    line = make()
+    line.run(200)
+    while line.age_ns <= 40 * MS:
+        line.run(2.5, per_ms=0.5)
+        assert moves(line) or line.age_ns > 40 * MS
+    began_ns = line.now_ns
+    while moves(line):
+        line.run(2.5, per_ms=0.5)
+    assert line.now_ns - began_ns <= 100 * MS
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_commands_that_are_delayed_by_30_ms_are_executed(make: Callable[[], Line]) -> None:
+    line = make()
+    line.run(200)
+    line.run(300, per_ms=0.1)
+    line.run(1000)
+    assert moves(line)
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_punctual_commands_move_again_only_after_a_disarm(make: Callable[[], Line]) -> None:
+    line = make()
+    line.run(200)
+    line.run(300, per_ms=0.2)
+    line.delay_ns = 0
+    line.run(1000)
+    assert not moves(line)
+    line.disarmed = True
+    line.run(100)
+    line.disarmed = False
+    line.run(100)
+    assert moves(line)
+
+
+def test_the_nodes_name_the_time_out() -> None:
+    crane, carrier, swing = valve(), vehicle(), arms()
+    for line in (crane, carrier, swing):
+        line.run(200)
+        line.run(300, per_ms=0.2)
+        line.run(100)
+    assert (crane.node.exit, crane.node.valve_state) == (ExitCode.COMMAND_TIMEOUT, ValveState.FAULT)
+    assert (carrier.node.fault, swing.node.state) == (VehicleFault.COMMAND_TIMEOUT, ArmState.FAULT)
