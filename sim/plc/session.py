@@ -49,21 +49,20 @@ class Session:
         return self._header(self._offer, hello.sequence, now_ns)
 
     def admits(self, client: Hashable, header: Header, command: Command, now_ns: int) -> bool:
-        """Whether a command is new; its number is then used up."""
-        if not self._echoes(header.echo, now_ns):
-            return False
-        if self._offer and (header.session, client) == (self._offer, self._offered_to):
-            if header.sequence <= self._hello or not is_neutral(command):
+        """Whether a command is new; its number is then used up.
+
+        The number of one that only echoes an old reply is used up too, so that the next reply echoes it: after a
+        silence in both directions this is how the two ends find each other again.
+        """
+        current, member = self._echoes(header.echo, now_ns), (header.session, client)
+        if self._offer and member == (self._offer, self._offered_to):
+            if not current or header.sequence <= self._hello or not is_neutral(command):
                 return False
             self.number, self.client, self._offer = self._offer, client, 0
-        elif (
-            not self.number
-            or (header.session, client) != (self.number, self.client)
-            or header.sequence <= self._sequence
-        ):
+        elif not self.number or member != (self.number, self.client) or header.sequence <= self._sequence:
             return False
         self._sequence = header.sequence
-        return True
+        return current
 
     def reply_header(self, now_ns: int) -> Header:
         """The header of the next reply in the open session."""

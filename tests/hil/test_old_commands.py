@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import pytest
 
 from autonomy.crane_job.activity import Activity
-from can_dbc.dbc.codec import load as load_dbc
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Steering
@@ -21,6 +20,7 @@ from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.wire.faults import Fault, Kind
+from hil.wire.node import Flight, Segment
 from machine.status.modes import Mode
 from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
@@ -47,20 +47,21 @@ class Crane:
         )  # fmt: skip
         self.executed: list[tuple[int, int]] = []
         """When a command was accepted, and its age then [ns]."""
-        self._sent: list[tuple[int, bytes]] = []
-        self._key = load_dbc("crane").message("ValveCmdA").key
-        self._watch_controller()
+        self._ages_ns: dict[int, int] = {}
+        """Of the controller's frames, by the end of their transmission: how long ago they were queued."""
+        self._watch_bus()
         self._watch_node()
 
-    def _watch_controller(self) -> None:
-        bus = self.system._crane.bus
-        send_all = bus.send_all
+    def _watch_bus(self) -> None:
+        core = self.system.core
+        finish = core._finish
 
-        def noting(frames):  # type: ignore[no-untyped-def]
-            self._sent += [(self.system.now_ns, data) for key, data in frames if key == self._key]
-            return send_all(frames)
+        def noting(segment: Segment, flight: Flight) -> None:
+            if flight.sender.name == "controller":
+                self._ages_ns[flight.end_ns] = flight.end_ns - flight.frame.ready_ns
+            finish(segment, flight)
 
-        bus.send_all = noting  # type: ignore[method-assign]
+        core._finish = noting  # type: ignore[method-assign]
 
     def _watch_node(self) -> None:
         commands = self.plant.valve._a
@@ -68,10 +69,8 @@ class Crane:
 
         def noting(data: bytes, now_ns: int) -> bool:
             accepted = accept(data, now_ns)
-            while self._sent and self._sent[0][1] != data:  # they arrive in the order in which they were sent
-                self._sent.pop(0)
-            if accepted and self._sent:
-                self.executed.append((now_ns, now_ns - self._sent[0][0]))
+            if accepted:
+                self.executed.append((now_ns, self._ages_ns[now_ns]))
             return accepted
 
         commands.accept = noting  # type: ignore[method-assign]

@@ -17,7 +17,7 @@ import pytest
 
 from can_dbc.plc import modbus
 from can_dbc.plc.datagram import Header, decode_reply, encode_command
-from can_dbc.plc.map import Fault, State
+from can_dbc.plc.map import Command, Fault, State
 from can_dbc.plc.modbus import MAX_CONNECTIONS, LinkError, ModbusClient, RegisterRefused
 from sim.plc.command_arbiter import MAX_DRAFT_COUNT
 from tests.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
@@ -269,18 +269,76 @@ def test_closing_discards_the_kernels_buffer(plc: ServedPlc) -> None:
     assert struct.unpack("ii", asyncio.run(run())) == (1, 0)
 
 
-def test_datagrams_from_everywhere_do_not_disturb_the_commander(plc: ServedPlc) -> None:
-    ours, theirs = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-    with ours, theirs:
-        ours.settimeout(5.0)
-        for each in (ours, theirs):
-            each.connect((LOOPBACK, plc.udp_port))
+class Datagrams:
+    """A bridge's end of the datagrams: asks for a session, and echoes the PLC's numbers."""
+
+    def __init__(self, plc: ServedPlc) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.settimeout(5.0)
+        self.socket.connect((LOOPBACK, plc.udp_port))
+        self.number = 100
+        self.session = self.echo = 0
+        self.sent: list[bytes] = []
+
+    def send(self, command: Command) -> None:
+        self.number += 1
+        self.sent.append(encode_command(Header(self.session, self.number, 0, self.echo), command))
+        self.socket.send(self.sent[-1])
+
+    def answered(self) -> None:
+        """Wait for the answer to the newest command."""
+        while (header := decode_reply(self.socket.recv(200))[0]).echo != self.number:
+            pass
+        self.session, self.echo = header.session, header.sequence
+
+    def begin(self) -> None:
+        """A session, and its first command."""
+        for _ in range(2):
+            self.send(Command())
+            self.answered()
+
+
+@pytest.fixture
+def bridge(plc: ServedPlc) -> Iterator[Datagrams]:
+    made = Datagrams(plc)
+    yield made
+    made.socket.close()
+
+
+def test_datagrams_from_everywhere_do_not_disturb_the_commander(plc: ServedPlc, bridge: Datagrams) -> None:
+    bridge.begin()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs:
+        theirs.connect((LOOPBACK, plc.udp_port))
         chance = random.Random(5)
         for n in range(1, ROUNDS + 1):
-            ours.send(encode_command(Header(n, 0, 0), MOVE))
-            theirs.send(encode_command(Header(n + 5000, 0, 0), MOVE))
-            theirs.send(chance.randbytes(96))
-            theirs.send(encode_command(Header(n + 6000, 0, 0), MOVE)[:-1])
-            while decode_reply(ours.recv(200))[0].echo != n:
-                pass
-    assert plc.program.arbiter.accepted == ROUNDS and plc.program.arbiter.fault is Fault.NONE
+            theirs.send(encode_command(Header(bridge.session, bridge.number + 1, 0, bridge.echo), Command()))
+            theirs.send(encode_command(Header(0, n, 0, 0), Command()))
+            theirs.send(chance.randbytes(100))
+            theirs.send(bridge.sent[-1][:-1])
+            bridge.send(MOVE)
+            bridge.answered()
+    arbiter = plc.program.arbiter
+    assert arbiter.accepted == ROUNDS + 1 and arbiter.fault is Fault.NONE and arbiter.command == MOVE
+    assert arbiter.dropped == 4 * ROUNDS and arbiter.replayed == 0
+
+
+def test_recorded_datagrams_are_refused_and_counted_after_a_silence(plc: ServedPlc, bridge: Datagrams) -> None:
+    """From the same address: 60 ms later in the open session, and after the PLC has ended it."""
+    bridge.begin()
+    for _ in range(ROUNDS):
+        bridge.send(MOVE)
+        bridge.answered()
+    arbiter, recorded = plc.program.arbiter, bridge.sent[1:]  # without the hello
+    time.sleep(0.06)
+    for data in recorded:
+        bridge.socket.send(data)
+    until(lambda: arbiter.replayed == len(recorded))
+    assert arbiter.accepted == ROUNDS + 1
+    until(lambda: plc.program.state is State.SAFE)
+    for data in recorded:
+        bridge.socket.send(data)
+    until(lambda: arbiter.replayed == 2 * len(recorded))
+    assert arbiter.accepted == ROUNDS + 1 and arbiter.command == Command() and arbiter.dropped == 0
+    bridge.session = bridge.echo = 0
+    bridge.begin()
+    assert arbiter.accepted == ROUNDS + 2
