@@ -23,6 +23,11 @@ LOST_SAMPLES: Final = 3
 _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "HeartbeatCtrl")
 
 
+def sample_timeout_ns(profile: Profile) -> int:
+    """After this long without a new sample an encoder behind a PLC is lost; 0 without one: the DBC's time-out counts."""
+    return 0 if profile.plc is None else LOST_SAMPLES * round(profile.plc.sample_ms * 1e6)
+
+
 class CraneInputs:
     """All inputs from crane0: message states, nodes, and what this tick brought."""
 
@@ -38,8 +43,8 @@ class CraneInputs:
         )
         self.pressures, self.grapple = helpful[:3], helpful[3]
         specs = encoders(profile)
-        sampled_ns = 0 if profile.plc is None else LOST_SAMPLES * round(profile.plc.sample_ms * 1e6)
-        sensed = {place: state(spec.message, ENCODER_BIT + place, sampled_ns) for place, spec in specs.items()}
+        lost_ns = sample_timeout_ns(profile)
+        sensed = {place: state(spec.message, ENCODER_BIT + place, lost_ns) for place, spec in specs.items()}
         self.encoders = [sensed.get(j) for j in JOINTS]
         """By joint; None where the machine has none."""
         self.articulation = sensed.get(ARTICULATION)

@@ -21,6 +21,7 @@ from can_dbc.plc.map import ESTOP_BYTES, Command, Feedback, Grapple, Role, State
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
 from controller.bus_io.messages import PeriodicTimer, ProtectedMessage
 from controller.config import ConfigError
+from controller.crane.inputs import sample_timeout_ns
 from controller.plc.emulated_nodes import EmulatedEncoder, EmulatedNode
 from controller.plc.handshake import Handshake
 from controller.plc.valve_gate import ValveGate, fault_bits, state_of
@@ -75,6 +76,8 @@ class Bridge:
         self._fast, self._slow = PeriodicTimer(5 * MS), PeriodicTimer(20 * MS)
         self._estop_key, self._estop_frame = database.message("EstopStat").key, bytes(ESTOP_BYTES)
         self._new_cycle = self._new_sample = False  # not sent yet
+        self._sampled_ns = 0
+        self._sample_timeout_ns = sample_timeout_ns(profile)
         self._sessions = 0
         self._counter = 0
         self._feedback: Feedback | None = None
@@ -88,7 +91,7 @@ class Bridge:
             self._sessions = shake.sessions
             self.gate.require_disarm()
         feedback = shake.feedback if shake.fresh(now_ns) else None
-        self._last = self.gate.command(now_ns, feedback)
+        self._last = self.gate.command(now_ns, feedback, now_ns - self._sampled_ns <= self._sample_timeout_ns)
         return self._last
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
@@ -99,7 +102,7 @@ class Bridge:
             self._boot_nodes()
         out: list[RawFrame] = []
         if feedback is not None and feedback is not self._feedback:
-            self._use_feedback(feedback)
+            self._use_feedback(feedback, now_ns)
         for frame in frames:
             self._receive(frame, now_ns, out if answering else None)
         if answering and feedback is not None:
@@ -111,11 +114,12 @@ class Bridge:
         for node in self._nodes:
             node.boot()
 
-    def _use_feedback(self, feedback: Feedback) -> None:
+    def _use_feedback(self, feedback: Feedback, now_ns: int) -> None:
         """Use a new answer; what the PLC only repeats does not count again."""
         before, self._feedback = self._feedback, feedback
         self._new_cycle = self._new_cycle or before is None or before.heartbeat != feedback.heartbeat
-        self._new_sample = self._new_sample or before is None or before.sampled_us != feedback.sampled_us
+        if before is None or before.sampled_us != feedback.sampled_us:
+            self._new_sample, self._sampled_ns = True, now_ns
 
     def _receive(self, frame: Frame, now_ns: int, out: list[RawFrame] | None) -> None:
         """``out`` is None while nothing may be sent; then only the gate uses the frame."""

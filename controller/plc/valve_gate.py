@@ -1,8 +1,8 @@
 """The controller's commands and the guard's enable, received from crane0 and turned into a command for the PLC.
 
 Pure, and safe by absence like every valve node: a command that moves needs ValveCmdA and B with the arm key, the
-guard's enable, and SYNC, all fresh, and no command late by its number; in role REFERENCES also the three reference
-frames.  After a loss while armed, and when a conversation with the PLC begins, it stays neutral until the controller
+guard's enable, SYNC, and the PLC's measurements, all fresh, and no command late by its number; in role REFERENCES also
+the three reference frames.  After a loss while armed, and when a conversation with the PLC begins, it stays neutral until the controller
 has disarmed.  A command beyond the PLC's limits is refused, never clamped.
 """
 
@@ -102,10 +102,10 @@ class ValveGate:
         """E2E counter of the newest good ValveCmdA, 0 when it is stale."""
         return self._a.get("Counter") or 0
 
-    def command(self, now_ns: int, feedback: Feedback | None) -> Command:
-        """The command for the PLC now."""
+    def command(self, now_ns: int, feedback: Feedback | None, sampling: bool) -> Command:
+        """The command for the PLC now; ``sampling``: the PLC has measured the joints lately."""
         age_out(self._states, now_ns)
-        missing = self._missing(now_ns)
+        missing = self._missing(now_ns) or (ExitCode.OK if sampling else ExitCode.FUNCTION_FAULT)
         if missing and self._armed:
             self._locked = missing
         armed = self._b.get("ArmKey") == ARM_KEY

@@ -1,6 +1,6 @@
 """Whole machines in lockstep behind a bus that holds their commands up: nothing old is executed, and they stop in time.
 
-Catalogue entries 7, 12 and 15 of docs/reference/safety.md section 5, as the nodes see them.
+Catalogue entries 7, 12, 13 and 15 of docs/reference/safety.md section 5, as the nodes see them.
 """
 
 from __future__ import annotations
@@ -169,6 +169,19 @@ class Drives:
                 speed_m_s=0.5, heights_m=(carrier.arm_transport_m,) * 4, float_front=False, float_rear=False,
             )
         )  # fmt: skip
+
+
+def test_bus_off_of_the_controller_stops_the_valves_within_100_ms_for_good(crane: Crane) -> None:
+    """Its frames fail 32 times; it recovers by itself after 0.1 s, and does not go on."""
+    crane.start()
+    now_ns = crane.system.now_ns
+    crane.system.core.inject(Fault(Kind.ERROR, now_ns, now_ns + 50 * MS, node="controller"))
+    assert crane.neutral_after_ns(S) <= PROMISE_NS
+    crane.executed.clear()
+    crane.wait(2 * S)
+    assert not crane.moving and crane.system.report is not None
+    assert crane.system.report.mode == Mode.FAULT
+    assert max(age_ns for _, age_ns in crane.executed) <= 30 * MS, "nothing old has left the queue"
 
 
 class Blind:

@@ -50,6 +50,28 @@ def test_only_loopback_addresses_are_accepted_by_default(module: str, tmp_path: 
     assert done.returncode == 2 and "--allow-network" in done.stderr
 
 
+@pytest.mark.parametrize(("module", "host"), [("controller.plc", "192.0.2.1"), ("sim.plc", "0.0.0.0")])
+def test_datagrams_on_a_network_need_a_key(module: str, host: str, tmp_path: Path) -> None:
+    profile = str(write_plc_profile("palms_471", "valves", tmp_path))
+    done = run(module, "--profile", profile, "--udp", f"{host}:1503", "--allow-network")
+    assert done.returncode == 2 and "--key-file" in done.stderr and "--no-key" in done.stderr
+    short = tmp_path / "key"
+    short.write_text("too short")
+    done = run(module, "--profile", profile, "--udp", f"{host}:1503", "--allow-network", "--key-file", str(short))
+    assert done.returncode == 3 and "too short" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_what_is_not_authenticated_on_a_network_is_warned_of(tmp_path: Path) -> None:
+    """There is no bus here, so it ends after the warning."""
+    profile = str(write_plc_profile("palms_471", "valves", tmp_path))
+    for link in (["--udp", "192.0.2.1:1503", "--no-key"], ["--modbus", "192.0.2.1:502"]):
+        done = run("controller.plc", "--profile", profile, "--bus", "crane0=wire:none", *link, "--allow-network",
+                   TIMBERHAND_WIRE_DIR=str(tmp_path))  # fmt: skip
+        assert done.returncode == 4 and "warning" in done.stderr
+    done = run("controller.plc", "--profile", profile, "--modbus", "127.0.0.1:502", "--key-file", str(tmp_path / "key"))
+    assert done.returncode == 2 and "Modbus" in done.stderr
+
+
 @pytest.mark.parametrize("module", ["controller.plc", "sim.plc"])
 def test_a_profile_without_a_plc_is_refused(module: str) -> None:
     done = run(module, "--profile", "palms_471", "--modbus", "127.0.0.1:1502")

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from autonomy.crane_job.activity import Activity
-from can_dbc.plc.map import Fault, State
+from can_dbc.frame import Frame, RawFrame
+from can_dbc.plc.map import Fault, Feedback, State
 from controller.config import load
 from controller.guard.__main__ import build as build_guard
+from controller.guard.guard import Verdict
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.plc.bridged_plant import BridgedPlant, Transport
 from hil.plc.profile import write_plc_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from sim.plc.program import Inputs
 
 pytestmark = pytest.mark.computed
 
@@ -55,6 +60,21 @@ class Run:
 
     def moving(self) -> bool:
         return any(abs(u) > 0.0 for u in self.plant.plc.outputs[:5])
+
+    def start(self) -> None:
+        """Until the crane has moved for half a second."""
+        self.until(Mode.ACTIVE)
+        while not self.moving():
+            self.system.advance()
+        self.wait(500)
+        assert self.moving()
+
+    def neutral_after_ms(self) -> float:
+        """How long the PLC's outputs take to be neutral from now on."""
+        began_ns = self.system.now_ns
+        while self.moving() and self.system.now_ns < began_ns + S:
+            self.system.advance()
+        return (self.system.now_ns - began_ns) / MS
 
 
 @pytest.mark.slow
@@ -136,3 +156,69 @@ def test_a_fault_of_the_plc_stops_the_controller(tmp_path: Path) -> None:
     assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.PLC_FAULT
     run.wait(50)
     assert not run.moving(), "its ramp takes 40 ms"
+
+
+class Damage:
+    """What a PLC or a bridge does to the emergency stop's frames, from ``begin`` on."""
+
+    def __init__(self, plant: BridgedPlant, kind: str) -> None:
+        self._plant, self._kind = plant, kind
+        self._key = plant._estop_key
+        self._last: bytes = b""
+
+    def begin(self) -> None:
+        if self._kind == "altered":
+            self._wrap(lambda data: data[:3] + bytes((data[3] ^ 0x10,)) + data[4:])
+            return
+        self._plant._estop_key = -1  # the safety module is cut off; the PLC keeps the last frame
+        if self._kind == "repeated":
+            self._last = self._plant._estop_frame
+            self._wrap(lambda data: data)
+
+    def _wrap(self, change: Callable[[bytes], bytes]) -> None:
+        bridge = self._plant.bridge
+        step = bridge.step
+
+        def damaged(now_ns: int, frames: list[Frame]) -> list[RawFrame]:
+            out = [(key, change(data) if key == self._key else data) for key, data in step(now_ns, frames)]
+            if self._last and now_ns % (10 * MS) == 0:
+                out.append((self._key, self._last))
+            return out
+
+        bridge.step = damaged  # type: ignore[method-assign]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["silent", "repeated", "altered"])
+def test_controller_and_guard_both_catch_a_state_of_the_emergency_stop_that_is_not_the_safety_modules_own(
+    kind: str, tmp_path: Path
+) -> None:
+    run = Run("valves", "udp", tmp_path)
+    damage = Damage(run.plant, kind)
+    run.start()
+    damage.begin()
+    assert run.neutral_after_ms() <= 100
+    run.wait(50)
+    assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.ESTOP_LOST
+    assert run.system._guard.verdict in (Verdict.ESTOP_LOST, Verdict.CORRUPT)
+    run.wait(1000)
+    assert not run.moving()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("role", "transport"), [("references", "udp"), ("valves", "modbus")])
+def test_encoders_that_the_plc_only_repeats_are_lost(role: RoleName, transport: Transport, tmp_path: Path) -> None:
+    """Its cycle and its heartbeat run on; the samples do not."""
+    run = Run(role, transport, tmp_path)
+    run.start()
+    program = run.plant.plc
+    make, kept = program._make_feedback, program.feedback
+
+    def frozen(inputs: Inputs, now_ns: int) -> Feedback:
+        return replace(make(inputs, now_ns), position=kept.position, sampled_us=kept.sampled_us)
+
+    program._make_feedback = frozen  # type: ignore[method-assign]
+    assert run.neutral_after_ms() <= 100
+    run.wait(50)
+    assert run.system.report is not None
+    assert run.system.report.reason & 0xFF in (Reason.ENCODER_LOST, Reason.VALVE_NODE_FAULT)

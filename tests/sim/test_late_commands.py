@@ -1,4 +1,7 @@
-"""Commands that come late, in order and with good checksums: no node executes them, and each needs a new arming."""
+"""Commands that a node must not execute: late ones in order and with good checksums, repeated, lost, masqueraded.
+
+Catalogue entries 7, 8, 9, 10 and 11 of docs/reference/safety.md section 5, at the nodes that execute commands.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Callable
 import pytest
 
 from can_dbc.dbc.codec import Database, load
-from can_dbc.protocols.e2e import Sender
+from can_dbc.protocols.e2e import Sender, frame_crc
 from machine.loading.profile_file import load_profile
 from sim.nodes.arms import ArmNode, ArmState
 from sim.nodes.valve import ExitCode, ValveInputs, ValveNode, ValveState
@@ -32,6 +35,9 @@ class Line:
         self.now_ns = 1_000 * MS
         self.delay_ns = self.age_ns = 0  # of a command sent now; of the newest one received
         self.disarmed = False
+        self.damage: Callable[[int, int, bytes], list[bytes]] = lambda n, key, data: [data]
+        """What becomes of a commander's frame: its number, key and data in, the frames that arrive out."""
+        self._count = 0
         self._database, self._period_ns = database, period_ns
         self._commands, self._punctual = commands, punctual
         self._senders: dict[str, Sender] = {}
@@ -51,8 +57,12 @@ class Line:
             self._due_ns += self._period_ns
             for name, values in self._punctual:
                 self.node.receive(*self._frame(name, values), self.now_ns)
+            self._count += 1
             for name, values in self._commands:
-                self._travelling.append((self.now_ns + self.delay_ns, self.now_ns, *self._frame(name, values)))
+                key, data = self._frame(name, values)
+                arrives_ns = self.now_ns + self.delay_ns
+                for damaged in self.damage(self._count, key, data):
+                    self._travelling.append((arrives_ns, self.now_ns, key, damaged))
         while self._travelling and self._travelling[0][0] <= self.now_ns:
             _, sent_ns, key, data = self._travelling.pop(0)
             self.age_ns = self.now_ns - sent_ns
@@ -153,3 +163,64 @@ def test_the_nodes_name_the_time_out() -> None:
         line.run(100)
     assert (crane.node.exit, crane.node.valve_state) == (ExitCode.COMMAND_TIMEOUT, ValveState.FAULT)
     assert (carrier.node.fault, swing.node.state) == (VehicleFault.COMMAND_TIMEOUT, ArmState.FAULT)
+
+
+def with_checksum(data: bytes, data_ids: bytes) -> bytes:
+    return bytes((frame_crc(data, data_ids),)) + data[1:]
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_repeated_commands_only_grow_old(make: Callable[[], Line]) -> None:
+    """The same counter again, with a good checksum."""
+    line = make()
+    line.run(200)
+    assert moves(line)
+    kept: dict[int, bytes] = {}
+    line.damage = lambda n, key, data: [kept.setdefault(key, data)]
+    began_ns = line.now_ns
+    while moves(line) and line.now_ns < began_ns + 1_000 * MS:
+        line.run(2.5)
+    assert line.now_ns - began_ns <= 125 * MS, "the first of them was new, one period after the begin"
+    line.run(500)
+    assert not moves(line)
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_a_single_lost_or_corrupt_command_is_tolerated(make: Callable[[], Line]) -> None:
+    line = make()
+    line.run(200)
+    line.damage = lambda n, key, data: [] if n % 40 == 0 else [data[:-1] + b"\xff"] if n % 40 == 20 else [data]
+    for _ in range(800):
+        line.step()
+        assert moves(line)
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_commands_of_which_three_of_four_are_lost_are_not_executed(make: Callable[[], Line]) -> None:
+    line = make()
+    line.run(200)
+    line.damage = lambda n, key, data: [data] if n % 4 == 0 else []
+    line.run(200)
+    assert not moves(line)
+    line.run(500)
+    assert not moves(line)
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_commands_with_the_data_id_of_another_message_are_not_executed(make: Callable[[], Line]) -> None:
+    """A masquerade: a good checksum by another message's list."""
+    line = make()
+    line.run(200)
+    foreign = CRANE.message("EstopStat").data_ids or b""
+    line.damage = lambda n, key, data: [with_checksum(data, foreign)]
+    line.run(200)
+    assert not moves(line)
+
+
+@pytest.mark.parametrize("make", NODES)
+def test_corrupt_commands_are_not_executed(make: Callable[[], Line]) -> None:
+    line = make()
+    line.run(200)
+    line.damage = lambda n, key, data: [bytes((data[0] ^ 0x40,)) + data[1:]]
+    line.run(200)
+    assert not moves(line)
