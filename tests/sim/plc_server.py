@@ -21,9 +21,9 @@ LOOPBACK = "127.0.0.1"
 class ServedPlc:
     """``port`` is the Modbus port, ``udp_port`` the other; the program's time is the host's."""
 
-    def __init__(self, order: WordOrder = WordOrder.HIGH_FIRST) -> None:
+    def __init__(self, order: WordOrder = WordOrder.HIGH_FIRST, key: bytes | None = None) -> None:
         self.inputs = Inputs(HOME, (10.0,) * 8, 0.5, 30.0, int(MOTION_ALLOWED))
-        self.program = Program(load_profile("palms_471"), Role.VALVES, lambda _: self.inputs, order)
+        self.program = Program(load_profile("palms_471"), Role.VALVES, lambda _: self.inputs, order, key=key)
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever)
 
