@@ -27,9 +27,9 @@ from controller.crane.motion import Crane
 from controller.crane.outputs import CraneWriter
 from controller.crane.startup import Startup, check_nodes
 from controller.estimation.joint_estimator import JointEstimator
-from controller.estimation.motion_monitor import MotionMonitor
 from controller.estimation.sensed_joint import SensedJoint
 from controller.evidence import Evidence
+from controller.joint_watch import JointWatch
 from controller.requests.gate import RequestGate
 from controller.requests.setpoint_gate import RequestRefused
 from controller.state_report import StateReporter
@@ -60,7 +60,7 @@ class Controller:
 
     __slots__ = (
         "_last_ns", "_receive_sdo", "_reporter", "_sensed", "_settings", "carrier_bus", "crane", "crane_bus_monitor",
-        "crane_inputs", "estimators", "evidence", "gate", "inputs_in_use", "motion_monitors", "outputs", "startup",
+        "crane_inputs", "estimators", "evidence", "gate", "inputs_in_use", "joint_watch", "outputs", "startup",
         "supervisor", "vehicle", "writer",
     )  # fmt: skip
 
@@ -89,17 +89,17 @@ class Controller:
         self._receive_sdo = self.startup.receive
         sample_s = period_s if profile.plc is None else max(period_s, profile.plc.sample_ms * 1e-3)
         self.estimators = [JointEstimator(s, sample_s) for s in specs]
-        self._sensed = [
-            SensedJoint(state, s.encoder, estimator)
+        sensed = [
+            SensedJoint(state, s.encoder, estimator) if state is not None and s.encoder is not None else None
             for state, s, estimator in zip(self.crane_inputs.encoders, specs, self.estimators, strict=True)
-            if state is not None and s.encoder is not None
         ]
+        self._sensed = [each for each in sensed if each is not None]
         self.supervisor = Supervisor(
             profile, self.crane_inputs, self.crane_bus_monitor, self.carrier_bus, self.estimators, self.startup
         )
         self.gate = RequestGate(profile, settings.profile_hash, settings.key)
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
-        self.motion_monitors = [MotionMonitor(s, period_s) for s in specs]
+        self.joint_watch = JointWatch(specs, period_s, self.crane, self.estimators, sensed)
         self.writer = CraneWriter(database, profile)
         states = self.crane_inputs.messages + (self.carrier_bus.inputs.messages if self.carrier_bus else ())
         self.inputs_in_use = tuple((state.codec.name, state) for state in states)
@@ -146,7 +146,8 @@ class Controller:
             estimator.predict(now_ns)
         for sensed in self._sensed:
             sensed.update()
-        self.crane.estimate_load(now_ns)
+        roll_rad, pitch_rad = (0.0, 0.0) if self.vehicle is None else self.vehicle.reckoning.tilt_rad
+        self.crane.estimate_load(roll_rad, pitch_rad, now_ns)
         if self.vehicle is not None:
             self.vehicle.estimate(elapsed_ns, now_ns)
 
@@ -203,6 +204,7 @@ class Controller:
             if reason is not _NONE:
                 raise RequestRefused(reason, detail)
             self.gate.start_session()
+            self.joint_watch.begin_session()
             if self.vehicle is not None:
                 self.vehicle.gate.start_session()
 
@@ -263,6 +265,8 @@ class Controller:
         supervisor.supervise(inputs.late_ns, period_ns, now_ns)
         if supervisor.mode is _ACTIVE:
             self._check_leases(now_ns)
+        if supervisor.mode is _ACTIVE and self.crane.overloads():
+            supervisor.react_to(Reason.OVERLOAD, 0, now_ns)
         run = self.crane.spool_run
         if supervisor.mode is _ACTIVE and run.running:
             tested = self.estimators[run.function]
@@ -273,16 +277,7 @@ class Controller:
             reason, detail = self.vehicle.check(supervisor.armed, now_ns)
             if reason is not _NONE:
                 supervisor.react_to(reason, detail, now_ns)
-        monitored = supervisor.mode in OPERATING
-        for j, monitor in enumerate(self.motion_monitors):
-            estimator = self.estimators[j]
-            if not monitored or not estimator.known:
-                monitor.reset()
-                continue
-            reason = monitor.step(self.crane.commands[j], estimator.velocity)
-            if reason is not _NONE:
-                supervisor.react_to(reason, j, now_ns)
-                monitored = supervisor.mode in OPERATING
+        self.joint_watch.step(supervisor, self.vehicle is not None and self.vehicle.is_moving, now_ns)
         self.evidence.update(inputs, now_ns)
 
     def _check_leases(self, now_ns: int) -> None:

@@ -32,6 +32,9 @@ _BOOT: Final = Mode.BOOT
 _ACTIVE: Final = Mode.ACTIVE
 _STOP: Final = Mode.STOP
 _WAITING: Final = (Mode.BOOT, Mode.STANDBY)
+_FAULT: Final = Mode.FAULT
+_MOVES: Final = Reason.MOVES_WHILE_STOPPED
+NO_JOINT: Final = -1
 RAMP_NS: Final = 60_000_000
 """Ramp of an R1: with the slowest detection before it (20 ms), neutral well within 100 ms of the loss."""
 RANGE_MARGIN_UNITS: Final = 0.05
@@ -88,6 +91,7 @@ class Supervisor:
         "latching",
         "late",
         "mode",
+        "moving_joint",
         "ramp_end_ns",
         "ramp_ns",
         "reason",
@@ -138,6 +142,8 @@ class Supervisor:
         """How long a driving carrier would take to stand if it stopped now."""
         self.latching = False
         """The present STOP is an R1: FAULT follows its ramp."""
+        self.moving_joint = NO_JOINT
+        """A joint that moves while nothing is armed, by hand lever it seems (`controller.joint_watch`)."""
         self.worst = Reason.NONE
         self.worst_detail = 0
         self._degraded_until_ns = 0
@@ -227,6 +233,8 @@ class Supervisor:
         for monitor in self._bus_monitors:
             if not monitor.usable(now_ns):
                 return Reason.BUS_UNSTABLE, monitor.number
+        if self.moving_joint != NO_JOINT:
+            return Reason.JOINT_MOVES, self.moving_joint
         self.worst, self.worst_detail = _NONE, 0
         self._check_values()
         self._collect(*received.nodes.worst_finding(now_ns))
@@ -289,6 +297,15 @@ class Supervisor:
         self.worst, self.worst_detail = reason, detail
         self._react(now_ns)
 
+    def latch_motion(self, moving_joint: int, now_ns: int) -> None:
+        """Cut the supply of a machine that moves although it is stopped; in FAULT this becomes the reason unless the
+        supply is cut already.
+        """
+        if self.mode is not _FAULT:
+            self.react_to(_MOVES, moving_joint, now_ns)
+        elif FAULTS[self.reason].reaction < Reaction.CUT:
+            self.reason, self.detail = _MOVES, moving_joint
+
     def reset_button_pressed(self) -> bool:
         """Whether the reset button of the safety module went down in this tick."""
         pressed = self._reset_button.value()
@@ -335,7 +352,7 @@ class Supervisor:
             self._collect(Reason.VALVE_FEEDBACK_LOST)
         for place, encoder, _ in self._alarms:
             if encoder.values is None:
-                self._collect(Reason.ENCODER_LOST, place)
+                self._collect(Reason.ENCODER_FROZEN if encoder.repeats else Reason.ENCODER_LOST, place)
         if any(state.values is None for state in received.pressures):
             self._collect(Reason.PRESSURE_LOST)
         if received.grapple.values is None:
@@ -360,6 +377,8 @@ class Supervisor:
         for j, estimator, lower, upper in self._axes:
             if estimator.jumped:
                 self._collect(Reason.ENCODER_JUMP, j)
+            if estimator.noisy:
+                self._collect(Reason.ENCODER_NOISY, j)
             if estimator.known and not lower <= estimator.position <= upper:
                 self._collect(Reason.POSITION_OUTSIDE, j)
 

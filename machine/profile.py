@@ -184,6 +184,31 @@ class Workspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pick_half_size_m: float
 
 
+class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A box that the boom tip keeps out of, turned about the vertical: middle and half edges, in the base frame."""
+
+    center_m: tuple[float, float, float]
+    half_m: tuple[float, float, float]
+    yaw_rad: float = 0.0
+
+
+class Stability(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the machine bears (`controller.crane.load_moment`).
+
+    The empty crane weighs like ``head_kg`` at the stick pin and ``pin_kg`` at the hanger pin.  It tips over a line
+    ``edge_m`` from the slew axis when the moment about it exceeds ``stabilising_nm`` on level ground; every radian by
+    which the ground falls under the boom takes ``slope_nm_rad``.  ``share`` of the moment may be used.  On a machine
+    that is bolted down the line is the lift joint and the moment what the crane lifts.
+    """
+
+    head_kg: float
+    pin_kg: float
+    edge_m: float
+    stabilising_nm: float
+    slope_nm_rad: float
+    share: float
+
+
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A stereo camera as mounted and calibrated (docs/reference/machines.md section 8): pinhole optics and depth range.
 
@@ -281,8 +306,8 @@ class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A machine; ``carrier`` is None for a stationary machine, ``cameras`` may be empty, ``plc``, ``sag`` and ``imu``
-    are None without one."""
+    """A machine; ``carrier`` is None for a stationary machine, ``cameras`` and ``keep_out`` may be empty, ``plc``,
+    ``sag``, ``imu`` and ``stability`` are None without one."""
 
     schema: Literal[1]
     name: str
@@ -302,6 +327,8 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     plc: Plc | None = None
     sag: Sag | None = None
     imu: Imu | None = None
+    stability: Stability | None = None
+    keep_out: dict[str, KeepOut] = {}
 
 
 def joint(profile: Profile, which: Joint) -> JointSpec:

@@ -18,11 +18,11 @@ import numpy as np
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.bunk import stake_walls
 from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_jaw_pivot_m
 from machine.joints import Joint
 from machine.profile import Bunk, Profile
 
-STAKE_THICKNESS_M: Final = 0.08
 FLOOR_THICKNESS_M: Final = 0.12
 FRAME_HALF_WIDTH_M: Final = 0.45
 HOOD_M: Final = (0.6, 0.65, 0.6)
@@ -181,19 +181,9 @@ class SweptCapsules:
 
 def bunk_boxes(bunk: Bunk) -> tuple[Box, ...]:
     """The floor, and each row of stakes as a wall: a log passes over the whole row wherever the stakes are."""
-    c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
     x, y = bunk.center_m
-    side = bunk.width_m / 2 + STAKE_THICKNESS_M / 2
-    middle_z = bunk.floor_z_m + bunk.stake_height_m / 2
-    walls = tuple(
-        Box(
-            f"the {name} stakes",
-            (x - k * side * s, y + k * side * c, middle_z),
-            (bunk.length_m / 2, STAKE_THICKNESS_M / 2, bunk.stake_height_m / 2),
-            bunk.yaw_rad,
-        )
-        for name, k in (("left", 1.0), ("right", -1.0))
-    )
+    rows = zip(("left", "right"), stake_walls(bunk), strict=True)
+    walls = tuple(Box(f"the {name} stakes", row.center_m, row.half_m, row.yaw_rad) for name, row in rows)
     floor = (bunk.length_m / 2, bunk.width_m / 2, FLOOR_THICKNESS_M / 2)
     return (Box("the bunk's floor", (x, y, bunk.floor_z_m - FLOOR_THICKNESS_M / 2), floor, bunk.yaw_rad), *walls)
 

@@ -18,8 +18,8 @@ from autonomy.navigation.waypoint_drive import WaypointDrive
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, VehicleReport
 from machine.profile import Carrier
 
-LEASE_NS: Final = 250_000_000
-"""Five report periods."""
+LEASE_NS: Final = 200_000_000
+"""Four report periods."""
 STANDSTILL_M_S: Final = 0.02
 REST_NS: Final = 500_000_000
 """The brake is on after this time: on a slope the drive holds the machine until then."""

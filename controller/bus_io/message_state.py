@@ -40,7 +40,7 @@ class MessageState:
 
     __slots__ = (
         "_alive", "_checker", "_index", "_last_alive", "_receive", "bit", "codec", "fresh", "machine", "refused",
-        "stamp_ns", "timeout_ns", "values",
+        "repeats", "stamp_ns", "timeout_ns", "values",
     )  # fmt: skip
 
     def __init__(
@@ -69,6 +69,8 @@ class MessageState:
         self._last_alive: Any = None
         self.stamp_ns = 0
         self.refused = 0
+        self.repeats = False
+        """The newest frame carried the time stamp of the one before: the device answers, but measures no more."""
         self.forget()
 
     def forget(self) -> None:
@@ -99,7 +101,8 @@ class MessageState:
             return
         if self._alive >= 0:
             last, self._last_alive = self._last_alive, values[self._alive]
-            if last == self._last_alive:
+            self.repeats = last == self._last_alive
+            if self.repeats:
                 self.refused += 1
                 return
         self.values = values

@@ -16,9 +16,11 @@ from controller.bus_io.message_state import or_nan
 from controller.bus_io.messages import PeriodicTimer
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs
+from controller.crane.load_moment import LoadMoment
 from controller.crane.reference_governor import ReferenceGovernor
 from controller.crane.spool_test_run import SpoolTestRun
 from controller.crane.trajectory_check import TrajectoryCheck
+from controller.crane.workspace_check import WorkspaceCheck
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.load_estimator import LoadEstimator
 from controller.laws.crane import LOADS, CraneLaw
@@ -41,8 +43,9 @@ class Crane:
 
     __slots__ = (
         "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_load", "_load_due",
-        "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "commands", "governor",
-        "grapple", "law", "lease_end_ns", "leased", "load_kg", "spool_run", "spools_pct", "sway",
+        "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "_workspace", "commands",
+        "governor", "grapple", "law", "lease_end_ns", "leased", "load_kg", "load_moment", "spool_run", "spools_pct",
+        "sway",
     )  # fmt: skip
 
     def __init__(
@@ -50,7 +53,7 @@ class Crane:
     ) -> None:
         profile = settings.profile
         self._inputs, self._estimators, self._gate = inputs, estimators, gate
-        self._check = TrajectoryCheck(profile)
+        self._check, self._workspace = TrajectoryCheck(profile), WorkspaceCheck(profile)
         self._opening_sensed = profile.grapple.opening_sensor
         self._sensed = [profile.joints[j.name.lower()].encoder is not None for j in JOINTS]
         self.law = CraneLaw(profile, settings.period_ns * 1e-9)
@@ -66,6 +69,8 @@ class Crane:
         self._load, self._load_due, self._load_updated = LoadEstimator(profile), PeriodicTimer(LOAD_PERIOD_NS), False
         self.load_kg = math.nan
         """Load in the grapple; NaN while unknown."""
+        self.load_moment = None if profile.stability is None else LoadMoment(profile, profile.stability)
+        """Whether the machine bears its load; None on a machine whose profile does not say."""
         self.commands = self.law.commands
         """Joint velocities commanded in this tick."""
         self.spools_pct = [0.0] * N_JOINTS
@@ -76,20 +81,25 @@ class Crane:
 
     # -- estimate
 
-    def estimate_load(self, now_ns: int) -> None:
-        """Estimate the load when it is due: by the load cell where there is one, else by the lift's pressures."""
+    def estimate_load(self, roll_rad: float, pitch_rad: float, now_ns: int) -> None:
+        """Estimate the load when it is due: by the load cell where there is one, else by the lift's pressures.
+
+        The inclination of the crane's base (0 where it is not measured) belongs to the judgement of the moment.
+        """
         self._load_updated = self._load_due.due(now_ns)
         if not self._load_updated:
             return
         measured = self._inputs.grapple.get("Load")
+        position = [e.position for e in self._estimators]
         if measured is not None:
             self.load_kg = float(measured)
-            return
-        lift, state = self._estimators[Joint.LIFT], self._inputs.pressures[0]
-        position = [e.position for e in self._estimators]
-        self.load_kg = self._load.step(
-            position, lift.velocity, state.get("LiftA"), state.get("LiftB"), LOAD_PERIOD_NS * 1e-9
-        )
+        else:
+            lift, state = self._estimators[Joint.LIFT], self._inputs.pressures[0]
+            self.load_kg = self._load.step(
+                position, lift.velocity, state.get("LiftA"), state.get("LiftB"), LOAD_PERIOD_NS * 1e-9
+            )
+        if self.load_moment is not None:
+            self.load_moment.update(position, self.load_kg, roll_rad, pitch_rad)
 
     # -- reference
 
@@ -125,7 +135,8 @@ class Crane:
         """Follow a trajectory from now on; True when this ended a spool test.
 
         Raises:
-            RequestRefused: the trajectory leaves the limits, or a spool test holds a valve open.
+            RequestRefused: the trajectory leaves the limits, the machine does not bear it, or a spool test holds a
+                valve open.
         """
         if self.spool_run.opened(now_ns):
             raise RequestRefused(Reason.TEST_BUSY, self.spool_run.function)
@@ -150,11 +161,21 @@ class Crane:
                 if refused.reason is not Reason.REFERENCE_JUMP:
                     raise
             else:
-                self._gate.mark_accepted(setpoint)
+                self._admit(setpoint)
                 return True
         check.load_and_check(setpoint, governor.candidate, governor.position, governor.velocity, now_ns)
-        self._gate.mark_accepted(setpoint)
+        self._admit(setpoint)
         return False
+
+    def _admit(self, setpoint: CraneSetpoint) -> None:
+        """Check where a trajectory within the joints' limits leads, and remember it as accepted; raises
+        RequestRefused.
+        """
+        self._workspace.check(setpoint.knots)
+        moment = self.load_moment
+        if moment is not None and moment.refuses(self.governor.position, setpoint.knots[-1].position):
+            raise RequestRefused(Reason.RAISES_MOMENT)
+        self._gate.mark_accepted(setpoint)
 
     def accept_spool_test(self, test: SpoolTest, now_ns: int) -> None:
         """Run a spool test from now on; raises RequestRefused."""
@@ -186,6 +207,13 @@ class Crane:
         if self.spool_run.running:
             return self.spool_run.ends_neutral(now_ns)
         return self._final and self.governor.at_rest(now_ns)
+
+    def overloads(self) -> bool:
+        """Whether the machine is overloaded and the crane moves outward or up all the same."""
+        moment = self.load_moment
+        if moment is None or not moment.overloaded or not self.leased:
+            return False
+        return self.spool_run.running or moment.raised_by_motion(self.governor.position, self.governor.velocity)
 
     # -- control
 

@@ -5,7 +5,7 @@ the Riccati recursion, computed at start from the encoder's noise and resolution
 no gain is per cycle; a tick is two scalar recurrences.  A sample belongs to the moment of SYNC, not to the tick: it is
 compared with the estimate extrapolated back to its stamp.  A sample that the joint cannot have reached is refused and
 counted; three refusals within 100 ms are a fault (docs/reference/safety.md section 5, case 2), after which the filter
-starts again.
+starts again.  The innovations, averaged, tell whether the encoder has become noisy (case 4).
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ ACCELERATION_SHARE: Final = 1.0 / 3.0
 """Root mean square of the acceleration over the joint's limit, ..."""
 ACCELERATION_S: Final = 0.1
 """... which lasts about this long: together the spectral density of the white acceleration."""
+NOISE_RATIO: Final = 25.0
+"""An encoder is noisy when the mean square of the innovation is this many times what its noise explains, ..."""
+NOISE_MEAN_S: Final = 0.15
+"""... averaged over this time."""
 _JUMP_WINDOW_NS: Final = 100_000_000
 _JUMP_LIMIT_COUNT: Final = 3
 _NAN: Final = math.nan
@@ -69,16 +73,20 @@ class JointEstimator:
     """Tracks one joint; ``known`` is False until the first sample, and then position and velocity are NaN."""
 
     __slots__ = (
-        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_period_s",
-        "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
+        "_alpha", "_beta", "_gate_speed", "_innovation", "_jump_stamps", "_max_innovation", "_mean_gain", "_measured",
+        "_measured_ns", "_period_s", "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
     )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float) -> None:
         encoder, valve = spec.encoder, spec.valve
         self._alpha, self._beta = 1.0, 0.0
-        self._slack = 0.0
+        self._slack = self._innovation = 0.0
+        self._max_innovation = math.inf
+        self._mean_gain = -math.expm1(-period_s / NOISE_MEAN_S)
         if encoder is not None:
             self._alpha, self._beta = steady_gains(period_s, acceleration_density(spec), measurement_variance(encoder))
+            # Variance of the innovation: that of the sample over one less the gain.
+            self._max_innovation = NOISE_RATIO * measurement_variance(encoder) / (1.0 - self._alpha)
             self._slack = 4.0 * encoder.unit_per_count + 6.0 * encoder.noise
         self._period_s = period_s
         self._gate_speed = 3.0 * max(valve.full_speed_plus, valve.full_speed_minus, spec.speed_limit)
@@ -91,6 +99,11 @@ class JointEstimator:
         self.position = self.velocity = self._measured = _NAN
         self._measured_ns = self._predicted_ns = 0
         self._jump_stamps = [-_JUMP_WINDOW_NS] * _JUMP_LIMIT_COUNT
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the samples scatter much more about the estimate than the encoder's noise explains."""
+        return self._innovation > self._max_innovation
 
     def predict(self, now_ns: int) -> None:
         """Extrapolate the estimate to ``now_ns``; once per tick, before `update`."""
@@ -119,6 +132,7 @@ class JointEstimator:
         age_s = (self._predicted_ns - stamp_ns) * 1e-9
         residual = measured - (self.position - self.velocity * age_s)
         correction = self._beta * residual
+        self._innovation += self._mean_gain * (residual * residual - self._innovation)
         self.velocity += correction
         self.position += self._alpha * residual + correction * age_s
         self._measured, self._measured_ns = measured, stamp_ns
@@ -126,7 +140,7 @@ class JointEstimator:
     def _start(self, measured: float, stamp_ns: int) -> None:
         self.known = True
         self.position = self._measured = measured
-        self.velocity = 0.0
+        self.velocity = self._innovation = 0.0
         self._measured_ns = stamp_ns
         for i in range(_JUMP_LIMIT_COUNT):
             self._jump_stamps[i] = stamp_ns - _JUMP_WINDOW_NS

@@ -5,7 +5,7 @@ commanded velocity passes two models of the valve, one at either bound, and a jo
 are compared with the measured velocity in leaky integrals (0.5 s), which are distances: how far the joint should have
 moved by now at the latest, how far it stayed behind that, how far it moved faster than any recent command, and how far
 against its command.  The monitor cannot see a stuck joint below a fifth of the speed limit: a wrong dead-band looks the
-same there.
+same there.  Slow motion without a command is seen by `controller.estimation.standstill_monitor`.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ class MotionMonitor:
         "_overspeed",
         "_period_s",
         "_recent_command",
+        "expected_velocity",
     )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float, later_s: float = 0.0, lag_s: float = LATE_LAG_S) -> None:
@@ -78,6 +79,8 @@ class MotionMonitor:
         """At rest with a neutral valve."""
         self._at = 0
         self._early = self._late = self._recent_command = 0.0
+        self.expected_velocity = 0.0
+        """What the joint should do now at the latest."""
         self._expected = self._behind = self._overspeed = self._against = 0.0
         for i in range(len(self._line)):
             self._line[i] = 0.0
@@ -88,7 +91,7 @@ class MotionMonitor:
         line[at] = command
         self._early = early = self._early + self._early_lag * (line[at - self._early_at] - self._early)
         self._at = at = at + 1 if at + 1 < len(line) else 0
-        self._late = late = self._late + self._late_lag * (line[at] - self._late)
+        self._late = self.expected_velocity = late = self._late + self._late_lag * (line[at] - self._late)
         dt, decay, limit = self._period_s, self._decay, self._limit
         wanted, moved = abs(late), abs(velocity)
         self._recent_command = recent = max(abs(early), wanted, self._recent_command - self._command_decay)

@@ -17,8 +17,8 @@ from machine.status.reasons import Reason
 
 STALL_NS: Final = 10_000_000
 """A stall of two periods at 200 Hz is long enough to lose a tick, and with it to stop a machine."""
-REACH_NS: Final = 450_000_000
-"""The slowest detection of a fault (a lease of 350 ms), with the period of setpoints and reports."""
+REACH_NS: Final = 300_000_000
+"""The slowest detection of a fault (a lease of 200 ms), with the period of setpoints and reports."""
 LOSING_STALL_NS: Final = 25_000_000
 """A stall of this length loses frames at any rate, a shorter one if the transmit queue overflows in it."""
 

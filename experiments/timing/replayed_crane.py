@@ -34,7 +34,7 @@ from controller.process.tick_recording import record, restore_inputs, transmitte
 from controller.step import Controller, step  # noqa: E402
 from controller.tick import Inputs  # noqa: E402
 from hil.replay.recording import files_of, manifest_of  # noqa: E402
-from hil.replay.replay import recorded_ticks, settings_for  # noqa: E402
+from hil.replay.replay import profile_beside, recorded_ticks, settings_for  # noqa: E402
 
 PRIORITY = 80
 
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     files = files_of(options.recording)
     ticks = list(islice(recorded_ticks(files), options.ticks))
-    settings = settings_for(manifest_of(files), ticks[:64], None, None)
+    settings = settings_for(manifest_of(files), ticks[:64], profile_beside(files), None)
     controller, inputs, buses = Controller(settings), Inputs(), (BusPair(), BusPair())
     sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sink.bind(("127.0.0.1", 0))

@@ -37,7 +37,7 @@ from machine.status.modes import Mode
 SEND_PERIOD_NS: Final = 50_000_000
 PRINT_PERIOD_NS: Final = 1_000_000_000
 KNOTS_MS: Final = (0, 100, 200, 300, 400)
-LEASE_MS: Final = 350
+LEASE_MS: Final = 200
 STAMP_AGE_NS: Final = 2_000_000
 """Age of a time stamp when it is sent: a controller in the middle of its tick must not find it in the future."""
 SWING_SHARE: Final = 0.05

@@ -40,8 +40,6 @@ START_S: Final = 60.0
 POLL_S: Final = 0.1
 PLANNER_END_S: Final = 10.0
 """A planner that is ended early waits until crane and machine stand still."""
-LEASE_MS: Final = 350
-"""Longer than the planner's default of 200 ms: on a bench the emulated hardware shares its processor."""
 HARDWARE_PRIORITY: Final = {"wire": 60, "sim": 50}
 """SCHED_FIFO priorities below those of controller and guard."""
 PLANNER_PRIORITY: Final = 20
@@ -201,7 +199,7 @@ class LiveRun(ABC, Generic[Outcome]):
             self._display.event(f"operator's page: {url}", "bold")
         self._start(
             "autonomy", "autonomy", *self._profile,
-            "--controller", control, "--report-port", ports["planner"], "--scene", scene, "--lease-ms", LEASE_MS,
+            "--controller", control, "--report-port", ports["planner"], "--scene", scene,
             "--order-port", ports["orders"], *(("--tell", f"{HOST}:{ports['page']}") if options.console_port else ()),
             *self.planner_arguments,
         )  # fmt: skip

@@ -6,6 +6,7 @@ import contextlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -13,6 +14,9 @@ from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
 from recorder.mcap_scan import Channel, NotMcap, Stored, scan
 from recorder.recover import recover, run_files
+
+PROFILE_FILE: Final = "profile.toml"
+"""The profile of the run, where it lies with the recording."""
 
 
 def files_of(log: Path) -> list[Path]:

@@ -25,7 +25,7 @@ from controller.process.tick_recording import restore_inputs, transmitted
 from controller.step import Controller, step
 from controller.tick import Inputs
 from hil.replay.difference import differing_lines
-from hil.replay.recording import manifest_of, messages
+from hil.replay.recording import PROFILE_FILE, manifest_of, messages
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
 from recorder.recorder import TICK
@@ -87,6 +87,12 @@ def settings_for(manifest: Manifest, ticks: list[TickRecord], profile: str | Non
     return settings
 
 
+def profile_beside(files: list[Path]) -> str | None:
+    """The profile that lies with a recording as ``profile.toml``, for machines whose profile has changed since."""
+    beside = files[0].parent / PROFILE_FILE
+    return str(beside) if beside.is_file() else None
+
+
 def replay(
     files: list[Path],
     profile: str | None = None,
@@ -100,7 +106,7 @@ def replay(
     """
     manifest = manifest_of(files)
     first = list(islice(recorded_ticks(files), _RATE_TICKS))
-    settings = settings_for(manifest, first, profile, key)
+    settings = settings_for(manifest, first, profile or profile_beside(files), key)
     result = Result(
         total=sum(1 for _ in messages(files, TICK)),
         profile=settings.profile.name,

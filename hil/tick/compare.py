@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from hil.replay.recording import PROFILE_FILE
 from hil.tick import worker
 from hil.tick.ratio import compared
 from hil.tick.release import Release
@@ -28,7 +29,8 @@ Progress = Callable[[str], None]
 
 
 def kept_recordings(folder: Path) -> list[Path]:
-    """The recordings that the tests keep, unpacked below ``folder``: a fixed crane and a forwarder on both buses.
+    """The recordings that the tests keep, unpacked below ``folder`` with the profiles of their runs: a fixed crane, and
+    a forwarder on both buses.
 
     Raises:
         CommandFailed: this is not a checkout.
@@ -45,6 +47,7 @@ def kept_recordings(folder: Path) -> list[Path]:
         run = folder / path.name.removesuffix(".mcap.xz") / "run.mcap"
         run.parent.mkdir()
         run.write_bytes(lzma.decompress(path.read_bytes()))
+        (run.parent / PROFILE_FILE).write_bytes(path.with_name(f"{run.parent.name}.toml").read_bytes())
         made.append(run)
     return made
 

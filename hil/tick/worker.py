@@ -60,11 +60,11 @@ def digest_of(outputs: tuple[Any, ...]) -> bytes:
 def recorded(place: Path, limit: int) -> tuple[Settings, list[TickRecord]]:
     """Settings and the first ticks of a recording."""
     from hil.replay.recording import files_of, manifest_of
-    from hil.replay.replay import recorded_ticks, settings_for
+    from hil.replay.replay import profile_beside, recorded_ticks, settings_for
 
     files = files_of(place)
     ticks = list(islice(recorded_ticks(files), limit or None))
-    return settings_for(manifest_of(files), ticks[:64], None, None), ticks
+    return settings_for(manifest_of(files), ticks[:64], profile_beside(files), None), ticks
 
 
 def cost(place: Path, limit: int) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from machine.profile import joint
 from machine.status.modes import Mode
 
 POLL_S: Final = 0.002
-LEASE_NS: Final = 400_000_000
+LEASE_NS: Final = 200_000_000
 PERIOD_NS: Final = 50_000_000
 SPEED_RAD_S: Final = 0.15
 RISE_S: Final = 1.0

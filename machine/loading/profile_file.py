@@ -27,7 +27,8 @@ _UNIT_SUFFIXES: Final = (
     "_rad_s2", "_rad_s", "_deg_s2", "_deg_s", "_m_s2", "_m_s", "_mm_s", "_1_s", "_degrees", "_deg", "_rad",
     "_mm", "_cm", "_ms", "_ns", "_us", "_hz", "_bar", "_mpa", "_pa", "_pct", "_percent", "_px", "_m", "_s",
 )  # fmt: skip
-_NO_IMU: Final = b',"imu":null}'
+_ABSENT: Final = (b',"keep_out":{}', b',"stability":null', b',"imu":null')
+"""Sections that came later, as they are encoded where a machine has none; the last one first."""
 _JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 
 
@@ -82,11 +83,13 @@ def _lines(path: Path, problems: Sequence[Problem]) -> str:
 def profile_hash(profile: Profile) -> int:
     """CRC-32 of the canonical content; datagrams carry it to prove that both ends use the same profile.
 
-    Comments, order and layout of the file do not count; every value does.  A missing IMU does not count, so
-    that a machine without one keeps the hash of its recordings.
+    Comments, order and layout of the file do not count; every value does.  Missing sections that came later do not
+    count, so that a machine without them keeps the hash of its recordings.
     """
-    content = msgspec.json.encode(profile, order="deterministic")
-    return zlib.crc32(content.removesuffix(_NO_IMU) + b"}" if profile.imu is None else content)
+    content = msgspec.json.encode(profile, order="deterministic").removesuffix(b"}")
+    for absent in _ABSENT:
+        content = content.removesuffix(absent)
+    return zlib.crc32(content + b"}")
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -64,6 +64,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
         "Arming is refused: {} was lost and came back three times within a minute",
         "Check cable, termination and bit rate, and arm after a quiet minute.",
     ),
+    Reason.JOINT_MOVES: Fault(
+        Reaction.REFUSE,
+        0,
+        _J,
+        "Arming is refused: {} moves without a command",
+        "Leave the hand lever; if nobody moves it, cut the pilot supply and check its valve.",
+    ),
     Reason.CONTROLLER_ENDED: Fault(Reaction.NOTE, 0, _N, "The controller has ended", "Start it again."),
     Reason.OPERATOR_STOP: Fault(Reaction.HOLD, 0, _N, "The operator stopped the machine", "Arm to continue."),
     Reason.OPERATOR_DISARM: Fault(Reaction.HOLD, 0, _N, "The operator disarmed the machine", "Arm to continue."),
@@ -96,6 +103,20 @@ FAULTS: Final[dict[Reason, Fault]] = {
         _J,
         "The encoder of {} jumps faster than the joint can move",
         "Check its coupling and shield, then reset and arm.",
+    ),
+    Reason.ENCODER_FROZEN: Fault(
+        Reaction.RAMP,
+        300,
+        _J,
+        "The encoder of {} sends the same sample again and again",
+        "Its bus works and its measurement does not: check the device and its coupling, then reset and arm.",
+    ),
+    Reason.ENCODER_NOISY: Fault(
+        Reaction.DEGRADE,
+        500,
+        _J,
+        "The encoder of {} is much noisier than its profile says; half speed",
+        "Check its shield, supply and coupling.",
     ),
     Reason.ENCODER_ALARM: Fault(
         Reaction.RAMP, 20, _J, "The encoder of {} reports an alarm", "Read objects 6503h or 5122h, then reset."
@@ -241,6 +262,21 @@ FAULTS: Final[dict[Reason, Fault]] = {
     ),
     Reason.JOINT_REVERSED: Fault(
         Reaction.RAMP, 200, _J, "{} moves against its command", "Check signs in the profile, then reset and arm."
+    ),
+    Reason.MOVES_WHILE_STOPPED: Fault(
+        Reaction.CUT,
+        600,
+        _J,
+        "{} moves although the machine is stopped",
+        "Check for a valve stuck open, then reset and arm; to move it by hand lever, disarm first.",
+        True,
+    ),
+    Reason.OVERLOAD: Fault(
+        Reaction.HOLD,
+        50,
+        _N,
+        "Load, reach and slope together are more than the machine bears",
+        "Lower the load or bring it nearer, or arm and command only that.",
     ),
     Reason.TEST_RANGE: Fault(
         Reaction.HOLD,

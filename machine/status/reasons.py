@@ -59,6 +59,7 @@ class Reason(IntEnum):
     NODE_NOT_OPERATIONAL = 12
     CONTROLLER_ENDED = 13
     BUS_UNSTABLE = 14
+    JOINT_MOVES = 15
 
     ESTOP_PRESSED = 20
     ESTOP_CHANNELS = 21
@@ -87,6 +88,8 @@ class Reason(IntEnum):
     SWING_ARMS_LOST = 44
     GNSS_LOST = 45
     ENGINE_LOST = 46
+    ENCODER_FROZEN = 47
+    ENCODER_NOISY = 48
 
     BUS_OFF = 50
     BUS_DOWN = 51
@@ -100,6 +103,7 @@ class Reason(IntEnum):
 
     LEASE_LOST = 70
     SETPOINTS_REFUSED = 71
+    OVERLOAD = 72
     JOINT_STUCK = 75
     JOINT_RUNAWAY = 76
     JOINT_REVERSED = 77
@@ -124,6 +128,7 @@ class Reason(IntEnum):
     ARM_STUCK = 95
     STEERING_STUCK = 96
     STEERING_RUNAWAY = 97
+    MOVES_WHILE_STOPPED = 98
 
     DATAGRAM_LENGTH = 101
     DATAGRAM_MAGIC = 102
@@ -155,6 +160,9 @@ class Reason(IntEnum):
     CRANE_MOVES = 129
     CARRIER_MOVES = 130
     NO_AUTHORITY = 131
+    BELOW_GROUND = 140
+    KEEP_OUT = 141
+    RAISES_MOMENT = 142
 
 
 class Fault(NamedTuple):

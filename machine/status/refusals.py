@@ -81,6 +81,23 @@ REFUSALS: Final[dict[Reason, Fault]] = {
         "A crane setpoint was refused: the machine is driving",
         "Move the crane when the machine stands still.",
     ),
+    Reason.BELOW_GROUND: Fault(
+        Reaction.REFUSE, 10, _N, "A setpoint was refused: the rotator would touch the ground", PLANNER
+    ),
+    Reason.KEEP_OUT: Fault(
+        Reaction.REFUSE,
+        10,
+        _N,
+        "A setpoint was refused: the boom tip would enter a box that it must keep out of",
+        PLANNER,
+    ),
+    Reason.RAISES_MOMENT: Fault(
+        Reaction.REFUSE,
+        10,
+        _N,
+        "A setpoint was refused: the machine is overloaded and the load would go outward or up",
+        "Lower the load or bring it nearer.",
+    ),
     Reason.NO_AUTHORITY: Fault(
         Reaction.REFUSE,
         10,

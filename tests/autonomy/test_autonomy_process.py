@@ -138,7 +138,7 @@ def test_a_mission_that_fails_gives_its_reason(world: World) -> None:
     ("extra", "value"),
     [
         (["--profile", "palms_472"], '"palms_471"'),
-        (["--lease-ms", "900"], "1..500"),
+        (["--lease-ms", "900"], "1..200"),
         (["--mission", "here.geojson"], "palms_471"),
         (["--profile", "aoro_fc8", "--mission", "/none.geojson"], "/none.geojson"),
     ],

@@ -48,9 +48,9 @@ def test_a_mission_ends_although_the_machine_does_not_stop() -> None:
 
 
 def test_setpoints_have_the_requested_lease() -> None:
-    forwarder, job, _ = begin(lease_ns=350_000_000)
+    forwarder, job, _ = begin(lease_ns=150_000_000)
     run(forwarder, job, lambda j: forwarder.drive is not None)
-    assert forwarder.drive is not None and forwarder.drive.lease_ns == 350_000_000
+    assert forwarder.drive is not None and forwarder.drive.lease_ns == 150_000_000
 
 
 def test_an_ended_job_sends_no_speed() -> None:

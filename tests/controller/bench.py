@@ -8,6 +8,7 @@ Faults are injected by name: ``dropped`` messages, ``changed`` signals, ``corrup
 from __future__ import annotations
 
 import math
+import random
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -130,6 +131,12 @@ class Bench:
         self.stuck: set[int] = set()
         self.backward: set[int] = set()
         self.moves_alone: dict[int, float] = {}
+        self.dither: random.Random | None = None
+        """Source of the encoders' noise; without one they are exact, as far as counts go."""
+        self.noise_factor: dict[int, float] = {}
+        self.frozen_counts: set[int] = set()
+        """Encoders that give their last count for ever, with a time stamp that runs on."""
+        self.last_counts: dict[int, int] = {}
         self.specs = [joint(settings.profile, j) for j in JOINTS]
         self.carrier = settings.profile.carrier
         self.articulation_rad = 0.0
@@ -214,7 +221,7 @@ class Bench:
         frames, self.pending = self.pending, []
         for place, encoder in encoders(self.settings.profile).items():
             if self.encoders[encoder.node].state == 0x05 and encoder.message not in self.dropped:
-                counts = counts_from_position(encoder, self.q[place] if place < N_JOINTS else self.articulation_rad)
+                counts = self._counts(place, encoder)
                 values = {"Position": counts}
                 codec = DATABASE.message(encoder.message)
                 if "TimeStamp" in codec.index and encoder.message not in self.frozen:
@@ -230,6 +237,17 @@ class Bench:
         frames += self.extra
         self.extra = []
         return frames
+
+    def _counts(self, place: int, encoder: Any) -> int:
+        if place in self.frozen_counts:
+            return self.last_counts[place]
+        position = self.q[place] if place < N_JOINTS else self.articulation_rad
+        if self.dither is not None:
+            position += self.dither.gauss(0.0, self.noise_factor.get(place, 1.0) * encoder.noise)
+        elif place in self.stuck:  # a live encoder flickers on a joint that does not move
+            position += (self.count % 2) * encoder.unit_per_count
+        self.last_counts[place] = counts_from_position(encoder, position)
+        return self.last_counts[place]
 
     def _machine_answers(self) -> list[tuple[int, bytes]]:
         frames, self.machine_extra = self.machine_extra, []

@@ -34,7 +34,7 @@ BAD = {
     "stamp of the past": (Reason.OUT_OF_ORDER, 0, lambda b: b.to(9, 0, stamp_ns=5)),
     "stamp of the future": (Reason.STAMP_FUTURE, 0, lambda b: b.to(9, 0, stamp_ns=b.now_ns + 50 * MS)),
     "too late": (Reason.STAMP_OLD, 0, lambda b: b.to(9, 0, lease_ms=1)),
-    "lease too long": (Reason.LEASE_TOO_LONG, 0, lambda b: b.to(9, 0, lease_ms=501)),
+    "lease too long": (Reason.LEASE_TOO_LONG, 0, lambda b: b.to(9, 0, lease_ms=201)),
     "too fast": (Reason.DRIVE_SPEED, 0, lambda b: b.to(9, 0, TOP + 0.01)),
     "too fast backwards": (Reason.DRIVE_SPEED, 0, lambda b: b.bend(0.0, speed_m_s=-TOP - 0.01)),
     "backwards to a waypoint": (Reason.DRIVE_SPEED, 0, lambda b: b.to(9, 0, -0.1)),
@@ -56,7 +56,7 @@ EDGES = {
     "both ends of the travel": lambda b: b.to(9, 0, heights_m=(0.0, CARRIER.arm_travel_m, 0.0, 0.6)),
     "the front floats": lambda b: b.to(9, 0, float_front=True),
     "the rear floats": lambda b: b.to(9, 0, float_rear=True),
-    "the longest lease": lambda b: b.to(9, 0, lease_ms=500),
+    "the longest lease": lambda b: b.to(9, 0, lease_ms=200),
 }
 
 
@@ -78,7 +78,7 @@ def standing() -> DriveBench:
 def test_drive_setpoint_is_refused_with_its_reason_and_changes_nothing(name, standing):
     reason, detail, make = BAD[name]
     standing.run(201)  # the third refusal within a second would hold the machine
-    standing.tick([standing.to(9, 0, 0.0, lease_ms=500)])
+    standing.tick([standing.to(9, 0, 0.0, lease_ms=200)])
     vehicle = standing.vehicle
     before, obeyed = vehicle.gate.refused, vehicle.setpoint
     standing.tick([make(standing)])
@@ -200,7 +200,7 @@ def test_fault_that_latches_brakes_at_once():
 
 def test_new_session_restarts_the_sequence():
     bench = DriveBench().under_way(60)
-    old = bench.to(50, 0, stamp_ns=bench.now_ns - 150 * MS, lease_ms=500)
+    old = bench.to(50, 0, stamp_ns=bench.now_ns - 150 * MS, lease_ms=200)
     bench.tick([bench.operator(OperatorAction.STOP)])
     bench.run(35)
     bench.tick([bench.operator(OperatorAction.ARM)])
@@ -324,7 +324,7 @@ near = st.fixed_dictionaries(
         "steering": st.sampled_from(Steering), "articulation_rad": st.floats(-0.6, 0.6),
         "articulation_rate_rad_s": st.floats(-0.2, 0.2), "speed_m_s": st.floats(-1.0, 1.0),
         "heights_m": st.tuples(*[st.floats(0.0, 0.6)] * 4), "float_front": st.booleans(), "float_rear": st.booleans(),
-        "level": st.booleans(), "lease_ms": st.integers(1, 500),
+        "level": st.booleans(), "lease_ms": st.integers(1, 200),
     }
 )  # fmt: skip
 noise = st.lists(st.tuples(st.sampled_from(MACHINE_KEYS), st.binary(max_size=8)), max_size=4)

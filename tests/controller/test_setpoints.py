@@ -48,7 +48,7 @@ BAD = {
     "stamp of the past": (Reason.OUT_OF_ORDER, 0, lambda b: b.hold(stamp_ns=5)),
     "stamp of the future": (Reason.STAMP_FUTURE, 0, lambda b: b.hold(stamp_ns=b.now_ns + 50 * MS)),
     "too late": (Reason.STAMP_OLD, 0, lambda b: b.hold(lease_ms=1, stamp_ns=b.now_ns)),
-    "lease too long": (Reason.LEASE_TOO_LONG, 0, lambda b: b.hold(lease_ms=501)),
+    "lease too long": (Reason.LEASE_TOO_LONG, 0, lambda b: b.hold(lease_ms=201)),
     "out of range": (Reason.JOINT_RANGE, 1, lambda b: b.setpoint(
         [(0, at(b), ZERO), (9000, at(b, 1, 0.9), ZERO)])),
     "first knot out of range": (Reason.JOINT_RANGE, 3, lambda b: b.setpoint([(0, at(b, 3, 9.0), ZERO)])),
@@ -102,6 +102,11 @@ def test_every_refusal_reason_is_tried():
     unreachable = {Reason.DATAGRAM_AUTHENTICATION, Reason.NOT_ARMED}  # own tests below and in test_modes
     unreachable |= {Reason.TEST_FUNCTION, Reason.TEST_SPOOL, Reason.TEST_BUSY}  # in test_spool_tests
     unreachable |= {r for r in Reason if Reason.DRIVE_SPEED <= r <= Reason.CARRIER_MOVES}  # in test_drive_setpoints
+    unreachable |= {
+        Reason.BELOW_GROUND,
+        Reason.KEEP_OUT,
+        Reason.RAISES_MOMENT,
+    }  # in test_workspace and test_load_moment
     tried = {reason for reason, _, _ in BAD.values()} | unreachable
     assert tried == {r for r in Reason if r > 100}
     assert {100 + f for f in DatagramFault} <= set(Reason)
@@ -161,4 +166,4 @@ def test_peak_and_extremes_bound_the_cubic(p):
 
 
 def test_limits_come_from_the_profile():
-    assert PROFILE.timeouts.lease_max_ms == 500 and SPECS[Joint.SLEW].speed_limit == 0.35
+    assert PROFILE.timeouts.lease_max_ms == 200 and SPECS[Joint.SLEW].speed_limit == 0.35

@@ -242,7 +242,7 @@ def feel(bench: Bench, **values: float) -> None:
 def at_rest(bench: Bench) -> Bench:
     """ACTIVE, with a constant reference and a lease that does not end."""
     bench.armed()
-    bench.tick([bench.hold(lease_ms=500)])
+    bench.tick([bench.hold(lease_ms=200)])
     assert bench.mode is Mode.ACTIVE
     return bench
 
@@ -252,12 +252,12 @@ def test_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
     for k in range(60):
         if k % 2 == 0:
             feel(bench, LeanTangential=0.15)
-        bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
+        bench.tick([bench.hold(lease_ms=200)] if k % 20 == 0 else [])
     moving = bench.controller.crane.commands[Joint.SLEW]
     assert moving > 0.01
     assert bench.controller.crane_inputs.stale_mask == 0
     for k in range(80):
-        bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
+        bench.tick([bench.hold(lease_ms=200)] if k % 20 == 0 else [])
     swung = bench.controller.crane.sway
     assert bench.controller.crane_inputs.imu.values is None
     assert bench.controller.crane_inputs.stale_mask == 0 and bench.mode is Mode.ACTIVE
@@ -269,7 +269,7 @@ def test_faulty_sensor_is_ignored(values):
     bench = at_rest(Bench(sensing()))
     for k in range(60):
         feel(bench, **{"LeanTangential": 0.15, "LeanRadial": 0.15, **values})
-        bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
+        bench.tick([bench.hold(lease_ms=200)] if k % 20 == 0 else [])
     assert bench.controller.crane_inputs.imu.values is not None
     assert not bench.controller.crane.sway.active
 

@@ -1,7 +1,8 @@
 """Recordings made before the rooms and names changed replay to the same bytes: the controller decides as it did.
 
 `tests/recordings` holds the first seconds of two lockstep runs at commit 7d68e2e: a crane on a fixed base (palms_471:
-start-up, arming, the first motion) and a forwarder on both buses (aoro_fc8: start-up, driving, a search).
+start-up, arming, the first motion) and a forwarder on both buses (aoro_fc8: start-up, driving, a search).  The profiles
+of their time lie beside them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.replay.recording import files_of
+from hil.replay.recording import PROFILE_FILE, files_of
 from hil.replay.replay import replay
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "recordings"
@@ -21,6 +22,7 @@ RECORDINGS = Path(__file__).resolve().parents[1] / "recordings"
 def test_a_kept_recording_replays_byte_for_byte(name: str, ticks: int, tmp_path: Path) -> None:
     run = tmp_path / "run.mcap"
     run.write_bytes(lzma.decompress((RECORDINGS / f"{name}.mcap.xz").read_bytes()))
+    (tmp_path / PROFILE_FILE).write_bytes((RECORDINGS / f"{name}.toml").read_bytes())
     result = replay(files_of(run))
     assert result.agrees, result
     assert result.ticks == ticks

@@ -1,0 +1,137 @@
+"""The crane's joints as they are watched: against their commands while armed, and for motion without one in every mode.
+
+Inputs: the mode, the commands and spools of the last tick, the joints' estimates.  Output: reactions of the supervisor.
+
+Armed (ARMED, ACTIVE): a joint that does not follow, runs away or goes backwards, and an encoder that stands still while
+its joint is commanded to move.  A stop: a joint that does not come to rest.  Not armed: who moves the machine?  A valve
+that stuck open keeps it moving, and a person with a hand lever starts it again.  So a joint that has not stood since
+the controller let go is a fault (`MOVES_WHILE_STOPPED`), and so is every motion in STOP, where nobody has taken over;
+one that has stood and moves again in STANDBY or FAULT is shown and prevents arming, but does not cut the pilot supply,
+because the levers need it: "move it back by hand lever" is the advice after POSITION_OUTSIDE.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from typing import Final
+
+from controller.crane.motion import Crane
+from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.motion_monitor import MotionMonitor
+from controller.estimation.sensed_joint import SensedJoint
+from controller.estimation.standstill_monitor import StandstillMonitor
+from controller.supervisor import NO_JOINT, Supervisor
+from controller.transitions import OPERATING
+from machine.joints import N_JOINTS
+from machine.profile import JointSpec
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+
+FROZEN_S: Final = 0.1
+"""An encoder that gives the same count for this long, ..."""
+FROZEN_S_AT_LIMIT: Final = 0.025
+"""... while its joint should have moved as far as in this time at the speed limit, ..."""
+FROZEN_NOISES: Final = 6.0
+"""... and by this many times its noise and resolution, is frozen."""
+STOOD_S: Final = 1.0
+"""A joint has stood when it has stayed in its place for this long."""
+_NONE: Final = Reason.NONE
+_RUNAWAY: Final = Reason.JOINT_RUNAWAY
+_REVERSED: Final = Reason.JOINT_REVERSED
+_BOOT: Final = Mode.BOOT
+_STOP: Final = Mode.STOP
+
+
+class JointWatch:
+    """All monitors of the crane's joints."""
+
+    __slots__ = (
+        "_crane", "_estimators", "_frozen_ticks", "_frozen_travel", "_monitors", "_period_s", "_sensed", "_standstill",
+        "_stood", "_travel", "_was_armed",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        specs: Sequence[JointSpec],
+        period_s: float,
+        crane: Crane,
+        estimators: Sequence[JointEstimator],
+        sensed: Sequence[SensedJoint | None],
+    ) -> None:
+        """All sequences are in ``Joint`` order; ``sensed`` is None where a joint has no encoder."""
+        self._crane, self._estimators, self._sensed = crane, estimators, sensed
+        self._period_s = period_s
+        self._monitors = [MotionMonitor(s, period_s) for s in specs]
+        self._standstill = [StandstillMonitor(s, period_s) for s in specs]
+        self._frozen_ticks = round(FROZEN_S / period_s)
+        self._frozen_travel = [
+            FROZEN_S_AT_LIMIT * s.speed_limit
+            + (FROZEN_NOISES * (s.encoder.noise + s.encoder.unit_per_count) if s.encoder is not None else 0.0)
+            for s in specs
+        ]
+        self._travel = array("d", [0.0] * N_JOINTS)
+        self._stood = True
+        self._was_armed = False
+
+    def begin_session(self) -> None:
+        """An operator armed: what a joint did before does not count."""
+        for j in range(N_JOINTS):
+            self._monitors[j].reset()
+            self._standstill[j].reset()
+            self._travel[j] = 0.0
+
+    def step(self, supervisor: Supervisor, carrier_moves: bool, now_ns: int) -> None:
+        """Watch every joint once and react; after the supervisor has decided on everything else."""
+        crane, estimators = self._crane, self._estimators
+        armed = supervisor.mode in OPERATING
+        if self._was_armed and not armed:
+            self._stood = False
+        self._was_armed = armed
+        shaken = carrier_moves or crane.grapple.spool_pct != 0.0
+        for pct in crane.spools_pct:
+            shaken = shaken or pct != 0.0
+        moving, stands = NO_JOINT, True
+        for j in range(N_JOINTS):
+            estimator, monitor, standstill = estimators[j], self._monitors[j], self._standstill[j]
+            if not estimator.known or estimator.jumped or supervisor.mode is _BOOT:
+                monitor.reset()
+                standstill.reset()
+                self._travel[j] = 0.0
+                continue  # what an encoder did that jumped or was lost is no motion
+            reason = monitor.step(crane.commands[j], estimator.velocity)
+            if standstill.step(crane.spools_pct[j] == 0.0, shaken, estimator.position) and reason is _NONE:
+                reason = _RUNAWAY
+            if supervisor.mode in OPERATING:
+                if self._frozen(j, monitor):
+                    reason = Reason.ENCODER_FROZEN
+                if reason is not _NONE:
+                    supervisor.react_to(reason, j, now_ns)
+                continue
+            if standstill.quiet_s < STOOD_S:
+                stands = False
+            if reason is _RUNAWAY or reason is _REVERSED:
+                moving = j
+        self._settle(supervisor, moving, stands, now_ns)
+
+    def _frozen(self, j: int, monitor: MotionMonitor) -> bool:
+        """Whether the encoder stands still to the last count although its joint should have moved."""
+        sensed = self._sensed[j]
+        if sensed is None or not sensed.dithers or sensed.unchanged == 0:
+            self._travel[j] = 0.0
+            return False
+        self._travel[j] += abs(monitor.expected_velocity) * self._period_s
+        return sensed.unchanged >= self._frozen_ticks and self._travel[j] > self._frozen_travel[j]
+
+    def _settle(self, supervisor: Supervisor, moving: int, stands: bool, now_ns: int) -> None:
+        """Judge a motion while nothing is armed."""
+        supervisor.moving_joint = NO_JOINT
+        if supervisor.mode in OPERATING or supervisor.mode is _BOOT:
+            return
+        if moving == NO_JOINT:
+            self._stood |= stands
+        elif not self._stood or supervisor.mode is _STOP:
+            self._stood = False  # a reset does not make it stand
+            supervisor.latch_motion(moving, now_ns)
+        else:
+            supervisor.moving_joint = moving

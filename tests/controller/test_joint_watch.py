@@ -1,0 +1,192 @@
+"""Joints that move without a command in every mode, frozen and noisy encoders: reaction, bound, and who may go on."""
+
+import random
+
+import pytest
+
+from can_dbc.messages.crane import OperatorAction
+from machine.joints import Joint
+from machine.status.faults import FAULTS, describe
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import MS, SPECS, Bench, T, count_until
+
+SHARES = (0.03, 0.1, 0.25)
+SLOW_MS = 600
+JOINTS = [Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT, Joint.ROT]
+
+
+def dithering(bench: Bench) -> Bench:
+    """Live encoders: their counts flicker, a moving joint's too."""
+    bench.dither = random.Random(1)
+    return bench
+
+
+def drifts(bench: Bench, j: int, share: float) -> None:
+    bench.moves_alone[j] = share * SPECS[j].speed_limit
+
+
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("j", JOINTS)
+def test_slow_motion_without_a_command_cuts_while_armed(j, share):
+    bench = dithering(Bench()).armed()
+    bench.run(500)
+    drifts(bench, j, share)
+    k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
+    assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, j)
+    assert k * T <= (SLOW_MS if share < 0.25 else 200) * MS
+    assert bench.neutral and bench.commands_b["ArmKey"] == 0
+
+
+@pytest.mark.parametrize("share", [0.03, 0.5, 1.0])
+def test_motion_in_stop_latches_and_cuts_whoever_causes_it(share):
+    bench = dithering(Bench()).active()
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.run(600)
+    assert bench.mode is Mode.STOP
+    drifts(bench, 0, share)
+    k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
+    assert bench.reason == Reason.MOVES_WHILE_STOPPED and bench.controller.supervisor.detail == 0
+    assert k * T <= FAULTS[Reason.MOVES_WHILE_STOPPED].bound_ms * MS
+    assert "hand lever" in describe(bench.reason, 0)
+
+
+@pytest.mark.parametrize("end", [OperatorAction.STOP, OperatorAction.DISARM])
+def test_a_joint_that_does_not_come_to_rest_after_the_end_latches(end):
+    bench = dithering(Bench()).active()
+    drifts(bench, 0, 0.3)
+    bench.tick([bench.operator(end)])
+    count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 300)
+    assert bench.reason in (Reason.MOVES_WHILE_STOPPED, Reason.JOINT_RUNAWAY)
+
+
+def test_a_fault_that_left_the_supply_on_is_raised_by_motion_that_goes_on():
+    bench = dithering(Bench()).active()
+    drifts(bench, 1, 0.2)
+    bench.dropped.add("EncSlew")
+    count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 60)
+    assert FAULTS[Reason(bench.reason)].reaction < FAULTS[Reason.MOVES_WHILE_STOPPED].reaction
+    count_until(bench.tick, lambda: bench.reason == Reason.MOVES_WHILE_STOPPED, 300)
+    assert bench.controller.supervisor.detail == 1
+
+
+@pytest.mark.parametrize("mode", [Mode.STANDBY, Mode.FAULT])
+def test_hand_levers_are_not_punished_but_prevent_arming(mode):
+    bench = dithering(Bench())
+    if mode is Mode.FAULT:
+        bench.active()
+        bench.dropped.add("EncRot")
+        bench.run(60)
+        bench.dropped.clear()
+    else:
+        bench.boot()
+    bench.run(600)
+    before = bench.reason
+    bench.moves_alone[2] = 0.3
+    bench.run(200)
+    assert bench.mode is mode
+    if mode is Mode.FAULT:
+        assert bench.reason == before, "its cause stays to be read"
+        bench.moves_alone.clear()
+        bench.run(300)
+        bench.tick([bench.operator(OperatorAction.RESET)])
+        bench.run(10)
+        assert bench.mode is Mode.STANDBY
+        return
+    assert bench.reason == Reason.JOINT_MOVES and bench.controller.supervisor.detail == 2
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.JOINT_MOVES
+    bench.moves_alone.clear()
+    bench.run(300)
+    assert bench.reason == Reason.NONE
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    bench.run(300)
+    assert bench.mode is Mode.ARMED, "what the lever did before does not count"
+
+
+def test_reset_while_it_still_moves_latches_again_and_afterwards_frees():
+    bench = dithering(Bench()).active()
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.run(400)
+    drifts(bench, 0, 0.2)
+    count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 400)
+    assert bench.reason == Reason.MOVES_WHILE_STOPPED
+    bench.moves_alone.clear()
+    bench.run(200)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.run(600)
+    assert bench.mode is Mode.STANDBY
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def move(bench: Bench, j: int, share: float, ticks: int, until=lambda: False) -> int:
+    """The planner moves one joint; ticks until the condition holds or the mode is left."""
+    for k in range(1, ticks + 1):
+        v = bench.controller.crane.governor.velocity[j]
+        wanted = share * SPECS[j].speed_limit
+        v += max(-0.02, min(0.02, wanted - v))
+        bench.tick([bench.moving(j, v)] if k % 10 == 1 and bench.mode in (Mode.ARMED, Mode.ACTIVE) else ())
+        if until() or bench.mode is Mode.STOP:
+            return k
+    return ticks
+
+
+@pytest.mark.parametrize("j", [Joint.SLEW, Joint.EXT])
+def test_an_encoder_that_stands_still_to_the_count_is_frozen_and_not_a_stuck_valve(j):
+    bench = dithering(Bench()).armed()
+    move(bench, j, 0.4, 100)
+    assert bench.mode is Mode.ACTIVE
+    bench.frozen_counts.add(j)
+    k = move(bench, j, 0.4, 200)
+    assert (bench.reason, bench.controller.supervisor.detail) == (Reason.ENCODER_FROZEN, j)
+    assert k * T <= FAULTS[Reason.ENCODER_FROZEN].bound_ms * MS
+
+
+def test_a_stuck_valve_under_a_live_encoder_stays_a_stuck_valve():
+    bench = dithering(Bench()).armed()
+    move(bench, 0, 0.7, 150)
+    bench.stuck.add(0)
+    move(bench, 0, 0.7, 200)
+    assert bench.reason == Reason.JOINT_STUCK
+
+
+@pytest.mark.parametrize("name", ["EncSlew", "EncTilt"])
+def test_a_time_stamp_that_stands_still_is_a_frozen_encoder_and_no_cut_cable(name):
+    bench = Bench().active()
+    bench.frozen.add(name)
+    k = count_until(bench.tick, lambda: bench.mode is Mode.STOP)
+    assert bench.reason == Reason.ENCODER_FROZEN and k * T <= 20 * MS + T
+
+
+def test_one_repeated_frame_is_no_frozen_encoder():
+    bench = Bench().active()
+    for _ in range(5):
+        bench.frozen.add("EncSlew")
+        bench.tick()
+        bench.frozen.clear()
+        bench.drive(0, 0.08, 10)
+    assert bench.mode is Mode.ACTIVE
+
+
+def test_an_encoder_at_rest_may_give_the_same_count_for_ever():
+    bench = Bench().armed()
+    bench.tick([bench.hold()])
+    for k in range(1000):
+        bench.tick([bench.hold()] if k % 10 == 0 else ())
+    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
+
+
+def test_ten_times_the_noise_halves_the_speed_in_time():
+    bench = dithering(Bench()).active()
+    bench.noise_factor[2] = 10.0
+    seen = 0
+    for k in range(1, 101):
+        bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else ())
+        if bench.reason == Reason.ENCODER_NOISY:
+            seen = k
+            break
+    assert seen and seen * T <= FAULTS[Reason.ENCODER_NOISY].bound_ms * MS
+    assert bench.controller.supervisor.half_speed and bench.controller.supervisor.detail == 2

@@ -1,0 +1,122 @@
+"""Where the boom tip may go: ground, stakes and the profile's boxes; a setpoint that leads there is refused."""
+
+import itertools
+
+import msgspec
+import pytest
+
+from can_dbc.messages.crane import Knot
+from controller.config import Settings
+from controller.crane.workspace_check import GROUND_MARGIN_M, MAX_KNOTS_CHECKED, WorkspaceCheck
+from controller.requests.setpoint_gate import RequestRefused
+from machine.geometry.bunk import stake_walls
+from machine.geometry.kinematics import Unreachable, pin_position, solve
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.profile import KeepOut
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import PROFILE, Bench
+
+KIN = PROFILE.kinematics
+HANG_M = KIN.hanger_to_fork_m + KIN.fork_to_rotator_m
+STILL = (0.0,) * 5
+ABOVE = (-1.8, 4.4, 0.5)
+
+
+def knots(*points):
+    return [Knot(i * 50_000_000, (*solve(PROFILE, *p), 0.0), STILL) for i, p in enumerate(points)]
+
+
+def refusal(check, *points):
+    try:
+        check.check(knots(*points))
+    except RequestRefused as refused:
+        return refused.reason
+    return Reason.NONE
+
+
+def test_ground_is_refused_from_above_and_a_way_out_is_not():
+    check = WorkspaceCheck(PROFILE)
+    lowest = PROFILE.workspace.ground_z_m - GROUND_MARGIN_M + HANG_M
+    x, y, _ = ABOVE
+    assert refusal(check, ABOVE, (x, y, lowest + 0.01)) is Reason.NONE
+    assert refusal(check, ABOVE, (x, y, lowest - 0.01)) is Reason.BELOW_GROUND
+    assert refusal(check, (x, y, lowest - 0.2), (x, y, lowest - 0.1)) is Reason.NONE, "upward out of the ground"
+    assert refusal(check, (x, y, lowest - 0.1), (x, y, lowest - 0.2)) is Reason.BELOW_GROUND
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_stakes_are_refused_and_their_number_is_told(row):
+    check, wall = WorkspaceCheck(PROFILE), stake_walls(PROFILE.bunk)[row]
+    x, y, z = wall.center_m
+    top = z + wall.half_m[2]
+    with pytest.raises(RequestRefused) as refused:
+        check.check(knots((x, y, top + 1.0), (x, y, top + HANG_M - 0.02)))
+    assert (refused.value.reason, refused.value.detail) == (Reason.KEEP_OUT, row)
+    assert refusal(check, (x, y, top + 1.0), (x, y, top + HANG_M + 0.02)) is Reason.NONE, "over the stakes"
+    bunk = PROFILE.bunk.center_m
+    assert refusal(check, (*bunk, top + 1.0), (*bunk, top + HANG_M - 0.3)) is Reason.NONE, "between them"
+
+
+def test_boxes_of_the_profile_are_turned_and_a_crane_inside_may_leave():
+    box = KeepOut((-1.8, 4.4, 0.5), (1.0, 0.1, 0.3), 0.7853981633974483)
+    check = WorkspaceCheck(msgspec.structs.replace(PROFILE, keep_out={"cabin": box}))
+    along, across = (-1.8 + 0.6, 4.4 + 0.6, 0.5), (-1.8 + 0.6, 4.4 - 0.6, 0.5)
+    high = (-1.8, 4.4, 1.6)
+    assert refusal(check, high, along) is Reason.KEEP_OUT
+    assert refusal(check, high, across) is Reason.NONE
+    assert refusal(check, along, high) is Reason.NONE and refusal(check, along, (-1.8, 4.4, 0.5)) is Reason.NONE
+
+
+def test_no_more_knots_than_promised_are_checked_and_the_last_always(monkeypatch):
+    asked = []
+    check = WorkspaceCheck(PROFILE)
+    monkeypatch.setattr(
+        "controller.crane.workspace_check.pin_position", lambda kin, q: asked.append(q) or pin_position(kin, q)
+    )
+    for n in range(1, 17):
+        asked.clear()
+        path = knots(*[(x * 0.01 - 1.8, 4.4, 0.5) for x in range(n)])
+        check.check(path)
+        assert len(asked) <= 1 + MAX_KNOTS_CHECKED
+        assert n == 1 or path[-1].position in asked
+
+
+def test_the_controller_refuses_such_a_setpoint_and_keeps_what_it_does():
+    bench = Bench().armed()
+    bench.tick([bench.hold()])
+    box = pin_position(KIN, bench.q)
+    keep_out = {"pole": KeepOut((box[0], box[1], box[2] - 0.5), (0.05, 0.05, 0.05))}
+    profile = msgspec.structs.replace(PROFILE, keep_out=keep_out)
+    bench = Bench(Settings(profile, profile_hash(profile), profile.rate_hz)).armed()
+    bench.tick([bench.hold()])
+    start = list(bench.controller.reference_position)
+    down = [start[0], start[1] - 0.02, *start[2:]]
+    refused = bench.controller.gate.refused
+    bench.tick([bench.setpoint([(0, start, STILL), (1000, down, STILL)])])
+    assert bench.controller.gate.refusal is Reason.KEEP_OUT and bench.controller.gate.refused == refused + 1
+    assert bench.mode is Mode.ACTIVE
+    up = [start[0], start[1] + 0.02, *start[2:]]
+    bench.tick([bench.setpoint([(0, start, STILL), (1000, up, STILL)])])
+    assert bench.controller.gate.refused == refused + 1
+
+
+@pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
+def test_work_places_of_the_shipped_machines_stay_free(name):
+    """The pin over every place where logs lie and in the bunk, as low as the closed jaws just reach the ground."""
+    profile = load_profile(name)
+    check, site, bunk = WorkspaceCheck(profile), profile.workspace, profile.bunk
+    jaws = max(profile.grapple.jaws.tip_below_pin_m) - 0.35
+    x, y = site.pick_center_m
+    spread = (-site.pick_half_size_m, 0.0, site.pick_half_size_m)
+    places = [(x + a, y + b, site.ground_z_m + jaws) for a, b in itertools.product(spread, spread)]
+    places += [(*bunk.center_m, bunk.floor_z_m + jaws)]
+    tried = 0
+    for place in places:
+        try:
+            start, end = (solve(profile, place[0], place[1], z) for z in (place[2] + 1.0, place[2]))
+        except Unreachable:
+            continue
+        check.check([Knot(0, (*start, 0.0), STILL), Knot(50_000_000, (*end, 0.0), STILL)])
+        tried += 1
+    assert tried > 5

@@ -1,0 +1,121 @@
+"""A crane at full speed in lockstep when its planner freezes, when it is stopped hard, when a valve sticks open."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
+from can_dbc.messages.datagrams import encode
+from machine.geometry.kinematics import max_reach_m
+from machine.joints import Joint
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.profile import joint
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.hil.sweep import LEASE_NS, Quiet, Sweep, Watched, watched
+
+pytestmark = [pytest.mark.slow, pytest.mark.computed]
+MS = 1_000_000
+NAMES = ("palms_471", "aoro_fc8")
+
+
+def full_speed(run: Watched, planner: Sweep) -> bool:
+    """Whether the joint has come to 95 % of its speed limit."""
+    spec = joint(planner.profile, planner.j)
+    return bool(run.reports) and abs(run.reports[-1].velocity[planner.j]) > 0.95 * spec.speed_limit
+
+
+def press(run: Watched, action: OperatorAction, sequence: int = 1000) -> None:
+    name = run.plant.profile
+    run.system._pressed.append(encode(OperatorCommand(sequence, profile_hash(name), run.system.now_ns, action)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_planner_that_freezes_at_full_speed_costs_its_lease_and_a_ramp(name, record_property):
+    planner = Sweep(load_profile(name), Joint.SLEW, silent_s=2.0)
+    run = watched(name, planner)
+    try:
+        assert run.run(20.0, lambda: planner.last_ns and run.system.now_ns > planner.last_ns + 60 * MS)
+        assert full_speed(run, planner)
+        begin, turned = run.tip(), run.reports[-1].position[Joint.SLEW]
+        assert run.run(2.0, lambda: run.mode == Mode.STOP) and run.reason == Reason.LEASE_LOST
+        run.run(0.6, lambda: run.neutral_since_ns)
+        ramp_ns = planner.profile.timeouts.stop_ramp_ms * MS
+        neutral_ns = run.neutral_since_ns - planner.last_ns
+        assert LEASE_NS + ramp_ns // 2 < neutral_ns <= LEASE_NS + ramp_ns + 10 * MS
+        run.run(4.0)
+        travel_rad = abs(run.reports[-1].position[Joint.SLEW] - turned)
+        spec = joint(planner.profile, Joint.SLEW)
+        record_property("neutral_ms", neutral_ns / MS)
+        record_property("tip_m", math.dist(begin, run.tip()))
+        record_property("slew_rad", travel_rad)
+        record_property("tip_at_full_reach_m", travel_rad * max_reach_m(planner.profile))
+        print(name, run.reports[-1].mode, neutral_ns / MS, math.dist(begin, run.tip()), travel_rad)
+        still_s = (LEASE_NS + ramp_ns) * 1e-9 + spec.valve.delay_s + spec.valve.lag_s + spec.valve.oil_s
+        assert travel_rad < spec.speed_limit * still_s
+        assert (run.mode, run.reason) == (Mode.STOP, Reason.LEASE_LOST), "and nothing is said to run away"
+    finally:
+        run.plant.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("j", [Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT])
+def test_a_hard_stop_at_full_speed_rings_and_nothing_is_said_to_run_away(name, j):
+    planner = Sweep(load_profile(name), j, silent_s=20.0)
+    run = watched(name, planner, seed=2 + j)
+    try:
+        assert run.run(20.0, lambda: full_speed(run, planner)), run.reports[-1]
+        press(run, OperatorAction.STOP)
+        run.run(8.0)
+        assert (run.mode, run.reason) == (Mode.STOP, Reason.OPERATOR_STOP)
+    finally:
+        run.plant.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("share", [0.04, 0.3, 1.0])
+def test_a_valve_stuck_open_is_cut_while_armed_and_while_stopped(name, share, record_property):
+    run = watched(name, Quiet(), seed=4)
+    spec = joint(run.plant.profile, Joint.SLEW)
+    try:
+        assert run.run(20.0, lambda: run.mode == Mode.ARMED)
+        run.run(3.0)
+        assert run.mode == Mode.ARMED
+        deadband = 0.01 * spec.valve.deadband_plus_pct
+        opening = deadband + (1.0 - deadband) * share * spec.speed_limit / spec.valve.full_speed_plus
+        begin, since_ns = run.tip(), run.system.now_ns
+        run.plant.stuck = {"slew": opening}
+        assert run.run(3.0, lambda: run.mode == Mode.FAULT) and run.reason == Reason.JOINT_RUNAWAY
+        found_ms = (run.system.now_ns - since_ns) / MS
+        travel_m = math.dist(begin, run.tip())
+        record_property("found_ms", found_ms)
+        record_property("travel_m", travel_m)
+        print(name, share, found_ms, travel_m)
+        assert travel_m < 0.20
+    finally:
+        run.plant.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hand_levers_move_a_machine_in_standby_without_a_fault(name):
+    run = watched(name, Quiet(), seed=5)
+    try:
+        assert run.run(20.0, lambda: run.mode == Mode.ARMED)
+        press(run, OperatorAction.DISARM)
+        run.system.operator._max_stops = -1  # nobody arms it again
+        run.run(2.5)
+        assert run.mode == Mode.STANDBY
+        begin = run.reports[-1].position[Joint.SLEW]
+        seen = set()
+        for _ in range(10):
+            run.plant.lever("slew", 0.4)
+            run.run(0.25)
+            seen |= {r.reason & 0xFF for r in run.reports[-10:]}
+        assert abs(run.reports[-1].position[Joint.SLEW] - begin) > 0.1
+        assert run.mode == Mode.STANDBY and Reason.JOINT_MOVES in seen
+        run.run(4.0)
+        assert run.reason == Reason.NONE
+    finally:
+        run.plant.close()
