@@ -3,11 +3,11 @@
 Inputs: the mode, the commands and spools of the last tick, the joints' estimates.  Output: reactions of the supervisor.
 
 Armed (ARMED, ACTIVE): a joint that does not follow, runs away or goes backwards, and an encoder that stands still while
-its joint is commanded to move.  A stop: a joint that does not come to rest.  Not armed: who moves the machine?  A valve
-that stuck open keeps it moving, and a person with a hand lever starts it again.  So a joint that has not stood since
-the controller let go is a fault (`MOVES_WHILE_STOPPED`), and so is every motion in STOP, where nobody has taken over;
-one that has stood and moves again in STANDBY or FAULT is shown and prevents arming, but does not cut the pilot supply,
-because the levers need it: "move it back by hand lever" is the advice after POSITION_OUTSIDE.
+its joint is commanded to move, or drifts.  A stop: a joint that does not come to rest.  Not armed: who moves the
+machine? A valve that stuck open keeps it moving, and a person with a hand lever starts it again.  So a joint that has
+not stood since the controller let go is a fault (`MOVES_WHILE_STOPPED`), and so is every motion in STOP, where nobody
+has taken over; one that has stood and moves again in STANDBY or FAULT is shown and prevents arming, but does not cut
+the pilot supply, because the levers need it: "move it back by hand lever" is the advice after POSITION_OUTSIDE.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from controller.crane.motion import Crane
+from controller.estimation.drift_monitor import DriftMonitor
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.estimation.sensed_joint import SensedJoint
@@ -38,7 +39,6 @@ STOOD_S: Final = 1.0
 """A joint has stood when it has stayed in its place for this long."""
 _NONE: Final = Reason.NONE
 _RUNAWAY: Final = Reason.JOINT_RUNAWAY
-_REVERSED: Final = Reason.JOINT_REVERSED
 _BOOT: Final = Mode.BOOT
 _STOP: Final = Mode.STOP
 
@@ -47,8 +47,8 @@ class JointWatch:
     """All monitors of the crane's joints."""
 
     __slots__ = (
-        "_crane", "_estimators", "_frozen_ticks", "_frozen_travel", "_monitors", "_period_s", "_sensed", "_standstill",
-        "_stood", "_travel", "_was_armed",
+        "_crane", "_drift", "_estimators", "_frozen_ticks", "_frozen_travel", "_monitors", "_period_s", "_sensed",
+        "_standstill", "_stood", "_travel", "_was_armed",
     )  # fmt: skip
 
     def __init__(
@@ -64,6 +64,7 @@ class JointWatch:
         self._period_s = period_s
         self._monitors = [MotionMonitor(s, period_s) for s in specs]
         self._standstill = [StandstillMonitor(s, period_s) for s in specs]
+        self._drift = [DriftMonitor(s, period_s) for s in specs]
         self._frozen_ticks = round(FROZEN_S / period_s)
         self._frozen_travel = [
             FROZEN_S_AT_LIMIT * s.speed_limit
@@ -79,6 +80,7 @@ class JointWatch:
         for j in range(N_JOINTS):
             self._monitors[j].reset()
             self._standstill[j].reset()
+            self._drift[j].reset()
             self._travel[j] = 0.0
 
     def step(self, supervisor: Supervisor, carrier_moves: bool, now_ns: int) -> None:
@@ -97,22 +99,35 @@ class JointWatch:
             if not estimator.known or estimator.jumped or supervisor.mode is _BOOT:
                 monitor.reset()
                 standstill.reset()
+                self._drift[j].reset()
                 self._travel[j] = 0.0
                 continue  # what an encoder did that jumped or was lost is no motion
+            neutral = crane.spools_pct[j] == 0.0
             reason = monitor.step(crane.commands[j], estimator.velocity)
-            if standstill.step(crane.spools_pct[j] == 0.0, shaken, estimator.position) and reason is _NONE:
+            if standstill.step(neutral, shaken, estimator.position):
                 reason = _RUNAWAY
             if supervisor.mode in OPERATING:
-                if self._frozen(j, monitor):
-                    reason = Reason.ENCODER_FROZEN
-                if reason is not _NONE:
-                    supervisor.react_to(reason, j, now_ns)
-                continue
-            if standstill.quiet_s < STOOD_S:
-                stands = False
-            if reason is _RUNAWAY or reason is _REVERSED:
-                moving = j
+                self._judge_encoder(supervisor, j, neutral, reason, now_ns)
+            else:
+                stands = stands and standstill.quiet_s >= STOOD_S
+                # During a stop's ramp the joint still shows what it was stopped for.
+                if reason is _RUNAWAY and not supervisor.ramping:
+                    moving = j
         self._settle(supervisor, moving, stands, now_ns)
+
+    def _judge_encoder(self, supervisor: Supervisor, j: int, neutral: bool, reason: Reason, now_ns: int) -> None:
+        """React to the finding about an armed joint, or to what its encoder shows besides."""
+        monitor = self._monitors[j]
+        drifts = self._drift[j].step(neutral, monitor.expected_velocity, self._estimators[j].position)
+        frozen = self._frozen(j, monitor)
+        if reason is _RUNAWAY:
+            supervisor.react_to(reason, j, now_ns)
+        elif frozen:
+            supervisor.react_to(Reason.ENCODER_FROZEN, j, now_ns)
+        elif reason is not _NONE:
+            supervisor.react_to(reason, j, now_ns)
+        elif drifts:
+            supervisor.react_to(Reason.ENCODER_DRIFT, j, now_ns)
 
     def _frozen(self, j: int, monitor: MotionMonitor) -> bool:
         """Whether the encoder stands still to the last count although its joint should have moved."""

@@ -27,9 +27,9 @@ FORGET_S: Final = 2.0
 CALM_S_AT_LIMIT: Final = 0.011
 """Distance while everything is calm: the way of this time at the speed limit.  It is ten times the noise of an estimate
 (0.2 mrad), and less than 3 % of the speed limit cover in 0.5 s."""
-SHAKEN_S_AT_LIMIT: Final = 0.06
+SHAKEN_S_AT_LIMIT: Final = 0.03
 """Distance while something else moves: a grapple that swings by 0.1 rad turns the slew by 5 mrad on its oil."""
-HOLD_S: Final = 0.25
+HOLD_S: Final = 0.15
 """Time at the distance that makes a runaway; at twice the distance half of it."""
 REST_S: Final = 0.5
 """A joint that has gone no further, as far as its noise lets tell, for this time rests, wherever it is; the noise over

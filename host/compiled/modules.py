@@ -50,6 +50,7 @@ MODULES: Final = (
     "controller.crane.trajectory",
     "controller.crane.trajectory_check",
     "controller.crane.workspace_check",
+    "controller.estimation.drift_monitor",
     "controller.estimation.joint_estimator",
     "controller.estimation.load_estimator",
     "controller.estimation.motion_monitor",

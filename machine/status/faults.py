@@ -118,6 +118,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
         "The encoder of {} is much noisier than its profile says; half speed",
         "Check its shield, supply and coupling.",
     ),
+    Reason.ENCODER_DRIFT: Fault(
+        Reaction.HOLD,
+        3000,
+        _J,
+        "{} creeps by its encoder while its valve is shut, and its law pulls it back again and again",
+        "Compare the joint with its encoder: it drifts, or the valve leaks; then arm.",
+    ),
     Reason.ENCODER_ALARM: Fault(
         Reaction.RAMP, 20, _J, "The encoder of {} reports an alarm", "Read objects 6503h or 5122h, then reset."
     ),

@@ -90,6 +90,7 @@ class Reason(IntEnum):
     ENGINE_LOST = 46
     ENCODER_FROZEN = 47
     ENCODER_NOISY = 48
+    ENCODER_DRIFT = 49
 
     BUS_OFF = 50
     BUS_DOWN = 51

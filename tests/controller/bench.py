@@ -137,6 +137,9 @@ class Bench:
         self.frozen_counts: set[int] = set()
         """Encoders that give their last count for ever, with a time stamp that runs on."""
         self.last_counts: dict[int, int] = {}
+        self.encoder_drift: dict[int, float] = {}
+        """How fast an encoder's zero moves [rad/s, m/s]."""
+        self.encoder_error: dict[int, float] = {}
         self.specs = [joint(settings.profile, j) for j in JOINTS]
         self.carrier = settings.profile.carrier
         self.articulation_rad = 0.0
@@ -242,6 +245,9 @@ class Bench:
         if place in self.frozen_counts:
             return self.last_counts[place]
         position = self.q[place] if place < N_JOINTS else self.articulation_rad
+        if place in self.encoder_drift:
+            self.encoder_error[place] = self.encoder_error.get(place, 0.0) + self.encoder_drift[place] * T * 1e-9
+            position += self.encoder_error[place]
         if self.dither is not None:
             position += self.dither.gauss(0.0, self.noise_factor.get(place, 1.0) * encoder.noise)
         elif place in self.stuck:  # a live encoder flickers on a joint that does not move

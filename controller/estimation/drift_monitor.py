@@ -1,0 +1,51 @@
+"""Drift monitor: does a joint creep away, by its encoder, while its valve is shut?  (docs/reference/safety.md case 3)
+
+An encoder that drifts slowly looks like a joint that moves.  While the reference stands, the law pulls the joint back
+by small pulses (`controller.laws.end_positioning`), so that the error stays small and nothing else shows: the real
+joint wanders with the drift.  What shows is that the joint goes one way whenever its valve is shut and is commanded the
+other way whenever it is open.  Both ways are summed in leaky integrals.  A valve that leaks as fast looks the same, and
+deserves the same.  While the reference moves, the valve is open and the monitor is blind.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from controller.estimation.joint_estimator import TrackedJoint
+
+MEMORY_S: Final = 3.0
+SHUT_S: Final = 0.4
+"""What a joint does until this time after its valve has shut belongs to the command before."""
+DRIFT_S_AT_LIMIT: Final = 0.012
+DRIFT_NOISES: Final = 4.0
+"""A drift is further than the way of the first at the speed limit and this many times noise and resolution, ..."""
+COMMANDED_SHARE: Final = 0.3
+"""... and the command went at least this share of it the other way: the gain of small pulses is known badly."""
+
+
+class DriftMonitor:
+    """Monitors one joint; `step` tells whether it drifts."""
+
+    __slots__ = ("_alone", "_before", "_commanded", "_decay", "_limit", "_period_s", "_shut_s")
+
+    def __init__(self, spec: TrackedJoint, period_s: float) -> None:
+        encoder = spec.encoder
+        noise = 0.0 if encoder is None else encoder.noise + encoder.unit_per_count
+        self._limit = DRIFT_S_AT_LIMIT * spec.speed_limit + DRIFT_NOISES * noise
+        self._period_s, self._decay = period_s, math.exp(-period_s / MEMORY_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing has moved yet."""
+        self._alone = self._commanded = self._before = self._shut_s = 0.0
+
+    def step(self, neutral: bool, expected_velocity: float, position: float) -> bool:
+        """One period: is the valve ``neutral``, the velocity that the command lets expect, and the position."""
+        self._shut_s = self._shut_s + self._period_s if neutral else 0.0
+        moved = position - self._before if self._shut_s > SHUT_S else 0.0
+        self._before = position
+        self._alone = alone = self._decay * self._alone + moved
+        self._commanded = self._decay * self._commanded + self._period_s * expected_velocity
+        against = -self._commanded if alone > 0.0 else self._commanded
+        return abs(alone) > self._limit and against > COMMANDED_SHARE * abs(alone)
