@@ -46,7 +46,10 @@ _HEARTBEATS: Final = (Reason.SAFETY_NODE_LOST, Reason.ENCODER_NODE_LOST, Reason.
 _EMERGENCIES: Final = (Reason.EMERGENCY_MESSAGE, Reason.EMERGENCY_WARNING)
 _BUS_STATES: Final = (Reason.BUS_OFF, Reason.BUS_DOWN, Reason.BUS_PASSIVE)
 _LATE: Final = (Reason.LOOP_LATE, Reason.LOOP_STALLED)
-_MOTIONS: Final = (Reason.JOINT_STUCK, Reason.JOINT_RUNAWAY, Reason.JOINT_REVERSED)
+_MOTIONS: Final = (
+    Reason.JOINT_STUCK, Reason.JOINT_RUNAWAY, Reason.JOINT_REVERSED, Reason.MOVES_WHILE_STOPPED, Reason.ENCODER_FROZEN,
+    Reason.ENCODER_NOISY, Reason.ENCODER_DRIFT,
+)  # fmt: skip
 _STEERINGS: Final = (Reason.STEERING_STUCK, Reason.STEERING_RUNAWAY)
 _SPEEDS: Final = (Reason.CARRIER_RUNAWAY, Reason.CARRIER_STUCK)
 _ARMS: Final = (Reason.ARM_OUTSIDE, Reason.ARM_STUCK)
@@ -138,6 +141,9 @@ class Evidence:
             crane, vehicle = self._crane, self._vehicle
             gate = self._gate if crane.leased or vehicle is None else vehicle.gate
             return float(gate.refused), _NAN, float(pack(gate.refusal, gate.detail))
+        moment = self._crane.load_moment
+        if reason is Reason.OVERLOAD and moment is not None:
+            return moment.last_nm, moment.limit_nm, self._crane.load_kg
         if detail < len(self._estimators):
             found = self._joint(reason, detail)
             if found:

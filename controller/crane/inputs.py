@@ -24,7 +24,7 @@ _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "
 
 
 def sample_timeout_ns(profile: Profile) -> int:
-    """After this long without a new sample an encoder behind a PLC is lost; 0 without one: the DBC's time-out counts."""
+    """An encoder behind a PLC is lost after this long without a new sample; 0: no PLC, the DBC's time-out counts."""
     return 0 if profile.plc is None else LOST_SAMPLES * round(profile.plc.sample_ms * 1e6)
 
 

@@ -33,23 +33,24 @@ AHEAD_TOLERANCE_M: Final = 0.0005
 
 
 class LoadMoment:
-    """The judgement of one machine: ``overloaded`` now."""
+    """The judgement of one machine: ``overloaded`` now; the moment that was judged last, and its limit [Nm]."""
 
-    __slots__ = ("_above", "_ahead", "_kinematics", "_limit_nm", "_stability", "_yaw_rad", "overloaded")
+    __slots__ = ("_above", "_ahead", "_kinematics", "_stability", "_yaw_rad", "last_nm", "limit_nm", "overloaded")
 
     def __init__(self, profile: Profile, stability: Stability) -> None:
         self._kinematics, self._stability = profile.kinematics, stability
         yaw_rad = 0.0 if profile.carrier is None else profile.carrier.crane_yaw_rad
         self._yaw_rad = yaw_rad + profile.kinematics.theta1_offset_rad
-        self._limit_nm = stability.share * stability.stabilising_nm
+        self.limit_nm = stability.share * stability.stabilising_nm
+        self.last_nm = 0.0
         self._above = 0
         self._ahead = [0.0] * N_JOINTS
         self.overloaded = False
 
     def update(self, position: Sequence[float], load_kg: float, roll_rad: float, pitch_rad: float) -> None:
         """Judge joint positions, load and inclination (+ right side down, + nose up; 0 where it is not measured)."""
-        moment_nm = self.moment_nm(position, load_kg, roll_rad, pitch_rad)
-        limit_nm = RELEASE_SHARE * self._limit_nm if self.overloaded else self._limit_nm
+        moment_nm = self.last_nm = self.moment_nm(position, load_kg, roll_rad, pitch_rad)
+        limit_nm = RELEASE_SHARE * self.limit_nm if self.overloaded else self.limit_nm
         # A moment that is not known (NaN) is no overload: the encoders' own checks stop the machine.
         self._above = self._above + 1 if moment_nm > limit_nm else 0
         self.overloaded = self._above >= CONFIRMATIONS or (self.overloaded and self._above > 0)

@@ -2,8 +2,8 @@
 
 Pure, and safe by absence like every valve node: a command that moves needs ValveCmdA and B with the arm key, the
 guard's enable, SYNC, and the PLC's measurements, all fresh, and no command late by its number; in role REFERENCES also
-the three reference frames.  After a loss while armed, and when a conversation with the PLC begins, it stays neutral until the controller
-has disarmed.  A command beyond the PLC's limits is refused, never clamped.
+the three reference frames.  After a loss while armed, and when a conversation with the PLC begins, it stays neutral
+until the controller has disarmed.  A command beyond the PLC's limits is refused, never clamped.
 """
 
 from __future__ import annotations

@@ -15,12 +15,13 @@ from machine.joints import Joint
 from machine.status.reasons import Reason
 
 _MS: Final = "ms"
-_RAD, _RAD_S, _M, _M_S = "rad", "rad/s", "m", "m/s"
+_RAD, _RAD_S, _M, _M_S, _NM, _KG = "rad", "rad/s", "m", "m/s", "Nm", "kg"
 _UNIT, _UNIT_S = "joint", "joint/s"
 """rad or m, by the joint that the detail names."""
 _COUNT, _BITS, _REASON = "", "bits", "reason"
 _SHOWN: Final = {_RAD: (180.0 / math.pi, 2, "°"), _RAD_S: (180.0 / math.pi, 2, "°/s"), _M: (1.0, 3, " m"),
-                 _M_S: (1.0, 3, " m/s"), _MS: (1.0, 1, " ms")}  # fmt: skip
+                 _M_S: (1.0, 3, " m/s"), _MS: (1.0, 1, " ms"),
+                 _NM: (1e-3, 1, " kNm"), _KG: (1.0, 0, " kg")}  # fmt: skip
 """By unit: factor, decimals and mark for a person."""
 
 
@@ -97,6 +98,11 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.JOINT_STUCK: _MOTION,
     Reason.JOINT_RUNAWAY: _MOTION,
     Reason.JOINT_REVERSED: _MOTION,
+    Reason.MOVES_WHILE_STOPPED: _MOTION,
+    Reason.ENCODER_FROZEN: _MOTION,
+    Reason.ENCODER_NOISY: _MOTION,
+    Reason.ENCODER_DRIFT: _MOTION,
+    Reason.OVERLOAD: Measurement("moment about the tipping line", _NM, "limit", "load", _KG),
     Reason.TEST_RANGE: Measurement("position", _UNIT, "end of the range"),
     Reason.TEST_SPEED: Measurement("velocity", _UNIT_S, "speed limit"),
     Reason.POSITION_LOST: _age("the last good position"),

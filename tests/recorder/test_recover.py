@@ -80,9 +80,7 @@ def test_a_flipped_byte_ends_the_valid_part(whole, tmp_path):
     assert 0 < len(kept) < TICKS and kept == [tick(k) for k in range(len(kept))]
 
 
-@pytest.mark.parametrize(
-    "damage", ["message without its header", "longer than its chunk", "unknown channel", "huge"]
-)
+@pytest.mark.parametrize("damage", ["message without its header", "longer than its chunk", "unknown channel", "huge"])
 def test_damaged_records_with_good_checksums_end_the_valid_part(tmp_path, damage):
     """A chunk may hold anything under a checksum that fits."""
     message = struct.pack("<HIQQ", 7, 0, 1, 1) + b"data"
