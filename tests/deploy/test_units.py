@@ -15,6 +15,7 @@ from autonomy.__main__ import arguments as autonomy_arguments
 from controller.plc.__main__ import parser as plc_parser
 from controller.process.command import parser as controller_parser
 from timberhand.service_status.status import SERVICE_PAGE
+from timberhand.why.stops import SERVICE_STOPS
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 UNITS = sorted((DEPLOY / "units").glob("*.service"))
@@ -193,6 +194,11 @@ def test_every_option_that_the_settings_explain_exists() -> None:
     for name in ("recorder", "console"):
         given = words(DEPLOY / f"units/timberhand-{name}.service")
         assert given[given.index("--timing") + 1] == str(SERVICE_PAGE)
+
+
+def test_the_stops_of_the_service_lie_where_everyone_looks_for_them() -> None:
+    given = words(DEPLOY / "units/timberhand-recorder.service")
+    assert given[given.index("--stops") + 1] == str(SERVICE_STOPS) and "--journal" in given
 
 
 def test_the_target_starts_and_stops_every_process() -> None:
