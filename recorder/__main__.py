@@ -165,7 +165,7 @@ def write_all(recorder: Recorder, inputs: InputCollector) -> None:
         if now >= flush_at:
             recorder.flush(time.monotonic_ns())
             flush_at = time.monotonic() + FLUSH_PERIOD_S
-        lost = recorder.dropped + inputs.dropped
+        lost = recorder.lost + inputs.dropped
         if lost > reported and now >= report_after_s:
             report(f"{lost} records could not be written so far; free space on the disk")
             reported, report_after_s = lost, now + 1.0

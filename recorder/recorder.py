@@ -115,6 +115,11 @@ class Recorder:
             ) from error
         self._stops = StopRecorder(StopFiles(stops or directory / STOPS_NAME, self._durable), manifest, key, on_stop)
 
+    @property
+    def lost(self) -> int:
+        """Records and stops that could not be written."""
+        return self.dropped + self._stops.dropped
+
     def on_frame(self, bus: str, frame: Frame, sent_by: str = "") -> None:
         """Records a frame on ``bus``; ``sent_by`` names the sender if it is known."""
         stamp_ns, key, data = frame
@@ -192,8 +197,7 @@ class Recorder:
                 self._abandon()
         for text in self._text.values():
             text.close()
-        dropped = self.dropped + self._stops.dropped
-        complete = msgspec.structs.replace(self._manifest, complete=True, dropped=dropped)
+        complete = msgspec.structs.replace(self._manifest, complete=True, dropped=self.lost)
         try:
             manifests.write(self._directory, complete)
         except OSError:

@@ -20,6 +20,7 @@ from can_dbc.messages.tick_record import decode
 from hil.replay.recording import manifest_of, messages
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
+from recorder import manifest as manifests
 from recorder import stop_files
 from recorder import stop_recorder as stop_recorder_module
 from recorder.mcap_scan import is_complete
@@ -260,7 +261,7 @@ def test_a_full_disk_costs_the_file_and_nothing_else(tmp_path: Path, monkeypatch
     bench.lose("GuardStat", 100)
     recorder.close()
     assert [stop_of(path).code for path in files_in(tmp_path / "stops")] == ["GUARD_LOST"]
-    assert recorder._stops.dropped == 1
+    assert recorder.lost == 1 and manifests.read(tmp_path).dropped == 1
 
 
 def test_a_directory_that_cannot_be_made_costs_the_stops_only(tmp_path: Path) -> None:
@@ -270,7 +271,7 @@ def test_a_directory_that_cannot_be_made_costs_the_stops_only(tmp_path: Path) ->
     bench.active(ticks=20)
     bench.lose("EncLift", 20)
     recorder.close()
-    assert recorder._stops.dropped == 1 and is_complete(tmp_path / "run" / "run.mcap")
+    assert recorder.lost == 1 and is_complete(tmp_path / "run" / "run.mcap")
 
 
 def test_live_a_stop_has_the_time_of_day_and_is_announced_at_once(tmp_path: Path) -> None:

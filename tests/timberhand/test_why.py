@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import json
 import lzma
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from can_dbc.messages.crane import OperatorAction
 from controller.process.tick_recording import record
 from host.exit_codes import CommandFailed, ExitCode
+from machine.status.reasons import Reason
 from recorder.stop_files import files_in
+from tests.controller.bench import SETTINGS, Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 from timberhand.cli import app
+from timberhand.why.screen import show
 from timberhand.why.stops import find_stops
 from timberhand.why.timeline import events_of
 
@@ -179,10 +186,6 @@ def test_a_run_with_a_key_needs_it_for_a_recording_only(tmp_path: Path) -> None:
 
 def keyed_run(tmp_path: Path) -> Path:
     """A recording of a controller whose datagrams are authenticated."""
-    from dataclasses import replace
-
-    from tests.controller.bench import SETTINGS, Bench
-
     recorder = recorder_in(tmp_path / "run")
     bench = Bench(replace(SETTINGS, key=b"0123456789abcdef"))
     for _ in range(20):
@@ -190,3 +193,19 @@ def keyed_run(tmp_path: Path) -> Path:
         recorder.on_tick(record(bench.inputs, outputs, bench.now_ns))
     recorder.close()
     return tmp_path / "run"
+
+
+@pytest.mark.parametrize(
+    ("reason", "numbers", "line"),
+    [
+        (Reason.PERSON_IN_ZONE, (None, None, None), "no number belongs to this reason"),
+        (Reason.GUARD_LOST, (None, None, None), "unknown"),
+        (Reason.GUARD_LOST, (), "not recorded; the recording is of an earlier release"),
+    ],
+)
+def test_missing_numbers_are_explained(run: Path, reason: Reason, numbers: tuple[None, ...], line: str) -> None:
+    (found,) = find_stops(run, newest=True)
+    stop = msgspec.structs.replace(found.stop, reason=int(reason), code=reason.name, numbers=numbers)
+    text = io.StringIO()
+    show(Console(file=text, width=120), replace(found, stop=stop), [])
+    assert f"  measured    {line}\n" in text.getvalue()

@@ -8,8 +8,9 @@ from typing import Any, Final
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
+from machine.status.evidence import EVIDENCE
+from machine.status.reasons import Reason
 from recorder.stop import Stop
 from timberhand.why.stops import FoundStop
 from timberhand.why.timeline import Event
@@ -33,14 +34,14 @@ def show(console: Console, found: FoundStop, events: Sequence[Event]) -> None:
     style = _STYLES.get(stop.mode, "bold")
     head = f"[{style}]{stop.mode}[/] {when(stop)}, {stop.mode_before} before, {escape(found.manifest.profile)}"
     _line(console, head)
-    facts = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-    facts.add_column(style="dim", no_wrap=True)
-    facts.add_column()
-    measured = "\n".join(quantity.text for quantity in explained.quantities) or "no number belongs to this reason"
-    rows = {"code": explained.code, "what": explained.sentence, "measured": measured, "what to do": explained.advice}
-    for name, text in rows.items():
-        facts.add_row(f"  {name}", escape(text))
-    console.print(facts)
+    for name, lines in (
+        ("code", [explained.code]),
+        ("what", [explained.sentence]),
+        ("measured", _measured(stop)),
+        ("what to do", [explained.advice]),
+    ):
+        for number, line in enumerate(lines):
+            _line(console, f"  [dim]{'' if number else name:<12}[/]{escape(line)}")
     _line(console, "[dim]  what happened[/]")
     kept = sorted(sorted(events, key=lambda event: abs(event.at_s))[:MAX_EVENTS])
     for event in kept:
@@ -50,6 +51,15 @@ def show(console: Console, found: FoundStop, events: Sequence[Event]) -> None:
     if len(kept) < len(events):
         _line(console, f"  {len(events) - len(kept)} more events are in --json")
     _line(console, f"[dim]  recorded in[/]  {escape(str(found.source))}")
+
+
+def _measured(stop: Stop) -> list[str]:
+    """The numbers, one a line, or why there are none."""
+    if found := [quantity.text for quantity in stop.explanation.quantities]:
+        return found
+    if Reason(stop.reason & 0xFF) not in EVIDENCE:
+        return ["no number belongs to this reason"]
+    return ["unknown" if stop.numbers else "not recorded; the recording is of an earlier release"]
 
 
 def _line(console: Console, markup: str) -> None:
