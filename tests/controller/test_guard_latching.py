@@ -100,10 +100,13 @@ lies = st.fixed_dictionaries(
         "slew_counts": st.sampled_from([CENTRE] * 3 + [CENTRE - 5200, CENTRE + 5200]),
         "gone": st.sampled_from([set()] * 5 + [{"EncLift"}, {"EstopStat"}, {"ValveCmdA"}]),
         "skip": st.sampled_from([0, 0, 0, 1, 2, 7]),
+        "mode": st.sampled_from([3, 3, 3, 2, 4]),
+        "person": st.sampled_from([0, 0, 0, 0, 1]),
+        "lift_spool": st.sampled_from([0.0, 0.0, 0.0, 30.0]),
     }
 )  # fmt: skip
 NEUTRAL_LIE = {"a": dict(GOOD_A), "b": dict(GOOD_B), "ticks": 60, "channels": (1, 1), "reset": False,
-               "slew_counts": CENTRE, "gone": set(), "skip": 0}  # fmt: skip
+               "slew_counts": CENTRE, "gone": set(), "skip": 0, "mode": 3, "person": 0, "lift_spool": 0.0}  # fmt: skip
 
 
 @given(st.lists(st.one_of(lies, st.just(NEUTRAL_LIE)), max_size=12))
@@ -115,7 +118,8 @@ def test_a_controller_that_lies_in_every_field_moves_nothing_outside_the_promise
     for lie in episodes:
         traffic.a, traffic.b = dict(lie["a"]), dict(lie["b"])
         a, b = lie["channels"]
-        traffic.estop = {"ChannelA": a, "ChannelB": b, "ResetReq": int(lie["reset"])}
+        traffic.estop = {"ChannelA": a, "ChannelB": b, "ResetReq": int(lie["reset"]), "Person": lie["person"]}
+        traffic.controller, traffic.valve_a = {"Mode": lie["mode"]}, {"SpoolLift": lie["lift_spool"]}
         traffic.encoder["EncSlew"] = lie["slew_counts"]
         traffic.dropped = set(lie["gone"])
         traffic.senders["ValveCmdA"].counter += lie["skip"]
@@ -141,6 +145,10 @@ def test_a_controller_that_lies_in_every_field_moves_nothing_outside_the_promise
             assert not lie["b"].get("Aux") and None not in {**lie["a"], **lie["b"]}.values()
             moves = spools or lie["b"].get("GrappleMode") in (1, 2)
             assert not moves or lie["b"]["ArmKey"] == 0xA
+            assert not moves or lie["mode"] in (2, 3) or k * T <= 220 * MS, "the controller says that it has stopped"
+            assert not moves or not lie["person"] or not seen or k * T <= 320 * MS
+            lifts = spools.get("Lift", 0.0) > 0.0 or k * T <= 260 * MS
+            assert not lie["lift_spool"] or lifts, "a spool is open, and nobody commands it"
             assert not spools or since_encoder * T <= 100 * MS
             side = (lie["slew_counts"] > CENTRE) - (lie["slew_counts"] < CENTRE)
             assert side * spools.get("Slew", 0.0) <= 0.0, "driven further out"
