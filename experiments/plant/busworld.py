@@ -69,12 +69,13 @@ class BusWorld:
     def _slow(self, spools: Sequence[float], drive: Drive, articulation_rad_s: float) -> list[tuple[int, bytes]]:
         pct = {n: 100.0 * u for n, u in zip(self._world.functions, spools, strict=True)}
         brake = 100.0 if drive.brake else 0.0
+        key = ARM_KEY if self._steps > SLOW_STEPS else 0  # a controller starts disarmed
         arms = (pct[name] for name in ("arm_fl", "arm_fr", "arm_rl", "arm_rr"))
         return [
             self._alive.frame(ARM_KEY, 0, 0, 0),
-            self._vehicle.frame(ARM_KEY, articulation_rad_s, drive.speed_m_s, brake),
-            self._arms_a.frame(ARM_KEY, *arms),
-            self._arms_b.frame(ARM_KEY, 0, 0),
+            self._vehicle.frame(key, articulation_rad_s, drive.speed_m_s, brake),
+            self._arms_a.frame(key, *arms),
+            self._arms_b.frame(key, 0, 0),
         ]
 
     def _pass(self, frames: list[tuple[str, int, bytes]]) -> None:

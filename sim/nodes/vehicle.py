@@ -87,8 +87,7 @@ class VehicleNode(J1939Node):
         command = self._command
         fresh = command.fresh(now_ns, COMMAND_NS) and not command.late
         guarded = self._guard.fresh(now_ns, GUARD_NS) and self._guard.get("Enable") == ARM_KEY
-        pilot = self._pilot_on()
-        if self.active and not pilot:
+        if not self._pilot_on():
             self.fault = VehicleFault.SAFETY_STOP
         elif self.active and not fresh:
             self.fault = VehicleFault.COMMAND_TIMEOUT
@@ -98,7 +97,6 @@ class VehicleNode(J1939Node):
         self.active = (
             not self.fault
             and not self.address_lost
-            and pilot
             and fresh
             and guarded
             and values is not None

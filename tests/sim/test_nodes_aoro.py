@@ -43,6 +43,7 @@ class Bench:
         self._senders = {m.name: Sender(m.data_ids) for d in databases for m in d.messages.values() if m.data_ids}
         self.sent: list[tuple[str, int, bytes]] = []
         self.exchange([("crane0", *nmt_frame(NmtCommand.START))], 0)
+        self.cycle(2, key=0)  # as a controller starts
 
     def exchange(self, frames: list[tuple[str, int, bytes]], advance_ns: int) -> None:
         received = [(bus, Frame(self.now_ns, key, data)) for bus, key, data in frames]

@@ -32,7 +32,7 @@ class Bench:
 
     def __init__(self, make) -> None:
         self.out: list[tuple[int, bytes]] = []
-        self.pilot = True
+        self.pilot = self.guard = True
         self.node = make(self.out, lambda: self.pilot)
         self.now_ns = 1_000_000_000
         self._senders = {m.name: Sender(m.data_ids) for m in MACHINE.messages.values() if m.data_ids}
@@ -43,7 +43,9 @@ class Bench:
         self.node.receive(codec.key, self._senders[name].protect(codec.encode(0, 0, *values)), self.now_ns)
 
     def wait(self, ns: int) -> None:
-        for _ in range(ns // STEP_NS):
+        for k in range(ns // STEP_NS):
+            if self.guard and k * STEP_NS % T_NS == 0:
+                self.send("GuardAlive", 0xA, 0, 15, 0)
             self.now_ns += STEP_NS
             self.node.decide(self.now_ns)
             self.node.tick(self.now_ns)
@@ -237,6 +239,30 @@ def test_floating_both_axles_is_refused(arms):
     lift(arms, 1, key=0)
     lift(arms, 2, floats=(0, 1))
     assert arms.node.float_rear and not arms.node.float_front
+
+
+@pytest.mark.parametrize("enable", [None, 0, 0xB])
+def test_without_the_guard_vehicle_and_arms_stop_within_a_tenth_of_a_second(vehicle, arms, enable):
+    drive(vehicle)
+    lift(arms)
+    vehicle.guard = arms.guard = False
+    for _ in range(6 if enable is None else 1):
+        for bench in (vehicle, arms):
+            if enable is not None:
+                bench.send("GuardAlive", enable, 0, 15, 0)
+        drive(vehicle, 1)
+        lift(arms, 1)
+    assert vehicle.node.brake and vehicle.node.fault is VehicleFault.GUARD_MISSING
+    assert arms.node.spools == [0.0] * 4 and arms.node.state is ArmState.FAULT
+    vehicle.guard = arms.guard = True
+    drive(vehicle, 3)
+    lift(arms, 3)
+    assert vehicle.node.brake and arms.node.state is ArmState.FAULT, "until a frame disarms"
+    drive(vehicle, 1, key=0)
+    lift(arms, 1, key=0)
+    drive(vehicle, 2)
+    lift(arms, 2)
+    assert not vehicle.node.brake and arms.node.state is ArmState.ACTIVE
 
 
 def test_the_emergency_stop_holds_the_arms(arms):
