@@ -1,0 +1,224 @@
+"""The supervisor's limits, each at the last value that passes and at the first that does not."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from can_dbc.messages.crane import OperatorAction
+from controller.supervisor import (
+    DEGRADE_NS,
+    LATE_NS,
+    LATE_WINDOW_NS,
+    MAX_ECHO_NS,
+    MAX_ECHO_TICKS,
+    RAMP_NS,
+    RANGE_MARGIN_UNITS,
+    STALLED_NS,
+)
+from controller.transitions import Event
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import AORO, MACHINE, MS, PROFILE, SPECS, Bench, T
+
+NOW = 100 * 10**9
+
+
+def supervisor_in(mode: Mode):
+    made = Bench().controller.supervisor
+    made.mode = mode
+    return made
+
+
+def test_the_limits_are_those_of_the_documentation() -> None:
+    assert (RAMP_NS, DEGRADE_NS, LATE_NS, LATE_WINDOW_NS, STALLED_NS) == (60 * MS, 10**9, 10 * MS, 10**9, 50 * MS)
+    assert (MAX_ECHO_TICKS, MAX_ECHO_NS, RANGE_MARGIN_UNITS) == (4, 20 * MS, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "late_ns", "found"),
+    [
+        (1, 10 * MS, Reason.NONE), (1, 10 * MS + 1, Reason.LOOP_LATE), (5, 10 * MS, Reason.NONE),
+        (5, 10 * MS + 1, Reason.LOOP_LATE), (20, 40 * MS, Reason.NONE), (20, 40 * MS + 1, Reason.LOOP_LATE),
+        (5, 50 * MS, Reason.LOOP_LATE), (5, 50 * MS + 1, Reason.LOOP_STALLED), (5, 0, Reason.NONE),
+    ],
+)  # fmt: skip
+def test_lateness(period_ms: int, late_ns: int, found: Reason) -> None:
+    supervisor = supervisor_in(Mode.STANDBY)
+    supervisor.supervise(late_ns, period_ms * MS, NOW)
+    assert supervisor.worst is found
+    assert supervisor.late == int(found is not Reason.NONE)
+
+
+@pytest.mark.parametrize(("apart_ns", "found"), [(LATE_WINDOW_NS // 2, Reason.LOOP_LATE),
+                                                 (LATE_WINDOW_NS // 2 - 1, Reason.LOOP_STALLED)])  # fmt: skip
+def test_three_late_ticks_within_a_second(apart_ns: int, found: Reason) -> None:
+    supervisor = supervisor_in(Mode.STANDBY)
+    for k in range(3):
+        assert k == 0 or supervisor.worst is Reason.LOOP_LATE
+        supervisor.supervise(10 * MS + 1, T, NOW + k * apart_ns)
+    assert supervisor.worst is found
+    supervisor.supervise(10 * MS + 1, T, NOW + 10 * LATE_WINDOW_NS)
+    assert supervisor.worst is Reason.LOOP_LATE, "the old ones are forgotten"
+    assert supervisor.late == 4
+
+
+def test_half_speed_lasts_a_second() -> None:
+    supervisor = supervisor_in(Mode.ACTIVE)
+    supervisor.react_to(Reason.BUS_PASSIVE, 1, NOW)
+    assert supervisor.half_speed and (supervisor.mode, supervisor.reason) == (Mode.ACTIVE, Reason.BUS_PASSIVE)
+    assert supervisor.detail == 1
+    supervisor.react_to(Reason.NONE, 0, NOW + DEGRADE_NS - 1)
+    assert supervisor.half_speed
+    supervisor.react_to(Reason.NONE, 0, NOW + DEGRADE_NS)
+    assert not supervisor.half_speed
+
+
+@pytest.mark.parametrize("mode", [Mode.STANDBY, Mode.STOP, Mode.FAULT, Mode.BOOT])
+def test_half_speed_is_no_reason_while_nothing_is_armed(mode: Mode) -> None:
+    supervisor = supervisor_in(mode)
+    supervisor.react_to(Reason.BUS_PASSIVE, 1, NOW)
+    assert supervisor.half_speed and supervisor.reason is Reason.NONE and supervisor.mode is mode
+
+
+@pytest.mark.parametrize(
+    ("reason", "mode", "after"),
+    [
+        (Reason.ESTOP_PRESSED, Mode.STANDBY, Mode.FAULT), (Reason.GUARD_REFUSES, Mode.STANDBY, Mode.STANDBY),
+        (Reason.GUARD_REFUSES, Mode.ARMED, Mode.FAULT), (Reason.ENCODER_LOST, Mode.ARMED, Mode.FAULT),
+        (Reason.PERSON_IN_ZONE, Mode.ARMED, Mode.STOP), (Reason.PERSON_IN_ZONE, Mode.STANDBY, Mode.STANDBY),
+        (Reason.ENCODER_LOST, Mode.ACTIVE, Mode.STOP), (Reason.INPUT_MISSING, Mode.ACTIVE, Mode.ACTIVE),
+    ],
+)  # fmt: skip
+def test_a_finding_reacts_only_while_armed_unless_it_always_does(reason: Reason, mode: Mode, after: Mode) -> None:
+    supervisor = supervisor_in(mode)
+    supervisor.react_to(reason, 3, NOW)
+    assert supervisor.mode is after
+    if after is not mode:
+        assert (supervisor.reason, supervisor.detail) == (reason, 3)
+
+
+@pytest.mark.parametrize(
+    ("event", "ramp_ns"), [(Event.HOLD, PROFILE.timeouts.stop_ramp_ms * MS), (Event.RAMP, RAMP_NS)]
+)
+@pytest.mark.parametrize("coast_ns", [0, 700 * MS])
+def test_a_ramp_begins_and_ends_to_the_nanosecond(event: Event, ramp_ns: int, coast_ns: int) -> None:
+    supervisor = supervisor_in(Mode.ACTIVE)
+    supervisor.coast_ns = coast_ns
+    assert supervisor.apply(event, Reason.ENCODER_LOST, 2, NOW) is True
+    latches = event is Event.RAMP
+    assert (supervisor.mode, supervisor.ramping, supervisor.latching) == (Mode.STOP, True, latches)
+    assert (supervisor.ramp_ns, supervisor.ramp_end_ns) == (ramp_ns, NOW + ramp_ns)
+    end_ns = NOW + (ramp_ns if latches else max(ramp_ns, coast_ns))
+    assert supervisor.apply(event, Reason.LEASE_LOST, 0, NOW) is False, "a second one changes nothing"
+    for ask in (supervisor.request_disarm, supervisor.request_reset):
+        ask(end_ns - 1)
+    assert supervisor.request_arm(end_ns - 1) == (Reason.STILL_STOPPING, 0)
+    assert (supervisor.mode, supervisor.ramping) == (Mode.STOP, True)
+    for at_ns in (end_ns - 1, end_ns):
+        assert supervisor.ramping and supervisor.mode is Mode.STOP
+        _only_time(supervisor, at_ns)
+    assert not supervisor.ramping
+    assert supervisor.mode is (Mode.FAULT if latches else Mode.STOP)
+    assert (supervisor.reason, supervisor.detail) == (Reason.ENCODER_LOST, 2)
+
+
+def _only_time(supervisor, now_ns: int) -> None:
+    """One call in which nothing is found: no input is checked."""
+    inputs, supervisor.crane_inputs = supervisor.crane_inputs, SimpleNamespace(
+        foreign=False, stale_mask=0, estop=SimpleNamespace(values=None), guard=SimpleNamespace(values=None),
+        nodes=SimpleNamespace(worst_finding=lambda at_ns: (Reason.NONE, 0)),
+    )  # fmt: skip
+    unknown = SimpleNamespace(value=lambda: None)
+    names = ("_person", "_valve_state", "_plc_faults", "_enable")
+    before = {name: getattr(supervisor, name) for name in (*names, "_alarms", "_axes", "_echo_counter")}
+    for name in names:
+        setattr(supervisor, name, unknown)
+    supervisor._alarms = supervisor._axes = ()
+    supervisor._echo_counter = SimpleNamespace(value=lambda: now_ns)
+    supervisor.supervise(0, T, now_ns)
+    supervisor.crane_inputs = inputs
+    for name, value in before.items():
+        setattr(supervisor, name, value)
+
+
+@pytest.mark.parametrize(("period_ms", "ticks"), [(5, 5), (1, 21), (10, 5)])
+def test_an_echo_that_stays_is_found_after_ticks_and_time(period_ms: int, ticks: int) -> None:
+    supervisor = supervisor_in(Mode.ACTIVE)
+    supervisor._echo_counter = SimpleNamespace(value=lambda: 7)
+    supervisor._check_echo(period_ms * MS)  # a new value
+    for k in range(1, ticks + 1):
+        assert supervisor.worst is Reason.NONE, k
+        supervisor._check_echo(period_ms * MS)
+    assert supervisor.worst is Reason.VALVE_ECHO_STUCK
+    supervisor.worst = Reason.NONE
+    supervisor._echo_counter = SimpleNamespace(value=lambda: 8)
+    supervisor._check_echo(period_ms * MS)
+    assert supervisor.worst is Reason.NONE
+
+
+def test_a_harder_finding_replaces_a_milder_one_and_never_the_other_way_round() -> None:
+    supervisor = supervisor_in(Mode.ACTIVE)
+    for reason, detail, kept in (
+        (Reason.NONE, 9, Reason.NONE), (Reason.PRESSURE_LOST, 1, Reason.PRESSURE_LOST),
+        (Reason.BUS_PASSIVE, 2, Reason.PRESSURE_LOST), (Reason.PERSON_IN_ZONE, 3, Reason.PERSON_IN_ZONE),
+        (Reason.ENCODER_LOST, 4, Reason.ENCODER_LOST), (Reason.PLC_FAULT, 5, Reason.ENCODER_LOST),
+        (Reason.ESTOP_PRESSED, 6, Reason.ESTOP_PRESSED), (Reason.GUARD_LOST, 7, Reason.ESTOP_PRESSED),
+    ):  # fmt: skip
+        supervisor._collect(reason, detail)
+        assert supervisor.worst is kept
+    assert supervisor.worst_detail == 6
+
+
+def test_the_reset_button_counts_at_its_edge_only() -> None:
+    supervisor = supervisor_in(Mode.FAULT)
+    seen = []
+    for value in (None, 1, 1, 0, 1, 1, None, 1, 0, None, 1):
+        supervisor._reset_button = SimpleNamespace(value=lambda value=value: value)
+        seen.append(supervisor.reset_button_pressed())
+    assert [k for k, pressed in enumerate(seen) if pressed] == [4, 10]
+    assert set(seen) == {True, False}
+
+
+@pytest.mark.parametrize("j", range(5))
+def test_the_range_ends_with_its_margin(j: int) -> None:
+    bench = Bench().boot()
+    supervisor, spec = bench.controller.supervisor, SPECS[j]
+    place = [axis for axis in supervisor._axes if axis[0] == j]
+    (_, estimator, lower, upper) = place[0]
+    assert (lower, upper) == (spec.lower - RANGE_MARGIN_UNITS, spec.upper + RANGE_MARGIN_UNITS)
+    for position, found in ((lower, False), (lower - 1e-9, True), (upper, False), (upper + 1e-9, True)):
+        estimator.position = position
+        supervisor.worst = Reason.NONE
+        supervisor._check_values()
+        assert (supervisor.worst is Reason.POSITION_OUTSIDE) is found, (position, supervisor.worst)
+        assert not found or supervisor.worst_detail == j
+
+
+def test_a_second_arm_is_no_refusal() -> None:
+    bench = Bench().armed()
+    refused = bench.controller.gate.refused
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED and bench.controller.gate.refused == refused
+
+
+def test_arm_in_the_tick_in_which_the_emergency_stop_opens_is_refused() -> None:
+    bench = Bench().boot()
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.run(bench.count % 2)  # the frame is due in the next tick
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.controller.gate.refusal is Reason.ESTOP_NOT_RELEASED and bench.mode is Mode.FAULT
+
+
+def test_a_reset_claims_a_lost_address_again() -> None:
+    bench = Bench(AORO).boot()
+    claim = MACHINE.message("AddressClaim")
+    bench.machine_extra.append((claim.key, bytes(8)))  # the name 0 wins against every other
+    bench.run(2)
+    address = bench.controller.carrier_bus.inputs.address
+    assert address.lost
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.controller.gate.refusal is Reason.ADDRESS_LOST
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    assert not address.lost
