@@ -8,8 +8,11 @@ from can_dbc.messages.envelope import DatagramRefused, unsealed
 from tests.fuzz.engine import REGRESSIONS, Broken, Target, fuzz, judged, packed, replay, smallest, unpacked
 from tests.fuzz.targets import TARGETS
 
-RUNS = {"controller-loader": 120, "controller-forwarder": 80, "guard": 300, "dbc": 60, "profile": 60, "guard-profile": 60, "trace-asc": 300,
-        "recording": 600, "mission-file": 1000, "timing-page": 1500}  # fmt: skip
+RUNS = {
+    "controller-loader": 120, "controller-forwarder": 80, "guard": 300, "dbc": 60, "profile": 60, "guard-profile": 60,
+    "guard-envelope": 100, "guard-dbc": 300, "trace-asc": 300, "recording": 600, "mission-file": 1000,
+    "timing-page": 1500,
+}  # fmt: skip
 GUARD = "the guard's readers raise what Python raises for numbers and characters that they cannot use"
 REPORTED = dict.fromkeys(("guard-dbc", "guard-profile"), GUARD)
 SAVED = [(path.parent.name, path) for path in sorted(REGRESSIONS.glob("*/*.inputs"))]
