@@ -110,8 +110,7 @@ class JointWatch:
                 self._judge_encoder(supervisor, j, neutral, reason, now_ns)
             else:
                 stands = stands and standstill.quiet_s >= STOOD_S
-                # During a stop's ramp the joint still shows what it was stopped for.
-                if reason is _RUNAWAY and not supervisor.ramping:
+                if reason is _RUNAWAY:
                     moving = j
         self._settle(supervisor, moving, stands, now_ns)
 

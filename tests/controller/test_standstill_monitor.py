@@ -69,6 +69,9 @@ def test_a_joint_that_shakes_rings_or_creeps_does_not_move(spec):
         "noise alone": lambda t: start,
         "creep": lambda t: start + 0.003 * limit * t,
         "a load that hangs on": lambda t: start + 0.008 * limit * (1.0 - math.exp(-t / 0.1)),
+        "a log lets go and the boom rings on": lambda t: (
+            start + 0.012 * limit * (1.0 - math.exp(-(t - 5) / 0.15) * math.cos(16 * math.pi * (t - 5))) * (t > 5)
+        ),
         "swinging grapple": lambda t: start + 0.009 * limit * math.sin(2 * math.pi * t / 1.8),
         "a stop that rings": lambda t: start + 0.1 * limit * math.exp(-0.4 * t) * math.sin(2 * math.pi * 1.5 * t),
     }
