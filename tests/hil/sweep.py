@@ -150,3 +150,26 @@ def watched(name: str, planner: Any, seed: int = 1, truth: str = "sampled", max_
     guard = build_guard(profile_path(name))
     system = Lockstep(settings, guard, plant, planner, operator, Observer(None, [reports.append]))
     return Watched(system, plant, InProcessBus(system.core, "witness", receive_own=True), reports)
+
+
+@dataclass
+class Hold:
+    """Planner: keeps the crane where it found it."""
+
+    profile: Profile
+    due_ns: int = 0
+    place: tuple[float, ...] = ()
+    duration_s = math.inf
+
+    def __post_init__(self) -> None:
+        self.stream = SetpointStream(profile_hash(self.profile), LEASE_NS)
+
+    def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return self.place, (0.0,) * len(self.place)
+
+    def step(self, now_ns: int, report: StateReport | None, logs: Any) -> bytes | None:
+        if report is None or report.mode not in (Mode.ARMED, Mode.ACTIVE) or now_ns < self.due_ns:
+            return None
+        self.place = self.place or tuple(0.0 if q != q else q for q in report.position)
+        self.due_ns = now_ns + PERIOD_NS
+        return self.stream.datagram(now_ns, self, 0.0, GrappleCommand.NEUTRAL)

@@ -14,7 +14,7 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.hil.sweep import LEASE_NS, Quiet, Sweep, Watched, watched
+from tests.hil.sweep import LEASE_NS, Hold, Quiet, Sweep, Watched, watched
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 MS = 1_000_000
@@ -117,5 +117,27 @@ def test_hand_levers_move_a_machine_in_standby_without_a_fault(name):
         assert run.mode == Mode.STANDBY and Reason.JOINT_MOVES in seen
         run.run(4.0)
         assert run.reason == Reason.NONE
+    finally:
+        run.plant.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("j", [Joint.SLEW, Joint.LIFT, Joint.TILT])
+def test_an_encoder_that_drifts_half_a_degree_a_second_holds_before_the_tip_wanders(name, j):
+    run = watched(name, Hold(load_profile(name)), seed=3)
+    try:
+        assert run.run(20.0, lambda: run.mode == Mode.ACTIVE)
+        run.run(4.0)
+        assert run.mode == Mode.ACTIVE
+        begin, since_ns = run.tip(), run.system.now_ns
+        node = run.plant.encoders[j.name.lower()]
+        observe = node.observe
+        node.observe = lambda now_ns, position, speed: observe(
+            now_ns, position + math.radians(0.5) * (now_ns - since_ns) * 1e-9, speed
+        )
+        assert run.run(3.0, lambda: run.mode in (Mode.STOP, Mode.FAULT))
+        assert run.reason in (Reason.ENCODER_DRIFT, Reason.JOINT_RUNAWAY)
+        print(name, j.name, run.reason, (run.system.now_ns - since_ns) / MS, math.dist(begin, run.tip()))
+        assert math.dist(begin, run.tip()) < 0.02
     finally:
         run.plant.close()
