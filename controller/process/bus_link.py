@@ -4,9 +4,9 @@ Nothing here ends the process, because a running controller can report the fault
 of both directions are discarded: they are from a time in which the machine was not under control.
 
 Old commands are never left in the transmit queue.  One that is full holds commands that have waited too long
-(`controller.process.tx_queue`): they are cancelled, and until the queue has been empty each tick cancels those of the
-tick before.  A kernel's queue cannot be emptied from outside: there its own length is the bound (`txqueuelen`), and
-guard and nodes refuse what comes late.
+(`controller.process.tx_queue`): they are cancelled, and until the queue has been empty every tick that sends cancels
+those of the one before.  A kernel's queue cannot be emptied from outside: there its own length is the bound
+(`txqueuelen`), and guard and nodes refuse what comes late.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class BusLink:
 
         Frames that find no room are offered again once the old ones are cancelled; each refusal counts.
         """
+        if not frames:
+            return 0
         bus = self.bus
         if self._held_up:
             self._held_up = bus.discard() > 0

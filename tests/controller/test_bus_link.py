@@ -10,7 +10,7 @@ from can_dbc.messages.tick_record import BusReading
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.config import load
 from controller.process.bus_link import BusLink
-from controller.process.tx_queue import TX_QUEUE_NS, crane_queue_frames
+from controller.process.tx_queue import MIN_QUEUE_FRAMES, TX_QUEUE_NS, crane_queue_frames
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault, Kind
 from hil.wire.inprocess import InProcessBus
@@ -78,6 +78,28 @@ def test_a_bus_that_transmits_nothing_is_reported_within_50_ms(rate_hz: int) -> 
     seen_ns = next(at_ns for at_ns, reason in rig.reasons if reason is Reason.SEND_REFUSED)
     assert seen_ns - 100 * MS <= 50 * MS
     assert rig.reasons[-1][1] is Reason.SEND_REFUSED, "and as long as it lasts"
+
+
+def test_commands_that_are_not_due_in_every_tick_are_neither_cancelled_early_nor_sent_late() -> None:
+    """As on mach0: four frames in every fourth tick, and a queue for two periods."""
+    core = WireCore(250_000)
+    core.inject(Fault(Kind.BABBLE, 100 * MS, 400 * MS, key=0x000))
+    bus, listener = InProcessBus(core, "controller", tx_queue=MIN_QUEUE_FRAMES), InProcessBus(core, "listener")
+    link, reading, monitor = BusLink(bus), BusReading(), BusMonitor(1)
+    arrived: list[Frame] = []
+    seen_ns, sent = None, False
+    for tick in range(120):
+        link.receive([], reading)
+        monitor.update(reading, sent, core.now_ns)
+        if seen_ns is None and monitor.reason is Reason.SEND_REFUSED:
+            seen_ns = core.now_ns
+        sent = tick % 4 == 0
+        link.send([(0x300 + i, core.now_ns.to_bytes(8, "big")) for i in range(4)] if sent else [])
+        core.advance(core.now_ns + 5 * MS)
+        listener.drain(arrived)
+    ages_ns = [frame.stamp_ns - int.from_bytes(frame.data, "big") for frame in arrived if frame.key >= 0x300]
+    assert max(ages_ns) <= 45 * MS and len([age for age in ages_ns if age < 5 * MS]) >= 4 * 14
+    assert seen_ns is not None and seen_ns - 100 * MS <= 100 * MS
 
 
 def test_joint_references_have_room_in_the_queue() -> None:

@@ -467,8 +467,23 @@ def test_handshake_measures_the_round_trip_by_the_echo() -> None:
     assert not shake.accept_datagram(encode_reply(Header(7, 1, 0, 9), reply), 105 * MS), "old"
     assert not shake.accept_datagram(encode_reply(Header(7, 2, 0, 9), reply)[:-1], 106 * MS), "cut"
     assert not shake.accept_datagram(encode_reply(Header(7, 3, 0, 99), reply), 107 * MS), "never sent"
+    assert not shake.accept_datagram(encode_reply(Header(7, 3, 0, 5), reply), 107 * MS), "to a command of 57 ms ago"
     assert shake.accept_datagram(encode_reply(Header(7, 3, 0, 9), reply), 107 * MS)
-    assert (shake.round_trip.count, shake.dropped, shake.replayed) == (2, 1, 2)
+    assert (shake.round_trip.count, shake.dropped, shake.replayed) == (2, 1, 3)
+
+
+def test_only_an_answer_to_a_hello_begins_a_session() -> None:
+    """A late reply of the session before would bring it back."""
+    shake, reply = Handshake(), Feedback(state=State.HOLD)
+    shake.datagram(Command(), 10 * MS)
+    assert shake.accept_datagram(encode_reply(Header(7, 1, 0, 1), reply), 20 * MS)
+    for n in range(2, 33):
+        shake.datagram(Command(), n * 10 * MS)
+    shake.datagram(Command(), 330 * MS)  # the session is over
+    assert not shake.accept_datagram(encode_reply(Header(7, 2, 0, 32), reply), 331 * MS)
+    assert not shake.accept_datagram(encode_reply(Header(0, 3, 0, 33), reply), 332 * MS), "no session is offered"
+    assert shake.accept_datagram(encode_reply(Header(8, 4, 0, 33), reply), 333 * MS)
+    assert (shake.sessions, shake.replayed) == (2, 2)
 
 
 def test_plc_of_another_word_order_is_refused() -> None:
