@@ -47,8 +47,8 @@ _EMERGENCIES: Final = (Reason.EMERGENCY_MESSAGE, Reason.EMERGENCY_WARNING)
 _BUS_STATES: Final = (Reason.BUS_OFF, Reason.BUS_DOWN, Reason.BUS_PASSIVE)
 _LATE: Final = (Reason.LOOP_LATE, Reason.LOOP_STALLED)
 _MOTIONS: Final = (
-    Reason.JOINT_STUCK, Reason.JOINT_RUNAWAY, Reason.JOINT_REVERSED, Reason.MOVES_WHILE_STOPPED, Reason.ENCODER_FROZEN,
-    Reason.ENCODER_NOISY, Reason.ENCODER_DRIFT,
+    Reason.JOINT_STUCK, Reason.JOINT_RUNAWAY, Reason.JOINT_REVERSED, Reason.MOVES_WHILE_STOPPED, Reason.ENCODER_NOISY,
+    Reason.ENCODER_DRIFT,
 )  # fmt: skip
 _STEERINGS: Final = (Reason.STEERING_STUCK, Reason.STEERING_RUNAWAY)
 _SPEEDS: Final = (Reason.CARRIER_RUNAWAY, Reason.CARRIER_STUCK)
@@ -144,6 +144,8 @@ class Evidence:
         moment = self._crane.load_moment
         if reason is Reason.OVERLOAD and moment is not None:
             return moment.last_nm, moment.limit_nm, self._crane.load_kg
+        if reason is Reason.ENCODER_FROZEN:
+            return self._frozen(detail)
         if detail < len(self._estimators):
             found = self._joint(reason, detail)
             if found:
@@ -178,6 +180,15 @@ class Evidence:
             setpoint = vehicle.setpoint
             return (now_ns - setpoint.stamp_ns) * _MS, setpoint.lease_ns * _MS, _NAN
         return ()
+
+    def _frozen(self, detail: int) -> Numbers:
+        """A frozen encoder arrives: its last sample is no evidence, what its joint was told to do is."""
+        if detail == ARTICULATION:
+            state = self._inputs.articulation
+            commanded = _NAN if self._vehicle is None else self._vehicle.steering.rate_rad_s
+            return commanded, _NAN, _NAN if state is None else float(state.refused)
+        state = self._inputs.encoders[detail]
+        return self._crane.commands[detail], self._limits[detail][2], _NAN if state is None else float(state.refused)
 
     def _joint(self, reason: Reason, detail: int) -> Numbers:
         estimator = self._estimators[detail]

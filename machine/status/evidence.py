@@ -99,7 +99,7 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.JOINT_RUNAWAY: _MOTION,
     Reason.JOINT_REVERSED: _MOTION,
     Reason.MOVES_WHILE_STOPPED: _MOTION,
-    Reason.ENCODER_FROZEN: _MOTION,
+    Reason.ENCODER_FROZEN: Measurement("commanded", _UNIT_S, "speed limit", "frames refused since the start"),
     Reason.ENCODER_NOISY: _MOTION,
     Reason.ENCODER_DRIFT: _MOTION,
     Reason.OVERLOAD: Measurement("moment about the tipping line", _NM, "limit", "load", _KG),

@@ -52,9 +52,9 @@ def test_a_silent_encoder_shows_its_age_and_that_nothing_was_refused() -> None:
 
 
 def test_a_frozen_encoder_differs_from_a_cut_cable_by_its_refused_frames() -> None:
-    bench = stopped(Bench().active(), lambda b: b.frozen.add("EncLift"), Reason.ENCODER_LOST)
-    age_ms, _, refused = numbers(bench)
-    assert age_ms > 15.0 and refused >= 3
+    bench = stopped(Bench().active(), lambda b: b.frozen.add("EncLift"), Reason.ENCODER_FROZEN)
+    commanded, _, refused = numbers(bench)
+    assert math.isfinite(commanded) and refused >= 2
 
 
 def test_of_several_messages_the_lost_one_is_measured() -> None:
