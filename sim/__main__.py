@@ -3,7 +3,8 @@
 
 Runs the plant in real time (`sim.process.live`).  ``--port`` answers JSON requests over UDP on the loopback
 interface: ``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "vehicle" | "survey" | "press" | "release" |
-"reset" | "scene" | "view" | "quit"}`` and ``{"op": "lever", "name": NAME, "value": "-1".."1"}``.  ``--site`` places
+"reset" | "scene" | "view" | "quit"}``, ``{"op": "fault", "name": NAME, "part": PART, "size": "1", "for_s": "0.5"}`` and
+``{"op": "lever", "name": NAME, "value": "-1".."1"}``.  ``--site`` places
 the logs of a mission (`sim.site.site_file`): "logs" then returns those in the cameras' view, and a collected log is
 replaced for the next lap.  ``--camera`` serves camera pictures over TCP on the loopback interface
 (``can_dbc.messages.rgbd``), rendered on request.

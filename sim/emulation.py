@@ -20,6 +20,8 @@ from machine.crane_nodes import CraneNode
 from machine.geometry.carrier import ARMS, height_from_arm_angle
 from machine.profile import Encoder, Profile
 from sim.errors import PlantError
+from sim.faults.frame_tap import FrameTap
+from sim.faults.spool_faults import SpoolFaults
 from sim.hydraulics.layout import PA_PER_BAR
 from sim.nodes import Outbox
 from sim.nodes.arms import ArmNode
@@ -35,6 +37,8 @@ from sim.truth.load import Truth
 
 SENSE_NS = 10 * MS
 """Sampling period of the carrier's own sensors."""
+COMMANDED = (*FUNCTIONS, "steer", *ARMS)
+"""Functions in the order of the nodes' commands; the first ones are those of a machine without a carrier."""
 
 
 class SensedWorld(Protocol):
@@ -58,9 +62,8 @@ class EmulatedMachine(ABC):
     """All nodes of a machine.  ``estop`` is the operator's emergency stop.
 
     ``vehicle_node``, ``arms``, ``engine`` and ``gnss`` are None on a machine without carrier, ``imu`` where the profile
-    has none.  ``cycle_ns`` is the period of the valve node's feedback and of the fast pressures.
-    ``stuck_open`` is a fault: valves of `FUNCTIONS` whose amplifier drives them to -1..1 whatever the node commands;
-    without pilot pressure their springs close them.
+    has none.  ``cycle_ns`` is the period of the valve node's feedback and of the fast pressures.  ``spool_faults`` and
+    ``tap`` make valves and nodes fail (`sim.plant_faults`); ``tilt_rad`` is added to the measured roll and pitch.
     """
 
     def __init__(
@@ -74,10 +77,11 @@ class EmulatedMachine(ABC):
     ) -> None:
         self.profile = profile
         self._surroundings = world
-        self.stuck_open: dict[str, float] = {}
         self._step_ns, self._sense_steps = step_ns, max(1, SENSE_NS // step_ns)
         self._time_ns: int | None = None
         self._steps = 0
+        self.spool_faults, self.tap = SpoolFaults(), FrameTap()
+        self.tilt_rad = (0.0, 0.0)
         self._pressures_of = -1
         self._pressures_pa: dict[str, tuple[float, float]] = {}
         self._received = {profile.crane_bus: self._deliver_crane, profile.machine_bus: self._deliver_machine}
@@ -147,6 +151,11 @@ class EmulatedMachine(ABC):
         ``received`` are (bus, frame) pairs sent by others since the last call, with stamps up to ``now_ns``.
         Returns (bus, key, data) of the frames that the nodes sent.
         """
+        self._run(now_ns, received)
+        return self.tap.pass_on(now_ns, self._collect())
+
+    def _run(self, now_ns: int, received: list[tuple[str, Frame]]) -> None:
+        """Advance to ``now_ns``; the nodes get what was received and fill their outboxes."""
         if self._time_ns is None:
             self._time_ns = now_ns
             self._tick(now_ns)
@@ -155,6 +164,9 @@ class EmulatedMachine(ABC):
             self._advance(stamp_ns)
             self._received[bus](frame.key, frame.data, stamp_ns)
         self._advance(now_ns)
+
+    def _collect(self) -> list[tuple[str, int, bytes]]:
+        """Empty both outboxes."""
         crane, machine = self.profile.crane_bus, self.profile.machine_bus or ""
         sent = [(crane, key, data) for key, data in self._crane_out]
         sent += [(machine, key, data) for key, data in self._machine_out]
@@ -187,14 +199,11 @@ class EmulatedMachine(ABC):
         self.estop.decide(now_ns)
         self.valve.decide(now_ns)
         commands = [u / 100.0 for u in self.valve.outputs_pct]
-        if self.estop.pilot_on:
-            for name, position in self.stuck_open.items():
-                commands[FUNCTIONS.index(name)] = position
         if self.vehicle_node is not None and self.arms is not None:
             self.vehicle_node.decide(now_ns)
             self.arms.decide(now_ns)
             commands += [self.vehicle_node.steer, *self.arms.spools]
-        return commands
+        return self.spool_faults.apply(COMMANDED, commands) if self.spool_faults else commands
 
     def _measure(self, now_ns: int) -> None:
         """Feed the present state to the sensors with a memory."""
@@ -246,7 +255,7 @@ class EmulatedMachine(ABC):
         middle = spec.arm_travel_m / 2.0
         arms.heights_mm = tuple(1e3 * (height_from_arm_angle(spec, w.q[arm]) - middle) for arm in ARMS)
         roll, pitch, _ = w.carrier.attitude("rear")
-        arms.roll_deg, arms.pitch_deg = math.degrees(roll), -math.degrees(pitch)
+        arms.roll_deg, arms.pitch_deg = math.degrees(roll + self.tilt_rad[0]), math.degrees(self.tilt_rad[1] - pitch)
         engine.energy_j, engine.brake = w.hydraulics.energy_j, vehicle.brake
 
     def _tick(self, now_ns: int) -> None:

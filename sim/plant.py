@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from machine.geometry.carrier import ARMS
 from machine.joints import JOINTS
 from machine.profile import Profile
-from sim.emulation import EmulatedMachine
+from sim.emulation import COMMANDED, EmulatedMachine
 from sim.errors import PlantError
 from sim.evaluator import Evaluation, Evaluator
 from sim.geometry.shape import Quaternion, Shape, Vector
@@ -20,7 +19,7 @@ from sim.mechanics.carrier import PARKED, Drive, carrier_links
 from sim.mechanics.crane import crane_shapes
 from sim.mechanics.hand_levers import DRIVE, HandLevers
 from sim.nodes.arms import ArmState
-from sim.nodes.valve import FUNCTIONS, ValveState
+from sim.nodes.valve import ValveState
 from sim.scenes.arrangements import arrangement, random_scene
 from sim.truth.load import Truth, load_truth
 from sim.wood.bunk import bunk_shapes
@@ -67,8 +66,7 @@ class Plant(EmulatedMachine):
         self._evaluator = Evaluator(self.world)
         self._floats = (False, False)
         # Commands arrive in the order of the nodes; the world has an order of its own.
-        self._order = (*FUNCTIONS, "steer", *ARMS)
-        self._by_function = [self._order.index(name) for name in self.world.functions]
+        self._by_function = [COMMANDED.index(name) for name in self.world.functions]
         self._levers = HandLevers(self.world.functions, self.world.carrier is not None)
         super().__init__(profile, facts, seed, self.world, STEP_NS)
 
@@ -88,7 +86,7 @@ class Plant(EmulatedMachine):
             if DRIVE in held and self.profile.carrier is not None:
                 drive = Drive(held.pop(DRIVE) * self.profile.carrier.cruise_speed_m_s)
             for name, position in held.items():
-                commands[self._order.index(name)] = position
+                commands[COMMANDED.index(name)] = position
         return [commands[i] for i in self._by_function], drive
 
     def _float(self, wanted: tuple[bool, bool]) -> None:

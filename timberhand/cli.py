@@ -25,6 +25,7 @@ from timberhand.commands import (
     doctor,
     experiment,
     hil,
+    inject,
     mission,
     plan,
     plan_learn,
@@ -74,6 +75,7 @@ app.command("calibrate")(calibrate.calibrate)
 app.command("survey-camera")(survey_camera.survey_camera)
 app.command("experiment")(experiment.experiment)
 app.command("report")(report.report)
+app.command("inject")(inject.inject)
 app.command("replay")(replay.replay)
 app.command("why")(why.why)
 app.command("record")(record.record)

@@ -110,6 +110,11 @@ EXPERIMENTS: Final = {
         "operators.",
         "experiments.productivity.experiment",
     ),
+    "faults": Entry(
+        "Is every fault of the catalogue answered in time, and does work without faults go on? 45 faults at random "
+        "moments; nominal hours.",
+        "experiments.faults.experiment",
+    ),
     "soak": Entry(
         "Does memory stay constant and is no frame lost in half an hour at the control rate?",
         "experiments.timing.soak",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -16,6 +17,8 @@ from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.demo.summary import Summary, outcome_sentence
+from hil.faults.injector import Injector
+from hil.faults.order import Order
 from hil.harness.display import Display
 from hil.harness.lockstep import START_NS, Lockstep, LogDetector, Observer
 from hil.harness.operator import Operator
@@ -33,14 +36,17 @@ SETTLE_NS: Final = 3_000_000_000
 
 
 def run_lockstep(
-    name: str, seed: int, truth: str, directory: Path, limit_s: float, console: Console, camera: str = ""
+    name: str, seed: int, truth: str, directory: Path, limit_s: float, console: Console, camera: str = "",
+    orders: Sequence[Order] = (),
 ) -> Summary:
     """Run the job in one process on virtual time; the same seed leaves the same bytes in ``directory``.
 
-    With ``camera`` the planner gets the logs detected through it, without it their true poses.
+    With ``camera`` the planner gets the logs detected through it, without it their true poses.  ``orders`` are faults to
+    inject.
 
     Raises:
         CommandFailed: profile, truth, camera or directory cannot be used.
+        FaultError: this machine has no such fault.
     """
     profile = load_profile(name)
     try:
@@ -52,7 +58,10 @@ def run_lockstep(
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
-            return _Job(name, profile, plant, recorder, display, detector).run(limit_s, str(directory))
+            job = _Job(name, profile, plant, recorder, display, detector)
+            if orders:
+                Injector(job.system, orders)
+            return job.run(limit_s, str(directory))
     finally:
         recorder.close()
 

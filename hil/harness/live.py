@@ -36,6 +36,8 @@ Outcome = TypeVar("Outcome")
 HOST: Final = "127.0.0.1"
 END_ORDER: Final = ("autonomy", "controller", "guard", "console", "detector", "plc", "sim", "recorder", "wire")
 PORTS: Final = ("control", "planner", "orders", "page", "reports", "sim", "pictures")
+ADDRESSES: Final = "live.json"
+"""File in the directory of a live run with the ports, buses and process ids."""
 START_S: Final = 60.0
 POLL_S: Final = 0.1
 PLANNER_END_S: Final = 10.0
@@ -139,7 +141,16 @@ class LiveRun(ABC, Generic[Outcome]):
         self._start_machine(bus, ports)
         self._start_page_and_planner(ports)
         self._start_control(bus, ports)
+        self._write_addresses(bus, ports)
         return ports
+
+    def _write_addresses(self, bus: list[str], ports: dict[str, int]) -> None:
+        """Tell other processes where this run can be reached (`hil.faults.live`)."""
+        document = {
+            "profile": self._options.profile_name, "ports": ports, "buses": dict(b.split("=", 1) for b in bus[1::2]),
+            "pids": {name: child.process.pid for name, child in self._processes.children.items()},
+        }  # fmt: skip
+        (self._options.directory / ADDRESSES).write_text(json.dumps(document, indent=2))
 
     def _start_bus(self) -> list[str]:
         """Start the wire where it is used; return the bus arguments of every process."""

@@ -24,7 +24,7 @@ from controller.process.bus_link import BusLink
 from controller.process.tick_recording import record
 from controller.process.tx_queue import MIN_QUEUE_FRAMES, crane_queue_frames
 from controller.step import Controller, step
-from controller.tick import Inputs
+from controller.tick import Inputs, Outputs
 from hil.harness.operator import Operator
 from hil.wire.bitrates import CRANE_BITRATE, MACHINE_BITRATE
 from hil.wire.core import WireCore
@@ -55,6 +55,22 @@ class LogDetector(Protocol):
         """The logs detected with the joints at ``q`` [rad, m]; None when there is nothing new."""
 
 
+class Disturbance(Protocol):
+    """What disturbs a run at its edges; `hil.faults.injector` is one."""
+
+    def begin(self, now_ns: int) -> None:
+        """Begin and end what is due now, before the slice."""
+
+    def datagrams(self, now_ns: int, sent: list[bytes]) -> list[bytes]:
+        """The datagrams of the planner that reach the controller in this tick."""
+
+    def stalled(self, process: str, now_ns: int) -> bool:
+        """Whether a process (controller, guard, planner) does not run now."""
+
+    def late_ns(self, now_ns: int) -> int:
+        """How late the controller wakes for the tick of now."""
+
+
 @dataclass(slots=True)
 class Observer:
     """Recorder and hooks of a run; all of them are optional."""
@@ -62,6 +78,8 @@ class Observer:
     recorder: Recorder | None = None
     on_report: list[Callable[[StateReport], None]] = field(default_factory=list)
     on_vehicle: list[Callable[[VehicleReport], None]] = field(default_factory=list)
+    on_outputs: list[Callable[[Outputs, int], None]] = field(default_factory=list)
+    """Called with the outputs and the time of every tick."""
 
 
 class Lockstep:
@@ -87,11 +105,12 @@ class Lockstep:
         self.report: StateReport | None = None
         self.vehicle_report: VehicleReport | None = None
         self.plant, self.activity, self.operator = plant, activity, operator
+        self.disturbance: Disturbance | None = None
         self._detector = detector
         self.core = WireCore(CRANE_BITRATE, profile.crane_bus)
-        self._cores = [self.core]
+        self.cores = [self.core]
         if profile.machine_bus is not None:
-            self._cores.append(WireCore(MACHINE_BITRATE, profile.machine_bus))
+            self.cores.append(WireCore(MACHINE_BITRATE, profile.machine_bus))
         self._observer = observer
         self._settings = settings
         self._period_ns = 1_000_000_000 // settings.rate_hz
@@ -102,23 +121,30 @@ class Lockstep:
         self._pressed: list[bytes] = []
         """The operator's commands on their way, as ``_datagrams`` are the planner's."""
         self._datagrams: list[bytes] = []
-        self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self._cores}
+        self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self.cores}
         queues = (crane_queue_frames(settings), MIN_QUEUE_FRAMES)
         self._crane, *more = (
             BusLink(InProcessBus(core, "controller", tx_queue=queue))
-            for core, queue in zip(self._cores, queues, strict=False)
+            for core, queue in zip(self.cores, queues, strict=False)
         )
         self._machine = more[0] if self._controller.carrier_bus and more else None
         keys = guard.keys_of_buses
-        self._guard_buses = [InProcessBus(c, "guard", filters=k) for c, k in zip(self._cores, keys, strict=False)]
-        self._listeners = [InProcessBus(core, "recorder") for core in self._cores]
+        self._guard_buses = [InProcessBus(c, "guard", filters=k) for c, k in zip(self.cores, keys, strict=False)]
+        self._listeners = [InProcessBus(core, "recorder") for core in self.cores]
         self._next_tick_ns = START_NS
         self._sync: RawFrame | None = None
+
+    @property
+    def period_ns(self) -> int:
+        """The tick period."""
+        return self._period_ns
 
     def advance(self) -> None:
         """Advance the whole system by one slice."""
         self.now_ns += SLICE_NS
-        for core in self._cores:
+        if self.disturbance is not None:
+            self.disturbance.begin(self.now_ns)
+        for core in self.cores:
             core.advance(self.now_ns)
         self._record_buses()
         received = [(name, frame) for name, bus in self._plant_buses.items() for frame in _drained(bus)]
@@ -132,9 +158,16 @@ class Lockstep:
             self._tick()
 
     def _tick(self) -> None:
-        heard = [frame for bus in self._guard_buses for frame in _drained(bus)]
-        for bus, frames in zip(self._guard_buses, split(self._guard.step(self.now_ns, heard)), strict=False):
-            bus.send_all(frames)
+        disturbance = self.disturbance
+        if disturbance is None or not disturbance.stalled("guard", self.now_ns):
+            heard = [frame for bus in self._guard_buses for frame in _drained(bus)]
+            for bus, frames in zip(self._guard_buses, split(self._guard.step(self.now_ns, heard)), strict=False):
+                bus.send_all(frames)
+        if disturbance is not None:
+            if disturbance.stalled("controller", self.now_ns):
+                return
+            self._inputs.late_ns = disturbance.late_ns(self.now_ns)
+            self._datagrams = disturbance.datagrams(self.now_ns, self._datagrams)
         inputs, machine = self._inputs, self._machine
         self._crane.receive(inputs.frames, inputs.bus)
         if machine is not None:
@@ -143,6 +176,8 @@ class Lockstep:
         self._pressed.clear()
         self._datagrams.clear()
         outputs = step(self._controller, inputs, self.now_ns)
+        for output_hook in self._observer.on_outputs:
+            output_hook(outputs, self.now_ns)
         self.ticks += 1
         self.frames += len(inputs.frames) + len(inputs.machine_frames)
         self._crane.send(outputs.frames)
@@ -170,6 +205,8 @@ class Lockstep:
                 self._observer.recorder.on_report(outputs.vehicle_report)
             for vehicle_hook in self._observer.on_vehicle:
                 vehicle_hook(vehicle)
+        if disturbance is not None and disturbance.stalled("planner", self.now_ns):
+            return
         requests = self.activity.step(self.now_ns, report, self._detect())
         if requests:
             self._datagrams.extend([requests] if isinstance(requests, bytes) else requests)

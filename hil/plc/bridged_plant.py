@@ -44,7 +44,7 @@ class BridgedPlant(PlcPlant):
         self._arrive(now_ns)
         crane = self.profile.crane_bus
         frames = [frame for bus, frame in received if bus == crane]
-        return [(crane, key, data) for key, data in self.bridge.step(now_ns, frames)]
+        return self.tap.pass_on(now_ns, [(crane, key, data) for key, data in self.bridge.step(now_ns, frames)])
 
     def _arrive(self, now_ns: int) -> None:
         """One slice of the cable: the answer reaches the bridge, the command reaches the PLC, a new command leaves."""

@@ -38,6 +38,8 @@ class Hydraulics:
         self._lines = np.zeros((n, int(self._constants["delay_steps"].max())))
         self._commands, self._q, self._qd, self._torques = (np.zeros(n) for _ in range(4))
         self._floating: str | None = None
+        self.burst: set[tuple[str, str]] = set()
+        """Hoses that have burst, as function and chamber ("a" or "b"): no pressure there, the oil runs out."""
         # Without a check valve the port is always open.
         self._states["poppet"] = self._constants["check_ratio"] == 0.0
         self.supply_pa = self._balance["supply"][0] = truth.supply.pressure_margin_pa
@@ -58,6 +60,9 @@ class Hydraulics:
     def step(self, commands: Sequence[float], q: Sequence[float], qd: Sequence[float]) -> list[float]:
         """Mean joint torques [Nm, N] over one physics step; commands -1..1, ``q`` and ``qd`` of the joints now."""
         self._commands[:], self._q[:], self._qd[:] = commands, q, qd
+        for name, chamber in self.burst:
+            at = self.names.index(name)
+            self._states[f"pressure_{chamber}"][at] = self._states[f"hose_{chamber}"][at] = 0.0
         floating = -1 if self._floating is None else self.names.index(AXLES[self._floating])
         self.supply_pa = advance(
             *(self._constants, self._states, self._tables, self._lines, self._pump, self._balance, floating),

@@ -20,6 +20,7 @@ import can_dbc
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER
 from machine.profile import Encoder
 from machine.sensing.encoder import counts_from_position, position_from_counts
+from sim.faults.encoder_fault import EncoderFault
 from sim.nodes import Outbox
 from sim.truth.encoders import EncoderTruth
 
@@ -72,7 +73,9 @@ class VirtualNetwork(canopen.Network):
 
 
 class EncoderNode:
-    """One encoder.  ``observe`` feeds the true position every physics step; ``set_alarm`` sets or clears a failure."""
+    """One encoder.  ``observe`` feeds the true position every physics step; ``set_alarm`` sets or clears a failure, and
+    ``fault`` is one that it does not know of.
+    """
 
     def __init__(
         self, name: str, spec: Encoder, truth: EncoderTruth, step_ns: int, seed: int, network: VirtualNetwork
@@ -83,6 +86,7 @@ class EncoderNode:
         self._speed = 0.0
         self._syncs = 0
         self.alarms = 0
+        self.fault: EncoderFault | None = None
         self._values = {(0x6004, 0): 0, (0x6030, 1): 0, (0x2120, 0): 0, (0x6503, 0): 0, (0x5122, 1): 0, (0x5122, 2): 0}
         self.node = canopen.LocalNode(spec.node, str(EDS_FOLDER / f"encoder_{spec.kind}.eds"))
         # The library's SDO server answers a malformed first request with the index of the request before it.
@@ -173,15 +177,17 @@ class EncoderNode:
             self._pdo = None
 
     def _sample(self, now_ns: int) -> None:
-        t = self._truth
-        position = self._history[0]
-        error = t.offset + t.eccentricity * math.sin(position + t.phase_rad) + self._rng.gauss(0.0, t.noise)
-        spec, v = self.spec, self._values
+        t, spec, v, fault = self._truth, self.spec, self._values, self.fault
+        position, noise = self._history[0], self._rng.gauss(0.0, t.noise)
+        if fault is not None:
+            position, noise = fault.position(position, now_ns), noise * fault.noise_factor
+        error = t.offset + t.eccentricity * math.sin(position + t.phase_rad) + noise
         steps = round(spec.direction * self._speed / spec.unit_per_count)
         if spec.kind == "linear":
             steps = max(-32768, min(32767, steps))
-        v[0x6004, 0] = counts_from_position(spec, position + error)
-        v[0x6030, 1] = steps
+        if fault is None or not fault.frozen:
+            v[0x6004, 0] = counts_from_position(spec, position + error)
+            v[0x6030, 1] = steps
         v[0x2120, 0] = (now_ns // TIMESTAMP_NS) & 0xFFFF
         v[0x6503, 0] = v[0x5122, 1] = self.alarms
 

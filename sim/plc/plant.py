@@ -11,6 +11,7 @@ from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.errors import PlantError
 from sim.hydraulics.layout import PA_PER_BAR
+from sim.nodes.valve import FUNCTIONS
 from sim.plant import Plant
 from sim.plc.program import Inputs, Program
 from sim.wood.log_shape import LogSpec
@@ -49,11 +50,13 @@ class PlcPlant(Plant):
 
     def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
         """Advance to ``now_ns``; there is no bus, so no frame is received or sent."""
-        super().step(now_ns, [])
+        self._run(now_ns, [])
+        self._collect()
         return []
 
     def _spools(self, now_ns: int) -> list[float]:
-        return list(self.plc.scan(now_ns))
+        spools = list(self.plc.scan(now_ns))
+        return self.spool_faults.apply(FUNCTIONS, spools) if self.spool_faults else spools
 
     def _tick(self, now_ns: int) -> None:
         self.estop.tick(now_ns)  # the safety module is wired to the PLC, which passes its frames on

@@ -5,7 +5,9 @@ Requests and answers are listed in ``sim/__main__.py``.  Both ports are bound on
 
 from __future__ import annotations
 
+import math
 import socket
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +18,7 @@ from sim.errors import PlantError
 from sim.instruments.ideal_detector import detect, detect_in_view
 from sim.instruments.total_station import TotalStation, grapple_yaw
 from sim.plant import Plant
+from sim.plant_faults import End, PlantFault, begin
 from sim.process.live import LiveMachine
 from sim.process.scene_view import scene_of, view_of
 from sim.site.log_supply import LogSupplier
@@ -44,6 +47,8 @@ class LivePlant(LiveMachine):
         self._plant = plant
         self._station = TotalStation(seed)
         self._poll_ns = self._supply_ns = 0
+        self._faults: list[tuple[int, End]] = []
+        """Faults that end by themselves: time [ns] and what ends them."""
         self._log_supplier = None if site is None else LogSupplier(plant, site.places, site.rounds)
         self._requests: socket.socket | None = None
         if port is not None:
@@ -58,6 +63,9 @@ class LivePlant(LiveMachine):
             self.cameras = CameraServer(CameraRig(plant.world, plant.profile, plant.world.truth, seed), cameras)
 
     def _on_step(self, now_ns: int) -> None:
+        for fault in [f for f in self._faults if now_ns >= f[0]]:
+            self._faults.remove(fault)
+            fault[1]()
         if self.cameras is not None:
             self.cameras.serve(now_ns)
         if self._requests is not None and now_ns >= self._poll_ns:
@@ -119,11 +127,34 @@ class LivePlant(LiveMachine):
             case "press" | "release" | "reset":
                 getattr(plant.estop, request["op"])()
                 return {"ok": True}
+            case "fault":
+                self._begin_fault(request)
+                return {"ok": True}
             case "quit":
                 self.stop()
                 return {"ok": True}
             case op:
                 return {"error": f"unknown op {op!r}"}
+
+    def _begin_fault(self, request: dict[str, str]) -> None:
+        """Begin the fault of a request now; ``for_s`` is its length, for ever without one.
+
+        Raises:
+            PlantError: this machine has no such fault.
+        """
+        now_ns = time.monotonic_ns() - self._skipped_ns
+        size, seed = _number(request, "size", 0.0), int(_number(request, "seed", 0.0))
+        end = begin(self._plant, PlantFault(request.get("name", ""), request.get("part", ""), size, seed), now_ns)
+        length_s = _number(request, "for_s", math.inf)
+        if math.isfinite(length_s):
+            self._faults.append((now_ns + round(length_s * 1e9), end))
+
+
+def _number(request: dict[str, str], name: str, otherwise: float) -> float:
+    try:
+        return float(request.get(name, otherwise))
+    except ValueError:
+        raise PlantError("fault.not-a-number", f"{name} of a fault is {request[name]!r}; give a number") from None
 
 
 def _lever_position(text: str) -> float:

@@ -49,7 +49,7 @@ def system():
 @pytest.mark.parametrize(("function", "position"), [("slew", 0.35), ("lift", -0.5), ("ext", 0.4)])
 def test_a_valve_that_sticks_open_is_stopped_by_the_guard_alone(system, function, position):
     plant, begin, began_ns = system.plant, system.plant.tip(), system.now_ns
-    plant.stuck_open[function] = position
+    plant.spool_faults.stuck[function] = position
     moved_ns = refused_ns = open_ns = 0
     verdict, travel_m = Verdict.GOOD, 0.0
     while system.now_ns < began_ns + 2_000_000_000:

@@ -61,6 +61,10 @@ def demo(
     camera: Annotated[
         str, typer.Option(help="Detect the logs with this camera of the profile (default: true log poses).")
     ] = "",
+    faults: Annotated[
+        list[str] | None,
+        typer.Option("--inject", help="Fault to inject, as in encoder-lift:stuck@12.3s (lockstep); see timberhand inject."),
+    ] = None,
     as_json: SummaryOption = False,
 ) -> None:
     """Lay one log from the ground into the bunk, over CAN.
@@ -102,6 +106,12 @@ def demo(
             f"--camera {camera}: profile {profile} has no such camera; it has: {', '.join(cameras) or 'none'}",
             ExitCode.USAGE,
         )
+    if faults and not lockstep:
+        raise CommandFailed(
+            "demo.inject-live",
+            "--inject needs --lockstep; in a live run use `timberhand inject` from another terminal",
+            ExitCode.USAGE,
+        )
     directory = out or new_directory(f"{'lockstep' if lockstep else bus.value}{'-plc' if plc else ''}-seed{seed}")
     if plc:
         from hil.plc.profile import write_plc_profile
@@ -110,8 +120,14 @@ def demo(
     screen = Console(stderr=as_json)
     if lockstep:
         from hil.demo.lockstep import run_lockstep
+        from hil.faults.order import parse
+        from hil.faults.table import FaultError
 
-        summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera)
+        try:
+            orders = [parse(text, seed) for text in faults or ()]
+            summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera, orders)
+        except FaultError as error:
+            raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     else:
         from hil.demo.live import run_live
 

@@ -1,0 +1,154 @@
+"""The fault campaign: 45 catalogue entries at random moments, and hours of nominal work (docs/reference/safety.md 5).
+
+``--trials`` is the number of injections of each entry, spread over its scenes; ``--minutes`` bounds the run: finished jobs
+stay in the checkpoint, the same command continues, and a page is written once all are done.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final
+
+from rich.console import Console
+
+from experiments.common import pool
+from experiments.common.errors import ExperimentError
+from experiments.common.pool import Checkpoint, Job
+from experiments.common.registry import Options
+from experiments.common.result import Result, make_result
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
+from experiments.faults import files, nominal, trial
+from experiments.faults.metrics import METRICS, gather, injections_of
+from experiments.faults.pages import CONCLUSION, INTRODUCTION, sections, write_evidence
+from hil.faults.catalogue import CASES, Case, Where, Work
+
+TRIALS: Final = 100
+QUICK_TRIALS: Final = 2
+NOMINAL_S: Final = 10.2 * 3600.0
+QUICK_NOMINAL_S: Final = 120.0
+PROFILES: Final = ("palms_471", "aoro_fc8")
+BATCH: Final = 25
+"""Injections of one job: a checkpoint keeps whole jobs."""
+PHYSICS: Final = " physics"
+
+
+def run(options: Options, console: Console) -> Result:
+    """Run the campaign; write ``options.out`` and, if requested, the docs.
+
+    Raises:
+        ExperimentError: the time given by ``--minutes`` is over; the same command continues.
+    """
+    trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
+    jobs = [*plan(options.seed, trials), *nominal_plan(options.seed, QUICK_NOMINAL_S if options.quick else NOMINAL_S)]
+    with checkpoint(options, jobs, PROFILES, options.truth, LOCKSTEP_SOURCES) as kept:
+        with _limited(options.minutes, kept, len(jobs)):
+            outcomes = pool.run(perform, jobs, kept, options.workers, "faults", console)
+        absent = {f"{c.name}/absent": _absent(c, trials) for c in CASES if c.where is Where.ABSENT}
+        everything = outcomes | absent
+        metrics = gather(everything)
+        result = make_result(
+            "faults", METRICS, metrics, profile=", ".join(PROFILES), seed=options.seed, trials=trials,
+            more={"truth": options.truth},
+        )  # fmt: skip
+        publish(result, page_of(result, {}), options, console)
+        by_case = injections_of(everything)
+        write_evidence(by_case, metrics, options.out / "evidence")
+        if options.docs is not None:
+            write_evidence(by_case, metrics, options.docs / "results" / "faults")
+    return result
+
+
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    return Page("Fault campaign", CONCLUSION, INTRODUCTION, sections(result))
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """One job of any kind."""
+    by_kind = {"case": trial.perform, "files": files.perform, "nominal": nominal.perform}
+    return by_kind[job.kind](job)
+
+
+def scenes_of(case: Case) -> list[str]:
+    """The scenes in which a case happens."""
+    physics = PHYSICS if case.physics else ""
+    by_work = {
+        Work.CRANE: [f"crane palms_471{physics}", f"crane aoro_fc8{physics}"],
+        Work.DRIVE: ["drive aoro_fc8"],
+        Work.PLC: ["plc valves palms_471", "plc references palms_471"],
+    }
+    return [scene for work in case.works for scene in by_work[work]]
+
+
+def plan(seed: int, trials: int) -> list[Job]:
+    """Every job with injections, by scene, so that a worker builds a machine once."""
+    jobs = []
+    for case in CASES:
+        match case.where:
+            case Where.RUN | Where.START:
+                scenes = scenes_of(case)
+                for i, scene in enumerate(scenes):
+                    count = trials // len(scenes) + (i < trials % len(scenes))
+                    jobs += list(_batches(case, "case", scene, seed, count))
+            case Where.FILES:
+                jobs += list(_batches(case, "files", "files", seed, trials))
+    return sorted(jobs, key=lambda job: str(job.options["scene"]))
+
+
+def _batches(case: Case, kind: str, scene: str, seed: int, count: int) -> Iterator[Job]:
+    for first in range(0, count, BATCH):
+        options = {"case": case.number, "scene": scene, "count": min(BATCH, count - first)}
+        yield Job(f"{case.label}/{scene}/{first}", kind, 1000 * seed + first, options)
+
+
+def nominal_plan(seed: int, seconds: float) -> list[Job]:
+    """Stretches of nominal work that add up to ``seconds``."""
+    shares = {scene: share for scene, (_, _, share) in nominal.SETTINGS.items()}
+    jobs = []
+    for scene, share in shares.items():
+        left_s, number = seconds * share / sum(shares.values()), 0
+        stretch_s = nominal.LOG_S if scene.startswith("log") else nominal.STRETCH_S
+        while left_s > 0.0:
+            options = {"scene": scene, "seconds": min(left_s, stretch_s)}
+            jobs.append(Job(f"nominal/{scene}/{number}", "nominal", 5000 + 1000 * seed + number, options))
+            left_s, number = left_s - stretch_s, number + 1
+    return jobs
+
+
+@contextmanager
+def _limited(minutes: float | None, kept: Checkpoint, total: int) -> Iterator[None]:
+    """End what runs inside when the time is over; finished jobs are kept.
+
+    Raises:
+        ExperimentError: the time is over.
+    """
+    if minutes is None:
+        yield
+        return
+
+    def over(number: int, frame: object) -> None:
+        raise ExperimentError(
+            "experiment.time-over",
+            f"the time is over with {len(kept.done)} of {total} jobs done; the same command continues",
+        )
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, 60.0 * minutes)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _absent(case: Case, trials: int) -> dict[str, Any]:
+    """An entry that nothing can see: all its injections are missed."""
+    row = {
+        "seed": case.name, "at_ms": 0.0, "orders": [], "expected": "H", "bound_ms": 0.0, "seen_ms": 0.0,
+        "tip_limit_m": None, "reached": {}, "reason": "", "refused_ms": None, "neutral_ms": None, "valves_ms": None,
+        "travel_m": 0.0, "standing": False, "timeline": [], "detect_ms": None, "verdict": "undetected", "missed": True,
+    }  # fmt: skip
+    return {"case": case.number, "scene": "no input", "outcomes": [row] * trials}

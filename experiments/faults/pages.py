@@ -1,0 +1,129 @@
+"""The pages of the fault campaign: a summary table, and one evidence page for each entry."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from experiments.common.result import Result
+from experiments.common.result_page import Section
+from experiments.faults.metrics import CAMPAIGN, NOMINAL, case_prefix, is_blind
+from hil.faults.catalogue import CASES, Case
+
+CONCLUSION: Final = (
+    "{injections} injections of {cases} faults: {unexplained} are missed outside the named blind spots, and "
+    "{blind_missed} inside them.",
+    "After the loss of a needed input all valves are neutral within {neutral_max_ms}.",
+    "In {nominal_hours} of work without a fault the machine stopped {false_trips} times.",
+)
+INTRODUCTION: Final = (
+    "Every entry of the fault catalogue ([safety](reference/safety.md) section 5) is injected at random moments into a "
+    "moving machine in lockstep: both machines, crane work and driving, over CAN and through a PLC where the fault "
+    "exists there. Faults of oil, steel and load act on the plant with physics, all others on the kinematic machine. "
+    "Many injections are forked from one running machine; each is drawn from its own seed. Detection is observed from "
+    "outside: the mode and reason to which the recorded ticks replay, the frames on the buses, and the counters of the "
+    "reports. A bound is a fault detection time; one tick is added because a fault between two ticks is met by the next."
+)
+_EMPTY: Final = "–"
+
+
+def sections(result: Result) -> tuple[Section, ...]:
+    """Sections of the summary page."""
+    return (
+        Section("Campaign", "", CAMPAIGN),
+        Section("Work without faults", "", NOMINAL),
+        Section("All entries", table(result.metrics), ()),
+        Section("Blind spots", blind_spots(result.metrics), ()),
+    )
+
+
+def table(metrics: Mapping[str, float]) -> str:
+    """One line for each entry."""
+    lines = [
+        "| # | fault | promised | injections | missed | detection p50 / p99 / max ms | neutral ms | tip travel m |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for case in CASES:
+        p = case_prefix(case)
+        times = " / ".join(_number(metrics.get(f"{p}_{key}_ms")) for key in ("p50", "p99", "max"))
+        lines.append(
+            f"| {case.number} | [{case.title}](results/faults/{case.label}.md) | {case.reaction}, {case.bound} "
+            f"| {_number(metrics.get(f'{p}_injections'))} | {_number(metrics.get(f'{p}_missed'))} | {times} "
+            f"| {_number(metrics.get(f'{p}_neutral_max_ms'))} | {_number(metrics.get(f'{p}_travel_max_m'))} |"
+        )
+    return "\n".join(lines)
+
+
+def blind_spots(metrics: Mapping[str, float]) -> str:
+    """What is not seen, with the largest way of the tip among the missed injections."""
+    lines = []
+    for case in CASES:
+        missed, harm_m = (metrics.get(f"{case_prefix(case)}_{key}") or 0.0 for key in ("missed", "harm_m"))
+        if case.blind or missed:
+            harm = "nothing to inject into" if is_blind(case) else f"largest way of a missed one {100 * harm_m:.1f} cm"
+            said = f" {case.blind}" if case.blind else ""
+            lines.append(f"- *{case.number}, {case.title}*: {missed:.0f} missed, {harm}.{said}")
+    return "\n".join(lines) or "None."
+
+
+def write_evidence(by_case: Mapping[int, Sequence[Mapping[str, Any]]], metrics: Mapping[str, float], folder: Path) -> None:
+    """Write the evidence page of every entry into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for case in CASES:
+        (folder / f"{case.label}.md").write_text(evidence(case, by_case.get(case.number, []), metrics))
+
+
+def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, float]) -> str:
+    """One page: what, bound, measured, one example, verdict."""
+    p = case_prefix(case)
+    verdicts = Counter(o["verdict"] for o in rows)
+    missed = [o for o in rows if o["missed"]]
+    verdict = "No injection." if not rows else "Missed: none." if not missed else f"Missed: {len(missed)} of {len(rows)}."
+    out = [
+        "---", "orphan: true", "---", "", f"# {case.number}: {case.title}", "", verdict, "",
+        f"Promised: {case.reaction}; bound {case.bound}. Injected as: {', '.join(sorted({w for o in rows for w in _kinds(o)})) or 'nothing'}.",
+        "",
+    ]  # fmt: skip
+    out += [f"Not seen: {case.blind}", ""] if case.blind else []
+    out += ["| | |", "|---|---|"]
+    for key, title in (
+        ("injections", "Injections"), ("p50_ms", "Detection, median [ms]"), ("p99_ms", "Detection, 99th percentile [ms]"),
+        ("max_ms", "Detection, longest [ms]"), ("neutral_max_ms", "All valves neutral, longest [ms]"),
+        ("travel_max_m", "Way of the tip until rest, longest [m]"), ("harm_m", "The same, of missed injections [m]"),
+    ):  # fmt: skip
+        out.append(f"| {title} | {_number(metrics.get(f'{p}_{key}'))} |")
+    out += ["", "| scene | injections | verdicts |", "|---|---|---|"]
+    for scene in sorted({o["scene"] for o in rows}):
+        counted = Counter(o["verdict"] for o in rows if o["scene"] == scene)
+        out.append(f"| {scene} | {sum(counted.values())} | {', '.join(f'{k} {n}' for k, n in sorted(counted.items()))} |")
+    example = max(missed or rows, key=lambda o: o["detect_ms"] or math.inf if missed else o["detect_ms"] or 0.0, default=None)
+    if example is not None:
+        out += ["", f"## {'A missed injection' if missed else 'The slowest detection'}", "", *_example(example)]
+    out += ["", f"Verdicts: {', '.join(f'{k} {n}' for k, n in sorted(verdicts.items())) or 'none'}.", ""]
+    return "\n".join(out)
+
+
+def _example(o: Mapping[str, Any]) -> list[str]:
+    detected = f"detected after {o['detect_ms']:.1f} ms" if o["detect_ms"] is not None else "not detected"
+    lines = [
+        f"Scene `{o['scene']}`, seed `{o['seed']}`, injected {', '.join(f'`{w}`' for w in o['orders'])} at "
+        f"{o['at_ms'] / 1e3:.3f} s; expected {o['expected']} within {o['bound_ms']:.0f} ms; {detected}; way of the tip "
+        f"{o['travel_m']:.3f} m; {'at rest' if o['standing'] else 'not at rest'} at the end; verdict {o['verdict']}.",
+        "", "| ms after the fault | |", "|---|---|",
+    ]  # fmt: skip
+    return lines + [f"| {ms:.1f} | {text} |" for ms, text in o["timeline"]]
+
+
+def _kinds(o: Mapping[str, Any]) -> list[str]:
+    return [f"`{words.split('/')[0].split('=')[0].split('+')[0]}`" for words in o["orders"]]
+
+
+def _number(value: float | None) -> str:
+    if value is None or math.isnan(value):
+        return _EMPTY
+    if math.isinf(value):
+        return "never"
+    return f"{value:.0f}" if value.is_integer() or value >= 100 else f"{value:.3g}"

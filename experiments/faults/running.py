@@ -1,0 +1,265 @@
+"""Running machines on which faults are injected: built once, warmed up until they move, and forked for each injection.
+
+A scene names machine, work and plant.  The work is a motion that never ends: the crane swings all joints, or the
+carrier follows a far waypoint.  Its setpoints are those of a real planner (20 Hz, lease of `draws.LEASE_MS`).
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import GrappleCommand, StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
+from controller.config import Settings
+from controller.config import load as load_settings
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from experiments.common.errors import ExperimentError
+from experiments.faults.evidence import Evidence
+from hil.faults.draws import LEASE_MS, Scene
+from hil.faults.injector import Injector
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.plc.bridged_plant import BridgedPlant
+from hil.plc.profile import write_plc_profile
+from machine.geometry.kinematics import pin_position
+from machine.joints import JOINTS
+from machine.profile import Profile
+from machine.status.modes import Mode
+from sim.kinematic.machine import KinematicMachine
+from sim.plant import Plant
+
+STEP_NS: Final = 2_500_000
+LEASE_NS: Final = round(LEASE_MS * 1e6)
+SWING_SHARE: Final = 0.04
+"""Amplitude of the swing as a share of the joint's range."""
+SPEED_SHARE: Final = 0.5
+"""Share of the joint's speed and acceleration limits that the swing uses."""
+FAR_M: Final = 150.0
+SPEED_M_S: Final = 0.6
+WARM_LIMIT_NS: Final = 20_000_000_000
+MOVING_NS: Final = 1_000_000_000
+"""The machine has moved for so long before the first injection."""
+KINDS: Final = {
+    "crane palms_471": ("palms_471", "kinematic"),
+    "crane palms_471 physics": ("palms_471", "physics"),
+    "crane aoro_fc8": ("aoro_fc8", "kinematic"),
+    "crane aoro_fc8 physics": ("aoro_fc8", "physics"),
+    "drive aoro_fc8": ("aoro_fc8", "kinematic"),
+    "drive aoro_fc8 physics": ("aoro_fc8", "physics"),
+    "plc valves palms_471": ("palms_471", "plc valves"),
+    "plc references palms_471": ("palms_471", "plc references"),
+}
+"""Scenes by name: profile, and plant."""
+
+
+class Swing:
+    """A motion of all joints without end; at rest at time 0.  A joint without an encoder stands."""
+
+    duration_s = math.inf
+
+    def __init__(self, profile: Profile, start: Sequence[float]) -> None:
+        self._joints = []
+        for j, q in zip(JOINTS, start, strict=True):
+            s = profile.joints[j.name.lower()]
+            known = s.encoder is not None and math.isfinite(q)
+            half = SWING_SHARE * (s.upper - s.lower) * (1.0 if s.upper - q > q - s.lower else -1.0) if known else 0.0
+            w = SPEED_SHARE * min(s.speed_limit / abs(half), math.sqrt(s.acceleration_limit / abs(half))) if half else 0.0
+            self._joints.append((q if math.isfinite(q) else 0.0, half, w))
+
+    def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Positions and velocities."""
+        t = max(0.0, time_s)
+        q = tuple(start + half * (1.0 - math.cos(w * t)) for start, half, w in self._joints)
+        return q, tuple(half * w * math.sin(w * t) for _, half, w in self._joints)
+
+
+class CranePlanner:
+    """Swings the crane while the machine is armed."""
+
+    def __init__(self, profile: Profile, profile_hash: int) -> None:
+        self._profile = profile
+        self._stream = SetpointStream(profile_hash, LEASE_NS)
+        self._motion: Swing | None = None
+        self._begin_ns = 0
+        self._report: StateReport | None = None
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        """The setpoint to send now."""
+        self._report = report or self._report
+        if self._report is None or self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
+            self._motion = None
+            return None
+        if not self._stream.due(now_ns):
+            return None
+        if self._motion is None:
+            self._motion, self._begin_ns = Swing(self._profile, self._report.reference), now_ns
+        time_s = (now_ns - self._begin_ns) * 1e-9
+        return self._stream.datagram(now_ns, self._motion, time_s, GrappleCommand.NEUTRAL)
+
+
+class DrivePlanner:
+    """Drives towards a waypoint far ahead and a little to the left, while the machine is armed."""
+
+    def __init__(self, profile: Profile, profile_hash: int) -> None:
+        assert profile.carrier is not None
+        self._carrier, self._hash = profile.carrier, profile_hash
+        self._vehicle: VehicleReport | None = None
+        self._goal: tuple[float, float] | None = None
+        self._sequence = self._sent_ns = 0
+        self._armed = False
+
+    def receive(self, report: VehicleReport) -> None:
+        """A report of the vehicle."""
+        self._vehicle = report
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        """The setpoint to send now."""
+        if report is not None:
+            self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)
+        v = self._vehicle
+        if not self._armed or v is None or now_ns - self._sent_ns < PERIOD_NS or math.isnan(v.heading_rad):
+            return None
+        if self._goal is None:
+            north, east = FAR_M * math.cos(v.heading_rad - 0.15), FAR_M * math.sin(v.heading_rad - 0.15)
+            per_deg_m = 111_320.0
+            self._goal = (
+                v.latitude_deg + north / per_deg_m,
+                v.longitude_deg + east / (per_deg_m * math.cos(math.radians(v.latitude_deg))),
+            )
+        self._sequence, self._sent_ns = self._sequence + 1, now_ns
+        heights = (self._carrier.arm_transport_m,) * 4
+        setpoint = DriveSetpoint(
+            self._sequence, self._hash, now_ns, LEASE_NS, Steering.WAYPOINT, *self._goal, 0.0, 0.0, SPEED_M_S, heights,
+            False, False,
+        )  # fmt: skip
+        return encode(setpoint)
+
+
+class Supervisor(Operator):
+    """The emulated operator, who lets go once ``hands_off`` is set: nothing may start by itself after that."""
+
+    hands_off = False
+
+    def step(self, report: StateReport) -> bytes | None:
+        """The command to send."""
+        return None if self.hands_off else super().step(report)
+
+
+class _NoLogs:
+    """A detector that sees nothing."""
+
+    def detect(self, q: Sequence[float], now_ns: int) -> None:
+        return None
+
+
+@dataclass(slots=True)
+class Running:
+    """A running machine with its evidence and its injector."""
+
+    name: str
+    scene: Scene
+    system: Lockstep
+    plant: Any
+    operator: Supervisor
+    evidence: Evidence
+    injector: Injector
+
+    def advance(self) -> None:
+        """One slice."""
+        self.system.advance()
+        self.evidence.slice(self.system.now_ns)
+
+    def until_moving(self) -> None:
+        """Run until the machine has moved for a second.
+
+        Raises:
+            ExperimentError: it does not.
+        """
+        system, since_ns = self.system, 0
+        while not since_ns or system.now_ns < since_ns + MOVING_NS:
+            self.advance()
+            moving = system.report is not None and system.report.mode == Mode.ACTIVE and self.speed() > 0.0
+            since_ns = (since_ns or system.now_ns) if moving else 0
+            if system.now_ns > START_NS + WARM_LIMIT_NS:
+                reason = system.report.reason if system.report else -1
+                raise ExperimentError(
+                    "experiment.not-moving", f"the machine of scene {self.name!r} does not move: reason {reason}"
+                )
+
+    def speed(self) -> float:
+        """Greatest speed of what moves here, as the machine itself reports it [rad/s, m/s]."""
+        if self.scene.drives:
+            vehicle = self.system.vehicle_report
+            return abs(vehicle.speed_m_s) if vehicle is not None and math.isfinite(vehicle.speed_m_s) else 0.0
+        report = self.system.report
+        return max((abs(v) for v in report.velocity if math.isfinite(v)), default=0.0) if report else 0.0
+
+    def place(self) -> tuple[float, ...]:
+        """True place of what could hurt [m]: the hanger pin in the base frame, or the front axle in the world."""
+        if self.scene.drives:
+            return tuple(self.plant.world.carrier.front_axle())
+        return tuple(pin_position(self.scene.profile.kinematics, self.plant.joint_positions()[:4]))
+
+    def valves_neutral(self) -> bool:
+        """Whether the valve node's outputs are neutral now (ground truth; a held grapple counts as neutral)."""
+        plc = getattr(self.plant, "plc", None)
+        outputs = plc.outputs if plc is not None else self.plant.valve.outputs_pct
+        node = self.plant.vehicle_node
+        return not any(outputs[:5]) and (node is None or node.brake or not node.drive_m_s)
+
+
+def build(name: str, seed: int = 0, truth: str = "nominal", terrain: str = "flat") -> Running:
+    """The machine of a scene at its start."""
+    profile_name, kind = KINDS[name]
+    with tempfile.TemporaryDirectory() as folder:
+        path = profile_path(profile_name)
+        if kind.startswith("plc"):
+            role = "valves" if kind.endswith("valves") else "references"
+            path = write_plc_profile(profile_name, role, Path(folder))  # type: ignore[arg-type]
+        settings, guard = load_settings(path), build_guard(path)
+    profile, plant = settings.profile, _plant(settings, kind, seed, truth, terrain)
+    drives = name.startswith("drive")
+    vehicle_hooks = []
+    planner: CranePlanner | DrivePlanner
+    if drives:
+        planner = DrivePlanner(profile, settings.profile_hash)
+        vehicle_hooks.append(planner.receive)
+    else:
+        planner = CranePlanner(profile, settings.profile_hash)
+    operator = Supervisor(settings.profile_hash, lambda *_: None)
+    observer = Observer(None, [], vehicle_hooks)
+    system = Lockstep(settings, guard, plant, planner, operator, observer, _NoLogs())
+    evidence = Evidence(system.cores, profile)
+    observer.on_outputs.append(evidence.outputs)
+    observer.on_report.append(evidence.report)
+    observer.on_vehicle.append(evidence.vehicle)
+    scene = Scene(profile, drives, kind.startswith("plc"))
+    return Running(name, scene, system, plant, operator, evidence, Injector(system))
+
+
+def _plant(settings: Settings, kind: str, seed: int, truth: str, terrain: str) -> Any:
+    profile = settings.profile
+    if kind == "kinematic":
+        return KinematicMachine(profile, seed, truth, step_ns=STEP_NS)
+    if kind == "physics":
+        return Plant(profile, seed, truth, scene=(), terrain=terrain)
+    return BridgedPlant(profile, seed, truth, logs=1, transport="udp" if kind.endswith("valves") else "modbus")
+
+
+@cache
+def warm(name: str) -> Running:
+    """The machine of a scene, moving; one per process."""
+    machine = build(name)
+    machine.until_moving()
+    machine.operator.hands_off = True
+    return machine

@@ -1,0 +1,188 @@
+"""One injection: forked from a running machine, watched until it stands, and judged.
+
+A child process continues the machine of its parent, so all injections of a scene share its start-up; the parent stays
+at the moment of the fork.  The same scene, case and seed give the same outcome, in a child as in a fresh process.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import os
+import signal
+import traceback
+from collections.abc import Callable
+from random import Random
+from typing import Any, Final
+
+from experiments.common.errors import ExperimentError
+from experiments.common.pool import Job
+from experiments.faults.judgement import judge
+from experiments.faults.running import Running, build, warm
+from hil.faults.catalogue import CASES, Where
+from hil.faults.draws import Injection
+from hil.harness.lockstep import SLICE_NS, START_NS
+from machine.joints import JOINTS
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+
+EARLIEST_S, LATEST_S = 0.0, 2.0
+"""When the injection comes after the fork."""
+MOVING_SHARE: Final = 0.2
+"""A joint moves if it is faster than this share of its limit (the motion monitor's own, docs/reference/safety.md 1)."""
+WAIT_FOR_MOTION_S: Final = 6.0
+REST_S: Final = 0.5
+MAX_REST_S: Final = 2.5
+STILL_M: Final = 0.0005
+"""The tip stands when it moves less than this in a tenth of a second."""
+CHILD_LIMIT_S: Final = 120
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """All injections of one case in one scene; options: case, scene, count."""
+    case = CASES[job.options["case"] - 1]
+    scene, count = job.options["scene"], job.options["count"]
+    outcomes = []
+    if case.where is Where.RUN:
+        machine = warm(scene)
+        gc.collect()
+        gc.freeze()
+        for i in range(count):
+            seed = f"{case.name} {scene} {job.seed} {i}"
+            outcomes.append(in_child(lambda seed=seed: inject(machine, job.options["case"], seed)))  # type: ignore[misc]
+    else:
+        for i in range(count):
+            seed = f"{case.name} {scene} {job.seed} {i}"
+            outcomes.append(in_child(lambda seed=seed: start(scene, job.options["case"], seed)))  # type: ignore[misc]
+    return {"case": case.number, "scene": scene, "outcomes": outcomes}
+
+
+def inject(machine: Running, number: int, seed: str) -> dict[str, Any]:
+    """Inject a drawn fault into the running machine and follow it; ``machine`` is used up."""
+    case, random = CASES[number - 1], Random(seed)
+    assert case.draw is not None
+    drawn = case.draw(random, machine.scene)
+    _wait(machine, random, drawn)
+    system, evidence = machine.system, machine.evidence
+    at_ns = system.now_ns + random.randrange(SLICE_NS)
+    for order in drawn.orders:
+        machine.injector.order(order, at_ns + round(order.at_s * 1e9))
+    evidence.begin(at_ns, machine.scene.drives)
+    before_ms = (at_ns - START_NS) * 1e-6
+    travel_m, valves_ms, standing = _follow(machine, drawn, at_ns)
+    outcome = {
+        "seed": seed, "at_ms": round(before_ms, 3), "orders": [_words(o.fault, o.part, o.sized(), o.length_s) for o in drawn.orders],
+        "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": drawn.seen_ms, "tip_limit_m": drawn.tip_limit_m,
+        "reached": evidence.reached, "reason": evidence.reason, "refused_ms": evidence.refused_ms,
+        "neutral_ms": evidence.neutral_ms if evidence.frames else None, "valves_ms": valves_ms,
+        "travel_m": round(travel_m, 4), "standing": standing, "timeline": evidence.timeline[:16],
+    }  # fmt: skip
+    return outcome | judge(outcome)
+
+
+def start(scene: str, number: int, seed: str) -> dict[str, Any]:
+    """Inject a fault before the machine's first boot and see whether it can be armed."""
+    case, random = CASES[number - 1], Random(seed)
+    machine = build(scene)
+    assert case.draw is not None
+    drawn = case.draw(random, machine.scene)
+    for order in drawn.orders:
+        machine.injector.order(order, START_NS)
+    machine.evidence.begin(START_NS, machine.scene.drives)
+    system, refused_ms, armed, reason = machine.system, None, False, 0
+    while system.now_ns < START_NS + round(2.0 * drawn.bound_ms * 1e6):
+        machine.advance()
+        if system.report is not None:
+            armed = armed or system.report.mode in (Mode.ARMED, Mode.ACTIVE)
+            named = Reason(system.report.reason & 0xFF) in (Reason.NODE_IDENTITY, Reason.NODE_CONFIGURATION)
+            if named and refused_ms is None:
+                refused_ms, reason = round((system.now_ns - START_NS) * 1e-6, 3), system.report.reason & 0xFF
+    reached = {} if refused_ms is None or armed else {"X": refused_ms}
+    outcome = {
+        "seed": seed, "at_ms": 0.0, "orders": [_words(o.fault, o.part, o.sized(), o.length_s) for o in drawn.orders],
+        "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": 0.0, "tip_limit_m": None, "reached": reached,
+        "reason": Reason(reason).name if reason else "", "refused_ms": refused_ms, "neutral_ms": 0.0, "valves_ms": 0.0,
+        "travel_m": 0.0, "standing": not armed, "timeline": machine.evidence.timeline[:16],
+    }  # fmt: skip
+    return outcome | judge(outcome)
+
+
+def _words(fault: str, part: str, size: float, length_s: float) -> str:
+    words = fault if not part else f"{fault}/{part}"
+    words += f"={size:.4g}" if math.isfinite(size) and size else ""
+    return words + (f"+{1e3 * length_s:.4g}ms" if math.isfinite(length_s) else "")
+
+
+def _wait(machine: Running, random: Random, drawn: Injection) -> None:
+    """Run to the moment of the injection: a random one, at which the joint moves that has to."""
+    system = machine.system
+    until_ns = system.now_ns + round(random.uniform(EARLIEST_S, LATEST_S) * 1e9)
+    while system.now_ns < until_ns:
+        machine.advance()
+    if not drawn.moves:
+        return
+    j = next(int(j) for j in JOINTS if j.name.lower() == drawn.moves)
+    needed = MOVING_SHARE * machine.scene.profile.joints[drawn.moves].speed_limit
+    limit_ns = system.now_ns + round(WAIT_FOR_MOTION_S * 1e9)
+    while system.now_ns < limit_ns and not (system.report and abs(system.report.velocity[j]) > needed):
+        machine.advance()
+
+
+def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, float | None, bool]:
+    """Watch until everything stands, or the window is over; way of the tip [m], time at which the valve node's outputs
+    became neutral for good [ms], and whether it stands."""
+    system, evidence = machine.system, machine.evidence
+    window_ns = at_ns + round((drawn.window_s or drawn.bound_ms * 1e-3 + 0.5) * 1e9)
+    place, travel_m = machine.place(), 0.0
+    mark, mark_ns, valves_ms, standing = place, system.now_ns, None, False
+    stop_ns = 0
+    while True:
+        machine.advance()
+        now_ns, here = system.now_ns, machine.place()
+        travel_m += math.dist(here, place)
+        place = here
+        if not machine.valves_neutral():
+            valves_ms = None
+        elif valves_ms is None:
+            valves_ms = round((now_ns - at_ns) * 1e-6, 3)
+        if now_ns - mark_ns >= 100_000_000:
+            standing = math.dist(here, mark) < STILL_M
+            mark, mark_ns = here, now_ns
+        stopped = any(r in evidence.reached for r in ("H", "R1", "R0")) or evidence.neutral_ms is not None
+        stop_ns = stop_ns or (now_ns if stopped else 0)
+        over = now_ns >= window_ns
+        if stopped and drawn.expected not in ("NONE", "REFUSED"):
+            over = (standing and now_ns >= stop_ns + round(REST_S * 1e9)) or now_ns >= stop_ns + round(MAX_REST_S * 1e9)
+        if over:
+            return travel_m, valves_ms, standing
+
+
+def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """The result of a function that runs in a forked child, which leaves this process as it is.
+
+    Raises:
+        ExperimentError: the child failed; its traceback is in the sentence.
+    """
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.alarm(CHILD_LIMIT_S)
+        try:
+            answer = json.dumps(function())
+        except BaseException:
+            answer = json.dumps({"failed": traceback.format_exc()})
+        with os.fdopen(writing, "w") as pipe:
+            pipe.write(answer)
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        text = pipe.read()
+    _, status = os.waitpid(child, 0)
+    answer = json.loads(text) if text else {"failed": f"the child ended with status {status}"}
+    if "failed" in answer:
+        raise ExperimentError("experiment.injection-failed", f"an injection failed: {answer['failed']}")
+    found: dict[str, Any] = answer
+    return found

@@ -1,0 +1,308 @@
+"""How an injection of each catalogue entry is drawn at random: orders, expected reaction, and bound.
+
+Bounds are fault detection times (docs/reference/safety.md section 4), from the moment of the fault to the tick that
+reacts.  A report shows a refusal up to one report period later, which `Injection.seen_ms` allows for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from random import Random
+from typing import Final
+
+from hil.faults.order import Order
+from machine.joints import JOINTS
+from machine.profile import Profile
+from sim.plant_faults import ENCODER_MESSAGES, message
+
+REPORT_MS: Final = 20.0
+T_MS: Final = 5.0
+LEASE_MS: Final = 100.0
+"""Lease of the setpoints in the campaign."""
+_DEG: Final = math.pi / 180.0
+_NEEDED_CRANE: Final = ("EstopStat", "ValveFbA", "ValveFbB")
+_NEEDED_DRIVE: Final = ("VehStat", "ArmHeightA", "ArmHeightB")
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Where an injection happens: the machine, and whether it drives."""
+
+    profile: Profile
+    drives: bool = False
+    plc: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Injection:
+    """One drawn injection; times of ``orders`` count from its moment.
+
+    ``expected`` is the least reaction: NONE (nothing may stop), REFUSED (counted, nothing stops), D, H, R1, R0, X.
+    ``moves``: the moment must be one at which this joint moves.  ``tip_limit_m``: largest tip travel that is promised.
+    """
+
+    orders: tuple[Order, ...]
+    expected: str
+    bound_ms: float
+    seen_ms: float = 0.0
+    moves: str = ""
+    tip_limit_m: float | None = None
+    window_s: float = 0.0
+    """How long to watch; 0 means the bound and half a second."""
+
+
+def _joint(random: Random, scene: Scene) -> str:
+    return random.choice([j.name.lower() for j in JOINTS if scene.profile.joints[j.name.lower()].encoder is not None])
+
+
+def _arm_joint(random: Random) -> str:
+    return random.choice(("slew", "lift", "tilt", "ext"))
+
+
+def _one(random: Random, fault: str, expected: str, bound_ms: float, part: str = "", size: float = math.nan,
+         length_s: float = math.inf, moves: str = "", seen_ms: float = 0.0, tip_limit_m: float | None = None,
+         window_s: float = 0.0) -> Injection:  # fmt: skip
+    order = Order(fault, part, 0.0, length_s, size, random.getrandbits(32))
+    return Injection((order,), expected, bound_ms, seen_ms, moves, tip_limit_m, window_s)
+
+
+def encoder_frozen(random: Random, scene: Scene) -> Injection:
+    joint = _joint(random, scene)
+    return _one(random, "encoder-stuck", "H", 300.0, joint, moves=joint)
+
+
+def encoder_jump(random: Random, scene: Scene) -> Injection:
+    joint, size = _joint(random, scene), random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.3)
+    if random.random() < 0.5:
+        return _one(random, "encoder-jump", "NONE", 10.0, joint, size, length_s=0.004)
+    return _one(random, "encoder-jump", "R1", 10.0 + 2 * T_MS, joint, size, length_s=0.05)
+
+
+def encoder_drift(random: Random, scene: Scene) -> Injection:
+    joint = random.choice(("slew", "lift", "tilt", "ext"))
+    rate = random.choice((-1.0, 1.0)) * (0.5 * _DEG if joint != "ext" else 0.01)
+    return _one(random, "encoder-drift", "D", 3000.0, joint, rate)
+
+
+def encoder_noise(random: Random, scene: Scene) -> Injection:
+    return _one(random, "encoder-noise", "D", 500.0, _joint(random, scene), 10.0)
+
+
+def encoder_scale(random: Random, scene: Scene) -> Injection:
+    joint, scale = _arm_joint(random), random.choice((-1.0, 0.5, 2.0))
+    return _one(random, "encoder-scale", "R1", 200.0, joint, scale, moves=joint, tip_limit_m=0.15)
+
+
+def _needed(random: Random, scene: Scene) -> str:
+    """A message that the present work needs."""
+    if scene.drives:
+        return random.choice((*_NEEDED_CRANE, *_NEEDED_DRIVE))
+    encoders = [ENCODER_MESSAGES[n] for n, s in scene.profile.joints.items() if s.encoder is not None]
+    return random.choice((*_NEEDED_CRANE, *encoders))
+
+
+def _protected(random: Random, scene: Scene) -> str:
+    return random.choice((*_NEEDED_CRANE, *(_NEEDED_DRIVE if scene.drives else ())))
+
+
+def _lost_ms(scene: Scene, name: str) -> float:
+    """Bound for the loss of a message: its time-out and one tick."""
+    return max(20.0, message(scene.profile, name)[1].timeout_ns * 1e-6 + T_MS)
+
+
+def message_off(random: Random, scene: Scene) -> Injection:
+    name = _needed(random, scene)
+    return _one(random, "message-off", "R1", _lost_ms(scene, name), name)
+
+
+def message_delayed(random: Random, scene: Scene) -> Injection:
+    name = _needed(random, scene)
+    codec = message(scene.profile, name)[1]
+    period_ms = max(T_MS, codec.cycle_time_ns * 1e-6)
+    timeout_periods = codec.timeout_ns * 1e-6 / period_ms
+    if random.random() < 0.5:
+        size = random.uniform(0.5, 0.6 * timeout_periods) * period_ms
+        return _one(random, "message-delayed", "NONE", 0.0, name, size, window_s=0.6)
+    size = random.uniform(1.3, 2.0) * timeout_periods * period_ms
+    return _one(random, "message-delayed", "R1", _lost_ms(scene, name), name, size)
+
+
+def message_repeated(random: Random, scene: Scene) -> Injection:
+    name = _protected(random, scene)
+    return _one(random, "message-stuck", "R1", _lost_ms(scene, name) + T_MS, name)
+
+
+def crc_failure(random: Random, scene: Scene) -> Injection:
+    name = _protected(random, scene)
+    codec = message(scene.profile, name)[1]
+    period_s = max(0.005, codec.cycle_time_ns * 1e-9)
+    if random.random() < 0.5:
+        return _one(random, "bus-corrupt", "NONE", 0.0, name, length_s=0.9 * period_s, window_s=0.6)
+    return _one(random, "bus-corrupt", "R1", max(30.0, 3e3 * period_s), name, length_s=max(0.03, 4 * period_s))
+
+
+def counter_skip(random: Random, scene: Scene) -> Injection:
+    name = _protected(random, scene)
+    codec = message(scene.profile, name)[1]
+    period_s = max(0.005, codec.cycle_time_ns * 1e-9)
+    if random.random() < 0.5:
+        return _one(random, "bus-drop", "NONE", 0.0, name, 1.0, length_s=0.9 * period_s, window_s=0.6)
+    lost_s = random.uniform(1.3, 3.0) * codec.timeout_ns * 1e-9
+    return _one(random, "bus-drop", "R1", _lost_ms(scene, name) + T_MS, name, 1.0, length_s=lost_s)
+
+
+def masquerade(random: Random, scene: Scene) -> Injection:
+    name = _protected(random, scene)
+    period_ms = message(scene.profile, name)[1].cycle_time_ns * 1e-6
+    return _one(random, "message-masquerade", "R1", 2.0 * max(T_MS, period_ms) + T_MS, name)
+
+
+def _bus(random: Random, scene: Scene) -> str:
+    machine = scene.profile.machine_bus
+    return random.choice((scene.profile.crane_bus, machine)) if scene.drives and machine else scene.profile.crane_bus
+
+
+def babble(random: Random, scene: Scene) -> Injection:
+    bus = _bus(random, scene)
+    return _one(random, "bus-babble", "R1", 50.0 if bus == scene.profile.crane_bus else 100.0 + T_MS, bus)
+
+
+def bus_off(random: Random, scene: Scene) -> Injection:
+    return _one(random, "bus-errors", "R0", 20.0, _bus(random, scene), 1.0)
+
+
+def error_passive(random: Random, scene: Scene) -> Injection:
+    """Seventeen errors in a row make a node error-passive; thirty-two would switch it off."""
+    return _one(random, "bus-errors", "D", 100.0, scene.profile.crane_bus, 1.0, length_s=0.0027)
+
+
+def cable_cut(random: Random, scene: Scene) -> Injection:
+    bus = _bus(random, scene)
+    bound = 30.0 if bus == scene.profile.crane_bus else 100.0 + T_MS
+    return _one(random, random.choice(("bus-cut", "bus-stub")), "R1", bound, bus)
+
+
+def valve_closed(random: Random, scene: Scene) -> Injection:
+    joint = _joint(random, scene)
+    return _one(random, "valve-stuck", "H", 400.0, joint, 0.0, moves=joint)
+
+
+def valve_open(random: Random, scene: Scene) -> Injection:
+    joint, size = _arm_joint(random), random.choice((-1.0, 1.0)) * random.uniform(0.45, 0.9)
+    return _one(random, "valve-stuck", "R0", 150.0, joint, size, tip_limit_m=0.20)
+
+
+def valve_gain(random: Random, scene: Scene) -> Injection:
+    joint = _arm_joint(random)
+    return _one(random, "valve-gain", "D", 2000.0, joint, random.choice((0.5, 1.5)), moves=joint)
+
+
+def node_reset(random: Random, scene: Scene) -> Injection:
+    return _one(random, "node-reset", "R1", 100.0, "valves")
+
+
+def hose_burst(random: Random, scene: Scene) -> Injection:
+    return _one(random, "hose-burst", "R0", 100.0, random.choice(("lift", "tilt")))
+
+
+def overload(random: Random, scene: Scene) -> Injection:
+    return _one(random, "load-overload", "D", 50.0, "", random.uniform(1500.0, 3000.0), window_s=1.5)
+
+
+def planner_killed(random: Random, scene: Scene) -> Injection:
+    return _one(random, "process-off", "H", LEASE_MS + 10.0, "planner")
+
+
+def planner_hung(random: Random, scene: Scene) -> Injection:
+    length_s = random.uniform(0.3, 0.8)
+    return _one(random, "process-stuck", "H", LEASE_MS + 10.0, "planner", length_s=length_s, window_s=1.5)
+
+
+def _some_bad(random: Random, fault: str, hold_ms: float = 160.0) -> Injection:
+    """One bad datagram is refused; from the third in a second on the machine stops."""
+    if random.random() < 0.5:
+        return _one(random, fault, "REFUSED", 50.0 + 10.0, length_s=0.05, seen_ms=REPORT_MS, window_s=0.6)
+    return _one(random, fault, "H", hold_ms, window_s=1.0)
+
+
+def planner_nan(random: Random, scene: Scene) -> Injection:
+    return _some_bad(random, "planner-nan")
+
+
+def planner_range(random: Random, scene: Scene) -> Injection:
+    return _some_bad(random, random.choice(("planner-range", "planner-speed")))
+
+
+def planner_jump(random: Random, scene: Scene) -> Injection:
+    return _some_bad(random, "planner-jump")
+
+
+def planner_replay(random: Random, scene: Scene) -> Injection:
+    fault = random.choice(("planner-replay", "planner-future"))
+    injection = _some_bad(random, fault)
+    if fault == "planner-replay":  # the first datagram is the one that is repeated, and itself good
+        longer = injection.orders[0].length_s + 0.05
+        return replace(
+            injection, orders=(replace(injection.orders[0], length_s=longer),), bound_ms=injection.bound_ms + 50.0
+        )
+    return injection
+
+
+def planner_corrupt(random: Random, scene: Scene) -> Injection:
+    return _some_bad(random, "planner-garbage")
+
+
+def gnss_lost(random: Random, scene: Scene) -> Injection:
+    return _one(random, "gnss-off", "H", 2300.0)
+
+
+def gnss_jump(random: Random, scene: Scene) -> Injection:
+    """A jump is in the next position frame: 100 ms of period and 100 ms of the receiver's own delay."""
+    if random.random() < 0.5:
+        return _one(random, "gnss-jump", "H", 200.0 + 200.0, "", 3.0)
+    return _one(random, "gnss-single", "H", 1200.0 + 200.0)
+
+
+def heading_wrong(random: Random, scene: Scene) -> Injection:
+    fault = random.choice(("heading-flip", "heading-stuck"))
+    return _one(random, fault, "H", 500.0 + 200.0, window_s=3.0)
+
+
+def estop(random: Random, scene: Scene) -> Injection:
+    return _one(random, random.choice(("estop-pressed", "estop-wire")), "R0", 20.0)
+
+
+def overrun(random: Random, scene: Scene) -> Injection:
+    match random.randrange(3):
+        case 0:  # one tick late by more than two periods and 10 ms
+            late_s = random.uniform(0.021, 0.040)
+            return _one(random, "process-stuck", "D", 1e3 * late_s + T_MS, "controller", length_s=late_s)
+        case 1:
+            late_s = random.uniform(0.060, 0.150)
+            return _one(random, "process-stuck", "H", 1e3 * late_s + T_MS, "controller", length_s=late_s)
+    return _one(random, "process-off", "NODE", 200.0, "controller")
+
+
+def wrong_node(random: Random, scene: Scene) -> Injection:
+    return _one(random, "encoder-identity", "X", 2000.0, _joint(random, scene))
+
+
+def foreign(random: Random, scene: Scene) -> Injection:
+    return _one(random, "bus-foreign", "R0", 20.0, _bus(random, scene))
+
+
+def person(random: Random, scene: Scene) -> Injection:
+    return _one(random, "person-in-zone", "H", 300.0)
+
+
+def log_slips(random: Random, scene: Scene) -> Injection:
+    return _one(random, "valve-stuck", "H", 300.0, "grapple", random.uniform(0.3, 1.0))
+
+
+def tilt(random: Random, scene: Scene) -> Injection:
+    return _one(random, "ground-tilt", "H", 200.0, "", random.choice((-1.0, 1.0)) * random.uniform(0.35, 0.6))
+
+
+def forged(random: Random, scene: Scene) -> Injection:
+    return _one(random, "planner-arms", "REFUSED", 60.0, length_s=0.05, seen_ms=REPORT_MS, window_s=0.6)

@@ -1,0 +1,116 @@
+"""Carries out orders on a lockstep run: a `hil.harness.lockstep.Disturbance`.
+
+``attach`` hangs it on a run; `order` adds orders at any time.  The same orders, seeds and run give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from hil.faults.datagrams import Effect, effect_of
+from hil.faults.order import Order
+from hil.faults.table import FAULTS, Edge, FaultError
+from hil.faults.wire_faults import wire_fault
+from hil.harness.lockstep import START_NS, Lockstep
+from hil.wire.faults import FOREVER_NS
+from sim.errors import PlantError
+from sim.plant_faults import PlantFault, begin
+
+_NOTHING: Final[Callable[[], None]] = lambda: None  # noqa: E731
+
+
+@dataclass(slots=True)
+class _Running:
+    """An order with its times on the run's clock [ns], and what ends it once it has begun."""
+
+    order: Order
+    start_ns: int
+    end_ns: int
+    end: Callable[[], None] | None = None
+
+
+class Injector:
+    """All orders of one run."""
+
+    def __init__(self, run: Lockstep, orders: Iterable[Order] = ()) -> None:
+        self._run = run
+        self._waiting: list[_Running] = []
+        self._datagrams: list[Effect] = []
+        self._stalled: dict[str, int] = {}
+        self._late_since_ns: int | None = None
+        self.begun: list[tuple[int, Order]] = []
+        """What has begun, with its time."""
+        run.disturbance = self
+        for order in orders:
+            self.order(order)
+
+    def order(self, order: Order, start_ns: int | None = None) -> None:
+        """Add an order; ``start_ns`` is a time on the run's clock instead of the order's own.
+
+        Raises:
+            FaultError: this machine has no such fault or part.
+        """
+        start_ns = START_NS + round(order.at_s * 1e9) if start_ns is None else start_ns
+        end_ns = start_ns + round(order.length_s * 1e9) if math.isfinite(order.length_s) else FOREVER_NS
+        if FAULTS[order.fault].edge is Edge.BUS:  # the bus keeps exact times itself
+            bus, fault = wire_fault(order, self._run.plant.profile, start_ns, end_ns)
+            next(core for core in self._run.cores if core.name == bus).inject(fault)
+            self.begun.append((start_ns, order))
+            return
+        self._waiting.append(_Running(order, start_ns, end_ns))
+
+    def begin(self, now_ns: int) -> None:
+        """Begin and end what is due before this slice."""
+        if not self._waiting:
+            return
+        left = []
+        for running in self._waiting:
+            if running.end is None and now_ns >= running.start_ns:
+                running.end = self._start(running, now_ns)
+                self.begun.append((now_ns, running.order))
+            if running.end is not None and now_ns >= running.end_ns:
+                running.end()
+            else:
+                left.append(running)
+        self._waiting = left
+
+    def datagrams(self, now_ns: int, sent: list[bytes]) -> list[bytes]:
+        """The datagrams that arrive."""
+        for effect in self._datagrams:
+            sent = effect(now_ns, sent)
+        return sent
+
+    def stalled(self, process: str, now_ns: int) -> bool:
+        """Whether the process does not run now."""
+        until_ns = self._stalled.get(process)
+        if until_ns is None:
+            return False
+        if now_ns >= until_ns:
+            del self._stalled[process]
+            return False
+        if process == "controller" and self._late_since_ns is None:
+            self._late_since_ns = now_ns
+        return True
+
+    def late_ns(self, now_ns: int) -> int:
+        """How long ago the first tick was due that has not run."""
+        since_ns, self._late_since_ns = self._late_since_ns, None
+        return 0 if since_ns is None else now_ns - since_ns
+
+    def _start(self, running: _Running, now_ns: int) -> Callable[[], None]:
+        order = running.order
+        match FAULTS[order.fault].edge:
+            case Edge.PLANNER:
+                effect = effect_of(order)
+                self._datagrams.append(effect)
+                return lambda: self._datagrams.remove(effect)
+            case Edge.PROCESS:
+                self._stalled[order.part] = running.end_ns if order.fault == "process-stuck" else FOREVER_NS
+                return _NOTHING
+        try:
+            return begin(self._run.plant, PlantFault(order.fault, order.part, order.sized(), order.seed), now_ns)
+        except PlantError as error:
+            raise FaultError(error.code, str(error)) from None

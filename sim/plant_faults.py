@@ -1,0 +1,294 @@
+"""The plant's faults by name: each begins on a running plant and returns what ends it.
+
+Lockstep runs call `begin` directly, a live plant on request (`sim.process.live_plant`).  Names and PX4's words are in
+`hil.faults.table`; here is only what the plant does.  Equal seeds and moments give equal bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from random import Random
+from typing import Final
+
+import msgspec
+
+from can_dbc.dbc.codec import Database, DbcError, MessageCodec, load
+from can_dbc.protocols.canopen import NMT_ID, NmtCommand
+from machine.crane_nodes import CraneNode
+from machine.profile import Profile
+from sim.emulation import EmulatedMachine
+from sim.errors import PlantError
+from sim.faults import frame_tap
+from sim.faults.encoder_fault import EncoderFault
+from sim.nodes.gnss import Fix, GnssNode
+from sim.plant import Plant
+
+End = Callable[[], None]
+ENCODER_MESSAGES: Final = {
+    "slew": "EncSlew", "lift": "EncLift", "tilt": "EncTilt", "ext": "EncExt", "rot": "EncRot",
+    "articulation": "EncArtic",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class PlantFault:
+    """One fault: its name, the part it acts on (joint, message or node, "" where there is only one), its size in the
+    unit of its name in `BEGINNERS`, and the seed of what it draws.
+    """
+
+    name: str
+    part: str = ""
+    size: float = 0.0
+    seed: int = 0
+
+
+def begin(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """Begin a fault; returns what ends it.
+
+    Raises:
+        PlantError: this machine has no such fault or part.
+    """
+    beginner = BEGINNERS.get(fault.name)
+    if beginner is None:
+        raise PlantError(
+            "fault.unknown", f"the plant has no fault {fault.name!r}; `timberhand inject --list` shows those it has"
+        )
+    return beginner(plant, fault, now_ns)
+
+
+def _encoder(**error: float | bool) -> Callable[[EmulatedMachine, PlantFault, int], End]:
+    """Errors of one encoder's reading; a value of NaN stands for the fault's size."""
+
+    def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+        encoder = plant.encoders.get(fault.part)
+        if encoder is None:
+            raise PlantError(
+                "fault.no-encoder", f"{plant.profile.name} has no encoder {fault.part!r}, only {', '.join(plant.encoders)}"
+            )
+        sized = {k: fault.size if isinstance(v, float) and math.isnan(v) else v for k, v in error.items()}
+        pivot = encoder.measure(now_ns) if "scale" in error else 0.0
+        encoder.fault = EncoderFault(since_ns=now_ns, pivot=pivot, **sized)  # type: ignore[arg-type]
+
+        def end() -> None:
+            encoder.fault = None
+
+        return end
+
+    return start
+
+
+def _identity(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """Another device answers under the node number; it boots."""
+    encoder = plant.encoders[fault.part]
+    encoder.spec = msgspec.structs.replace(encoder.spec, device_type=encoder.spec.device_type ^ 1)
+    plant._deliver_crane(NMT_ID, bytes((NmtCommand.RESET_NODE, encoder.spec.node)), now_ns)
+    return _nothing
+
+
+def _spool(kind: str) -> Callable[[EmulatedMachine, PlantFault, int], End]:
+    def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+        table: dict[str, float] = getattr(plant.spool_faults, kind)
+        table[fault.part] = fault.size
+        return lambda: table.pop(fault.part, None) and None
+
+    return start
+
+
+def _burst(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """The chamber with the higher pressure loses its oil: that one carries the load."""
+    hydraulics = _physical(plant, fault).world.hydraulics
+    if fault.part not in hydraulics.names:
+        raise PlantError("fault.no-function", f"{plant.profile.name} has no hydraulic function {fault.part!r}")
+    pressure_a, pressure_b = hydraulics.pressures_pa[fault.part]
+    hose = (fault.part, "a" if pressure_a >= pressure_b else "b")
+    hydraulics.burst.add(hose)
+    return lambda: hydraulics.burst.discard(hose)
+
+
+def _overload(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """A mass [kg] hangs on the rotator, as from a log that is caught by another."""
+    world = _physical(plant, fault).world
+    body, link = world.crane.body, world.crane.link["rotator"]
+    before = world.client.getDynamicsInfo(body, link)[0]
+    world.client.changeDynamics(body, link, mass=before + fault.size)
+    return lambda: world.client.changeDynamics(body, link, mass=before)
+
+
+def _tilt(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """The ground gives way on one side: roll [rad], + right side down."""
+    plant.tilt_rad = (fault.size, 0.0)
+
+    def end() -> None:
+        plant.tilt_rad = (0.0, 0.0)
+
+    return end
+
+
+def _node_reset(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """A node resets as after a drop of its supply: boot-up, and everything that it knew is gone."""
+    node = CraneNode[fault.part.upper().replace("-", "_")]
+    reset = bytes((NmtCommand.RESET_NODE, node))
+    plant._deliver_crane(NMT_ID, reset, now_ns)
+    return _nothing
+
+
+def _estop(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    plant.estop.press()
+    return _nothing
+
+
+def _estop_wire(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """The wire of one of the two normally closed contacts breaks."""
+    codec = message(plant.profile, "EstopStat")[1]
+    channel = "ChannelA" if fault.seed % 2 else "ChannelB"
+    return plant.tap.add(plant.profile.crane_bus, codec.key, frame_tap.rewritten(codec, {channel: 0}))
+
+
+def _person(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    codec = message(plant.profile, "EstopStat")[1]
+    return plant.tap.add(plant.profile.crane_bus, codec.key, frame_tap.rewritten(codec, {"Person": 1}))
+
+
+def _gnss(change: Callable[[GnssNode, PlantFault], End]) -> Callable[[EmulatedMachine, PlantFault, int], End]:
+    def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+        if plant.gnss is None:
+            raise PlantError("fault.no-gnss", f"{plant.profile.name} has no GNSS receiver")
+        return change(plant.gnss, fault)
+
+    return start
+
+
+def _silence(gnss: GnssNode, fault: PlantFault) -> End:
+    gnss.silent = True
+
+    def end() -> None:
+        gnss.silent = False
+
+    return end
+
+
+def _jump(gnss: GnssNode, fault: PlantFault) -> End:
+    angle = Random(fault.seed).uniform(0.0, math.tau)
+    gnss.jump_m = (fault.size * math.cos(angle), fault.size * math.sin(angle))
+
+    def end() -> None:
+        gnss.jump_m = (0.0, 0.0)
+
+    return end
+
+
+def _fix(gnss: GnssNode, fault: PlantFault) -> End:
+    gnss.set_fix(Fix.SINGLE)
+    return lambda: gnss.set_fix(Fix.RTK_FIXED)
+
+
+def _heading(gnss: GnssNode, fault: PlantFault) -> End:
+    gnss.heading_error_rad = math.pi
+
+    def end() -> None:
+        gnss.heading_error_rad = 0.0
+
+    return end
+
+
+def _heading_frozen(gnss: GnssNode, fault: PlantFault) -> End:
+    gnss.heading_frozen = True
+
+    def end() -> None:
+        gnss.heading_frozen = False
+
+    return end
+
+
+@cache
+def database(name: str) -> Database:
+    """A shipped database, compiled once per process."""
+    return load(name)
+
+
+def message(profile: Profile, name: str) -> tuple[str, MessageCodec]:
+    """Bus and codec of a message of a machine.
+
+    Raises:
+        PlantError: no bus of this machine has it.
+    """
+    buses = [(profile.crane_bus, "crane")]
+    if profile.machine_bus:
+        buses += [(profile.machine_bus, "machine"), (profile.machine_bus, "gnss")]
+    for bus, kind in buses:
+        try:
+            return bus, database(kind).message(name)
+        except DbcError:
+            continue
+    raise PlantError("fault.no-message", f"{profile.name} has no message {name!r}; take a name of its DBC files")
+
+
+def _frames(make: Callable[[PlantFault, MessageCodec], frame_tap.Effect]) -> Callable[
+    [EmulatedMachine, PlantFault, int], End
+]:
+    """An effect on the frames of one message."""
+
+    def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+        bus, codec = message(plant.profile, fault.part)
+        return plant.tap.add(bus, codec.key, make(fault, codec))
+
+    return start
+
+
+def _late(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    bus, codec = message(plant.profile, fault.part)
+    return plant.tap.delay(bus, codec.key, round(fault.size * 1e6))
+
+
+def _foreign(fault: PlantFault, codec: MessageCodec) -> frame_tap.Effect:
+    if codec.data_ids is None:
+        raise PlantError("fault.no-data-id", f"{codec.name} has no Data IDs to mistake; choose a protected message")
+    return frame_tap.masqueraded(bytes(b ^ 0x5A for b in codec.data_ids))
+
+
+def _physical(plant: EmulatedMachine, fault: PlantFault) -> Plant:
+    if not isinstance(plant, Plant):
+        raise PlantError("fault.no-physics", f"{fault.name} needs the plant with physics, not the kinematic machine")
+    return plant
+
+
+def _nothing() -> None:
+    """What has happened cannot be undone."""
+
+
+SIZE: Final = math.nan
+BEGINNERS: Final[dict[str, Callable[[EmulatedMachine, PlantFault, int], End]]] = {
+    "encoder-stuck": _encoder(frozen=True),
+    "encoder-jump": _encoder(offset=SIZE),
+    "encoder-drift": _encoder(drift_per_s=SIZE),
+    "encoder-noise": _encoder(noise_factor=SIZE),
+    "encoder-scale": _encoder(scale=SIZE),
+    "encoder-identity": _identity,
+    "message-off": _frames(lambda fault, codec: frame_tap.silent),
+    "message-stuck": _frames(lambda fault, codec: frame_tap.repeated()),
+    "message-garbage": _frames(lambda fault, codec: frame_tap.garbage(Random(fault.seed))),
+    "message-intermittent": _frames(lambda fault, codec: frame_tap.intermittent(Random(fault.seed), fault.size)),
+    "message-slow": _frames(lambda fault, codec: frame_tap.every(max(2, round(fault.size)))),
+    "message-delayed": _late,
+    "message-masquerade": _frames(_foreign),
+    "valve-stuck": _spool("stuck"),
+    "valve-drift": _spool("bias"),
+    "valve-gain": _spool("gain"),
+    "hose-burst": _burst,
+    "load-overload": _overload,
+    "ground-tilt": _tilt,
+    "node-reset": _node_reset,
+    "estop-pressed": _estop,
+    "estop-wire": _estop_wire,
+    "person-in-zone": _person,
+    "gnss-off": _gnss(_silence),
+    "gnss-jump": _gnss(_jump),
+    "gnss-single": _gnss(_fix),
+    "heading-flip": _gnss(_heading),
+    "heading-stuck": _gnss(_heading_frozen),
+}
+"""Size: rad or m (jump), per s (drift), factor (noise, scale, gain), ms (delayed), share of frames lost (intermittent),
+every n-th frame (slow), -1..1 of the spool (stuck, drift), kg (overload), rad (tilt), m (gnss-jump)."""

@@ -1,0 +1,117 @@
+"""The fault campaign: its verdicts, its metrics, and a machine that is forked at a moment and continues the same."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from experiments.common.errors import ExperimentError
+from experiments.common.pool import Job
+from experiments.faults import files
+from experiments.faults.experiment import _absent, nominal_plan, plan, scenes_of
+from experiments.faults.judgement import judge
+from experiments.faults.metrics import METRICS, gather
+from experiments.faults.pages import evidence, table
+from experiments.faults.running import build
+from experiments.faults.trial import in_child, inject
+from hil.faults.catalogue import BY_NAME, CASES, Where
+from tests.codes import coded
+
+
+def outcome(**changed: Any) -> dict[str, Any]:
+    row = {
+        "seed": "s", "at_ms": 1.0, "orders": ["encoder-stuck/lift"], "expected": "R1", "bound_ms": 20.0, "seen_ms": 0.0,
+        "tip_limit_m": None, "reached": {"R1": 15.0}, "reason": "ENCODER_LOST", "refused_ms": None, "neutral_ms": 80.0,
+        "valves_ms": 70.0, "travel_m": 0.02, "standing": True, "timeline": [[1.0, "STOP"]],
+    } | changed  # fmt: skip
+    return row | judge(row)
+
+
+@pytest.mark.parametrize(
+    ("changed", "verdict", "detect_ms"),
+    [
+        ({}, "ok", 15.0),
+        ({"reached": {"R1": 26.0}}, "late", 26.0),
+        ({"reached": {"R0": 26.0, "D": 3.0}, "expected": "H"}, "late", 26.0),
+        ({"reached": {"D": 3.0}}, "weak", 3.0),
+        ({"reached": {}}, "undetected", None),
+        ({"reached": {"R0": 2.0}, "tip_limit_m": 0.01}, "far", 2.0),
+        ({"expected": "NONE"}, "tripped", 15.0),
+        ({"expected": "NONE", "reached": {"D": 1.0}}, "ok", None),
+        ({"expected": "REFUSED", "reached": {}, "refused_ms": 10.0}, "ok", 10.0),
+        ({"expected": "REFUSED", "reached": {}}, "undetected", None),
+        ({"expected": "REFUSED", "refused_ms": 10.0}, "tripped", 10.0),
+        ({"expected": "NODE", "reached": {}, "bound_ms": 200.0}, "ok", 70.0),
+        ({"expected": "X", "reached": {"X": 1.0}}, "ok", 1.0),
+    ],
+)
+def test_a_verdict_is_the_promise_kept_or_how_it_was_broken(
+    changed: dict[str, Any], verdict: str, detect_ms: float | None
+) -> None:
+    found = outcome(**changed)
+    assert (found["verdict"], found["detect_ms"], found["missed"]) == (verdict, detect_ms, verdict != "ok")
+
+
+def test_a_missed_injection_is_counted_and_a_blind_spot_is_told_apart() -> None:
+    rows = [outcome(), outcome(reached={}, neutral_ms=None, valves_ms=None, travel_m=0.4)]
+    everything = {c.name: {"case": c.number, "scene": "crane", "outcomes": rows} for c in CASES if c.draw}
+    everything |= {c.name: _absent(c, 2) for c in CASES if c.where is Where.ABSENT}
+    everything["n"] = {"scene": "x", "seconds": 7200.0, "trips": [(1.0, "why")]}
+    metrics = gather(everything)
+    assert {m.name for m in METRICS} <= metrics.keys()
+    with_draw, absent = sum(c.draw is not None for c in CASES), sum(c.where is Where.ABSENT for c in CASES)
+    assert metrics["injections"] == 2 * (with_draw + absent)
+    assert metrics["missed"] == with_draw + 2 * absent
+    assert (metrics["blind_missed"], metrics["unexplained"]) == (2 * absent, with_draw)
+    assert math.isinf(metrics["neutral_max_ms"]), "valves that never became neutral"
+    assert (metrics["nominal_hours"], metrics["false_trips"]) == (2.0, 1.0)
+    assert metrics["c06_harm_m"] == 0.4 and metrics["c06_max_ms"] == 15.0
+    case = BY_NAME["message-off"]
+    page = evidence(case, [row | {"scene": "crane"} for row in rows], metrics)
+    assert "Missed: 1 of 2." in page and "never" in page and page.startswith("---\norphan: true")
+    assert table(metrics).count("\n") == len(CASES) + 1
+
+
+def test_the_plan_spreads_the_trials_over_the_scenes_and_leaves_none_out() -> None:
+    jobs = plan(1, 100)
+    counts: dict[int, int] = {}
+    for job in jobs:
+        counts[job.options["case"]] = counts.get(job.options["case"], 0) + job.options["count"]
+    assert counts == {c.number: 100 for c in CASES if c.where is not Where.ABSENT}
+    assert len({job.name for job in jobs}) == len(jobs)
+    assert len(scenes_of(BY_NAME["message-off"])) == 5
+    assert sum(j.options["seconds"] for j in nominal_plan(1, 36_000.0)) == pytest.approx(36_000.0)
+
+
+def test_a_child_answers_and_its_failure_is_told() -> None:
+    assert in_child(lambda: {"a": 1}) == {"a": 1}
+    with pytest.raises(ExperimentError, check=coded("experiment.injection-failed")):
+        in_child(lambda: {"a": 1 // 0})
+
+
+@pytest.mark.parametrize("name", sorted(files.CHECKS))
+def test_files_and_clocks_keep_their_promise(name: str) -> None:
+    found = files.perform(Job("j", "files", 1, {"case": BY_NAME[name].number, "count": 3}))
+    assert [o["verdict"] for o in found["outcomes"]] == ["ok"] * 3, found["outcomes"]
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_an_injection_in_a_forked_child_is_that_of_a_fresh_machine_and_of_its_repetition() -> None:
+    def machine() -> Any:
+        made = build("crane palms_471")
+        made.until_moving()
+        made.operator.hands_off = True
+        return made
+
+    number, seed = BY_NAME["message-off"].number, "a seed"
+    warm = machine()
+    first = in_child(lambda: inject(warm, number, seed))
+    again = in_child(lambda: inject(warm, number, seed))
+    fresh = inject(machine(), number, seed)
+    assert first == again
+    assert first["timeline"] == [list(row) for row in fresh["timeline"]]
+    assert {k: v for k, v in first.items() if k != "timeline"} == {k: v for k, v in fresh.items() if k != "timeline"}
+    assert first["verdict"] == "ok" and first["neutral_ms"] <= 100.0

@@ -1,0 +1,162 @@
+"""Faults of the plant's parts: the frames and readings that leave it are those of the fault, and whole again after."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+import pytest
+
+from can_dbc.protocols.e2e import Checker, Status
+from machine.loading.profile_file import load_profile
+from sim.errors import PlantError
+from sim.faults import frame_tap
+from sim.faults.encoder_fault import EncoderFault
+from sim.faults.frame_tap import FrameTap
+from sim.faults.spool_faults import SpoolFaults
+from sim.kinematic.machine import KinematicMachine
+from sim.plant_faults import BEGINNERS, PlantFault, begin, database, message
+from tests.codes import coded
+
+MS = 1_000_000
+PROFILE = load_profile("palms_471")
+ESTOP = database("crane").message("EstopStat")
+
+
+def machine() -> KinematicMachine:
+    return KinematicMachine(PROFILE, 0, step_ns=2_500_000)
+
+
+def sent_of(plant: KinematicMachine, key: int, ms: int, start_ms: int = 0) -> list[bytes]:
+    """Payloads under a key in a span of time, stepped in slices."""
+    found = []
+    for k in range(start_ms * 4 // 5, (start_ms + ms) * 4 // 5):
+        found += [data for _, found_key, data in plant.step(1_000_000_000 + k * 1_250_000, []) if found_key == key]
+    return found
+
+
+def test_a_silent_message_is_not_sent_and_comes_back() -> None:
+    plant = machine()
+    assert sent_of(plant, ESTOP.key, 50)
+    end = begin(plant, PlantFault("message-off", "EstopStat"), 0)
+    assert not sent_of(plant, ESTOP.key, 50, 50)
+    end()
+    assert sent_of(plant, ESTOP.key, 50, 100)
+
+
+def test_a_repeated_message_has_a_counter_that_stands_still() -> None:
+    plant = machine()
+    begin(plant, PlantFault("message-stuck", "EstopStat"), 0)
+    found = sent_of(plant, ESTOP.key, 60)
+    assert len(found) > 3 and len(set(found)) == 1
+
+
+def test_a_masquerade_has_a_checksum_that_is_right_for_another_message_only() -> None:
+    plant = machine()
+    begin(plant, PlantFault("message-masquerade", "EstopStat"), 0)
+    assert ESTOP.data_ids is not None
+    checker = Checker(ESTOP.data_ids)
+    assert {checker.check(data) for data in sent_of(plant, ESTOP.key, 60)} == {Status.ERROR}
+
+
+def test_a_broken_wire_and_a_person_are_protected_correctly() -> None:
+    plant = machine()
+    begin(plant, PlantFault("estop-wire", seed=1), 0)
+    begin(plant, PlantFault("person-in-zone"), 0)
+    assert ESTOP.data_ids is not None
+    checker, values = Checker(ESTOP.data_ids), {}
+    for data in sent_of(plant, ESTOP.key, 60):
+        assert checker.check(data) is not Status.ERROR
+        values = ESTOP.named(ESTOP.receive(data))
+    assert (values["ChannelA"], values["ChannelB"], values["Person"]) == (0, 1, 1)
+
+
+def test_a_delayed_message_keeps_its_payload() -> None:
+    tap = FrameTap()
+    end = tap.delay("crane0", 7, 20 * MS)
+    assert tap.pass_on(0, [("crane0", 7, b"a"), ("crane0", 8, b"b")]) == [("crane0", 8, b"b")]
+    end()
+    assert tap.pass_on(10 * MS, []) == []
+    assert tap.pass_on(20 * MS, []) == [("crane0", 7, b"a")]
+
+
+def test_intermittent_and_slow_lose_frames_reproducibly() -> None:
+    def lost(effect: frame_tap.Effect) -> str:
+        return "".join("." if effect(b"x", 0) is None else "x" for _ in range(40))
+
+    assert lost(frame_tap.every(4)) == "...x" * 10
+    one, again = (lost(frame_tap.intermittent(Random(3), 0.5)) for _ in range(2))
+    assert one == again and 5 < one.count(".") < 35
+
+
+def test_encoder_faults_change_the_reading_as_they_say() -> None:
+    plant = machine()
+    plant.step(1_000_000_000, [])
+    lift = plant.encoders["lift"]
+    true = lift.measure(1_000_000_000)
+    for name, size, expected in (
+        ("encoder-jump", 0.2, true + 0.2),
+        ("encoder-drift", 0.01, true + 0.02),
+        ("encoder-scale", -1.0, true),
+    ):
+        end = begin(plant, PlantFault(name, "lift", size), 1_000_000_000)
+        assert lift.measure(3_000_000_000) == pytest.approx(expected, abs=2e-3), name
+        end()
+    assert lift.measure(4_000_000_000) == pytest.approx(true, abs=2e-3)
+
+
+def test_a_reversed_encoder_turns_about_where_it_was() -> None:
+    fault = EncoderFault(scale=-1.0, pivot=0.5)
+    assert fault.position(0.7, 0) == pytest.approx(0.3)
+
+
+def test_a_frozen_encoder_repeats_its_position() -> None:
+    plant = machine()
+    plant.step(1_000_000_000, [])
+    slew = plant.encoders["slew"]
+    before = slew.measure(1_000_000_000)
+    begin(plant, PlantFault("encoder-stuck", "slew"), 1_000_000_000)
+    slew.observe(2_000_000_000, before + 0.3, 0.1)
+    assert slew.measure(2_000_000_000) == before
+
+
+def test_spools_stick_drift_and_weaken_by_name() -> None:
+    faults = SpoolFaults()
+    assert not faults
+    faults.stuck["lift"], faults.bias["tilt"], faults.gain["ext"] = 0.7, 0.2, 0.5
+    assert faults and faults.apply(("slew", "lift", "tilt", "ext"), (0.1, 0.0, 0.1, -0.4)) == pytest.approx(
+        [0.1, 0.7, 0.3, -0.2]
+    )
+
+
+def test_a_valve_node_boots_again() -> None:
+    plant = machine()
+    sent_of(plant, 0x710, 20)
+    begin(plant, PlantFault("node-reset", "valves"), 0)
+    assert b"\x00" in sent_of(plant, 0x710, 20, 20)
+
+
+def test_what_a_machine_does_not_have_is_refused_in_words() -> None:
+    plant = machine()
+    for fault, code in (
+        (PlantFault("no-such"), "fault.unknown"),
+        (PlantFault("encoder-stuck", "articulation"), "fault.no-encoder"),
+        (PlantFault("gnss-off"), "fault.no-gnss"),
+        (PlantFault("hose-burst", "lift"), "fault.no-physics"),
+        (PlantFault("message-off", "VehStat"), "fault.no-message"),
+        (PlantFault("message-masquerade", "EncLift"), "fault.no-data-id"),
+    ):
+        with pytest.raises(PlantError, check=coded(code)):
+            begin(plant, fault, 0)
+
+
+def test_every_fault_begins_and_ends_on_a_machine_that_drives() -> None:
+    plant = KinematicMachine(load_profile("aoro_fc8"), 0, step_ns=2_500_000)
+    plant.step(1_000_000_000, [])
+    parts = {"encoder": "lift", "message": "VehStat", "valve": "lift", "node": "valves"}
+    for name in BEGINNERS:
+        if name in ("hose-burst", "load-overload"):
+            continue  # need physics
+        begin(plant, PlantFault(name, parts.get(name.partition("-")[0], ""), 2.0, 1), 1_000_000_000)()
+    assert message(plant.profile, "VesselHeading")[0] == "mach0"
+    assert math.isfinite(plant.encoders["lift"].measure(1_000_000_000))

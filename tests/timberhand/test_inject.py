@@ -1,0 +1,112 @@
+"""``timberhand inject``: what it lists, refuses, and does to a live run."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from hil.faults.live import LiveTarget, inject
+from hil.faults.order import make
+from hil.faults.table import FAULTS, FaultError
+from hil.harness.live import ADDRESSES
+from host.exit_codes import CommandFailed
+from machine.loading.profile_file import load_profile
+from tests.codes import coded
+from timberhand.cli import app
+
+PALMS = load_profile("palms_471")
+
+
+def target(**changed: Any) -> LiveTarget:
+    parts: dict[str, Any] = {"ports": {"sim": 1, "control": 1}, "buses": {"crane0": "socketcan:can0"}, "pids": {}}
+    return LiveTarget(PALMS, **(parts | changed))
+
+
+def test_the_list_shows_every_fault() -> None:
+    result = CliRunner().invoke(app, ["inject", "--list"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0
+    assert all(name in result.stdout for name in FAULTS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["no-such-fault"], "fault.unknown"),
+        (["encoder-lift", "off"], "fault.unknown-word"),
+        (["encoder-lift", "stuck", "--at", "soon"], "fault.time-syntax"),
+        (["encoder-stuck", "--run", "/nonexistent"], "fault.no-live-run"),
+        (["planner-nan", "--run", "."], "fault.no-live-run"),
+    ],
+)
+def test_what_cannot_be_injected_is_one_sentence_with_a_code(arguments: list[str], code: str) -> None:
+    result = CliRunner().invoke(app, ["inject", *arguments])
+    assert isinstance(result.exception, CommandFailed) and result.exception.code == code
+
+
+def test_a_live_demo_takes_no_orders_in_advance() -> None:
+    result = CliRunner().invoke(app, ["demo", "--bus", "wire", "--inject", "encoder-stuck@1"])
+    assert isinstance(result.exception, CommandFailed) and result.exception.code == "demo.inject-live"
+
+
+def test_a_real_bus_is_left_alone() -> None:
+    for order, code in (
+        (make("bus-babble", length_s=0.01), "fault.real-bus"),
+        (make("bus-cut"), "fault.only-on-wire"),
+        (make("planner-nan"), "fault.not-live"),
+        (make("process-off"), "fault.no-process"),
+    ):
+        with pytest.raises(FaultError, check=coded(code)):
+            inject(order, target())
+
+
+def test_a_process_is_stopped_for_a_while_and_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
+        there = target(pids={"autonomy": process.pid})
+        assert "stopped for" in inject(make("process-stuck", part="planner", length_s=0.05), there)
+        assert process.poll() is None
+        inject(make("process-off", part="planner"), there)
+        assert process.wait(10) == -signal.SIGKILL
+
+
+def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plant:
+        plant.bind(("127.0.0.1", 0))
+        plant.settimeout(10)
+        asked: list[dict[str, str]] = []
+
+        def answer() -> None:
+            for reply in ({"ok": True}, {"error": "no such encoder"}):
+                data, sender = plant.recvfrom(4096)
+                asked.append(json.loads(data))
+                plant.sendto(json.dumps(reply).encode(), sender)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        document = {"profile": "palms_471", "ports": {"sim": plant.getsockname()[1]}, "buses": {}, "pids": {}}
+        (tmp_path / ADDRESSES).write_text(json.dumps(document))
+        there = LiveTarget.of(tmp_path)
+        assert "begun" in inject(make("encoder-lift", "stuck", length_s=0.5), there)
+        with pytest.raises(FaultError, check=coded("fault.plant-refuses")):
+            inject(make("encoder-stuck"), there)
+        thread.join()
+    assert asked[0] == {
+        "op": "fault", "name": "encoder-stuck", "part": "lift", "size": "0.0", "seed": "0", "for_s": "0.5",
+    }  # fmt: skip
+
+
+def test_forged_datagrams_reach_the_controllers_port() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
+        controller.bind(("127.0.0.1", 0))
+        there = target(ports={"control": controller.getsockname()[1]})
+        for fault in ("planner-garbage", "planner-arms", "planner-replay"):
+            assert "sent" in inject(make(fault, length_s=0.03), there)
+            assert controller.recv(2048)
