@@ -66,7 +66,8 @@ def _encoder(**error: float | bool) -> Callable[[EmulatedMachine, PlantFault, in
         encoder = plant.encoders.get(fault.part)
         if encoder is None:
             raise PlantError(
-                "fault.no-encoder", f"{plant.profile.name} has no encoder {fault.part!r}, only {', '.join(plant.encoders)}"
+                "fault.no-encoder",
+                f"{plant.profile.name} has no encoder {fault.part!r}, only {', '.join(plant.encoders)}",
             )
         sized = {k: fault.size if isinstance(v, float) and math.isnan(v) else v for k, v in error.items()}
         pivot = encoder.measure(now_ns) if "scale" in error else 0.0
@@ -92,7 +93,11 @@ def _spool(kind: str) -> Callable[[EmulatedMachine, PlantFault, int], End]:
     def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
         table: dict[str, float] = getattr(plant.spool_faults, kind)
         table[fault.part] = fault.size
-        return lambda: table.pop(fault.part, None) and None
+
+        def end() -> None:
+            table.pop(fault.part, None)
+
+        return end
 
     return start
 
@@ -226,9 +231,9 @@ def message(profile: Profile, name: str) -> tuple[str, MessageCodec]:
     raise PlantError("fault.no-message", f"{profile.name} has no message {name!r}; take a name of its DBC files")
 
 
-def _frames(make: Callable[[PlantFault, MessageCodec], frame_tap.Effect]) -> Callable[
-    [EmulatedMachine, PlantFault, int], End
-]:
+def _frames(
+    make: Callable[[PlantFault, MessageCodec], frame_tap.Effect],
+) -> Callable[[EmulatedMachine, PlantFault, int], End]:
     """An effect on the frames of one message."""
 
     def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:

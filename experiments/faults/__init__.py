@@ -1,1 +1,1 @@
-"""The fault campaign: every entry of the fault catalogue injected at random moments, and nominal work without faults."""
+"""The fault campaign: every entry of the fault catalogue at random moments, and work without faults."""

@@ -129,12 +129,16 @@ class Evidence:
     def _neutral(self) -> bool:
         a, b, node = (self._state.get(name) for name in ("ValveCmdA", "ValveCmdB", "ValveFbA"))
         spools = ("Slew", "Lift", "Tilt", "Ext")
-        commanded = a is None or b is None or (
-            b.get("ArmKey") == _ARMED
-            and (
-                (a.get("Mode") == _SPOOL_MODE and any(a.get(s) for s in spools))
-                or bool(b.get("Rot"))
-                or (bool(b.get("Grapple")) and b.get("GrappleMode") in (1, 2))
+        commanded = (
+            a is None
+            or b is None
+            or (
+                b.get("ArmKey") == _ARMED
+                and (
+                    (a.get("Mode") == _SPOOL_MODE and any(a.get(s) for s in spools))
+                    or bool(b.get("Rot"))
+                    or (bool(b.get("Grapple")) and b.get("GrappleMode") in (1, 2))
+                )
             )
         )
         crane = not commanded or (node is not None and node.get("State") in _AT_REST)

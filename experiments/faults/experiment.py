@@ -1,7 +1,7 @@
 """The fault campaign: 45 catalogue entries at random moments, and hours of nominal work (docs/reference/safety.md 5).
 
-``--trials`` is the number of injections of each entry, spread over its scenes; ``--minutes`` bounds the run: finished jobs
-stay in the checkpoint, the same command continues, and a page is written once all are done.
+``--trials`` is the number of injections of each entry, spread over its scenes; ``--minutes`` bounds the run: finished
+jobs stay in the checkpoint, the same command continues, and a page is written once all are done.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ def scenes_of(case: Case) -> list[str]:
     physics = PHYSICS if case.physics else ""
     by_work = {
         Work.CRANE: [f"crane palms_471{physics}", f"crane aoro_fc8{physics}"],
+        Work.CARRY: ["carry palms_471", "carry aoro_fc8"],
         Work.DRIVE: ["drive aoro_fc8"],
         Work.PLC: ["plc valves palms_471", "plc references palms_471"],
     }
@@ -149,6 +150,7 @@ def _absent(case: Case, trials: int) -> dict[str, Any]:
     row = {
         "seed": case.name, "at_ms": 0.0, "orders": [], "expected": "H", "bound_ms": 0.0, "seen_ms": 0.0,
         "tip_limit_m": None, "reached": {}, "reason": "", "refused_ms": None, "neutral_ms": None, "valves_ms": None,
-        "travel_m": 0.0, "standing": False, "timeline": [], "detect_ms": None, "verdict": "undetected", "missed": True,
+        "travel_m": 0.0, "astray_m": 0.0, "standing": False, "timeline": [],
+        "detect_ms": None, "verdict": "undetected", "missed": True,
     }  # fmt: skip
     return {"case": case.number, "scene": "no input", "outcomes": [row] * trials}

@@ -57,7 +57,8 @@ def _outcome(what: str, bound_ms: float, found_ms: float | None, good: bool, sai
     return {
         "at_ms": 0.0, "orders": [what], "expected": "REFUSED", "bound_ms": bound_ms, "seen_ms": 0.0,
         "tip_limit_m": None, "reached": {}, "reason": "", "refused_ms": found_ms, "neutral_ms": None, "valves_ms": None,
-        "travel_m": 0.0, "standing": True, "timeline": [[found_ms or 0.0, said]], "detect_ms": found_ms,
+        "travel_m": 0.0, "astray_m": 0.0, "standing": True, "timeline": [[found_ms or 0.0, said]],
+        "detect_ms": found_ms,
         "verdict": verdict, "missed": verdict != "ok",
     }  # fmt: skip
 
@@ -187,7 +188,9 @@ def _many(random: Random) -> bytes:
 
 
 def _cut(random: Random) -> bytes:
-    data = (MISSIONS / random.choice(("paper_b.geojson", "route.gpx", "route.plan", "site.kml", "harvest.hpr"))).read_bytes()
+    data = (
+        MISSIONS / random.choice(("paper_b.geojson", "route.gpx", "route.plan", "site.kml", "harvest.hpr"))
+    ).read_bytes()
     return data[: random.randrange(1, len(data) * 9 // 10)]
 
 

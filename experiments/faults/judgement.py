@@ -39,7 +39,7 @@ def judge(outcome: Mapping[str, Any]) -> dict[str, Any]:
     detect_ms = min(enough)
     verdict = _timed(detect_ms, bound_ms)
     limit_m = outcome["tip_limit_m"]
-    if verdict == "ok" and limit_m is not None and outcome["travel_m"] > limit_m:
+    if verdict == "ok" and limit_m is not None and outcome["astray_m"] > limit_m:
         verdict = "far"
     return _answer(detect_ms, verdict)
 

@@ -90,7 +90,8 @@ def case_prefix(case: Case) -> str:
 
 
 def case_metrics(case: Case, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Metrics of one case: number, missed, detection, time to neutral, travel, and the travel of the missed ones."""
+    """Metrics of one case: number, missed, detection, time to neutral, travel, distance from the reference, and the
+    harm of the missed ones: that distance, or the travel where there is no reference."""
     p = case_prefix(case)
     times = [float(o["detect_ms"]) for o in rows if o["detect_ms"] is not None]
     neutral = [ms for o in rows if (ms := neutral_ms(o)) is not None]
@@ -104,5 +105,6 @@ def case_metrics(case: Case, rows: Sequence[Mapping[str, Any]]) -> dict[str, flo
         f"{p}_p50_ms": at(50), f"{p}_p99_ms": at(99), f"{p}_max_ms": max(times, default=math.nan),
         f"{p}_neutral_max_ms": max(neutral, default=math.nan),
         f"{p}_travel_max_m": max((o["travel_m"] for o in rows), default=math.nan),
-        f"{p}_harm_m": max((o["travel_m"] for o in missed), default=0.0),
+        f"{p}_astray_max_m": max((o["astray_m"] for o in rows), default=math.nan),
+        f"{p}_harm_m": max((max(o["astray_m"], 0.0) or o["travel_m"] for o in missed), default=0.0),
     }  # fmt: skip

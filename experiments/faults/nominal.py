@@ -82,9 +82,7 @@ def _log_job(name: str, seed: int, truth: str) -> dict[str, Any]:
     plant = Plant(settings.profile, seed, truth)
     trips = _Trips()
     try:
-        activity = Activity(
-            settings.profile, settings.profile_hash, grasp_selector=PlannerSelection(SamplingPlanner())
-        )
+        activity = Activity(settings.profile, settings.profile_hash, grasp_selector=PlannerSelection(SamplingPlanner()))
         operator = Operator(settings.profile_hash, lambda *_: None)
         system = Lockstep(
             settings, build_guard(profile_path(name)), plant, activity, operator, Observer(on_outputs=[trips.outputs])

@@ -25,7 +25,7 @@ INTRODUCTION: Final = (
     "exists there. Faults of oil, steel and load act on the plant with physics, all others on the kinematic machine. "
     "Many injections are forked from one running machine; each is drawn from its own seed. Detection is observed from "
     "outside: the mode and reason to which the recorded ticks replay, the frames on the buses, and the counters of the "
-    "reports. A bound is a fault detection time; one tick is added because a fault between two ticks is met by the next."
+    "reports. A bound is a fault detection time; one tick is added, because a fault between ticks is met by the next."
 )
 _EMPTY: Final = "–"
 
@@ -43,8 +43,9 @@ def sections(result: Result) -> tuple[Section, ...]:
 def table(metrics: Mapping[str, float]) -> str:
     """One line for each entry."""
     lines = [
-        "| # | fault | promised | injections | missed | detection p50 / p99 / max ms | neutral ms | tip travel m |",
-        "|---|---|---|---|---|---|---|---|",
+        "| # | fault | promised | injections | missed | detection p50 / p99 / max ms | neutral ms | tip travel m "
+        "| off its reference m |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for case in CASES:
         p = case_prefix(case)
@@ -52,7 +53,8 @@ def table(metrics: Mapping[str, float]) -> str:
         lines.append(
             f"| {case.number} | [{case.title}](results/faults/{case.label}.md) | {case.reaction}, {case.bound} "
             f"| {_number(metrics.get(f'{p}_injections'))} | {_number(metrics.get(f'{p}_missed'))} | {times} "
-            f"| {_number(metrics.get(f'{p}_neutral_max_ms'))} | {_number(metrics.get(f'{p}_travel_max_m'))} |"
+            f"| {_number(metrics.get(f'{p}_neutral_max_ms'))} | {_number(metrics.get(f'{p}_travel_max_m'))} "
+            f"| {_number(metrics.get(f'{p}_astray_max_m'))} |"
         )
     return "\n".join(lines)
 
@@ -63,13 +65,19 @@ def blind_spots(metrics: Mapping[str, float]) -> str:
     for case in CASES:
         missed, harm_m = (metrics.get(f"{case_prefix(case)}_{key}") or 0.0 for key in ("missed", "harm_m"))
         if case.blind or missed:
-            harm = "nothing to inject into" if is_blind(case) else f"largest way of a missed one {100 * harm_m:.1f} cm"
+            harm = (
+                "nothing to inject into"
+                if is_blind(case)
+                else f"the tip up to {100 * harm_m:.1f} cm from its reference (driving: way)"
+            )
             said = f" {case.blind}" if case.blind else ""
             lines.append(f"- *{case.number}, {case.title}*: {missed:.0f} missed, {harm}.{said}")
     return "\n".join(lines) or "None."
 
 
-def write_evidence(by_case: Mapping[int, Sequence[Mapping[str, Any]]], metrics: Mapping[str, float], folder: Path) -> None:
+def write_evidence(
+    by_case: Mapping[int, Sequence[Mapping[str, Any]]], metrics: Mapping[str, float], folder: Path
+) -> None:
     """Write the evidence page of every entry into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     for case in CASES:
@@ -80,26 +88,36 @@ def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str
     """One page: what, bound, measured, one example, verdict."""
     p = case_prefix(case)
     verdicts = Counter(o["verdict"] for o in rows)
+    kinds = ", ".join(sorted({kind for o in rows for kind in _kinds(o)}))
     missed = [o for o in rows if o["missed"]]
-    verdict = "No injection." if not rows else "Missed: none." if not missed else f"Missed: {len(missed)} of {len(rows)}."
+    verdict = (
+        "No injection." if not rows else "Missed: none." if not missed else f"Missed: {len(missed)} of {len(rows)}."
+    )
     out = [
         "---", "orphan: true", "---", "", f"# {case.number}: {case.title}", "", verdict, "",
-        f"Promised: {case.reaction}; bound {case.bound}. Injected as: {', '.join(sorted({w for o in rows for w in _kinds(o)})) or 'nothing'}.",
+        f"Promised: {case.reaction}; bound {case.bound}. Injected as: {kinds or 'nothing'}.",
         "",
     ]  # fmt: skip
     out += [f"Not seen: {case.blind}", ""] if case.blind else []
     out += ["| | |", "|---|---|"]
     for key, title in (
-        ("injections", "Injections"), ("p50_ms", "Detection, median [ms]"), ("p99_ms", "Detection, 99th percentile [ms]"),
+        ("injections", "Injections"), ("p50_ms", "Detection, median [ms]"),
+        ("p99_ms", "Detection, 99th percentile [ms]"),
         ("max_ms", "Detection, longest [ms]"), ("neutral_max_ms", "All valves neutral, longest [ms]"),
-        ("travel_max_m", "Way of the tip until rest, longest [m]"), ("harm_m", "The same, of missed injections [m]"),
+        ("travel_max_m", "Way of the tip until rest, longest [m]"),
+        ("astray_max_m", "Distance of the tip from its reference, largest [m]"),
+        ("harm_m", "The same, of missed injections; driving: way [m]"),
     ):  # fmt: skip
         out.append(f"| {title} | {_number(metrics.get(f'{p}_{key}'))} |")
     out += ["", "| scene | injections | verdicts |", "|---|---|---|"]
     for scene in sorted({o["scene"] for o in rows}):
         counted = Counter(o["verdict"] for o in rows if o["scene"] == scene)
-        out.append(f"| {scene} | {sum(counted.values())} | {', '.join(f'{k} {n}' for k, n in sorted(counted.items()))} |")
-    example = max(missed or rows, key=lambda o: o["detect_ms"] or math.inf if missed else o["detect_ms"] or 0.0, default=None)
+        out.append(
+            f"| {scene} | {sum(counted.values())} | {', '.join(f'{k} {n}' for k, n in sorted(counted.items()))} |"
+        )
+    example = max(
+        missed or rows, key=lambda o: o["detect_ms"] or math.inf if missed else o["detect_ms"] or 0.0, default=None
+    )
     if example is not None:
         out += ["", f"## {'A missed injection' if missed else 'The slowest detection'}", "", *_example(example)]
     out += ["", f"Verdicts: {', '.join(f'{k} {n}' for k, n in sorted(verdicts.items())) or 'none'}.", ""]

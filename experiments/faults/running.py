@@ -1,7 +1,8 @@
 """Running machines on which faults are injected: built once, warmed up until they move, and forked for each injection.
 
 A scene names machine, work and plant.  The work is a motion that never ends: the crane swings all joints, or the
-carrier follows a far waypoint.  Its setpoints are those of a real planner (20 Hz, lease of `draws.LEASE_MS`).
+carrier follows far waypoints.  Its setpoints are those of a real planner (20 Hz, lease of `draws.LEASE_MS`).  In the
+scenes named carry the real planner carries a log to the bunk.
 """
 
 from __future__ import annotations
@@ -14,6 +15,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
@@ -44,16 +49,22 @@ SWING_SHARE: Final = 0.04
 """Amplitude of the swing as a share of the joint's range."""
 SPEED_SHARE: Final = 0.5
 """Share of the joint's speed and acceleration limits that the swing uses."""
-FAR_M: Final = 150.0
+FAR_M: Final = 80.0
+TURN_RAD: Final = 0.6
+TURN_NS: Final = 5_000_000_000
+"""The next waypoint lies this far to the other side after this time, so that the machine always turns."""
 SPEED_M_S: Final = 0.6
-WARM_LIMIT_NS: Final = 20_000_000_000
+WARM_LIMIT_NS: Final = 60_000_000_000
 MOVING_NS: Final = 1_000_000_000
-"""The machine has moved for so long before the first injection."""
+CARRIED_NS: Final = 300_000_000
+"""The machine has moved, or carried its log, for so long before the first injection."""
 KINDS: Final = {
     "crane palms_471": ("palms_471", "kinematic"),
     "crane palms_471 physics": ("palms_471", "physics"),
     "crane aoro_fc8": ("aoro_fc8", "kinematic"),
     "crane aoro_fc8 physics": ("aoro_fc8", "physics"),
+    "carry palms_471": ("palms_471", "physics"),
+    "carry aoro_fc8": ("aoro_fc8", "physics"),
     "drive aoro_fc8": ("aoro_fc8", "kinematic"),
     "drive aoro_fc8 physics": ("aoro_fc8", "physics"),
     "plc valves palms_471": ("palms_471", "plc valves"),
@@ -73,7 +84,11 @@ class Swing:
             s = profile.joints[j.name.lower()]
             known = s.encoder is not None and math.isfinite(q)
             half = SWING_SHARE * (s.upper - s.lower) * (1.0 if s.upper - q > q - s.lower else -1.0) if known else 0.0
-            w = SPEED_SHARE * min(s.speed_limit / abs(half), math.sqrt(s.acceleration_limit / abs(half))) if half else 0.0
+            w = (
+                SPEED_SHARE * min(s.speed_limit / abs(half), math.sqrt(s.acceleration_limit / abs(half)))
+                if half
+                else 0.0
+            )
             self._joints.append((q if math.isfinite(q) else 0.0, half, w))
 
     def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -108,14 +123,15 @@ class CranePlanner:
 
 
 class DrivePlanner:
-    """Drives towards a waypoint far ahead and a little to the left, while the machine is armed."""
+    """Drives towards waypoints far ahead, to the left and to the right in turn, while the machine is armed."""
 
     def __init__(self, profile: Profile, profile_hash: int) -> None:
         assert profile.carrier is not None
         self._carrier, self._hash = profile.carrier, profile_hash
         self._vehicle: VehicleReport | None = None
         self._goal: tuple[float, float] | None = None
-        self._sequence = self._sent_ns = 0
+        self._sequence = self._sent_ns = self._turned_ns = 0
+        self._side = 1.0
         self._armed = False
 
     def receive(self, report: VehicleReport) -> None:
@@ -129,8 +145,10 @@ class DrivePlanner:
         v = self._vehicle
         if not self._armed or v is None or now_ns - self._sent_ns < PERIOD_NS or math.isnan(v.heading_rad):
             return None
-        if self._goal is None:
-            north, east = FAR_M * math.cos(v.heading_rad - 0.15), FAR_M * math.sin(v.heading_rad - 0.15)
+        if self._goal is None or now_ns - self._turned_ns > TURN_NS:
+            self._side, self._turned_ns = -self._side, now_ns
+            bearing = v.heading_rad + self._side * TURN_RAD
+            north, east = FAR_M * math.cos(bearing), FAR_M * math.sin(bearing)
             per_deg_m = 111_320.0
             self._goal = (
                 v.latitude_deg + north / per_deg_m,
@@ -186,15 +204,22 @@ class Running:
             ExperimentError: it does not.
         """
         system, since_ns = self.system, 0
-        while not since_ns or system.now_ns < since_ns + MOVING_NS:
+        needed_ns = MOVING_NS if self.phase() is None else CARRIED_NS
+        while not since_ns or system.now_ns < since_ns + needed_ns:
             self.advance()
             moving = system.report is not None and system.report.mode == Mode.ACTIVE and self.speed() > 0.0
+            moving = moving and self.phase() in (None, Phase.CARRY)
             since_ns = (since_ns or system.now_ns) if moving else 0
             if system.now_ns > START_NS + WARM_LIMIT_NS:
                 reason = system.report.reason if system.report else -1
                 raise ExperimentError(
                     "experiment.not-moving", f"the machine of scene {self.name!r} does not move: reason {reason}"
                 )
+
+    def phase(self) -> Phase | None:
+        """The phase of the log job, as its planner tells it; None in the other scenes."""
+        planner = self.system.activity
+        return planner.phase if isinstance(planner, Activity) else None
 
     def speed(self) -> float:
         """Greatest speed of what moves here, as the machine itself reports it [rad/s, m/s]."""
@@ -209,6 +234,13 @@ class Running:
         if self.scene.drives:
             return tuple(self.plant.world.carrier.front_axle())
         return tuple(pin_position(self.scene.profile.kinematics, self.plant.joint_positions()[:4]))
+
+    def astray_m(self) -> float:
+        """Distance of the hanger pin from its reference [m]; 0 while driving, where the way itself counts."""
+        report = self.system.report
+        if self.scene.drives or report is None or not all(map(math.isfinite, report.reference[:4])):
+            return 0.0
+        return math.dist(pin_position(self.scene.profile.kinematics, report.reference[:4]), self.place())
 
     def valves_neutral(self) -> bool:
         """Whether the valve node's outputs are neutral now (ground truth; a held grapple counts as neutral)."""
@@ -227,18 +259,21 @@ def build(name: str, seed: int = 0, truth: str = "nominal", terrain: str = "flat
             role = "valves" if kind.endswith("valves") else "references"
             path = write_plc_profile(profile_name, role, Path(folder))  # type: ignore[arg-type]
         settings, guard = load_settings(path), build_guard(path)
-    profile, plant = settings.profile, _plant(settings, kind, seed, truth, terrain)
-    drives = name.startswith("drive")
+    drives, carries = name.startswith("drive"), name.startswith("carry")
+    profile = settings.profile
+    plant = Plant(profile, seed, truth) if carries else _plant(settings, kind, seed, truth, terrain)
     vehicle_hooks = []
-    planner: CranePlanner | DrivePlanner
-    if drives:
+    planner: CranePlanner | DrivePlanner | Activity
+    if carries:
+        planner = Activity(profile, settings.profile_hash, grasp_selector=PlannerSelection(SamplingPlanner()))
+    elif drives:
         planner = DrivePlanner(profile, settings.profile_hash)
         vehicle_hooks.append(planner.receive)
     else:
         planner = CranePlanner(profile, settings.profile_hash)
     operator = Supervisor(settings.profile_hash, lambda *_: None)
     observer = Observer(None, [], vehicle_hooks)
-    system = Lockstep(settings, guard, plant, planner, operator, observer, _NoLogs())
+    system = Lockstep(settings, guard, plant, planner, operator, observer, None if carries else _NoLogs())
     evidence = Evidence(system.cores, profile)
     observer.on_outputs.append(evidence.outputs)
     observer.on_report.append(evidence.report)

@@ -16,12 +16,14 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
+from autonomy.crane_job.phases import Phase
 from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.faults.judgement import judge
 from experiments.faults.running import Running, build, warm
 from hil.faults.catalogue import CASES, Where
 from hil.faults.draws import Injection
+from hil.faults.order import Order
 from hil.harness.lockstep import SLICE_NS, START_NS
 from machine.joints import JOINTS
 from machine.status.modes import Mode
@@ -34,7 +36,7 @@ MOVING_SHARE: Final = 0.2
 WAIT_FOR_MOTION_S: Final = 6.0
 REST_S: Final = 0.5
 MAX_REST_S: Final = 2.5
-STILL_M: Final = 0.0005
+STILL_M: Final = 0.002
 """The tip stands when it moves less than this in a tenth of a second."""
 CHILD_LIMIT_S: Final = 120
 
@@ -65,18 +67,20 @@ def inject(machine: Running, number: int, seed: str) -> dict[str, Any]:
     drawn = case.draw(random, machine.scene)
     _wait(machine, random, drawn)
     system, evidence = machine.system, machine.evidence
-    at_ns = system.now_ns + random.randrange(SLICE_NS)
+    at_ns = system.next_tick_ns if drawn.aligned else system.now_ns + random.randrange(SLICE_NS)
     for order in drawn.orders:
         machine.injector.order(order, at_ns + round(order.at_s * 1e9))
     evidence.begin(at_ns, machine.scene.drives)
     before_ms = (at_ns - START_NS) * 1e-6
-    travel_m, valves_ms, standing = _follow(machine, drawn, at_ns)
+    travel_m, astray_m, valves_ms, standing = _follow(machine, drawn, at_ns)
     outcome = {
-        "seed": seed, "at_ms": round(before_ms, 3), "orders": [_words(o.fault, o.part, o.sized(), o.length_s) for o in drawn.orders],
-        "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": drawn.seen_ms, "tip_limit_m": drawn.tip_limit_m,
+        "seed": seed, "at_ms": round(before_ms, 3), "orders": [_words(o) for o in drawn.orders],
+        "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": drawn.seen_ms,
+        "tip_limit_m": drawn.tip_limit_m,
         "reached": evidence.reached, "reason": evidence.reason, "refused_ms": evidence.refused_ms,
         "neutral_ms": evidence.neutral_ms if evidence.frames else None, "valves_ms": valves_ms,
-        "travel_m": round(travel_m, 4), "standing": standing, "timeline": evidence.timeline[:16],
+        "travel_m": round(travel_m, 4), "astray_m": round(astray_m, 4), "standing": standing,
+        "timeline": evidence.timeline[:16],
     }  # fmt: skip
     return outcome | judge(outcome)
 
@@ -100,18 +104,19 @@ def start(scene: str, number: int, seed: str) -> dict[str, Any]:
                 refused_ms, reason = round((system.now_ns - START_NS) * 1e-6, 3), system.report.reason & 0xFF
     reached = {} if refused_ms is None or armed else {"X": refused_ms}
     outcome = {
-        "seed": seed, "at_ms": 0.0, "orders": [_words(o.fault, o.part, o.sized(), o.length_s) for o in drawn.orders],
+        "seed": seed, "at_ms": 0.0, "orders": [_words(o) for o in drawn.orders],
         "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": 0.0, "tip_limit_m": None, "reached": reached,
         "reason": Reason(reason).name if reason else "", "refused_ms": refused_ms, "neutral_ms": 0.0, "valves_ms": 0.0,
-        "travel_m": 0.0, "standing": not armed, "timeline": machine.evidence.timeline[:16],
+        "travel_m": 0.0, "astray_m": 0.0, "standing": not armed, "timeline": machine.evidence.timeline[:16],
     }  # fmt: skip
     return outcome | judge(outcome)
 
 
-def _words(fault: str, part: str, size: float, length_s: float) -> str:
-    words = fault if not part else f"{fault}/{part}"
-    words += f"={size:.4g}" if math.isfinite(size) and size else ""
-    return words + (f"+{1e3 * length_s:.4g}ms" if math.isfinite(length_s) else "")
+def _words(order: Order) -> str:
+    """The order as a person writes it, without its moment."""
+    words = order.fault if not order.part else f"{order.fault}/{order.part}"
+    words += f"+{1e3 * order.length_s:.4g}ms" if math.isfinite(order.length_s) else ""
+    return words + (f"={order.sized():.4g}" if math.isfinite(order.sized()) and order.sized() else "")
 
 
 def _wait(machine: Running, random: Random, drawn: Injection) -> None:
@@ -129,12 +134,15 @@ def _wait(machine: Running, random: Random, drawn: Injection) -> None:
         machine.advance()
 
 
-def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, float | None, bool]:
-    """Watch until everything stands, or the window is over; way of the tip [m], time at which the valve node's outputs
-    became neutral for good [ms], and whether it stands."""
+def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, float, float | None, bool]:
+    """Watch until everything stands, or the window is over.
+
+    Way of the tip [m]; its greatest distance from its reference, less that at the beginning [m]; time at which the
+    valve node's outputs became neutral for good [ms]; whether it stands.
+    """
     system, evidence = machine.system, machine.evidence
     window_ns = at_ns + round((drawn.window_s or drawn.bound_ms * 1e-3 + 0.5) * 1e9)
-    place, travel_m = machine.place(), 0.0
+    place, travel_m, astray_m, usual_m = machine.place(), 0.0, 0.0, machine.astray_m()
     mark, mark_ns, valves_ms, standing = place, system.now_ns, None, False
     stop_ns = 0
     while True:
@@ -142,6 +150,7 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
         now_ns, here = system.now_ns, machine.place()
         travel_m += math.dist(here, place)
         place = here
+        astray_m = max(astray_m, machine.astray_m() - usual_m)
         if not machine.valves_neutral():
             valves_ms = None
         elif valves_ms is None:
@@ -149,13 +158,15 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
         if now_ns - mark_ns >= 100_000_000:
             standing = math.dist(here, mark) < STILL_M
             mark, mark_ns = here, now_ns
+        if machine.phase() not in (None, Phase.CARRY, Phase.LOWER):  # the planner gives the carry up
+            evidence.reached.setdefault("H", round((now_ns - at_ns) * 1e-6, 3))
         stopped = any(r in evidence.reached for r in ("H", "R1", "R0")) or evidence.neutral_ms is not None
         stop_ns = stop_ns or (now_ns if stopped else 0)
         over = now_ns >= window_ns
         if stopped and drawn.expected not in ("NONE", "REFUSED"):
             over = (standing and now_ns >= stop_ns + round(REST_S * 1e9)) or now_ns >= stop_ns + round(MAX_REST_S * 1e9)
         if over:
-            return travel_m, valves_ms, standing
+            return travel_m, astray_m, valves_ms, standing
 
 
 def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -172,7 +183,7 @@ def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         signal.alarm(CHILD_LIMIT_S)
         try:
             answer = json.dumps(function())
-        except BaseException:
+        except BaseException:  # noqa: BLE001  the parent must hear of everything, and the child must not go on
             answer = json.dumps({"failed": traceback.format_exc()})
         with os.fdopen(writing, "w") as pipe:
             pipe.write(answer)

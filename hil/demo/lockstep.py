@@ -36,13 +36,19 @@ SETTLE_NS: Final = 3_000_000_000
 
 
 def run_lockstep(
-    name: str, seed: int, truth: str, directory: Path, limit_s: float, console: Console, camera: str = "",
+    name: str,
+    seed: int,
+    truth: str,
+    directory: Path,
+    limit_s: float,
+    console: Console,
+    camera: str = "",
     orders: Sequence[Order] = (),
 ) -> Summary:
     """Run the job in one process on virtual time; the same seed leaves the same bytes in ``directory``.
 
-    With ``camera`` the planner gets the logs detected through it, without it their true poses.  ``orders`` are faults to
-    inject.
+    With ``camera`` the planner gets the logs detected through it, without it their true poses.  ``orders``:
+    faults to inject.
 
     Raises:
         CommandFailed: profile, truth, camera or directory cannot be used.

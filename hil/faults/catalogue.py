@@ -35,6 +35,8 @@ class Work(StrEnum):
     """What the machine does when the fault comes."""
 
     CRANE = "crane"
+    CARRY = "carry"
+    """Carrying a log to the bunk."""
     DRIVE = "drive"
     PLC = "plc"
     """Crane work through a PLC."""
@@ -130,16 +132,17 @@ CASES: Final[tuple[Case, ...]] = (
     Case(35, "wall-clock", "Wall clock stepped", "none: the same commands", "0", _CRANE, None, _FILES),
     Case(36, "disk-full", "Disk full while recording", "recorder stops with a warning, control untouched", "1000 ms",
          _CRANE, None, _FILES),
-    Case(37, "power-cut", "Power cut at any byte of a log or profile", "at most 250 ms lost; old or new", "2 s at start",
+    Case(37, "power-cut", "Power cut at any byte of a log or profile", "at most 250 ms lost", "2 s at start",
          _CRANE, None, _FILES),
     Case(38, "wrong-node", "A node is not the one of the profile", "X", "2 s at start", _CRANE, draws.wrong_node,
          _START),
     Case(39, "two-controllers", "Another controller on the bus", "R0", "20 ms", _BOTH, draws.foreign, promise=True),
     Case(40, "malformed-mission", "Malformed mission file", "refused at load", "1 s", _CRANE, None, _FILES),
     Case(41, "person-in-zone", "Person in the zone", "H", "300 ms", _BOTH, draws.person,
-         blind="Only the safety module's input is watched. No camera looks for persons, so a blind camera goes unseen."),
-    Case(42, "log-slips", "Grapple opens under load", "slew over the cabin stops", "300 ms", _CRANE, draws.log_slips,
-         physics=True, blind="An opening grapple is seen only by the planner, at the next verification of its grasp."),
+         blind="Only the safety module's input is watched. No camera looks for persons; a blind one goes unseen."),
+    Case(42, "log-slips", "Grapple opens under load", "slew over the cabin stops", "300 ms", (Work.CARRY,),
+         draws.log_slips, physics=True,
+         blind="An opening grapple is seen only by the planner, at the next verification of its grasp."),
     Case(43, "ground-tilts", "Machine tilts", "H while driving", "200 ms", _DRIVE, draws.tilt,
          blind="Roll and pitch are not watched while the crane works."),
     Case(44, "joystick", "Joystick moved during automatic work", "the person wins", "20 ms", _CRANE, None, _ABSENT,

@@ -18,8 +18,8 @@ from sim.plant_faults import ENCODER_MESSAGES, message
 
 REPORT_MS: Final = 20.0
 T_MS: Final = 5.0
-LEASE_MS: Final = 100.0
-"""Lease of the setpoints in the campaign."""
+LEASE_MS: Final = 200.0
+"""Lease of the setpoints in the campaign: the planner's own (`autonomy`)."""
 _DEG: Final = math.pi / 180.0
 _NEEDED_CRANE: Final = ("EstopStat", "ValveFbA", "ValveFbB")
 _NEEDED_DRIVE: Final = ("VehStat", "ArmHeightA", "ArmHeightB")
@@ -50,6 +50,8 @@ class Injection:
     tip_limit_m: float | None = None
     window_s: float = 0.0
     """How long to watch; 0 means the bound and half a second."""
+    aligned: bool = False
+    """The moment must be the beginning of a tick, when the controller sends."""
 
 
 def _joint(random: Random, scene: Scene) -> str:
@@ -99,11 +101,13 @@ def _needed(random: Random, scene: Scene) -> str:
     if scene.drives:
         return random.choice((*_NEEDED_CRANE, *_NEEDED_DRIVE))
     encoders = [ENCODER_MESSAGES[n] for n, s in scene.profile.joints.items() if s.encoder is not None]
-    return random.choice((*_NEEDED_CRANE, *encoders))
+    names: tuple[str, ...] = (*_NEEDED_CRANE, *encoders)
+    return random.choice(names)
 
 
 def _protected(random: Random, scene: Scene) -> str:
-    return random.choice((*_NEEDED_CRANE, *(_NEEDED_DRIVE if scene.drives else ())))
+    names: tuple[str, ...] = _NEEDED_CRANE + _NEEDED_DRIVE if scene.drives else _NEEDED_CRANE
+    return random.choice(names)
 
 
 def _lost_ms(scene: Scene, name: str) -> float:
@@ -159,8 +163,8 @@ def masquerade(random: Random, scene: Scene) -> Injection:
 
 
 def _bus(random: Random, scene: Scene) -> str:
-    machine = scene.profile.machine_bus
-    return random.choice((scene.profile.crane_bus, machine)) if scene.drives and machine else scene.profile.crane_bus
+    crane, machine = scene.profile.crane_bus, scene.profile.machine_bus
+    return random.choice((crane, machine)) if scene.drives and machine else crane
 
 
 def babble(random: Random, scene: Scene) -> Injection:
@@ -169,12 +173,14 @@ def babble(random: Random, scene: Scene) -> Injection:
 
 
 def bus_off(random: Random, scene: Scene) -> Injection:
-    return _one(random, "bus-errors", "R0", 20.0, _bus(random, scene), 1.0)
+    """Bus-off takes 32 errors: 5 ms on crane0, 20 ms on mach0, where the next frame may be 20 ms away, too."""
+    bus = _bus(random, scene)
+    return _one(random, "bus-errors", "R0", 20.0 + (10.0 if bus == scene.profile.crane_bus else 40.0), bus, 1.0)
 
 
 def error_passive(random: Random, scene: Scene) -> Injection:
     """Seventeen errors in a row make a node error-passive; thirty-two would switch it off."""
-    return _one(random, "bus-errors", "D", 100.0, scene.profile.crane_bus, 1.0, length_s=0.0027)
+    return replace(_one(random, "bus-errors", "D", 100.0, scene.profile.crane_bus, 1.0, length_s=0.0027), aligned=True)
 
 
 def cable_cut(random: Random, scene: Scene) -> Injection:

@@ -83,7 +83,13 @@ def inject(order: Order, target: LiveTarget, consent: bool = False) -> str:
 
 
 def _ask_plant(order: Order, port: int) -> str:
-    request = {"op": "fault", "name": order.fault, "part": order.part, "size": str(order.sized()), "seed": str(order.seed)}
+    request = {
+        "op": "fault",
+        "name": order.fault,
+        "part": order.part,
+        "size": str(order.sized()),
+        "seed": str(order.seed),
+    }
     if math.isfinite(order.length_s):
         request["for_s"] = str(order.length_s)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
@@ -117,11 +123,12 @@ def _send_frames(order: Order, address: str, fault: Fault, consent: bool) -> str
     if fault.kind is not Kind.BABBLE:
         raise FaultError(
             "fault.only-on-wire",
-            f"{order.fault} needs the wire: frames on {address} cannot be lost or changed; start the run with --bus wire",
+            f"{order.fault} needs the wire: frames on {address} cannot be lost or changed; use --bus wire",
         )
     if "vcan" not in address and not consent:
         raise FaultError(
-            "fault.real-bus", f"{address} may be a machine; add --i-know to send {order.fault} there, with nobody near it"
+            "fault.real-bus",
+            f"{address} may be a machine; add --i-know to send {order.fault} there, with nobody near it",
         )
     if not math.isfinite(order.length_s):
         raise FaultError("fault.endless", f"{order.fault} on {address} needs an end; add --for")

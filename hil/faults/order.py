@@ -48,7 +48,9 @@ def make(
     chosen = _JOINT_ALIASES.get(part or named, part or named) or kind.default_part
     _check_part(fault, kind.part, chosen)
     if not (math.isfinite(at_s) and at_s >= 0.0 and length_s > 0.0):
-        raise FaultError("fault.time", f"{fault} at {at_s:g} s for {length_s:g} s: give a time of 0 or more, and a length")
+        raise FaultError(
+            "fault.time", f"{fault} at {at_s:g} s for {length_s:g} s: give a time of 0 or more, and a length"
+        )
     return Order(fault, chosen, at_s, length_s, size, seed)
 
 
@@ -61,7 +63,8 @@ def parse(text: str, seed: int = 0) -> Order:
     found = _TEXT.fullmatch(text)
     if found is None:
         raise FaultError(
-            "fault.syntax", f"{text!r} is not NAME[:WORD][/PART][@START][+DURATION][=SIZE], as in encoder-lift:stuck@12.3s"
+            "fault.syntax",
+            f"{text!r} is not NAME[:WORD][/PART][@START][+DURATION][=SIZE], as in encoder-lift:stuck@12.3s",
         )
     try:
         at_s = float(found["at"] or 0.0)

@@ -135,6 +135,11 @@ class Lockstep:
         self._sync: RawFrame | None = None
 
     @property
+    def next_tick_ns(self) -> int:
+        """Time of the next tick."""
+        return self._next_tick_ns
+
+    @property
     def period_ns(self) -> int:
         """The tick period."""
         return self._period_ns

@@ -56,7 +56,10 @@ class PlcPlant(Plant):
 
     def _spools(self, now_ns: int) -> list[float]:
         spools = list(self.plc.scan(now_ns))
-        return self.spool_faults.apply(FUNCTIONS, spools) if self.spool_faults else spools
+        return self.spool_faults.apply(FUNCTIONS, spools) if self.spool_faults and self._powered() else spools
+
+    def _powered(self) -> bool:
+        return self.plc.state is State.EXECUTE
 
     def _tick(self, now_ns: int) -> None:
         self.estop.tick(now_ns)  # the safety module is wired to the PLC, which passes its frames on

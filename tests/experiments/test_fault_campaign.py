@@ -24,7 +24,7 @@ def outcome(**changed: Any) -> dict[str, Any]:
     row = {
         "seed": "s", "at_ms": 1.0, "orders": ["encoder-stuck/lift"], "expected": "R1", "bound_ms": 20.0, "seen_ms": 0.0,
         "tip_limit_m": None, "reached": {"R1": 15.0}, "reason": "ENCODER_LOST", "refused_ms": None, "neutral_ms": 80.0,
-        "valves_ms": 70.0, "travel_m": 0.02, "standing": True, "timeline": [[1.0, "STOP"]],
+        "valves_ms": 70.0, "travel_m": 0.02, "astray_m": 0.02, "standing": True, "timeline": [[1.0, "STOP"]],
     } | changed  # fmt: skip
     return row | judge(row)
 
@@ -55,7 +55,7 @@ def test_a_verdict_is_the_promise_kept_or_how_it_was_broken(
 
 
 def test_a_missed_injection_is_counted_and_a_blind_spot_is_told_apart() -> None:
-    rows = [outcome(), outcome(reached={}, neutral_ms=None, valves_ms=None, travel_m=0.4)]
+    rows = [outcome(), outcome(reached={}, neutral_ms=None, valves_ms=None, travel_m=0.4, astray_m=0.4)]
     everything = {c.name: {"case": c.number, "scene": "crane", "outcomes": rows} for c in CASES if c.draw}
     everything |= {c.name: _absent(c, 2) for c in CASES if c.where is Where.ABSENT}
     everything["n"] = {"scene": "x", "seconds": 7200.0, "trips": [(1.0, "why")]}

@@ -63,7 +63,9 @@ def demo(
     ] = "",
     faults: Annotated[
         list[str] | None,
-        typer.Option("--inject", help="Fault to inject, as in encoder-lift:stuck@12.3s (lockstep); see timberhand inject."),
+        typer.Option(
+            "--inject", help="Fault to inject, as in encoder-lift:stuck@12.3s (lockstep); see timberhand inject."
+        ),
     ] = None,
     as_json: SummaryOption = False,
 ) -> None:

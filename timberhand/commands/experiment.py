@@ -42,7 +42,12 @@ def experiment(
     docs: Annotated[
         Path | None, typer.Option(help="Folder in which to update the page, its plots and results/NAME.json.")
     ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="soak: duration in minutes (default: 30); faults: time limit, the same command continues.")] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1, help="soak: duration in minutes (default: 30); faults: time limit, the same command continues."
+        ),
+    ] = None,
     repetitions: Annotated[
         int | None, typer.Option(min=1, help="crane-accuracy: motions to every goal (default: 20).")
     ] = None,

@@ -121,5 +121,7 @@ def _newest_run() -> Path:
 
     found = sorted(Path("runs").glob(f"*/{ADDRESSES}"), key=lambda path: path.stat().st_mtime)
     if not found:
-        raise FaultError("fault.no-live-run", "there is no live run below runs/; start `timberhand demo`, or add --lockstep")
+        raise FaultError(
+            "fault.no-live-run", "there is no live run below runs/; start `timberhand demo`, or add --lockstep"
+        )
     return found[-1].parent
