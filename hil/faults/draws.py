@@ -184,6 +184,9 @@ def error_passive(random: Random, scene: Scene) -> Injection:
 
 
 def cable_cut(random: Random, scene: Scene) -> Injection:
+    """A PLC has another cable, whose loss shows after its exchange of 10 ms and the time-out of its status."""
+    if scene.plc and random.random() < 0.5:
+        return _one(random, "plc-off", "R1", 100.0 + 10.0)
     bus = _bus(random, scene)
     bound = 30.0 if bus == scene.profile.crane_bus else 100.0 + T_MS
     return _one(random, random.choice(("bus-cut", "bus-stub")), "R1", bound, bus)

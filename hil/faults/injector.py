@@ -15,6 +15,7 @@ from hil.faults.order import Order
 from hil.faults.table import FAULTS, Edge, FaultError
 from hil.faults.wire_faults import wire_fault
 from hil.harness.lockstep import START_NS, Lockstep
+from hil.plc.bridged_plant import BridgedPlant
 from hil.wire.faults import FOREVER_NS
 from sim.errors import PlantError
 from sim.plant_faults import PlantFault, begin
@@ -100,6 +101,20 @@ class Injector:
         since_ns, self._late_since_ns = self._late_since_ns, None
         return 0 if since_ns is None else now_ns - since_ns
 
+    def _cut_link(self) -> Callable[[], None]:
+        """Open the cable between bridge and PLC."""
+        plant = self._run.plant
+        if not isinstance(plant, BridgedPlant):
+            raise FaultError(
+                "fault.no-plc", f"{plant.profile.name} has no PLC here; add --plc, or choose another fault"
+            )
+        plant.cut = True
+
+        def end() -> None:
+            plant.cut = False
+
+        return end
+
     def _start(self, running: _Running, now_ns: int) -> Callable[[], None]:
         order = running.order
         match FAULTS[order.fault].edge:
@@ -107,6 +122,8 @@ class Injector:
                 effect = effect_of(order)
                 self._datagrams.append(effect)
                 return lambda: self._datagrams.remove(effect)
+            case Edge.LINK:
+                return self._cut_link()
             case Edge.PROCESS:
                 self._stalled[order.part] = running.end_ns if order.fault == "process-stuck" else FOREVER_NS
                 return _NOTHING

@@ -41,6 +41,8 @@ class Edge(StrEnum):
     BUS = "bus"
     PLANNER = "planner"
     PROCESS = "process"
+    LINK = "link"
+    """The Ethernet cable of a PLC."""
 
 
 class Part(StrEnum):
@@ -86,7 +88,7 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "message-off": FaultKind("message", Word.OFF, _P, "is never sent", _M, "EncLift"),
     "message-stuck": FaultKind("message", Word.STUCK, _P, "the same frame again and again", _M, "ValveFbA"),
     "message-garbage": FaultKind("message", Word.GARBAGE, _P, "random bytes", _M, "ValveFbA"),
-    "message-intermittent": FaultKind("message", Word.INTERMITTENT, _P, "is lost now", _M, "EncLift", "share", 0.5),
+    "message-intermittent": FaultKind("message", Word.INTERMITTENT, _P, "is lost often", _M, "EncLift", "share", 0.5),
     "message-slow": FaultKind("message", Word.SLOW, _P, "only every n-th is sent", _M, "EncLift", "n", 4.0),
     "message-delayed": FaultKind("message", Word.DELAYED, _P, "is sent late", _M, "EncLift", "ms", 20.0),
     "message-masquerade": FaultKind("message", Word.WRONG, _P, "right checksum, wrong Data ID", _M, "ValveFbA"),
@@ -119,10 +121,11 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "planner-speed": FaultKind("planner", Word.WRONG, _U, "too fast", not_live=_WORKS_ALONE),
     "planner-jump": FaultKind("planner", Word.WRONG, _U, "a step in the reference", not_live=_WORKS_ALONE),
     "planner-replay": FaultKind("planner", Word.STUCK, _U, "the same datagram again"),
-    "planner-future": FaultKind("planner", Word.WRONG, _U, "from the future", unit="ms", size=500.0, not_live=_WORKS_ALONE),
+    "planner-future": FaultKind("planner", Word.WRONG, _U, "future stamp", unit="ms", size=500, not_live=_WORKS_ALONE),
     "planner-delayed": FaultKind("planner", Word.DELAYED, _U, "late", unit="ms", size=150.0, not_live=_WORKS_ALONE),
     "planner-garbage": FaultKind("planner", Word.GARBAGE, _U, "damaged datagrams"),
     "planner-arms": FaultKind("planner", Word.WRONG, _U, "forged ARM and RESET of an operator"),
+    "plc-off": FaultKind("plc", Word.OFF, Edge.LINK, "cable is open", not_live="pull its cable or end its process"),
     "process-off": FaultKind("process", Word.OFF, _S, "is killed", Part.PROCESS, "planner"),
     "process-stuck": FaultKind("process", Word.STUCK, _S, "does not run for a while", Part.PROCESS, "controller"),
 }  # fmt: skip

@@ -14,9 +14,11 @@ from experiments.faults.experiment import _absent, nominal_plan, plan, scenes_of
 from experiments.faults.judgement import judge
 from experiments.faults.metrics import METRICS, gather
 from experiments.faults.pages import evidence, table
-from experiments.faults.running import build
+from experiments.faults.running import build, warm
 from experiments.faults.trial import in_child, inject
 from hil.faults.catalogue import BY_NAME, CASES, Where
+from hil.faults.order import parse
+from hil.faults.table import FaultError
 from tests.codes import coded
 
 
@@ -115,3 +117,34 @@ def test_an_injection_in_a_forked_child_is_that_of_a_fresh_machine_and_of_its_re
     assert first["timeline"] == [list(row) for row in fresh["timeline"]]
     assert {k: v for k, v in first.items() if k != "timeline"} == {k: v for k, v in fresh.items() if k != "timeline"}
     assert first["verdict"] == "ok" and first["neutral_ms"] <= 100.0
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_a_fault_at_every_edge_is_answered_and_named() -> None:
+    for scene, text, reaction, reason in (
+        ("crane palms_471", "estop-pressed", "R0", "ESTOP_PRESSED"),
+        ("crane palms_471", "bus-stub/crane0", "R1", "BUS_PASSIVE"),
+        ("crane palms_471", "process-off/planner", "H", "LEASE_LOST"),
+        ("crane palms_471", "process-off/guard", "R0", "GUARD_LOST"),
+        ("crane palms_471", "process-stuck/controller+30ms", "R1", "ENCODER_LOST"),  # no SYNC meanwhile
+        ("crane palms_471", "planner-nan", "H", "SETPOINTS_REFUSED"),
+        ("drive aoro_fc8", "message-off/VehStat", "R0", "CARRIER_LOST"),
+        ("drive aoro_fc8", "gnss-off", "H", "HEADING_LOST"),
+        ("plc valves palms_471", "plc-off", "R1", "ENCODER_LOST"),
+    ):
+        found = in_child(lambda scene=scene, text=text: _injected(scene, text))  # type: ignore[misc]
+        assert reaction in found["reached"], (scene, text, found)
+        assert found["reason"] == reason, (scene, text, found)
+    with pytest.raises(FaultError, check=coded("fault.no-plc")):
+        _injected("crane palms_471", "plc-off")
+
+
+def _injected(scene: str, text: str) -> dict[str, Any]:
+    machine = warm(scene)
+    at_ns = machine.system.now_ns
+    machine.injector.order(parse(text), at_ns)
+    machine.evidence.begin(at_ns, machine.scene.drives)
+    while machine.system.now_ns < at_ns + 900_000_000:
+        machine.advance()
+    return {"reached": machine.evidence.reached, "reason": machine.evidence.reason}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from random import Random
 
 import pytest
@@ -15,7 +16,9 @@ from sim.faults.encoder_fault import EncoderFault
 from sim.faults.frame_tap import FrameTap
 from sim.faults.spool_faults import SpoolFaults
 from sim.kinematic.machine import KinematicMachine
+from sim.plant import Plant
 from sim.plant_faults import BEGINNERS, PlantFault, begin, database, message
+from sim.process.live_plant import LivePlant
 from tests.codes import coded
 
 MS = 1_000_000
@@ -160,3 +163,41 @@ def test_every_fault_begins_and_ends_on_a_machine_that_drives() -> None:
         begin(plant, PlantFault(name, parts.get(name.partition("-")[0], ""), 2.0, 1), 1_000_000_000)()
     assert message(plant.profile, "VesselHeading")[0] == "mach0"
     assert math.isfinite(plant.encoders["lift"].measure(1_000_000_000))
+
+
+def test_a_live_plant_begins_a_fault_on_request_and_ends_it_in_time() -> None:
+    plant = Plant(PROFILE, scene=())
+    try:
+        live = LivePlant(plant, {}, None)
+        assert live._reply({"op": "fault", "name": "encoder-stuck", "part": "lift", "for_s": "0.5"}) == {"ok": True}
+        assert plant.encoders["lift"].fault is not None
+        live._on_step(time.monotonic_ns())
+        assert plant.encoders["lift"].fault is not None, "not before its time"
+        live._on_step(time.monotonic_ns() + 600 * MS)
+        assert plant.encoders["lift"].fault is None
+        with pytest.raises(PlantError, check=coded("fault.not-a-number")):
+            live._reply({"op": "fault", "name": "encoder-jump", "part": "lift", "size": "much"})
+    finally:
+        plant.close()
+
+
+def test_a_stuck_spool_moves_its_joint_only_while_the_pump_is_on() -> None:
+    plant = machine()
+    plant.step(1_000_000_000, [])
+    begin(plant, PlantFault("valve-stuck", "lift", 0.8), 1_000_000_000)
+    assert plant._spools(1_000_000_000)[1] == 0.0
+    plant._powered = lambda: True  # type: ignore[method-assign]
+    assert plant._spools(1_000_000_000)[1] == 0.8
+
+
+def test_a_burst_hose_lets_the_boom_fall() -> None:
+    plant = Plant(PROFILE, scene=())
+    try:
+        neutral = [0.0] * len(plant.world.functions)
+        before = plant.world.tip()[2]
+        begin(plant, PlantFault("hose-burst", "lift"), 0)
+        for _ in range(200):
+            plant.world.step(neutral)
+        assert plant.world.tip()[2] < before - 0.1
+    finally:
+        plant.close()

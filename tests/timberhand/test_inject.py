@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import signal
 import socket
 import subprocess
@@ -14,10 +15,14 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from can_dbc.bus.factory import open_bus
+from can_dbc.frame import Frame
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import make
 from hil.faults.table import FAULTS, FaultError
+from hil.faults.wire_faults import BABBLE_KEY
 from hil.harness.live import ADDRESSES
+from hil.wire.launch import wire_daemon
 from host.exit_codes import CommandFailed
 from machine.loading.profile_file import load_profile
 from tests.codes import coded
@@ -110,3 +115,14 @@ def test_forged_datagrams_reach_the_controllers_port() -> None:
         for fault in ("planner-garbage", "planner-arms", "planner-replay"):
             assert "sent" in inject(make(fault, length_s=0.03), there)
             assert controller.recv(2048)
+
+
+def test_the_wire_damages_frames_of_a_live_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
+    there = target(buses={"crane0": "wire:crane0"})
+    with wire_daemon({"crane0": 1_000_000}), open_bus("wire:crane0") as listener:
+        assert "begun" in inject(make("bus-babble", length_s=0.02), there)
+        frames: list[Frame] = []
+        assert select.select([listener], [], [], 10.0)[0]
+        listener.drain(frames)
+    assert {frame.key for frame in frames} == {BABBLE_KEY}
