@@ -6,6 +6,7 @@ ground; the log job is that of `timberhand demo`, with another log for every str
 
 from __future__ import annotations
 
+import gc
 from typing import Any, Final
 
 from autonomy.crane_job.activity import Activity
@@ -66,6 +67,8 @@ def perform(job: Job) -> dict[str, Any]:
         return _log_job(scene.split()[1], job.seed, truth)
     machine = build(scene, job.seed, truth, terrain)
     trips = _Trips()
+    gc.collect()
+    gc.freeze()
     machine.system._observer.on_outputs.append(trips.outputs)
     try:
         while machine.system.now_ns < START_NS + round(seconds * 1e9):

@@ -25,7 +25,9 @@ INTRODUCTION: Final = (
     "exists there. Faults of oil, steel and load act on the plant with physics, all others on the kinematic machine. "
     "Many injections are forked from one running machine; each is drawn from its own seed. Detection is observed from "
     "outside: the mode and reason to which the recorded ticks replay, the frames on the buses, and the counters of the "
-    "reports. A bound is a fault detection time; one tick is added, because a fault between ticks is met by the next."
+    "reports. *Tip astray* is the greatest distance of the hanger pin from its reference while the machine is active, "
+    "and its whole way after that; while driving it is only that way, of the front axle. A bound is a fault detection "
+    "time; one tick is added, because a fault between ticks is met by the next."
 )
 _EMPTY: Final = "–"
 
@@ -36,7 +38,7 @@ def sections(result: Result) -> tuple[Section, ...]:
         Section("Campaign", "", CAMPAIGN),
         Section("Work without faults", "", NOMINAL),
         Section("All entries", table(result.metrics), ()),
-        Section("Blind spots", blind_spots(result.metrics), ()),
+        Section("Missed injections and blind spots", blind_spots(result.metrics), ()),
     )
 
 
@@ -44,7 +46,7 @@ def table(metrics: Mapping[str, float]) -> str:
     """One line for each entry."""
     lines = [
         "| # | fault | promised | injections | missed | detection p50 / p99 / max ms | neutral ms | tip travel m "
-        "| off its reference m |",
+        "| tip astray m |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for case in CASES:
@@ -65,11 +67,7 @@ def blind_spots(metrics: Mapping[str, float]) -> str:
     for case in CASES:
         missed, harm_m = (metrics.get(f"{case_prefix(case)}_{key}") or 0.0 for key in ("missed", "harm_m"))
         if case.blind or missed:
-            harm = (
-                "nothing to inject into"
-                if is_blind(case)
-                else f"the tip up to {100 * harm_m:.1f} cm from its reference (driving: way)"
-            )
+            harm = "nothing to inject into" if is_blind(case) else f"the tip up to {100 * harm_m:.1f} cm astray"
             said = f" {case.blind}" if case.blind else ""
             lines.append(f"- *{case.number}, {case.title}*: {missed:.0f} missed, {harm}.{said}")
     return "\n".join(lines) or "None."
@@ -105,8 +103,8 @@ def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str
         ("p99_ms", "Detection, 99th percentile [ms]"),
         ("max_ms", "Detection, longest [ms]"), ("neutral_max_ms", "All valves neutral, longest [ms]"),
         ("travel_max_m", "Way of the tip until rest, longest [m]"),
-        ("astray_max_m", "Distance of the tip from its reference, largest [m]"),
-        ("harm_m", "The same, of missed injections; driving: way [m]"),
+        ("astray_max_m", "Tip astray, largest [m]"),
+        ("harm_m", "The same, of missed injections [m]"),
     ):  # fmt: skip
         out.append(f"| {title} | {_number(metrics.get(f'{p}_{key}'))} |")
     out += ["", "| scene | injections | verdicts |", "|---|---|---|"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -262,7 +262,7 @@ def build(name: str, seed: int = 0, truth: str = "nominal", terrain: str = "flat
     drives, carries = name.startswith("drive"), name.startswith("carry")
     profile = settings.profile
     plant = Plant(profile, seed, truth) if carries else _plant(settings, kind, seed, truth, terrain)
-    vehicle_hooks = []
+    vehicle_hooks: list[Callable[[VehicleReport], None]] = []
     planner: CranePlanner | DrivePlanner | Activity
     if carries:
         planner = Activity(profile, settings.profile_hash, grasp_selector=PlannerSelection(SamplingPlanner()))

@@ -137,20 +137,26 @@ def _wait(machine: Running, random: Random, drawn: Injection) -> None:
 def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, float, float | None, bool]:
     """Watch until everything stands, or the window is over.
 
-    Way of the tip [m]; its greatest distance from its reference, less that at the beginning [m]; time at which the
-    valve node's outputs became neutral for good [ms]; whether it stands.
+    Way of the tip [m]; how far it went astray [m]: its greatest distance from its reference while the machine is
+    active, less that at the beginning, and its way after that; time at which the valve node's outputs became
+    neutral for good [ms]; whether it stands.
     """
     system, evidence = machine.system, machine.evidence
     window_ns = at_ns + round((drawn.window_s or drawn.bound_ms * 1e-3 + 0.5) * 1e9)
-    place, travel_m, astray_m, usual_m = machine.place(), 0.0, 0.0, machine.astray_m()
+    place, usual_m = machine.place(), machine.astray_m()
+    travel_m = astray_m = overrun_m = 0.0
     mark, mark_ns, valves_ms, standing = place, system.now_ns, None, False
     stop_ns = 0
     while True:
         machine.advance()
         now_ns, here = system.now_ns, machine.place()
-        travel_m += math.dist(here, place)
+        step_m = math.dist(here, place)
+        travel_m += step_m
         place = here
-        astray_m = max(astray_m, machine.astray_m() - usual_m)
+        if system.report is not None and system.report.mode == Mode.ACTIVE:
+            astray_m = max(astray_m, machine.astray_m() - usual_m)
+        else:
+            overrun_m += step_m
         if not machine.valves_neutral():
             valves_ms = None
         elif valves_ms is None:
@@ -166,7 +172,7 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
         if stopped and drawn.expected not in ("NONE", "REFUSED"):
             over = (standing and now_ns >= stop_ns + round(REST_S * 1e9)) or now_ns >= stop_ns + round(MAX_REST_S * 1e9)
         if over:
-            return travel_m, astray_m, valves_ms, standing
+            return travel_m, astray_m + overrun_m, valves_ms, standing
 
 
 def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -182,18 +188,17 @@ def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.alarm(CHILD_LIMIT_S)
         try:
-            answer = json.dumps(function())
+            said = json.dumps(function())
         except BaseException:  # noqa: BLE001  the parent must hear of everything, and the child must not go on
-            answer = json.dumps({"failed": traceback.format_exc()})
+            said = json.dumps({"failed": traceback.format_exc()})
         with os.fdopen(writing, "w") as pipe:
-            pipe.write(answer)
+            pipe.write(said)
         os._exit(0)
     os.close(writing)
     with os.fdopen(reading) as pipe:
         text = pipe.read()
     _, status = os.waitpid(child, 0)
-    answer = json.loads(text) if text else {"failed": f"the child ended with status {status}"}
+    answer: dict[str, Any] = json.loads(text) if text else {"failed": f"the child ended with status {status}"}
     if "failed" in answer:
         raise ExperimentError("experiment.injection-failed", f"an injection failed: {answer['failed']}")
-    found: dict[str, Any] = answer
-    return found
+    return answer
