@@ -191,9 +191,11 @@ def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
             said = json.dumps(function())
         except BaseException:  # noqa: BLE001  the parent must hear of everything, and the child must not go on
             said = json.dumps({"failed": traceback.format_exc()})
-        with os.fdopen(writing, "w") as pipe:
-            pipe.write(said)
-        os._exit(0)
+        try:
+            with os.fdopen(writing, "w") as pipe:
+                pipe.write(said)
+        finally:
+            os._exit(0)  # whatever happens, the child must not go on as its parent
     os.close(writing)
     with os.fdopen(reading) as pipe:
         text = pipe.read()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from experiments.common.errors import ExperimentError
-from experiments.common.pool import Job
+from experiments.common.pool import Checkpoint, Job
 from experiments.faults import files
-from experiments.faults.experiment import _absent, nominal_plan, plan, scenes_of
+from experiments.faults.experiment import _absent, _limited, nominal_plan, plan, scenes_of
 from experiments.faults.judgement import judge
 from experiments.faults.metrics import METRICS, gather
 from experiments.faults.pages import evidence, table
@@ -85,6 +87,16 @@ def test_the_plan_spreads_the_trials_over_the_scenes_and_leaves_none_out() -> No
     assert len({job.name for job in jobs}) == len(jobs)
     assert len(scenes_of(BY_NAME["message-off"])) == 5
     assert sum(j.options["seconds"] for j in nominal_plan(1, 36_000.0)) == pytest.approx(36_000.0)
+
+
+def test_the_time_limit_ends_a_run_and_keeps_what_is_done(tmp_path: Path) -> None:
+    with Checkpoint(tmp_path / "trials.jsonl", "run") as kept, _limited(None, kept, 2):
+        kept.add("a", {})
+    over = pytest.raises(ExperimentError, check=coded("experiment.time-over"))
+    with over, Checkpoint(tmp_path / "trials.jsonl", "run") as kept, _limited(0.002, kept, 2):
+        kept.add("a", {"x": 1})
+        time.sleep(10.0)
+    assert Checkpoint(tmp_path / "trials.jsonl", "run").done == {"a": {"x": 1}}
 
 
 def test_a_child_answers_and_its_failure_is_told() -> None:
