@@ -27,7 +27,7 @@ from hil.faults.catalogue import CASES, Case, Where, Work
 
 TRIALS: Final = 100
 QUICK_TRIALS: Final = 2
-NOMINAL_S: Final = 10.2 * 3600.0
+NOMINAL_S: Final = 10.05 * 3600.0
 QUICK_NOMINAL_S: Final = 120.0
 PROFILES: Final = ("palms_471", "aoro_fc8")
 BATCH: Final = 25

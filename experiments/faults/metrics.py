@@ -25,8 +25,8 @@ CAMPAIGN: Final = (
            "no input or detector; each is named with its harm."),
     Metric("unexplained", "Missed injections outside the named blind spots", "", "The difference.", most=0.0),
     Metric("neutral_max_ms", "Longest time to neutral valves after the loss of a needed input", "ms", "From the fault "
-           "to the first moment after which commands or valve node are neutral for good, from the frames on the buses; "
-           "where the bus itself is cut, from the node's outputs. Entries marked with the promise.", most=100.0),
+           "to the moment after which commands or node are neutral for good on the buses, and the outputs of valve node or "
+           "PLC too (ground truth): the later of both. Entries of which a needed input is lost.", most=100.0),
     Metric("travel_max_m", "Longest way of the tip from the fault to rest", "m", "Hanger pin in the crane's base frame "
            "by the true joints, intended motion included; all injections that must stop the crane."),
 )  # fmt: skip
@@ -72,11 +72,14 @@ def injections_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[int, list[d
 
 
 def neutral_ms(outcome: Mapping[str, Any]) -> float | None:
-    """Time to neutral valves of one injection that must stop the machine; infinite if they never were."""
+    """Time to neutral valves of one injection that must stop the machine, by the buses and by the outputs of valve node
+    or PLC, the later of both; infinite if they never were.
+    """
     if outcome["expected"] not in ("H", "R1", "R0", "NODE"):
         return None
-    found = outcome["neutral_ms"] if outcome["neutral_ms"] is not None else outcome["valves_ms"]
-    return math.inf if found is None else float(found)
+    if outcome["valves_ms"] is None:
+        return math.inf
+    return max(float(outcome["valves_ms"]), float(outcome["neutral_ms"] or 0.0))  # a cut bus shows nothing
 
 
 def is_blind(case: Case) -> bool:

@@ -30,14 +30,14 @@ LOG_S: Final = 30.0
 """A log job takes longer than this."""
 LOG_LIMIT_S: Final = 150.0
 SETTINGS: Final = {
-    "crane palms_471": ("nominal", "flat", 1.0),
+    "crane palms_471": ("nominal", "flat", 2.0),
     "crane palms_471 physics": ("sampled", "flat", 1.0),
     "crane aoro_fc8": ("nominal", "flat", 1.0),
     "crane aoro_fc8 physics": ("sampled", "rough", 0.2),
-    "drive aoro_fc8": ("nominal", "flat", 0.6),
+    "drive aoro_fc8": ("nominal", "flat", 1.0),
     "drive aoro_fc8 physics": ("sampled", "rough", 0.2),
-    "log palms_471": ("sampled", "flat", 0.5),
-    "log aoro_fc8": ("sampled", "flat", 0.3),
+    "log palms_471": ("sampled", "flat", 0.3),
+    "log aoro_fc8": ("sampled", "flat", 0.15),
 }
 """Scene to truth, ground, and its part of the hours relative to the others."""
 
