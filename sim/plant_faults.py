@@ -243,6 +243,11 @@ def _frames(
     return start
 
 
+def _stuck(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    bus, codec = message(plant.profile, fault.part)
+    return plant.tap.repeat(bus, codec.key)
+
+
 def _late(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
     bus, codec = message(plant.profile, fault.part)
     return plant.tap.delay(bus, codec.key, round(fault.size * 1e6))
@@ -273,7 +278,7 @@ BEGINNERS: Final[dict[str, Callable[[EmulatedMachine, PlantFault, int], End]]] =
     "encoder-scale": _encoder(scale=SIZE),
     "encoder-identity": _identity,
     "message-off": _frames(lambda fault, codec: frame_tap.silent),
-    "message-stuck": _frames(lambda fault, codec: frame_tap.repeated()),
+    "message-stuck": _stuck,
     "message-garbage": _frames(lambda fault, codec: frame_tap.garbage(Random(fault.seed))),
     "message-intermittent": _frames(lambda fault, codec: frame_tap.intermittent(Random(fault.seed), fault.size)),
     "message-slow": _frames(lambda fault, codec: frame_tap.every(max(2, round(fault.size)))),

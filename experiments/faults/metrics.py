@@ -25,8 +25,8 @@ CAMPAIGN: Final = (
            "no input or detector; each is named with its harm."),
     Metric("unexplained", "Missed injections outside the named blind spots", "", "The difference.", most=0.0),
     Metric("neutral_max_ms", "Longest time to neutral valves after the loss of a needed input", "ms", "From the fault "
-           "to the moment after which commands or node are neutral for good on the buses, and the outputs of valve node or "
-           "PLC too (ground truth): the later of both. Entries of which a needed input is lost.", most=100.0),
+           "to the moment after which commands or node are neutral for good on the buses, and the outputs of valve node"
+           " or PLC too (ground truth): the later of both. Entries of which a needed input is lost.", most=100.0),
     Metric("travel_max_m", "Longest way of the tip from the fault to rest", "m", "Hanger pin in the crane's base frame "
            "by the true joints, intended motion included; all injections that must stop the crane."),
 )  # fmt: skip

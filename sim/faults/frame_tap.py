@@ -25,6 +25,7 @@ class FrameTap:
 
     def __init__(self) -> None:
         self._effects: dict[tuple[str, int], list[Effect]] = {}
+        self._last: dict[tuple[str, int], bytes] = {}
         self._late: deque[tuple[int, Sent]] = deque()
         self._now_ns = 0
 
@@ -38,6 +39,11 @@ class FrameTap:
 
         return remove
 
+    def repeat(self, bus: str, key: int) -> Callable[[], None]:
+        """Send the last frame again and again: counter, time stamp and values stand still; returns what ends that."""
+        kept = self._last.get((bus, key))
+        return self.add(bus, key, lambda data, now_ns: data if kept is None else kept)
+
     def delay(self, bus: str, key: int, delay_ns: int) -> Callable[[], None]:
         """Send a frame ``delay_ns`` late; returns what ends that."""
 
@@ -48,6 +54,8 @@ class FrameTap:
 
     def pass_on(self, now_ns: int, sent: list[Sent]) -> list[Sent]:
         """The frames that reach the buses now."""
+        for bus, key, data in sent:
+            self._last[bus, key] = data
         if not self._effects and not self._late:
             return sent
         out: list[Sent] = []
@@ -65,18 +73,6 @@ class FrameTap:
 
 def silent(data: bytes, now_ns: int) -> None:
     """The frame is never sent."""
-
-
-def repeated() -> Effect:
-    """The first payload again and again: counter, time stamp and values stand still."""
-    kept: list[bytes] = []
-
-    def effect(data: bytes, now_ns: int) -> bytes:
-        if not kept:
-            kept.append(data)
-        return kept[0]
-
-    return effect
 
 
 def garbage(random: Random) -> Effect:
