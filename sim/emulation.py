@@ -31,7 +31,7 @@ from sim.nodes.engine import EngineNode
 from sim.nodes.gnss import GnssNode
 from sim.nodes.imu import ImuNode
 from sim.nodes.messages import MS
-from sim.nodes.valve import CYCLE_NS, FUNCTIONS, ValveInputs, ValveNode, ValveState
+from sim.nodes.valve import CYCLE_NS, FUNCTIONS, ValveInputs, ValveNode
 from sim.nodes.vehicle import VehicleNode
 from sim.truth.load import Truth
 
@@ -203,11 +203,7 @@ class EmulatedMachine(ABC):
             self.vehicle_node.decide(now_ns)
             self.arms.decide(now_ns)
             commands += [self.vehicle_node.steer, *self.arms.spools]
-        return self.spool_faults.apply(COMMANDED, commands) if self.spool_faults and self._powered() else commands
-
-    def _powered(self) -> bool:
-        """Whether the valve node keeps the pump on: without it a spool moves nothing, wherever it is stuck."""
-        return self.valve.valve_state in (ValveState.ACTIVE, ValveState.RAMP)
+        return self.spool_faults.apply(COMMANDED, commands) if self.spool_faults and self.estop.pilot_on else commands
 
     def _measure(self, now_ns: int) -> None:
         """Feed the present state to the sensors with a memory."""

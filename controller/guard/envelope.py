@@ -87,7 +87,7 @@ def read_envelope(path: Path) -> Envelope:
     """Read a profile file and the envelope of its machine; raises GuardConfigError."""
     try:
         profile = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise GuardConfigError("guard.profile-unreadable", f"{path}: unreadable profile: {error}.") from error
     try:
         limits = _sealed(_find(path, str(profile["name"])))
@@ -97,7 +97,7 @@ def read_envelope(path: Path) -> Envelope:
         carrier = CarrierLimits(**limits["carrier"]) if "machine_bus" in profile else None
         geometry, ground_m = Kinematics(**limits["kinematics"]), float(limits["ground_m"])
         return Envelope(axes, 1_000_000_000 // int(profile["rate_hz"]), geometry, ground_m, boxes, carrier)
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise GuardConfigError(
             "guard.profile-incomplete", f"{path} or its envelope: a joint or the rate is incomplete: {error!r}."
         ) from error

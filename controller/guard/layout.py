@@ -56,13 +56,21 @@ def read_layouts(path: Path, names: list[str]) -> dict[str, Layout]:
     """Read the layouts of the named messages; raises GuardConfigError."""
     try:
         text = path.read_text(encoding="cp1252")
-    except OSError as error:
-        raise GuardConfigError("guard.dbc-unreadable", f"{path}: cannot be read: {error.strerror}.") from error
-    return {name: _layout(text, name, path) for name in names}
+    except (OSError, UnicodeDecodeError) as error:
+        raise GuardConfigError("guard.dbc-unreadable", f"{path}: cannot be read: {error}.") from error
+    found = {}
+    for name in names:
+        try:
+            found[name] = _layout(text, name, path)
+        except (ValueError, OverflowError) as error:
+            raise GuardConfigError(
+                "guard.signal-unreadable", f"{path}: a number of {name} is unreadable: {error}."
+            ) from error
+    return found
 
 
 def _layout(text: str, name: str, path: Path) -> Layout:
-    head = re.search(rf"^BO_ (\d+) {name}: (\d+) \w+\n((?: SG_ .*\n)*)", text, re.MULTILINE)
+    head = re.search(rf"^BO_ (\d+) {re.escape(name)}: (\d+) \w+\n((?: SG_ .*\n)*)", text, re.MULTILINE)
     if head is None:
         raise GuardConfigError("guard.message-missing", f"{path}: message {name} is missing; use the shipped DBC.")
     number = int(head[1])

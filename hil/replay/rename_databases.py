@@ -44,7 +44,7 @@ def renamed(recording: bytes) -> bytes:
         writer.add_message(
             channels[channel.id], message.log_time, data, message.publish_time, sequence=message.sequence
         )
-    writer.finish()
+    writer.finish()  # type: ignore[no-untyped-call]
     return out.getvalue()
 
 

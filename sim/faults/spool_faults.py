@@ -9,7 +9,8 @@ class SpoolFaults:
     """Changes commands, -1..1 of the spool, by the name of their function.
 
     ``stuck`` holds a spool wherever the node wants it, ``bias`` adds to the command (the spool drifts), ``gain``
-    multiplies it.  They act while the pump is on.
+    multiplies it.  They are faults of the amplifiers: without
+    pilot pressure the springs centre the spools.
     """
 
     def __init__(self) -> None:

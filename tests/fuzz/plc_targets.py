@@ -28,13 +28,13 @@ COMMAND = Command(Mode.VALVES, True, (0.5,) * 5 + (0.0, 0.0))
 
 def replies() -> list[bytes]:
     """Replies of a PLC, numbered."""
-    return [encode_reply(Header(n, 1000 * n, n), FEEDBACK) for n in (1, 2, 3, 0xFFFF_FFFF)]
+    return [encode_reply(Header(7, n, 1000 * n & 0xFFFF_FFFF, n), FEEDBACK) for n in (1, 2, 3, 0xFFFF_FFFF)]
 
 
 def commands() -> list[bytes]:
     """Commands to a PLC, numbered."""
-    return [encode_command(Header(n, 1000 * n, n), COMMAND) for n in (1, 2, 3)] + [
-        encode_command(Header(9, 1, 1), Command())
+    return [encode_command(Header(7, n, 1000 * n, n), COMMAND) for n in (1, 2, 3)] + [
+        encode_command(Header(7, 9, 1, 1), Command())
     ]
 
 

@@ -13,16 +13,12 @@ RUNS = {
     "guard-envelope": 100, "guard-dbc": 300, "trace-asc": 300, "recording": 600, "mission-file": 1000,
     "timing-page": 1500,
 }  # fmt: skip
-GUARD = "the guard's readers raise what Python raises for numbers and characters that they cannot use"
-REPORTED = dict.fromkeys(("guard-dbc", "guard-profile"), GUARD)
 SAVED = [(path.parent.name, path) for path in sorted(REGRESSIONS.glob("*/*.inputs"))]
 
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_short_run_holds_the_contract(name: str) -> None:
     result = fuzz(TARGETS[name], seed=2, runs=RUNS.get(name, 3000))
-    if result.failure and name in REPORTED:
-        pytest.xfail(f"{REPORTED[name]}: {result.failure}")
     assert not result.failure, f"{result.failure}; inputs: {packed(result.inputs)[-400:]!r}"
     assert result.units > 0 and result.outcomes > 1
 

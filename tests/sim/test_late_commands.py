@@ -23,6 +23,7 @@ CRANE, MACHINE = load("crane"), load("machine")
 CARRIER = load_profile("aoro_fc8").carrier
 assert CARRIER is not None
 Message = tuple[str, tuple[float, ...]]
+ALIVE: list[Message] = [("GuardAlive", (ARMED, 0, 15, 0))]
 
 
 class Line:
@@ -86,13 +87,13 @@ def valve() -> Line:
 
 def vehicle() -> Line:
     return Line(
-        VehicleNode(MACHINE, [], CARRIER, lambda: True), MACHINE, 20 * MS, [("VehCmd", (ARMED, 0.0, 0.6, 0.0))], []
+        VehicleNode(MACHINE, [], CARRIER, lambda: True), MACHINE, 20 * MS, [("VehCmd", (ARMED, 0.0, 0.6, 0.0))], ALIVE
     )
 
 
 def arms() -> Line:
     commands = [("ArmCmdA", (ARMED, 50.0, 0.0, 0.0, 0.0)), ("ArmCmdB", (ARMED, 0, 0))]
-    return Line(ArmNode(MACHINE, [], lambda: True), MACHINE, 20 * MS, commands, [])
+    return Line(ArmNode(MACHINE, [], lambda: True), MACHINE, 20 * MS, commands, ALIVE)
 
 
 def moves(line: Line) -> bool:
