@@ -59,7 +59,8 @@ class JointWatch:
         estimators: Sequence[JointEstimator],
         sensed: Sequence[SensedJoint | None],
     ) -> None:
-        """All sequences are in ``Joint`` order; ``sensed`` is None where a joint has no encoder."""
+        """All sequences are in ``Joint`` order; ``sensed`` is None where a joint has no encoder, or one whose
+        counts do not tell whether it is frozen."""
         self._crane, self._estimators, self._sensed = crane, estimators, sensed
         self._period_s = period_s
         self._monitors = [MotionMonitor(s, period_s) for s in specs]

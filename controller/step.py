@@ -99,7 +99,9 @@ class Controller:
         )
         self.gate = RequestGate(profile, settings.profile_hash, settings.key)
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
-        self.joint_watch = JointWatch(specs, period_s, self.crane, self.estimators, sensed)
+        # A PLC passes on positions that its own cycle has smoothed: the same count again says nothing of the encoder.
+        counted = sensed if profile.plc is None else [None] * len(sensed)
+        self.joint_watch = JointWatch(specs, period_s, self.crane, self.estimators, counted)
         self.writer = CraneWriter(database, profile)
         states = self.crane_inputs.messages + (self.carrier_bus.inputs.messages if self.carrier_bus else ())
         self.inputs_in_use = tuple((state.codec.name, state) for state in states)

@@ -2,14 +2,18 @@
 
 import random
 
+import msgspec
 import pytest
 
 from can_dbc.messages.crane import OperatorAction
+from controller.config import Settings
 from machine.joints import Joint
+from machine.loading.profile_file import profile_hash
+from machine.profile import Plc
 from machine.status.faults import FAULTS, describe
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import MS, SPECS, Bench, T, count_until
+from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, count_until
 
 SHARES = (0.03, 0.1, 0.25)
 SLOW_MS = 600
@@ -143,6 +147,15 @@ def test_an_encoder_that_stands_still_to_the_count_is_frozen_and_not_a_stuck_val
     k = move(bench, j, 0.4, 200)
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.ENCODER_FROZEN, j)
     assert k * T <= FAULTS[Reason.ENCODER_FROZEN].bound_ms * MS
+
+
+def test_behind_a_plc_the_same_count_is_no_evidence():
+    profile = msgspec.structs.replace(PROFILE, plc=Plc("valves"))
+    bench = dithering(Bench(Settings(profile, profile_hash(profile), profile.rate_hz))).armed()
+    move(bench, 0, 0.4, 100)
+    bench.frozen_counts.add(0)
+    move(bench, 0, 0.4, 400)
+    assert bench.reason == Reason.JOINT_STUCK
 
 
 def test_a_stuck_valve_under_a_live_encoder_stays_a_stuck_valve():
