@@ -8,6 +8,7 @@ signals.  A profile whose ranges or speeds exceed the envelope stops the start.
 from __future__ import annotations
 
 import hashlib
+import math
 import tomllib
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -92,15 +93,31 @@ def read_envelope(path: Path) -> Envelope:
     try:
         limits = _sealed(_find(path, str(profile["name"])))
         _compare(path, profile, limits)
-        axes = tuple(_axis(i, profile["joints"][n], limits["joints"][n]) for i, n in enumerate(JOINT_NAMES))
-        boxes = tuple((tuple(box["low_m"]), tuple(box["high_m"])) for box in limits.get("boxes", ()))
-        carrier = CarrierLimits(**limits["carrier"]) if "machine_bus" in profile else None
-        geometry, ground_m = Kinematics(**limits["kinematics"]), float(limits["ground_m"])
+        axes = tuple(_axis(i, profile["joints"][n], _numbers(limits["joints"][n])) for i, n in enumerate(JOINT_NAMES))
+        boxes = tuple((_corner(box["low_m"]), _corner(box["high_m"])) for box in limits.get("boxes", ()))
+        carrier = CarrierLimits(**_numbers(limits["carrier"])) if "machine_bus" in profile else None
+        geometry, ground_m = Kinematics(**_numbers(limits["kinematics"])), _number(limits["ground_m"])
         return Envelope(axes, 1_000_000_000 // int(profile["rate_hz"]), geometry, ground_m, boxes, carrier)
-    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise GuardConfigError(
             "guard.profile-incomplete", f"{path} or its envelope: a joint or the rate is incomplete: {error!r}."
         ) from error
+
+
+def _number(value: object) -> float:
+    """A limit; a NaN would switch its rule off."""
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{value!r} is not a finite number")
+    return float(value)
+
+
+def _numbers(table: dict[str, Any]) -> dict[str, float]:
+    return {key: _number(value) for key, value in table.items()}
+
+
+def _corner(values: list[Any]) -> Corner:
+    x, y, z = map(_number, values)
+    return x, y, z
 
 
 def _find(profile: Path, machine: str) -> Path:
@@ -140,11 +157,14 @@ def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
     valve, encoder = joint["valve"], joint.get("encoder")
     slowest = min(valve["full_speed_plus"], valve["full_speed_minus"])
     linear = encoder is not None and encoder["kind"] == "linear"
+    deadband_pct = float(min(valve["deadband_plus_pct"], valve["deadband_minus_pct"]))
+    if not (0.0 <= deadband_pct < 100.0 and 0.0 < slowest < math.inf):  # a NaN would switch rules off
+        raise ValueError(f"the valve {valve['signal']!r} has a dead-band or a speed that no valve has")
     return Axis(
         number=number,
         signal=str(valve["signal"]),
         sign=int(valve["sign"]),
-        deadband_pct=float(min(valve["deadband_plus_pct"], valve["deadband_minus_pct"])),
+        deadband_pct=deadband_pct,
         full_speed=float(max(valve["full_speed_plus"], valve["full_speed_minus"])),
         rate_pct_s=100.0 * RATE_FACTOR * limits["acceleration_limit"] / float(slowest),
         closing_ns=int((DELAY_FACTOR * valve["delay_s"] + LAGS * valve["lag_s"]) * 1e9),

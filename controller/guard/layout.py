@@ -56,17 +56,12 @@ def read_layouts(path: Path, names: list[str]) -> dict[str, Layout]:
     """Read the layouts of the named messages; raises GuardConfigError."""
     try:
         text = path.read_text(encoding="cp1252")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeError) as error:
         raise GuardConfigError("guard.dbc-unreadable", f"{path}: cannot be read: {error}.") from error
-    found = {}
-    for name in names:
-        try:
-            found[name] = _layout(text, name, path)
-        except (ValueError, OverflowError) as error:
-            raise GuardConfigError(
-                "guard.signal-unreadable", f"{path}: a number of {name} is unreadable: {error}."
-            ) from error
-    return found
+    try:
+        return {name: _layout(text, name, path) for name in names}
+    except (ValueError, OverflowError) as error:  # a number of a form that Python does not convert
+        raise GuardConfigError("guard.dbc-unreadable", f"{path}: a number cannot be read: {error}.") from error
 
 
 def _layout(text: str, name: str, path: Path) -> Layout:
@@ -77,7 +72,7 @@ def _layout(text: str, name: str, path: Path) -> Layout:
     fields = {}
     for line in head[3].splitlines():
         match = re.match(r" SG_ (\w+) : (\d+)\|(\d+)@1([+-]) \(([^,]+),([^)]+)\) \[([^|]+)\|([^\]]+)\]", line)
-        if match is None or float(match[6]) != 0.0:
+        if match is None or float(match[6]) != 0.0 or not 1 <= int(match[3]) <= 64 or int(match[2]) > 63:
             raise GuardConfigError("guard.signal-unreadable", f"{path}: unreadable signal of {name}: {line.strip()}")
         fields[match[1]] = Field(
             int(match[2]), int(match[3]), match[4] == "-", float(match[5]), float(match[7]), float(match[8])

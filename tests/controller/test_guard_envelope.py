@@ -1,11 +1,13 @@
 """The guard's envelope file: sealed, apart from the profile, and never exceeded by it."""
 
+import re
+
 import pytest
 
 from controller.guard import seal
-from controller.guard.__main__ import build
+from controller.guard.__main__ import DATABASES, build
 from controller.guard.envelope import SHIPPED, read_envelope
-from controller.guard.layout import GuardConfigError
+from controller.guard.layout import GuardConfigError, read_layouts
 from machine.loading.profile_file import shipped_profiles
 from tests.codes import coded
 from tests.controller.guard_traffic import PROFILE
@@ -84,3 +86,35 @@ def test_a_machine_without_an_envelope_does_not_start(files, capsys):
         build(profile)
     assert seal.main([str(profile.with_name("none"))]) == 3
     assert "none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("deadband_plus_pct = 12.0", "deadband_plus_pct = nan"),
+        ("deadband_plus_pct = 12.0", "deadband_plus_pct = 100.0"),
+        ("full_speed_plus = ", "full_speed_plus = inf # "),
+        ("total_counts = ", "total_counts = inf # "),
+        ("rate_hz = ", "rate_hz = inf # "),
+    ],
+)
+def test_numbers_that_would_switch_a_rule_off_or_end_the_guard_stop_the_start(files, old, new):
+    profile, _ = files
+    text = profile.read_text()
+    assert old in text
+    changed = text.replace(old, new)
+    for name, value in (("full_speed", "inf"), ("deadband", "100.0")):
+        if name in old and "nan" not in new:  # the better side counts, so both must be bad
+            changed = re.sub(rf"({name}_\w+) = [^ ]+", rf"\1 = {value}", changed)
+    profile.write_text(changed)
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
+        build(profile)
+
+
+@pytest.mark.parametrize("damage", [b"\x81", b"@1+ (x,0)", b"0|99999999999@1+ (1,0)"])
+def test_a_database_with_numbers_or_bytes_that_cannot_be_read_stops_the_start(tmp_path, damage):
+    text = (DATABASES / "crane.dbc").read_bytes()
+    path = tmp_path / "crane.dbc"
+    path.write_bytes(text.replace(b"@1+ (1,0)", damage).replace(b"0|8@1+ (1,0)", damage))
+    with pytest.raises(GuardConfigError):
+        read_layouts(path, ["ValveCmdA"])

@@ -24,9 +24,11 @@ from can_dbc.trace.candump import MalformedRecord, read_trace
 from controller.config import ConfigError
 from controller.config import load as load_settings
 from controller.guard.__main__ import build
+from controller.guard.envelope import SEAL, digest
 from controller.guard.layout import GuardConfigError, read_layouts
 from recorder.mcap_scan import NotMcap, is_complete, scan
 from recorder.recover import recover
+from tests.controller.guard_traffic import MOVING, Traffic
 from tests.fuzz.engine import Run, Target
 from tests.fuzz.message_targets import in_file
 from tests.fuzz.sentences import coded_sentence
@@ -250,15 +252,52 @@ def guard_limits(*suffixes: str) -> Callable[[], Run]:
         def run(data: bytes) -> tuple[int, Hashable]:
             (folder / f"fuzz{suffixes[-1]}").write_bytes(data)
             try:
-                build(folder / "fuzz.toml")
+                traffic = Traffic()
+                traffic.guard = build(folder / "fuzz.toml")
             except GuardConfigError as refused:
                 coded_sentence(refused)
                 return 1, refused.code
+            traffic.tick(3)
+            traffic.a.update(MOVING)
+            traffic.tick(2)
             return 1, "good"
 
         return run
 
     return start
+
+
+def sealed(data: bytes) -> bytes:
+    """An envelope file with the digest that fits, after other values."""
+    body = other_values(envelope_seeds, _TOML_VALUE, _TOML)(data).rpartition(SEAL)[0]
+    return body + SEAL + digest(body) + b"\n"
+
+
+def envelope_seeds() -> list[bytes]:
+    return [(ROOT / "machine" / "palms_471.envelope.toml").read_bytes()]
+
+
+def start_envelope() -> Run:
+    """The guard's envelope beside a good profile: whatever passes makes a guard that judges."""
+    folder = in_file("guard")
+    folder.mkdir()
+    shutil.copy(ROOT / "machine" / "palms_471.toml", folder / "fuzz.toml")
+
+    def run(data: bytes) -> tuple[int, Hashable]:
+        (folder / "palms_471.envelope.toml").write_bytes(data)
+        try:
+            guard = build(folder / "fuzz.toml")
+        except GuardConfigError as refused:
+            coded_sentence(refused)
+            return 1, refused.code
+        traffic = Traffic()
+        traffic.guard = guard
+        traffic.tick(3)
+        traffic.a.update(MOVING)
+        traffic.tick(2)
+        return 1, traffic.guard.verdict
+
+    return run
 
 
 def small_network() -> Network:
@@ -364,5 +403,6 @@ FILES = (
     _files("profile", start_profile, profile_seeds, _TOML, value=_TOML_VALUE),
     _files("guard-dbc", start_guard_dbc, dbc_seeds, _DBC, 1 << 14, _DBC_VALUE),
     _files("guard-profile", guard_limits(".toml"), profile_seeds, _TOML, value=_TOML_VALUE),
+    Target("guard-envelope", "files", start_envelope, envelope_seeds, _TOML, sealed),
     _files("weights", start_weights, weight_seeds, _JSON),
 )
