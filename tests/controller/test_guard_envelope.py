@@ -118,3 +118,12 @@ def test_a_database_with_numbers_or_bytes_that_cannot_be_read_stops_the_start(tm
     path.write_bytes(text.replace(b"@1+ (1,0)", damage).replace(b"0|8@1+ (1,0)", damage))
     with pytest.raises(GuardConfigError):
         read_layouts(path, ["ValveCmdA"])
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", '"a text"', "[1.0]"])
+def test_a_sealed_limit_that_is_no_finite_number_stops_the_start(files, value):
+    profile, envelope = files
+    envelope.write_text(envelope.read_text().replace("ground_m = -1.39", f"ground_m = {value}"))
+    assert seal.main([str(envelope)]) == 0
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
+        build(profile)
