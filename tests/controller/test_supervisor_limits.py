@@ -222,3 +222,12 @@ def test_a_reset_claims_a_lost_address_again() -> None:
     assert bench.controller.gate.refusal is Reason.ADDRESS_LOST
     bench.tick([bench.operator(OperatorAction.RESET)])
     assert not address.lost
+
+
+def test_a_new_supervisor_has_found_nothing() -> None:
+    new = Bench().controller.supervisor
+    assert (new.mode, new.reason, new.worst) == (Mode.BOOT, Reason.NONE, Reason.NONE)
+    assert (new.detail, new.worst_detail, new.late, new.coast_ns) == (0, 0, 0, 0)
+    assert (new.ramp_ns, new.ramp_end_ns, new._slow_end_ns, new._degraded_until_ns) == (0, 0, 0, 0)
+    assert (new._echo, new._echo_ticks) == (None, 0)
+    assert not any((new.half_speed, new.latching, new.ramping, new.armed)) and new._reset_pressed
