@@ -182,12 +182,13 @@ def test_a_live_plant_begins_a_fault_on_request_and_ends_it_in_time() -> None:
         plant.close()
 
 
-def test_a_stuck_spool_moves_its_joint_only_while_the_pump_is_on() -> None:
+def test_a_stuck_spool_moves_its_joint_only_with_pilot_pressure(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = machine()
     plant.step(1_000_000_000, [])
     begin(plant, PlantFault("valve-stuck", "lift", 0.8), 1_000_000_000)
+    monkeypatch.setattr(type(plant.estop), "pilot_on", False)
     assert plant._spools(1_000_000_000)[1] == 0.0
-    plant._powered = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(type(plant.estop), "pilot_on", True)
     assert plant._spools(1_000_000_000)[1] == 0.8
 
 
