@@ -57,4 +57,7 @@ class MotionWatch:
         creep = self._creep_s * elapsed_s
         self._place += min(max(joint.position - self._place, -creep), creep)
         self._away = self._away + 1 if abs(joint.position - self._place) > MOVED_UNITS else 0
-        return (Verdict.MOVING, self.number) if self._away >= MOVED_STEPS else FINE
+        if self._away < MOVED_STEPS:
+            return FINE
+        self._place, self._away = joint.position, 0  # found; where it stands now is its place, so that a reset can work
+        return Verdict.MOVING, self.number

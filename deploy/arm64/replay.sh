@@ -34,6 +34,7 @@ if [ $# -eq 0 ]; then
     for name in palms aoro; do
         mkdir -p "$work/$name"
         xz -dc "tests/recordings/$name.mcap.xz" >"$work/$name/run.mcap"
+        cp "tests/recordings/$name.toml" "$work/$name/profile.toml"
         set -- "$@" "$work/$name/run.mcap"
     done
 fi

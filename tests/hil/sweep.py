@@ -79,24 +79,12 @@ class Quiet:
         return None
 
 
-class StickingPlant(Plant):
-    """The plant with valves that no command closes: ``stuck`` is the opening [-1..1] by function."""
-
-    stuck: dict[str, float]
-
-    def _spools(self, now_ns: int) -> list[float]:
-        commands = super()._spools(now_ns)
-        for name, opening in getattr(self, "stuck", {}).items():
-            commands[self._order.index(name)] = opening
-        return commands
-
-
 @dataclass
 class Watched:
     """A lockstep run with what happened on the bus and at the tip."""
 
     system: Lockstep
-    plant: StickingPlant
+    plant: Plant
     witness: InProcessBus
     reports: list[StateReport] = field(default_factory=list)
     _open: set[int] = field(default_factory=set)
@@ -140,14 +128,21 @@ class Watched:
         return self.plant.world.tip()
 
 
-def watched(name: str, planner: Any, seed: int = 1, truth: str = "sampled", max_stops: int = 0) -> Watched:
-    """A run whose operator arms once and leaves a stopped machine alone."""
+def watched(
+    name: str, planner: Any, seed: int = 1, truth: str = "sampled", max_stops: int = 0, blind: bool = False
+) -> Watched:
+    """A run whose operator arms once and leaves a stopped machine alone.
+
+    ``blind``: the guard does not compare motion with commands, so that the supervisor has to see it.
+    """
     profile = load_profile(name)
-    plant = StickingPlant(profile, seed=seed, truth=truth, logs=0)
+    plant = Plant(profile, seed=seed, truth=truth, logs=0)
     reports: list[StateReport] = []
     operator = Operator(profile_hash(profile), lambda action, report: None, max_stops)
     settings = Settings(profile, profile_hash(profile), profile.rate_hz)
     guard = build_guard(profile_path(name))
+    if blind:
+        guard._motion.clear()
     system = Lockstep(settings, guard, plant, planner, operator, Observer(None, [reports.append]))
     return Watched(system, plant, InProcessBus(system.core, "witness", receive_own=True), reports)
 

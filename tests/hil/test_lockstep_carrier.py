@@ -115,7 +115,9 @@ def test_the_carrier_stands_with_its_brake_on(life) -> None:
     commands, states, arms = topics.values()
     assert all((c["Brake"], c["Speed"], c["ArmKey"]) == (100, 0, 0) for c in commands)
     # The vehicle node follows our counter, so our frames arrive there and are good.
-    assert {s["Fault"] for s in states} == {0} and {s["EchoCounter"] for s in states} == set(range(16))
+    assert {s["EchoCounter"] for s in states} == set(range(16))
+    # In the first second the guard has not switched the pilot supply on.
+    assert {s["Fault"] for s in states[:50]} <= {0, 2} and {s["Fault"] for s in states[50:]} == {0}
     assert {a["State"] for a in arms} == {0}
     assert 45 < len(commands) / (len(ticks(directory)) / SETTINGS.rate_hz) < 55
 

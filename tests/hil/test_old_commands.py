@@ -210,7 +210,7 @@ def test_the_carrier_brakes_when_its_commands_come_60_ms_late_in_order() -> None
         system.advance()
         assert system.now_ns < START_NS + 30 * S
     began_ns = system.now_ns
-    system._cores[1].inject(Fault(Kind.DELAY, began_ns, node="controller", shift_ns=60 * MS))
+    system.cores[1].inject(Fault(Kind.DELAY, began_ns, node="controller", shift_ns=60 * MS))
     while not node.brake and system.now_ns < began_ns + S:
         system.advance()
     assert system.now_ns - began_ns <= PROMISE_NS
