@@ -151,3 +151,9 @@ def test_without_an_address_it_uses_the_usual_one(monkeypatch):
 def test_a_profile_is_found_by_its_name_or_its_path(tmp_path):
     assert profile_path("palms_471").is_file()
     assert profile_path(str(tmp_path / "x.toml")) == tmp_path / "x.toml"
+
+
+def test_a_negative_rate_is_a_usage_error(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run_guard(monkeypatch, World(1), "--rate", "-5")
+    assert ended.value.code == 2 and "--rate -5: write the controller's rate in Hz" in capsys.readouterr().err

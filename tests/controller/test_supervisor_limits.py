@@ -13,6 +13,7 @@ from controller.supervisor import (
     LATE_WINDOW_NS,
     MAX_ECHO_NS,
     MAX_ECHO_TICKS,
+    NO_JOINT,
     RAMP_NS,
     RANGE_MARGIN_UNITS,
     STALLED_NS,
@@ -229,5 +230,32 @@ def test_a_new_supervisor_has_found_nothing() -> None:
     assert (new.mode, new.reason, new.worst) == (Mode.BOOT, Reason.NONE, Reason.NONE)
     assert (new.detail, new.worst_detail, new.late, new.coast_ns) == (0, 0, 0, 0)
     assert (new.ramp_ns, new.ramp_end_ns, new._slow_end_ns, new._degraded_until_ns) == (0, 0, 0, 0)
-    assert (new._echo, new._echo_ticks) == (None, 0)
+    assert (new._echo, new._echo_ticks, new.moving_joint) == (None, 0, NO_JOINT)
     assert not any((new.half_speed, new.latching, new.ramping, new.armed)) and new._reset_pressed
+
+
+@pytest.mark.parametrize("mode", [Mode.ARMED, Mode.ACTIVE])
+def test_arm_says_nothing_against_an_armed_machine(mode) -> None:
+    assert supervisor_in(mode).request_arm(NOW) == (Reason.NONE, 0)
+
+
+def test_a_refused_arm_has_no_detail() -> None:
+    assert supervisor_in(Mode.FAULT).request_arm(NOW) == (Reason.FAULT_LATCHED, 0)
+    stopping = supervisor_in(Mode.STOP)
+    stopping.ramp_ns = 1
+    assert stopping.request_arm(NOW) == (Reason.STILL_STOPPING, 0)
+
+
+def test_arming_forgets_the_echo_and_the_detail_of_the_time_before() -> None:
+    bench = Bench().boot()
+    supervisor = bench.controller.supervisor
+    supervisor._echo_ticks, supervisor.detail = 3, 9
+    assert supervisor.request_arm(bench.now_ns) == (Reason.NONE, 0) and supervisor.mode is Mode.ARMED
+    assert (supervisor._echo_ticks, supervisor.reason, supervisor.detail) == (0, Reason.NONE, 0)
+
+
+def test_only_a_stop_of_a_moving_machine_has_a_ramp() -> None:
+    for mode, ramp in ((Mode.ARMED, False), (Mode.ACTIVE, True)):
+        supervisor = supervisor_in(mode)
+        assert supervisor.apply(Event.HOLD, Reason.OPERATOR_STOP, 0, NOW) and supervisor.mode is Mode.STOP
+        assert supervisor.ramping is ramp
