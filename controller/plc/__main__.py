@@ -124,7 +124,8 @@ def summary(bridge: Bridge) -> str:
             "replayed": shake.replayed, "sessions": shake.sessions,
             "refused_here": bridge.gate.refused, "round_trip": shake.round_trip.summary(), "problem": shake.problem,
             "feedback": None if shake.feedback is None else asdict(shake.feedback),
-        }
+        },
+        default=bytes.hex,
     )  # fmt: skip
 
 
