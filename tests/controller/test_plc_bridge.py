@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from can_dbc.protocols.canopen import parse_heartbeat
 from can_dbc.protocols.e2e import Checker, Sender, Status
 from controller.config import ConfigError
 from controller.crane.startup import Startup
+from controller.plc.__main__ import summary
 from controller.plc.bridge import Bridge, role_of
 from controller.plc.handshake import Handshake
 from machine.loading.profile_file import load_profile
@@ -499,3 +501,10 @@ def test_machine_without_a_plc_or_with_a_carrier_is_refused() -> None:
     with pytest.raises(ConfigError, check=coded("config.plc-carrier")):
         role_of(msgspec.structs.replace(load_profile("aoro_fc8"), plc=Plc("valves")))
     assert role_of(profile("references")) is Role.REFERENCES
+
+
+def test_the_summary_of_an_exchange_is_json_with_the_emergency_stop_frame_as_hex() -> None:
+    rig = Rig()
+    rig.run(100)
+    told = json.loads(summary(rig.bridge))
+    assert told["answers"] > 0 and told["feedback"]["estop_frame"] == rig.feedback.estop_frame.hex()
