@@ -12,11 +12,13 @@ from typing import Final
 
 from controller.guard.joints import MeasuredJoint
 from controller.guard.layout import Field
-from controller.guard.verdicts import FINE, Finding, Verdict
+from controller.guard.verdicts import FINE, ROTATOR_AXIS, Finding, Verdict
 
 REST_NS: Final = 500_000_000
 MOVED_UNITS: Final = 0.02
 """[rad, m]"""
+ROTATOR_MOVED_RAD: Final = 0.2
+"""Tongs that close about logs turn the rotator against its shut valve: 0.02 rad tripped in an ordinary grasp."""
 CREEP_SHARE: Final = 0.05
 MOVED_STEPS: Final = 3
 """Steps of the guard in a row for which a joint must be away: one sample that jumps is an encoder's fault."""
@@ -25,7 +27,9 @@ MOVED_STEPS: Final = 3
 class MotionWatch:
     """One function: its spool's feedback ``field``, and its joint if an encoder measures it."""
 
-    __slots__ = ("_away", "_closing_ns", "_creep_s", "_field", "_joint", "_opened_ns", "_place", "_shut_pct", "number")
+    __slots__ = (
+        "_away", "_closing_ns", "_creep_s", "_field", "_joint", "_moved", "_opened_ns", "_place", "_shut_pct", "number",
+    )  # fmt: skip
 
     def __init__(
         self, number: int, field: Field, shut_pct: float, closing_ns: int, joint: MeasuredJoint | None = None
@@ -33,6 +37,7 @@ class MotionWatch:
         self.number = number
         self._field, self._shut_pct, self._closing_ns, self._joint = field, shut_pct, closing_ns, joint
         self._creep_s = CREEP_SHARE * joint.axis.speed_limit if joint is not None else 0.0
+        self._moved = ROTATOR_MOVED_RAD if number == ROTATOR_AXIS else MOVED_UNITS
         self._opened_ns = [0, 0]  # when it was last commanded to the minus and to the plus side
         self._place: float | None = None  # not known yet
         self._away = 0
@@ -56,7 +61,7 @@ class MotionWatch:
             return FINE
         creep = self._creep_s * elapsed_s
         self._place += min(max(joint.position - self._place, -creep), creep)
-        self._away = self._away + 1 if abs(joint.position - self._place) > MOVED_UNITS else 0
+        self._away = self._away + 1 if abs(joint.position - self._place) > self._moved else 0
         if self._away < MOVED_STEPS:
             return FINE
         self._place, self._away = joint.position, 0  # found; where it stands now is its place, so that a reset can work

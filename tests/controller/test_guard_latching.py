@@ -164,3 +164,14 @@ def test_a_joint_that_was_moved_far_by_hand_lever_can_be_reset_where_it_stands()
     assert traffic.tick(100) is Verdict.LATCHED
     press_reset(traffic)
     assert count_until(traffic.tick, lambda: traffic.guard.enabled) * T <= CALM_NS + 2 * T
+
+
+def test_a_rotator_that_the_logs_turn_is_no_motion_without_a_command_and_one_that_spins_is():
+    traffic = Traffic().good()
+    place = traffic.encoder["EncRot"]
+    unit_rad = next(j.axis.unit for j in traffic.guard._joints.values() if j.axis.number == 4)
+    traffic.encoder["EncRot"] = place + round(0.15 / abs(unit_rad))
+    assert traffic.tick(20) is Verdict.GOOD
+    traffic.encoder["EncRot"] = place + round(0.3 / abs(unit_rad))
+    traffic.tick(20)
+    assert traffic.guard.verdict is Verdict.LATCHED

@@ -143,7 +143,7 @@ def test_a_fault_at_every_edge_is_answered_and_named() -> None:
         ("crane palms_471", "planner-nan", "H", "SETPOINTS_REFUSED"),
         ("drive aoro_fc8", "message-off/VehStat", "R0", "CARRIER_LOST"),
         ("drive aoro_fc8", "gnss-off", "H", "HEADING_LOST"),
-        ("plc valves palms_471", "plc-off", "R1", "ENCODER_LOST"),
+        ("plc valves palms_471", "plc-off", "R0", "ESTOP_LOST"),  # its frame comes through the PLC
     ):
         found = in_child(lambda scene=scene, text=text: _injected(scene, text))  # type: ignore[misc]
         assert reaction in found["reached"], (scene, text, found)
