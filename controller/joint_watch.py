@@ -24,7 +24,7 @@ from controller.estimation.sensed_joint import SensedJoint
 from controller.estimation.standstill_monitor import StandstillMonitor
 from controller.supervisor import NO_JOINT, Supervisor
 from controller.transitions import OPERATING
-from machine.joints import N_JOINTS
+from machine.joints import N_JOINTS, Joint
 from machine.profile import JointSpec
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
@@ -40,6 +40,7 @@ STOOD_S: Final = 1.0
 _NONE: Final = Reason.NONE
 _RUNAWAY: Final = Reason.JOINT_RUNAWAY
 _BOOT: Final = Mode.BOOT
+_ROT: Final = int(Joint.ROT)
 _STOP: Final = Mode.STOP
 
 
@@ -105,7 +106,9 @@ class JointWatch:
                 continue  # what an encoder did that jumped or was lost is no motion
             neutral = crane.spools_pct[j] == 0.0
             reason = monitor.step(crane.commands[j], estimator.velocity)
-            if standstill.step(neutral, shaken, estimator.position):
+            # Tongs that close about logs turn the rotator against its shut valve, and its law turns it back: only a
+            # fast motion of it is a runaway, and none is drift.
+            if standstill.step(neutral, shaken, estimator.position) and j != _ROT:
                 reason = _RUNAWAY
             if supervisor.mode in OPERATING:
                 self._judge_encoder(supervisor, j, neutral, reason, now_ns)
@@ -118,7 +121,7 @@ class JointWatch:
     def _judge_encoder(self, supervisor: Supervisor, j: int, neutral: bool, reason: Reason, now_ns: int) -> None:
         """React to the finding about an armed joint, or to what its encoder shows besides."""
         monitor = self._monitors[j]
-        drifts = self._drift[j].step(neutral, monitor.expected_velocity, self._estimators[j].position)
+        drifts = j != _ROT and self._drift[j].step(neutral, monitor.expected_velocity, self._estimators[j].position)
         frozen = self._frozen(j, monitor)
         if reason is _RUNAWAY:
             supervisor.react_to(reason, j, now_ns)

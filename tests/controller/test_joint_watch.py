@@ -36,6 +36,10 @@ def test_slow_motion_without_a_command_cuts_while_armed(j, share):
     bench = dithering(Bench()).armed()
     bench.run(500)
     drifts(bench, j, share)
+    if j == Joint.ROT and share <= 0.25:  # as slowly as tongs that close about logs turn it
+        bench.run(100)
+        assert bench.mode is Mode.ARMED
+        return
     k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, j)
     assert k * T <= (SLOW_MS if share < 0.25 else 150) * MS
