@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Kept bytecode halves pytest's collection (25 s to 13 s of CPU per worker); an environment may forbid it, this one does not.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup wheel wheel-arm64 demo test check lint docs coverage mutants fuzz bench soak lab-kernel clean
+.PHONY: help setup wheel wheel-arm64 demo test test-live test-long test-all check lint docs coverage mutants fuzz bench soak lab-kernel clean
 
 help:  ## show this list
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,14 +29,28 @@ wheel-arm64: setup  ## the same for arm64, cross-compiled
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)
 
-test: lint docs coverage  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
+# Fast tests that start a process or hold a limit by the real clock: they run with the live ones.
+TIMED := $(addprefix tests/,autonomy/test_autonomy_process.py autonomy/test_calibration_live.py autonomy/test_planner_process.py \
+    can_dbc/test_bus_fast_path.py console/test_console.py console/test_mission_state.py console/test_plant_view.py \
+    hil/test_bus_contract.py hil/test_bus_daemon.py hil/test_wire_daemon.py hil/test_wirebus.py recorder/test_recover.py \
+    recorder/test_stop_process.py sim/test_camera_server.py sim/test_plant_process.py)
+FAST  := -m "not slow" -n 2 --dist worksteal $(addprefix --ignore=,$(TIMED))
+
+test: lint  ## lint, types, architecture and the tests that no other load can disturb; before every push
+	@$(BIN)/pytest $(FAST) $(ARGS)
+
+test-live: setup  ## every test that starts processes: runs on the wire and on vcan, services, the real-time kernel
 	@sh deploy/debian_packages.sh
-	@$(BIN)/pytest -m "not slow" -n 2 --dist worksteal $(ARGS) || [ $$? -eq 5 ]
-	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
-	@$(BIN)/pytest -m "slow and not computed" $(ARGS) || [ $$? -eq 5 ]
+	@$(BIN)/pytest -m "not slow" $(TIMED) $(ARGS) || [ $$? -eq 5 ]
+	@$(BIN)/pytest -m "slow and not computed" $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
+
+test-long: setup docs coverage  ## long runs in virtual time, the documentation site, branch coverage of supervisor and guard
+	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal $(ARGS)
+
+test-all: test test-long test-live  ## the three
 
 check: lint  ## lint, types, architecture and the fast tests
-	@$(BIN)/pytest -q -m "not slow" -n 2 --dist worksteal $(ARGS)
+	@$(BIN)/pytest -q $(FAST) $(ARGS)
 
 lint: setup  ## style, types and the three floors
 	@$(BIN)/ruff check .
