@@ -15,9 +15,8 @@ help:  ## show this list
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
 	@touch $@
-	@sh deploy/compile_in_background.sh $(VENV)
 
-setup: $(VENV)/.ready  ## create the virtual environment; compiles the tick in the background
+setup: $(VENV)/.ready  ## create the virtual environment
 
 wheel: setup  ## a wheel for this platform with the compiled tick, in dist/
 	@TIMBERHAND_COMPILE=1 $(BIN)/python -m pip wheel --no-deps --no-build-isolation -w dist .
@@ -33,7 +32,7 @@ demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--locks
 TIMED := $(addprefix tests/,autonomy/test_autonomy_process.py autonomy/test_calibration_live.py autonomy/test_planner_process.py \
     can_dbc/test_bus_fast_path.py console/test_console.py console/test_mission_state.py console/test_plant_view.py \
     hil/test_bus_contract.py hil/test_bus_daemon.py hil/test_wire_daemon.py hil/test_wirebus.py recorder/test_recover.py \
-    recorder/test_stop_process.py sim/test_camera_server.py sim/test_plant_process.py)
+    recorder/test_stop_process.py runtime/test_allocator.py runtime/test_huge_pages.py sim/test_camera_server.py sim/test_plant_process.py)
 FAST  := -m "not slow" -n 2 --dist worksteal $(addprefix --ignore=,$(TIMED))
 
 test: lint  ## lint, types, architecture and the tests that no other load can disturb; before every push
