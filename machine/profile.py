@@ -299,10 +299,14 @@ class Plc(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Reaction times of the supervisor in ms; frame timeouts come from the DBC."""
+    """Reaction times of the supervisor in ms; frame timeouts come from the DBC.
+
+    ``operator_link_ms``: so long may an operator who watches be silent; 0: the link is not watched.
+    """
 
     lease_max_ms: int
     stop_ramp_ms: int
+    operator_link_ms: int = 1000
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

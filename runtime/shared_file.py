@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import mmap
 import os
 from pathlib import Path
@@ -11,7 +12,20 @@ from pathlib import Path
 def shared_path(name: str) -> Path:
     """Path of a shared file: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / name
+    return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / name  # see make_own_folder  # nosec B108
+
+
+def make_own_folder(folder: Path) -> None:
+    """Make a folder for files and sockets that others may find; one that another user made first is not trusted.
+
+    Raises:
+        OSError: It cannot be made, or belongs to another user than this one and root.
+    """
+    folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+    if folder.stat().st_uid not in (os.getuid(), 0):
+        raise PermissionError(
+            errno.EPERM, "the folder belongs to another user, who could change what is in it", str(folder)
+        )
 
 
 class SharedFile:
@@ -21,7 +35,7 @@ class SharedFile:
 
     def __init__(self, path: Path, size: int) -> None:
         """Raises OSError if it cannot be created."""
-        path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        make_own_folder(path.parent)
         # A new file each time: a reader of a former process's file keeps its mapping.
         with contextlib.suppress(FileNotFoundError):
             path.unlink()

@@ -63,7 +63,7 @@ def compile_message(name: str, length: int, signals: Sequence[SignalInfo]) -> tu
         lines += _flat_decode("receive", length, signals, aligned is not None, checked=True)
         lines += _flat_encode(length, signals)
     source = "\n".join(lines) + "\n"
-    exec(compile(source, f"<codec of {name}>", "exec"), space)
+    exec(compile(source, f"<codec of {name}>", "exec"), space)  # text of ours, see above  # nosec B102
     compiled = AHEAD_OF_TIME.get(key_of(source))
     if compiled is not None:
         made = compiled(space["_slow_receive"], space["_slow_encode"], space["_length"])

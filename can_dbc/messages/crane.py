@@ -24,6 +24,8 @@ _SPOOL_KNOT: Final = struct.Struct("<Id")
 _REPORT: Final = struct.Struct(f"<BBHIHHH{3 * N_AXES + 3}d4I")
 _EVIDENCE: Final = struct.Struct("<Q3d")
 """Behind a report whose reason slowed or stopped the machine."""
+_LINK: Final = struct.Struct("<B")
+"""Behind everything else, once an operator watches."""
 
 
 class GrappleCommand(IntEnum):
@@ -46,6 +48,24 @@ class OperatorAction(IntEnum):
     DISARM = 2
     STOP = 3
     RESET = 4
+    WATCH = 5
+    """Heartbeat of a person who watches the machine; without the next one in time the machine holds."""
+    WATCH_END = 6
+    """The person ends the watch on purpose."""
+
+
+WATCH_ACTIONS: Final = (OperatorAction.WATCH, OperatorAction.WATCH_END)
+WATCH_PERIOD_NS: Final = 200_000_000
+"""Period of the heartbeats: of the shortest limit that a profile allows, one may be lost."""
+
+
+class LinkWatch(IntEnum):
+    """Whether the link of an operator who watches is there (`controller.operator_link`)."""
+
+    OFF = 0
+    """Nobody watches."""
+    WATCHED = 1
+    LOST = 2
 
 
 class Knot(NamedTuple):
@@ -119,6 +139,7 @@ class StateReport:
 
     While the reason is one that slows or stops the machine, ``since_ns`` is when it began, else 0, and ``numbers`` is
     its evidence: measured value, limit and one more (`machine.status.evidence`), NaN where there is none.
+    ``operator_link`` is a `LinkWatch`.
     """
 
     sequence: int
@@ -143,6 +164,7 @@ class StateReport:
     frames_received: int
     since_ns: int = 0
     numbers: tuple[float, ...] = ()
+    operator_link: int = LinkWatch.OFF
 
 
 def crane_body(m: CraneSetpoint) -> bytes:
@@ -169,7 +191,9 @@ def report_body(m: StateReport) -> bytes:
         *m.position, *m.velocity, *m.reference, m.opening_pct, m.clamp_bar, m.load_kg,
         m.tick_ns & 0xFFFFFFFF, m.late_ns & 0xFFFFFFFF, m.missed_ticks & 0xFFFFFFFF, m.frames_received & 0xFFFFFFFF,
     )  # fmt: skip
-    return body + _EVIDENCE.pack(m.since_ns, *m.numbers) if m.since_ns else body
+    if m.since_ns:
+        body += _EVIDENCE.pack(m.since_ns, *m.numbers)
+    return body + _LINK.pack(m.operator_link) if m.operator_link else body
 
 
 def crane_from(common: Common, body: bytes) -> CraneSetpoint:
@@ -216,13 +240,20 @@ def operator_from(common: Common, body: bytes) -> OperatorCommand:
 
 
 def report_from(common: Common, body: bytes) -> StateReport:
-    """The report in a body, with or without evidence; raises struct.error for a wrong length."""
+    """The report in a body, with or without evidence and link; raises struct.error for a wrong length."""
     values = _REPORT.unpack(body[: _REPORT.size])
-    evidence: tuple[Any, ...] = ()
-    if len(body) > _REPORT.size:
-        since_ns, *numbers = _EVIDENCE.unpack(body[_REPORT.size :])
-        evidence = since_ns, tuple(numbers)
+    more = body[_REPORT.size :]
+    since_ns, link = 0, 0
+    numbers: tuple[Any, ...] = ()
+    if len(more) % _EVIDENCE.size == _LINK.size:
+        more, link = more[: -_LINK.size], more[-1]
+        if link not in (LinkWatch.WATCHED, LinkWatch.LOST):
+            raise DatagramRefused(DatagramFault.LENGTH)
+    if more:
+        since_ns, *measured = _EVIDENCE.unpack(more)
+        numbers = tuple(measured)
     joints = values[7 : 7 + 3 * N_AXES]
     fields: list[Any] = [*common, *values[:7]]
     fields += [joints[:N_AXES], joints[N_AXES : 2 * N_AXES], joints[2 * N_AXES :]]
-    return StateReport(*fields, *values[7 + 3 * N_AXES :], *evidence)
+    fields += [*values[7 + 3 * N_AXES :], since_ns, numbers, link]
+    return StateReport(*fields)

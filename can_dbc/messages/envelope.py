@@ -41,6 +41,8 @@ class Kind(IntEnum):
     VEHICLE = 6
     ORDER = 7
     MISSION = 8
+    UPLOAD = 9
+    GRASP = 10
 
 
 class DatagramFault(IntEnum):
@@ -90,9 +92,14 @@ def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
     return kind, (sequence, profile_hash, stamp_ns), signed[_HEADER.size :]
 
 
+def kind_of(data: bytes) -> int:
+    """The kind that a datagram says it is, 0 if it is too short; nothing of it is checked."""
+    return int(_HEADER.unpack_from(data)[2]) if len(data) >= _HEADER.size else 0
+
+
 def is_operator_command(data: bytes) -> bool:
     """Whether a datagram says that it is an operator's command; nothing of it is checked."""
-    return len(data) >= _HEADER.size and _HEADER.unpack_from(data)[2] == Kind.OPERATOR
+    return kind_of(data) == Kind.OPERATOR
 
 
 def _mac(data: bytes, key: bytes) -> bytes:

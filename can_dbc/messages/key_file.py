@@ -8,6 +8,8 @@ from typing import Final
 from runtime.errors import CodedError
 
 MIN_KEY_BYTES: Final = 16
+SERVICE_KEY: Final = Path("/etc/timberhand/key")
+"""The key of the installed services; root and the group timberhand-operator may read it."""
 
 
 class KeyFileError(CodedError, ValueError):
@@ -25,3 +27,11 @@ def read_key(path: Path) -> bytes:
             "key.short", f"{path}: a key of {len(key)} bytes is too short; use at least {MIN_KEY_BYTES}."
         )
     return key
+
+
+def service_key() -> bytes | None:
+    """The key of the services that are installed here; None where there is none, or this user may not read it."""
+    try:
+        return read_key(SERVICE_KEY)
+    except KeyFileError:
+        return None

@@ -110,7 +110,8 @@ class MissionReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``state`` is the short name of its state and ``words`` describes it; ``paused`` says why nothing moves,
     ``waits_for`` which transition waits for the next single step, ``failure`` why the mission ended early.  ``targets``
     are the numbers of the logs to grasp, ``crane`` describes what the crane does.  ``route`` is driven repeatedly if
-    ``closed``.  ``order`` is the sequence number of the last command and ``refusal`` why it was refused.
+    ``closed``.  ``order`` is the sequence number of the last command or upload and ``refusal`` why it was refused; a
+    refused upload has a ``refusal_code``, too.
     """
 
     schema: Literal[1]
@@ -140,6 +141,7 @@ class MissionReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fences: Annotated[tuple[Fence, ...], msgspec.Meta(max_length=MAX_FENCES)]
     landings: Annotated[tuple[Landing, ...], msgspec.Meta(max_length=MAX_LANDINGS)]
     logs: Annotated[tuple[KnownLog, ...], msgspec.Meta(max_length=MAX_LOGS)]
+    refusal_code: Text = ""
 
 
 _REPORT: Final = msgspec.json.Decoder(MissionReport)

@@ -6,9 +6,9 @@ Layout (docs/reference/can-bus.md section 10)::
         | mode u16 | arm u16
     command, 100: header | 7 x (reference i32, rate i32; 1e-6) | grapple, grapple %, speed %, reset: 4 x u16
         | [HMAC 16] | CRC-32
-    reply, 132: header (mode: state; arm: key when it moves) | 7 x (position i32, velocity i32; 1e-6)
+    reply, 144: header (mode: state; arm: key when it moves) | 7 x (position i32, velocity i32; 1e-6)
         | 8 pressures i16 0.1 bar | E-stop bits, fault, axis, longest cycle us, opening 0.1 %, load kg: 6 x u16
-        | EstopStat 8 bytes | time of the positions us u16 | reserved u16 | [HMAC 16] | CRC-32
+        | EstopStat 8 bytes | time of the positions us u16 | 7 x output i16 1e-3 | [HMAC 16] | CRC-32
 
 ``session`` is drawn by the PLC and 0 in a request for one (hello).  ``seq`` only ever increases within a session.
 ``echo_seq`` is the sequence number of the newest valid datagram from the other side: it gives the round-trip time, and
@@ -42,13 +42,13 @@ from can_dbc.plc.map import (
 from runtime.errors import CodedError
 
 MAGIC: Final = 0x314E5243  # "CRN1"
-VERSION: Final = 2
+VERSION: Final = 3
 COMMAND_TYPE, REPLY_TYPE = 1, 2
-COMMAND_BYTES, REPLY_BYTES = 100, 132
+COMMAND_BYTES, REPLY_BYTES = 100, 144
 """Without the HMAC."""
 MAC_BYTES: Final = 16
 _COMMAND: Final = struct.Struct(f"<IHHIIQIHH{2 * N_AXES}i4H")
-_REPLY: Final = struct.Struct(f"<IHHIIQIHH{2 * N_AXES}i{N_PRESSURES}h6H{ESTOP_BYTES}sH2x")
+_REPLY: Final = struct.Struct(f"<IHHIIQIHH{2 * N_AXES}i{N_PRESSURES}h6H{ESTOP_BYTES}sH{N_AXES}h")
 _CRC: Final = struct.Struct("<I")
 _MICRO: Final = 1e6
 _U32: Final = 0xFFFF_FFFF
@@ -102,9 +102,9 @@ def encode_reply(header: Header, feedback: Feedback, key: bytes | None = None) -
     opening, load = plc.whole(f.opening, 1e3, 0, 1000, "the opening"), plc.whole(f.load_kg, 1, 0, 0xFFFF, "the load")
     plc.estop_words(f.estop_frame)  # checks its length
     end = (f.estop, f.fault, f.fault_axis, min(f.longest_cycle_us, 0xFFFF), opening, load, f.estop_frame)
-    arm = ARM_KEY if f.state is State.EXECUTE else 0
-    packed = _REPLY.pack(*_head(header, REPLY_TYPE), f.state, arm, *body, *pressures, *end, f.sampled_us & 0xFFFF)
-    return _closed(packed, key)
+    outputs = [plc.signed16(u, 1e3, f"output of axis {i}") for i, u in enumerate(f.output)]
+    head = (*_head(header, REPLY_TYPE), f.state, ARM_KEY if f.state is State.EXECUTE else 0)
+    return _closed(_REPLY.pack(*head, *body, *pressures, *end, f.sampled_us & 0xFFFF, *outputs), key)
 
 
 def decode_reply(data: bytes, key: bytes | None = None) -> tuple[Header, Feedback]:
@@ -112,7 +112,7 @@ def decode_reply(data: bytes, key: bytes | None = None) -> tuple[Header, Feedbac
     header, state, _, values = _opened(data, _REPLY, REPLY_TYPE, key)
     position, velocity = _halves(values[: 2 * N_AXES])
     pressures = values[2 * N_AXES : 2 * N_AXES + N_PRESSURES]
-    estop, fault, axis, longest, opening, load, estop_frame, sampled_us = values[2 * N_AXES + N_PRESSURES :]
+    estop, fault, axis, longest, opening, load, estop_frame, sampled_us, *outputs = values[2 * N_AXES + N_PRESSURES :]
     if state not in set(State):
         raise DatagramRefused("plc-datagram.state", f"the PLC's state is {state}, which is not defined")
     return header, Feedback(
@@ -130,6 +130,7 @@ def decode_reply(data: bytes, key: bytes | None = None) -> tuple[Header, Feedbac
         load_kg=load,
         estop_frame=estop_frame,
         sampled_us=sampled_us,
+        output=tuple(u / 1e3 for u in outputs),
     )
 
 

@@ -25,11 +25,11 @@ N_PRESSURES: Final = 8
 ESTOP_BYTES: Final = 8
 
 MAGIC: Final = 0x4352
-MAP_VERSION: Final = 2
+MAP_VERSION: Final = 3
 WORD_TEST: Final = 0x0102_0304
 ARM_KEY: Final = 0x5AA5
 
-STATUS_AT, STATUS_COUNT = 0, 48
+STATUS_AT, STATUS_COUNT = 0, 56
 COMMAND_AT, COMMAND_COUNT = 100, 32
 HEARTBEAT_AT, SEQUENCE_AT, MODE_AT, ARM_AT = 100, 101, 102, 103
 WATCHDOG_AT: Final = 11
@@ -160,6 +160,8 @@ class Feedback:
     """The newest EstopStat as the safety module sent it, with its checksum and counter; zeros before the first."""
     sampled_us: int = 0
     """When the positions were read, by the PLC's clock modulo 2**16."""
+    output: tuple[float, ...] = (0.0,) * N_AXES
+    """Opening that the PLC commands to each valve now, -1..1 of full opening."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +302,7 @@ def estop_words(frame: bytes) -> tuple[int, ...]:
 
 
 def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> list[int]:
-    """The status block, registers 0 to 47; raises MapError."""
+    """The status block, registers 0 to 55; raises MapError."""
     f = feedback
     words = [MAGIC, MAP_VERSION, *_pair(WORD_TEST, order)]
     words += [f.heartbeat & _U16, f.state, f.fault & _U16, f.fault_axis & _U16]
@@ -311,7 +313,8 @@ def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> 
     words += [signed16(p, 10.0, f"pressure {i}") & _U16 for i, p in enumerate(f.pressure_bar)]
     words += [whole(f.opening, _MILLI, 0, 1000, "the opening"), whole(f.load_kg, 1, 0, _U16, "the load")]
     words += [*estop_words(f.estop_frame), f.sampled_us & _U16]
-    return words
+    words += [signed16(u, _MILLI, f"output of axis {i}") & _U16 for i, u in enumerate(f.output)]
+    return [*words, 0]
 
 
 def check_identity(registers: Sequence[int], order: WordOrder) -> None:
@@ -342,7 +345,7 @@ def check_identity(registers: Sequence[int], order: WordOrder) -> None:
 
 
 def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, int]:
-    """Feedback and watchdog [ms] in the 48 registers from `STATUS_AT`; raises MapError."""
+    """Feedback and watchdog [ms] in the 56 registers from `STATUS_AT`; raises MapError."""
     check_identity(registers, order)
     try:
         state = State(registers[5])
@@ -363,6 +366,7 @@ def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, i
         load_kg=registers[42],
         estop_frame=struct.pack(">4H", *registers[43:47]),
         sampled_us=registers[47],
+        output=tuple(_short(registers[48 + i]) / _MILLI for i in range(N_AXES)),
     )
     return feedback, registers[WATCHDOG_AT]
 

@@ -9,7 +9,7 @@ closer at every height at which the arm is steeper.  Heights count from the lowe
 
 from __future__ import annotations
 
-from math import asin, cos, inf, sin, sqrt
+from math import asin, cos, inf, pi, sin, sqrt
 from typing import Final
 
 from machine.profile import Carrier
@@ -93,6 +93,14 @@ def base_from_rear(carrier: Carrier, point: Point) -> Point:
     """A point of the rear frame in the crane's base frame [m]."""
     bx, by, bz = carrier.crane_base_m
     return _turned((point[0] - bx, point[1] - by, point[2] - bz), -carrier.crane_yaw_rad)
+
+
+def axis_from_antenna(carrier: Carrier, antenna_m: tuple[float, float], heading_rad: float) -> tuple[float, float]:
+    """The articulation axis [m] east and north of where the place of the main antenna counts from; ``heading_rad`` is
+    that of the front half, clockwise from true north.
+    """
+    x, y, _ = _turned(carrier.antenna_main_m, 0.5 * pi - heading_rad)
+    return antenna_m[0] - x, antenna_m[1] - y
 
 
 def wheel_gap_m(carrier: Carrier, articulation_rad: float) -> float:

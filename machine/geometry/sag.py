@@ -129,6 +129,9 @@ def _iterate(
         there = true_pin(sag, kin, q, load_kg)
         off = (x - there[0], y - there[1], z - there[2])
         if hypot(*off) < AIM_TOLERANCE_M:
-            break
+            return q
         up = (up[0] + off[0], up[1] + off[1], up[2] + off[2])
-    return q
+    raise Unreachable(
+        f"({x:.3f}, {y:.3f}, {z:.3f}) m lies too near the mast: the lean of the column carries the pin past it; aim "
+        "farther out"
+    )

@@ -36,6 +36,8 @@ MAX_GAIN_DELAY: Final = 0.5
 (docs/reference/machines.md section 4).
 """
 MAX_DEADBAND_PCT: Final = 50.0
+FULL_SPEED_SHARE: Final = 2.0
+"""A valve may let a joint be this many times faster than any speed limit; nobody opens it so far."""
 MIN_ANTENNA_DISTANCE_M: Final = 0.3
 """Antennas closer together give no useful heading (docs/reference/machines.md section 8)."""
 MAX_ARM_DROP_SHARE: Final = 0.9
@@ -57,6 +59,8 @@ IMU_MESSAGE: Final = "GrappleImu"
 _CRANE_LINKS: Final = ("base", "boom", "stick")
 _CARRIER_LINKS: Final = ("front", "rear")
 _VALVE_SIGNALS: Final = ("Slew", "Lift", "Tilt", "Ext", "Rot")
+MIN_LINK_MS: Final = 500
+"""Shortest limit of an operator's link: one of two heartbeats may be lost."""
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
 
@@ -89,6 +93,10 @@ def _top_level_problems(profile: Profile) -> Iterator[Problem]:
     if profile.rate_hz > 0 and 1_000_000 % profile.rate_hz:
         text = f"{profile.rate_hz} Hz is not a whole number of microseconds; use for example 100, 200 or 250"
         yield Problem("profile.rate-not-whole", "rate_hz", text)
+    link_ms = profile.timeouts.operator_link_ms
+    if 0 < link_ms < MIN_LINK_MS:
+        text = f"{link_ms} ms is too short for heartbeats every 200 ms; use {MIN_LINK_MS}..1000, or 0 to watch no link"
+        yield Problem("profile.link-limit-short", "timeouts.operator_link_ms", text)
     floor_z_m, ground_z_m = profile.bunk.floor_z_m, profile.workspace.ground_z_m
     if floor_z_m < ground_z_m:
         text = f"{floor_z_m} m is below the ground at {ground_z_m} m; a bunk floor is at or above it"
@@ -128,7 +136,8 @@ def _valve_problems(path: str, spec: JointSpec, speed: Range) -> Iterator[Proble
     if valve.signal not in _VALVE_SIGNALS:
         text = f'"{valve.signal}" is not a valve command; use one of {", ".join(_VALVE_SIGNALS)}'
         yield Problem("profile.valve-signal", f"{path}.valve.signal", text)
-    yield from _side_problems(f"{path}.valve", valve, "speed_limit", spec.speed_limit, speed)
+    full: Range = (speed[0], FULL_SPEED_SHARE * speed[1], speed[2])
+    yield from _side_problems(f"{path}.valve", valve, "speed_limit", spec.speed_limit, full)
     if len(valve.lever) != len(valve.lever_at) or len(valve.lever) == 1:
         text = f"{len(valve.lever)} lever arms for {len(valve.lever_at)} positions; give one for each lever_at"
         yield Problem("profile.lever-length", f"{path}.valve.lever", text)

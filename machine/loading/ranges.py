@@ -174,6 +174,7 @@ _RANGES: Final[dict[type[msgspec.Struct], dict[str, Range]]] = {
     Timeouts: {
         "lease_max_ms": (20, 500, "ms"),
         "stop_ramp_ms": (10, 300, "ms"),
+        "operator_link_ms": (0, 1000, "ms"),
     },
 }
 _SLIPS: Final = {

@@ -15,13 +15,13 @@ from machine.joints import Joint
 from machine.status.reasons import Reason
 
 _MS: Final = "ms"
-_RAD, _RAD_S, _M, _M_S, _NM, _KG = "rad", "rad/s", "m", "m/s", "Nm", "kg"
+_RAD, _RAD_S, _M, _M_S, _NM, _KG, _PCT, _BAR = "rad", "rad/s", "m", "m/s", "Nm", "kg", "%", "bar"
 _UNIT, _UNIT_S = "joint", "joint/s"
 """rad or m, by the joint that the detail names."""
 _COUNT, _BITS, _REASON = "", "bits", "reason"
 _SHOWN: Final = {_RAD: (180.0 / math.pi, 2, "°"), _RAD_S: (180.0 / math.pi, 2, "°/s"), _M: (1.0, 3, " m"),
                  _M_S: (1.0, 3, " m/s"), _MS: (1.0, 1, " ms"),
-                 _NM: (1e-3, 1, " kNm"), _KG: (1.0, 0, " kg")}  # fmt: skip
+                 _NM: (1e-3, 1, " kNm"), _KG: (1.0, 0, " kg"), _BAR: (1.0, 1, " bar")}  # fmt: skip
 """By unit: factor, decimals and mark for a person."""
 
 
@@ -59,10 +59,12 @@ def _age(of: str) -> Measurement:
 _HEARTBEAT: Final = Measurement("age of its heartbeat", _MS)
 _EMERGENCY: Final = Measurement("emergency error code (CiA 301)", _BITS, "")
 _MOTION: Final = Measurement("velocity", _UNIT_S, "speed limit", "commanded", _UNIT_S)
+_SPOOL: Final = Measurement("spool", _PCT, "", "commanded", _PCT)
 _BUS: Final = Measurement("error frames since the start", _COUNT, "", "recoveries")
 _STEERING: Final = Measurement("rate of the articulation", _RAD_S, "", "commanded", _RAD_S)
 
 EVIDENCE: Final[dict[Reason, Measurement]] = {
+    Reason.OPERATOR_LINK_LOST: Measurement("age of the operator's last heartbeat", _MS),
     Reason.ESTOP_PRESSED: Measurement("channel A", _COUNT, "released is", "channel B"),
     Reason.ESTOP_CHANNELS: Measurement("channel A", _COUNT, "released is", "channel B"),
     Reason.ESTOP_LOST: _age("the last good EstopStat"),
@@ -75,7 +77,7 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.VALVE_FEEDBACK_LOST: _age("the last good feedback"),
     Reason.VALVE_ECHO_STUCK: Measurement("time without a newly accepted command", _MS, "limit", "exit code"),
     Reason.VALVE_NODE_FAULT: Measurement("state of the valve node", _COUNT, "", "exit code"),
-    Reason.PLC_LOST: _age("the last good PlcStatus"),
+    Reason.PLC_LOST: _age("the last good PlcStatus or PlcOut"),
     Reason.PLC_FAULT: Measurement("fault bits", _BITS, ""),
     Reason.PRESSURE_LOST: _age("its last good frame"),
     Reason.GRAPPLE_STATUS_LOST: _age("the last good GrappleStat"),
@@ -95,6 +97,10 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.LOOP_STALLED: Measurement("lateness", _MS, "limit", "late ticks since the start"),
     Reason.LEASE_LOST: Measurement("age of the last setpoint", _MS, "lease"),
     Reason.SETPOINTS_REFUSED: Measurement("setpoints refused since the start", _COUNT, "", "the last one for", _REASON),
+    Reason.SPOOL_OPEN: _SPOOL,
+    Reason.SPOOL_SHUT: _SPOOL,
+    Reason.SPOOL_WRONG: _SPOOL,
+    Reason.SPEED_WRONG: _MOTION,
     Reason.JOINT_STUCK: _MOTION,
     Reason.JOINT_RUNAWAY: _MOTION,
     Reason.JOINT_REVERSED: _MOTION,
@@ -103,6 +109,8 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.ENCODER_NOISY: _MOTION,
     Reason.ENCODER_DRIFT: _MOTION,
     Reason.OVERLOAD: Measurement("moment about the tipping line", _NM, "limit", "load", _KG),
+    Reason.OVERLOADED: Measurement("moment about the tipping line", _NM, "limit", "load", _KG),
+    Reason.HOSE_BURST: Measurement("pressure in the chamber", _BAR, "", "before", _BAR),
     Reason.TEST_RANGE: Measurement("position", _UNIT, "end of the range"),
     Reason.TEST_SPEED: Measurement("velocity", _UNIT_S, "speed limit"),
     Reason.POSITION_LOST: _age("the last good position"),

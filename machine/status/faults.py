@@ -74,6 +74,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
     Reason.CONTROLLER_ENDED: Fault(Reaction.NOTE, 0, _N, "The controller has ended", "Start it again."),
     Reason.OPERATOR_STOP: Fault(Reaction.HOLD, 0, _N, "The operator stopped the machine", "Arm to continue."),
     Reason.OPERATOR_DISARM: Fault(Reaction.HOLD, 0, _N, "The operator disarmed the machine", "Arm to continue."),
+    Reason.OPERATOR_LINK_LOST: Fault(
+        Reaction.HOLD,
+        1000,
+        _N,
+        "The operator who watches no longer reaches the machine",
+        "Open the operator's page again, or end the watch by `timberhand operator unwatch`; then arm.",
+    ),
     Reason.ESTOP_PRESSED: Fault(Reaction.CUT, 15, _N, "The emergency stop is pressed", _SESSION, True),
     Reason.ESTOP_CHANNELS: Fault(
         Reaction.CUT,
@@ -115,7 +122,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.DEGRADE,
         500,
         _J,
-        "The encoder of {} is much noisier than its profile says; half speed",
+        "The encoder of {} is much noisier than it was, or than its profile says; half speed",
         "Check its shield, supply and coupling.",
     ),
     Reason.ENCODER_DRIFT: Fault(
@@ -176,6 +183,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
     ),
     Reason.PERSON_IN_ZONE: Fault(
         Reaction.HOLD, 20, _N, "A person is in the machine's zone", "Clear the zone, then arm."
+    ),
+    Reason.LEVER_MOVED: Fault(
+        Reaction.HOLD,
+        20,
+        _N,
+        "A hand lever was moved or its switch is faulty: automatic work has ended",
+        "Leave the levers in neutral, then arm; if nobody moved one, check its switch.",
     ),
     Reason.CARRIER_LOST: Fault(
         Reaction.CUT,
@@ -257,6 +271,34 @@ FAULTS: Final[dict[Reason, Fault]] = {
     ),
     Reason.LEASE_LOST: Fault(Reaction.HOLD, 10, _N, "The planner's setpoints ended while moving", PLANNER),
     Reason.SETPOINTS_REFUSED: Fault(Reaction.HOLD, 10, _N, "Three setpoints were refused within a second", PLANNER),
+    Reason.SPOOL_OPEN: Fault(
+        Reaction.CUT,
+        150,
+        _J,
+        "The valve of {} is further open than commanded",
+        "Check its spool for dirt and its solenoid, then reset and arm.",
+    ),
+    Reason.SPOOL_SHUT: Fault(
+        Reaction.HOLD,
+        400,
+        _J,
+        "The valve of {} stays shut although it is commanded to open",
+        "Check its spool, solenoid and plug, then arm.",
+    ),
+    Reason.SPOOL_WRONG: Fault(
+        Reaction.DEGRADE,
+        2000,
+        _J,
+        "The valve of {} opens more or less than commanded; half speed",
+        "Check pilot pressure and solenoid, and calibrate the valve.",
+    ),
+    Reason.SPEED_WRONG: Fault(
+        Reaction.RAMP,
+        200,
+        _J,
+        "{} moves at another speed than its open valve gives",
+        "Compare the joint with its encoder: check coupling and scale; or calibrate the valve. Then reset and arm.",
+    ),
     Reason.JOINT_STUCK: Fault(
         Reaction.HOLD,
         400,
@@ -284,6 +326,20 @@ FAULTS: Final[dict[Reason, Fault]] = {
         _N,
         "Load, reach and slope together are more than the machine bears",
         "Lower the load or bring it nearer, or arm and command only that.",
+    ),
+    Reason.OVERLOADED: Fault(
+        Reaction.DEGRADE,
+        50,
+        _N,
+        "The machine bears no more: nothing goes outward or up; half speed",
+        "Lower the load or bring it nearer.",
+    ),
+    Reason.HOSE_BURST: Fault(
+        Reaction.CUT,
+        100,
+        _J,
+        "The oil that carries {} is gone: a hose or a pipe has burst",
+        "Stay clear of the load; replace the hose, then reset and arm.",
     ),
     Reason.TEST_RANGE: Fault(
         Reaction.HOLD,
