@@ -10,11 +10,11 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from controller.bus_io.message_state import MessageState, Signal
+from controller.bus_io.message_state import MessageState, Signal, or_nan
 from controller.carrier.monitors import BEND_MARGIN_RAD, DISAGREE_RAD
 from controller.carrier.vehicle import Vehicle
 from controller.config import Settings
-from controller.crane.inputs import CraneInputs
+from controller.crane.inputs import CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.crane.nodes import HEARTBEAT_TIMEOUT_NS
 from controller.estimation.joint_estimator import JointEstimator
@@ -45,11 +45,13 @@ _ESTOP: Final = (Reason.ESTOP_PRESSED, Reason.ESTOP_CHANNELS)
 _HEARTBEATS: Final = (Reason.SAFETY_NODE_LOST, Reason.ENCODER_NODE_LOST, Reason.PRESSURE_NODE_LOST)
 _EMERGENCIES: Final = (Reason.EMERGENCY_MESSAGE, Reason.EMERGENCY_WARNING)
 _BUS_STATES: Final = (Reason.BUS_OFF, Reason.BUS_DOWN, Reason.BUS_PASSIVE)
+_OVERLOADS: Final = (Reason.OVERLOAD, Reason.OVERLOADED)
 _LATE: Final = (Reason.LOOP_LATE, Reason.LOOP_STALLED)
 _MOTIONS: Final = (
     Reason.JOINT_STUCK, Reason.JOINT_RUNAWAY, Reason.JOINT_REVERSED, Reason.MOVES_WHILE_STOPPED, Reason.ENCODER_NOISY,
-    Reason.ENCODER_DRIFT,
+    Reason.ENCODER_DRIFT, Reason.SPEED_WRONG,
 )  # fmt: skip
+_SPOOLS: Final = (Reason.SPOOL_OPEN, Reason.SPOOL_SHUT, Reason.SPOOL_WRONG)
 _STEERINGS: Final = (Reason.STEERING_STUCK, Reason.STEERING_RUNAWAY)
 _SPEEDS: Final = (Reason.CARRIER_RUNAWAY, Reason.CARRIER_STUCK)
 _ARMS: Final = (Reason.ARM_OUTSIDE, Reason.ARM_STUCK)
@@ -61,7 +63,8 @@ class Evidence:
     __slots__ = (
         "_alarms", "_articulation", "_carrier_spec", "_channel_a", "_channel_b", "_crane", "_detail", "_estimators",
         "_exit_code", "_gate", "_guard_axis", "_inputs", "_limits", "_messages", "_period_ns", "_plc_faults",
-        "_reason", "_supervisor", "_valve_state", "_vehicle", "_vehicle_fault", "_verdict", "numbers", "since_ns",
+        "_reason", "_spools", "_supervisor", "_valve_state", "_vehicle", "_vehicle_fault", "_verdict", "numbers",
+        "since_ns",
     )  # fmt: skip
 
     def __init__(
@@ -81,6 +84,7 @@ class Evidence:
         self._verdict, self._guard_axis = Signal(inputs.guard, "Verdict"), Signal(inputs.guard, "FaultAxis")
         self._valve_state, self._exit_code = Signal(inputs.valve_a, "State"), Signal(inputs.valve_b, "ExitCode")
         self._plc_faults = Signal(inputs.plc, "FaultBits")
+        self._spools = spool_signals(inputs)
         sensed = [*inputs.encoders, inputs.articulation]
         self._alarms = [
             None if state is None else Signal(state, "Alarms" if "Alarms" in state.codec.index else "SystemReg")
@@ -93,7 +97,7 @@ class Evidence:
         self._messages: dict[Reason, list[MessageState]] = {
             Reason.ESTOP_LOST: [inputs.estop],
             Reason.GUARD_LOST: [inputs.guard],
-            Reason.PLC_LOST: [inputs.plc],
+            Reason.PLC_LOST: inputs.plc_states,
             Reason.VALVE_FEEDBACK_LOST: [inputs.valve_a, inputs.valve_b],
             Reason.PRESSURE_LOST: [*inputs.pressures],
             Reason.GRAPPLE_STATUS_LOST: [inputs.grapple],
@@ -137,12 +141,15 @@ class Evidence:
             return float(reading.errors), _NAN, float(reading.recoveries)
         if reason is Reason.LEASE_LOST:
             return self._lease(now_ns)
+        if reason is Reason.OPERATOR_LINK_LOST:
+            link = self._supervisor.operator_link
+            return (now_ns - link.stamp_ns) * _MS, link.limit_ns * _MS, _NAN
         if reason is Reason.SETPOINTS_REFUSED:
             crane, vehicle = self._crane, self._vehicle
             gate = self._gate if crane.leased or vehicle is None else vehicle.gate
             return float(gate.refused), _NAN, float(pack(gate.refusal, gate.detail))
         moment = self._crane.load_moment
-        if reason is Reason.OVERLOAD and moment is not None:
+        if reason in _OVERLOADS and moment is not None:
             return moment.last_nm, moment.limit_nm, self._crane.load_kg
         if reason is Reason.ENCODER_FROZEN:
             return self._frozen(detail)
@@ -195,6 +202,8 @@ class Evidence:
         lower, upper, speed_limit = self._limits[detail]
         if reason in _MOTIONS:
             return estimator.velocity, speed_limit, self._crane.commands[detail]
+        if reason in _SPOOLS:
+            return or_nan(self._spools[detail].value()), _NAN, self._crane.spools_pct[detail]
         if reason is Reason.POSITION_OUTSIDE:
             low = estimator.position < lower
             return estimator.position, lower - RANGE_MARGIN_UNITS if low else upper + RANGE_MARGIN_UNITS, _NAN
@@ -205,6 +214,9 @@ class Evidence:
             return estimator.position, lower if near_lower else upper, _NAN
         if reason is Reason.TEST_SPEED:
             return estimator.velocity, speed_limit, _NAN
+        if reason is Reason.HOSE_BURST:
+            cylinder = self._crane.pressure_monitor.cylinders[detail]
+            return cylinder.now_bar, _NAN, cylinder.before_bar
         return ()
 
     def _node(self, reason: Reason, detail: int, now_ns: int) -> Numbers:

@@ -83,6 +83,7 @@ class StateReporter:
             frames_received=frames,
             since_ns=self._evidence.since_ns,
             numbers=self._evidence.numbers,
+            operator_link=supervisor.operator_link.state(now_ns),
         )
         self.late_ns = self.tick_ns = 0
         return encode(report, self._settings.key)

@@ -22,11 +22,12 @@ from can_dbc.messages.vehicle import DriveSetpoint
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, Settings
-from controller.crane.inputs import CraneInputs
+from controller.crane.inputs import CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.crane.outputs import CraneWriter
 from controller.crane.startup import Startup, check_nodes
 from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.pressure_monitor import NO_FUNCTION
 from controller.estimation.sensed_joint import SensedJoint
 from controller.evidence import Evidence
 from controller.joint_watch import JointWatch
@@ -36,6 +37,7 @@ from controller.state_report import StateReporter
 from controller.supervisor import Supervisor
 from controller.tick import Inputs, Outputs
 from controller.transitions import OPERATING, Event
+from controller.valve_watch import ValveWatch
 from machine.joints import JOINTS
 from machine.profile import joint
 from machine.status.modes import Mode
@@ -43,6 +45,8 @@ from machine.status.reasons import Reason
 
 # A constant of the module is found faster than a member of an enumeration, in every tick.
 _NONE: Final = Reason.NONE
+_UNREADABLE: Final = (Reason.DATAGRAM_LENGTH, Reason.DATAGRAM_VALUE)
+"""First and last reason of a datagram without a readable setpoint."""
 _ACTIVE: Final = Mode.ACTIVE
 HALF_SPEED_SHARE: Final = 0.5
 MAX_ELAPSED_PERIODS: Final = 4
@@ -61,7 +65,7 @@ class Controller:
     __slots__ = (
         "_last_ns", "_receive_sdo", "_reporter", "_sensed", "_settings", "carrier_bus", "crane", "crane_bus_monitor",
         "crane_inputs", "estimators", "evidence", "gate", "inputs_in_use", "joint_watch", "outputs", "startup",
-        "supervisor", "vehicle", "writer",
+        "supervisor", "valve_watch", "vehicle", "writer",
     )  # fmt: skip
 
     def __init__(
@@ -88,7 +92,7 @@ class Controller:
         self.startup = Startup(profile)
         self._receive_sdo = self.startup.receive
         sample_s = period_s if profile.plc is None else max(period_s, profile.plc.sample_ms * 1e-3)
-        self.estimators = [JointEstimator(s, sample_s) for s in specs]
+        self.estimators = [JointEstimator(s, sample_s, profile.plc is None) for s in specs]
         sensed = [
             SensedJoint(state, s.encoder, estimator) if state is not None and s.encoder is not None else None
             for state, s, estimator in zip(self.crane_inputs.encoders, specs, self.estimators, strict=True)
@@ -101,7 +105,10 @@ class Controller:
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
         # A PLC passes on positions that its own cycle has smoothed: the same count again says nothing of the encoder.
         counted = sensed if profile.plc is None else [None] * len(sensed)
-        self.joint_watch = JointWatch(specs, period_s, self.crane, self.estimators, counted)
+        closed_elsewhere = profile.plc is not None and profile.plc.role == "references"
+        loop_outputs = spool_signals(self.crane_inputs) if closed_elsewhere else ()
+        self.joint_watch = JointWatch(specs, period_s, self.crane, self.estimators, counted, loop_outputs)
+        self.valve_watch = ValveWatch(specs, period_s, profile.plc, self.crane, self.crane_inputs, self.estimators)
         self.writer = CraneWriter(database, profile)
         states = self.crane_inputs.messages + (self.carrier_bus.inputs.messages if self.carrier_bus else ())
         self.inputs_in_use = tuple((state.codec.name, state) for state in states)
@@ -192,6 +199,11 @@ class Controller:
                 self._apply_operator_action(message, now_ns)
         except RequestRefused as refused:
             self.gate.count_refusal(refused.reason, refused.detail, now_ns)
+            # Nobody can tell for whom an unreadable datagram was: it counts for a carrier that drives, too.
+            if not operator and _UNREADABLE[0] <= refused.reason <= _UNREADABLE[1]:
+                vehicle = self.vehicle
+                if vehicle is not None and vehicle.setpoint is not None:
+                    vehicle.gate.count_refusal(refused.reason, refused.detail, now_ns)
 
     def _apply_operator_action(self, action: OperatorAction, now_ns: int) -> None:
         supervisor = self.supervisor
@@ -201,12 +213,17 @@ class Controller:
             supervisor.request_disarm(now_ns)
         elif action is OperatorAction.RESET:
             supervisor.request_reset(now_ns)
+        elif action is OperatorAction.WATCH:
+            supervisor.operator_link.beat(self.gate.watch_stamp_ns)
+        elif action is OperatorAction.WATCH_END:
+            supervisor.operator_link.end(self.gate.watch_stamp_ns)
         else:
             reason, detail = supervisor.request_arm(now_ns)
             if reason is not _NONE:
                 raise RequestRefused(reason, detail)
             self.gate.start_session()
             self.joint_watch.begin_session()
+            self.crane.pressure_monitor.reset()
             if self.vehicle is not None:
                 self.vehicle.gate.start_session()
 
@@ -267,8 +284,13 @@ class Controller:
         supervisor.supervise(inputs.late_ns, period_ns, now_ns)
         if supervisor.mode is _ACTIVE:
             self._check_leases(now_ns)
-        if supervisor.mode is _ACTIVE and self.crane.overloads():
-            supervisor.react_to(Reason.OVERLOAD, 0, now_ns)
+        moment = self.crane.load_moment
+        if moment is not None and moment.overloaded and supervisor.mode in OPERATING:
+            raises = supervisor.mode is _ACTIVE and self.crane.overloads()
+            supervisor.react_to(Reason.OVERLOAD if raises else Reason.OVERLOADED, 0, now_ns)
+        burst = self.crane.pressure_monitor.step()
+        if burst != NO_FUNCTION:
+            supervisor.react_to(Reason.HOSE_BURST, burst, now_ns)
         run = self.crane.spool_run
         if supervisor.mode is _ACTIVE and run.running:
             tested = self.estimators[run.function]
@@ -279,6 +301,7 @@ class Controller:
             reason, detail = self.vehicle.check(supervisor.armed, now_ns)
             if reason is not _NONE:
                 supervisor.react_to(reason, detail, now_ns)
+        self.valve_watch.step(supervisor, now_ns)
         self.joint_watch.step(supervisor, self.vehicle is not None and self.vehicle.is_moving, now_ns)
         self.evidence.update(inputs, now_ns)
 

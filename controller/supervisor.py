@@ -4,8 +4,8 @@ Inputs of a tick: received values, the loop's own lateness, accepted setpoints a
 ``mode``, ``reason`` with ``detail``, and ``half_speed``.  The transitions are data (`controller.transitions`); the
 supervisor only decides which event occurs.  Nothing starts by itself: only the operator's ARM enters ARMED, and a
 latched FAULT needs RESET and then ARM.  STOP begins with a ramp while the machine moves (``ramp_ns``, and as long as a
-carrier needs to stand); the valves are neutral in every other mode but ACTIVE.  The supervisor never clips: it refuses,
-slows or stops.
+carrier needs to stand), without one after a hand lever was moved; the valves are neutral in every other mode but
+ACTIVE.  The supervisor never clips: it refuses, slows or stops.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from controller.carrier.inputs import CarrierInputs
 from controller.crane.inputs import CraneInputs
 from controller.crane.startup import Startup
 from controller.estimation.joint_estimator import JointEstimator
+from controller.operator_link import OperatorLink
 from controller.transitions import OPERATING, TRANSITIONS, Event
 from machine.joints import JOINTS
 from machine.profile import Profile, encoders, joint
@@ -34,9 +35,13 @@ _STOP: Final = Mode.STOP
 _WAITING: Final = (Mode.BOOT, Mode.STANDBY)
 _FAULT: Final = Mode.FAULT
 _MOVES: Final = Reason.MOVES_WHILE_STOPPED
+_LEVER: Final = Reason.LEVER_MOVED
 NO_JOINT: Final = -1
-RAMP_NS: Final = 60_000_000
-"""Ramp of an R1: with the slowest detection before it (20 ms), neutral well within 100 ms of the loss."""
+RAMP_NS: Final = 50_000_000
+"""Ramp of an R1: with the slowest detection before it (20 ms, 43 ms for a bus-off on mach0), neutral within 100 ms of
+the loss."""
+PLC_RAMP_NS: Final = 10_000_000
+"""The same before a PLC, which adds its own ramp (40 ms) and its cycle (10 ms)."""
 RANGE_MARGIN_UNITS: Final = 0.05
 """How far beyond the profile's range [rad, m] a joint may be before it counts as outside."""
 MAX_ECHO_TICKS: Final = 4
@@ -73,8 +78,10 @@ class Supervisor:
         "_echo_ticks",
         "_enable",
         "_heading",
+        "_latch_ramp_ns",
         "_late_stamps",
         "_latitude",
+        "_lever",
         "_person",
         "_plc_faults",
         "_reset_button",
@@ -92,6 +99,7 @@ class Supervisor:
         "late",
         "mode",
         "moving_joint",
+        "operator_link",
         "ramp_end_ns",
         "ramp_ns",
         "reason",
@@ -114,6 +122,7 @@ class Supervisor:
             Signal(inputs.guard, "Enable"), Signal(inputs.estop, "Person"), Signal(inputs.estop, "ResetReq"),
             Signal(inputs.estop, "ChannelA"), Signal(inputs.estop, "ChannelB"),
         )  # fmt: skip
+        self._lever = Signal(inputs.estop, "Lever")
         self._valve_state, self._echo_counter = Signal(inputs.valve_a, "State"), Signal(inputs.valve_b, "EchoCounter")
         self._plc_faults = Signal(inputs.plc, "FaultBits")
         carrier = self.carrier_inputs
@@ -121,6 +130,7 @@ class Supervisor:
         self._heading = Signal(carrier.heading, "Heading") if carrier is not None else None
         self._bus_monitors = (crane_monitor,) if carrier_bus is None else (crane_monitor, carrier_bus.monitor)
         self._startup = startup
+        self.operator_link = OperatorLink(profile)
         sensed = [*inputs.encoders, inputs.articulation]
         self._alarms = tuple(
             (place, state, state.codec.index[_ALARM_SIGNALS[spec.kind]])
@@ -132,6 +142,7 @@ class Supervisor:
             for j in JOINTS
             if (spec := joint(profile, j)).encoder is not None
         )
+        self._latch_ramp_ns = RAMP_NS if profile.plc is None else PLC_RAMP_NS
         self._stop_ramp_ns = profile.timeouts.stop_ramp_ms * 1_000_000
         self.mode = Mode.BOOT
         self.reason = Reason.NONE
@@ -165,6 +176,11 @@ class Supervisor:
         return self.mode is _STOP and self.ramp_ns > 0
 
     @property
+    def lever_moved(self) -> bool:
+        """Whether a hand lever is out of neutral, or its switch faulty; False on a machine that cannot tell."""
+        return bool(self._lever.value())
+
+    @property
     def echo_ticks(self) -> int:
         """How many ticks in a row the valve node's echo has been the same."""
         return self._echo_ticks
@@ -179,8 +195,8 @@ class Supervisor:
         self.ramp_ns, self.latching = 0, False
         if before is Mode.ACTIVE and after is Mode.STOP:
             self.latching = event is Event.RAMP
-            self.ramp_ns = RAMP_NS if self.latching else self._stop_ramp_ns
-            self.ramp_end_ns = self._slow_end_ns = now_ns + self.ramp_ns
+            self.ramp_ns = self._latch_ramp_ns if self.latching else self._stop_ramp_ns
+            self.ramp_end_ns = self._slow_end_ns = now_ns + (0 if reason is _LEVER else self.ramp_ns)
             if not self.latching:
                 self._slow_end_ns = max(self.ramp_end_ns, now_ns + self.coast_ns)
         return True
@@ -236,7 +252,7 @@ class Supervisor:
         if self.moving_joint != NO_JOINT:
             return Reason.JOINT_MOVES, self.moving_joint
         self.worst, self.worst_detail = _NONE, 0
-        self._check_values()
+        self._check_values(now_ns)
         self._collect(*received.nodes.worst_finding(now_ns))
         if carrier is not None:
             self._check_carrier(carrier)
@@ -258,7 +274,7 @@ class Supervisor:
         if self.armed:
             if self.crane_inputs.stale_mask:
                 self._check_stale()
-            self._check_values()
+            self._check_values(now_ns)
             reason, node = self.crane_inputs.nodes.worst_finding(now_ns)
             self._collect(reason, node)
             self._check_echo(period_ns)
@@ -346,7 +362,7 @@ class Supervisor:
             self._collect(Reason.ESTOP_LOST)
         if received.guard.values is None:
             self._collect(Reason.GUARD_LOST)
-        if received.plc.values is None:
+        if any(state.values is None for state in received.plc_states):
             self._collect(Reason.PLC_LOST)
         if received.valve_a.values is None or received.valve_b.values is None:
             self._collect(Reason.VALVE_FEEDBACK_LOST)
@@ -358,13 +374,17 @@ class Supervisor:
         if received.grapple.values is None:
             self._collect(Reason.GRAPPLE_STATUS_LOST)
 
-    def _check_values(self) -> None:
+    def _check_values(self, now_ns: int) -> None:
         """Values that are known and bad; a stale value is not checked here."""
         received = self.crane_inputs
         if received.guard.values is not None and self._enable.value() != _ENABLED:
             self._collect(Reason.GUARD_REFUSES)
+        if self.lever_moved:
+            self._collect(_LEVER)
         if self._person.value() == _YES:
             self._collect(Reason.PERSON_IN_ZONE)
+        if now_ns >= self.operator_link.lost_from_ns:
+            self._collect(Reason.OPERATOR_LINK_LOST)
         state = self._valve_state.value()
         if state == _VALVE_FAULT or (state == _VALVE_PILOT_OFF and self.mode is _ACTIVE):
             self._collect(Reason.VALVE_NODE_FAULT)

@@ -34,6 +34,9 @@ FROZEN_SAMPLES_COUNT: Final = 5
 MIN_TURN_RAD_S: Final = 0.02
 MIN_COURSE_SPEED_M_S: Final = 0.25
 """From this speed on the course over ground distinguishes forward from reverse."""
+MIN_COURSE_SHARE: Final = 0.8
+"""A machine that is slower over ground than this share of its wheels' speed slips: it may slide to any side, and its
+mast rocks."""
 MAX_COURSE_ERROR_RAD: Final = 1.2
 """Greatest angle between course and heading; beyond it the heading is wrong."""
 MAX_BEND_RAD: Final = 1.2
@@ -184,7 +187,8 @@ class DeadReckoning:
         course, ground = state.get("Cog"), state.get("Sog")
         if not state.fresh or course is None or ground is None:
             return
-        goes = ground > MIN_COURSE_SPEED_M_S and self.speed_m_s > MIN_COURSE_SPEED_M_S
+        goes = self.speed_m_s > MIN_COURSE_SPEED_M_S
+        goes = goes and ground > max(MIN_COURSE_SPEED_M_S, MIN_COURSE_SHARE * self.speed_m_s)
         against = abs(math.remainder(0.5 * math.pi - course - self.yaw_rad, math.tau)) > MAX_COURSE_ERROR_RAD
         self._against = self._against + 1 if goes and against else 0
         if self._against >= 2 and not self.finding:

@@ -12,7 +12,7 @@ from typing import Final
 from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import EMCY_BASE, HEARTBEAT_BASE, SDO_TO_CLIENT
-from controller.bus_io.message_state import MessageState, age_out
+from controller.bus_io.message_state import MessageState, Signal, age_out
 from controller.crane.nodes import NodeMonitor
 from machine.joints import ARTICULATION, JOINTS
 from machine.profile import Profile, encoders
@@ -42,6 +42,9 @@ class CraneInputs:
             state(name, bit) for name, bit in CRANE_INPUT_BITS.items()
         )
         self.pressures, self.grapple = helpful[:3], helpful[3]
+        self.plc_outputs = None if profile.plc is None else state("PlcOut", CRANE_INPUT_BITS["PlcStatus"])
+        """Openings that a PLC commands to the valves, None without one: part of its status, so with the same bit."""
+        self.plc_states = [self.plc] if self.plc_outputs is None else [self.plc, self.plc_outputs]
         specs = encoders(profile)
         lost_ns = sample_timeout_ns(profile)
         sensed = {place: state(spec.message, ENCODER_BIT + place, lost_ns) for place, spec in specs.items()}
@@ -54,7 +57,7 @@ class CraneInputs:
             codec = database.message(profile.imu.message)
             self.imu = self._by_key.setdefault(codec.key, MessageState(codec, 0, watched=False))
         self._masked = tuple(s for s in self._by_key.values() if s is not self.imu)
-        self.needed = [self.estop, self.guard, self.valve_a, self.valve_b, self.plc, *sensed.values()]
+        self.needed = [self.estop, self.guard, self.valve_a, self.valve_b, *self.plc_states, *sensed.values()]
         self.nodes = NodeMonitor([spec.node for spec in specs.values()])
         self._own = frozenset(database.message(name).key for name in _OWN_MESSAGES)
         self.messages = tuple(self._by_key.values())
@@ -95,3 +98,14 @@ class CraneInputs:
         self.stale_mask = age_out(self._masked, now_ns)
         if self.imu is not None:
             age_out((self.imu,), now_ns)
+
+
+def spool_signals(inputs: CraneInputs) -> list[Signal]:
+    """Positions of the spools [%], in ``Joint`` order: measured, or as a PLC reports its outputs to them; without a
+    value where neither is known.
+    """
+    outputs = inputs.plc_outputs
+    if outputs is not None:
+        return [Signal(outputs, joint.name.capitalize()) for joint in JOINTS]
+    names = ("SpoolSlew", "SpoolLift", "SpoolTilt", "SpoolExt")
+    return [*(Signal(inputs.valve_a, name) for name in names), Signal(inputs.valve_b, "SpoolRot")]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest
-from controller.bus_io.message_state import or_nan
+from controller.bus_io.message_state import Signal, or_nan
 from controller.bus_io.messages import PeriodicTimer
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs
@@ -23,6 +23,7 @@ from controller.crane.trajectory_check import TrajectoryCheck
 from controller.crane.workspace_check import WorkspaceCheck
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.load_estimator import LoadEstimator
+from controller.estimation.pressure_monitor import PressureMonitor
 from controller.laws.crane import LOADS, CraneLaw
 from controller.laws.grapple import GrappleLaw
 from controller.laws.joint import STANDING_UNIT_S
@@ -42,10 +43,10 @@ class Crane:
     """All state of the crane's motion, built once; ``leased`` while a setpoint or a spool test is in force."""
 
     __slots__ = (
-        "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_load", "_load_due",
-        "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "_workspace", "commands",
-        "governor", "grapple", "law", "lease_end_ns", "leased", "load_kg", "load_moment", "spool_run", "spools_pct",
-        "sway",
+        "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_lift_a", "_lift_b", "_load",
+        "_load_due", "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "_workspace",
+        "commands", "governor", "grapple", "law", "lease_end_ns", "leased", "load_kg", "load_moment",
+        "pitch_rad", "pressure_monitor", "roll_rad", "spool_run", "spools_pct", "sway",
     )  # fmt: skip
 
     def __init__(
@@ -65,10 +66,14 @@ class Crane:
         self.spool_run = SpoolTestRun(profile)
         pressures = {name: state for state in inputs.pressures for name in state.codec.index}
         self._pressure_pairs = tuple(pair and (pressures[pair[0]], *pair) for pair in LOADS)
+        self._lift_a, self._lift_b = Signal(inputs.pressures[0], "LiftA"), Signal(inputs.pressures[0], "LiftB")
+        self.pressure_monitor = PressureMonitor(self._pressure_pairs)
         self._pressures_bar = [math.nan] * N_JOINTS
         self._load, self._load_due, self._load_updated = LoadEstimator(profile), PeriodicTimer(LOAD_PERIOD_NS), False
         self.load_kg = math.nan
         """Load in the grapple; NaN while unknown."""
+        self.roll_rad = self.pitch_rad = 0.0
+        """Inclination of the crane's base; 0 where it is not measured."""
         self.load_moment = None if profile.stability is None else LoadMoment(profile, profile.stability)
         """Whether the machine bears its load; None on a machine whose profile does not say."""
         self.commands = self.law.commands
@@ -86,6 +91,11 @@ class Crane:
 
         The inclination of the crane's base (0 where it is not measured) belongs to the judgement of the moment.
         """
+        self.roll_rad, self.pitch_rad = roll_rad, pitch_rad
+        moment, lift_pressures = self.load_moment, self._inputs.pressures[0]
+        if moment is not None and lift_pressures.fresh:
+            load_bar = self.law.load_pressure_bar(Joint.LIFT, self._lift_a.value(), self._lift_b.value())
+            moment.update_pressure(load_bar, lift_pressures.stamp_ns)
         self._load_updated = self._load_due.due(now_ns)
         if not self._load_updated:
             return
@@ -94,12 +104,12 @@ class Crane:
         if measured is not None:
             self.load_kg = float(measured)
         else:
-            lift, state = self._estimators[Joint.LIFT], self._inputs.pressures[0]
+            lift = self._estimators[Joint.LIFT]
             self.load_kg = self._load.step(
-                position, lift.velocity, state.get("LiftA"), state.get("LiftB"), LOAD_PERIOD_NS * 1e-9
+                position, lift.velocity, self._lift_a.value(), self._lift_b.value(), LOAD_PERIOD_NS * 1e-9
             )
-        if self.load_moment is not None:
-            self.load_moment.update(position, self.load_kg, roll_rad, pitch_rad)
+        if moment is not None:
+            moment.update(position, self.load_kg, roll_rad, pitch_rad)
 
     # -- reference
 

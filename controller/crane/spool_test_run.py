@@ -21,7 +21,7 @@ from typing import Final
 from can_dbc.messages.crane import MAX_KNOTS, SpoolTest
 from controller.laws.joint import ACCELERATION_FACTOR
 from controller.requests.setpoint_gate import RequestRefused
-from machine.joints import JOINTS, Joint
+from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import JointSpec, Profile, joint
 from machine.status.reasons import Reason
@@ -30,6 +30,8 @@ RATE_SLACK_S: Final = 0.002
 """Growth by which a line may be ahead of its time: knots are cut to a microsecond, and commands to 0.05 %."""
 STOP_S: Final = 0.3
 """A joint stops within its speed times this: dead time, stop ramp and oil."""
+TESTED_NS: Final = 600_000_000
+"""What a valve does until this time after its test belongs to the test: the longest dead time, spool and oil."""
 MAX_OPEN_NS: Final = 20_000_000_000
 MAX_OPEN_UNSENSED_NS: Final = 5_000_000_000
 """A rotator that nothing measures creeps for this long at most by a command believed to be inside its dead-band."""
@@ -82,7 +84,8 @@ class SpoolTestRun:
     """The test in force, or none (``function`` is `NO_FUNCTION`)."""
 
     __slots__ = (
-        "_begun_ns", "_driven_ns", "_last", "_limits", "_n", "_percents", "_times_ns", "function", "integrated_rad",
+        "_begun_ns", "_driven_ns", "_last", "_limits", "_n", "_percents", "_tested_ns", "_times_ns", "function",
+        "integrated_rad",
     )  # fmt: skip
 
     def __init__(self, profile: Profile) -> None:
@@ -92,6 +95,7 @@ class SpoolTestRun:
         self._n = 0
         self._begun_ns = 0
         self._driven_ns = 0
+        self._tested_ns = array("q", [-TESTED_NS] * N_JOINTS)
         self._last = 0.0
         self.function = NO_FUNCTION
         self.integrated_rad = 0.0
@@ -101,6 +105,10 @@ class SpoolTestRun:
     def running(self) -> bool:
         """Whether a test is in force."""
         return self.function != NO_FUNCTION
+
+    def tested(self, j: int, now_ns: int) -> bool:
+        """Whether a test drives the valve of a joint, or drove it a moment ago."""
+        return now_ns - self._tested_ns[j] < TESTED_NS
 
     def end(self) -> None:
         """End the test."""
@@ -170,6 +178,7 @@ class SpoolTestRun:
         if share == 1.0:
             self._last = self.percent(now_ns)
         percent = share * self._last
+        self._tested_ns[self.function] = now_ns
         speed = limits.speed(percent)
         if not limits.sensed:
             self.integrated_rad += speed * min(now_ns - self._driven_ns, MAX_STEP_NS) * 1e-9

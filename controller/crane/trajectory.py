@@ -14,9 +14,9 @@ from typing import Final
 from can_dbc.messages.crane import MAX_KNOTS, CraneSetpoint
 from machine.joints import N_JOINTS
 
-HISTORY_KNOTS: Final = 20
-"""Knots of earlier setpoints that a trajectory keeps while its time is behind the planner's."""
-_CAPACITY_KNOTS: Final = MAX_KNOTS + HISTORY_KNOTS
+HISTORY_KNOTS: Final = 40
+"""Knots of earlier setpoints that a trajectory keeps while its time is behind the planner's: two of each setpoint."""
+_CAPACITY_KNOTS: Final = MAX_KNOTS + HISTORY_KNOTS + 2
 _S_PER_NS: Final = 1e-9
 
 
@@ -41,11 +41,18 @@ class Trajectory:
                 self._velocity[i * N_JOINTS + joint] = velocity[joint]
 
     def extend(self, newer: Trajectory, from_ns: int) -> None:
-        """Continue as ``newer`` from its first knot; keeps the knots before that and not before ``from_ns``."""
+        """Continue as ``newer`` from its first knot; keeps the knots before that and not before ``from_ns``.
+
+        The curve up to that knot stays what it was.  Where ``newer`` begins at another place the curve steps, as the
+        reference does that changes to another trajectory: a cubic between two knots that lie close together would turn
+        the step into a speed that no joint has.
+        """
         times, first_ns = self._times_ns, newer._times_ns[0]
         end = 0
         while end < self._n and times[end] < first_ns:
             end += 1
+        if end:
+            end = self._cut(end, first_ns)
         start = max(0, end - HISTORY_KNOTS)
         while start + 1 < end and times[start + 1] <= from_ns:
             start += 1
@@ -54,6 +61,29 @@ class Trajectory:
         for i in range(newer._n):
             self._copy(end - start + i, newer, i)
         self._n = end - start + newer._n
+
+    def _cut(self, end: int, time_ns: int) -> int:
+        """End the curve at ``time_ns``, after the first ``end`` knots; returns the number of knots."""
+        times, p, v = self._times_ns, self._position, self._velocity
+        before, at = (end - 1) * N_JOINTS, end * N_JOINTS
+        if end == self._n:  # it rests at its last position
+            for j in range(N_JOINTS):
+                p[at + j], v[at + j] = p[before + j], 0.0
+            times[end] = times[end - 1]
+            if not any(v[before : before + N_JOINTS]):
+                times[end] = time_ns
+                return end + 1
+            for j in range(N_JOINTS):
+                p[at + N_JOINTS + j], v[at + N_JOINTS + j] = p[before + j], 0.0
+            times[end + 1] = time_ns
+            return end + 2
+        h = (times[end] - times[end - 1]) * _S_PER_NS
+        share = (time_ns - times[end - 1]) * _S_PER_NS / h
+        for j in range(N_JOINTS):
+            a, b = before + j, at + j
+            p[b], v[b] = hermite(p[a], v[a], p[b], v[b], h, share)
+        times[end] = time_ns
+        return end + 1
 
     def _copy(self, to: int, other: Trajectory, knot: int) -> None:
         self._times_ns[to] = other._times_ns[knot]

@@ -4,7 +4,12 @@ An encoder that drifts slowly looks like a joint that moves.  While the referenc
 by small pulses (`controller.laws.end_positioning`), so that the error stays small and nothing else shows: the real
 joint wanders with the drift.  What shows is that the joint goes one way whenever its valve is shut and is commanded the
 other way whenever it is open.  Both ways are summed in leaky integrals.  A valve that leaks as fast looks the same, and
-deserves the same.  While the reference moves, the valve is open and the monitor is blind.
+deserves the same.  While the reference moves, the valve is open and the monitor is blind; what was commanded then is
+no pulse and does not count, or the way to a pose would hide a drift along it for seconds.
+
+Jaws that press on ground and logs, and a log that they let go, move every joint by some millimetres on its oil, within
+some tenths of a second.  So while the jaws are at work, and a while after, only slow motion counts in full: faster
+than `DRIFT_SPEED_SHARE` of the speed limit no encoder drifts unseen by other monitors.
 """
 
 from __future__ import annotations
@@ -17,9 +22,13 @@ from controller.estimation.joint_estimator import TrackedJoint
 MEMORY_S: Final = 3.0
 SHUT_S: Final = 0.4
 """What a joint does until this time after its valve has shut belongs to the command before."""
+PULSE_S: Final = 1.0
+"""A valve that is open for longer follows a reference that moves: the longest pulse takes 0.8 s."""
 DRIFT_S_AT_LIMIT: Final = 0.012
-DRIFT_NOISES: Final = 4.0
+DRIFT_NOISES: Final = 3.0
 """A drift is further than the way of the first at the speed limit and this many times noise and resolution, ..."""
+DRIFT_SPEED_SHARE: Final = 0.05
+"""While jaws are at work a joint's motion counts up to this share of its speed limit."""
 COMMANDED_SHARE: Final = 0.3
 """... and the command went at least this share of it the other way: the gain of small pulses is known badly."""
 
@@ -27,25 +36,38 @@ COMMANDED_SHARE: Final = 0.3
 class DriftMonitor:
     """Monitors one joint; `step` tells whether it drifts."""
 
-    __slots__ = ("_alone", "_before", "_commanded", "_decay", "_limit", "_period_s", "_shut_s")
+    __slots__ = ("_alone", "_before", "_commanded", "_decay", "_limit", "_most", "_open_s", "_period_s", "_shut_s")
 
-    def __init__(self, spec: TrackedJoint, period_s: float) -> None:
+    def __init__(self, spec: TrackedJoint, period_s: float, least_speed: float = 0.0) -> None:
+        """``least_speed``: see `controller.estimation.usual_speed`."""
         encoder = spec.encoder
         noise = 0.0 if encoder is None else encoder.noise + encoder.unit_per_count
-        self._limit = DRIFT_S_AT_LIMIT * spec.speed_limit + DRIFT_NOISES * noise
+        usual = max(spec.speed_limit, least_speed)
+        self._limit = DRIFT_S_AT_LIMIT * usual + DRIFT_NOISES * noise
+        self._most = DRIFT_SPEED_SHARE * usual * period_s
         self._period_s, self._decay = period_s, math.exp(-period_s / MEMORY_S)
         self.reset()
 
     def reset(self) -> None:
         """Nothing has moved yet."""
-        self._alone = self._commanded = self._before = self._shut_s = 0.0
+        self._alone = self._commanded = self._before = self._shut_s = self._open_s = 0.0
 
-    def step(self, neutral: bool, expected_velocity: float, position: float) -> bool:
-        """One period: is the valve ``neutral``, the velocity that the command lets expect, and the position."""
+    def step(
+        self, neutral: bool, expected_velocity: float, position: float, yields: bool = False, pressed: bool = False
+    ) -> bool:
+        """One period: is the valve ``neutral``, the velocity that the command lets expect, the position, whether the
+        joint ``yields`` to a load that changes (`controller.estimation.slope_yield`), and whether jaws are at work.
+        """
         self._shut_s = self._shut_s + self._period_s if neutral else 0.0
-        moved = position - self._before if self._shut_s > SHUT_S else 0.0
+        self._open_s = 0.0 if neutral else self._open_s + self._period_s
+        moved = position - self._before if self._shut_s > SHUT_S and not yields else 0.0
+        if pressed:
+            moved = min(max(moved, -self._most), self._most)
         self._before = position
         self._alone = alone = self._decay * self._alone + moved
-        self._commanded = self._decay * self._commanded + self._period_s * expected_velocity
+        if self._open_s > PULSE_S:
+            self._commanded = 0.0
+        else:
+            self._commanded = self._decay * self._commanded + self._period_s * expected_velocity
         against = -self._commanded if alone > 0.0 else self._commanded
         return abs(alone) > self._limit and against > COMMANDED_SHARE * abs(alone)

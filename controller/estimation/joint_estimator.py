@@ -5,7 +5,7 @@ the Riccati recursion, computed at start from the encoder's noise and resolution
 no gain is per cycle; a tick is two scalar recurrences.  A sample belongs to the moment of SYNC, not to the tick: it is
 compared with the estimate extrapolated back to its stamp.  A sample that the joint cannot have reached is refused and
 counted; three refusals within 100 ms are a fault (docs/reference/safety.md section 5, case 2), after which the filter
-starts again.  The innovations, averaged, tell whether the encoder has become noisy (case 4).
+starts again.  The innovations tell whether the encoder has become noisy (`controller.estimation.noise_monitor`).
 """
 
 from __future__ import annotations
@@ -14,16 +14,13 @@ import cmath
 import math
 from typing import Final, Protocol
 
+from controller.estimation.noise_monitor import NoiseMonitor
 from machine.profile import CarrierValve, Encoder, Valve
 
 ACCELERATION_SHARE: Final = 1.0 / 3.0
 """Root mean square of the acceleration over the joint's limit, ..."""
 ACCELERATION_S: Final = 0.1
 """... which lasts about this long: together the spectral density of the white acceleration."""
-NOISE_RATIO: Final = 25.0
-"""An encoder is noisy when the mean square of the innovation is this many times what its noise explains, ..."""
-NOISE_MEAN_S: Final = 0.15
-"""... averaged over this time."""
 _JUMP_WINDOW_NS: Final = 100_000_000
 _JUMP_LIMIT_COUNT: Final = 3
 _NAN: Final = math.nan
@@ -73,20 +70,22 @@ class JointEstimator:
     """Tracks one joint; ``known`` is False until the first sample, and then position and velocity are NaN."""
 
     __slots__ = (
-        "_alpha", "_beta", "_gate_speed", "_innovation", "_jump_stamps", "_max_innovation", "_mean_gain", "_measured",
-        "_measured_ns", "_period_s", "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
+        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_noise", "_period_s",
+        "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
     )  # fmt: skip
 
-    def __init__(self, spec: TrackedJoint, period_s: float) -> None:
+    def __init__(self, spec: TrackedJoint, period_s: float, punctual: bool = True) -> None:
+        """``period_s`` is that of the samples, ``punctual`` whether each was measured when its stamp says."""
         encoder, valve = spec.encoder, spec.valve
         self._alpha, self._beta = 1.0, 0.0
-        self._slack = self._innovation = 0.0
-        self._max_innovation = math.inf
-        self._mean_gain = -math.expm1(-period_s / NOISE_MEAN_S)
+        self._slack = 0.0
+        self._noise: NoiseMonitor | None = None
         if encoder is not None:
-            self._alpha, self._beta = steady_gains(period_s, acceleration_density(spec), measurement_variance(encoder))
+            variance = measurement_variance(encoder)
+            self._alpha, self._beta = steady_gains(period_s, acceleration_density(spec), variance)
             # Variance of the innovation: that of the sample over one less the gain.
-            self._max_innovation = NOISE_RATIO * measurement_variance(encoder) / (1.0 - self._alpha)
+            ratio = 1.0 / (1.0 - self._alpha)
+            self._noise = NoiseMonitor(encoder.noise, encoder.unit_per_count, ratio, period_s, punctual)
             self._slack = 4.0 * encoder.unit_per_count + 6.0 * encoder.noise
         self._period_s = period_s
         self._gate_speed = 3.0 * max(valve.full_speed_plus, valve.full_speed_minus, spec.speed_limit)
@@ -102,8 +101,8 @@ class JointEstimator:
 
     @property
     def noisy(self) -> bool:
-        """Whether the samples scatter much more about the estimate than the encoder's noise explains."""
-        return self._innovation > self._max_innovation
+        """Whether the samples scatter much more about the estimate than before, or than the profile explains."""
+        return self._noise is not None and self._noise.noisy
 
     def predict(self, now_ns: int) -> None:
         """Extrapolate the estimate to ``now_ns``; once per tick, before `update`."""
@@ -132,7 +131,8 @@ class JointEstimator:
         age_s = (self._predicted_ns - stamp_ns) * 1e-9
         residual = measured - (self.position - self.velocity * age_s)
         correction = self._beta * residual
-        self._innovation += self._mean_gain * (residual * residual - self._innovation)
+        if self._noise is not None:
+            self._noise.update(residual)
         self.velocity += correction
         self.position += self._alpha * residual + correction * age_s
         self._measured, self._measured_ns = measured, stamp_ns
@@ -140,7 +140,9 @@ class JointEstimator:
     def _start(self, measured: float, stamp_ns: int) -> None:
         self.known = True
         self.position = self._measured = measured
-        self.velocity = self._innovation = 0.0
+        self.velocity = 0.0
+        if self._noise is not None:
+            self._noise.restart()
         self._measured_ns = stamp_ns
         for i in range(_JUMP_LIMIT_COUNT):
             self._jump_stamps[i] = stamp_ns - _JUMP_WINDOW_NS

@@ -28,7 +28,11 @@ _COMMAND_DECAY_S: Final = 0.2
 _MIN_TRAVEL_S: Final = 0.08
 """A joint can be stuck once it should have moved as far as in this time at its speed limit."""
 _STUCK_SHARE: Final = 0.7
-_AGAINST_S: Final = 0.02
+AGAINST_S: Final = 0.02
+"""A joint that went as far against its command as in this time at its speed limit is reversed."""
+AGAINST_ELSEWHERE_S: Final = 0.05
+"""The same where a PLC closes the loop: its law overshoots and lets the oil ring while ours, which acts on nothing,
+asks for a steady speed (0.03 s in one of fifty log jobs on sampled machines)."""
 _RUNAWAY_S: Final = 0.06
 _OVERSPEED_SHARE: Final = 0.25
 """Share of the speed limit by which a joint may be faster than its command: pendulum, ringing, ..."""
@@ -44,6 +48,7 @@ class MotionMonitor:
 
     __slots__ = (
         "_against",
+        "_against_most",
         "_at",
         "_behind",
         "_command_decay",
@@ -60,19 +65,32 @@ class MotionMonitor:
         "_overspeed",
         "_period_s",
         "_recent_command",
+        "_usual",
         "expected_velocity",
     )  # fmt: skip
 
-    def __init__(self, spec: TrackedJoint, period_s: float, later_s: float = 0.0, lag_s: float = LATE_LAG_S) -> None:
-        """``later_s``: delay that a bus and a node add to the late bound; ``lag_s``: the lag behind it."""
+    def __init__(
+        self,
+        spec: TrackedJoint,
+        period_s: float,
+        later_s: float = 0.0,
+        lag_s: float = LATE_LAG_S,
+        against_s: float = AGAINST_S,
+        least_speed: float = 0.0,
+    ) -> None:
+        """``later_s``: delay that a bus and a node add to the late bound; ``lag_s``: the lag behind it; ``against_s``:
+        one of the two above; ``least_speed``: see `controller.estimation.usual_speed`.
+        """
+        usual = max(spec.speed_limit, least_speed)
+        self._against_most = against_s * usual
         self._line = array("d", [0.0] * (round((LATE_DELAY_S + later_s) / period_s) + 1))
         self._early_at = round(EARLY_DELAY_S / period_s)
         self._period_s = period_s
         self._early_lag, self._late_lag = (-math.expm1(-period_s / s) for s in (EARLY_LAG_S, lag_s))
         self._decay = math.exp(-period_s / _MEMORY_S)
-        self._limit = spec.speed_limit
+        self._limit, self._usual = spec.speed_limit, usual
         self._command_decay = spec.speed_limit * period_s / _COMMAND_DECAY_S
-        self._min_travel = _MIN_TRAVEL_S * spec.speed_limit
+        self._min_travel = _MIN_TRAVEL_S * usual
         self.reset()
 
     def reset(self) -> None:
@@ -85,6 +103,10 @@ class MotionMonitor:
         for i in range(len(self._line)):
             self._line[i] = 0.0
 
+    def forgive(self) -> None:
+        """What the joint has done so far is no evidence: its command was a spool's, and the map is being measured."""
+        self._expected = self._behind = self._overspeed = self._against = 0.0
+
     def step(self, command: float, velocity: float) -> Reason:
         """One period with the commanded and the measured velocity [rad/s or m/s]."""
         line, at = self._line, self._at
@@ -92,22 +114,22 @@ class MotionMonitor:
         self._early = early = self._early + self._early_lag * (line[at - self._early_at] - self._early)
         self._at = at = at + 1 if at + 1 < len(line) else 0
         self._late = self.expected_velocity = late = self._late + self._late_lag * (line[at] - self._late)
-        dt, decay, limit = self._period_s, self._decay, self._limit
+        dt, decay, usual = self._period_s, self._decay, self._usual
         wanted, moved = abs(late), abs(velocity)
         self._recent_command = recent = max(abs(early), wanted, self._recent_command - self._command_decay)
         self._expected = decay * self._expected + dt * wanted
         self._behind = decay * self._behind + dt * (late - velocity) * math.copysign(1.0, late)
-        commanded = _REVERSAL_SHARE * limit
+        commanded = _REVERSAL_SHARE * self._limit
         opposed = (velocity < 0.0 and min(early, late) > commanded) or (
             velocity > 0.0 and max(early, late) < -commanded
         )
         self._against = decay * self._against + (dt * moved if opposed else 0.0)
-        faster = 0.0 if opposed else moved - (1.0 + _OVERSPEED_GAIN) * recent - _OVERSPEED_SHARE * limit
+        faster = 0.0 if opposed else moved - (1.0 + _OVERSPEED_GAIN) * recent - _OVERSPEED_SHARE * usual
         self._overspeed = max(0.0, decay * self._overspeed + dt * faster)
-        if self._against > _AGAINST_S * limit:
+        if self._against > self._against_most:
             return Reason.JOINT_REVERSED
         if self._expected > self._min_travel and self._behind > _STUCK_SHARE * self._expected:
             return Reason.JOINT_STUCK
-        if self._overspeed > _RUNAWAY_S * limit:
+        if self._overspeed > _RUNAWAY_S * usual:
             return Reason.JOINT_RUNAWAY
         return _NONE

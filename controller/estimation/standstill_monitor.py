@@ -19,7 +19,8 @@ from controller.estimation.joint_estimator import TrackedJoint
 
 CLOSING_S: Final = 0.5
 """A valve that was open shuts, and its oil comes to rest, within this time (dead time 0.15 s, lags 0.06 s and 0.04 s):
-the range grows with the joint meanwhile."""
+the range grows with the joint meanwhile.  A dead time that is longer by the profile is added."""
+USUAL_DELAY_S: Final = 0.15
 CALM_S: Final = 1.5
 """Time without any command after which the distance is the small one."""
 FORGET_S: Final = 2.0
@@ -42,17 +43,22 @@ class StandstillMonitor:
     """Monitors one joint; ``moves`` tells whether it moves without a command."""
 
     __slots__ = (
-        "_calm_far", "_calm_s", "_forget", "_gone_to", "_high", "_low", "_neutral_s", "_noise", "_out_s", "_peak",
-        "_period_s", "_rest_s", "_shaken_far", "_started", "moves", "quiet_s",
+        "_calm_far", "_calm_s", "_closing_s", "_forget", "_gone_to", "_high", "_low", "_neutral_s", "_noise", "_out_s",
+        "_peak", "_period_s", "_rest_s", "_shaken_far", "_started", "moves", "quiet_s",
     )  # fmt: skip
 
-    def __init__(self, spec: TrackedJoint, period_s: float) -> None:
+    def __init__(self, spec: TrackedJoint, period_s: float, delay_s: float = 0.0, least_speed: float = 0.0) -> None:
+        """``delay_s``: the dead time of the joint's valve by the profile; ``least_speed``: see
+        `controller.estimation.usual_speed`.
+        """
+        usual = max(spec.speed_limit, least_speed)
         encoder = spec.encoder
         self._noise = 0.0 if encoder is None else encoder.noise + encoder.unit_per_count
         self._period_s = period_s
+        self._closing_s = CLOSING_S + max(0.0, delay_s - USUAL_DELAY_S)
         self._forget = period_s / FORGET_S
-        self._calm_far = CALM_S_AT_LIMIT * spec.speed_limit
-        self._shaken_far = SHAKEN_S_AT_LIMIT * spec.speed_limit
+        self._calm_far = CALM_S_AT_LIMIT * usual
+        self._shaken_far = SHAKEN_S_AT_LIMIT * usual
         self.moves = False
         self.reset()
 
@@ -64,8 +70,10 @@ class StandstillMonitor:
         self.quiet_s = 0.0
         """How long the joint has not moved."""
 
-    def step(self, neutral: bool, shaken: bool, position: float) -> bool:
-        """One period: whether the valve is ``neutral``, whether something else shakes the joint, and its position."""
+    def step(self, neutral: bool, shaken: bool, position: float, slack: float = 0.0) -> bool:
+        """One period: whether the valve is ``neutral``, whether something else shakes the joint, its position, and how
+        much farther it may yield to a slope (`controller.estimation.slope_yield`).
+        """
         if not self._started or not neutral:
             self._started = True
             self._low = self._high = self._peak = self._gone_to = position
@@ -77,7 +85,7 @@ class StandstillMonitor:
         self._calm_s = 0.0 if shaken else self._calm_s + dt
         calm = self._calm_s > CALM_S
         begins = calm and self._calm_s <= CALM_S + dt  # the range that counts now is that of the shaken joint
-        far = self._calm_far if calm else self._shaken_far
+        far = (self._calm_far if calm else self._shaken_far) + slack
         low, high = self._low, self._high
         if position > high:
             out = position - high
@@ -94,7 +102,7 @@ class StandstillMonitor:
         else:
             self._rest_s += dt
         learns = begins or self._rest_s > REST_S
-        if out == 0.0 or learns or self._neutral_s <= CLOSING_S or turned > TURNED_SHARE * out + self._noise:
+        if out == 0.0 or learns or self._neutral_s <= self._closing_s or turned > TURNED_SHARE * out + self._noise:
             self._absorb(position)
         else:
             self._out_s += dt

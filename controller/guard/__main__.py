@@ -15,7 +15,7 @@ import argparse
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -25,6 +25,7 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame, RawFrame
 from can_dbc.messages.tick_record import BusReading
 from controller.guard import carrier
+from controller.guard.can_socket import GuardSocket
 from controller.guard.envelope import SHIPPED, read_envelope
 from controller.guard.guard import MESSAGES, Guard
 from controller.guard.layout import GuardConfigError, read_layouts
@@ -56,6 +57,12 @@ def profile_path(name: str) -> Path:
     return shipped if shipped.is_file() else Path(name)
 
 
+def open_link(address: str, keys: Iterable[int]) -> Bus:
+    """The bus at an address: a kernel's interface by the guard's own socket, the wire by that of its emulation."""
+    backend, _, interface = address.partition(":")
+    return GuardSocket(interface, keys) if backend == "socketcan" and interface else open_bus(address, filters=keys)
+
+
 def split(frames: list[RawFrame]) -> tuple[list[RawFrame], list[RawFrame]]:
     """The guard's frames for crane0 (11-bit identifiers) and for mach0 (29 bits)."""
     return [f for f in frames if not f[0] & EXTENDED], [f for f in frames if f[0] & EXTENDED]
@@ -84,12 +91,9 @@ def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier) ->
     notifier.stopping()
 
 
-def _status_text(guard: Guard, buses: list[Bus]) -> Callable[[], str]:
-    def text() -> str:
-        states = " and ".join(bus.stats.state.name for bus in buses)
-        return f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}. The bus is {states}."
-
-    return text
+def _status_text(guard: Guard, buses: list[Bus]) -> str:
+    states = " and ".join(bus.stats.state.name for bus in buses)
+    return f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}. The bus is {states}."
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -114,15 +118,13 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         guard = build(profile_path(options.profile), rate_hz=options.rate)
         with ExitStack() as opened:
-            buses = [
-                opened.enter_context(open_bus(addresses.get(name) or default_address(name), filters=keys))
-                for name, keys in zip(BUSES, guard.keys_of_buses, strict=True)
-                if keys
-            ]
+            needed = [(name, keys) for name, keys in zip(BUSES, guard.keys_of_buses, strict=True) if keys]
+            links = [open_link(addresses.get(name) or default_address(name), keys) for name, keys in needed]
+            buses = [opened.enter_context(link) for link in links]
             if not options.no_realtime:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
-            run(guard, buses, ended, Notifier(_status_text(guard, buses)))
+            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)))
     except (GuardConfigError, BusError) as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3 if isinstance(error, GuardConfigError) else 4

@@ -78,10 +78,10 @@ class Carrier:
         return any(field.raw(drive.word) for field in (self._speed, self._rate)) or self._brake.raw(drive.word) == 0
 
     @property
-    def raised(self) -> bool:
-        """Whether a swing arm or a float valve is commanded."""
-        floats = self.arms_b.raw("FloatFront") or self.arms_b.raw("FloatRear")
-        return bool(floats) or any(field.raw(self.arms_a.word) for field in self._arms)
+    def raised(self) -> list[WatchedMessage]:
+        """The messages that command a swing arm or a float valve."""
+        floats = bool(self.arms_b.raw("FloatFront") or self.arms_b.raw("FloatRear"))
+        return [self.arms_a] * any(field.raw(self.arms_a.word) for field in self._arms) + [self.arms_b] * floats
 
     def check(self, crane_moves: bool, now_ns: int) -> Finding:
         """Check the rules on the present state of commands and machine."""
@@ -98,7 +98,8 @@ class Carrier:
         driven, raised = self.driven, self.raised
         if driven and not armed:
             return Verdict.NOT_ARMED, DRIVE_AXIS
-        if raised and not self.arms_a.raw("ArmKey") == self.arms_b.raw("ArmKey") == ARM_KEY:
+        # Each message by its own key: a step may fall between the two, and the node moves only while both are armed.
+        if any(watch.raw("ArmKey") != ARM_KEY for watch in raised):
             return Verdict.NOT_ARMED, ARMS_AXIS
         speed_m_s = self._value(self._speed, drive)
         if not crane_moves or max(abs(speed_m_s), abs(measured_m_s)) <= CREEP_M_S:

@@ -27,13 +27,16 @@ Corner = tuple[float, float, float]
 
 
 class Axis(NamedTuple):
-    """One joint: command, valve, encoder (message name empty without one), limits [rad or m, per second; %, %/s]."""
+    """One joint: command, valve, encoder (message name empty without one), limits [rad or m, per second; %, %/s].
+
+    ``deadbands_pct`` and ``full_speeds`` are those of a command of a negative and of a positive sign.
+    """
 
     number: int
     signal: str
     sign: int
-    deadband_pct: float
-    full_speed: float
+    deadbands_pct: tuple[float, float]
+    full_speeds: tuple[float, float]
     rate_pct_s: float
     closing_ns: int
     lower: float
@@ -155,18 +158,19 @@ def _compare(path: Path, profile: dict[str, Any], limits: dict[str, Any]) -> Non
 
 def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
     valve, encoder = joint["valve"], joint.get("encoder")
-    slowest = min(valve["full_speed_plus"], valve["full_speed_minus"])
     linear = encoder is not None and encoder["kind"] == "linear"
-    deadband_pct = float(min(valve["deadband_plus_pct"], valve["deadband_minus_pct"]))
-    if not (0.0 <= deadband_pct < 100.0 and 0.0 < slowest < math.inf):  # a NaN would switch rules off
+    sides = ("minus", "plus") if int(valve["sign"]) > 0 else ("plus", "minus")
+    deadbands = [float(valve[f"deadband_{side}_pct"]) for side in sides]
+    fulls = [float(valve[f"full_speed_{side}"]) for side in sides]
+    if not all(0.0 <= d < 100.0 and 0.0 < f < math.inf for d, f in zip(deadbands, fulls, strict=True)):  # nor a NaN
         raise ValueError(f"the valve {valve['signal']!r} has a dead-band or a speed that no valve has")
     return Axis(
         number=number,
         signal=str(valve["signal"]),
         sign=int(valve["sign"]),
-        deadband_pct=deadband_pct,
-        full_speed=float(max(valve["full_speed_plus"], valve["full_speed_minus"])),
-        rate_pct_s=100.0 * RATE_FACTOR * limits["acceleration_limit"] / float(slowest),
+        deadbands_pct=(deadbands[0], deadbands[1]),
+        full_speeds=(fulls[0], fulls[1]),
+        rate_pct_s=100.0 * RATE_FACTOR * limits["acceleration_limit"] / min(fulls),
         closing_ns=int((DELAY_FACTOR * valve["delay_s"] + LAGS * valve["lag_s"]) * 1e9),
         lower=limits["lower"],
         upper=limits["upper"],

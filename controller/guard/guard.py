@@ -44,6 +44,8 @@ HELD_PCT: Final = 30.0
 """Past the dead-band; an opening below this holds a joint in place while the carrier drives."""
 RANGE_MARGIN_UNITS: Final = 0.08
 """How far outside its range [rad, m] a joint may still be driven outward."""
+BEYOND_STEPS: Final = 2
+"""Steps in a row in which the crane must be where it must not: one sample that jumps is an encoder's fault."""
 GRAPPLE_DEADBAND_PCT: Final = 10.0
 GRAPPLE_CLOSING_NS: Final = 250_000_000
 _NEUTRAL, _SPOOL = 0, 2
@@ -62,7 +64,7 @@ class Guard:
     """All state of the guard; `step` is its whole behaviour."""
 
     __slots__ = (
-        "_a", "_agreed_ns", "_b", "_calm_ns", "_carrier", "_clear_ns", "_commands", "_commands_of", "_estop",
+        "_a", "_agreed_ns", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands", "_commands_of", "_estop",
         "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_latched", "_motion", "_now_ns",
         "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status", "_supply", "_watches", "axis",
         "events", "verdict",
@@ -96,7 +98,7 @@ class Guard:
             self._b: [c for c in self._commands if c.axis.signal in fields_b],
         }
         self._motion: list[tuple[WatchedMessage, MotionWatch]] = []
-        spools = [(axis.number, axis.signal, axis.deadband_pct, axis.closing_ns) for axis in axes]
+        spools = [(axis.number, axis.signal, min(axis.deadbands_pct), axis.closing_ns) for axis in axes]
         spools.append((GRAPPLE_AXIS, "Grapple", GRAPPLE_DEADBAND_PCT, GRAPPLE_CLOSING_NS))
         for number, signal, deadband_pct, closing_ns in spools:
             feedback = next(m for m in self._feedback if f"Spool{signal}" in m.layout.fields)
@@ -106,7 +108,7 @@ class Guard:
         self._grapple_field = fields_b["Grapple"]
         self.verdict, self.axis = Verdict.NO_COMMAND, NO_AXIS
         self.events = 0
-        self._supply = False
+        self._supply, self._beyond = False, 0
         self._now_ns = self._calm_ns = self._heartbeat_ns = 0
         self._heard_ns = -SILENCE_NS - 1
         self._clear_ns = self._agreed_ns = 0
@@ -234,14 +236,18 @@ class Guard:
         if now_ns - self._agreed_ns > AGREE_NS:
             return Verdict.DISAGREE, NO_AXIS
         for joint in self._joints.values():
-            number = joint.axis.number
             if joint.silent(now_ns):
-                return Verdict.ENCODER, number
-            outward = self._commands[number].percent * joint.axis.sign
-            above = joint.position > joint.axis.upper + RANGE_MARGIN_UNITS and outward > 0.0
-            below = joint.position < joint.axis.lower - RANGE_MARGIN_UNITS and outward < 0.0
-            if above or below:
-                return Verdict.OUTSIDE, number
+                return Verdict.ENCODER, joint.axis.number
+        self._beyond = 0 if (found := self._check_place()) is FINE else self._beyond + 1
+        return found if self._beyond >= BEYOND_STEPS else FINE
+
+    def _check_place(self) -> Finding:
+        """Rules on where the crane is and whereto its commands lead."""
+        for joint in self._joints.values():
+            outward = self._commands[joint.axis.number].percent * joint.axis.sign
+            beyond = joint.position - joint.axis.upper if outward > 0.0 else joint.axis.lower - joint.position
+            if outward and beyond > RANGE_MARGIN_UNITS:
+                return Verdict.OUTSIDE, joint.axis.number
         at = [joint.position for joint in self._joints.values() if joint.axis.number < 4]
         deeper = len(at) == 4 and self._reach.deeper(at, [command.speed for command in self._commands[:4]])
         return (Verdict.REACH, NO_AXIS) if deeper else FINE

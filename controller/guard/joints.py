@@ -38,12 +38,12 @@ class RateCredit:
 class CommandedAxis:
     """One commanded axis: ``percent`` of the spool, and ``opening``, the part of it past the dead-band."""
 
-    __slots__ = ("_credit", "_deadband", "_field", "axis", "opening", "percent")
+    __slots__ = ("_credit", "_deadbands", "_field", "axis", "opening", "percent")
 
     def __init__(self, axis: Axis, field: Field) -> None:
         self.axis = axis
         self._field = field
-        self._deadband = axis.deadband_pct
+        self._deadbands = axis.deadbands_pct
         self._credit = RateCredit(axis.rate_pct_s)
         self.percent = self.opening = 0.0
 
@@ -53,14 +53,14 @@ class CommandedAxis:
         if not self._field.inside(raw):
             return Verdict.RANGE
         self.percent = raw * self._field.scale
-        size = max(0.0, abs(self.percent) - self._deadband) * 100.0 / (100.0 - self._deadband)
+        size = max(0.0, abs(self.percent) - (shut := self._deadbands[self.percent > 0.0])) * 100.0 / (100.0 - shut)
         self.opening = size if self.percent > 0.0 else -size
         return Verdict.RATE if self._credit.spent(self.opening, elapsed_s) else Verdict.GOOD
 
     @property
     def speed(self) -> float:
         """The speed that the command asks of the joint [rad/s, m/s]."""
-        return self.opening * 0.01 * self.axis.full_speed * self.axis.sign
+        return self.opening * 0.01 * self.axis.full_speeds[self.opening > 0.0] * self.axis.sign
 
 
 class MeasuredJoint:

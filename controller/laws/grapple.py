@@ -83,6 +83,11 @@ class GrappleLaw:
         self.spool_pct = 0.0
         self.mode = GrappleCommand.NEUTRAL
 
+    @property
+    def at_work(self) -> bool:
+        """Whether the tongs move or hold, so that logs between them may turn or hold the rotator."""
+        return self.mode is not GrappleCommand.NEUTRAL
+
     def step(
         self, wanted: GrappleCommand, clamp_bar: float, opening_pct: float, release_bar: float, now_ns: int
     ) -> None:

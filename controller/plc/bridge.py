@@ -7,7 +7,7 @@ nodes.  Values that a PLC does not measure (spools, pump and slew pressures) are
 
 Nothing is invented between two answers.  EstopStat is the safety module's own frame, with its checksum and counter, and
 is passed on once.  A sample of the encoders is sent once, at the next SYNC, with the PLC's time stamp, and pressures
-once per PLC cycle: where the PLC repeats a sample, controller and guard see none.
+and the PLC's outputs to its valves once per PLC cycle: where the PLC repeats a sample, controller and guard see none.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Final
 
 from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame, RawFrame
-from can_dbc.plc.map import ESTOP_BYTES, Command, Feedback, Grapple, Role, State
+from can_dbc.plc.map import ESTOP_BYTES, N_JOINTS, Command, Feedback, Grapple, Role, State
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
 from controller.bus_io.messages import PeriodicTimer, ProtectedMessage
 from controller.config import ConfigError
@@ -71,7 +71,7 @@ class Bridge:
         helpers = [EmulatedNode(n, {}, starts=True) for n in numbers]
         self._nodes: list[EmulatedNode] = [*helpers, *self._encoders.values()]
         self._by_number = {node.node: node for node in self._nodes}
-        names = ("ValveFbA", "ValveFbB", "PressA", "PressB", "PressC", "GrappleStat", "PlcStatus")
+        names = ("ValveFbA", "ValveFbB", "PressA", "PressB", "PressC", "GrappleStat", "PlcStatus", "PlcOut")
         self._messages = {name: ProtectedMessage(database.message(name)) for name in names}
         self._fast, self._slow = PeriodicTimer(5 * MS), PeriodicTimer(20 * MS)
         self._estop_key, self._estop_frame = database.message("EstopStat").key, bytes(ESTOP_BYTES)
@@ -164,6 +164,8 @@ class Bridge:
         p, wire = feedback.pressure_bar, self._messages
         if slow and running[CraneNode.VALVES]:
             out += (self._grapple(feedback), self._status(feedback))
+        if running[CraneNode.VALVES]:
+            out.append(wire["PlcOut"].frame_with(*(100.0 * u for u in feedback.output[:N_JOINTS])))
         if running[PRESSURE_NODES[0]]:
             out.append(wire["PressA"].frame_with(0, *p[0:4]))
         if running[PRESSURE_NODES[1]]:

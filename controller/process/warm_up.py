@@ -38,7 +38,7 @@ TICKS: Final = 400
 VALUES: Final = {"GnssPositionData": {"Method": 4}, "EncArtic": {"Position": 8192}}
 """Values that are not zero, because a drive setpoint needs them: an RTK fix, and a straight carrier."""
 _LEASE_NS: Final = 100_000_000
-_MEMORY: Final = Path("/dev/shm")
+_MEMORY: Final = Path("/dev/shm")  # only mkdtemp makes names in it  # nosec B108
 
 
 class NullBus(BaseBus):

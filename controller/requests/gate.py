@@ -4,13 +4,14 @@ Every datagram is a request, refused whole with a `Reason` or passed on; nothing
 length, version, finite numbers, by the codec), profile, age, order and lease.  The motion of a crane setpoint is
 checked by `controller.crane.trajectory_check`, that of a drive setpoint by `controller.carrier.vehicle`.  An operator's
 STOP is accepted whatever profile, age or order it carries, and from anyone; any other action only from an operator.
+The heartbeats of those who watch are ordered by `controller.operator_link`, so that none of them can outrun an ARM.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from can_dbc.messages.crane import CraneSetpoint, OperatorAction, OperatorCommand, SpoolTest
+from can_dbc.messages.crane import WATCH_ACTIONS, CraneSetpoint, OperatorAction, OperatorCommand, SpoolTest
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.vehicle import DriveSetpoint
@@ -24,13 +25,15 @@ OPERATOR_AGE_NS: Final = 1_000_000_000
 class RequestGate(SetpointGate):
     """The gate of all datagrams; as a `SetpointGate` it keeps the order of crane setpoints and spool tests."""
 
-    __slots__ = ("_drives", "_key", "_operator_sequence", "_operator_stamp_ns")
+    __slots__ = ("_drives", "_key", "_operator_sequence", "_operator_stamp_ns", "watch_stamp_ns")
 
     def __init__(self, profile: Profile, profile_hash: int, key: bytes | None) -> None:
         super().__init__(profile, profile_hash)
         self._drives = profile.carrier is not None
         self._key = key
         self._operator_stamp_ns = self._operator_sequence = -1
+        self.watch_stamp_ns = 0
+        """Stamp of the last WATCH or WATCH_END."""
 
     def accept(
         self, data: bytes, now_ns: int, late_ns: int, operator: bool = False
@@ -67,11 +70,14 @@ class RequestGate(SetpointGate):
     def _check_operator(self, message: OperatorCommand, latest_ns: int) -> None:
         if message.profile_hash != self._profile_hash:
             raise RequestRefused(Reason.WRONG_PROFILE)
-        order = (message.stamp_ns, message.sequence)
-        if order <= (self._operator_stamp_ns, self._operator_sequence):
+        order, watches = (message.stamp_ns, message.sequence), message.action in WATCH_ACTIONS
+        if not watches and order <= (self._operator_stamp_ns, self._operator_sequence):
             raise RequestRefused(Reason.OUT_OF_ORDER)
         if message.stamp_ns > latest_ns:
             raise RequestRefused(Reason.STAMP_FUTURE)
         if latest_ns - message.stamp_ns > OPERATOR_AGE_NS:
             raise RequestRefused(Reason.STAMP_OLD)
-        self._operator_stamp_ns, self._operator_sequence = order
+        if watches:
+            self.watch_stamp_ns = message.stamp_ns
+        else:
+            self._operator_stamp_ns, self._operator_sequence = order

@@ -1,0 +1,74 @@
+"""How far the slew may yield on its oil because the machine leans, although its valve is shut.
+
+On ground that falls across the boom, gravity turns the slew; the oil holds it like a spring.  A crane of mass m at
+reach r that swings on this oil with w has the stiffness m r^2 w^2, and leans against it with m g r sin(lean): it yields
+by g sin(lean) / (r w^2), 0.2 rad for each radian far out (7.5 m, a period of 2.5 s), and swings as far again.  So a
+slew yields when the lean changes, as a wheel climbs a stump, and on a slope when a log is lifted: 110 kg at 7.5 m on 10
+degrees are 1.4 kNm, which turned it by 7 mrad within a second (measured on the plant).  Jaws that close about a log
+pull it likewise.  On level ground there is nothing to yield to, and nothing changes.  Jaws at work press on every
+joint, on level ground, too (``pressed``).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+CHANGE_KG: Final = 40.0
+"""Least difference from the load's mean that is a change: twice what friction of the lift falsifies."""
+MEAN_S: Final = 1.0
+YIELD_S: Final = 1.2
+"""A joint comes to rest on its oil within half of its slowest period (2.5 s)."""
+FORGET_S: Final = 2.0
+"""The range of the last inclinations shrinks with this time constant."""
+LEVEL_RAD: Final = 0.02
+"""An inclination, or a change of it, below this is none: noise of the sensor, and tyres that give."""
+YIELD_SHARE: Final = 0.4
+"""Yield for each radian of lean, with its swing."""
+LIMIT_RAD: Final = 0.06
+
+
+class SlopeYield:
+    """`step` once per period; ``rad`` is how far the slew may yield now, ``loads`` whether a load comes or goes on a
+    slope, ``pressed`` whether the jaws move, or did a moment ago.
+    """
+
+    __slots__ = ("_high", "_left_s", "_low", "_mean_kg", "_moved_s", "_period_s", "loads", "pressed", "rad")
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._mean_kg = self._left_s = self._moved_s = 0.0
+        self._low = [0.0, 0.0]
+        self._high = [0.0, 0.0]
+        self.rad = 0.0
+        self.loads = self.pressed = False
+
+    def step(self, load_kg: float, jaws_move: bool, roll_rad: float, pitch_rad: float) -> None:
+        """The estimated load and the inclination of the crane's base (NaN: not known); whether the jaws move."""
+        changes = False
+        if load_kg == load_kg:
+            off_kg = load_kg - self._mean_kg
+            changes = abs(off_kg) > CHANGE_KG
+            self._mean_kg += self._period_s / MEAN_S * off_kg
+        if changes or jaws_move:
+            self._left_s = YIELD_S
+        else:
+            self._left_s = max(0.0, self._left_s - self._period_s)
+        self._moved_s = YIELD_S if jaws_move else max(0.0, self._moved_s - self._period_s)
+        self.pressed = self._moved_s > 0.0
+        lean = self._beyond_level(abs(roll_rad)) + self._beyond_level(abs(pitch_rad))
+        turned = self._range(0, roll_rad) + self._range(1, pitch_rad)
+        self.loads = self._left_s > 0.0 and lean > 0.0
+        self.rad = min(YIELD_SHARE * (turned + (lean if self.loads else 0.0)), LIMIT_RAD)
+
+    def _beyond_level(self, angle_rad: float) -> float:
+        return angle_rad - LEVEL_RAD if angle_rad > LEVEL_RAD else 0.0
+
+    def _range(self, axis: int, angle_rad: float) -> float:
+        """How far the machine has leaned to and fro about an axis lately."""
+        if angle_rad != angle_rad:
+            return 0.0
+        low, high = self._low, self._high
+        forget = self._period_s / FORGET_S
+        low[axis] = min(angle_rad, low[axis] + forget * (angle_rad - low[axis]))
+        high[axis] = max(angle_rad, high[axis] + forget * (angle_rad - high[axis]))
+        return self._beyond_level(high[axis] - low[axis])
