@@ -1,15 +1,20 @@
 """The planning process: controller reports and log lists in, setpoints out, events as JSON lines.
 
 ``python -m autonomy --profile palms_471 --controller 127.0.0.1:47001 --report-port 47002 --scene 127.0.0.1:47003``
-loads one log into the bunk; with ``--mission FILE`` and a machine that drives, it executes the mission.
-``--tell HOST:PORT`` receives a mission report twice a second, and ``--order-port`` accepts operator commands from this
-computer only (`can_dbc.messages.mission` defines both datagrams).  ``--progress FILE`` stores a checkpoint of the
-mission; if the file exists already, the mission is resumed from it after the operator has commanded Auto.
+loads one log into the bunk; with ``--mission FILE`` and a machine that drives, it executes the mission.  With
+``--memory`` the detector is one that looks ahead (`autonomy.perception`, ``--driving``).
+``--tell HOST:PORT`` receives a mission report and the chosen grasp twice a second, and ``--order-port`` accepts
+operator commands from this computer only (`can_dbc.messages.mission` and `can_dbc.messages.grasp` define them).
+``--progress FILE`` stores a checkpoint of the mission; if the file exists already, the mission is resumed from it after
+the operator has commanded Auto.
+``--missions DIR`` waits for a mission to be uploaded instead: the console names a file of that folder, and the planner
+takes it while the machine is not armed and stands (`autonomy.process.upload`).
 
 Events on stdout: ``phase``, ``grasp`` (logs, reason and probability), ``paused`` (reason), ``running``, ``refused`` (a
 setpoint, with the controller's reason number), ``detector`` (an invalid log list); of a mission ``state``, ``load``
-(logs on board), ``order`` (an operator command, and why it is refused), ``resumed`` (the counts so far), ``progress``
-(why no checkpoint can be written); ``done``, ``failed`` (reason).
+(logs on board), ``order`` (an operator command, and why it is refused), ``upload`` (a mission's file, and why it is
+refused), ``resumed`` (the counts so far), ``progress`` (why no checkpoint can be written); ``done``, ``failed``
+(reason).
 SIGTERM and SIGINT stop crane and machine smoothly.  Exit codes: `autonomy.process.exit_codes`, and 2 for usage.
 """
 
@@ -24,7 +29,7 @@ from autonomy.missions.model import MissionError
 from autonomy.process.command_line import arguments
 from autonomy.process.event_output import emit
 from autonomy.process.exit_codes import BUSY, CONFIGURATION, FAILED, FINE, INTERRUPTED, SAFETY
-from autonomy.process.job_setup import make_job
+from autonomy.process.job_setup import make_job, uploaded_missions
 from autonomy.process.planner_process import PlannerProcess
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 
@@ -44,13 +49,14 @@ def main(argv: list[str] | None = None) -> int:
         return _complain(f"{options.key_file}: the key cannot be read: {error.strerror}")
     try:
         job = make_job(options, profile, options.lease_ms * 1_000_000, key)
+        uploads = uploaded_missions(options, profile, options.lease_ms * 1_000_000, key)
     except MissionError as error:
         return _complain(str(error))
     except MissionFinished as finished:
         emit("done", reason=str(finished))
         return FINE
     try:
-        process = PlannerProcess(job, profile_hash(profile), options, key)
+        process = PlannerProcess(job, profile_hash(profile), options, key, uploads)
     except (OSError, OverflowError) as error:
         ports = f"{options.report_port}" + (f" or {options.order_port}" if options.order_port is not None else "")
         return _complain(f"UDP port {ports} cannot be opened ({error}); choose another one", BUSY)
@@ -67,6 +73,7 @@ def main(argv: list[str] | None = None) -> int:
         process.close()
     if process.foreign:
         return _complain("the controller runs another profile than this planner; start both with the same one")
+    job = process.job
     if job.done:
         emit("done", **job.outcome())
         return FINE

@@ -19,10 +19,10 @@ from scipy.signal import lfilter
 
 from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 
-MAX_DELAY_S: Final = 0.3
+MAX_DELAY_S: Final = 0.35
 SPOOL_RESOLUTION: Final = 0.0005
 """Valve nodes report spools in steps of 0.05 %."""
-_DELAY_GUESSES_S: Final = (0.04, 0.08, 0.12, 0.16)
+_DELAY_GUESSES_S: Final = (0.04, 0.08, 0.12, 0.16, 0.2, 0.24)
 MOVED_SHARE: Final = 0.2
 
 

@@ -6,7 +6,6 @@ checks them like any planner's.  One thread; it blocks only between ticks.
 
 from __future__ import annotations
 
-import select
 import socket
 import time
 from collections.abc import Callable
@@ -17,16 +16,15 @@ from typing import Final, Protocol
 import msgspec
 
 from autonomy.calibration.procedure import Calibration
+from autonomy.process.command_line import Address
+from autonomy.process.controller_link import ControllerLink
 from can_dbc.bus.base import Bus
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import StateReport
-from can_dbc.messages.datagrams import decode
-from can_dbc.messages.envelope import DatagramRefused
 from machine.geometry.kinematics import Point
 
 POLL_S: Final = 0.005
 SURVEY_REQUEST: Final = b'{"op":"survey"}'
-Address = tuple[str, int]
 
 
 class SurveyAnswer(msgspec.Struct):
@@ -85,46 +83,6 @@ class Surveyor(Protocol):
 
     def read_yaw(self, now_ns: int) -> float | None:
         """The direction along which the grapple opens, base frame, rad modulo pi; NaN where it cannot be read."""
-
-
-class ControllerLink:
-    """Receives reports and sends datagrams; ``foreign``: the controller runs another profile."""
-
-    def __init__(self, controller: Address, report_port: int, profile_hash: int, key: bytes | None) -> None:
-        self.foreign = False
-        self._controller, self._hash, self._key = controller, profile_hash, key
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", report_port))
-        self._socket.setblocking(False)
-
-    def wait(self, seconds: float) -> None:
-        """Wait until a report arrives, at most ``seconds``."""
-        select.select([self._socket], [], [], seconds)
-
-    def newest(self) -> StateReport | None:
-        """The newest report that arrived since the last call."""
-        newest = None
-        while True:
-            try:
-                data = self._socket.recv(65535)
-            except BlockingIOError:
-                return newest
-            except ConnectionRefusedError:
-                continue
-            with suppress(DatagramRefused):
-                message = decode(data, self._key)
-                if isinstance(message, StateReport):
-                    self.foreign = self.foreign or message.profile_hash != self._hash
-                    newest = message
-
-    def send(self, data: bytes) -> None:
-        """Send to the controller; a lost datagram is followed by the next."""
-        with suppress(ConnectionRefusedError, BlockingIOError):
-            self._socket.sendto(data, self._controller)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
 
 
 def first_report(link: ControllerLink, within_s: float, ready: tuple[int, ...]) -> StateReport | None:

@@ -6,7 +6,7 @@ Failure: ``CalibrationImpossible`` before anything moves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations, product
 from math import hypot
@@ -62,7 +62,7 @@ class JointPlan:
 @dataclass(frozen=True, slots=True)
 class CalibrationPlan:
     """All tests in order.  ``skipped`` are the joints without an encoder; ``turned`` is the one of them that is tested
-    by surveyed directions.
+    by surveyed directions; ``grapple``: whether its times are measured.
     """
 
     joints: tuple[JointPlan, ...]
@@ -70,6 +70,7 @@ class CalibrationPlan:
     skipped: tuple[Joint, ...]
     clear_z_m: float
     turned: Joint | None = None
+    grapple: bool = True
 
 
 def free_range(spec: JointSpec) -> tuple[float, float]:
@@ -92,22 +93,32 @@ def required_range(spec: JointSpec) -> float:
     return RANGE_MARGIN * (max(ways[:2]) + max(ways[2:]))
 
 
-def make_plan(profile: Profile, position: Sequence[float], surveyed: bool) -> CalibrationPlan:
+def make_plan(
+    profile: Profile, position: Sequence[float], surveyed: bool, chosen: Collection[Joint] = JOINTS
+) -> CalibrationPlan:
     """The plan from the present joints (``Joint`` order, NaN without an encoder).
 
+    With fewer joints ``chosen``, only these are tested, and not the grapple: enough after a valve was replaced.
+
     Raises:
-        CalibrationImpossible: a joint has too little room.
+        CalibrationImpossible: a joint has too little room, or nothing chosen can be tested.
     """
     here = [0.0 if np.isnan(p) else float(p) for p in position]
     clear = clear_height_m(profile)
-    sensed = [j for j in JOINTS if joint(profile, j).encoder is not None]
+    blind = tuple(j for j in JOINTS if joint(profile, j).encoder is None)
     plans: list[JointPlan] = []
-    for j in sensed:
-        plans.append(_joint_plan(profile, j, plans[-1].pose if plans else here, here[Joint.SLEW], clear))
+    for j in JOINTS:
+        if j in chosen and j not in blind:
+            plans.append(_joint_plan(profile, j, plans[-1].pose if plans else here, here[Joint.SLEW], clear))
     survey = _survey_poses(profile, here, clear) if surveyed else ()
-    blind = tuple(j for j in JOINTS if j not in sensed)
-    turned = Joint.ROT if surveyed and Joint.ROT in blind else None
-    return CalibrationPlan(tuple(plans), survey, blind, clear, turned)
+    turned = Joint.ROT if surveyed and Joint.ROT in blind and Joint.ROT in chosen else None
+    if not plans and turned is None:
+        names = ", ".join(j.name.lower() for j in chosen)
+        raise CalibrationImpossible(
+            "calibration.no-encoder", f"{names}: without an encoder only a survey can test it; choose other joints"
+        )
+    whole = all(j in chosen for j in JOINTS)
+    return CalibrationPlan(tuple(plans), survey, blind, clear, turned, grapple=whole)
 
 
 def _grids(profile: Profile) -> list[list[float]]:
@@ -209,7 +220,8 @@ def plan_summary(profile: Profile, plan: CalibrationPlan) -> list[str]:
             f"boom tip at {hypot(x, y):.1f} m reach, {z:.1f} m high"
         )
     lines += [f"{j.name.lower()}: not tested, it has no encoder" for j in plan.skipped if j is not plan.turned]
-    lines.append("grapple: opens, closes and opens once, empty")
+    if plan.grapple:
+        lines.append("grapple: opens, closes and opens once, empty")
     if plan.survey:
         reach = max(hypot(*pin_position(profile.kinematics, q)[:2]) for q in plan.survey)
         lines.append(f"survey: {len(plan.survey)} poses within {reach:.1f} m reach")

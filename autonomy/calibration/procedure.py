@@ -1,13 +1,17 @@
 """The calibration as a pure state machine: reports and bus frames in, setpoints out, a list of test records at the end.
 
-``Calibration.step`` returns the datagram to send now, or None.  The procedure waits until a person has armed, wiggles
-every joint to see that it moves the right way, then takes joint after joint to its pose by an ordinary trajectory and
-runs its slow sweep and its staircase on either side as spool tests.  It closes and opens the grapple, and stands at
-the survey poses.  A rotator without an encoder turns there and back at the last of them, while the surveyor reads the
-grapple's direction at every rest.  One function moves at a time.
+``Calibration.step`` returns the datagram to send now, or None.  The procedure waits until a person has armed.  Then it
+wiggles every joint: it opens the valve slowly from neutral until the joint moves, knowing nothing of the valve, sees
+that it moves the right way and learns roughly what valve it is.  It takes joint after joint to its pose, by an ordinary
+trajectory where the controller's profile suits the valves, else by the spools, and runs its slow sweep and its
+staircase on either side as spool tests.  It closes and opens the grapple, and stands at the survey poses.  A rotator
+without an encoder turns there and back at the last of them, while the surveyor reads the grapple's direction at every
+rest.  One function moves at a time.
 
 Failure: a stop, a refusal, a joint that moves the wrong way or not at all, or too little room ends the run with a
-sentence in ``failure``; ``abort`` closes the valve and ends it.  A run that has ended does not continue.
+sentence in ``failure``; ``abort`` closes the valve and ends it.  A run that has ended does not continue.  A stop whose
+cause lies outside of the machine's motion (`INTERRUPTIONS`: a lost message, a person in the zone) only interrupts a run
+with ``patience_s``: once a person has reset and armed in that time, it repeats the interrupted test.
 """
 
 from __future__ import annotations
@@ -17,8 +21,9 @@ from math import isfinite, isnan
 from typing import Final
 
 from autonomy.calibration.plan import BEGIN_SHARE
-from autonomy.calibration.procedure_state import CalibrationState
-from autonomy.calibration.spool_run import LEAD_S, TAIL_S, MonitoredSpoolRun, SpoolRun, program_for
+from autonomy.calibration.procedure_spools import SpoolTasks
+from autonomy.calibration.procedure_state import INTERRUPTIONS
+from autonomy.calibration.spool_run import LEAD_S, TAIL_S, MonitoredSpoolRun, SpoolRun
 from autonomy.calibration.survey import SurveyReading
 from autonomy.calibration.tasks import (
     GrappleTask,
@@ -27,6 +32,7 @@ from autonomy.calibration.tasks import (
     PulseTask,
     SpoolTask,
     Task,
+    TurnSearchTask,
     YawReadingTask,
 )
 from autonomy.motion.trajectory import hold, joint_motion
@@ -34,7 +40,7 @@ from can_dbc.frame import Frame
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.kinematics import Point
 from machine.joints import JOINTS, Joint
-from machine.profile import JointSpec, joint
+from machine.profile import joint
 from machine.status.faults import describe
 from machine.status.modes import Mode
 from runtime.errors import Problem
@@ -54,11 +60,13 @@ _TIMEOUT_FACTOR: Final = 2.0
 _TIMEOUT_EXTRA_S: Final = 20.0
 """Extra time, as a joint whose dead-band is unknown may have to inch to its goal."""
 _BRAKE_S: Final = 0.8
+_UNREPEATABLE: Final = (PulseTask, TurnSearchTask, YawReadingTask)
+"""Tasks that count a joint without an encoder from where it was: after a stop nobody knows where it is."""
 _STATE_OPEN, _STATE_CLOSED_EMPTY, _STATE_HOLDING = 1, 4, 5  # GrappleStat.State
 _MAX_TICK_S: Final = 0.1
 
 
-class Calibration(CalibrationState):
+class Calibration(SpoolTasks):
     """One run.
 
     ``task`` is the present task (None before and after), ``failure`` why the run ended early and ``failure_code`` its
@@ -92,8 +100,10 @@ class Calibration(CalibrationState):
             return None
         blocked = self._blocked_reason(now_ns)
         if blocked is not None:
-            self._interrupt(blocked)
+            self._interrupt(blocked, now_ns)
             return None
+        if self._interrupted_ns is not None:
+            self._repeat_task()
         self._waiting = None
         if self.begun_ns is None:
             self.begun_ns = now_ns
@@ -104,8 +114,10 @@ class Calibration(CalibrationState):
         if self.done:
             self.idle = True
             return None
-        if not self._entered:
+        while not self._entered and not self.done:
             self._enter(now_ns)
+        if self.done:
+            return None
         return self._run_task(now_ns, dt_s, survey, yaw_rad)
 
     def _blocked_reason(self, now_ns: int) -> Problem | None:
@@ -124,12 +136,37 @@ class Calibration(CalibrationState):
             return None
         return Problem("calibration.position-unknown", "a joint position is unknown")
 
-    def _interrupt(self, blocked: Problem) -> None:
-        """Wait before the start; end a run that was interrupted, because anything may have moved since."""
+    def _interrupt(self, blocked: Problem, now_ns: int) -> None:
+        """Wait before the start; end a run that was interrupted, unless it may go on."""
         self._waiting = blocked
-        if self.begun_ns is not None:
+        if self.begun_ns is None:
+            return
+        since_ns = now_ns if self._interrupted_ns is None else self._interrupted_ns
+        if self._may_go_on() and now_ns - since_ns < self._patience_ns:
+            again = f"reset and arm within {self._patience_ns * 1e-9:.0f} s of the stop, and it repeats this test"
+            self._interrupted_ns = since_ns
+            self._waiting = Problem(blocked.code, f"{blocked.sentence}; {again}")
+        else:
             self._failure = self._failure or blocked
             self.idle = True
+
+    def _may_go_on(self) -> bool:
+        """Whether the present stop, or the pause after one, leaves what was measured valid."""
+        if self._failure is not None or self._report is None or isinstance(self.task, _UNREPEATABLE):
+            return False
+        paused = self._report.mode == Mode.STANDBY and self._interrupted_ns is not None
+        return paused or self._report.reason & 0xFF in INTERRUPTIONS
+
+    def _repeat_task(self) -> None:
+        """Do the interrupted task once more, from where it began: the crane may have moved since."""
+        self.resumptions += 1
+        self._interrupted_ns = self._refused = None
+        self._spool = self._driven = None
+        self._entered = self._at_end = False
+        task = self.task
+        wiggles = isinstance(task, SpoolTask) and task.kind == "wiggle"  # goes a hand's breadth, from anywhere
+        if self._began_at is not None and not wiggles and not isinstance(task, MoveTask | None):
+            self._tasks.insert(self._at, MoveTask(self._began_at, "back to the interrupted test"))
 
     def _check_refusals(self) -> None:
         assert self._report is not None
@@ -137,18 +174,10 @@ class Calibration(CalibrationState):
         if before is not None and self._report.refused != before:
             self.abort(describe(self._report.refusal), "calibration.setpoint-refused")
 
-    def _position(self) -> tuple[float, ...]:
-        """The measured joints; one without an encoder at 0."""
-        assert self._report is not None
-        return tuple(p if isfinite(p) else 0.0 for p in self._report.position)
-
-    def _spec(self, which: Joint) -> JointSpec:
-        return joint(self._profile, which)
-
     def _expected_s(self, task: Task) -> float:
         match task:
             case SpoolTask():
-                whole = LEAD_S + program_for(self._spec(task.joint), task).duration_s + TAIL_S
+                whole = LEAD_S + self._program(task).duration_s + TAIL_S
                 return 0.75 * whole if task.kind != "staircase" else whole
             case MoveTask():
                 return 4.0
@@ -156,26 +185,42 @@ class Calibration(CalibrationState):
                 return 1.2 * self._profile.grapple.close_time_s
             case PulseTask():
                 return LEAD_S + EXPECTED_PULSE_S + TAIL_S
+            case TurnSearchTask():
+                return 0.0  # most are left out
             case YawReadingTask():
                 return YAW_SETTLE_S + self._readings * READING_PERIOD_NS * 1e-9
         return SURVEY_SETTLE_S + self._readings * READING_PERIOD_NS * 1e-9
 
     def _enter(self, now_ns: int) -> None:
         """Begin the task."""
+        self._driven = None
         self._entered, self._task_ns = True, now_ns
         self._clock_s, self._rate = 0.0, 1.0
         task = self._tasks[self._at]
         assert self._report is not None
+        self._began_at = None if isinstance(task, MoveTask) else self._position()
         follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference[:4]))
         start = tuple(r if isfinite(r) else 0.0 for r in self._report.reference) if follows else self._position()
         match task:
             case MoveTask():
-                self._motion = joint_motion(self._arm, start, task.pose)
+                if self.found.travelled_by_spool:
+                    self._travel = self._travel_to(task.pose)
+                    self._spool = None
+                else:
+                    self._motion = joint_motion(self._arm, start, task.pose)
             case SpoolTask():
-                self._spool = MonitoredSpoolRun(self._spec(task.joint), task, self._position()[task.joint])
+                spec, allowed = self._spec(task.joint), self._allowed[task.joint]
+                self._spool = MonitoredSpoolRun(spec, task, self._position()[task.joint], allowed)
+                self._driven = task.joint
                 self._check_room(task, self._spool.end)
             case PulseTask():
-                self._spool = SpoolRun(self._turning.program(task))
+                if (program := self._turning.program(task)) is None:
+                    del self._tasks[self._at : self._at + 2]  # the pulse, and the reading after it
+                    self._entered = False
+                    return
+                self._spool, self._driven = SpoolRun(program), task.joint
+            case TurnSearchTask():
+                self._spool, self._driven = SpoolRun(self._turning.search(task)), task.joint
             case _:
                 self._motion = hold(start)
                 self._points, self._poses, self._point_ns = [], [], 0
@@ -197,17 +242,14 @@ class Calibration(CalibrationState):
         self._tasks.insert(self._at, MoveTask(tuple(start), f"back for more room of the {name}"))
         self._enter(self._task_ns)
 
-    def _next_task(self) -> None:
-        self._at += 1
-        self._entered = False
-        self.wants_reading = self.wants_yaw = False
-
     def _run_task(self, now_ns: int, dt_s: float, survey: Point | None, yaw_rad: float | None) -> bytes | None:
         task = self._tasks[self._at]
         time_s = (now_ns - self._task_ns) * 1e-9
         match task:
-            case SpoolTask() | PulseTask():
-                return self._run_spool(task, time_s, now_ns)
+            case SpoolTask() | PulseTask() | TurnSearchTask():
+                return self._run_spool(task, now_ns)
+            case MoveTask() if self.found.travelled_by_spool:
+                return self._run_travel(task, now_ns)
             case MoveTask():
                 self._clock_s += dt_s
                 if self._clock_s >= self._motion.duration_s + SETTLE_S and self._arrived():
@@ -238,34 +280,31 @@ class Calibration(CalibrationState):
             return None
         return self._stream.datagram(now_ns, self._motion, self._clock_s, grapple, self._rate)
 
-    def _run_spool(self, task: SpoolTask | PulseTask, time_s: float, now_ns: int) -> bytes | None:
+    def _run_spool(self, task: SpoolTask | PulseTask | TurnSearchTask, now_ns: int) -> bytes | None:
         assert self._spool is not None and self._report is not None
         run, position = self._spool, self._position()[task.joint]
-        run_s = time_s - LEAD_S
-        if run_s >= 0.0 and not run.begun:
-            # However late this tick is, the program starts from its beginning.
-            run.begun, self._task_ns, run_s = True, now_ns - round(LEAD_S * 1e9), 0.0
+        run_s = self._run_s(now_ns)
         if wrong := run.follow(run_s, position, self._report.velocity[task.joint]):
             self.abort(wrong.sentence, wrong.code)
             return None
         if run_s >= run.program.duration_s + TAIL_S:
             self._finish_spool(task, run.final_check(position), now_ns)
             return None
-        # A changed program is sent at once, and its end always, however late this tick is.
-        if run.is_silent(run_s) or not (self._stream.due(now_ns) or run.changed):
-            return None
-        return self._stream.spool(now_ns, task.joint, run.window(run_s))
+        return self._spool_datagram(run, task.joint, run_s, now_ns)
 
-    def _finish_spool(self, task: SpoolTask | PulseTask, wrong: Problem | None, now_ns: int) -> None:
+    def _finish_spool(self, task: SpoolTask | PulseTask | TurnSearchTask, wrong: Problem | None, now_ns: int) -> None:
         if wrong:
             self.abort(wrong.sentence, wrong.code)
             return
-        if isinstance(task, PulseTask):
-            self._turning.pulse_finished(self.trace.test(task.joint, task.side, "pulse", self._task_ns, now_ns))
+        if isinstance(task, PulseTask | TurnSearchTask):
+            kind = "pulse" if isinstance(task, PulseTask) else "search"
+            self._turning.pulse_finished(self.trace.test(task.joint, task.side, kind, self._task_ns, now_ns))
             self._next_task()
             return
         test = self.trace.test(task.joint, task.side, task.kind, self._task_ns, now_ns)
         (self.found.wiggles if task.kind == "wiggle" else self.found.tests).append(test)
+        if task.kind == "wiggle" and task.side < 0:
+            self._learn(task.joint)
         self._next_task()
 
     def _run_grapple(self, task: GrappleTask, time_s: float) -> None:
@@ -318,11 +357,19 @@ class Calibration(CalibrationState):
                 self.abort(wrong.sentence, wrong.code)
                 return
             self._next_task()
+            self._skip_found_sides()
+
+    def _skip_found_sides(self) -> None:
+        """Leave out the rest of a search that has turned the joint."""
+        while isinstance(task := self._tasks[self._at] if self._at < len(self._tasks) else None, TurnSearchTask):
+            if not self._turning.is_found(task.side):
+                return
+            del self._tasks[self._at : self._at + 2]  # the ramp, and the reading after it
 
     def _brake(self, now_ns: int, dt_s: float) -> bytes | None:
         """End a failed run: close the valve, or brake the motion on its path."""
         task = self._tasks[self._at] if self._at < len(self._tasks) else None
-        if isinstance(task, SpoolTask | PulseTask) and self._entered:
+        if self._driven is not None and self._entered:
             run_s = (now_ns - self._task_ns) * 1e-9 - LEAD_S
             assert self._spool is not None
             if self._rate != 0.0:
@@ -331,7 +378,10 @@ class Calibration(CalibrationState):
             if run_s > self._spool.program.duration_s:
                 self.idle = True
                 return None
-            return self._stream.spool(now_ns, task.joint, self._spool.window(run_s))
+            return self._stream.spool(now_ns, self._driven, self._spool.window(run_s))
+        if isinstance(task, MoveTask) and self.found.travelled_by_spool:
+            self.idle = True  # between two legs: every valve is shut
+            return None
         if task is None or not self._entered or self._rate == 0.0:
             self.idle = True
             return None

@@ -6,7 +6,9 @@ from typing import Final
 
 from autonomy.calibration.plan import CalibrationPlan
 from autonomy.calibration.rotator_turns import RotatorTurns
+from autonomy.calibration.spool_program import allowed_by
 from autonomy.calibration.spool_run import SpoolRun
+from autonomy.calibration.spool_travel import SpoolTravel
 from autonomy.calibration.tasks import (
     Findings,
     Task,
@@ -21,10 +23,21 @@ from can_dbc.messages.crane import StateReport
 from machine.geometry.kinematics import Point
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
+from machine.status.reasons import Reason
 from runtime.errors import Problem
 
 READING_COUNT: Final = 8
 """Surveyor's readings at each pose."""
+PATIENCE_S: Final = 120.0
+"""How long a live run waits, after an interruption, until a person has armed again."""
+
+INTERRUPTIONS: Final = frozenset({
+    Reason.ESTOP_LOST, Reason.GUARD_LOST, Reason.GUARD_REFUSES, Reason.SAFETY_NODE_LOST, Reason.ENCODER_LOST,
+    Reason.ENCODER_NODE_LOST, Reason.VALVE_FEEDBACK_LOST, Reason.PRESSURE_LOST, Reason.PRESSURE_NODE_LOST,
+    Reason.GRAPPLE_STATUS_LOST, Reason.PERSON_IN_ZONE, Reason.BUS_PASSIVE, Reason.SEND_REFUSED, Reason.LOOP_LATE,
+    Reason.LOOP_STALLED, Reason.LEASE_LOST,
+})  # fmt: skip
+"""Reasons of a stop that say nothing about the tested joint."""
 
 
 class CalibrationState:
@@ -39,6 +52,7 @@ class CalibrationState:
         lease_ns: int = 200_000_000,
         key: bytes | None = None,
         asked_readings: int = READING_COUNT,
+        patience_s: float = 0.0,
     ) -> None:
         self.trace = BusTrace(profile, database)
         self.found = Findings()
@@ -48,6 +62,10 @@ class CalibrationState:
         self.wants_reading = self.wants_yaw = False
         self.begun_ns: int | None = None
         self.elapsed_s = 0.0
+        self.resumptions = 0
+        self._patience_ns = round(patience_s * 1e9)
+        self._interrupted_ns: int | None = None
+        self._began_at: tuple[float, ...] | None = None
         self._profile, self._plan = profile, plan
         self._plans = {p.joint: p for p in plan.joints}
         self._tasks = build_tasks(plan)
@@ -65,7 +83,10 @@ class CalibrationState:
         self._clock_s = 0.0
         self._rate = 1.0
         self._spool: SpoolRun | None = None
-        self._turning = RotatorTurns(joint(profile, Joint.ROT), self.found.turns)
+        self._driven: Joint | None = None
+        self._travel: SpoolTravel | None = None
+        self._allowed = [allowed_by(joint(profile, j)) for j in JOINTS]
+        self._turning = RotatorTurns(joint(profile, Joint.ROT), self.found.turns, self.found.searched)
         self._points: list[Point] = []
         self._point_ns = 0
         self._poses: list[tuple[float, ...]] = []
@@ -83,7 +104,7 @@ class CalibrationState:
 
     @property
     def waiting(self) -> str | None:
-        """Why it waits before the start, or None."""
+        """Why it waits before the start or after an interruption, or None."""
         return self._waiting.sentence if self._waiting else None
 
     @property

@@ -14,6 +14,7 @@ from typing import Any, Final
 import tomlkit
 from tomlkit.items import Item
 
+from autonomy.calibration.loop_gain import borne_gain_1_s
 from autonomy.calibration.result import CalibrationResult, JointResult
 from autonomy.calibration.survey import OFFSETS, SurveyFit
 from autonomy.calibration.turn_fit import TurnFit
@@ -90,7 +91,26 @@ def _joint_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> li
     if r.delay is not None:
         found.append(((*path, "valve", "delay_s"), round(r.delay.delay_s, 4), "dead time, command to spool"))
         found.append(((*path, "valve", "lag_s"), round(r.delay.lag_s, 4), "of the spool"))
-    return found
+    return found + _gain_changes(path, spec, r)
+
+
+def _gain_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> list[Change]:
+    """A lower gain where the profile's would oscillate with the measured dead time."""
+    borne, given = borne_gain_1_s(spec, r), spec.law.kp_1_s
+    if borne >= given:
+        return []
+    assert r.delay is not None
+    remark = f"lowered from {given:g}: with {1e3 * r.delay.delay_s:.0f} ms of dead time that would oscillate"
+    return [((*path, "law", "kp_1_s"), borne, remark)]
+
+
+def lowered_gains(changed: Sequence[Change]) -> list[str]:
+    """A sentence for each joint whose loop gain a calibration has lowered."""
+    return [
+        f"{path[1]}: kp_1_s {value:g} 1/s, {remark}; it follows its path more slowly"
+        for path, value, remark in changed
+        if path[-2:] == ("law", "kp_1_s")
+    ]
 
 
 def _turn_changes(path: tuple[str, ...], spec: JointSpec, turns: TurnFit) -> list[Change]:

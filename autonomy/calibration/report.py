@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.calibration.profile_file import Change
+from autonomy.calibration.profile_file import Change, lowered_gains
 from autonomy.calibration.result import CalibrationResult, JointResult
 from autonomy.calibration.survey import OFFSETS
 from autonomy.calibration.turn_fit import TurnFit
@@ -44,6 +44,7 @@ def result_document(result: CalibrationResult, facts: dict[str, Any], changed: l
             "survey": survey,
             **({} if result.turns is None else {"rotator": _rotator(result.turns)}),
             **({"kept": list(result.kept)} if result.kept else {}),
+            **({"lowered": lowered} if (lowered := lowered_gains(changed)) else {}),
             "changes": {".".join(path): value for path, value, _ in changed},
         }
     )

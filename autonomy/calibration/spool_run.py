@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from autonomy.calibration import spool_program
-from autonomy.calibration.spool_program import SpoolProgram
+from autonomy.calibration.spool_program import Allowed, SpoolProgram
 from autonomy.calibration.tasks import SpoolTask
 from can_dbc.messages.crane import SpoolKnot
 from machine.profile import JointSpec
@@ -17,26 +17,31 @@ from runtime.errors import Problem
 
 LEAD_S: Final = 0.15
 """A spool test's record begins this long before its program, with the joint at rest, ..."""
-TAIL_S: Final = 0.55
-"""... and ends this long after it: dead time, and the oil's ringing."""
-HORIZON_S: Final = 0.4
+TAIL_S: Final = 0.2
+"""... and ends this long after it: the oil's ringing.  Dead time and spool are over: every program ends at rest."""
+HORIZON_S: Final = 0.5
 MIN_MOVED, MIN_MOVED_S = 0.008, 0.02
 """A joint has moved after this travel [rad, m], or this time at its speed limit: more than noise and ringing oil."""
 REBOUND_FACTOR: Final = 3.0
 """A joint whose direction is proven may swing back this many times farther: oil rings after a staircase."""
 REVERSAL_SPEED_SHARE: Final = 0.16
-"""A sweep reverses when the joint has this share of its speed limit: the foot of the metering curve is visible then."""
+"""A sweep reverses when the joint has this share of its speed limit: the foot of the metering curve is visible, ..."""
+SHOWN: Final = 1.2
+"""... and when it has gone this many times as far as a joint that certainly moves."""
+ENOUGH_SPEED_SHARE: Final = 1.1
+"""A staircase is planned up to 0.8 of the speed limit, by a full speed that the search knows within a third, and
+sometimes worse: at this share of the limit it has shown enough.  The controller stops a test at 1.25."""
 CLOSE_S: Final = 0.06
 TRAVEL_UNCERTAINTY: Final = 1.3
 """A joint may travel this many times as far as the profile's valve map says."""
 
 
-def program_for(spec: JointSpec, task: SpoolTask) -> SpoolProgram:
+def program_for(spec: JointSpec, task: SpoolTask, allowed: Allowed) -> SpoolProgram:
     """The program of a task before anything has moved."""
     build = {"wiggle": spool_program.wiggle, "sweep": spool_program.sweep, "staircase": spool_program.staircase}[
         task.kind
     ]
-    return build(spec, task.side)
+    return build(spec, task.side, allowed)
 
 
 class SpoolRun:
@@ -56,8 +61,12 @@ class SpoolRun:
         return None
 
     def close(self, run_s: float) -> None:
-        """Close the valve from now on."""
+        """Close the valve from now on, and be neutral at once: the run is over."""
         self.program = self.program.closing(run_s, CLOSE_S)
+
+    def finish(self, run_s: float, close_s: float = CLOSE_S, edge_pct: float = 0.0) -> None:
+        """Close the valve from now on, slowly to the edge of its dead-band; the program ends as planned ones do."""
+        self.program = self.program.ending(run_s, close_s, edge_pct)
 
     def is_silent(self, run_s: float) -> bool:
         """Whether there is nothing to send: before the start, and once the end has been sent."""
@@ -78,8 +87,8 @@ class SpoolRun:
 class MonitoredSpoolRun(SpoolRun):
     """The program of a joint with an encoder; ``closed``: it is ending."""
 
-    def __init__(self, spec: JointSpec, task: SpoolTask, position: float) -> None:
-        super().__init__(program_for(spec, task))
+    def __init__(self, spec: JointSpec, task: SpoolTask, position: float, allowed: Allowed) -> None:
+        super().__init__(program_for(spec, task, allowed))
         self._spec, self._task, self._from = spec, task, position
         self._name = task.joint.name.lower()
         self.closed = False
@@ -95,15 +104,25 @@ class MonitoredSpoolRun(SpoolRun):
         """Adapt the program to the joint's motion; returns a problem when the joint moves the wrong way."""
         moved, enough = self._moved(position), _min_travel(self._spec)
         if moved < -enough * (1.0 if self._task.kind == "wiggle" else REBOUND_FACTOR):
-            why = "check sign and direction of its valve and encoder in the profile"
-            return Problem("calibration.wrong-direction", f"the {self._name} moves the wrong way: {why}")
+            asked, seen = ("plus", "minus") if self._task.side > 0 else ("minus", "plus")
+            return Problem(
+                "calibration.wrong-direction",
+                f"the {self._name} moves the wrong way: its valve was opened to {asked}, its encoder went to {seen}; "
+                "look which way it moved: if that was wrong, swap its solenoids (or sign of its valve in the profile), "
+                "else direction of its encoder; nothing was corrected",
+            )
         if self.closed:
             return None
         if self._task.kind == "wiggle" and moved > enough:
-            self.close(run_s)
+            self.finish(run_s)
             self.closed = True
-        elif self._task.kind == "sweep" and self._turns(run_s, velocity):
+        elif self._task.kind == "sweep" and moved > SHOWN * enough and self._turns(run_s, velocity):
             self.program = spool_program.reversed_sweep(self.program, run_s)
+            self.closed = True
+        elif (
+            self._task.kind == "staircase" and self._task.side * velocity > ENOUGH_SPEED_SHARE * self._spec.speed_limit
+        ):
+            self.finish(run_s)
             self.closed = True
         elif run_s >= self.program.duration_s:
             self.closed = True
@@ -113,15 +132,17 @@ class MonitoredSpoolRun(SpoolRun):
         """At the end of the program: a problem when the joint has not moved."""
         if self._moved(position) >= _min_travel(self._spec):
             return None
-        why = "check its valve, pump and encoder, or correct deadband in the profile"
+        top = max(abs(percent) for _, percent in self.program.points)
+        why = f"its valve was opened up to {top:.0f} %; check spool, solenoid and plug of its valve, pump and encoder"
         return Problem("calibration.no-motion", f"the {self._name} does not move: {why}")
 
     def _moved(self, position: float) -> float:
         return self._task.side * (position - self._from)
 
     def _turns(self, run_s: float, velocity: float) -> bool:
-        rising = self.program.points[1][0] < run_s < self.program.points[2][0]
-        return rising and self._task.side * velocity > REVERSAL_SPEED_SHARE * self._spec.speed_limit
+        rising = spool_program.rises(self.program, run_s)
+        side = self._task.side
+        return rising and side * velocity > REVERSAL_SPEED_SHARE * spool_program.side_limit(self._spec, side)
 
 
 def _min_travel(spec: JointSpec) -> float:

@@ -13,24 +13,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi, radians, remainder, sqrt
+from math import log, pi, radians, remainder, sqrt
 from typing import Final
 
+import msgspec
 import numpy as np
 from scipy.optimize import least_squares
 
-from autonomy.calibration.spool_program import SpoolProgram, deadband_pct, pulse
+from autonomy.calibration.spool_program import Allowed, SpoolProgram, allowed_by, deadband_pct, pulse
 from autonomy.calibration.trace import GRID_S, SpoolTestRecord
 from autonomy.calibration.valve_fit import apply_backlash
 from machine.profile import JointSpec
 
 YAW_SIGMA_RAD: Final = radians(1.0)
 """Standard deviation of one reading of the direction; the caller averages several readings at one rest."""
-DEADBAND_SIGMA, FULL_SPEED_SIGMA = 0.04, 0.4
-"""Standard deviations of a valve from its profile, share of the stroke and of the full speed; they matter for few
-turns."""
+DEADBAND_SIGMA, FULL_SPEED_SIGMA = 0.12, 0.9
+"""Standard deviations of a valve from its profile, share of the stroke and logarithm of the full speed; they matter for
+few turns."""
+DEADBAND_STARTS: Final = (0.04, 0.1, 0.18, 0.28)
+"""A fit begins at each: where a dead-band is above a command, a turn does not tell how far above."""
 HOLD_BOUNDS_S: Final = (0.2, 3.0)
-"""Bounds of a pulse's hold time: the controller ends a test of a joint without an encoder after five seconds."""
+"""Bounds of a pulse's hold time."""
+MAX_PULSE_S: Final = 4.7
+"""Longest pulse: the controller ends a test of a joint without an encoder after five seconds.  A slow valve takes one
+second to open far enough, and one to close."""
 SIDES: Final = (1, -1)
 
 
@@ -82,12 +88,27 @@ def fit_turns(turns: Sequence[Turn], spec: JointSpec) -> TurnFit:
     return TurnFit(plus, minus)
 
 
-def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: float) -> SpoolProgram:
+def fitted_spec(spec: JointSpec, fit: TurnFit) -> JointSpec:
+    """The joint with the valve that a fit has found."""
+    valve = msgspec.structs.replace(
+        spec.valve,
+        deadband_plus_pct=100.0 * fit.plus.deadband,
+        deadband_minus_pct=100.0 * fit.minus.deadband,
+        full_speed_plus=fit.plus.full_speed,
+        full_speed_minus=fit.minus.full_speed,
+    )
+    return msgspec.structs.replace(spec, valve=valve)
+
+
+def pulse_to(
+    spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: float, allowed: Allowed | None = None
+) -> SpoolProgram:
     """The pulse that should end at an angle, counted as ``angle_rad``."""
-    known = fit.side(side)
+    known, allowed = fit.side(side), allowed or allowed_by(spec)
+    spec = fitted_spec(spec, fit)
 
     def turn_rad(hold_s: float) -> float:
-        program = pulse(spec, side, share, hold_s)
+        program = pulse(spec, side, share, hold_s, allowed)
         times = np.arange(0.0, program.duration_s, GRID_S)
         spool = np.array([side * program.at(t) / 100.0 for t in times])
         return known.full_speed * _full_speed_seconds(apply_backlash(spool, _half_backlash(spec)), spec, known.deadband)
@@ -95,8 +116,9 @@ def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: flo
     shut, held = turn_rad(0.0), turn_rad(1.0)
     wanted = side * (to_rad - fit.angle_rad)
     least, most = HOLD_BOUNDS_S
+    most = max(least, min(most, MAX_PULSE_S - pulse(spec, side, share, 0.0, allowed).duration_s))
     hold_s = (wanted - shut) / (held - shut) if held > shut else most
-    return pulse(spec, side, share, min(max(hold_s, least), most))
+    return pulse(spec, side, share, min(max(hold_s, least), most), allowed)
 
 
 def _half_backlash(spec: JointSpec) -> float:
@@ -138,10 +160,14 @@ def _solve_side(
         return result
 
     def residuals(p: np.ndarray) -> np.ndarray:
-        before = [(p[0] - deadband) / DEADBAND_SIGMA, (p[1] - 1.0) / FULL_SPEED_SIGMA]
+        before = [(p[0] - deadband) / DEADBAND_SIGMA, log(p[1]) / FULL_SPEED_SIGMA]
         return np.concatenate([left(p) / noises, before])
 
-    found = least_squares(residuals, (deadband, 1.0), bounds=((0.0, 0.1), (0.6, 5.0)), x_scale=(0.01, 0.1))
+    fits = [
+        least_squares(residuals, (start, 1.0), bounds=((0.0, 0.1), (0.6, 5.0)), x_scale=(0.01, 0.1))
+        for start in sorted({deadband, *DEADBAND_STARTS})
+    ]
+    found = min(fits, key=lambda fit: float(fit.cost))
     error = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
     p = found.x
     return SideFit(

@@ -39,6 +39,7 @@ _PARAMETER_NAMES: Final = (
     "deadband_plus", "deadband_minus", "hysteresis", "exponent", "full_plus", "full_minus", "lever", "ring_rad_s",
     "ring_zeta", "lag_plus_s", "lag_minus_s",
 )  # fmt: skip
+_SPEED_NAMES: Final = ("speed_plus", "speed_minus")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,9 @@ class ValveFit:
 
     ``ringing`` is the oil spring (rad/s, damping ratio), ``lags_s`` the delay of oil and pump between spool and joint,
     plus and minus side; ``residual`` the root mean square of the position residuals [rad, m]; ``modelled`` the fitted
-    positions of every test, in order.  ``errors`` are standard errors by parameter name.
+    positions of every test, in order.  ``errors`` are standard errors by parameter name, and as ``speed_plus`` and
+    ``speed_minus`` those of the speed limit's own speed, as shares: no test opens a fast valve further, so its full
+    speed is a wide extrapolation, and nobody drives it there.
     """
 
     deadbands: tuple[float, float]
@@ -163,19 +166,32 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
         lags_s=(float(p[9]), float(p[10])),
         residual=float(np.sqrt(np.mean(errors**2))),
         modelled=modelled,
-        errors=_standard_errors(found),
+        errors=_standard_errors(found, spec.speed_limit),
     )
 
 
-def _standard_errors(found: Any) -> dict[str, float]:
-    """Standard errors of the parameters from the curvature of the cost, for correlated residuals."""
+def _standard_errors(found: Any, speed_limit: float) -> dict[str, float]:
+    """Standard errors of the parameters from the curvature of the cost, for correlated residuals, and of the speeds."""
+    names = (*_PARAMETER_NAMES, *_SPEED_NAMES)
     try:
         covariance = np.linalg.inv(found.jac.T @ found.jac)
     except np.linalg.LinAlgError:
-        return dict.fromkeys(_PARAMETER_NAMES, float("inf"))
-    scale = 2.0 * found.cost / len(found.fun) * PRIOR_WEIGHT**2
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) * scale)
-    return dict(zip(_PARAMETER_NAMES, errors.tolist(), strict=True))
+        return dict.fromkeys(names, float("inf"))
+    covariance *= 2.0 * found.cost / len(found.fun) * PRIOR_WEIGHT**2
+    slopes = [_speed_slopes(found.x, first, speed_limit) for first in (0, 1)]
+    variances = [*np.diag(covariance), *(slope @ covariance @ slope for slope in slopes)]
+    return dict(zip(names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
+
+
+def _speed_slopes(p: np.ndarray, first: int, speed_limit: float) -> np.ndarray:
+    """Derivatives of the logarithm of a side's speed by the parameters, at the spool that gives the speed limit."""
+    deadband, half, exponent, full = p[first], 0.5 * p[2], p[3], p[4 + first]
+    opening = min(1.0, (speed_limit / full) ** (1.0 / exponent))
+    rest = 1.0 - half - deadband
+    edge = exponent / rest * (1.0 - 1.0 / opening)
+    slopes = np.zeros(len(p))
+    slopes[first], slopes[2], slopes[3], slopes[4 + first] = edge, 0.5 * edge, np.log(opening), 1.0 / full
+    return slopes
 
 
 def deadband_difference(fit: ValveFit, test: SpoolTestRecord) -> float:

@@ -25,7 +25,7 @@ from autonomy.crane_job.rotator_estimate import (
 from autonomy.crane_job.trajectory_tracker import BRAKE_S
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.grasp.planner import BunkFull, NoGrasp
-from autonomy.motion.trajectory import hold, with_rotation
+from autonomy.motion.trajectory import hold
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.kinematics import Unreachable
@@ -37,6 +37,8 @@ SETTLE_AFTER_ARRIVAL_NS: Final = 300_000_000
 """A crane at rest above logs uses a detection made this much later, ..."""
 DETECTION_TIMEOUT_NS: Final = 1_500_000_000
 """... and continues without one after this long."""
+HIDDEN_LOAD_NS: Final = 1_200_000_000
+"""Time for four pictures of a load that was hidden during the motion: three make it a log of the list."""
 _TIMEOUT_FACTOR: Final = 2.0
 _FINAL_HOLD_S: Final = 0.1
 _MAX_TICK_S: Final = 0.1
@@ -56,6 +58,7 @@ class Activity(ActivityState):
             stakes with open jaws; otherwise it rises above them.
         stow_only: fetch no log, but move over the bunk with the present load so that the machine may drive.
         rotator: the estimate of earlier jobs for a rotator without an encoder; holds the newest estimate afterwards.
+        slope: how the machine stands, see `autonomy.motion.arm_kinematics`; level by default.
     """
 
     # ------------------------------------------------------------------ one tick
@@ -137,6 +140,7 @@ class Activity(ActivityState):
         command = grapple_command(self.phase, self._cycle.is_bundle, stow_only=self._first is Phase.STOW)
         if command is GrappleCommand.OPEN and self.phase is not Phase.OPEN:
             command = GrappleCommand.NEUTRAL if self._cycle.is_between_stakes(self._position()) else command
+        self._grapple.laden_kg = self._cycle.lifted_kg
         if self.phase is Phase.OPEN:
             self._grapple.release(dt_s)
         else:
@@ -166,6 +170,9 @@ class Activity(ActivityState):
         if lifts_bundle and self._cycle.has_slipped_off(self._grapple, self._position()):
             self._restart_phase = Phase.ABOVE
             return
+        if self.phase in (Phase.CARRY, Phase.LOWER) and self._touches_down():
+            self._restart_phase = Phase.OPEN
+            return
         if self.phase in (Phase.LIFT, Phase.CARRY) and self._direct and not lifts_bundle:
             self._verify_load(now_ns)
             if self._restart_phase is not None or self._failure is not None:
@@ -192,9 +199,13 @@ class Activity(ActivityState):
             case Phase.CLOSE:
                 return self._cycle.after_closing(self._grapple)
             case Phase.LIFT | Phase.CARRY:
+                if self._waits_for_load(now_ns):
+                    return None
                 if self.phase is Phase.CARRY and self._is_seen_in_grapple(now_ns):
                     return Phase.LOWER
                 return self._after_lift() if seen else None
+            case Phase.LOWER if self._cycle.may_spin_on:
+                return self._after_turn(now_ns)
             case Phase.OPEN:
                 return self._after_open(now_ns)
             case Phase.RETREAT:
@@ -222,12 +233,12 @@ class Activity(ActivityState):
         assert self._arrived_ns is not None
         if not self._cycle.needs_reselection:
             return Phase.DESCEND
-        if self._inbox.logs_ns < self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS:
+        if self._inbox.logs_ns < self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS or self._cycle.sees_a_part:
             return None if now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS else Phase.DESCEND
         return Phase.ABOVE if self._cycle.reselect_grasp(self.motion.goal) else Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
-        if self._cycle.confirm_lift((self._position(), self._tracker.setpoint)):
+        if self._cycle.confirm_lift((self._position(), self._tracker.setpoint), self._grapple):
             if self.phase is Phase.LIFT:
                 self._update_rotator()
             return Phase(self.phase + 1)
@@ -236,11 +247,24 @@ class Activity(ActivityState):
             return None
         return Phase.LOOK
 
+    def _touches_down(self) -> bool:
+        """Whether the load already rests, close above its place: what lies there may lie higher than was known."""
+        return self._grapple.load_rests and self._cycle.is_close_above_place(self._position())
+
+    def _after_turn(self, now_ns: int) -> Phase | None:
+        """Open the jaws, or first turn the load back: a picture that is newer than the turn tells."""
+        assert self._arrived_ns is not None
+        q = self._position()
+        if self._inbox.logs_ns >= self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS and self._cycle.shows_load(q):
+            return Phase.CARRY if self._cycle.has_spun_on(q) else Phase.OPEN
+        return None if now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS else Phase.OPEN
+
     def _after_open(self, now_ns: int) -> Phase | None:
         """Up and away, or done here with the next log in view."""
         assert self.grasp is not None
         if not self._grapple.has_released(self.grasp, self._elapsed_s):
-            return None
+            higher = self._grapple.must_open_higher(self.grasp) and self._cycle.open_higher()
+            return Phase.LOWER if higher else None
         if self._put_back_reason:
             self._fail(self._put_back_reason)
             return None
@@ -265,7 +289,8 @@ class Activity(ActivityState):
             if self.phase is Phase.CARRY or risen_m > VERIFY_LIFT_M or self._arrived_ns is not None:
                 self._ready_ns = now_ns
             return
-        if self._inbox.logs_ns <= self._ready_ns:
+        lost = self.grasp is not None and self._grapple.has_lost(self.grasp)
+        if not lost and (self._inbox.logs_ns <= self._ready_ns or self._waits_for_load(now_ns)):
             return
         self._ready_ns = self._inbox.logs_ns
         before = self.grasp
@@ -274,12 +299,22 @@ class Activity(ActivityState):
             self._restart_phase = Phase.LOOK
         elif following is Phase.CARRY:
             turn = self._cycle.rotator_correction(self._position()) if self.grasp is before else None
-            if turn is None:
+            turned = None if turn is None else self._cycle.with_turn(self.motion, self._tracker.clock_s, turn)
+            if turned is None:
                 self._restart_phase = Phase.CARRY
                 return
             self.phase = Phase.CARRY
-            if turn:
-                self._tracker.motion = with_rotation(self.motion, self._tracker.clock_s, turn)
+            self._tracker.motion = turned
+
+    def _waits_for_load(self, now_ns: int) -> bool:
+        """Whether a load that no picture shows may be seen yet: during the motion while something hangs in the jaws,
+        and for a while when the crane stands.
+        """
+        if not self._cycle.is_load_hidden(self._position()):
+            return False
+        if self._arrived_ns is None:
+            return not self._grapple.lifts_nothing
+        return now_ns < self._arrived_ns + HIDDEN_LOAD_NS
 
     def _is_seen_in_grapple(self, now_ns: int) -> bool:
         """Whether a recent log list shows the log in the grapple."""

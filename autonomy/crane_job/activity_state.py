@@ -17,6 +17,7 @@ from autonomy.grasp.grasp import Grasp
 from autonomy.grasp.planner import GraspSelector
 from autonomy.grasp.selection import select_direct
 from autonomy.missions.crane_job import CraneJob
+from autonomy.motion.arm_kinematics import LEVEL
 from autonomy.motion.motion_planner import MotionPlanner, TimeOptimalPlanner
 from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import SetpointStream
@@ -43,6 +44,7 @@ class ActivityState:
         fetches_next: Callable[[LogObservation], bool] | None = None,
         stow_only: bool = False,
         rotator: RotatorEstimate | None = None,
+        slope: tuple[float, float] = LEVEL,
     ) -> None:
         self.phase = Phase.WAIT
         self._paused: Problem | None = Problem("activity.no-report", "the controller has not reported")
@@ -60,7 +62,7 @@ class ActivityState:
         self._direct = motion_planner.direct
         self._stream = SetpointStream(profile_hash, lease_ns, key)
         self._inbox = Inbox(self._profile)
-        self._cycle = Cycle(self._profile, job or CraneJob(), motion_planner, grasp_selector, self._inbox)
+        self._cycle = Cycle(self._profile, job or CraneJob(), motion_planner, grasp_selector, self._inbox, slope)
         self._grapple = GrappleSequence(self._profile, self._inbox)
         self._tracker = TrajectoryTracker(profile, last_setpoint)
         self._elapsed_s = 0.0
@@ -100,6 +102,11 @@ class ActivityState:
     def arrived(self) -> bool:
         """Whether the motion of the present phase is done; the phase may still wait for a condition."""
         return self._arrived_ns is not None
+
+    @property
+    def profile(self) -> Profile:
+        """The machine as motions are planned for it."""
+        return self._profile
 
     @property
     def grasp(self) -> Grasp | None:

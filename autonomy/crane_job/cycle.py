@@ -6,13 +6,13 @@ m).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import dist
 from typing import Final
 
 import msgspec
 
-from autonomy.crane_job.grapple import GrappleSequence, is_between_stakes, lifts_nothing
+from autonomy.crane_job.grapple import THICK_LOG_M, GrappleSequence, is_between_stakes
 from autonomy.crane_job.grasp_recovery import GraspRecovery, is_camera_measured
 from autonomy.crane_job.grasp_verification import (
     COLUMN_RADIUS_M,
@@ -20,6 +20,7 @@ from autonomy.crane_job.grasp_verification import (
     is_at_target,
     lifted_part,
     visible_grasped_logs,
+    with_load_recognized,
 )
 from autonomy.crane_job.inbox import Inbox
 from autonomy.crane_job.phase_motions import (
@@ -30,6 +31,7 @@ from autonomy.crane_job.phase_motions import (
     corrected_grasp,
     extraction_motion,
     stow_motion,
+    turn_motion,
 )
 from autonomy.crane_job.phases import Phase
 from autonomy.crane_job.rotator_estimate import has_no_encoder
@@ -39,10 +41,11 @@ from autonomy.grasp.placement import lies_in_bunk, plan_place
 from autonomy.grasp.planner import GraspSelector, NoGrasp
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import LEVEL
 from autonomy.motion.motion_planner import MotionPlanner
 from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import Axes
-from autonomy.motion.trajectory import Trajectory, hold, straight_line, with_quick_rotation
+from autonomy.motion.trajectory import Trajectory, hold, straight_line, with_quick_rotation, with_rotation
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import grapple_yaw
 from machine.geometry.sag import plausible_load_kg
@@ -50,6 +53,8 @@ from machine.joints import Joint
 from machine.profile import Profile
 from runtime.errors import Problem
 
+SHORTEST_LOG_M: Final = 1.6
+"""Nothing shorter is cut: what is seen of it is a part, and its middle is elsewhere."""
 MAX_ATTEMPTS: Final = 3
 MAX_RESELECTIONS: Final = 2
 """A grasp is selected again from above it this often."""
@@ -58,6 +63,17 @@ WEIGHABLE_RISE_M: Final = 0.2
 EXTRACTION_DEPTH_M: Final = 0.1
 """How much lower than usual the jaws begin to close for an extraction: usually they sweep down from 0.15 m or more over
 the ground, and would slide over the log before they are beside its middle."""
+LOOSE_TURN_S_RAD: Final = 5.0
+"""Duration of a turn of the rotator above the place: a thin log in closed jaws, once it spins, spins on."""
+MAX_FURTHER_TURNS: Final = 2
+"""A load that has spun on above its place is turned back this often."""
+TOUCH_DOWN_M: Final = 0.5
+"""A load that rests on something is released from so far above its place."""
+MAX_HIGHER: Final = 2
+HIGHER_M: Final = 0.15
+"""Jaws that push against other logs or the stakes while they open are raised by this, and open again, this often."""
+_ASKEW_RAD: Final = 0.2
+"""A thin load may lie askew by this much: its ends stay clear of the stakes, and each turn may make it spin."""
 _SAME_GRASP_M, _SAME_GRASP_RAD = 0.02, 0.03
 """Grasps that differ by less share the same descent."""
 _BUNDLE_RELEASE_HEIGHT_M: Final = 0.2
@@ -80,6 +96,7 @@ class Cycle:
         motion_planner: MotionPlanner,
         grasp_selector: GraspSelector,
         inbox: Inbox,
+        slope: tuple[float, float] = LEVEL,
     ) -> None:
         self.grasp: Grasp | None = None
         self.place: Pose | None = None
@@ -90,11 +107,21 @@ class Cycle:
         self._target = job.to(profile.bunk)
         self._quick_rotation = has_no_encoder(profile) and motion_planner.direct
         self._inbox = inbox
-        self._arm = Arm(profile, free_telescope=motion_planner.free_telescope)
+        self._arm = Arm(profile, free_telescope=motion_planner.free_telescope, slope=slope)
         """The arm with the load of the present phase."""
         self._phase_start_z_m = 0.0
         self._reselection_count, self._recovery = 0, GraspRecovery()
+        self._turn_count = 0
+        """Turns of a thin load above its place."""
+        self._higher_count = 0
+        """How often the jaws had to open higher above the place."""
         self._previous_grasp: Grasp | None = None
+        self._stirred = False
+        """Whether the jaws have closed in vain since the last selection."""
+        self._load_id: int | None = None
+        """The number under which the load was last seen in the jaws."""
+        self._load_ids: set[int] = set()
+        """All these numbers since the selection: the list remembers a load that is hidden where it was seen before."""
 
     @property
     def is_bundle(self) -> bool:
@@ -107,17 +134,30 @@ class Cycle:
         self._select(q)
 
     def _select(self, q: Axes) -> None:
-        self._reselection_count = 0
+        self._reselection_count = self._turn_count = self._higher_count = 0
+        self._load_ids.clear()
         self._previous_grasp = None
+        self._stirred = False
         job = msgspec.structs.replace(self._job, leave=self._job.leave + self._recovery.excluded_logs)
         self.grasp = self._select_grasp(self._arm, job, self._inbox.logs, q[Joint.SLEW], q[Joint.ROT])
 
     @property
+    def sees_a_part(self) -> bool:
+        """Whether only a part of the log to be gripped has been in view until now."""
+        if self.grasp is None or not is_camera_measured(self.grasp):
+            return False
+        number = self.grasp.log.id
+        newest = next((log for log in self._inbox.logs if log.id == number), self.grasp.log)
+        return newest.length_m < SHORTEST_LOG_M
+
+    @property
     def needs_reselection(self) -> bool:
-        """Whether a detection from above may improve the grasp: it is of camera-measured logs among others."""
+        """Whether a detection from above may improve the grasp: it is of camera-measured logs among others, jaws that
+        closed in vain may have moved its log, or only a part of it was in view.
+        """
         return (
             self.grasp is not None
-            and self.is_bundle
+            and (self.is_bundle or self._stirred or self.grasp.log.length_m < SHORTEST_LOG_M)
             and is_camera_measured(self.grasp)
             and self._reselection_count < MAX_RESELECTIONS
         )
@@ -166,7 +206,8 @@ class Cycle:
         return True
 
     def _allow_reselection(self) -> None:
-        self._reselection_count = min(self._reselection_count, MAX_RESELECTIONS - 1)  # the jaws moved the logs
+        self._reselection_count = min(self._reselection_count, MAX_RESELECTIONS - 1)
+        self._stirred = True
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with grasp and place updated by the newest log list.
@@ -183,7 +224,8 @@ class Cycle:
 
     def _plan(self, phase: Phase, q: Axes, closing_s: float) -> Trajectory:
         arm = self._arm
-        grasp, start, logs = self.grasp, arm.pose(q), self._inbox.logs
+        grasp, start = self.grasp, arm.pose(q)
+        logs: Sequence[LogObservation] = self._inbox.logs
         if phase is Phase.STOW:
             return stow_motion(arm, self._motion_planner, start, logs)
         if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
@@ -208,7 +250,15 @@ class Cycle:
                 return carry_motion(arm, self._motion_planner, start, self.place, grasp, logs, hangs=False)
             case Phase.CARRY:
                 self.lifted_kg = arm.load_kg
-                self.place = plan_place(arm, self._job, grasp, logs, grapple_yaw(self._profile, q))
+                logs = self._logs_with_load([q])
+                self.place = place = plan_place(
+                    arm, self._job, grasp, logs, grapple_yaw(self._profile, q), q[Joint.ROT]
+                )
+                if grasp.thinnest_m < THICK_LOG_M and self._horizontal_distance_m(q, place) < COLUMN_RADIUS_M:
+                    load = next((log for log in logs if log.seen and log.id == grasp.log.id), None)
+                    if load is not None:
+                        self._turn_count += 1
+                        return turn_motion(arm, start, place, self._target, load, LOOSE_TURN_S_RAD)
                 return carry_motion(arm, self._motion_planner, start, self.place, grasp, logs, hangs=True)
         assert self.place is not None
         if phase is Phase.LOWER:
@@ -220,6 +270,12 @@ class Cycle:
         return plausible_load_kg(self._inbox.report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
 
     # ------------------------------------------------------------------ position of the crane
+    def is_close_above_place(self, q: Axes) -> bool:
+        """Whether the crane is in the last part of its way down to the place."""
+        if self.place is None or self._horizontal_distance_m(q, self.place) > COLUMN_RADIUS_M:
+            return False
+        return 0.0 < self._arm.pose(q).z_m - self.place.z_m < TOUCH_DOWN_M
+
     def is_off_column(self, phase: Phase, q: Axes) -> bool:
         """Whether the crane is outside the column of the phase's grasp or place."""
         assert self.grasp is not None
@@ -259,16 +315,39 @@ class Cycle:
         taken = {log.id for log in self._visible_grasped_logs()}
         return [log for log in self._inbox.logs if log.id not in taken]
 
-    def confirm_lift(self, positions: Iterable[Axes]) -> bool:
+    def confirm_lift(self, positions: Iterable[Axes], grapple: GrappleSequence) -> bool:
         """Whether the gripped logs hang below one of the joint positions, and restrict the grasp to them.
 
-        Hidden logs count as held where the jaws did not close on nothing, or the load cell reads a load.
+        Hidden logs count as held where the jaws did not close on nothing, or the load cell reads a load; thick ones
+        always weigh something.
         """
         assert self.grasp is not None
-        seen = self._visible_grasped_logs()
-        held = lifted_part(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
+        reached = list(positions)
+        seen = visible_grasped_logs(self.grasp, self._logs_with_load(reached))
+        held = lifted_part(self._arm, self.grasp, seen, map(self._arm.pose, reached))
         self.grasp = held or self.grasp
-        return held is not None or (not seen and not lifts_nothing(self._inbox.report))
+        hidden = not seen and not grapple.lifts_nothing and not grapple.has_lost(self.grasp)
+        return held is not None or hidden
+
+    def is_load_hidden(self, q: Axes) -> bool:
+        """Whether the load is thin, so that it may lie askew in closed jaws or weigh too little to tell, and no
+        picture shows it.
+        """
+        assert self.grasp is not None
+        if not is_camera_measured(self.grasp) or self.grasp.thinnest_m >= THICK_LOG_M:
+            return False
+        return not visible_grasped_logs(self.grasp, self._logs_with_load([q]))
+
+    def _logs_with_load(self, positions: Iterable[Axes], remembered: bool = True) -> Sequence[LogObservation]:
+        """The newest list, with or without what it remembers; what hangs in the jaws at one of these positions has the
+        number of the gripped log, and is nowhere else.
+        """
+        assert self.grasp is not None
+        pins, gripped = map(self._arm.pose, positions), self.grasp.log.id
+        listed = [log for log in self._inbox.logs if remembered or log.seen]
+        logs, self._load_id = with_load_recognized(self._arm, self.grasp, listed, pins)
+        self._load_ids.add(self._load_id)
+        return [log for log in logs if log.seen or log.id == gripped or log.id not in self._load_ids]
 
     def count_miss(self) -> Problem | None:
         """Count a grasp that came up empty; returns why no other is tried, or None."""
@@ -288,12 +367,33 @@ class Cycle:
         needed.
         """
         assert self.grasp is not None and self.place is not None
-        place = corrected_place(self._arm, self._job, self.grasp, self.place, self._inbox.logs, q)
+        place = corrected_place(self._arm, self._job, self.grasp, self.place, self._logs_with_load([q]), q)
         if place is None:
             return None
         turn = place.rot_rad - self.place.rot_rad
         self.place, self.lifted_kg = place, self._hanging_kg(Phase.CARRY)
         return turn
+
+    @property
+    def may_spin_on(self) -> bool:
+        """Whether a thin load has just been turned above its place, and may be turned back."""
+        return 0 < self._turn_count <= MAX_FURTHER_TURNS
+
+    def shows_load(self, q: Axes) -> bool:
+        """Whether the newest picture shows the load, and not only the list, which remembers it as it hung before."""
+        assert self.grasp is not None
+        return bool(visible_grasped_logs(self.grasp, self._logs_with_load([q], remembered=False)))
+
+    def has_spun_on(self, q: Axes) -> bool:
+        """Whether the newest picture shows the load askew above its place."""
+        assert self.grasp is not None and self.place is not None
+        shown = self._logs_with_load([q], remembered=False)
+        place = corrected_place(self._arm, self._job, self.grasp, self.place, shown, q)
+        return place is None or abs(place.rot_rad - self.place.rot_rad) > _ASKEW_RAD
+
+    def with_turn(self, motion: Trajectory, from_s: float, turn_rad: float) -> Trajectory | None:
+        """The running motion with a further turn of the rotator; None where it ends too soon for that."""
+        return with_rotation(self._arm, motion, from_s, turn_rad) if turn_rad else motion
 
     def plan_return(self) -> None:
         """Plan to lay the load down where it was gripped, because no path leads on."""
@@ -302,14 +402,24 @@ class Cycle:
         above_m = _BUNDLE_RELEASE_HEIGHT_M if self.grasp.is_bundle else 0.0
         self.place = self.grasp.pose.at_height(self.grasp.pose.z_m + above_m)
 
+    def open_higher(self) -> bool:
+        """Raise the place where the jaws open, because something is in their way; False after too many times."""
+        assert self.place is not None
+        if self._higher_count == MAX_HIGHER:
+            return False
+        self._higher_count += 1
+        self.place = self.place.at_height(self.place.z_m + HIGHER_M)
+        return True
+
     def misplaced_log(self) -> Problem | None:
         """Why a released log does not lie where it should, or None when all do."""
-        seen = self._visible_grasped_logs()
+        seen = [log for log in self._inbox.logs if log.seen and log.id == self._load_id] or self._visible_grasped_logs()
         log = next((log for log in seen if not is_at_target(self._job, self._target, log)), None)
         if log is None:
             return None
         x, y, z = log.center_m
-        sentence = f"log {log.id} was released but lies at ({x:.2f}, {y:.2f}, {z:.2f}) m, not in the bunk"
+        where = "across the stakes" if lies_in_bunk(self._target, log) else "not in the bunk"
+        sentence = f"log {log.id} was released but lies at ({x:.2f}, {y:.2f}, {z:.2f}) m, {where}"
         return Problem("activity.log-misplaced", sentence)
 
     def _visible_grasped_logs(self) -> list[LogObservation]:

@@ -7,7 +7,7 @@ sensor it works by time; without a load cell it assumes that the grapple holds s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import isfinite, nan
 from typing import Final
 
 from autonomy.crane_job.inbox import Inbox
@@ -32,13 +32,24 @@ _ASSUMED_GRIP_RAD: Final = 1.5
 _STALLED_WIDE_PCT, _STALLED_WIDE_STEP_PCT, _STALLED_EXCESS_M = 70.0, 3.0, 0.15
 """Jaws that stop closing this wide open, or with a gap this much wider than their logs side by side, clasp the sides
 of a pile: their tips are not under it."""
-_THICK_LOG_M: Final = 0.2
+THICK_LOG_M: Final = 0.2
 """Thinner logs may be held in fully closed jaws."""
 _EMPTY_ON_GROUND_KG: Final = 8.0
 """Less than the thinnest log weighs with half of it lying on others."""
 _EMPTY_LIFTED_KG: Final = 12.0
-"""Less than the thinnest hanging log weighs, more than the reading of an empty crane at rest.  The controller reports a
-held load from 30 kg on: thin logs weigh less and vanish in fully closed jaws."""
+"""Less than a thick hanging log weighs, more than a single reading of an empty crane.  The controller reports a held
+load from 30 kg on: thin logs weigh less and vanish in fully closed jaws."""
+_EMPTY_MEAN_KG, _MEAN_S = 5.0, 0.8
+"""Less than the mean over this time of the thinnest hanging log: 12 kg (12 cm thick), 7 kg while the lift slows down,
+of readings from 0 to 16 kg.  That of an empty crane is below 1 kg, of readings up to 6 kg."""
+_UNLADEN_S: Final = 1.0
+"""A hanging load swings, and its weight with it: jaws that bear nothing for longer than half a swing are empty."""
+_LIVE_S: Final = 0.5
+"""A load that is weighed changes within this time; one that is estimated from pressures keeps its value while the lift
+speeds up."""
+_RESTING_SHARE, _RESTING_S, _RESTING_FROM_KG = 0.35, 0.1, 60.0
+"""A load on its way down that weighs less than this share of itself for so long rests on something.  Lighter loads
+vary by as much while the crane slows down."""
 _RELEASED_KG: Final = 30.0
 """Greatest load in the jaws once they have released their logs."""
 _PUSH_LOAD_KG, _PUSH_FACTOR = 250.0, 1.5
@@ -70,11 +81,6 @@ def has_closed(report: StateReport, closing_s: float) -> bool:
 def is_closed_empty(report: StateReport) -> bool:
     """Whether the jaws closed to the end of their stroke without holding anything."""
     return report.grapple_state == _STATE_CLOSED_EMPTY
-
-
-def lifts_nothing(report: StateReport) -> bool:
-    """Whether the jaws closed fully and came up with no known load."""
-    return is_closed_empty(report) and not report.load_kg >= _EMPTY_LIFTED_KG
 
 
 def is_open(profile: Profile, report: StateReport, opening_s: float) -> bool:
@@ -118,7 +124,10 @@ class GrappleSequence:
         self.command = GrappleCommand.HOLD
         self._profile, self._inbox = profile, inbox
         self._opening_s = self._close_from_s = self._still_s = self._since_push_s = 0.0
-        self._reference_pct = self._held_kg = 0.0
+        self._reference_pct = self._held_kg = self._unladen_s = self._same_s = self._weighed_kg = 0.0
+        self._mean_kg = nan
+        self.laden_kg = self._resting_s = 0.0
+        """``laden_kg``: what hung in the jaws when the crane set out for the place."""
         self._has_let_go = self.is_obstructed = False
         """Whether the opening jaws push against something; only a load cell tells."""
 
@@ -133,6 +142,7 @@ class GrappleSequence:
         self.command = command
         opening = self._inbox.report.opening_pct if self._inbox.report is not None else 0.0
         self._still_s += dt_s
+        self._weigh(dt_s)
         if abs(opening - self._reference_pct) > _STILL_BAND_PCT:
             self._reference_pct, self._still_s = opening, 0.0
         if gives_way or command in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
@@ -143,6 +153,17 @@ class GrappleSequence:
             self._opening_s += dt_s
         elif command is not GrappleCommand.NEUTRAL:
             self._opening_s = 0.0
+
+    def _weigh(self, dt_s: float) -> None:
+        """Take the mean, and count how long a live reading has been that of empty jaws."""
+        before, self._weighed_kg = self._weighed_kg, self._load_kg
+        mean_kg = self._mean_kg if isfinite(self._mean_kg) else self._weighed_kg
+        self._mean_kg = mean_kg + min(dt_s / _MEAN_S, 1.0) * (self._weighed_kg - mean_kg)
+        self._same_s = self._same_s + dt_s if before == self._weighed_kg else 0.0
+        resting = self._weighed_kg < _RESTING_SHARE * self.laden_kg
+        self._resting_s = self._resting_s + dt_s if resting else 0.0
+        nothing = self._weighed_kg < _EMPTY_LIFTED_KG and self._same_s < _LIVE_S
+        self._unladen_s = self._unladen_s + dt_s if nothing else 0.0
 
     def _sense_load(self, dt_s: float) -> None:
         self._has_let_go |= self._load_kg < _RELEASED_KG
@@ -173,11 +194,28 @@ class GrappleSequence:
 
     def has_missed(self, grasp: Grasp) -> bool:
         """Whether the jaws are measured to have closed on nothing where thick logs were, or to pinch the upper half
-        of a log whose underside they should reach; False without a sensor.
+        of a log whose underside they should reach; False without a sensor.  What a load cell weighs was not missed: a
+        log may be thinner than it was measured.
         """
         if is_closed_empty(self._inbox.report):
-            return grasp.thinnest_m > _THICK_LOG_M
+            return grasp.thinnest_m > THICK_LOG_M and self.lifts_nothing
         return grasp.extracts and self._gap_m() > _UNDER_LOG_SHARE * grasp.thinnest_m
+
+    def has_lost(self, grasp: Grasp) -> bool:
+        """Whether nothing has been weighed for a while although thick logs should hang in the jaws; False where the
+        load is not known.
+        """
+        return grasp.thinnest_m > THICK_LOG_M and self._unladen_s > _UNLADEN_S
+
+    @property
+    def load_rests(self) -> bool:
+        """Whether something else bears the load; False where the load is light or not known."""
+        return self.laden_kg > _RESTING_FROM_KG and self._resting_s > _RESTING_S
+
+    @property
+    def lifts_nothing(self) -> bool:
+        """Whether the jaws closed fully and came up with no known load."""
+        return is_closed_empty(self._inbox.report) and not self._mean_kg >= _EMPTY_MEAN_KG
 
     @property
     def holds_nothing(self) -> bool:
@@ -207,11 +245,20 @@ class GrappleSequence:
         """Whether the jaws have left the logs of a grasp, ``opening_s`` after the command to open, or have opened until
         they pushed against something, given way, and the crane has swung out.
         """
-        return (
-            self._since_push_s > _STILL_S
-            if self.is_obstructed
-            else has_released(self._profile, self._inbox.report, grasp, opening_s)
-        )
+        if self.is_obstructed:
+            return self._since_push_s > _STILL_S and not self._encloses(grasp)
+        return has_released(self._profile, self._inbox.report, grasp, opening_s)
+
+    def must_open_higher(self, grasp: Grasp) -> bool:
+        """Whether jaws that gave way, and are at rest, still enclose the log: risen, they would take it with them."""
+        return self.is_obstructed and self._since_push_s > _STILL_S and self._encloses(grasp)
+
+    def _encloses(self, grasp: Grasp) -> bool:
+        """Whether the jaws are measured too far closed to leave the log of a grasp behind; the logs of a bundle roll
+        out of jaws that are half open.
+        """
+        report = self._inbox.report
+        return isfinite(report.opening_pct) and not grasp.others and not has_released(self._profile, report, grasp, 0.0)
 
     def start_following(self) -> float:
         """Let the pin follow the jaws from now on: returns how long they have been closing, s; 0 without a sensor."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from math import dist, hypot
 from typing import Final
 
 from autonomy.grasp.bunk_load import is_over_bunk
 from autonomy.grasp.grasp import Grasp, hangs_below, restricted_to
-from autonomy.grasp.placement import lies_in_bunk, plan_place
+from autonomy.grasp.placement import lies_across_stakes, lies_in_bunk, plan_place
 from autonomy.grasp.planner import NoGrasp
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
@@ -21,6 +22,8 @@ COLUMN_RADIUS_M: Final = 0.15
 """A column or a place farther than this from the intended one is another one."""
 MAX_EXTRA_SAG_M: Final = 0.20
 """Where one end of a log hangs lower than assumed by more than this, the path is planned again."""
+LOAD_MARGIN_M: Final = 0.15
+"""A log in the jaws is measured this near to them, although the jaws hide its middle."""
 MIN_CORRECTION_RAD: Final = 0.03
 MAX_CORRECTION_RAD: Final = 0.4
 """The rotator corrects the log's direction during the motion between these angles; more asks for a new path."""
@@ -42,25 +45,69 @@ def lifted_part(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: It
     return restricted_to(arm, grasp, held + hidden)
 
 
-def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose) -> bool:
+def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose, margin_m: float = 0.0) -> bool:
     """Whether a log lies on the centre line of closed jaws under a pin: only what they hold can.  A list may contain
     the held log twice when it was measured wrongly during the motion and tracked as another one.
+
+    ``margin_m``: how far beside the jaws, and beyond its ends, it may be measured; never lower, where other logs lie.
     """
     (x, y), c, a = arm.xy(pin), log.center_m, log.axis
     level2 = a[0] ** 2 + a[1] ** 2
     along_m = ((x - c[0]) * a[0] + (y - c[1]) * a[1]) / level2 if level2 > 0.0 else 0.0
-    along_m = min(max(along_m, -0.5 * log.length_m), 0.5 * log.length_m)
+    half_m = 0.5 * log.length_m + margin_m
+    along_m = min(max(along_m, -half_m), half_m)
     below_m = pin.z_m - c[2] - along_m * a[2]
     aside_m = hypot(c[0] + along_m * a[0] - x, c[1] + along_m * a[1] - y)
-    return aside_m < 0.5 * log.diameter_m and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.jaws)
+    near = aside_m < 0.5 * log.diameter_m + margin_m
+    return near and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.jaws)
+
+
+def is_part_of_load(arm: Arm, load: LogObservation, found: LogObservation, pin: Pose) -> bool:
+    """Whether a found log is a visible part of the load under the pin: grapple and crane hide the rest of it."""
+    return is_between_jaws(arm, _made_whole(arm, load, found, pin), pin, LOAD_MARGIN_M)
+
+
+def _made_whole(arm: Arm, load: LogObservation, found: LogObservation, pin: Pose) -> LogObservation:
+    """What is found, as long as the load: its end away from the pin is a true end, the other one is hidden."""
+    missing_m = load.length_m - found.length_m
+    if missing_m <= 0.0:
+        return found
+    (x, y), c, a = arm.xy(pin), found.center_m, found.axis
+    towards = 1.0 if (x - c[0]) * a[0] + (y - c[1]) * a[1] > 0.0 else -1.0
+    shift_m = 0.5 * towards * missing_m
+    center = (c[0] + shift_m * a[0], c[1] + shift_m * a[1], c[2] + shift_m * a[2])
+    return replace(found, center_m=center, length_m=load.length_m)
+
+
+def with_load_recognized(
+    arm: Arm, grasp: Grasp, logs: Sequence[LogObservation], pins: Iterable[Pose]
+) -> tuple[Sequence[LogObservation], int]:
+    """The list with the log that hangs in the jaws under the number of the gripped one, and its number in the list.
+
+    A log that was hidden on its way is found again as another one: its track stayed where it was gripped.  Only a part
+    of it may be visible, or both its ends as two logs, so its length stays that of the gripped log.  The newest picture
+    need not show it: what was found in the air between the jaws cannot be another log while they are there.
+    """
+    gripped = grasp.log
+    if any(log.seen and log.id == gripped.id for log in logs):
+        return logs, gripped.id
+    known, poses = {log.id for log in grasp.logs}, list(pins)
+    for pin in poses:
+        parts = [o for o in logs if o.id not in known and is_part_of_load(arm, gripped, o, pin)]
+        if parts:
+            shown = max(parts, key=lambda part: (part.seen, part.length_m))
+            load = replace(_made_whole(arm, gripped, shown, pin), id=gripped.id, seen=True)
+            gone = {gripped.id, *(part.id for part in parts)}
+            return [load, *(log for log in logs if log.id not in gone)], shown.id
+    return logs, gripped.id
 
 
 def is_at_target(job: CraneJob, target: Bunk, log: LogObservation) -> bool:
-    """Whether a released log lies where it should: in the target, or, where a job only clears its source, low beside
-    the source, for it may roll.
+    """Whether a released log lies where it should: in the target and not across its stakes, or, where a job only clears
+    its source, low beside the source, for it may roll.
     """
     if lies_in_bunk(target, log) or job.source is None:
-        return lies_in_bunk(target, log)
+        return lies_in_bunk(target, log) and not lies_across_stakes(target, log)
     return (
         not is_over_bunk(job.source, *log.center_m[:2]) and log.center_m[2] < target.floor_z_m + target.stake_height_m
     )
@@ -79,7 +126,7 @@ def corrected_place(
     if 0.5 * seen.length_m * (abs(seen.axis[2]) - abs(grasp.log.axis[2])) > MAX_EXTRA_SAG_M:
         return None
     try:
-        wanted = plan_place(arm, job, grasp, logs, grapple_yaw(arm.profile, position))
+        wanted = plan_place(arm, job, grasp, logs, grapple_yaw(arm.profile, position), place.rot_rad)
     except NoGrasp:
         return None  # planning the phase again reports why
     turn = abs(wanted.rot_rad - place.rot_rad)

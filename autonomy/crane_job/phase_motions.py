@@ -10,8 +10,8 @@ from dataclasses import replace
 from math import hypot
 from typing import Final
 
-from autonomy.crane_job.grasp_verification import is_between_jaws
-from autonomy.grasp.bunk_load import is_over_bunk
+from autonomy.crane_job.grasp_verification import is_part_of_load
+from autonomy.grasp.bunk_load import is_over_bunk, point_in_bunk
 from autonomy.grasp.grapple_heights import (
     approach_length_m,
     closing_height_curve,
@@ -21,13 +21,15 @@ from autonomy.grasp.grapple_heights import (
     travel_height_m,
 )
 from autonomy.grasp.grasp import Grasp
+from autonomy.grasp.placement import STAKE_CLEARANCE_M
 from autonomy.motion.arm import Arm
 from autonomy.motion.motion_planner import MotionPlanner
-from autonomy.motion.obstacles import collision_scene, held_log
+from autonomy.motion.obstacles import CollisionScene, HeldLog, collision_scene, held_log
 from autonomy.motion.pose import Pose
-from autonomy.motion.trajectory import Trajectory, follow_path, slow_line, straight_line
+from autonomy.motion.trajectory import Trajectory, follow_path, joined, slow_line, straight_line
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.kinematics import Unreachable
+from machine.profile import Bunk
 
 APPROACH_CLEARANCE_M: Final = 0.25
 """Extra clearance on the approach from the log that is to be gripped."""
@@ -72,7 +74,7 @@ def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> G
     """The grasp moved with its log, which the list now sees elsewhere: the machine leans, and a nearer view is better.
 
     Unchanged where the shift is less than ``MIN_AIM_CORRECTION_M`` or more than ``MAX_AIM_CORRECTION_M``, or where the
-    moved grasp is out of reach.
+    moved grasp is out of reach.  A log on known ground does not rise: it is only measured higher.
     """
     seen = next((log for log in logs if log.id == grasp.log.id), None)
     if seen is None:
@@ -80,7 +82,10 @@ def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> G
     dx, dy, dz = (b - a for a, b in zip(grasp.log.center_m, seen.center_m, strict=True))
     if not MIN_AIM_CORRECTION_M < hypot(dx, dy, dz) < MAX_AIM_CORRECTION_M:
         return grasp
-    support = max(grasp.support_z_m + dz, known_ground_m(arm.profile))
+    ground_m = known_ground_m(arm.profile)
+    support = max(grasp.support_z_m + dz, ground_m)
+    if grasp.support_z_m <= ground_m + MIN_AIM_CORRECTION_M:
+        support = grasp.support_z_m
     (x, y), z = arm.xy(grasp.pose), grasp.pose.z_m + support - grasp.support_z_m
     try:
         pose = arm.pose_above(x + dx, y + dy, z, travel_height_m(arm.profile))._replace(rot_rad=grasp.pose.rot_rad)
@@ -100,11 +105,7 @@ def carry_motion(
     hangs: bool,
 ) -> Trajectory:
     """With the log to its place; ``hangs``: the log is seen in the grapple, otherwise it lies as it was gripped."""
-    taken = {log.id for log in grasp.logs} | {log.id for log in logs if is_between_jaws(arm, log, start)}
-    scene = collision_scene(arm.profile, logs, without=taken)
-    seen = next((log for log in logs if log.id == grasp.log.id), None) if hangs else None
-    held = held_log(arm, grasp.pose, grasp.log) if seen is None else held_log(arm, start, seen)
-    held = replace(held, diameter_m=hypot(*(log.diameter_m for log in grasp.logs)))  # a bundle counts as one thick log
+    scene, held = _scene_of_load(arm, start, grasp, logs, hangs)
     high_m, free_m = travel_height_m(arm.profile), approach_length_m(arm.profile, grasp.log)
     try:
         return motion_planner(arm, start, place, scene, held, high_m, free_m)
@@ -112,6 +113,41 @@ def carry_motion(
         if place.z_m >= high_m:
             raise
         return motion_planner(arm, start, place.at_height(high_m), scene, held, high_m, free_m)
+
+
+def turn_motion(arm: Arm, start: Pose, place: Pose, bunk: Bunk, load: LogObservation, s_rad: float) -> Trajectory:
+    """At the place, a thin load turned by ``s_rad`` seconds per radian, as it spins when turned fast.
+
+    A load whose ends reach among the stakes goes up as it came, turns above them, and comes down again: a stake may be
+    inside of its turn.
+    """
+    least_s = s_rad * abs(place.rot_rad - start.rot_rad)
+    if not reaches_stakes(bunk, load):
+        return slow_line(arm, start, place, least_s)
+    high_m = travel_height_m(arm.profile)
+    above, over = start.at_height(max(high_m, start.z_m)), place.at_height(max(high_m, start.z_m))
+    turn = slow_line(arm, above, over, least_s)
+    return joined(straight_line(arm, start, above), turn, straight_line(arm, over, place))
+
+
+def reaches_stakes(bunk: Bunk, log: LogObservation) -> bool:
+    """Whether an end of a log is as far out as the stakes, or a hand's breadth from it."""
+    half_m = 0.5 * log.length_m
+    ends = [[c + side * half_m * a for c, a in zip(log.center_m, log.axis, strict=True)] for side in (-1, 1)]
+    most_m = 0.5 * bunk.width_m - STAKE_CLEARANCE_M
+    return any(abs(point_in_bunk(bunk, x, y)[1]) + 0.5 * log.diameter_m > most_m for x, y, _ in ends)
+
+
+def _scene_of_load(
+    arm: Arm, start: Pose, grasp: Grasp, logs: Sequence[LogObservation], hangs: bool
+) -> tuple[CollisionScene, HeldLog]:
+    """What the load may hit, and the load."""
+    taken = {log.id for log in grasp.logs}
+    taken |= {log.id for log in logs if is_part_of_load(arm, grasp.log, log, start)}
+    scene = collision_scene(arm.profile, logs, without=taken)
+    seen = next((log for log in logs if log.id == grasp.log.id), None) if hangs else None
+    held = held_log(arm, grasp.pose, grasp.log) if seen is None else held_log(arm, start, seen)
+    return scene, replace(held, diameter_m=hypot(*(log.diameter_m for log in grasp.logs)))  # a bundle: one thick log
 
 
 def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:

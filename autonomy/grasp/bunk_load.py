@@ -31,6 +31,8 @@ _COST_GRAIN_M: Final = 0.03
 """Places whose cost differs by less are equal."""
 _ROLL_GRAIN_M: Final = 0.1
 """A log that rolls less far rests where it was released."""
+ROLLS_FROM: Final = 0.05
+"""A log that lies on others or on a plane rolls from this slope on."""
 _SECTION_SHARE: Final = 0.35
 """Positions of the cross-sections through the new log, as shares of its length from the middle."""
 
@@ -47,9 +49,15 @@ class RestingPlace:
 
 
 class BunkLoad:
-    """The load of a bunk, as a new log of the given diameter and length [m] meets it."""
+    """The load of a bunk, as a new log of the given diameter and length [m] meets it.
 
-    def __init__(self, bunk: Bunk, logs: Sequence[LogObservation], diameter_m: float, length_m: float) -> None:
+    ``slope``: how the machine stands (`autonomy.motion.arm_kinematics`); on a slope logs roll to the lower stakes.
+    """
+
+    def __init__(
+        self, bunk: Bunk, logs: Sequence[LogObservation], diameter_m: float, length_m: float,
+        slope: tuple[float, float] = (0.0, 0.0),
+    ) -> None:  # fmt: skip
         self._radius_m = radius = diameter_m / 2
         half = max(bunk.width_m / 2 - radius, 0.0)
         steps = int(half / GRID_M)
@@ -63,7 +71,9 @@ class BunkLoad:
         self._empty = bool(np.all(self._bed <= bunk.floor_z_m + radius))
         near = np.where(beside < wide + OPENING_CLEARANCE_M, height + other, -np.inf)
         self._under = np.max(near, axis=1, initial=bunk.floor_z_m)
-        self._hollow = _hollows(self._bed)
+        downhill = _rotated(bunk, *slope)[1]
+        fall = downhill * self._across if abs(downhill) > ROLLS_FROM else 0.0
+        self._hollow = _hollows(self._bed - fall)
         self._rest = self._bed[self._hollow]
 
     def place_at(self, across_m: float) -> RestingPlace:
@@ -128,12 +138,14 @@ def is_over_bunk(bunk: Bunk, x_m: float, y_m: float) -> bool:
     return abs(along) <= bunk.length_m / 2 and abs(across) <= bunk.width_m / 2
 
 
-def settled_in_bunk(bunk: Bunk, log: LogObservation, logs: Sequence[LogObservation]) -> LogObservation:
+def settled_in_bunk(
+    bunk: Bunk, log: LogObservation, logs: Sequence[LogObservation], slope: tuple[float, float] = (0.0, 0.0)
+) -> LogObservation:
     """A log released over a bunk that holds others, as it then lies; a log beside the bunk stays as it is."""
     if not is_over_bunk(bunk, *log.center_m[:2]):
         return log
     across = log_in_bunk(bunk, log)[1]
-    at, z = BunkLoad(bunk, logs, log.diameter_m, log.length_m).resting_point(across)
+    at, z = BunkLoad(bunk, logs, log.diameter_m, log.length_m, slope).resting_point(across)
     c, s, aside = cos(bunk.yaw_rad), sin(bunk.yaw_rad), at - across
     level = hypot(*log.axis[:2])
     axis = (log.axis[0] / level, log.axis[1] / level, 0.0) if level > 0.0 else log.axis

@@ -104,9 +104,10 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         self._motion = self._motion + (after - before)[[State.X, State.Y, State.YAW]]
         self._store(stamp_ns)
 
-    def add_position_noise(self, sigma_m: float) -> None:
-        """Add position uncertainty for motion that the wheels do not measure."""
+    def add_creep(self, sigma_m: float, sigma_rad: float) -> None:
+        """Add uncertainty of position and yaw for motion that the wheels do not measure."""
         self.P[[State.X, State.Y], [State.X, State.Y]] += sigma_m**2
+        self.P[State.YAW, State.YAW] += sigma_rad**2
 
     def predict_x(self, u: float = 0) -> None:
         """Use the state from ``predict_motion``: the model is not linear."""

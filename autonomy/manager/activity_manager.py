@@ -46,6 +46,7 @@ from autonomy.motion.movement_primitives import load
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
 from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.standpoint import Standpoint
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VehicleReport
@@ -176,6 +177,13 @@ class ActivityManager:
             finished=self.state is State.DONE,
         )
 
+    def standpoint(self, now_ns: int) -> Standpoint | None:
+        """With memory: where the camera's next picture is taken; None while it must take none, because the crane works
+        in front of it or the machine is not located."""
+        if self.log_memory is None or RULES[self.state].crane or self.state in FINAL_STATES:
+            return None
+        return self.world.standpoint(now_ns)
+
     # ------------------------------------------------------------------ operator commands
     def auto(self) -> None:
         """Set the mode switch to Auto."""
@@ -214,11 +222,14 @@ class ActivityManager:
         seen_ns = now_ns if seen_ns is None else seen_ns
         if self.log_memory is not None:
             world.update_map(logs, seen_ns)
+            if logs and world.located:
+                self.log_memory.lose(self.load.check_fallen(now_ns))
             logs = world.recall(self.log_memory, self.activity, now_ns)
         elif RULES[self.state].crane:  # a log in the grapple does not lie on the ground
             world.count_bunk(logs, seen_ns)
         else:
             world.observe(logs, seen_ns)
+            self.load.check_bunk(now_ns, self.route.driven_m)
         obstacle = world.blocked_reason(now_ns) or self._off()
         if obstacle:
             if not self.paused:
@@ -313,7 +324,7 @@ class ActivityManager:
         elif state is State.LOOK and self._target.is_ahead:
             self._target.restart_average()
         elif state is State.COLLECT and self.activity is None:
-            self._crane.load_target(self.target)
+            self._crane.load_target(self.target, only=self._target.clearing is not None)
         elif state is State.STOW and self.activity is None:
             self._crane.stow()
         elif not rule.crane:

@@ -87,7 +87,8 @@ def copied_tally(tally: Tally, later_ns: int = 0) -> Tally:
     loads = [
         msgspec.structs.replace(load, logs=tuple(moved(load.logs)), at_ns=load.at_ns + later_ns) for load in tally.loads
     ]
-    return replace(tally, given_up=dict(tally.given_up), board=moved(tally.board), loads=loads)
+    remarks = [msgspec.structs.replace(remark, at_ns=remark.at_ns + later_ns) for remark in tally.remarks]
+    return replace(tally, given_up=dict(tally.given_up), board=moved(tally.board), loads=loads, remarks=remarks)
 
 
 def fits_mission(progress: Checkpoint, mission: ForwardingMission) -> bool:

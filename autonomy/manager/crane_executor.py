@@ -13,6 +13,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
 from autonomy.grasp.grasp import Grasp
 from autonomy.grasp.placement import lies_in_bunk
@@ -29,7 +30,9 @@ from machine.profile import Profile
 from runtime.errors import Problem
 
 MAX_STOPS: Final = 3
-"""A grasp is given up after the controller has stopped the crane this many times."""
+"""A grasp is given up after the controller has stopped the crane this many times, ..."""
+MAX_STOPS_WITH_LOAD: Final = 6
+"""... with a log in the jaws after this many."""
 MAX_FAILURES: Final = 3
 """Unloading fails after this many failed grasps from the bunk in a row."""
 
@@ -73,9 +76,9 @@ class CraneExecutor:
         return self._rotator if self.job is None else self.job.rotator
 
     # ------------------------------------------------------------------ starting a job
-    def load_target(self, target: int | None) -> None:
-        """Load the target log into the bunk, and other logs that one grasp holds."""
-        self._begin(CraneJob(log_id=self._world.list_number(target) if self._as_paper_b else None), target)
+    def load_target(self, target: int | None, only: bool = False) -> None:
+        """Load the target log into the bunk, and other logs that one grasp holds; ``only``: no other log."""
+        self._begin(CraneJob(log_id=self._world.list_number(target) if self._as_paper_b or only else None), target)
 
     def unload_bunk(self) -> None:
         """Move logs from the bunk to the landing of the load."""
@@ -102,7 +105,7 @@ class CraneExecutor:
         self.job = Activity(
             self._profile, self._hash, mission, self._lease_ns, self._key,
             self._unloading_selector if unloads else choose, self._reference, self._motions,
-            None if self._as_paper_b else onward, mission is None, self.rotator,
+            None if self._as_paper_b else onward, mission is None, self.rotator, self._world.slope,
         )  # fmt: skip
 
     def _unloads_next(self, log: LogObservation) -> bool:
@@ -135,8 +138,11 @@ class CraneExecutor:
         self._stops += self.job is not None and self._world.stopped
 
     def on_resumed(self) -> None:
-        """Setpoints are executed again; a job that was stopped too often is aborted."""
-        if self._stops >= MAX_STOPS:
+        """Setpoints are executed again; a job that was stopped too often is aborted, one with a log in the jaws later:
+        nobody else lays it down.
+        """
+        carries = self.job is not None and Phase.LIFT <= self.job.phase <= Phase.OPEN
+        if self._stops >= (MAX_STOPS_WITH_LOAD if carries else MAX_STOPS):
             self.abort(f"the controller stopped the crane {self._stops} times")
 
     # ------------------------------------------------------------------ ending a job

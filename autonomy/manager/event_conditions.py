@@ -73,6 +73,8 @@ class EventConditions:
                 return self._crane.stowed()
             case Event.ROUND_END:
                 return self._route.ended and self._load.needs_another_round
+            case Event.IN_THE_WAY:
+                return self._target.is_in_the_way()
             case Event.ROUTE_END:
                 return self._route.ended or self._load.has_enough
         return False

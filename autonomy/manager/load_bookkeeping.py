@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.manager.checkpoint import Checkpoint, copied_tally
+from autonomy.manager.fallen_logs import FallenLogs
+from autonomy.manager.load_detector import expected_kg
+from autonomy.manager.log_memory import Grip
 from autonomy.manager.tally import LoadedLog, Tally, volume_m3
 from autonomy.manager.world_model import WorldModel
 from autonomy.missions.local_frame import yaw_from_bearing
@@ -15,6 +19,11 @@ from autonomy.missions.model import ForwardingMission, Point
 from autonomy.navigation.clothoid_path import Point2
 from autonomy.perception.log_list.observation import LogObservation
 from machine.profile import Profile
+
+LOOKS: Final = 4
+"""Log lists in a row, a second of them, that must show the same number of logs in the bunk before it is believed."""
+UNSURE_KG: Final = 30.0
+"""Two sigmas of the scale (`autonomy.manager.load_detector`): a lighter load cannot be told from none."""
 
 
 class LoadBookkeeping:
@@ -28,6 +37,13 @@ class LoadBookkeeping:
             self.tally = copied_tally(progress.tally)
             self.sorting.restore(progress.landing, progress.served, progress.rounds)
         self._world, self._bunk = world, profile.bunk
+        self._from_before: int | None = None
+        """Logs in the bunk that were there before this mission; None before the first look."""
+        self._looked_ns = self._booked_ns = 0
+        self._difference = self._differing = 0
+        self._fallen = FallenLogs(profile.bunk)
+        self._agreed_m = 0.0
+        """Driven distance at the last look that agreed with what was booked."""
         self._wanted, self._lands = mission.options.logs_wanted, bool(mission.landings)
         bearings = [landing.bearing_deg for landing in mission.landings]
         self._log_direction_rad = [None if deg is None else yaw_from_bearing(deg) for deg in bearings]
@@ -86,9 +102,92 @@ class LoadBookkeeping:
     def book_loaded(self, job: Activity, now_ns: int) -> None:
         """Book a grasp that was placed in the bunk."""
         assert job.grasp is not None
-        loaded_logs = [self._loaded_log(log, now_ns) for log in job.grasp.logs]
+        grip = self._world.grip
+        logs = job.grasp.logs + (() if grip is None else grip.also)
+        if grip is not None:
+            self._remark_grip(job.grasp.logs, grip, now_ns)
+        loaded_logs = [self._loaded_log(log, now_ns) for log in logs]
         self.tally.book_loaded(loaded_logs, job.lifted_kg)
+        self._booked_ns = now_ns
         self.sorting.book_loaded(log.assortment for log in loaded_logs)
+
+    def _remark_grip(self, logs: Sequence[LogObservation], grip: Grip, now_ns: int) -> None:
+        """Say where the weight in the grapple differs from what was meant, or cannot tell."""
+        names = " and ".join(str(log.id) for log in logs)
+        for log in grip.also:
+            self.tally.remark(
+                now_ns, f"log {log.id} came up with log {names}: {grip.read_kg:.0f} kg hung in the grapple"
+            )
+        for number in grip.left:
+            self.tally.remark(
+                now_ns,
+                f"log {number} did not come up with log {names}: only {grip.read_kg:.0f} kg hung in the grapple; it is "
+                "looked for again where it lay",
+            )
+        weight_kg = sum(expected_kg(log) for log in logs)
+        if not grip.left and weight_kg < UNSURE_KG:
+            self.tally.remark(
+                now_ns,
+                f"log {names} weighs some {weight_kg:.0f} kg, less than the scale can tell from none; it is "
+                "counted unseen",
+            )
+
+    def check_bunk(self, now_ns: int, driven_m: float) -> None:
+        """Compare a look into the bunk with what was booked; call it while no log hangs in the grapple.
+
+        A difference that `LOOKS` lists in a row show is booked and said.  ``driven_m`` is the driven distance.
+        """
+        world, tally = self._world, self.tally
+        if world.counted_ns == self._looked_ns or world.counted_ns <= self._booked_ns:
+            return
+        self._looked_ns = world.counted_ns
+        if self._from_before is None:
+            self._from_before = max(0, world.in_bunk - tally.on_board)
+        difference = world.in_bunk - self._from_before - tally.on_board
+        self._differing = self._differing + 1 if difference and difference == self._difference else 1
+        self._difference = difference
+        if not difference:
+            self._agreed_m = driven_m
+        elif self._differing >= LOOKS:
+            self._book_difference(difference, driven_m, now_ns)
+            self._differing = 0
+
+    def check_fallen(self, now_ns: int) -> int:
+        """With a camera that only looks ahead: book the logs that it finds where they can only have fallen off the
+        machine, and say so; returns how many.
+        """
+        world, tally = self._world, self.tally
+        if not tally.on_board:
+            self._fallen.forget()
+            return 0
+        self._fallen.passes(world.base, world.log_map.next_number)
+        found = [log for log in self._fallen.fallen(world.log_map.logs) if not world.is_on_landing(log)]
+        lost = found[: tally.on_board]
+        for log in lost:
+            tally.book_lost(1)
+            tally.remark(
+                now_ns,
+                f"log {log.number} lies where the loaded machine has been: it fell off; {tally.on_board} are on board, "
+                "and it is loaded again like any log on the ground",
+            )
+        return len(lost)
+
+    def _book_difference(self, difference: int, driven_m: float, now_ns: int) -> None:
+        tally, one = self.tally, abs(difference) == 1
+        if difference > 0:
+            tally.book_found(difference)
+            more = "one log more lies" if one else f"{difference} logs more lie"
+            tally.remark(now_ns, f"{more} in the bunk than was gripped on purpose; {tally.on_board} are on board")
+            return
+        on_board = min(-difference, tally.on_board)
+        tally.book_lost(on_board)
+        assert self._from_before is not None
+        self._from_before += difference + on_board
+        tally.remark(
+            now_ns,
+            f"{'a log was' if one else f'{-difference} logs were'} lost between {self._agreed_m:.0f} m and "
+            f"{driven_m:.0f} m of the drive; {tally.on_board} are on board; what was lost is looked for again",
+        )
 
     def _loaded_log(self, log: LogObservation, now_ns: int) -> LoadedLog:
         """Remove a grasped log from the map and return it with the place where it had lain."""
@@ -125,5 +224,6 @@ class LoadBookkeeping:
 
     def book_empty(self, now_ns: int, driven_m: float) -> None:
         """Book an empty bunk."""
+        self._from_before, self._booked_ns = 0, now_ns
         self.tally.book_empty(now_ns, driven_m, self.sorting.landing or 0)
         self.sorting.book_unloaded()

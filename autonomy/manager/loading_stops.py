@@ -63,10 +63,16 @@ class CraneReach:
         kin = arm.profile.kinematics
         self.max_distance_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BEYOND_ARM_M
 
-    def work_s(self, log: LogObservation) -> float:
-        """Rough duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped."""
+    def work_s(self, log: LogObservation, is_clear: bool = False) -> float:
+        """Rough duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped.  ``is_clear``:
+        the log is known to lie clear of the machine.
+        """
         x, y, _ = log.center_m
-        if abs(y) < self._side_clearance_m + 0.5 * log.diameter_m and x < self._rear_end_m + 0.5 * log.length_m:
+        if (
+            not is_clear
+            and abs(y) < self._side_clearance_m + 0.5 * log.diameter_m
+            and x < self._rear_end_m + 0.5 * log.length_m
+        ):
             return math.inf  # under the machine, or its bunk
         try:
             pose = plan_single_log_grasp(self._arm, log, 0.0).pose

@@ -9,7 +9,8 @@ with the map's numbers.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -18,9 +19,10 @@ from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.bunk_load import settled_in_bunk
 from autonomy.grasp.placement import lies_in_bunk
-from autonomy.manager.load_detector import LoadDetector
+from autonomy.manager.load_detector import LoadDetector, WoodScale
 from autonomy.manager.log_map import LogMap
 from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import slope_of
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
@@ -32,6 +34,19 @@ PERIOD_NS: Final = 250_000_000
 RANGE_M: Final = 12.0
 LIFTED_M: Final = 0.5
 """The scale is used above this height only: below it, the log may still rest on the ground."""
+BESIDE_M: Final = 0.45
+"""Jaws may close on a log whose axis is no farther than this from the middle of the grasp on the ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """What a released grip held, by its weight ``read_kg`` [kg] (NaN: not weighed): logs that nobody meant to grip, and
+    the numbers of those that were meant and did not come up.
+    """
+
+    also: tuple[LogObservation, ...]
+    left: tuple[int, ...]
+    read_kg: float
 
 
 class LogMemory:
@@ -44,8 +59,15 @@ class LogMemory:
         self._job: Activity | None = None
         self._held: dict[int, LogObservation] = {}
         """Logs of the grasp relative to hanger pin and grapple yaw, from the time it closed."""
+        self._meant: tuple[int, ...] = ()
         self._low_m = 0.0
         self._released: list[LogObservation] = []
+        self._beside: tuple[LogObservation, ...] = ()
+        self._beside_held: dict[int, LogObservation] = {}
+        """The logs beside the grasp as they would hang."""
+        self.grip: Grip | None = None
+        """What the job has released, by its weight; None before that."""
+        self._wood = WoodScale()
         self._load_detector: LoadDetector | None = None
         self._slipped = False
 
@@ -54,6 +76,11 @@ class LogMemory:
         """Number of logs that were placed in the bunk."""
         return len(self._in_bunk)
 
+    def lose(self, count: int) -> None:
+        """So many logs fell off the bunk: which ones is unknown, so those laid last, which lie on top."""
+        if count:
+            del self._in_bunk[-count:]
+
     def log_list(
         self, now_ns: int, log_map: LogMap, base: Pose, report: StateReport | None, job: Activity | None
     ) -> tuple[LogObservation, ...] | None:
@@ -61,17 +88,20 @@ class LogMemory:
         if job is not self._job:
             self._end()
             self._job = job
+            self._arm = Arm(self._profile, slope=slope_of(base.rotation))  # as the job takes it
+
+        def lying() -> list[LogObservation]:
+            here = base.position_m[:2]
+            return [log.observation(base) for log in log_map.logs if math.dist(log.center_m[:2], here) < RANGE_M]
+
         if job is not None and report is not None:
-            self._follow(job, report)
+            self._follow(job, report, lying)
         if now_ns < self._due_ns:
             return None
         self._due_ns = now_ns + PERIOD_NS
         hanging = self._hanging(report)
         gone = {log.id for log in (*hanging, *self._released)}
-        near = [
-            log.observation(base) for log in log_map.logs
-            if log.number not in gone and math.dist(log.center_m[:2], base.position_m[:2]) < RANGE_M
-        ]  # fmt: skip
+        near = [log for log in lying() if log.id not in gone]
         return (*near, *hanging, *self._released, *(log for log in self._in_bunk if log.id not in gone))
 
     def _end(self) -> None:
@@ -80,8 +110,9 @@ class LogMemory:
         self._in_bunk = [log for log in self._in_bunk if log.id not in moved]
         self._in_bunk += [log for log in self._released if lies_in_bunk(self._profile.bunk, log)]
         self._released, self._held, self._load_detector, self._slipped = [], {}, None, False
+        self._beside, self._beside_held, self.grip = (), {}, None
 
-    def _follow(self, job: Activity, report: StateReport) -> None:
+    def _follow(self, job: Activity, report: StateReport, lying: Callable[[], Sequence[LogObservation]]) -> None:
         """Track what the grapple closes on, loses and releases."""
         grasp = job.grasp
         if grasp is None:
@@ -91,20 +122,39 @@ class LogMemory:
         elif Phase.LIFT <= job.phase < Phase.OPEN and not self._held and not self._slipped:
             pin, yaw = self._pin(report)
             self._low_m = pin[2]
-            self._held, self._load_detector = (
-                {log.id: _relative(log, pin, yaw) for log in grasp.logs},
-                LoadDetector(grasp.logs),
-            )
+            self._held = {log.id: _relative(log, pin, yaw) for log in grasp.logs}
+            meant = {log.id for log in grasp.logs}
+            self._beside = tuple(o for o in lying() if o.id not in meant and _aside_m(o, pin) < BESIDE_M)
+            self._beside_held = {log.id: _relative(log, pin, yaw) for log in self._beside}
+            self._meant = tuple(sorted(meant))
+            self._load_detector = LoadDetector(grasp.logs, self._beside, self._wood)
         elif Phase.LIFT <= job.phase < Phase.OPEN and self._load_detector is not None:
             self._load_detector.update(report.stamp_ns, report.load_kg)
-            if self._load_detector.is_empty and self._pin(report)[0][2] > self._low_m + LIFTED_M:
-                self._held, self._load_detector, self._slipped = {}, None, True
+            if self._pin(report)[0][2] > self._low_m + LIFTED_M:
+                self._judge(self._load_detector)
         elif Phase.OPEN <= job.phase <= Phase.DONE and self._held:
+            if self._load_detector is not None:
+                self._weigh(self._load_detector)
             under = [log for log in self._in_bunk if log.id not in self._held]
             laid: list[LogObservation] = []
             for log in self._hanging(report):
-                laid.append(settled_in_bunk(self._profile.bunk, log, under + laid))
+                laid.append(settled_in_bunk(self._profile.bunk, log, under + laid, self._arm.slope))
             self._released, self._held, self._load_detector = laid, {}, None
+
+    def _judge(self, detector: LoadDetector) -> None:
+        """Logs that the weight does not explain still lie where they lay."""
+        if detector.is_empty:
+            self._held, self._load_detector, self._slipped = {}, None, True
+        elif kept := {number: log for number, log in self._held.items() if number in detector.gripped}:
+            self._held = kept
+
+    def _weigh(self, detector: LoadDetector) -> None:
+        """The load is released: what was in it, by its weight, is booked."""
+        detector.learn()
+        also = tuple(log for log in self._beside if log.id in detector.gripped)
+        left = tuple(number for number in self._meant if number not in self._held)
+        self.grip = Grip(also, left, detector.read_kg)
+        self._held |= {log.id: self._beside_held[log.id] for log in also}
 
     def _hanging(self, report: StateReport | None) -> list[LogObservation]:
         if not self._held or report is None:
@@ -133,6 +183,14 @@ def _relative(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservatio
     drawn = level * float(off @ level) / max(float(level @ level), 1e-9)
     center = _turned((float(drawn[0]), float(drawn[1]), float(off[2])), -yaw)
     return replace(log, center_m=center, axis=_turned(log.axis, -yaw), covariance=None)
+
+
+def _aside_m(log: LogObservation, pin: np.ndarray) -> float:
+    """Distance on the ground from below a pin to the nearest point of a log's axis."""
+    center, axis = np.asarray(log.center_m)[:2], np.asarray(log.axis)[:2]
+    along = float((pin[:2] - center) @ axis) / max(float(axis @ axis), 1e-9)
+    along = min(max(along, -0.5 * log.length_m), 0.5 * log.length_m)
+    return float(np.linalg.norm(center + along * axis - pin[:2]))
 
 
 def _absolute(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservation:

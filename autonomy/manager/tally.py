@@ -39,12 +39,19 @@ class Load(msgspec.Struct, frozen=True):
     landing: int = 0
 
 
+class Remark(msgspec.Struct, frozen=True):
+    """What the machine found out about its load against its expectation, in words, and when."""
+
+    at_ns: int
+    text: str
+
+
 @dataclass(slots=True)
 class Tally:
     """Counts and sums of a mission.
 
     ``on_board`` counts logs in the bunk, ``board`` lists those that this mission loaded, ``loads`` went to landings.
-    ``counted_m`` is the driven distance at the last unloading.
+    ``counted_m`` is the driven distance at the last unloading; ``remarks`` are for the report.
     """
 
     loaded: int = 0
@@ -60,6 +67,7 @@ class Tally:
     loads: list[Load] = field(default_factory=list)
     board: list[LoadedLog] = field(default_factory=list)
     counted_m: float = 0.0
+    remarks: list[Remark] = field(default_factory=list)
 
     def book_loaded(self, logs: Sequence[LoadedLog], load_kg: float) -> None:
         """Book a grasp that was placed in the bunk."""
@@ -69,6 +77,26 @@ class Tally:
         self.board += logs
         self.board_m3 += sum(log.volume_m3 for log in logs)
         self.board_kg += load_kg if math.isfinite(load_kg) else 0.0
+
+    def remark(self, now_ns: int, text: str) -> None:
+        """Add a remark."""
+        self.remarks.append(Remark(now_ns, text))
+
+    def book_lost(self, logs: int) -> None:
+        """Book that logs are no longer on board: which ones is unknown, so those loaded last."""
+        self.loaded, self.on_board = max(0, self.loaded - logs), max(0, self.on_board - logs)
+        for _ in range(min(logs, len(self.board))):
+            self.board_m3 -= self.board.pop().volume_m3
+        self.brimful = False
+
+    def book_found(self, logs: int) -> None:
+        """Book that more logs are on board than were booked: where they had lain and their size are those of the last
+        one.
+        """
+        self.loaded, self.on_board = self.loaded + logs, self.on_board + logs
+        if self.board:
+            self.board_m3 += logs * self.board[-1].volume_m3
+            self.board += logs * [self.board[-1]]
 
     def full(self, bunk: Bunk, next_m3: float = 0.0) -> bool:
         """Whether the bunk has no room for ``next_m3`` more wood [m3]."""

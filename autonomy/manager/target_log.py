@@ -7,7 +7,7 @@ from typing import Final
 from autonomy.manager.load_bookkeeping import LoadBookkeeping
 from autonomy.manager.log_map import MappedLog
 from autonomy.manager.route_driver import RouteDriver
-from autonomy.manager.world_model import WorldModel
+from autonomy.manager.world_model import BRAKING_M, CLEARING_M, WorldModel
 
 COMMIT_M: Final = 2.5
 """A stop no farther ahead than this is final."""
@@ -26,6 +26,9 @@ class TargetLog:
         self._world, self._route, self._load = world, route, load
         self._was_inside = False
         self._weighed_ns = 0
+        self.clearing: int | None = None
+        """Map number of the log that is taken out of the way of the wheels; None without one."""
+        self._stopped_for: set[int] = set()
 
     @property
     def log(self) -> MappedLog | None:
@@ -34,7 +37,7 @@ class TargetLog:
 
     def clear(self) -> None:
         """Drop the target and search for another one."""
-        self.number, self._was_inside = None, False
+        self.number, self.clearing, self._was_inside = None, None, False
 
     @property
     def is_ahead(self) -> bool:
@@ -66,6 +69,15 @@ class TargetLog:
         self.stop_m, self.number = stop.along_m, stop.numbers[0]
         return True
 
+    def is_in_the_way(self) -> bool:
+        """Whether to stop for a log before a wheel, because the crane can load it; once for each log."""
+        log = self._world.log_before_wheel(BRAKING_M + CLEARING_M)
+        if log is None or log.number in self._stopped_for or self._load.full or not self._world.can_clear(log):
+            return False
+        self._stopped_for.add(log.number)
+        self.number = self.clearing = log.number
+        return True
+
     @property
     def averaged(self) -> bool:
         """Whether the target was observed often enough."""
@@ -83,6 +95,12 @@ class TargetLog:
 
     def is_graspable(self) -> bool:
         """Whether a log can be grasped from here: for paper B only the target, for ours any log in the list."""
+        if self.clearing is not None and not self._load.full:
+            log = self._world.log_map.get(self.clearing)
+            if log is not None and self._world.list_number(log.number) is not None and self._world.can_clear(log):
+                self.number = log.number
+                return True
+            self.clearing = None
         found = [] if self._load.full else self._world.graspable(self.number if self._route.as_paper_b else None)
         if found:
             self.number = found[0].number

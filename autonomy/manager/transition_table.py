@@ -59,6 +59,7 @@ class Event(IntEnum):
     ROUND_END = 17
     ROUTE_END = 18
     TIME_OUT = 19
+    IN_THE_WAY = 20
 
 
 EVENT_DESCRIPTIONS: Final[Mapping[Event, str]] = {
@@ -82,6 +83,7 @@ EVENT_DESCRIPTIONS: Final[Mapping[Event, str]] = {
     Event.ROUND_END: "the last waypoint is reached, and logs of other landings still lie along the route",
     Event.ROUTE_END: "the last waypoint is reached, or all wanted logs are loaded",
     Event.TIME_OUT: "the state has timed out",
+    Event.IN_THE_WAY: "a log that the crane can load lies in the way of a wheel",
 }
 
 
@@ -167,6 +169,9 @@ OURS: Final[Table] = {
     (State.SEARCH, Event.LOG_NEAR): State.APPROACH,
     (State.SEARCH, Event.ROUND_END): State.RAISE,
     (State.SEARCH, Event.ROUTE_END): State.DONE,
+    (State.SEARCH, Event.IN_THE_WAY): State.STOP,
+    (State.APPROACH, Event.IN_THE_WAY): State.STOP,
+    (State.STOP, Event.STANDING): State.CHECK,
     (State.APPROACH, Event.ARRIVED): State.CHECK,
     (State.APPROACH, Event.GONE): State.SEARCH,
     (State.CHECK, Event.VALID): State.LOWER,

@@ -23,15 +23,17 @@ from autonomy.localization.location import Location
 from autonomy.manager.checkpoint import LogKnowledge, MissedLog
 from autonomy.manager.loading_stops import BaseAt, CraneReach, LoadingStop, best_stop
 from autonomy.manager.log_map import CONFIRMED_HITS, LogMap, MappedLog, listed_log, nearest
-from autonomy.manager.log_memory import LogMemory
+from autonomy.manager.log_memory import Grip, LogMemory
 from autonomy.manager.sorting import Sorting
 from autonomy.missions.area import Area
 from autonomy.missions.local_frame import bearing_from_yaw
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import LEVEL, slope_of
 from autonomy.navigation.clothoid_path import Point2
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.vehicle import VehicleReport
 from machine.profile import Bunk, Profile
@@ -47,11 +49,17 @@ HORIZON_M: Final = 16.0
 AHEAD_M: Final = 0.5
 BRAKING_M: Final = 0.5
 """Stopping distance from the usual speed."""
+JAWS_M: Final = 0.3
+"""Room that the jaws need between a front wheel and the middle of a log ahead of it."""
+CLEARING_M: Final = 0.7
+"""The machine stops this much earlier for a log that the crane can take out of the way."""
 SPINE_POINTS: Final = 15
 """Points along a log that are tested against the wheel tracks."""
 MAX_ATTEMPTS: Final = 3
 STANDSTILL_M_S: Final = 0.02
 MAX_POSES: Final = 40
+STANDPOINT_NS: Final = 300_000_000
+"""A standpoint's velocities are means over about this time, so that the receiver's noise hardly counts."""
 MAX_EXTRAPOLATION_STEPS: Final = 4.0
 """The base pose is extrapolated by at most this many report intervals."""
 PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 3.0, 2.6, 1.5
@@ -80,6 +88,8 @@ class WorldModel:
         self.list_ns = 0
         """When the newest log list was observed."""
         self.in_bunk, self.counted_ns = 0, 0
+        self.grip: Grip | None = None
+        """With a camera that only looks ahead: what the scale says of the grip that was released last."""
         self.outside_fence_m = 0.0
         """Distance of the front axle or the crane's base outside the fences; 0 inside."""
         self._carrier, self._bunk, self._ground_z_m = profile.carrier, profile.bunk, profile.workspace.ground_z_m
@@ -87,6 +97,8 @@ class WorldModel:
         self._reach = CraneReach(Arm(profile), profile.carrier)
         self._report_ns = self._vehicle_ns = 0
         self._bases: deque[tuple[int, Pose]] = deque(maxlen=MAX_POSES)
+        self._bends_rad: deque[float] = deque(maxlen=MAX_POSES)
+        """The articulation with every stored pose."""
         self._numbers: dict[int, int] = {}
         self.landings: list[Point2] = []
         """Landing positions in the plane; empty before the first location."""
@@ -111,6 +123,11 @@ class WorldModel:
         """The crane's base now."""
         return self._bases[-1][1]
 
+    @property
+    def slope(self) -> tuple[float, float]:
+        """How the machine stands now (`autonomy.motion.arm_kinematics`); level before it is located."""
+        return slope_of(self.base.rotation) if self._bases else LEVEL
+
     def base_at(self, at_ns: int) -> Pose:
         """The crane's base at a time: the nearest stored pose, extrapolated after the last one."""
         stamp, last = self._bases[-1]
@@ -126,6 +143,17 @@ class WorldModel:
             Rotation.from_rotvec(share * turn).as_matrix() @ last.rotation,
         )
 
+    def standpoint(self, now_ns: int) -> Standpoint | None:
+        """Where the machine was at its newest report; None when it is not located now."""
+        if not self._bases:
+            return None
+        stamp, here = self._bases[-1]
+        at = next((k for k, (known, _) in enumerate(self._bases) if stamp - known <= STANDPOINT_NS), -1)
+        before_ns, before = self._bases[at]
+        bends_rad = (self._bends_rad[at], self._bends_rad[-1])
+        found = standpoint(stamp, here, before, bends_rad, (stamp - before_ns) * 1e-9)
+        return found if now_ns - stamp <= MAX_AGE_NS else None
+
     def update(self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None) -> None:
         """Accept the newest reports and update the location."""
         if report is not None:
@@ -135,6 +163,7 @@ class WorldModel:
             self.location = self._localizer.step(vehicle)
             if self.location.usable:
                 self._bases.append((self.location.stamp_ns, Frames(self._carrier, self.location).base()))
+                self._bends_rad.append(vehicle.articulation_rad)
                 if len(self._bases) == 1:
                     self._resolve_mission()
                 places = np.array([(self.location.x_m, self.location.y_m), self.base.position_m[:2]])
@@ -175,8 +204,8 @@ class WorldModel:
         known_log = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
         return MissedLog(log.number, known_log, log.misses)
 
-    def log_before_wheel(self) -> MappedLog | None:
-        """The first log that a front wheel would hit next; None without one."""
+    def log_before_wheel(self, braking_m: float = BRAKING_M) -> MappedLog | None:
+        """The first log that a front wheel would hit within a distance [m]; None without one."""
         assert self.location is not None
         here, c = self.location, self._carrier
         cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
@@ -184,10 +213,21 @@ class WorldModel:
         for log in self.log_map.logs:
             spine = log.center_m + np.linspace(-0.5, 0.5, SPINE_POINTS)[:, None] * log.length_m * log.axis
             ahead, lateral = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
-            near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + BRAKING_M)
+            near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + braking_m)
             if np.any(near & (np.abs(np.abs(lateral) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
                 return log
         return None
+
+    def can_clear(self, log: MappedLog) -> bool:
+        """Whether the crane can load a log that lies ahead of the front wheels from here."""
+        assert self.location is not None
+        here, c = self.location, self._carrier
+        ahead = np.array([math.cos(here.yaw_rad), math.sin(here.yaw_rad)])
+        ahead_m = float((log.center_m[:2] - (here.x_m, here.y_m)) @ ahead)
+        if log.misses >= MAX_ATTEMPTS or not self.sorting.wants(log.assortment) or self.is_on_landing(log):
+            return False
+        clear = ahead_m > c.wheel_radius_m + JAWS_M
+        return clear and math.isfinite(self._reach.work_s(log.observation(self.base), is_clear=True))
 
     def observe(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
         """Accept a log list in the base frame of a time; ignored before the machine is located."""
@@ -207,6 +247,7 @@ class WorldModel:
         if not self._bases:
             return ()
         logs = log_memory.log_list(now_ns, self.log_map, self.base, self.report, job)
+        self.grip = log_memory.grip
         if logs is None:
             return ()
         self._numbers = {log.id: log.id for log in logs}

@@ -110,8 +110,17 @@ def save_mission(path: str | Path, mission: ForwardingMission) -> None:
     Raises:
         MissionError: the file cannot be written.
     """
+    save_bytes(path, geojson.write(mission))
+
+
+def save_bytes(path: str | Path, data: bytes) -> None:
+    """Write a mission's file.
+
+    Raises:
+        MissionError: the file cannot be written.
+    """
     try:
-        Path(path).write_bytes(geojson.write(mission))
+        Path(path).write_bytes(data)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise MissionError("mission.not-written", f"cannot be written: {reason}", str(path)) from None

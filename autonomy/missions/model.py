@@ -62,7 +62,7 @@ def _restored(code: str, text: str, problems: tuple[Problem, ...]) -> MissionErr
     return error
 
 
-class Point(msgspec.Struct, frozen=True):
+class Point(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A position: latitude and longitude [deg], height above the ellipsoid [m] or None."""
 
     latitude_deg: float
@@ -70,7 +70,7 @@ class Point(msgspec.Struct, frozen=True):
     altitude_m: float | None = None
 
 
-class Fence(msgspec.Struct, frozen=True):
+class Fence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A polygon without its closing corner, counter-clockwise seen from above.
 
     The machine stays inside one of the keep-in fences and outside all keep-out fences.
@@ -81,7 +81,7 @@ class Fence(msgspec.Struct, frozen=True):
     name: str = ""
 
 
-class KnownLog(msgspec.Struct, frozen=True):
+class KnownLog(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A log that is known before the mission: its centre, and its direction and size as far as known.
 
     ``sigma_m`` is the standard deviation of the position in each horizontal direction, None if unknown.
@@ -106,7 +106,7 @@ class KnownLog(msgspec.Struct, frozen=True):
         return 0.25 * math.pi * self.diameter_m**2 * self.length_m
 
 
-class Landing(msgspec.Struct, frozen=True):
+class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where logs are unloaded: the centre of the pile, the direction of its logs, and the assortments it accepts (all,
     if none is named).
     """
@@ -135,7 +135,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sort_by_assortment: bool = False
 
 
-class ForwardingMission(msgspec.Struct, frozen=True):
+class ForwardingMission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All data that a forwarder needs before it drives."""
 
     name: str = ""

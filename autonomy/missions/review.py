@@ -11,8 +11,8 @@ import numpy as np
 
 from autonomy.missions.area import path_distance_m
 from autonomy.missions.local_frame import LocalFrame, site_frame
-from autonomy.missions.model import ForwardingMission, MissionError, Problem
-from autonomy.missions.validation import MAX_SITE_DISTANCE_M, area_of, legs
+from autonomy.missions.model import ForwardingMission, MissionError
+from autonomy.missions.validation import MAX_SITE_DISTANCE_M, SWAPPED_HINT, Finding, area_of, legs, swapped_m
 from machine.geometry.carrier import turning_radius_m
 from machine.geometry.kinematics import max_reach_m
 from machine.profile import Carrier, Profile
@@ -23,6 +23,8 @@ R tan(turn / 2)).
 """
 LOG_S: Final = 25.0
 """Duration in which an expert loads one log from the ground into the bunk (docs/reference/machines.md section 10)."""
+SWAPPED_SHARE: Final = 0.5
+"""A far mission whose axes look swapped is at most this share of its distance from the site with its axes exchanged."""
 SHARPEST_RAD: Final = math.radians(150.0)
 MAX_SHOWN: Final = 5
 
@@ -45,7 +47,7 @@ class Review:
     logs: int
     crane_s: float
     corners: tuple[Corner, ...]
-    warnings: tuple[Problem, ...]
+    warnings: tuple[Finding, ...]
 
     @property
     def total_s(self) -> float:
@@ -112,54 +114,58 @@ def _corners(at: np.ndarray, route_legs: list[tuple[int, int]], radius_m: float)
     return tuple(found)
 
 
-def _site(mission: ForwardingMission, carrier: Carrier) -> list[Problem]:
+def _site(mission: ForwardingMission, carrier: Carrier) -> list[Finding]:
     origin = LocalFrame(carrier.site_lat_deg, carrier.site_lon_deg)
     away = float(np.linalg.norm(origin.points_enu(mission.waypoints[:1])))
     if away <= MAX_SITE_DISTANCE_M:
         return []
-    return [Problem("mission.far-from-site", f"it is {away / 1000:.0f} km from the site in the machine's profile")]
+    far, first = f"it is {away / 1000:.0f} km from the site in the machine's profile", ("waypoint", 0)
+    other = swapped_m(origin, mission.waypoints[0])
+    if other < SWAPPED_SHARE * away:
+        return [Finding(first, "mission.swapped-axes", f"{far}, exchanged {other / 1000:.0f} km; {SWAPPED_HINT}")]
+    return [Finding(first, "mission.far-from-site", far)]
 
 
-def _speed(mission: ForwardingMission, carrier: Carrier) -> list[Problem]:
+def _speed(mission: ForwardingMission, carrier: Carrier) -> list[Finding]:
     speed, height = mission.options.speed_m_s, mission.options.transport_height_m
     found = []
     if speed is not None and speed > carrier.speed_limit_m_s:
         sentence = f"speed_m_s is {speed:g}; the machine drives at most {carrier.speed_limit_m_s:g} m/s"
-        found.append(Problem("mission.speed-limit", sentence))
+        found.append(Finding(None, "mission.speed-limit", sentence))
     if height is not None and height > carrier.arm_travel_m:
         sentence = f"transport_height_m is {height:g}; the swing arms lift {carrier.arm_travel_m:g} m"
-        found.append(Problem("mission.height-limit", sentence))
+        found.append(Finding(None, "mission.height-limit", sentence))
     return found
 
 
 def _tight(
     corners: tuple[Corner, ...], route_legs: list[tuple[int, int]], lengths: list[float], radius_m: float
-) -> list[Problem]:
+) -> list[Finding]:
     """Corners that the machine cannot drive as drawn: too sharp, or with legs too short for the bends."""
     found = []
     room = {corner.waypoint: corner.switch_m for corner in corners if math.isfinite(corner.switch_m)}
     for corner in corners:
         if math.isinf(corner.switch_m):
-            found.append(Problem(
-                "mission.turn-on-the-spot",
+            found.append(Finding(
+                ("waypoint", corner.waypoint), "mission.turn-on-the-spot",
                 f"waypoint {corner.waypoint + 1}: the route turns by {math.degrees(corner.turn_rad):.0f} degrees on "
                 f"the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop",
             ))  # fmt: skip
     for (i, j), length in zip(route_legs, lengths, strict=True):
         needed = room.get(i, 0.0) + room.get(j, 0.0)
         if length < needed:
-            found.append(Problem(
-                "mission.short-leg",
+            found.append(Finding(
+                ("waypoint", j), "mission.short-leg",
                 f"leg {i + 1} to {j + 1} is {length:.1f} m long and its corners need {needed:.1f} m at a turning "
                 f"radius of {radius_m:.1f} m; the machine will cut or overshoot them",
             ))  # fmt: skip
     return _few(found)
 
 
-def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> list[Problem]:
+def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> list[Finding]:
     """Waypoints so close to the fence that a wheel would leave it."""
     if not mission.fences:
-        return [Problem("mission.no-fence", "there is no fence; add one to keep the machine inside an area")]
+        return [Finding(None, "mission.no-fence", "there is no fence; add one to keep the machine inside an area")]
     area = area_of(mission, frame)
     half = 0.5 * (carrier.track_width_m + carrier.wheel_width_m)
     at = frame.points_enu(mission.waypoints)[:, :2]
@@ -167,18 +173,19 @@ def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> li
     near = np.min([path_distance_m(np.vstack([ring, ring[:1]]), at) for ring in rings], axis=0)
     return _few(
         [
-            Problem(
+            Finding(
+                ("waypoint", i),
                 "mission.close-to-fence",
                 f"waypoint {i + 1} is {near[i]:.1f} m from the fence; the machine is {2 * half:.1f} m wide",
             )
-            for i in np.flatnonzero(near < half)
+            for i in np.flatnonzero(near < half).tolist()
         ]
     )
 
 
 def _logs(
     mission: ForwardingMission, frame: LocalFrame, at: np.ndarray, route_legs: list[tuple[int, int]], profile: Profile
-) -> list[Problem]:
+) -> list[Finding]:
     """Logs that the crane cannot reach from the route, or that lie on the route."""
     if not mission.logs or not len(at) or profile.carrier is None:
         return []
@@ -187,33 +194,34 @@ def _logs(
     reach = max_reach_m(profile)
     half = 0.5 * (profile.carrier.track_width_m + profile.carrier.wheel_width_m)
     far = [
-        Problem(
+        Finding(
+            ("log", i),
             "mission.log-out-of-reach",
             f"log {i + 1} lies {away[i]:.1f} m from the route; the crane reaches {reach:.1f} m",
         )
-        for i in np.flatnonzero(away > reach)
+        for i in np.flatnonzero(away > reach).tolist()
     ]
     known = np.array([(log.sigma_m or 0.0) < half for log in mission.logs])
-    on_route = np.flatnonzero((away < half) & known)
+    on_route = np.flatnonzero((away < half) & known).tolist()
     under = [
-        Problem("mission.log-on-route", f"log {i + 1} lies on the route; the wheels would roll over it")
+        Finding(("log", i), "mission.log-on-route", f"log {i + 1} lies on the route; the wheels would roll over it")
         for i in on_route
     ]
     return [*_few(far), *_few(under)]
 
 
-def _unlisted(mission: ForwardingMission) -> list[Problem]:
+def _unlisted(mission: ForwardingMission) -> list[Finding]:
     """Assortments to collect that no listed log has."""
     listed = {log.assortment for log in mission.logs}
     return _few([
-        Problem("mission.unlisted-assortment", f'no log is "{name}", which is to be collected')
+        Finding(None, "mission.unlisted-assortment", f'no log is "{name}", which is to be collected')
         for name in mission.options.assortments if name not in listed
     ])  # fmt: skip
 
 
-def _few(warnings: list[Problem]) -> list[Problem]:
+def _few(warnings: list[Finding]) -> list[Finding]:
     """The first few of many warnings of one kind."""
     more = len(warnings) - MAX_SHOWN
     if more <= 0:
         return warnings
-    return [*warnings[:MAX_SHOWN], Problem(warnings[-1].code, f"and {more} more like the last")]
+    return [*warnings[:MAX_SHOWN], Finding(None, warnings[-1].code, f"and {more} more like the last")]

@@ -22,6 +22,8 @@ MAX_XML_BYTES: Final = 64 << 20
 MAX_VALUES: Final = 500_000
 """Lists and objects in a JSON file; 50 000 logs have four each."""
 MAX_SHOWN: Final = 10
+MAX_LINED_CHARS: Final = 1 << 20
+"""In a longer text no line is looked for: every level of it is read again, which takes a second in 6 MB."""
 
 Place = int | tuple[str | int, ...] | None
 _SPACE: Final = re.compile(r"[ \t\r\n]*")
@@ -38,7 +40,10 @@ class Source:
 
     def at(self, place: Place) -> str:
         """``name:line`` of a place, or ``name`` if the line is unknown."""
-        line = line_of(self.text, place) if isinstance(place, tuple) else place
+        if isinstance(place, tuple):
+            line = line_of(self.text, place) if len(self.text) <= MAX_LINED_CHARS else None
+        else:
+            line = place
         return self.name if line is None else f"{self.name}:{line}"
 
     def error(self, code: str, place: Place, sentence: str) -> MissionError:

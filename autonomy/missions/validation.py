@@ -31,7 +31,7 @@ LENGTHS_M: Final = (0.3, 30.0)
 DIAMETERS_M: Final = (0.02, 2.0)
 MAX_LAPS: Final = 1000
 
-SWAPPED_HINT: Final = "longitude and latitude look swapped"
+SWAPPED_HINT: Final = "latitude and longitude look swapped"
 METRES_HINT: Final = "this looks like metres of a map projection; export the file as WGS84 (EPSG:4326)"
 
 
@@ -215,14 +215,14 @@ def _together(mission: ForwardingMission) -> Iterator[Finding]:
     for (key, at), distance in zip(named, away, strict=True):
         if distance > MAX_EXTENT_M:
             far = f"{key_text(key)} is {distance / 1000:.0f} km away from {anchor[0]}"
-            if _swapped_m(origin, at) <= MAX_EXTENT_M:
+            if swapped_m(origin, at) <= MAX_EXTENT_M:
                 yield Finding(key, "mission.swapped-axes", f"{far}; {SWAPPED_HINT}")
             else:
                 extent = f"a mission spans at most {MAX_EXTENT_M / 1000:.0f} km"
                 yield Finding(key, "mission.too-far-apart", f"{far}; {extent}")
 
 
-def _swapped_m(origin: LocalFrame, at: Point) -> float:
+def swapped_m(origin: LocalFrame, at: Point) -> float:
     """Distance of a place from the origin with its axes exchanged [m]."""
     if abs(at.longitude_deg) > 90.0:
         return math.inf
@@ -236,7 +236,7 @@ def _at_site(mission: ForwardingMission, site: tuple[float, float] | None) -> It
         return
     origin = LocalFrame(*site)
     away = float(np.linalg.norm(origin.points_enu([Point(anchor[1].latitude_deg, anchor[1].longitude_deg)])))
-    if away > MAX_SITE_DISTANCE_M >= _swapped_m(origin, anchor[1]):
+    if away > MAX_SITE_DISTANCE_M >= swapped_m(origin, anchor[1]):
         yield Finding(
             None, "mission.swapped-axes",
             f"the mission is {away / 1000:.0f} km away from the machine's site; {SWAPPED_HINT}",

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.arm_kinematics import STOP_MARGIN, ArmKinematics
+from autonomy.motion.arm_kinematics import LEVEL, STOP_MARGIN, ArmKinematics
 from autonomy.motion.pose import Pose
 from autonomy.motion.telescope import fastest_extension
 from machine.geometry.kinematics import Unreachable
@@ -27,35 +27,39 @@ directions."""
 
 
 class Arm(ArmKinematics):
-    """One machine with a load [kg] in its grapple, prepared for planning.
+    """One machine with a load [kg] in its grapple, prepared for planning; ``slope`` as in `ArmKinematics`.
 
     ``free_telescope``: `pose_above` chooses the extension from which the crane gets over the bunk fastest; otherwise it
     works like `compact_pose_above`.
     """
 
-    def __init__(self, profile: Profile, load_kg: float = 0.0, free_telescope: bool = True) -> None:
-        super().__init__(profile, load_kg)
+    def __init__(
+        self, profile: Profile, load_kg: float = 0.0, free_telescope: bool = True, slope: tuple[float, float] = LEVEL
+    ) -> None:
+        super().__init__(profile, load_kg, slope)
         self._free_telescope = free_telescope
         self._extension_cache: dict[tuple[int, int, int], float | None] = {}
 
     def loaded(self, load_kg: float) -> Arm:
         """The same machine with another load."""
-        return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope)
+        return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope, self.slope)
 
     def pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
-        """The pose above a point at ``low_z_m`` whose extension also serves at ``high_z_m``; rotator at 0.
+        """The pose with the jaws above a point, the pin at ``low_z_m``, whose extension also serves at ``high_z_m``;
+        rotator at 0.
 
         Raises:
             Unreachable: the point is out of reach at one of the heights.
         """
+        x, y = x - self._aside_m[0], y - self._aside_m[1]
         if not self._free_telescope:
-            return self.compact_pose_above(x, y, low_z_m, high_z_m)
+            return self._compact_pose(x, y, low_z_m, high_z_m)
         try:
             return self._pose_with_extension(
                 x, y, low_z_m, high_z_m, self._fastest_extension(hypot(x, y), low_z_m, high_z_m)
             )
         except Unreachable:
-            return self.compact_pose_above(x, y, low_z_m, high_z_m)
+            return self._compact_pose(x, y, low_z_m, high_z_m)
 
     def compact_pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
         """The same with the telescope out only as far as leaves the arm speed in all directions there.
@@ -63,6 +67,10 @@ class Arm(ArmKinematics):
         Raises:
             Unreachable: the point is out of reach at one of the heights.
         """
+        return self._compact_pose(x - self._aside_m[0], y - self._aside_m[1], low_z_m, high_z_m)
+
+    def _compact_pose(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
+        """The pose with the pin above a point."""
         r = hypot(x, y) - self._kin.a1_m
         stretch = max(hypot(r, z - self._kin.d1_m) for z in (low_z_m, high_z_m)) / DEXTEROUS_STRETCH
         return self._pose_with_extension(x, y, low_z_m, high_z_m, stretch - self._kin.a2_m - self._kin.d4_m)

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from autonomy.motion.pose import Pose
+from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.geometry.kinematics import Unreachable
 from machine.geometry.sag import AIM_TOLERANCE_M, FOOT_SHARE, GRAVITY_M_S2, MAX_AIM_ITERATIONS, aim, true_pin
 from machine.joints import JOINTS, Joint
@@ -36,11 +37,29 @@ STOP_ROUNDING: Final = 1e-9
 """Rounding tolerance of a joint at its stop."""
 
 
-class ArmKinematics:
-    """Kinematics and limits of one machine with a load [kg] in its grapple."""
+LEVEL: Final = (0.0, 0.0)
 
-    def __init__(self, profile: Profile, load_kg: float = 0.0) -> None:
-        self.profile, self.load_kg = profile, load_kg
+
+def slope_of(rotation: np.ndarray) -> tuple[float, float]:
+    """How far what hangs from the pin is beside it, along the base's x and y, per metre below it [m/m].
+
+    ``rotation`` (3, 3) turns the base's vectors into the level frame, z up.
+    """
+    x, y, z = rotation[2].tolist()
+    return -x / z, -y / z
+
+
+class ArmKinematics:
+    """Kinematics and limits of one machine with a load [kg] in its grapple.
+
+    ``slope``: where the machine does not stand level, what hangs from the pin is beside it, by this much per metre
+    below it along the base's x and y (`slope_of`).
+    """
+
+    def __init__(self, profile: Profile, load_kg: float = 0.0, slope: tuple[float, float] = LEVEL) -> None:
+        self.profile, self.load_kg, self.slope = profile, load_kg, slope
+        below_m = lowest_tip_below_pin_m(profile.grapple.jaws)
+        self._aside_m = slope[0] * below_m, slope[1] * below_m
         self._kin = profile.kinematics
         self._limits = joint_limits(profile)
         specs = [profile.joints[j.name.lower()] for j in JOINTS]
@@ -65,9 +84,9 @@ class ArmKinematics:
         return Pose(q[Joint.SLEW], hypot(x, y), z, q[Joint.EXT], q[Joint.ROT])
 
     def xy(self, pose: Pose) -> tuple[float, float]:
-        """Horizontal position of the pin in the base frame, m."""
-        theta = pose.slew_rad + self._kin.theta1_offset_rad
-        return pose.r_m * cos(theta), pose.r_m * sin(theta)
+        """Horizontal position of the jaws below a pose of the pin in the base frame, m."""
+        theta, (x, y) = pose.slew_rad + self._kin.theta1_offset_rad, self._aside_m
+        return pose.r_m * cos(theta) + x, pose.r_m * sin(theta) + y
 
     def joints(self, poses: np.ndarray) -> np.ndarray:
         """Joint vectors (n, 5) of poses (n, 5), with the sag compensated.

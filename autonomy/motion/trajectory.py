@@ -90,15 +90,21 @@ def _sampled_trajectory(position: np.ndarray) -> Trajectory:
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in curve(curve.x, 1).tolist()])
 
 
-def with_rotation(motion: Trajectory, from_s: float, by_rad: float) -> Trajectory:
-    """The motion with the rotator turned by ``by_rad`` more between a time and its end."""
+def with_rotation(arm: Arm, motion: Trajectory, from_s: float, by_rad: float) -> Trajectory | None:
+    """The motion with the rotator turned by ``by_rad`` more between a time and its end; None where the rest of it is
+    too short for that.
+    """
     position, velocity = np.array(motion.position), np.array(motion.velocity)
     span_s = motion.duration_s - from_s
+    if span_s < float(np.sqrt(_MAX_CURVATURE * abs(by_rad) / arm.acceleration[Joint.ROT])) or span_s <= 0.0:
+        return None
     time = (np.arange(len(position)) * STEP_S - from_s) / span_s
     done = smooth_progress(time)
     position[:, Joint.ROT] += by_rad * done
     t = np.clip(time, 0.0, 1.0)
     velocity[:, Joint.ROT] += by_rad * 140.0 * t**3 * (1.0 - t) ** 3 / span_s
+    if np.max(np.abs(velocity[:, Joint.ROT])) > arm.speed[Joint.ROT]:
+        return None
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in velocity.tolist()])
 
 
@@ -279,6 +285,15 @@ def slow_line(arm: Arm, start: Pose, goal: Pose, least_s: float) -> Trajectory:
         return arm.joints(first + smooth_progress(time / duration_s)[:, None] * delta)
 
     return within_limits(arm, sampled, least_s)
+
+
+def joined(*motions: Trajectory) -> Trajectory:
+    """Motions one after the other, each from where the one before ends, at rest between them."""
+    position, velocity = list(motions[0].position), list(motions[0].velocity)
+    for motion in motions[1:]:
+        position += motion.position[1:]
+        velocity += motion.velocity[1:]
+    return Trajectory(position, velocity)
 
 
 def follow_path(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:

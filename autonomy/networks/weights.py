@@ -27,8 +27,10 @@ class WeightsError(CodedError, ValueError):
     """A weight file that cannot be used."""
 
 
-def save(path: Path, network: Network, arrays: Mapping[str, np.ndarray], facts: Mapping[str, str]) -> None:
-    """Write a weight file atomically.
+def save(
+    path: Path, network: Network, arrays: Mapping[str, np.ndarray], facts: Mapping[str, str], half: bool = False
+) -> None:
+    """Write a weight file atomically; ``half`` rounds convolutions to float16, which halves the file.
 
     Raises:
         NetworkError: the arrays are not the network's.
@@ -39,6 +41,8 @@ def save(path: Path, network: Network, arrays: Mapping[str, np.ndarray], facts: 
             "network.bad-arrays", f"names or shapes of the arrays are not those of network {network.name}"
         )
     whole = {name: np.ascontiguousarray(arrays[name], np.float32) for name in shapes}
+    if half:
+        whole = {name: a.astype(np.float16) if a.ndim == 4 else a for name, a in whole.items()}
     own = {"network": network.name, "fingerprint": fingerprint(network), "digest": _digest(whole)}
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
@@ -74,7 +78,7 @@ def load(path: Path, network: Network) -> tuple[dict[str, np.ndarray], dict[str,
         raise WeightsError("weights.changed", f"{path}: its arrays were changed; fetch or train it again")
     if not all(np.isfinite(a).all() for a in arrays.values()):
         raise WeightsError("weights.not-finite", f"{path}: some values are not finite; train it again")
-    return arrays, facts
+    return {name: a.astype(np.float32, copy=False) for name, a in arrays.items()}, facts
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:

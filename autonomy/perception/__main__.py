@@ -2,9 +2,12 @@
 
 ``python -m autonomy.perception --profile palms_471 --camera stick --frames 127.0.0.1:47004 --port 47003``
 
+With ``--driving`` the camera looks ahead of a machine that drives (`autonomy.perception.driving_requests`).
+
 The process answers requests for logs (``autonomy.perception.log_list.datagrams``) over UDP on the loopback interface.
-Each request with joints triggers a detection; as long as there is no new result, there is no reply.  A request without
-joints, as from a page that only displays logs, gets the last list.  ``--frames`` is the address of a server of frames
+A request with joints triggers a detection, of several that wait the newest one; as long as there is no new result,
+there is no reply.  A request without joints, as from a page that only displays logs, gets the last list, and a request
+for a picture the last measured one (``can_dbc.messages.picture``).  ``--frames`` is the address of a server of frames
 (``can_dbc.messages.rgbd``), ``zed`` for a Stereolabs camera on this computer, or a folder of frames.
 
 JSON lines on stdout: ``ready`` with the port, ``trouble`` with its reason.  SIGTERM and SIGINT end the process.
@@ -15,29 +18,47 @@ from __future__ import annotations
 
 import argparse
 import os
-import select
 import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from autonomy.networks.weights import WeightsError
+from autonomy.perception.driving_log_detector import (
+    CylinderLocalizer,
+    DrivingLogDetector,
+    LogLocalizer,
+    PaperBLocalizer,
+)
+from autonomy.perception.driving_requests import DrivingRequests, asked_ns
 from autonomy.perception.log_detector import LogDetector
-from autonomy.perception.log_list.datagrams import LogListError, decode_request, encode_error, encode_logs
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
+from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter
+from autonomy.perception.shown_picture import MeasuredPicture, NewestPicture
 from autonomy.perception.sources.camera_source import CameraSource, SourceError
+from autonomy.perception.standing_requests import StandingRequests
+from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
+from machine.geometry.optics import Intrinsics
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
 from runtime.allocator import keep_memory
 
 EXIT_OK, EXIT_CONFIGURATION, EXIT_PORT = 0, 3, 4
 FRAME_TIMEOUT_S: Final = 0.5
-POLL_S: Final = 0.2
-MAX_REQUEST_BYTES: Final = 2048
+FRAME_PX: Final = 608
+"""Size of paper B's pictures."""
+LOCALIZERS: Final[dict[str, Callable[[Profile], LogLocalizer]]] = {
+    "ours": lambda profile: CylinderLocalizer(profile, SURVEYED_BY_GNSS),
+    "paper-b": lambda profile: PaperBLocalizer(),
+}
+"""Methods with a surveyed camera and a position from the receiver."""
 
 
 def open_source(address: str, camera: str, profile: Profile) -> CameraSource:
@@ -59,31 +80,26 @@ def open_source(address: str, camera: str, profile: Profile) -> CameraSource:
     return StreamCamera(address, camera, FRAME_TIMEOUT_S)
 
 
-def serve(detector: LogDetector, link: socket.socket, signals: list[int]) -> None:
-    """Reply to requests until a signal arrives."""
-    reported = ""
-    while not signals:
-        if not select.select([link], [], [], POLL_S)[0]:
-            continue
-        data, sender = link.recvfrom(MAX_REQUEST_BYTES)
-        try:
-            q = decode_request(data)
-        except LogListError as error:
-            link.sendto(encode_error(str(error)), sender)
-            continue
-        has_joints = any(value == value for value in q)
-        logs = detector.detect(q, time.monotonic_ns()) if has_joints else detector.logs
-        if logs is not None:
-            link.sendto(encode_logs(logs), sender)
-        if detector.problem and detector.problem != reported:
-            write_line(event="trouble", reason=detector.problem)
-        reported = detector.problem
+def warm_up(segmenter: LogSegmenter | MaskSegmenter) -> None:
+    """Segment a grey picture, so that the network is compiled before the machine drives."""
+    grey = np.full((FRAME_PX, FRAME_PX, 3), 96, np.uint8)
+    pinhole = Intrinsics(FRAME_PX, FRAME_PX, FRAME_PX, FRAME_PX, 0.5 * FRAME_PX, 0.5 * FRAME_PX)
+    segmenter.segment_picture(grey, np.full((FRAME_PX, FRAME_PX), 5.0, np.float32), pinhole)
+
+
+def write_trouble(reason: str) -> None:
+    """Say why there are no logs."""
+    write_line(event="trouble", reason=reason)
 
 
 def write_line(**fields: object) -> None:
     """Write one JSON line to stdout."""
     sys.stdout.write(msgspec.json.encode(fields).decode() + "\n")
     sys.stdout.flush()
+
+
+MASKS: Final = {"masks": "rgbd", "masks-depth": "depth", "masks-colour": "colour"}
+"""Variants of the mask network by their mode: for looks that the drawn pictures do not have."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -95,7 +111,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--camera", required=True, help="name of the camera in the profile")
     parser.add_argument("--frames", required=True, metavar="HOST:PORT|zed|FOLDER", help="source of the pictures")
     parser.add_argument("--port", type=int, default=0, help="UDP port of the log list (default: any free port)")
-    parser.add_argument("--variant", choices=("rgbd", "depth"), default="rgbd", help="input of the network")
+    parser.add_argument("--variant", choices=("rgbd", "depth", *MASKS), default="rgbd", help="network and its input")
+    parser.add_argument("--driving", action="store_true", help="the machine drives, and its planner says where it is")
+    parser.add_argument("--localizer", choices=LOCALIZERS, default="ours", help="with --driving: how masks become logs")
     parser.add_argument("--weights", type=Path, help="weights of the network (default: the shipped weights)")
     options = parser.parse_args(argv)
     keep_memory()
@@ -104,10 +122,16 @@ def main(argv: list[str] | None = None) -> int:
         if options.camera not in profile.cameras:
             known = ", ".join(profile.cameras) or "none"
             return _fail(f"{profile.name} has no camera {options.camera!r}; it has: {known}")
-        segmenter = LogSegmenter(options.variant, options.weights)
+        segmenter: LogSegmenter | MaskSegmenter
+        if options.variant in MASKS:
+            segmenter = MaskSegmenter(MASKS[options.variant], options.weights)
+        else:
+            segmenter = LogSegmenter(options.variant, options.weights)
         source = open_source(options.frames, options.camera, profile)
     except (ProfileError, WeightsError, SourceError) as error:
         return _fail(str(error))
+    warm_up(segmenter)
+    segment = segmenter.segment
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
@@ -117,8 +141,19 @@ def main(argv: list[str] | None = None) -> int:
         except (OSError, OverflowError) as error:
             return _fail(f"UDP port {options.port} cannot be opened ({error}); choose another port", EXIT_PORT)
         write_line(ready=link.getsockname()[1], camera=options.camera)
+        pictures = NewestPicture(options.camera)
+
+        def measured(picture: MeasuredPicture) -> None:
+            pictures.keep(picture, time.monotonic_ns())
+
         try:
-            serve(LogDetector(profile, options.camera, source, segmenter.segment), link, signals)
+            if options.driving:
+                localizer = LOCALIZERS[options.localizer](profile)
+                detector = DrivingLogDetector(profile, options.camera, source, segment, localizer, measured)
+                DrivingRequests(detector, link, partial(asked_ns, source), write_trouble, pictures).serve(signals)
+            else:
+                still = LogDetector(profile, options.camera, source, segment, measured)
+                StandingRequests(still, link, write_trouble, pictures).serve(signals)
         finally:
             source.close()
     return EXIT_OK

@@ -21,6 +21,7 @@ from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.papers.paper_a import log_from_mask
 from autonomy.perception.papers.paper_b import position_in_box
 from autonomy.perception.pipeline import Perception
+from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource, SourceError
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors
 from machine.profile import Profile
@@ -110,19 +111,26 @@ _PAPER_B_COVARIANCE: Final = tuple(np.diag(np.square(_PAPER_B_SIGMAS))[np.triu_i
 class DrivingLogDetector:
     """One camera of a machine that drives.
 
-    ``segment`` returns the masks of the logs in a frame.  ``problem`` says why the last call of ``detect`` returned no
-    logs; it is empty when the call succeeded.
+    ``segment`` returns the masks of the logs in a frame; ``measured`` gets every picture that was measured.
+    ``problem`` says why the last call of ``detect`` returned no logs; it is empty when the call succeeded.
 
     Raises:
         KeyError: the machine has no such camera.
     """
 
     def __init__(
-        self, profile: Profile, camera: str, source: CameraSource, segment: Segmentation, localizer: LogLocalizer
+        self,
+        profile: Profile,
+        camera: str,
+        source: CameraSource,
+        segment: Segmentation,
+        localizer: LogLocalizer,
+        measured: Callable[[MeasuredPicture], None] = ignore_picture,
     ) -> None:
         self.problem = ""
         self._profile, self._camera = profile, profile.cameras[camera]
         self._source, self._segment, self._localizer = source, segment, localizer
+        self._measured = measured
 
     def detect(self, base: Pose, q: Sequence[float], articulation_rad: float) -> tuple[LogObservation, ...] | None:
         """The logs of a new picture in the crane's base frame; None when there is no usable picture.
@@ -130,13 +138,28 @@ class DrivingLogDetector:
         ``base`` is that frame in the plane, ``q`` the joints in ``Joint`` order [rad, m], both at the time of the
         picture.
         """
+        logs = self.detect_in_plane(lambda: (base, articulation_rad), q)
+        return None if logs is None else tuple(in_base(o, base) for o in logs)
+
+    def detect_in_plane(
+        self, standing: Callable[[], tuple[Pose, float] | None], q: Sequence[float]
+    ) -> tuple[LogObservation, ...] | None:
+        """The logs of a new picture in the plane; None when there is no usable picture.
+
+        ``standing`` is called after the picture and returns base and articulation at its time, None when unknown.
+        """
         self.problem = ""
         try:
-            mount = optical_pose(self._profile, self._camera, q, articulation_rad)
             frame = self._source.frame()
             if frame is None:
                 self.problem = getattr(self._source, "problem", "") or "the camera delivers no picture"
                 return None
+            stood = standing()
+            if stood is None:
+                self.problem = "the planner says too seldom where the machine is; this computer is too busy"
+                return None
+            base, articulation_rad = stood
+            mount = optical_pose(self._profile, self._camera, q, articulation_rad)
             frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
             masks = [one for one in self._segment(frame) if one.score >= MIN_SCORE]
@@ -144,11 +167,12 @@ class DrivingLogDetector:
         except (SourceError, RgbdFrameError, CameraMountError) as error:
             self.problem = str(error)
             return None
-        near = [o for o in logs if np.linalg.norm(np.asarray(o.center_m) - pose.position_m) < MAX_RANGE_M]
-        return tuple(_in_base(o, base) for o in near)
+        near = tuple(o for o in logs if np.linalg.norm(np.asarray(o.center_m) - pose.position_m) < MAX_RANGE_M)
+        self._measured(MeasuredPicture(frame, mount, masks, [in_base(o, base) for o in near]))
+        return near
 
 
-def _in_base(o: LogObservation, base: Pose) -> LogObservation:
+def in_base(o: LogObservation, base: Pose) -> LogObservation:
     """From the plane into the base frame; the covariance refers to the axis and turns with it."""
     x, y, z = base.to_optical(np.asarray(o.center_m)).tolist()
     ax, ay, az = (np.asarray(o.axis) @ base.rotation).tolist()

@@ -16,6 +16,7 @@ from autonomy.perception.camera.mount import CameraMountError, optical_pose
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.pipeline import Perception
+from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource, SourceError
 from machine.joints import N_JOINTS
 from machine.profile import Profile
@@ -29,37 +30,45 @@ MAX_REQUEST_GAP_NS: Final = 1_000_000_000
 class LogDetector:
     """One camera of a machine.
 
-    ``segment`` returns the masks of the logs in a frame.  ``problem`` says why the last call of ``detect`` returned no
-    logs; it is empty when the call succeeded or the crane was moving.
+    ``segment`` returns the masks of the logs in a frame; ``measured`` gets every picture that was measured.
+    ``problem`` says why the last call of ``detect`` returned no logs; it is empty when the call succeeded or the crane
+    was moving.
 
     Raises:
         KeyError: the machine has no such camera.
     """
 
     def __init__(
-        self, profile: Profile, camera: str, source: CameraSource, segment: Callable[[RgbdFrame], Sequence[Masked]]
+        self,
+        profile: Profile,
+        camera: str,
+        source: CameraSource,
+        segment: Callable[[RgbdFrame], Sequence[Masked]],
+        measured: Callable[[MeasuredPicture], None] = ignore_picture,
     ) -> None:
         self.problem = ""
         self.logs: tuple[LogObservation, ...] = ()
         """Result of the last successful detection."""
         self._profile, self._camera = profile, profile.cameras[camera]
-        self._source, self._segment = source, segment
+        self._source, self._segment, self._measured = source, segment, measured
         self._perception = Perception(profile)
         self._last_q = np.full(N_JOINTS, np.nan)
         self._last_request_ns = 0
+
+    def rests(self, q: Sequence[float], now_ns: int) -> bool:
+        """Whether the crane rests: its joints ``q`` at ``now_ns`` are those of the last call, not long ago."""
+        at = np.array(q, float)
+        moved = np.abs(at - self._last_q)
+        recent = now_ns - self._last_request_ns < MAX_REQUEST_GAP_NS
+        self._last_q, self._last_request_ns = at, now_ns
+        return recent and bool(np.all(moved[np.isfinite(at)] < REST_TOLERANCE))
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
         """The logs in the base frame from a picture that is newer than the request; None when there is none.
 
         ``q`` are the joints in ``Joint`` order [rad, m] at ``now_ns``, NaN where there is no encoder.
         """
-        at = np.array(q, float)
-        moved = np.abs(at - self._last_q)
-        at_rest = now_ns - self._last_request_ns < MAX_REQUEST_GAP_NS and bool(
-            np.all(moved[np.isfinite(at)] < REST_TOLERANCE)
-        )
-        self._last_q, self._last_request_ns = at, now_ns
-        if not at_rest:
+        if not self.rests(q, now_ns):
             self.problem = ""
             return None
         try:
@@ -72,10 +81,12 @@ class LogDetector:
                 self.problem = getattr(self._source, "problem", "") or "the camera delivers no picture"
                 return None
             frame = rescaled(frame, self._camera.depth_scale)
-            tracks = self._perception.step(frame, pose, self._segment(frame))
+            masks = self._segment(frame)
+            tracks = self._perception.step(frame, pose, masks)
         except (SourceError, RgbdFrameError, CameraMountError) as error:
             self.problem = str(error)
             return None
         self.problem = ""
         self.logs = tuple(t.estimate.observation(t.id, t.last_seen_ns == frame.stamp_ns) for t in tracks)
+        self._measured(MeasuredPicture(frame, pose, masks, self.logs))
         return self.logs

@@ -20,10 +20,19 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--scene", type=address_argument, required=True, help="HOST:PORT of the log detector")
     parser.add_argument("--log", type=int, help="number of the log to pick (default: the best one)")
     parser.add_argument("--mission", type=Path, help="mission file to execute, in any format of `timberhand plan`")
+    parser.add_argument("--missions", type=Path, metavar="DIR", help="wait for a mission of this folder to be uploaded")
     parser.add_argument("--progress", type=Path, help="checkpoint file of the mission, from which it is resumed")
     parser.add_argument("--manager", choices=TABLES, default="ours", help="transition table of the activity manager")
     parser.add_argument(
-        "--tell", type=address_argument, action="append", default=[], help="HOST:PORT that receives mission reports"
+        "--memory", action="store_true",
+        help="the detector's camera looks ahead of the driving machine, and the crane works from memory",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tell",
+        type=address_argument,
+        action="append",
+        default=[],
+        help="HOST:PORT that receives mission reports",
     )
     parser.add_argument("--order-port", type=int, help="local UDP port for operator commands to the mission")
     parser.add_argument("--lease-ms", type=int, default=200, help="validity of a setpoint")
@@ -31,4 +40,8 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     options = parser.parse_args(argv)
     if options.progress is not None and (options.mission is None or options.order_port is None):
         parser.error("--progress needs --mission and --order-port: a resumed mission waits for the command Auto")
+    if options.missions is not None and (options.mission is not None or options.order_port is None):
+        parser.error("--missions needs --order-port and no --mission: it waits for an upload")
+    if options.memory and ((options.mission or options.missions) is None or options.progress is not None):
+        parser.error("--memory needs --mission, and cannot resume one: what lies in the bunk is only remembered")
     return options

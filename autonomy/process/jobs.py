@@ -18,13 +18,19 @@ from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.checkpoint import Checkpoint
 from autonomy.manager.transition_table import FINAL_STATES, State
 from autonomy.missions.model import ForwardingMission
+from autonomy.perception.driving_log_detector import in_base
 from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.standpoint import Standpoint
+from autonomy.process.grasp_publisher import chosen_grasp
 from autonomy.process.mission_publisher import MissionPublisher
 from can_dbc.messages.crane import StateReport
+from can_dbc.messages.grasp import ChosenGrasp
 from can_dbc.messages.mission import MissionAction, MissionCommand, MissionReport
 from can_dbc.messages.vehicle import VehicleReport
 
 JobEvent = tuple[str, Mapping[str, Any]]
+MAX_TOLD: Final = 3
+"""Remarks on the load in one event: the newest."""
 STOPPING_TIMEOUT_NS: Final = 5_000_000_000
 """After its end a mission keeps sending stop setpoints until the machine stands, at most for this long."""
 
@@ -51,10 +57,21 @@ class Job(Protocol):
     def failure(self) -> str | None:
         """Why the job has failed, None otherwise."""
 
+    @property
+    def begun(self) -> bool:
+        """Whether the job must not be replaced by another."""
+
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
         """One step; call it at 20 Hz or faster."""
+
+    @property
+    def drives(self) -> bool:
+        """Whether the detector's camera looks ahead of a machine that drives: its lists are in the plane."""
+
+    def standpoint(self, now_ns: int) -> Standpoint | None:
+        """Of such a job: where the next picture is taken, None while none is wanted."""
 
     def abort(self, reason: str) -> None:
         """Fail the job; the machine stops smoothly."""
@@ -71,12 +88,17 @@ class Job(Protocol):
     def report(self, now_ns: int) -> MissionReport | None:
         """The mission report, None without a mission."""
 
+    def chosen_grasp(self) -> ChosenGrasp | None:
+        """The grasp that the crane is about to make, None at other times."""
+
     def progress(self) -> Checkpoint | None:
         """The checkpoint from which the job can be resumed, None if it cannot."""
 
 
 class SingleLogJob:
     """One crane job: a single log."""
+
+    begun = True
 
     def __init__(self, activity: Activity) -> None:
         self._activity = activity
@@ -103,6 +125,15 @@ class SingleLogJob:
         data = self._activity.step(now_ns, report, logs)
         return [] if data is None else [data]
 
+    @property
+    def drives(self) -> bool:
+        """The machine stands."""
+        return False
+
+    def standpoint(self, now_ns: int) -> Standpoint | None:
+        """None: the crane's joints say where its camera is."""
+        return None
+
     def abort(self, reason: str) -> None:
         """Fail the activity; the crane stops smoothly."""
         self._activity.abort(reason)
@@ -127,21 +158,25 @@ class SingleLogJob:
         """None: there is no mission."""
         return None
 
+    def chosen_grasp(self) -> ChosenGrasp | None:
+        """The grasp of the activity."""
+        return chosen_grasp(self._activity)
+
     def progress(self) -> Checkpoint | None:
         """None: the job starts over with a new detection."""
         return None
 
 
 class ForwardingJob:
-    """A mission as a job.  Its mode switch starts at Auto, for a resumed mission at Idle, because the machine may have
-    been changed in the meantime.
+    """A mission as a job.  Its mode switch starts at Auto, but at Idle for a resumed mission, because the machine may
+    have been changed in the meantime, and without ``begin``.  ``begun`` says whether it was ever at Auto.
     """
 
-    def __init__(self, manager: ActivityManager, mission: ForwardingMission) -> None:
+    def __init__(self, manager: ActivityManager, mission: ForwardingMission, begin: bool = True) -> None:
         self._manager = manager
         self._ended_ns = self._now_ns = 0
         self._publisher = MissionPublisher(manager, mission)
-        self._auto = not manager.resumed
+        self._auto = self.begun = begin and not manager.resumed
         self._command, self._refusal = 0, ""
         if self._auto:
             manager.auto()
@@ -168,22 +203,43 @@ class ForwardingJob:
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
-        """One step of the manager."""
+        """One step of the manager; with memory the logs are in the plane."""
         self._now_ns = now_ns
+        if self.drives and logs:
+            logs = self._in_base(now_ns, logs)
         sent = self._manager.step(now_ns, report, vehicle, logs)
         if self._manager.state not in FINAL_STATES:
             self._ended_ns = now_ns
         return sent
+
+    @property
+    def drives(self) -> bool:
+        """Whether the crane works from memory of what a camera ahead has seen."""
+        return self._manager.log_memory is not None
+
+    def standpoint(self, now_ns: int) -> Standpoint | None:
+        """Where the next picture is taken."""
+        return self._manager.standpoint(now_ns)
+
+    def _in_base(self, now_ns: int, logs: tuple[LogObservation, ...]) -> tuple[LogObservation, ...]:
+        """A list that was asked for while the machine drove; one that comes when the crane works already is dropped,
+        because a log in the grapple does not lie on the ground."""
+        if self.standpoint(now_ns) is None:
+            return ()
+        base = self._manager.world.base_at(now_ns)
+        return tuple(in_base(log, base) for log in logs)
 
     def abort(self, reason: str) -> None:
         """Fail the mission; crane and machine stop smoothly."""
         self._manager.abort(reason)
 
     def events(self) -> Iterator[JobEvent]:
-        """State, load, grasp, crane phase and pause reason."""
+        """State, load, remarks on it, grasp, crane phase and pause reason."""
         manager, activity = self._manager, self._manager.activity
         yield "state", {"state": manager.state.name, "words": manager.description}
         yield "load", {"logs": manager.tally.loaded}
+        if remarks := manager.tally.remarks:
+            yield "remark", {"count": len(remarks), "texts": [remark.text for remark in remarks[-MAX_TOLD:]]}
         if activity is not None:
             yield from _crane_events(activity.grasp, activity.phase.name)
         yield _pause_event(manager.paused or None)
@@ -194,7 +250,7 @@ class ForwardingJob:
         given_up = [{"log": number, "reason": reason} for number, reason in tally.given_up.items()]
         return {
             "loaded": tally.loaded, "driven_m": round(self._manager.route.driven_m, 1), "given_up": given_up,
-            "loads": msgspec.to_builtins(tally.loads),
+            "loads": msgspec.to_builtins(tally.loads), "remarks": [remark.text for remark in tally.remarks],
         }  # fmt: skip
 
     def execute(self, command: MissionCommand) -> str:
@@ -208,7 +264,7 @@ class ForwardingJob:
             return MISSION_ENDED
         match action:
             case MissionAction.AUTO:
-                self._auto = True
+                self._auto = self.begun = True
                 manager.auto()
             case MissionAction.PAUSE:
                 self._auto = False
@@ -228,6 +284,10 @@ class ForwardingJob:
     def report(self, now_ns: int) -> MissionReport:
         """The mission report."""
         return self._publisher.report(now_ns, self._auto, self._command, self._refusal)
+
+    def chosen_grasp(self) -> ChosenGrasp | None:
+        """The grasp of the present crane job."""
+        return chosen_grasp(self._manager.activity)
 
     def progress(self) -> Checkpoint:
         """The checkpoint of the mission."""

@@ -63,15 +63,15 @@ class MissionPublisher:
 
     def __init__(self, manager: ActivityManager, mission: ForwardingMission) -> None:
         self._manager = manager
-        self._name = _text(mission.name)
+        self._name = short_text(mission.name)
         self._route = tuple(map(_place, _thinned(mission.waypoints, MAX_ROUTE_POINTS)))
         self._closed = mission.options.laps > 1
         fences = mission.fences[:MAX_FENCES]
         share = MAX_CORNERS // max(1, len(fences))
         self._fences = tuple(
-            Fence(tuple(map(_place, _thinned(f.corners, share))), f.keep_out, _text(f.name)) for f in fences
+            Fence(tuple(map(_place, _thinned(f.corners, share))), f.keep_out, short_text(f.name)) for f in fences
         )
-        self._landings = tuple(Landing(_place(x.position), _text(x.name)) for x in mission.landings[:MAX_LANDINGS])
+        self._landings = tuple(Landing(_place(x.position), short_text(x.name)) for x in mission.landings[:MAX_LANDINGS])
 
     def report(self, now_ns: int, auto: bool, order: int = 0, refusal: str = "") -> MissionReport:
         """The report; ``auto`` is the mode switch, ``order`` and ``refusal`` are those of the last command."""
@@ -82,21 +82,21 @@ class MissionPublisher:
             schema=1,
             name=self._name,
             state=manager.state.name,
-            words=_text(manager.description),
+            words=short_text(manager.description),
             ended=manager.state in FINAL_STATES,
             auto=auto,
             single_step=manager.single_step,
-            paused="" if manager.state in FINAL_STATES else _text(manager.paused),
+            paused="" if manager.state in FINAL_STATES else short_text(manager.paused),
             waits_for="" if manager.pending_event is None else EVENT_DESCRIPTIONS[manager.pending_event],
-            failure=_text(manager.failure),
+            failure=short_text(manager.failure),
             order=order,
-            refusal=_text(refusal),
+            refusal=short_text(refusal),
             loaded=tally.loaded,
             on_board=tally.on_board,
             on_board_m3=round(tally.board_m3, 3),
             unloaded=tally.unloaded,
             missed=tally.missed,
-            given_up=tuple(AbandonedLog(number, _text(reason)) for number, reason in given_up),
+            given_up=tuple(AbandonedLog(number, short_text(reason)) for number, reason in given_up),
             driven_m=round(manager.route.driven_m, 1),
             targets=self._targets(),
             crane="" if activity is None else CRANE_PHASES[activity.phase],
@@ -172,7 +172,7 @@ def _degrees(plane: LocalPlane, points: Sequence[Sequence[float] | np.ndarray]) 
     ]
 
 
-def _text(text: str) -> str:
+def short_text(text: str) -> str:
     """The text limited to the field's bytes; unprintable characters become spaces."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     if len(plain.encode()) <= MAX_TEXT_CHARS:

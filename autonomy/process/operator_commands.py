@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.envelope import DatagramRefused, Kind, kind_of
 from can_dbc.messages.mission import MissionCommand, decode_mission_command
+from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload
 from runtime.errors import CodedError
 
 MAX_AGE_NS: Final = 1_000_000_000
@@ -27,14 +28,15 @@ class CommandReceiver:
         self._hash, self._key = profile_hash, key
         self._last = (-1, -1)
 
-    def accept(self, data: bytes, now_ns: int) -> MissionCommand:
-        """The command in a datagram.
+    def accept(self, data: bytes, now_ns: int) -> MissionCommand | MissionUpload:
+        """The command or upload in a datagram.
 
         Raises:
             CommandRefused: it is not accepted and must not be executed.
         """
         try:
-            command = decode_mission_command(data, self._key)
+            decode = decode_mission_upload if kind_of(data) == Kind.UPLOAD else decode_mission_command
+            command: MissionCommand | MissionUpload = decode(data, self._key)
         except DatagramRefused as error:
             raise CommandRefused("command.datagram", str(error)) from None
         if command.profile_hash != self._hash:

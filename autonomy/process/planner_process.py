@@ -1,4 +1,5 @@
-"""The sockets round a job: receives reports, log lists and operator commands; sends setpoints and mission reports.
+"""The sockets round a job: receives reports, log lists and operator commands; sends setpoints, mission reports and the
+chosen grasp.
 
 `PlannerProcess.run` steps the job at 100 Hz or faster until it is idle.  A detector or controller that does not listen
 is not an error; a checkpoint that cannot be written is emitted as an event and does not stop the machine.
@@ -13,19 +14,26 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from typing import Any, Final
+
+import msgspec
 
 from autonomy.manager.checkpoint_file import CheckpointFile
+from autonomy.missions.model import MissionError
 from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.process.command_line import Address
 from autonomy.process.event_output import emit
 from autonomy.process.jobs import Job
+from autonomy.process.mission_publisher import short_text
 from autonomy.process.operator_commands import CommandReceiver, CommandRefused
+from autonomy.process.upload import MachineAtRest, UploadedMissions, UploadRefused
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.grasp import encode_grasp
 from can_dbc.messages.mission import encode_mission
+from can_dbc.messages.mission_upload import MissionUpload
 from can_dbc.messages.vehicle import VehicleReport
 from machine.status.modes import Mode
 
@@ -38,9 +46,15 @@ NOT_PAUSED: Final = {"reason": None}
 
 
 class PlannerProcess:
-    """Runs one job.  ``signals`` are the signals received, ``foreign`` whether the controller has another profile."""
+    """Runs one job.  ``signals`` are the signals received, ``foreign`` whether the controller has another profile.
 
-    def __init__(self, job: Job, profile_hash: int, options: argparse.Namespace, key: bytes | None = None) -> None:
+    ``uploads`` makes a job of an uploaded mission, None refuses it.
+    """
+
+    def __init__(
+        self, job: Job, profile_hash: int, options: argparse.Namespace, key: bytes | None = None,
+        uploads: UploadedMissions | None = None,
+    ) -> None:  # fmt: skip
         self._key = key
         self.signals: list[int] = []
         self.foreign = False
@@ -61,7 +75,8 @@ class PlannerProcess:
         for each in (self._link, self._detector, self._commands):
             each.setblocking(False)
         self._request_ns = self._report_ns = 0
-        self._mode = -1
+        self._uploads, self._machine = uploads, MachineAtRest()
+        self._answer: dict[str, Any] = {}
         self._joints: tuple[float, ...] = ()
         self._emitted: dict[str, object] = {}
 
@@ -71,9 +86,14 @@ class PlannerProcess:
             each.close()
 
     @property
+    def job(self) -> Job:
+        """The job: the first one, or that of the mission that was uploaded last."""
+        return self._job
+
+    @property
     def stopped(self) -> bool:
         """Whether the controller's last report was in STOP or FAULT."""
-        return self._mode in (Mode.STOP, Mode.FAULT)
+        return self._machine.mode in (Mode.STOP, Mode.FAULT)
 
     def run(self) -> None:
         """Step the job until it is idle."""
@@ -89,9 +109,12 @@ class PlannerProcess:
         """One step: request logs, receive, step the job, send, emit events, report."""
         if now_ns >= self._request_ns:
             self._request_ns = now_ns + REQUEST_PERIOD_NS
-            self._send(self._detector.send, encode_request(self._joints))
+            standpoint = self._job.standpoint(now_ns)
+            if standpoint is not None or not self._job.drives:
+                self._send(self._detector.send, encode_request(self._joints, standpoint))
         self._execute_commands(now_ns)
         (report, vehicle), logs = self._newest_reports(), self._newest_logs()
+        self._machine.on_reports(report, vehicle, now_ns)
         for data in self._job.step(now_ns, report, vehicle, logs):
             self._send(lambda d: self._link.sendto(d, self._controller), data)
         self._emit_changes(report)
@@ -127,18 +150,42 @@ class PlannerProcess:
             except CommandRefused as error:
                 emit("order", order=None, refused=str(error))
                 continue
+            self._report_ns = 0  # the operator sees the result at once
+            if isinstance(command, MissionUpload):
+                self._take(command, now_ns)
+                continue
+            self._answer = {}
             refused = self._job.execute(command)
             emit("order", order=command.action.name, refused=refused or None)
-            self._report_ns = 0  # the operator sees the result at once
+
+    def _take(self, upload: MissionUpload, now_ns: int) -> None:
+        """Take an uploaded mission, or refuse it and change nothing."""
+        code = refused = ""
+        try:
+            if self._uploads is None:
+                raise UploadRefused("upload.not-awaited", "this planner was started with its job, not with --missions")
+            if self._job.begun:
+                raise UploadRefused("upload.begun", "a mission has begun; abort it and start the planner anew")
+            self._machine.check(now_ns)
+            self._job = self._uploads.job(upload)
+        except (UploadRefused, MissionError) as error:
+            code, refused = error.code, short_text(str(error).partition("\n")[0])
+        self._answer = {"order": upload.sequence, "refusal": refused, "refusal_code": code}
+        emit("upload", name=upload.name, refused=refused or None, code=code or None)
 
     def _report_mission(self, now_ns: int) -> None:
-        report = self._job.report(now_ns) if self._watchers else None
-        if report is None:
+        if not self._watchers:
             return
         self._sequence += 1
-        data = encode_mission(report, self._sequence, self._hash, now_ns, self._key)
+        sent = []
+        if (grasp := self._job.chosen_grasp()) is not None:
+            sent.append(encode_grasp(grasp, self._sequence, self._hash, now_ns, self._key))
+        if (report := self._job.report(now_ns)) is not None:
+            report = msgspec.structs.replace(report, **self._answer)
+            sent.append(encode_mission(report, self._sequence, self._hash, now_ns, self._key))
         for watcher in self._watchers:
-            self._send(lambda d, to=watcher: self._link.sendto(d, to), data)  # type: ignore[misc]
+            for data in sent:
+                self._send(lambda d, to=watcher: self._link.sendto(d, to), data)  # type: ignore[misc]
 
     def _newest_reports(self) -> tuple[StateReport | None, VehicleReport | None]:
         newest, vehicle = None, None
@@ -155,14 +202,14 @@ class PlannerProcess:
             if isinstance(message, VehicleReport):
                 vehicle = message
             else:
-                newest, self._mode, self._joints = message, message.mode, message.position
+                newest, self._joints = message, message.position
         return newest, vehicle
 
     def _newest_logs(self) -> tuple[LogObservation, ...]:
         logs: tuple[LogObservation, ...] = ()
         for data in _received(self._detector):
             try:
-                logs = decode_logs(data)
+                logs = decode_logs(data, in_plane=self._job.drives)
             except LogListError as error:
                 if self._changed("detector", str(error)):
                     emit("detector", reason=str(error))

@@ -1,10 +1,11 @@
 """The log list's datagrams: a request for logs and the reply of a detector.
 
 The request is ``{"op":"logs","q":"..."}``.  ``q`` holds the joint positions [rad, m] in the order of ``Joint``, "nan"
-where a joint is not measured: a detector whose camera rides on the crane needs them.  The reply is
-``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame, or
-``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the list), ``covariance`` may be missing,
-and ``seen`` is false when the log is remembered from an earlier picture.
+where a joint is not measured: a detector whose camera rides on the crane needs them.  For a camera of a machine that
+drives, ``"at_ns"`` and ``"standpoint"`` say where the machine is in the plane (`autonomy.perception.standpoint`).  The
+reply is ``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame,
+``{"plane": [...]}`` in that plane, or ``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the
+list), ``covariance`` may be missing, and ``seen`` is false when the log is remembered from an earlier picture.
 
 A list is accepted or refused as a whole.  It is refused for a number that is not finite, an axis without length, a log
 that is wider than long (the cause of paper A's only real failures), a negative variance, or a number used twice.
@@ -14,11 +15,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import msgspec
 
 from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from autonomy.perception.standpoint import NUMBERS, Standpoint, from_numbers
 from machine.joints import N_JOINTS
 from runtime.errors import CodedError
 
@@ -41,26 +44,43 @@ class _Log(msgspec.Struct):
     seen: bool = True
 
 
-class _Error(msgspec.Struct, forbid_unknown_fields=True):
-    error: str
+class _Answer(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """One of the two."""
+
+    error: str | None = None
+    plane: list[_Log] | None = None
 
 
-class _Request(msgspec.Struct):
+class _Request(msgspec.Struct, omit_defaults=True):
     op: str
     q: str = ""
+    at_ns: str = ""
+    standpoint: str = ""
 
 
-_REPLIES: Final = msgspec.json.Decoder(list[_Log] | _Error)
+@dataclass(frozen=True, slots=True)
+class LogRequest:
+    """A request: joints [rad, m] in ``Joint`` order, NaN where unknown, and where a machine stands that drives."""
+
+    q: tuple[float, ...]
+    standpoint: Standpoint | None = None
+
+
+_REPLIES: Final = msgspec.json.Decoder(list[_Log] | _Answer)
 _REQUESTS: Final = msgspec.json.Decoder(_Request)
 
 
-def encode_request(q: Sequence[float]) -> bytes:
+def encode_request(q: Sequence[float], standpoint: Standpoint | None = None) -> bytes:
     """A request for logs; ``q`` are the joint positions, empty when none are known."""
-    return msgspec.json.encode(_Request("logs", " ".join(f"{value:.6g}" for value in q)))
+    joints = " ".join(f"{value:.6g}" for value in q)
+    if standpoint is None:
+        return msgspec.json.encode(_Request("logs", joints))
+    numbers = " ".join(f"{value:.9g}" for value in standpoint.numbers())
+    return msgspec.json.encode(_Request("logs", joints, str(standpoint.stamp_ns), numbers))
 
 
-def decode_request(data: bytes) -> tuple[float, ...]:
-    """The ``N_JOINTS`` joint positions of a request; all NaN when it holds none.
+def decode_request(data: bytes) -> LogRequest:
+    """The request of a datagram; all joints are NaN when it holds none.
 
     Raises:
         LogListError: the datagram is not a request for logs.
@@ -68,6 +88,8 @@ def decode_request(data: bytes) -> tuple[float, ...]:
     try:
         request = _REQUESTS.decode(data)
         q = tuple(float(word) for word in request.q.split()) or (math.nan,) * N_JOINTS
+        numbers = tuple(float(word) for word in request.standpoint.split())
+        at_ns = int(request.at_ns or "0")
     except (msgspec.DecodeError, ValueError) as error:
         raise LogListError("log-list.not-a-request", f"the datagram is not a request for logs: {error}") from None
     if request.op != "logs" or len(q) != N_JOINTS:
@@ -75,33 +97,50 @@ def decode_request(data: bytes) -> tuple[float, ...]:
             "log-list.not-a-request",
             f"the datagram is not a request for logs: op {request.op!r} with {len(q)} joints instead of {N_JOINTS}",
         )
-    return q
+    if not numbers:
+        return LogRequest(q)
+    if len(numbers) != NUMBERS or not all(map(math.isfinite, numbers)):
+        raise LogListError(
+            "log-list.bad-standpoint",
+            f"the request's standpoint is not {NUMBERS} finite numbers; its planner is of another release",
+        )
+    return LogRequest(q, from_numbers(at_ns, numbers))
 
 
-def encode_logs(logs: Iterable[LogObservation]) -> bytes:
-    """A reply with a log list."""
+def encode_logs(logs: Iterable[LogObservation], in_plane: bool = False) -> bytes:
+    """A reply with a log list, in the crane's base frame or in the plane."""
     rows = [_Log(o.center_m, o.axis, o.length_m, o.diameter_m, o.id, o.covariance, o.seen) for o in logs]
-    return msgspec.json.encode(rows)
+    return msgspec.json.encode(_Answer(plane=rows) if in_plane else rows)
 
 
 def encode_error(sentence: str) -> bytes:
     """A reply without a log list: ``sentence`` says why there is none."""
-    return msgspec.json.encode(_Error(sentence))
+    return msgspec.json.encode(_Answer(sentence))
 
 
-def decode_logs(data: bytes) -> tuple[LogObservation, ...]:
-    """The log list of a reply, axes normalised.
+def decode_logs(data: bytes, in_plane: bool = False) -> tuple[LogObservation, ...]:
+    """The log list of a reply, axes normalised; in the crane's base frame or ``in_plane``.
 
     Raises:
-        LogListError: the reply is not a log list, a log in it is impossible, or the reply is an error.
+        LogListError: the reply is not a log list, is in the other frame, a log in it is impossible, or it is an error.
     """
     try:
         reply = _REPLIES.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise LogListError("log-list.not-a-list", f"the detector's reply is not a log list: {error}") from None
-    if isinstance(reply, _Error):
-        raise LogListError("log-list.detector-error", reply.error)
-    logs = tuple(_checked(index if log.id is None else log.id, log) for index, log in enumerate(reply))
+    rows = reply
+    if isinstance(reply, _Answer):
+        if reply.error is not None or reply.plane is None:
+            raise LogListError("log-list.detector-error", reply.error or "the detector's reply is empty")
+        rows = reply.plane
+    if isinstance(reply, _Answer) != in_plane:
+        wanted, camera = ("plane", "looks ahead of") if in_plane else ("crane's base frame", "stands still with")
+        raise LogListError(
+            "log-list.other-frame",
+            f"the detector's list is not in the {wanted}; start a detector whose camera {camera} the machine",
+        )
+    assert isinstance(rows, list)
+    logs = tuple(_checked(index if log.id is None else log.id, log) for index, log in enumerate(rows))
     if len({log.id for log in logs}) < len(logs):
         raise LogListError("log-list.duplicate-id", "two logs of the detector's reply have the same number")
     return logs

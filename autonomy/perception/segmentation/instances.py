@@ -63,7 +63,7 @@ def decode_instances(
     ends = sigmoid(maps[ENDS])
     found = []
     for number, log in enumerate(logs, 1):
-        instance = _instance(log, number, x, y, labels, probability, ends, scale, (shape[0], shape[1]))
+        instance = instance_at(log, number, x, y, labels, probability, ends, scale, (shape[0], shape[1]))
         if instance is not None:
             found.append(instance)
     return tuple(sorted(found, key=lambda i: -i.score))
@@ -79,7 +79,7 @@ def foreground_of(maps: np.ndarray, scale: int, depth_m: np.ndarray) -> Foregrou
     return make_foreground(maps, probability, probability > MIN_MASK_PROBABILITY, inverse, grain)
 
 
-def _instance(
+def instance_at(
     log: LogSegment,
     number: int,
     x: np.ndarray,

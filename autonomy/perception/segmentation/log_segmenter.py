@@ -171,7 +171,7 @@ class LogSegmenter:
         while len(rows) and at > MIN_FACTOR:
             at *= 0.5
             sizes = ((round(at * h), round(at * w)) for h, w in WINDOWS)
-            found = (_window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
+            found = (window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
             window, factor = next(((w, at) for w in found if w is not None), (window, factor))
         return window, factor
 
@@ -198,7 +198,7 @@ def segment(frame: RgbdFrame) -> tuple[Instance, ...]:
     return _shipped().segment(frame)
 
 
-def _window_around(
+def window_around(
     rows: np.ndarray, columns: np.ndarray, scale: int, margin: int, size: tuple[int, int], shape: tuple[int, ...]
 ) -> Window | None:
     """The window of ``size`` around these rows and columns, each ``scale`` pixels wide, clipped to the picture (H, W).

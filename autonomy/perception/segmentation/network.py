@@ -95,11 +95,11 @@ def network_input(
     image[-2][~known] = 0.0
     image[-1] = known
     if variant == "rgbd":
-        _normalise_colour(rgb, known, image[:3])
+        normalised_colour(rgb, known, image[:3])
     return image
 
 
-def _normalise_colour(rgb: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
+def normalised_colour(rgb: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
     """Write colours (3, H, W) of mean 0 and standard deviation 1, which removes exposure and white balance.
 
     The statistics are those of pixels with depth when there are enough: a bright sky would compress everything else.

@@ -23,7 +23,7 @@ MAX_TURN_BOUNDARY: Final = 0.97
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
     """1 / (1 + exp(-x))."""
-    return np.asarray(1.0 / (1.0 + np.exp(-x)))
+    return np.asarray(1.0 / (1.0 + np.exp(-np.maximum(x, -80.0))))
 
 
 def boundary_map(maps: np.ndarray) -> np.ndarray:

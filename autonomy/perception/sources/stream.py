@@ -32,6 +32,8 @@ class StreamCamera:
         self._socket: socket.socket | None = None
         self._requested, self._data = False, bytearray()
         self.problem = self.problem_code = ""
+        self.asked_ns = 0
+        """When the frame that was returned last was asked for; the server takes it at once and draws it afterwards."""
 
     def frame(self) -> RgbdFrame | None:
         """The newest frame, or None with ``problem`` and ``problem_code`` set."""
@@ -61,6 +63,7 @@ class StreamCamera:
         sock = self._socket or self._connect(end_s)
         if not self._requested:
             sock.settimeout(_left(end_s))
+            self.asked_ns = time.monotonic_ns()
             sock.sendall(encode_request(self._camera))
             self._requested = True
         wanted = HEADER_BYTES

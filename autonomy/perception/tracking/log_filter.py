@@ -9,7 +9,7 @@ frames never claim a millimetre.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -43,6 +43,10 @@ class CameraErrors:
 
 
 NOMINAL_ERRORS: Final = CameraErrors()
+SURVEYED: Final = CameraErrors(scale=0.0015, mount_rad=0.0015, mount_m=0.004)
+"""Errors that remain after the survey of a camera on the crane."""
+SURVEYED_BY_GNSS: Final = replace(SURVEYED, pose_rad=0.002, pose_m=0.012)
+"""The same on a vehicle that a dual-antenna RTK receiver localizes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,116 @@
+"""Requests for logs to a detector whose camera looks ahead of a machine that drives.
+
+Every request with a standpoint asks for one picture; while one is being measured, only the newest request waits.  The
+reply is in the plane of the standpoint, because the machine has driven on by the time it arrives.  A request without a
+standpoint, as from a page that only displays logs, gets the last list in the base frame of the last standpoint.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.driving_log_detector import in_base
+from autonomy.perception.log_list.datagrams import LogListError, LogRequest, decode_request, encode_error, encode_logs
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.shown_picture import NewestPicture
+from autonomy.perception.sources.camera_source import CameraSource
+
+POLL_S: Final = 0.2
+MAX_REQUEST_BYTES: Final = 2048
+Address = tuple[str, int]
+
+
+class DetectorInPlane(Protocol):
+    """`autonomy.perception.driving_log_detector.DrivingLogDetector`."""
+
+    problem: str
+
+    def detect_in_plane(
+        self, standing: Callable[[], tuple[Pose, float] | None], q: tuple[float, ...]
+    ) -> tuple[LogObservation, ...] | None:
+        """The logs of a new picture in the plane."""
+
+
+def asked_ns(source: CameraSource) -> int | None:
+    """When a source was asked for its last picture; None when it does not know."""
+    asked: int | None = getattr(source, "asked_ns", None)
+    return asked
+
+
+class DrivingRequests:
+    """Replies to requests that arrive on a socket; ``taken_ns`` says when the last picture was taken, None: at the
+    beginning of its detection.  ``report`` is told why there are no logs.  ``pictures`` answers those who watch.
+    """
+
+    def __init__(
+        self,
+        detector: DetectorInPlane,
+        link: socket.socket,
+        taken_ns: Callable[[], int | None],
+        report: Callable[[str], None],
+        pictures: NewestPicture,
+    ) -> None:
+        self._detector, self._link, self._taken_ns, self._report = detector, link, taken_ns, report
+        self._pictures = pictures
+        self._logs: tuple[LogObservation, ...] = ()
+        self._base: Pose | None = None
+        self._reported = ""
+
+    def serve(self, signals: list[int]) -> None:
+        """Reply until a signal arrives."""
+        while not signals:
+            if select.select([self._link], [], [], POLL_S)[0]:
+                self.answer_waiting()
+
+    def answer_waiting(self) -> None:
+        """Answer the requests that wait: one picture for the newest standpoint, the last list for every page."""
+        newest: tuple[LogRequest, Address] | None = None
+        self._link.setblocking(False)
+        while True:
+            try:
+                data, sender = self._link.recvfrom(MAX_REQUEST_BYTES)
+            except BlockingIOError:
+                break
+            if (picture := self._pictures.reply(data, self._reported)) is not None:
+                self._send(picture, sender)
+                continue
+            try:
+                request = decode_request(data)
+            except LogListError as error:
+                self._send(encode_error(str(error)), sender)
+                continue
+            if request.standpoint is not None:
+                newest = (request, sender)
+            elif not any(value == value for value in request.q):
+                base = self._base
+                self._send(encode_logs(in_base(log, base) for log in self._logs) if base else encode_logs(()), sender)
+        if newest is not None:
+            self._take_picture(*newest)
+
+    def _take_picture(self, request: LogRequest, sender: Address) -> None:
+        standpoint, begun_ns = request.standpoint, time.monotonic_ns()
+        assert standpoint is not None
+
+        def standing() -> tuple[Pose, float] | None:
+            taken_ns = self._taken_ns()
+            return standpoint.at(begun_ns if taken_ns is None else taken_ns)
+
+        logs = self._detector.detect_in_plane(standing, request.q)
+        if logs is not None:
+            self._logs, self._base = logs, standpoint.base
+            self._send(encode_logs(logs, in_plane=True), sender)
+        problem = self._detector.problem
+        if problem and problem != self._reported:
+            self._report(problem)
+        self._reported = problem
+
+    def _send(self, data: bytes, sender: Address) -> None:
+        try:
+            self._link.sendto(data, sender)
+        except OSError:
+            return  # who asked is gone; the next request gets an answer

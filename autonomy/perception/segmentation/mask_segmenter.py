@@ -1,0 +1,191 @@
+"""The mask segmenter: a picture with or without depth in, instances of logs out.
+
+A coarse view shows where wood may be; a window around it is seen once more, as large as the network's picture allows.
+Where a picture has depth, what has none is no log: sky, glare and mist have no shape.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from autonomy.networks.openvino_net import OpenVinoNet
+from autonomy.networks.weights import SHIPPED, load
+from autonomy.perception.camera.frame import RgbdFrame, check_frame, content_window
+from autonomy.perception.segmentation.ground_plane import height_over_plane
+from autonomy.perception.segmentation.instances import Instance, instance_at, shifted_instance
+from autonomy.perception.segmentation.kernel_masks import KernelLog, KernelLogs, kernel_logs
+from autonomy.perception.segmentation.log_segmenter import View, crop, window_around
+from autonomy.perception.segmentation.mask_network import MULTIPLE, mask_input, mask_network
+from autonomy.perception.segmentation.network import COS2, ENDS, MASK, SIN2, STRIDE
+from autonomy.perception.segmentation.resize import doubled, shrunk
+from autonomy.perception.segmentation.segment_merging import LogSegment
+from autonomy.perception.segmentation.watershed import sigmoid
+from machine.geometry.optics import Intrinsics
+
+SIZE_PX: Final = 320  # of the coarse view
+WINDOWS: Final = ((320, 640), (448, 448), (640, 320))
+"""Height and width of a window [px of the network]; few sizes, because the network is compiled for each."""
+MIN_FACTOR: Final = 0.5  # a picture is at most doubled
+MIN_WOOD_PROBABILITY: Final = 0.3
+MARGIN_PX: Final = 12  # around the wood in a window [px of the network]
+MIN_BEST_SCORE: Final = 0.3
+"""When the best log of a window scores less, the whole picture is segmented."""
+MIN_PICTURE_SHARE, MIN_LOG_SHARE = 0.1, 0.2
+"""Where at least the first share of a picture has depth, a log needs depth in at least the second share of its
+pixels."""
+MODES: Final = ("rgbd", "depth", "colour")
+WOOD_SHIFT: Final = 1.5  # by which the outline trusts a log's own mask more than the wood's
+STEEPNESS, EVEN_ODDS = 16.0, 0.58
+"""Of the logistic curve from heat times certainty to a probability, fitted on training pictures: see the card."""
+
+
+class MaskSegmenter:
+    """The mask network with its weights, for frames of any size; one thread.
+
+    Args:
+        mode: "rgbd", or one sense alone: "depth" or "colour".
+        weights: weight file; None selects the shipped weights.
+        size_px: approximate length of the network's picture of a whole frame.
+        precision: of the network, see ``OpenVinoNet``.
+        use_window: whether a window around the wood is segmented at a finer scale.
+
+    Raises:
+        WeightsError: the weights are missing, damaged or of another network.
+    """
+
+    def __init__(
+        self, mode: str = "rgbd", weights: Path | None = None, size_px: int = 2 * SIZE_PX, precision: str = "bf16",
+        use_window: bool = True,
+    ) -> None:  # fmt: skip
+        self.mode, self.size_px, self._precision, self._use_window = mode, size_px, precision, use_window
+        self._network = mask_network()
+        self._arrays, self.facts = load(weights or SHIPPED / "logs.safetensors", self._network)
+        self._nets: dict[tuple[int, int], OpenVinoNet] = {}
+
+    def segment(self, frame: RgbdFrame) -> tuple[Instance, ...]:
+        """The logs of a frame in descending order of score; empty when there is none.
+
+        Raises:
+            RgbdFrameError: the frame is invalid.
+        """
+        check_frame(frame)
+        return self.segment_picture(frame.rgb, frame.depth_m, frame.intrinsics)
+
+    def segment_picture(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:
+        """As ``segment``; depth may be unknown everywhere (a photograph)."""
+        if self.mode == "colour":
+            depth_m = np.full_like(depth_m, np.nan)
+        outer = content_window(rgb)
+        view = crop((rgb, depth_m, pinhole), outer)
+        longest = max(view[1].shape)
+        factor = max(1, round(longest / self.size_px))
+        corner = (outer[0], outer[2])
+        if self._use_window:
+            coarse = max(1, math.ceil(longest / SIZE_PX))
+            maps, _ = self.answers(*shrunk(*view, coarse))
+            inner, finer = finer_window(sigmoid(maps[MASK]), coarse * STRIDE, view[1].shape, factor)
+            if finer < factor:
+                top, left = inner[0], inner[2]
+                found = self._logs(crop(view, inner), finer, (corner[0] + top, corner[1] + left), depth_m)
+                if found and found[0].score > MIN_BEST_SCORE:
+                    return found
+        return self._logs(view, factor, corner, depth_m)
+
+    def _logs(self, view: View, factor: float, corner: tuple[int, int], whole: np.ndarray) -> tuple[Instance, ...]:
+        """The logs of a part of a picture with its corner (row, column) in the ``whole`` (H, W)."""
+        maps, kernels = self.answers(*(doubled(*view) if factor < 1.0 else shrunk(*view, round(factor))))
+        found = decoded(maps, kernels, round(factor * STRIDE), view[1])
+        if view[1].shape == whole.shape:
+            return found
+        return tuple(shifted_instance(i, corner[1], corner[0], (whole.shape[0], whole.shape[1])) for i in found)
+
+    def answers(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+        """Maps and kernels of a picture of the network's size, which is padded to a multiple of MULTIPLE."""
+        image = mask_input(None if self.mode == "depth" else rgb, depth_m, pinhole, height_over_plane(depth_m, pinhole))
+        h, w = image.shape[1:]
+        high, wide = -(-h // MULTIPLE) * MULTIPLE, -(-w // MULTIPLE) * MULTIPLE
+        padded = np.zeros((1, len(image), high, wide), np.float32)
+        padded[0, :, :h, :w] = image
+        if (high, wide) not in self._nets:
+            self._nets[high, wide] = OpenVinoNet(self._network, self._arrays, padded.shape, self._precision)
+        answer = self._nets[high, wide](padded)
+        return answer["maps"][0][:, : -(-h // STRIDE), : -(-w // STRIDE)], answer["kernels"][0]
+
+
+@cache
+def _shipped() -> MaskSegmenter:
+    return MaskSegmenter()
+
+
+def segment(frame: RgbdFrame) -> tuple[Instance, ...]:
+    """The logs of a frame by the shipped weights; see ``MaskSegmenter.segment``."""
+    return _shipped().segment(frame)
+
+
+def finer_window(
+    wood: np.ndarray, scale: int, shape: tuple[int, ...], factor: float
+) -> tuple[tuple[int, int, int, int], float]:
+    """The window of a picture (H, W) that holds all wood at the finest possible scale, and its shrink factor.
+
+    ``wood`` (h, w) is the probability of wood, in pixels that are ``scale`` pixels of the picture wide.
+    """
+    window, at = (0, shape[0], 0, shape[1]), factor
+    rows, columns = (np.flatnonzero((wood > MIN_WOOD_PROBABILITY).any(axis=k)) * scale for k in (1, 0))
+    while len(rows) and at > MIN_FACTOR:
+        at *= 0.5
+        sizes = ((round(at * h), round(at * w)) for h, w in WINDOWS)
+        found = (window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
+        window, factor = next(((w, at) for w in found if w is not None), (window, factor))
+    return window, factor
+
+
+def decoded(maps: np.ndarray, kernels: np.ndarray, scale: int, depth_m: np.ndarray) -> tuple[Instance, ...]:
+    """The logs of maps (24, h, w) and kernels, whose pixels are ``scale`` pixels of the picture (H, W) wide."""
+    known = np.isfinite(depth_m[scale // 2 :: scale, scale // 2 :: scale])
+    found = kernel_logs(maps, kernels)
+    logs = [log for log in found.logs if _has_shape(found, log, known)]
+    if not logs:
+        return ()
+    labels = np.zeros(maps.shape[1:], np.int32)
+    probability = np.zeros(maps.shape[1:])
+    for number, log in enumerate(logs, 1):
+        at = found.y[log.members], found.x[log.members]
+        labels[at] = number
+        probability[at] = sigmoid(np.minimum(log.logits, maps[MASK][at] + WOOD_SHIFT))
+    nearest = ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+    labels = labels[tuple(nearest)]
+    ends, out = sigmoid(maps[ENDS]), []
+    for number, log in enumerate(logs, 1):
+        x, y = found.x[log.members], found.y[log.members]
+        segment_ = LogSegment(log.members, _axis(maps, x, y), score(log))
+        one = instance_at(segment_, number, found.x, found.y, labels, probability, ends, scale, depth_m.shape)
+        if one is not None:
+            out.append(one)
+    return tuple(sorted(out, key=lambda i: -i.score))
+
+
+def _has_shape(found: KernelLogs, log: KernelLog, known: np.ndarray) -> bool:
+    """Whether enough of a log's pixels have depth, in a picture that has any."""
+    if known.mean() < MIN_PICTURE_SHARE:
+        return True
+    y, x = found.y[log.members], found.x[log.members]
+    inside = (y < known.shape[0]) & (x < known.shape[1])
+    return bool(inside.any()) and float(known[y[inside], x[inside]].mean()) >= MIN_LOG_SHARE
+
+
+def _axis(maps: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Unit axis (2,) of a log by the network's angles at its pixels."""
+    c, s = maps[COS2, y, x].sum(), maps[SIN2, y, x].sum()
+    angle = 0.5 * math.atan2(float(s), float(c))
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def score(log: KernelLog) -> float:
+    """The probability that a log overlaps a true one by half, from heat and certainty."""
+    return 1.0 / (1.0 + math.exp(-STEEPNESS * (log.heat * log.certainty - EVEN_ODDS)))

@@ -1,0 +1,151 @@
+"""A planner that is started without a mission: it waits for one, and takes an uploaded one while the machine rests.
+
+An upload names a file of the missions folder and its SHA-256 (`can_dbc.messages.mission_upload`).  It is taken when the
+controller reports, the machine is neither armed nor moving, and no mission has begun; it is refused otherwise, with a
+code and a sentence.  A taken mission does not start by itself: it waits for the command Auto.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from autonomy.manager.checkpoint import Checkpoint
+from autonomy.missions.folder import MissionFolder
+from autonomy.missions.mission_file import read, verify
+from autonomy.missions.model import ForwardingMission
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.standpoint import Standpoint
+from autonomy.process.jobs import Job, JobEvent
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.grasp import ChosenGrasp
+from can_dbc.messages.mission import MissionCommand, MissionReport
+from can_dbc.messages.mission_upload import MissionUpload
+from can_dbc.messages.vehicle import VehicleReport
+from machine.status.modes import Mode
+from runtime.errors import CodedError
+
+REPORT_AGE_NS: Final = 1_000_000_000
+STANDING_M_S: Final = 0.05
+WAITING: Final = "waits for a mission"
+NO_MISSION: Final = "there is no mission yet; upload one"
+
+
+class UploadRefused(CodedError, ValueError):
+    """An uploaded mission is not taken; nothing has changed."""
+
+
+@dataclass(slots=True)
+class MachineAtRest:
+    """What is known of the machine: its mode and speed, and when they were reported."""
+
+    mode: int = -1
+    speed_m_s: float = math.nan
+    mode_ns: int = -REPORT_AGE_NS
+    speed_ns: int = -REPORT_AGE_NS
+
+    def on_reports(self, report: StateReport | None, vehicle: VehicleReport | None, now_ns: int) -> None:
+        """Take the newest reports."""
+        if report is not None:
+            self.mode, self.mode_ns = report.mode, now_ns
+        if vehicle is not None:
+            self.speed_m_s, self.speed_ns = vehicle.speed_m_s, now_ns
+
+    def check(self, now_ns: int) -> None:
+        """Whether a mission may be taken now.
+
+        Raises:
+            UploadRefused: it may not.
+        """
+        if now_ns - min(self.mode_ns, self.speed_ns) > REPORT_AGE_NS:
+            raise UploadRefused("upload.no-report", "the controller does not report; start it first")
+        if self.mode in (Mode.ARMED, Mode.ACTIVE):
+            raise UploadRefused("upload.armed", "the machine is armed; disarm it first")
+        if not abs(self.speed_m_s) < STANDING_M_S:
+            raise UploadRefused("upload.moving", "the machine moves, or its speed is unknown; let it stand first")
+
+
+@dataclass(frozen=True, slots=True)
+class UploadedMissions:
+    """Makes jobs of uploaded missions; ``site`` is the latitude and longitude [deg] of the machine's site."""
+
+    folder: MissionFolder
+    site: tuple[float, float]
+    job_of: Callable[[ForwardingMission], Job]
+
+    def job(self, upload: MissionUpload) -> Job:
+        """The job of an uploaded mission.
+
+        Raises:
+            UploadRefused: the file is not the one that was uploaded.
+            MissionError: the mission cannot be read or driven.
+        """
+        data = self.folder.read(upload.name)
+        if hashlib.sha256(data).digest() != upload.digest:
+            sentence = f"{upload.name} is not the file that was uploaded; do both use the same folder?"
+            raise UploadRefused("upload.other-file", sentence)
+        draft = read(data, upload.name)
+        verify(draft, route_wanted=True, site=self.site)
+        return self.job_of(draft.mission)
+
+
+class WaitingJob:
+    """No mission yet: nothing is sent, and every command is refused."""
+
+    done = begun = drives = False
+
+    def __init__(self) -> None:
+        self.failure: str | None = None
+        self._command, self._refusal = 0, ""
+
+    @property
+    def idle(self) -> bool:
+        """Whether the process shall end."""
+        return self.failure is not None
+
+    def step(
+        self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
+    ) -> list[bytes]:
+        """Nothing."""
+        return []
+
+    def standpoint(self, now_ns: int) -> Standpoint | None:
+        """None: no picture is wanted."""
+        return None
+
+    def abort(self, reason: str) -> None:
+        """End the process."""
+        self.failure = reason
+
+    def events(self) -> Iterator[JobEvent]:
+        """That it waits."""
+        yield "state", {"state": "WAITING", "words": WAITING}
+
+    def outcome(self) -> dict[str, Any]:
+        """No fields."""
+        return {}
+
+    def execute(self, command: MissionCommand) -> str:
+        """Every command is refused."""
+        self._command, self._refusal = command.sequence, NO_MISSION
+        return NO_MISSION
+
+    def report(self, now_ns: int) -> MissionReport:
+        """An empty report."""
+        return MissionReport(
+            schema=1, name="", state="WAITING", words=WAITING, ended=False, auto=False, single_step=False, paused="",
+            waits_for="", failure="", order=self._command, refusal=self._refusal, loaded=0, on_board=0,
+            on_board_m3=0.0, unloaded=0, missed=0, given_up=(), driven_m=0.0, targets=(), crane="", here=None,
+            route=(), closed=False, fences=(), landings=(), logs=(),
+        )  # fmt: skip
+
+    def chosen_grasp(self) -> ChosenGrasp | None:
+        """None: the crane does not work."""
+        return None
+
+    def progress(self) -> Checkpoint | None:
+        """None."""
+        return None
