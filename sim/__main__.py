@@ -30,6 +30,7 @@ from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 from sim.errors import PlantError
 from sim.ground.terrain import KINDS as TERRAINS
+from sim.individual import beside
 from sim.plant import Plant
 from sim.process.live import TX_QUEUE_FRAMES
 from sim.process.live_plant import LivePlant
@@ -78,7 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim", description="The live plant of a machine on its CAN buses.")
     parser.add_argument("--profile", default="palms_471", help="shipped profile name or TOML file")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--truth", default="nominal", help="nominal, sampled or a TOML file")
+    parser.add_argument("--truth", default="nominal", help="nominal, sampled, wide_valves, FILE, or as in sampled:FILE")
     parser.add_argument("--logs", type=int, default=1)
     parser.add_argument("--scene", default="random", help=f"arrangement of the logs: random, {', '.join(KINDS)}")
     parser.add_argument("--site", type=Path, help="site file of a mission, instead of --logs and --scene")
@@ -92,6 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
         profile = load_profile(options.profile)
         _check_buses(profile, addresses)
         site = None if options.site is None else load_site(options.site)
+        options.truth = beside(options.profile, profile.name, options.truth)
         plant = _plant(profile, site, options)
         with contextlib.ExitStack() as stack:
             buses = {

@@ -6,4 +6,9 @@ from runtime.errors import CodedError
 
 
 class PlantError(CodedError, ValueError):
-    """A truth, scene, site or request that the plant cannot use."""
+    """A truth, scene, site or request that the plant cannot use.
+
+    ``logs`` are the numbers of the logs in a scene that it is about; empty where it is about none.
+    """
+
+    logs: tuple[int, ...] = ()

@@ -142,7 +142,8 @@ class Plant(EmulatedMachine):
     def shapes(self) -> list[Shape]:
         """Boxes to draw, in the frames of their links (crane, bunk, carrier)."""
         under = carrier_links(self.profile, self.world.truth)[0] if self.world.carrier is not None else []
-        return [*(s for link in under for s in link.shapes), *crane_shapes(self.profile), *bunk_shapes(self.profile)]
+        crane = crane_shapes(self.profile, self.world.truth.steel)
+        return [*(s for link in under for s in link.shapes), *crane, *bunk_shapes(self.profile)]
 
     def vehicle(self) -> VehicleState | None:
         """Ground truth of the carrier; None on a machine without one."""

@@ -157,6 +157,11 @@ def _person(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
     return plant.tap.add(plant.profile.crane_bus, codec.key, frame_tap.rewritten(codec, {"Person": 1}))
 
 
+def _lever(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    plant.estop.move_lever(True)
+    return lambda: plant.estop.move_lever(False)
+
+
 def _gnss(change: Callable[[GnssNode, PlantFault], End]) -> Callable[[EmulatedMachine, PlantFault, int], End]:
     def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
         if plant.gnss is None:
@@ -294,6 +299,7 @@ BEGINNERS: Final[dict[str, Callable[[EmulatedMachine, PlantFault, int], End]]] =
     "estop-pressed": _estop,
     "estop-wire": _estop_wire,
     "person-in-zone": _person,
+    "lever-moved": _lever,
     "gnss-off": _gnss(_silence),
     "gnss-jump": _gnss(_jump),
     "gnss-single": _gnss(_fix),

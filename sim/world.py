@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
+import msgspec
+
 from machine.profile import Profile
 from sim.bullet.body import Body, Pose, fixed_boxes, magnitude
 from sim.bullet.client import GRAVITY_M_S2, new_client
@@ -24,16 +26,12 @@ from sim.mechanics.crane import CRANE_LINKS, FLEX_JOINTS, PASSIVE_JOINTS, crane_
 from sim.truth.load import Truth, load_truth
 from sim.wood.bunk import bunk_shapes
 from sim.wood.log_shape import LogSpec
-from sim.wood.logs import LogBodies
+from sim.wood.logs import LogBodies, reach_m
 from sim.wood.stowage import Stowage
 
 STEP_NS: Final = 2_500_000
 STEP_S: Final = STEP_NS * 1e-9
 SOLVER_ITERATIONS: Final = 40
-HOME_POSE: Final = {
-    "palms_471": {"slew": 0.0, "lift": 0.75, "tilt": -1.6, "ext": 0.30, "rot": 0.0},
-    "aoro_fc8": {"slew": 0.0, "lift": 1.25, "tilt": -2.39, "ext": 0.10, "rot": 0.0},
-}
 SETTLE_STEP_COUNT: Final = 240
 CARRIER_SETTLE_STEP_COUNT: Final = 960
 HAND_OVER_STEP_COUNT: Final = 80
@@ -45,17 +43,20 @@ GRAPPLE_LINKS: Final = (*JAW_LINKS, "rotator", "telescope", "stick")
 JOINTS_OF_FUNCTION: Final = {"grapple": JAW_LINKS, "steer": ("articulation",)}
 
 
-def home_pose(profile: Profile) -> dict[str, float]:
-    """Start pose of the crane; a machine of another name starts like the shipped machine of its kind."""
-    kind = "palms_471" if profile.carrier is None else "aoro_fc8"
-    return dict(HOME_POSE.get(profile.name, HOME_POSE[kind]))
+def home_pose(profile: Profile, truth: str = "nominal") -> dict[str, float]:
+    """Joint positions in which the crane of a machine starts [rad, m].
+
+    Raises:
+        PlantError: there is no such truth for the machine.
+    """
+    return msgspec.structs.asdict(load_truth(truth, 0, profile.name).home)
 
 
 class World:
     """The machine and its environment.  ``q`` and ``qd`` map joint names to position and velocity.
 
     Raises:
-        PlantError: logs overlap or do not come to rest, or the machine has no steel dimensions.
+        PlantError: logs overlap or do not come to rest.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class World:
             deterministicOverlappingPairs=1,
         )
         mobile = profile.carrier is not None
-        ground = (terrain, seed, 0.0 if mobile else profile.workspace.ground_z_m)
+        ground = (terrain, seed, 0.0 if mobile else profile.workspace.ground_z_m, reach_m(scene))
         self.terrain = Terrain(*ground)
         self.terrain.add_to(p, truth.contact.ground_friction)
         self.crane = self._build()
@@ -91,8 +92,9 @@ class World:
         self._motors = [self.crane.index[j] for j in driven if j not in JAW_LINKS]
         self._motors += [self.crane.index[j] for j in (*JAW_LINKS, *FLEX_JOINTS)]
         self._hanger = self.crane.names.index("hanger")
+        self._home = msgspec.structs.asdict(truth.home)
         self.column = self._level()
-        self._settle(home_pose(profile) | dict(home or {}))
+        self._settle(self._home | dict(home or {}))
         # The logs come to rest in a physics client of their own, which needs its own ground.
         self.log_bodies = LogBodies(p, profile, truth, scene, Terrain(*ground), self.base_pose())
         self._log_of = {body: i for i, body in enumerate(self.log_bodies.body_ids)}
@@ -157,7 +159,7 @@ class World:
 
     def _level(self) -> Column:
         """Zero the encoders: at the home pose with an empty grapple the column stands plumb."""
-        self._place(home_pose(self.profile))
+        self._place(self._home)
         return Column(self.truth.structure, self._moments())
 
     def _settle(self, home: Mapping[str, float]) -> None:
@@ -314,5 +316,5 @@ def open_world(
     terrain: str = "flat",
     home: Mapping[str, float] | None = None,
 ) -> World:
-    """A World with a truth given by name (nominal, sampled or a TOML file)."""
+    """A World with a truth given by name (nominal, sampled, wide_valves or a TOML file)."""
     return World(profile, load_truth(truth, seed, profile.name), seed, scene, terrain, home)

@@ -217,7 +217,8 @@ class WorldScenes:
         self._world = world
         self.style: Style = "asphalt" if profile.carrier is None else "forest"
         self.ground = Ground(*terrain.origin_m, terrain.cell_m, terrain.heights)
-        shapes = [(s, CRANE) for s in crane_shapes(profile)] + [(s, BUNK) for s in bunk_shapes(profile)]
+        shapes = [(s, CRANE) for s in crane_shapes(profile, world.truth.steel)]
+        shapes += [(s, BUNK) for s in bunk_shapes(profile)]
         if profile.carrier is not None:
             under, _ = carrier_links(profile, world.truth)
             shapes += [(s, CARRIER) for link in under if link.name in CARRIER_LINKS for s in link.shapes]

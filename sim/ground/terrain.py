@@ -19,26 +19,36 @@ from numpy.typing import NDArray
 from sim.bullet.client import BulletClient
 from sim.errors import PlantError
 from sim.geometry.shape import Vector
+from sim.ground.drawn_ground import drawn_ground, extended
 
 
 class Soil(NamedTuple):
-    """Factors of the tyres' friction and slip stiffness, and the addition to their rolling resistance."""
+    """Factors of the tyres' friction and slip stiffness, the addition to their rolling resistance, and to that of logs.
+
+    ``log_rolling_m``: rolling resistance of a log over its weight times its radius, times the radius [m], beyond what
+    `sim.truth.body.Contact.log_rolling_m` has for any ground.
+    """
 
     friction: float = 1.0
     stiffness: float = 1.0
     rolling: float = 0.0
+    log_rolling_m: float = 0.0
 
 
-KINDS: Final = ("flat", "rough", "slope", "hill", "mud")
+KINDS: Final = ("flat", "rough", "slope", "hill", "mud", "drawn")
 SIDE_SLOPE: Final = 0.10  # rise per metre towards +y of kind "slope"
 HILL_SLOPE: Final = math.tan(math.radians(10.0))  # of kind "hill"
-MUD: Final = Soil(0.5, 0.3, 0.10)  # assumed: a wheel pulls at most a third of its load and sinks in
-EXTENT_M: Final = 120.0  # edge of all but rough
+# A log of 0.25 m that lies 1 cm deep in moss and litter, 2 cm in mud (docs/reference/plant-model.md section 1).
+FOREST_FLOOR: Final = Soil(log_rolling_m=0.019)
+MUD: Final = Soil(0.5, 0.3, 0.10, 0.026)  # assumed: a wheel pulls at most a third of its load and sinks in
+EXTENT_M: Final = 120.0  # least edge of all but rough and drawn
 ROUGH_CELL_COUNT: Final = 400
 ROUGH_CELL_M: Final = 0.2
 # Roughness: standard deviation and smoothing length [m] of each layer; correlation falls to 1/e at twice the length.
 ROUGHNESS_LAYERS: Final = ((0.06, 0.75), (0.20, 6.0))
 THICKNESS_M: Final = 1.0  # of the box under flat and slope
+LOG_FRICTION: Final = 0.8
+"""Friction of a log, by which Bullet multiplies the rolling resistance of the ground under it."""
 
 
 @njit(cache=True)
@@ -83,29 +93,37 @@ def _rough(seed: int) -> NDArray[np.float64]:
 
 class Terrain:
     """Ground of a kind: ``flat`` at ``datum_m``, ``slope`` and the steeper ``hill`` rising to +y, ``mud`` flat and
-    slippery, ``rough`` undulating, drawn from ``seed``.
+    slippery, ``rough`` undulating, ``drawn`` with a slope, undulation, ruts, stones and stumps; the last two follow
+    ``seed``.  It reaches at least ``reach_m`` from the origin in x and y; a greater reach changes nothing nearer by.
 
     Raises:
         PlantError: the kind is not one of KINDS.
     """
 
-    def __init__(self, kind: str = "flat", seed: int = 0, datum_m: float = 0.0) -> None:
+    def __init__(self, kind: str = "flat", seed: int = 0, datum_m: float = 0.0, reach_m: float = 0.0) -> None:
         if kind not in KINDS:
             raise PlantError("terrain.unknown-kind", f"terrain {kind!r} is unknown; use one of {', '.join(KINDS)}")
         self.kind = kind
         self.colour: Vector = (0.55, 0.60, 0.45)
-        self.soil = MUD if kind == "mud" else Soil()
-        if kind == "rough":
-            self.cell_m, heights = ROUGH_CELL_M, _rough(seed)
+        self.soil = {"flat": Soil(), "mud": MUD}.get(kind, FOREST_FLOOR)
+        if kind in ("rough", "drawn"):
+            self.cell_m, heights = ROUGH_CELL_M, extended(_rough(seed), reach_m / ROUGH_CELL_M)
+            heights = drawn_ground(heights, ROUGH_CELL_M, seed) if kind == "drawn" else heights
         else:
             rise = {"slope": SIDE_SLOPE, "hill": HILL_SLOPE}.get(kind, 0.0)
-            self.cell_m, edge = EXTENT_M, rise * EXTENT_M / 2
+            self.cell_m = max(EXTENT_M, 2.0 * reach_m)
+            edge = rise * self.cell_m / 2
             heights = np.array([[-edge, edge], [-edge, edge]])
         self.heights: NDArray[np.float64] = np.ascontiguousarray(heights + datum_m)
         half = (self.heights.shape[0] - 1) * self.cell_m / 2
         self.origin_m: tuple[float, float] = (-half, -half)
         self.grid = (*self.origin_m, self.cell_m, self.heights)
         self.body = -1
+
+    @property
+    def level(self) -> bool:
+        """Whether all of it has one height."""
+        return self.kind in ("flat", "mud")
 
     def height(self, x: float, y: float) -> float:
         """Height of the surface [m]."""
@@ -124,7 +142,7 @@ class Terrain:
 
     def add_to(self, client: BulletClient, friction: float) -> int:
         """Create the fixed body in a client that holds the logs; stores and returns its id."""
-        if self.kind == "rough":
+        if len(self.heights) > 2:
             low, high = float(self.heights.min()), float(self.heights.max())
             rows, columns = self.heights.shape
             shape = client.createCollisionShape(
@@ -138,12 +156,13 @@ class Terrain:
             at, turn = [0.0, 0.0, (low + high) / 2], [0.0, 0.0, 0.0, 1.0]
         else:
             normal, middle = self.normal(0.0, 0.0), self.height(0.0, 0.0)
-            half = [EXTENT_M / 2, EXTENT_M / 2, THICKNESS_M / 2]
+            half = [self.cell_m / 2, self.cell_m / 2 / normal[2], THICKNESS_M / 2]
             shape = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
             at = [-THICKNESS_M / 2 * normal[0], -THICKNESS_M / 2 * normal[1], middle - THICKNESS_M / 2 * normal[2]]
             turn = client.getQuaternionFromEuler([math.atan2(-normal[1], normal[2]), 0.0, 0.0])
         self.body = client.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
-        client.changeDynamics(self.body, -1, lateralFriction=friction)
+        rolling_m = self.soil.log_rolling_m / LOG_FRICTION
+        client.changeDynamics(self.body, -1, lateralFriction=friction, rollingFriction=rolling_m)
         # Bullet computes the contacts of two bodies unless both sleep: sleeping ground makes logs at rest cost nothing.
         for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
             client.changeDynamics(self.body, -1, activationState=state)

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from machine.profile import Kinematics, Profile
 from sim.bullet.urdf import JointDef, LinkDef
-from sim.errors import PlantError
 from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
+from sim.truth.body import Steel
 from sim.truth.load import Truth
 
 FLEX_JOINTS: Final = ("flex_pitch", "flex_roll")
@@ -34,38 +33,7 @@ FLEX_STOP_RAD: Final = 0.15
 SMALL_LINKS: Final = {"base": (100.0, 5.0), "turntable": (15.0, 0.5), "flexure": (5.0, 0.1)}
 
 
-@dataclass(frozen=True, slots=True)
-class SteelDimensions:
-    """Dimensions of the steel that are not in the profile.
-
-    ``telescope_frame_m``: its link frame at 0 in the stick's; None: where the telescope's axis passes the stick pin.
-    ``beam_m``: width and height of boom, stick and telescope.
-    """
-
-    bearing_z_m: float
-    telescope_frame_m: Vector | None
-    beam_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    column_m: float
-
-
-STEEL_DIMENSIONS: Final = {
-    "palms_471": SteelDimensions(
-        0.26881, (0.0, 0.1256771629, 0.21905106705), ((0.16, 0.22), (0.14, 0.16), (0.10, 0.10)), 0.28
-    ),
-    "aoro_fc8": SteelDimensions(0.40, None, ((0.20, 0.26), (0.18, 0.20), (0.13, 0.13)), 0.36),
-}  # fmt: skip
-
-
-def _steel_dimensions(profile: Profile) -> SteelDimensions:
-    if profile.name not in STEEL_DIMENSIONS:
-        raise PlantError(
-            "plant.unknown-machine",
-            f"the plant has no steel dimensions for machine {profile.name!r}; use {', '.join(STEEL_DIMENSIONS)}",
-        )
-    return STEEL_DIMENSIONS[profile.name]
-
-
-def _telescope(k: Kinematics, build: SteelDimensions) -> tuple[float, Vector, Vector, Vector]:
+def _telescope(k: Kinematics, steel: Steel) -> tuple[float, Vector, Vector, Vector]:
     """The telescope in the stick frame: pitch [rad] and direction of its axis, its frame at 0, the pin at 0.
 
     Third and fourth row of the DH chain: a3 across and d4 along the telescope's own axis, which theta3's offset turns.
@@ -73,20 +41,20 @@ def _telescope(k: Kinematics, build: SteelDimensions) -> tuple[float, Vector, Ve
     a = k.theta3_offset_rad + k.theta2_offset_rad - math.pi / 2
     along = (0.0, math.cos(a), math.sin(a))
     across = (0.0, -math.sin(a), math.cos(a))
-    frame = build.telescope_frame_m or (0.0, k.a3_m * across[1], k.a3_m * across[2])
+    frame = steel.telescope_frame_m or (0.0, k.a3_m * across[1], k.a3_m * across[2])
     pin = (0.0, k.a3_m * across[1] + k.d4_m * along[1], k.a3_m * across[2] + k.d4_m * along[2])
     return a, along, frame, pin
 
 
-def crane_shapes(profile: Profile) -> list[Shape]:
+def crane_shapes(profile: Profile, steel: Steel) -> list[Shape]:
     """All boxes of the crane; ``solid`` ones collide."""
-    k, build = profile.kinematics, _steel_dimensions(profile)
-    steel, yellow, dark = (0.45, 0.47, 0.5), (0.95, 0.72, 0.1), (0.2, 0.2, 0.22)
-    pitch, along, frame, pin = _telescope(k, build)
+    k = profile.kinematics
+    grey, yellow, dark = (0.45, 0.47, 0.5), (0.95, 0.72, 0.1), (0.2, 0.2, 0.22)
+    pitch, along, frame, pin = _telescope(k, steel)
     tilted = rpy_quaternion(pitch, 0.0)
     foot = profile.workspace.ground_z_m if profile.carrier is None else 0.0
-    pivot = k.d1_m - build.bearing_z_m
-    (boom_x, boom_z), stick, inner = build.beam_m
+    pivot = k.d1_m - steel.bearing_z_m
+    (boom_x, boom_z), stick, inner = steel.beams_m
     length = 0.88 * k.d4_m  # of the stick's tube and of the telescope in it
 
     def beside_pin(back_m: float) -> Vector:
@@ -94,23 +62,23 @@ def crane_shapes(profile: Profile) -> list[Shape]:
 
     middle = beside_pin(0.62 * k.d4_m)
     tube = beside_pin(0.03 + length / 2)
-    wide = 1.8 * build.column_m
-    pedestal = ((wide, wide, build.bearing_z_m - foot), (0.0, 0.0, (build.bearing_z_m + foot) / 2))
+    wide = 1.8 * steel.column_m
+    pedestal = ((wide, wide, steel.bearing_z_m - foot), (0.0, 0.0, (steel.bearing_z_m + foot) / 2))
     return [
         Shape("base", *pedestal, IDENTITY, dark, False),
         Shape(
-            "mast", (build.column_m, build.column_m, pivot + 0.05), (0, k.a1_m / 2, pivot / 2), IDENTITY, steel, False
+            "mast", (steel.column_m, steel.column_m, pivot + 0.05), (0, k.a1_m / 2, pivot / 2), IDENTITY, grey, False
         ),
         Shape("boom", (boom_x, k.a2_m, boom_z), (0, k.a2_m / 2, 0), IDENTITY, yellow),
         Shape("stick", (stick[0], length, stick[1]), middle, tilted, yellow),
-        Shape("telescope", (inner[0], length, inner[1]), (0, tube[1] - frame[1], tube[2] - frame[2]), tilted, steel),
+        Shape("telescope", (inner[0], length, inner[1]), (0, tube[1] - frame[1], tube[2] - frame[2]), tilted, grey),
         *grapple_shapes(profile),
     ]
 
 
 def crane_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[JointDef]]:
     """Links in CRANE_LINKS order, the root ``base`` first, and joints in CRANE_JOINTS order."""
-    shapes = crane_shapes(profile)
+    shapes = crane_shapes(profile, truth.steel)
     links = []
     for name in CRANE_LINKS:
         own = tuple(s for s in shapes if s.link == name)
@@ -121,21 +89,21 @@ def crane_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[Joi
         t = truth.links["tong" if name.startswith("tong") else name]
         com = (-t.com_m[0], t.com_m[1], t.com_m[2]) if name == "tong_left" else t.com_m
         links.append(LinkDef(name, t.mass_kg, com, t.inertia_kg_m2, own))
-    return links, _joints(profile)
+    return links, _joints(profile, truth.steel)
 
 
-def _joints(profile: Profile) -> list[JointDef]:
-    k, build = profile.kinematics, _steel_dimensions(profile)
-    _, along, frame, pin = _telescope(k, build)
+def _joints(profile: Profile, steel: Steel) -> list[JointDef]:
+    k = profile.kinematics
+    _, along, frame, pin = _telescope(k, steel)
     jaws = jaw_geometry(profile)
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     boom = (0.0, k.a2_m * math.cos(k.theta2_offset_rad), k.a2_m * math.sin(k.theta2_offset_rad))
     pivot = -jaws.pivot_z_m
     table = {
-        "slew": ("base", "turntable", (0.0, 0.0, build.bearing_z_m), z),
+        "slew": ("base", "turntable", (0.0, 0.0, steel.bearing_z_m), z),
         "flex_pitch": ("turntable", "flexure", (0.0, 0.0, 0.0), x),
         "flex_roll": ("flexure", "mast", (0.0, 0.0, 0.0), y),
-        "lift": ("mast", "boom", (0.0, k.a1_m, k.d1_m - build.bearing_z_m), x),
+        "lift": ("mast", "boom", (0.0, k.a1_m, k.d1_m - steel.bearing_z_m), x),
         "tilt": ("boom", "stick", boom, x),
         "ext": ("stick", "telescope", frame, along),
         "hanger": ("telescope", "hanger", (0.0, pin[1] - frame[1], pin[2] - frame[2]), x),

@@ -20,7 +20,7 @@ from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, Prote
 
 ADDRESS = 0x30
 SUSPENSION_FUNCTION = 21  # J1939 NAME function of a suspension system controller
-COMMAND_NS = GUARD_NS = 100 * MS
+COMMAND_NS, GUARD_NS = 90 * MS, 100 * MS
 CYCLE_NS = 20 * MS
 ARM_COUNT = 4
 

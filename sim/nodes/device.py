@@ -60,8 +60,8 @@ class Device(CanopenSlave):
 class EstopBox(Device):
     """Safety module: two channels, reset button, and the pilot supply: hard-wired relay and guard in series.
 
-    ``press``, ``release`` and ``reset`` are its buttons.  `receive` takes GuardPilot; a machine whose guard does not
-    switch the supply (behind a PLC) never calls `decide`.
+    ``press``, ``release`` and ``reset`` are its buttons, `move_lever` is what it sees of the hand levers.  `receive`
+    takes GuardPilot; a machine whose guard does not switch the supply (behind a PLC) never calls `decide`.
     """
 
     RESET_PULSE_NS = 200 * MS
@@ -72,7 +72,7 @@ class EstopBox(Device):
         self._message = ProtectedMessage(database, "EstopStat")
         self._period = PeriodicTimer(10 * MS)
         self._channels = (1, 1)
-        self._source = self._events = 0
+        self._source = self._events = self._lever = 0
         self._reset_until_ns: int | None = None
         self._wants_reset = self._changed = False
         self.relay_on = self.guard_on = True
@@ -119,6 +119,11 @@ class EstopBox(Device):
             self._source, self.relay_on = 0, True
         self._event()
 
+    def move_lever(self, moved: bool) -> None:
+        """A person moves a hand lever, or lets go of it; what the lever does to the oil is not modelled."""
+        self._lever = int(moved)
+        self._event()
+
     def _event(self) -> None:
         self._events = (self._events + 1) & 0xFF
         self._changed = True
@@ -134,9 +139,8 @@ class EstopBox(Device):
             self._changed = False
             reset = int(self._reset_until_ns is not None)
             pressure = self.PILOT_BAR if self.pilot_on else 0.0
-            self.outbox.append(
-                self._message.frame(*self._channels, self._source, reset, int(self.pilot_on), 0, pressure, self._events)
-            )
+            state = (*self._channels, self._source, reset, int(self.pilot_on), 0, self._lever, pressure, self._events)
+            self.outbox.append(self._message.frame(*state))
 
 
 class PressureModule(Device):

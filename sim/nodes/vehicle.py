@@ -20,7 +20,7 @@ from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, Prote
 
 ADDRESS = 0x03
 DRIVE_FUNCTION = 23  # J1939 NAME function of a propulsion controller
-COMMAND_NS = GUARD_NS = 100 * MS
+COMMAND_NS, GUARD_NS = 90 * MS, 100 * MS
 CYCLE_NS = 20 * MS
 STANDSTILL_M_S = 0.02
 MIN_RATE_RAD_S = 5e-4

@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.plc", description="The live plant behind an emulated PLC.")
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file with a [plc] table")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--truth", default="nominal", help="nominal, sampled or a TOML file")
+    parser.add_argument("--truth", default="nominal", help="nominal, sampled, wide_valves or a TOML file")
     parser.add_argument("--logs", type=int, default=1)
     parser.add_argument("--modbus", type=_listening, metavar="HOST:PORT", help="Modbus/TCP; port 0 takes a free one")
     parser.add_argument("--udp", type=_listening, metavar="HOST:PORT", help="cyclic datagrams; port 0 takes a free one")

@@ -190,4 +190,5 @@ class Program:
             load_kg=min(max(round(inputs.load_kg), 0), 4093),
             estop_frame=inputs.estop_frame,
             sampled_us=now_ns // 1000 & 0xFFFF,
+            output=(*self.outputs, 0.0),
         )

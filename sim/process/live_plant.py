@@ -60,7 +60,13 @@ class LivePlant(LiveMachine):
             from sim.camera.rig import CameraRig
             from sim.camera.server import CameraServer
 
-            self.cameras = CameraServer(CameraRig(plant.world, plant.profile, plant.world.truth, seed), cameras)
+            def rig() -> CameraRig:
+                return CameraRig(plant.world, plant.profile, plant.world.truth, seed)
+
+            warm = rig()  # the first picture loads compiled code: for longer than the buses wait
+            for name in warm.names:
+                warm.frame(name, 0)
+            self.cameras = CameraServer(rig(), cameras)
 
     def _on_step(self, now_ns: int) -> None:
         for fault in [f for f in self._faults if now_ns >= f[0]]:

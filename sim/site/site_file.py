@@ -12,15 +12,18 @@ import msgspec
 
 from machine.profile import Profile
 from sim.errors import PlantError
+from sim.ground.terrain import Terrain
 from sim.plant import Plant
+from sim.site.laying import laid_at_rest
 from sim.wood.log_shape import LogSpec
+from sim.wood.logs import reach_m
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
     """``logs`` in laps: the first ``places`` lie at their places, and there are ``rounds`` laps of them.
 
-    `sim.site.log_supply.LogSupplier` replaces collected logs.
+    `sim.site.log_supply.LogSupplier` replaces collected logs.  ``terrain`` is a kind of `sim.ground.terrain.Terrain`.
     """
 
     latitude_deg: float
@@ -28,6 +31,7 @@ class Site:
     logs: tuple[LogSpec, ...]
     places: int = 0
     rounds: int = 1
+    terrain: str = "flat"
 
     def plant(self, profile: Profile, truth: str, seed: int) -> Plant:
         """The plant whose world has its origin at this site.
@@ -41,7 +45,14 @@ class Site:
             )
         here = {"site_lat_deg": self.latitude_deg, "site_lon_deg": self.longitude_deg}
         carrier = msgspec.structs.replace(profile.carrier, **here)
-        return Plant(msgspec.structs.replace(profile, carrier=carrier), seed, truth, scene=self.logs)
+        here_profile = msgspec.structs.replace(profile, carrier=carrier)
+
+        def build(scene: tuple[LogSpec, ...]) -> Plant:
+            return Plant(here_profile, seed, truth, scene=scene, terrain=self.terrain)
+
+        if self.terrain == "flat":  # logs on level ground stay where they are laid
+            return build(self.logs)
+        return laid_at_rest(build, self.logs, Terrain(self.terrain, seed, reach_m=reach_m(self.logs)))
 
     def save(self, path: Path) -> None:
         """Write the file."""

@@ -1,4 +1,4 @@
-"""Masses and flexibility of one machine: the rigid bodies of its crane."""
+"""Masses, steel and flexibility of one machine: the rigid bodies of its crane, and the pose in which it starts."""
 
 from __future__ import annotations
 
@@ -19,6 +19,30 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         scale = draw.factor(draw.spread.mass)
         x, y, z = (scale * i for i in self.inertia_kg_m2)
         return msgspec.structs.replace(self, mass_kg=scale * self.mass_kg, inertia_kg_m2=(x, y, z))
+
+
+class Steel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Dimensions of the steel that are not in the profile [m].
+
+    ``bearing_z_m``: slew bearing above the base origin.  ``beams_m``: width and height of boom, stick and telescope;
+    ``column_m``: width of the column.  ``telescope_frame_m``: the telescope's link frame at extension 0 in the
+    stick's; None: where the telescope's axis passes the stick pin.
+    """
+
+    bearing_z_m: float
+    beams_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    column_m: float
+    telescope_frame_m: tuple[float, float, float] | None = None
+
+
+class Home(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Joint positions in which the crane starts [rad, m]; there its column stands plumb with an empty grapple."""
+
+    slew: float
+    lift: float
+    tilt: float
+    ext: float
+    rot: float
 
 
 class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

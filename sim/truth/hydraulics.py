@@ -5,11 +5,16 @@ docs/reference/plant-model.md section 2, docs/reference/machines.md section 3.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 
 from sim.truth.variation import VariationSampler
+
+WIDE_DEADBAND: Final = (0.03, 0.30)
+WIDE_DELAY_S: Final = (0.020, 0.250)
+WIDE_GAIN: Final = (1.0 / 3.0, 3.0)
+"""Ranges of the valves that a crane may have at all: share of the stroke, s, times the nominal full speed."""
 
 
 class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -110,6 +115,19 @@ class ValveTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             deadband_minus=self.deadband_minus * draw.factor(s.deadband),
             full_speed_plus=self.full_speed_plus * draw.factor(s.gain),
             full_speed_minus=self.full_speed_minus * draw.factor(s.gain),
+        )
+
+    def widely_sampled(self, draw: VariationSampler, nominal: ValveTruth) -> ValveTruth:
+        """Any sensible valve instead of this one: dead-bands, dead time and full speeds, each drawn for itself, the
+        full speeds around the ``nominal`` ones.
+        """
+        return msgspec.structs.replace(
+            self,
+            delay_s=draw.log_uniform(*WIDE_DELAY_S),
+            deadband_plus=draw.log_uniform(*WIDE_DEADBAND),
+            deadband_minus=draw.log_uniform(*WIDE_DEADBAND),
+            full_speed_plus=nominal.full_speed_plus * draw.log_uniform(*WIDE_GAIN),
+            full_speed_minus=nominal.full_speed_minus * draw.log_uniform(*WIDE_GAIN),
         )
 
 

@@ -1,17 +1,21 @@
 """Loads the ground truth about one individual machine.
 
-``load_truth(name, seed, machine)`` reads the machine's nominal file beside this one (or any TOML path) and, for
-``"sampled"``, draws one individual around it.  Equal name, seed and machine give the same truth.
+``load_truth(choice, seed, machine)`` reads the machine's nominal file beside this one (or the file of the choice,
+`sim.individual`) and, for ``"sampled"``, draws one individual around it; for ``"wide_valves"`` that individual gets
+valves from the whole range of mobile valves, about which its profile knows nothing.  Equal choice, seed and machine
+give the same truth.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Final
 
 import msgspec
 
 from sim.errors import PlantError
-from sim.truth.body import Contact, Link, Structure
+from sim.individual import DRAWN, split
+from sim.truth.body import Contact, Home, Link, Steel, Structure
 from sim.truth.carrier import CarrierTruth
 from sim.truth.encoders import EncoderTruth
 from sim.truth.hydraulics import Function, Supply
@@ -20,12 +24,17 @@ from sim.truth.variation import Variation, VariationSampler
 from sim.truth.wood import Wood
 
 FILES = {"palms_471": "nominal.toml", "aoro_fc8": "nominal_aoro_fc8.toml"}
+SHIPPED_SECTIONS: Final = ("home", "steel")
+"""A truth file of a shipped machine without them has the shipped ones."""
+JOINT_FUNCTIONS: Final = ("slew", "lift", "tilt", "ext", "rot")
 
 
 class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything about the machine that the plant uses and the controller does not know."""
 
     machine: str
+    home: Home
+    steel: Steel
     links: dict[str, Link]
     structure: Structure
     contact: Contact
@@ -39,33 +48,46 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     carrier: CarrierTruth | None = None
 
 
-def load_truth(name: str, seed: int, machine: str) -> Truth:
-    """``"nominal"``, ``"sampled"`` (an individual drawn from ``seed``) or the path of a truth file, for ``machine``.
+def load_truth(choice: str, seed: int, machine: str) -> Truth:
+    """The truth of a choice (`sim.individual`) for ``machine``; ``seed`` draws the individual.
 
     Raises:
         PlantError: the file is missing, incomplete, has unknown keys or describes another machine.
     """
-    if name in ("nominal", "sampled"):
+    kind, path = split(choice)
+    if path is None:
         if machine not in FILES:
             raise PlantError(
                 "truth.unknown-machine",
-                f"there is no truth for machine {machine!r}; use {', '.join(FILES)} or the path of a truth file",
+                f"there is no shipped truth for machine {machine!r}, only for {', '.join(FILES)}; put "
+                f"{machine}.truth.toml beside its profile, or name a truth file",
             )
         path = Path(__file__).with_name(FILES[machine])
-    else:
-        path = Path(name)
     try:
-        truth = msgspec.toml.decode(path.read_bytes(), type=Truth)
+        truth = msgspec.convert(_with_shipped_sections(msgspec.toml.decode(path.read_bytes())), Truth)
     except (OSError, msgspec.DecodeError) as error:
         raise PlantError(
-            "truth.unreadable", f"truth file {path}: {error}; use nominal, sampled or a complete TOML file"
+            "truth.unreadable",
+            f"truth file {path}: {error}; use nominal, sampled, wide_valves or a complete TOML file",
         ) from None
     if truth.machine != machine:
         raise PlantError(
             "truth.other-machine",
             f"truth file {path} describes machine {truth.machine!r}, not {machine!r}; use the file of {machine!r}",
         )
-    return _sampled(truth, seed) if name == "sampled" else truth
+    if kind not in DRAWN:
+        return truth
+    one = _sampled(truth, seed)
+    return _with_wide_valves(truth, one, seed) if kind == "wide_valves" else one
+
+
+def _with_shipped_sections(content: dict[str, Any]) -> dict[str, Any]:
+    """A file's content; a file about a shipped machine need not repeat what no individual varies."""
+    machine = content.get("machine")
+    if not isinstance(machine, str) or machine not in FILES:
+        return content
+    defaults = msgspec.toml.decode(Path(__file__).with_name(FILES[machine]).read_bytes())
+    return {name: defaults[name] for name in SHIPPED_SECTIONS} | content
 
 
 def _sampled(truth: Truth, seed: int) -> Truth:
@@ -85,3 +107,16 @@ def _sampled(truth: Truth, seed: int) -> Truth:
         gnss=truth.gnss and truth.gnss.sampled(draw("gnss")),
         carrier=truth.carrier and truth.carrier.sampled(draw("carrier")),
     )
+
+
+def _with_wide_valves(nominal: Truth, truth: Truth, seed: int) -> Truth:
+    """The same individual with other valves on its joints; grapple and carrier keep theirs: nobody maps them."""
+
+    def changed(name: str, function: Function) -> Function:
+        if name not in JOINT_FUNCTIONS:
+            return function
+        draw = VariationSampler(truth.spread, f"wide valve {name}", seed)
+        return Function(function.cylinder, function.valve.widely_sampled(draw, nominal.functions[name].valve))
+
+    functions = {name: changed(name, function) for name, function in truth.functions.items()}
+    return msgspec.structs.replace(truth, functions=functions)

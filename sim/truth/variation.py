@@ -54,3 +54,7 @@ class VariationSampler:
         """A dead time [s] between the two bounds; a function without dead time keeps none."""
         s = self.spread
         return self.rng.triangular(s.delay_min_s, s.delay_max_s, nominal_s) if nominal_s else 0.0
+
+    def log_uniform(self, low: float, high: float) -> float:
+        """A number in low..high, both positive; equal ratios are equally likely."""
+        return float(low * (high / low) ** self.rng.random())

@@ -41,6 +41,13 @@ SETTLE_DAMPING: Final = (0.3, 0.9)
 INSIDE_M: Final = 0.003  # deepest contact at the start that does not count as an overlap
 NUDGE_RAD_S: Final = 0.1
 NEIGHBOUR_M: Final = 0.05
+RISE_POINTS: Final = 11
+SPINE_POINTS: Final = 11
+CROSS_SHARES: Final = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+FINE_POINTS: Final = 41
+FINE_SHARES: Final = tuple((0.5 * i, 0.5 * j) for i in range(-2, 3) for j in range(-2, 3))
+FINE_MARGIN_M: Final = 0.02
+GROUND_MARGIN_M: Final = 8.0  # of ground beyond the outermost log
 BARK: Final = (0.55, 0.35, 0.18, 1.0)
 
 
@@ -62,10 +69,15 @@ class LogState:
     ends_m: tuple[Vector, Vector]
 
 
+def reach_m(scene: Sequence[LogSpec]) -> float:
+    """How far the ground must reach from the origin for a scene, in x and y [m]."""
+    return GROUND_MARGIN_M + max((abs(at) for log in scene for at in (log.x_m, log.y_m)), default=0.0)
+
+
 class LogBodies:
     """The logs' rigid bodies.  ``body_ids`` are in scene order, ``masses`` in kg.
 
-    ``terrain`` is used in the private client only; ``base`` is the crane's base frame in the world, for the bunk.
+    ``terrain`` gets a body in the private client only; ``base`` is the crane's base frame in the world, for the bunk.
 
     Raises:
         PlantError: logs overlap each other or the machine at the start, or do not come to rest.
@@ -80,7 +92,7 @@ class LogBodies:
         terrain: Terrain,
         base: Pose,
     ) -> None:
-        self._p, self.scene = client, tuple(scene)
+        self._p, self.scene, self._terrain = client, tuple(scene), terrain
         wood = [mass_of(spec) for spec in self.scene]
         self.masses = [m.mass_kg for m in wood]
         poses = _settled(profile, truth.contact, self.scene, terrain, base) if self.scene else []
@@ -106,10 +118,25 @@ class LogBodies:
                 self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
     def move(self, which: int, east_m: float, north_m: float) -> None:
-        """Move a log, without turning it, to another place on level ground."""
+        """Move a log, without turning it, to another place; on uneven ground it drops a little."""
         (x, y, z), turn = self._p.getBasePositionAndOrientation(self.body_ids[which])
-        self._p.resetBasePositionAndOrientation(self.body_ids[which], (x + east_m, y + north_m, z), turn)
+        at = (x + east_m, y + north_m, z + self._rise_m(which, east_m, north_m))
+        self._p.resetBasePositionAndOrientation(self.body_ids[which], at, turn)
         self._p.resetBaseVelocity(self.body_ids[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    def _rise_m(self, which: int, east_m: float, north_m: float) -> float:
+        """How much higher a log must lie at another place so as not to touch the ground there [m]."""
+        if self._terrain.level:
+            return 0.0
+        log = self.states()[which]
+        (ax, ay, az), (bx, by, bz) = log.ends_m
+        ground = self._terrain.height
+        return max(
+            ground(ax + s * (bx - ax) + east_m + dx, ay + s * (by - ay) + north_m + dy)
+            - (az + s * (bz - az) - 0.5 * log.diameter_m)
+            for s in (i / (RISE_POINTS - 1) for i in range(RISE_POINTS))
+            for dx, dy in ((0.0, 0.0), (0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1))
+        )
 
     def states(self) -> list[LogState]:
         """The logs now, in scene order.  Only those that moved since the last call are computed."""
@@ -200,16 +227,20 @@ def _body(p: BulletClient, spec: LogSpec, mass: Mass, pose: Pose, contact: Conta
 def _lifts(scene: Sequence[LogSpec], terrain: Terrain) -> list[float]:
     """Height of the ground under each log's lowest line; logs that are near each other share the highest."""
     lifts = []
+    # Stones and stumps are as narrow as the ground's cells: they must not hide between two points.
+    fine = terrain.kind == "drawn"
+    shares, count, margin_m = (FINE_SHARES, FINE_POINTS, FINE_MARGIN_M) if fine else (CROSS_SHARES, SPINE_POINTS, 0.0)
     for s in scene:
-        points = s.spine()
+        points = s.spine(count)
         radii = [s.radius(i / (len(points) - 1) - 0.5) for i in range(len(points))]
         low = [pt[2] - r for pt, r in zip(points, radii, strict=True)]
         least, d = min(low), s.diameter_m / 2
         lifts.append(
-            max(
-                terrain.height(s.x_m + pt[0] + dx, s.y_m + pt[1] + dy) - (z - least)
+            margin_m
+            + max(
+                terrain.height(s.x_m + pt[0] + d * u, s.y_m + pt[1] + d * v) - (z - least)
                 for pt, z in zip(points, low, strict=True)
-                for dx, dy in ((0.0, 0.0), (d, 0.0), (-d, 0.0), (0.0, d), (0.0, -d))
+                for u, v in shares
             )
         )
     near = [
@@ -287,10 +318,12 @@ def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
         if all(free.values()) and min(still.values()) >= STILL_CHECK_COUNT:
             return
     worst = min(range(len(bodies)), key=lambda i: (free[bodies[i]], still[bodies[i]]))
-    raise PlantError(
+    error = PlantError(
         "logs.not-at-rest",
         f"log {worst} still moves {SETTLE_S:.0f} s after its release; place the logs on flatter ground or use fewer",
     )
+    error.logs = tuple(i for i, body in enumerate(bodies) if not free[body] or still[body] < STILL_CHECK_COUNT)
+    raise error
 
 
 def _check_apart(p: BulletClient, bodies: Sequence[int], when: str) -> None:
