@@ -28,7 +28,9 @@ from can_dbc.bus.batch import enlarge_receive_buffer
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.frame import Frame
+from can_dbc.messages.picture import PictureRefused, decode_picture, encode_picture_request
 from can_dbc.messages.record_ring import RingReader, default_path
+from can_dbc.messages.udp_address import address_argument
 from can_dbc.timing.page import Timing, TimingRefused, read_timing
 from machine.loading.profile_file import ProfileError, load_profile
 from recorder import journal
@@ -42,6 +44,7 @@ FLUSH_PERIOD_S: Final = 0.1
 POLL_PERIOD_S: Final = 0.02
 MAX_DATAGRAM_BYTES: Final = 65536
 TIMING_PERIOD_S: Final = 1.0
+PICTURE_PERIOD_S: Final = 1.0
 
 Item = tuple[str, str, list[Frame] | bytes | Timing]
 
@@ -54,7 +57,12 @@ class InputCollector:
     """
 
     def __init__(
-        self, buses: dict[str, Bus], ticks: RingReader, reports: socket.socket, timing: Path | None = None
+        self,
+        buses: dict[str, Bus],
+        ticks: RingReader,
+        reports: socket.socket,
+        timing: Path | None = None,
+        detector: tuple[str, int] | None = None,
     ) -> None:
         self.items: queue.Queue[Item | None] = queue.Queue(QUEUE_ITEMS)
         self.dropped = 0
@@ -64,6 +72,7 @@ class InputCollector:
         self._ticks = ticks
         self._receivers += [self._tick_records, self._datagrams("report", reports)]
         self._receivers += [self._timing_page(timing)] if timing else []
+        self._receivers += [self._pictures(detector)] if detector else []
 
     def run(self) -> None:
         """Receives until ``end``, then what still waits."""
@@ -125,6 +134,28 @@ class InputCollector:
 
         return receive
 
+    def _pictures(self, detector: tuple[str, int]) -> Callable[[], None]:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        sock.connect(detector)
+        next_ask_s, newest_ns = 0.0, 0
+
+        def receive() -> None:
+            nonlocal next_ask_s, newest_ns
+            with contextlib.suppress(OSError, PictureRefused):  # no detector yet, or one without a camera
+                while True:
+                    data = sock.recv(MAX_DATAGRAM_BYTES)
+                    facts, jpeg = decode_picture(data)
+                    if jpeg and facts.measured_ns > newest_ns:
+                        newest_ns = facts.measured_ns
+                        self._put(("picture", "", data), 1)
+            if (now := time.monotonic()) >= next_ask_s:
+                next_ask_s = now + PICTURE_PERIOD_S
+                with contextlib.suppress(OSError):
+                    sock.send(encode_picture_request(newest_ns))
+
+        return receive
+
     def _tick_records(self) -> None:
         for record in self._ticks.read():
             self._put(("tick", "", record), 1)
@@ -161,6 +192,8 @@ def write_all(recorder: Recorder, inputs: InputCollector) -> None:
             recorder.on_tick(what)
         elif kind == "report":
             recorder.on_report(what)
+        elif kind == "picture":
+            recorder.on_picture(what)
         now = time.monotonic()
         if now >= flush_at:
             recorder.flush(time.monotonic_ns())
@@ -213,6 +246,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--timing", type=Path, metavar="FILE", help="the controller's timing page, recorded once per second"
     )
+    parser.add_argument(
+        "--pictures",
+        type=address_argument,
+        metavar="HOST:PORT",
+        help="log detector whose pictures are recorded, at most one a second",
+    )
     parser.add_argument("--seed", type=int, help="seed of the run, for the manifest")
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
     parser.add_argument("--stops", type=Path, metavar="DIR", help="directory of the stops' files; default: OUT/stops")
@@ -241,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, OverflowError) as error:
         report(f"a port or file cannot be used ({error}); choose another")
         return 4
-    inputs = InputCollector(buses, ticks, reports, a.timing)
+    inputs = InputCollector(buses, ticks, reports, a.timing, a.pictures)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: inputs.end())
     writer = threading.Thread(target=write_all, args=(recorder, inputs), name="writer")

@@ -7,7 +7,8 @@ stamp; the recorder has no clock.  Outputs, in one directory:
 * ``run.mcap`` (then ``run-0002.mcap`` and so on, one per 512 MiB and after a full disk): ``/<bus>/raw`` (the
   16 bytes of the kernel's ``struct can_frame``, then the sender's name if it is known), ``/<bus>/<message>``
   (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.messages.tick_record``), ``/controller/report``,
-  ``/timing`` (the controller's timing page) and ``/manifest`` (JSON).
+  ``/timing`` (the controller's timing page) and ``/manifest`` (JSON), and what Foxglove and Lichtblick draw of the
+  machine (``machine.foxglove.topics``).
   Publish time is monotonic; log time is UTC if the manifest has it (live), else monotonic, too.
 * ``manifest.json``: see ``recorder.manifest``.
 * ``stops/``: a file for every stop of the machine, see ``recorder.stop_recorder``.
@@ -30,8 +31,13 @@ from can_dbc.frame import ERROR, REMOTE, Frame, describe
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.grasp import decode_grasp
+from can_dbc.messages.json_schema import flat_schema
+from can_dbc.messages.mission import decode_mission
+from can_dbc.messages.picture import PictureRefused, decode_picture
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
+from machine.foxglove.topics import ENCODING, MachineTopics, Message
 from machine.profile import Profile
 from recorder import manifest as manifests
 from recorder.files import CommitFile
@@ -93,6 +99,7 @@ class Recorder:
         self._offset_ns = manifest.utc_offset_ns
         databases = manifests.databases(profile)
         self._signals = {bus: BusSignals(map(codec.load, databases[bus])) for bus in manifest.buses}
+        self._topics = MachineTopics(profile)
         self._chunk_start_ns: int | None = None
         self._chunk_end_ns: int | None = None
         self._now_ns = manifest.start_monotonic_ns or 0
@@ -144,10 +151,12 @@ class Recorder:
         self._stops.on_tick(tick, record)
 
     def on_report(self, datagram: bytes) -> None:
-        """Records the controller's state report or vehicle report."""
+        """Records the controller's state report or vehicle report, and the log map of the planner's mission report."""
         try:
             report = datagrams.decode(datagram, self._key)
         except DatagramRefused:
+            if self._on_planner(datagram):
+                return
             report = None
         if isinstance(report, VehicleReport) and self._drives:
             topic = VEHICLE
@@ -156,8 +165,32 @@ class Recorder:
         else:
             self.refused += 1
             return
-        self._at(report.stamp_ns)
-        self._add(topic, report.stamp_ns, _JSON.encode(report))
+        stamp_ns, time_ns = report.stamp_ns, report.stamp_ns + self._offset_ns
+        self._at(stamp_ns)
+        self._add(topic, stamp_ns, _JSON.encode(report))
+        on = self._topics.on_position if isinstance(report, VehicleReport) else self._topics.on_state
+        self._add_drawing(on(report, time_ns), stamp_ns)  # type: ignore[arg-type]
+
+    def _on_planner(self, datagram: bytes) -> bool:
+        """Records the log map of a mission report; False when the planner did not send the datagram."""
+        try:
+            _, stamp_ns, mission = decode_mission(datagram, self._key)
+        except DatagramRefused:
+            return _is_grasp(datagram, self._key)
+        self._at(stamp_ns)
+        self._add_drawing(self._topics.on_mission(mission, stamp_ns + self._offset_ns), stamp_ns)
+        return True
+
+    def on_picture(self, datagram: bytes) -> None:
+        """Records a log detector's reply to a request for its newest picture; a reply without one is not recorded."""
+        try:
+            facts, jpeg = decode_picture(datagram)
+        except PictureRefused:
+            return
+        if jpeg:
+            self._at(facts.measured_ns)
+            messages = self._topics.on_picture(facts.camera, jpeg, facts.measured_ns + self._offset_ns)
+            self._add_drawing(messages, facts.measured_ns)
 
     def on_timing(self, timing: Timing) -> None:
         """Records the controller's timing, once per state of its page."""
@@ -222,6 +255,12 @@ class Recorder:
         else:
             self._segment.add(topic, stamp_ns + self._offset_ns, stamp_ns, data)
 
+    def _add_drawing(self, messages: list[Message], stamp_ns: int) -> None:
+        """Adds what is drawn from a record that is kept anyway: a full disk does not count it as lost."""
+        if self._segment is not None:
+            for topic, data in messages:
+                self._segment.add(topic, stamp_ns + self._offset_ns, stamp_ns, data, counted=False)
+
     def _open_segment(self) -> None:
         """Opens the next file; its first chunk has every channel and the manifest, and is written immediately."""
         name = f"run-{self._segments + 1:04d}.mcap" if self._segments else RUN_NAME
@@ -231,11 +270,13 @@ class Recorder:
             for message in signals.messages():
                 segment.channel(f"/{bus}/{message.name}", "json", message.name, json_schema(message))
         segment.channel(TICK, "timberhand.tick")
-        segment.channel(REPORT, "json", "StateReport", _OBJECT)
+        segment.channel(REPORT, "json", "StateReport", flat_schema(StateReport))
         if self._drives:
-            segment.channel(VEHICLE, "json", "VehicleReport", _OBJECT)
+            segment.channel(VEHICLE, "json", "VehicleReport", flat_schema(VehicleReport))
         segment.channel(TIMING, "json", "Timing", _OBJECT)
         segment.channel("/manifest", "json", "Manifest", _OBJECT)
+        for topic, schema in self._topics.topics:
+            segment.channel(topic, ENCODING, schema.name, schema.data, schema.encoding)
         segment.add("/manifest", self._now_ns + self._offset_ns, self._now_ns, _JSON.encode(self._manifest))
         try:
             segment.commit()
@@ -252,3 +293,12 @@ class Recorder:
             self.dropped += self._segment.pending
             self._segment.close()
             self._segment = None
+
+
+def _is_grasp(datagram: bytes, key: bytes | None) -> bool:
+    """Whether it is a chosen grasp, which the planner sends to all that it tells; it is not recorded."""
+    try:
+        decode_grasp(datagram, key)
+    except DatagramRefused:
+        return False
+    return True

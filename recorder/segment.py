@@ -15,21 +15,23 @@ class Segment:
     def __init__(self, path: Path, durable: bool) -> None:
         """Creates the file; raises OSError, also if it exists already."""
         self.pending = 0
-        """Messages since the last commit."""
+        """Counted messages since the last commit."""
         self._file = CommitFile(path, durable)
         fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._writer = McapFile(self._file, "timberhand")
         self._channels: dict[str, int] = {}
 
-    def channel(self, topic: str, encoding: str, schema: str = "", text: bytes = b"") -> None:
-        """Adds a topic; ``text`` is the JSON schema of the name ``schema``."""
-        schema_id = self._writer.register_schema(schema, "jsonschema", text) if schema else 0
+    def channel(
+        self, topic: str, encoding: str, schema: str = "", text: bytes = b"", schema_encoding: str = "jsonschema"
+    ) -> None:
+        """Adds a topic; ``text`` is the schema of the name ``schema``, in its encoding."""
+        schema_id = self._writer.register_schema(schema, schema_encoding, text) if schema else 0
         self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
 
-    def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes) -> None:
-        """Adds a message to the open chunk."""
+    def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes, counted: bool = True) -> None:
+        """Adds a message to the open chunk; what is drawn from other records is not ``counted`` as one."""
         self._writer.add_message(self._channels[topic], log_ns, data, publish_ns)
-        self.pending += 1
+        self.pending += counted
 
     def commit(self) -> int:
         """Ends the chunk and writes it; returns the size of the file [bytes]; raises OSError."""

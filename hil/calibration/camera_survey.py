@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import replace
 from typing import Any, Final
 
 import msgspec
@@ -16,7 +15,6 @@ import numpy as np
 
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.camera.survey import surveyed
-from autonomy.perception.tracking.log_filter import CameraErrors
 from machine.geometry.optics import intrinsics
 from machine.profile import Camera, Profile
 from sim.camera.geometry import mount_view
@@ -28,10 +26,6 @@ SIGMA_M, SIGMA_PX, FRAMES = 0.002, 0.3, 30
 """Errors of a target's surveyed position and of its pixel; pictures of each target."""
 MARGIN_PX: Final = 60
 RANGE_M: Final = (3.0, 8.0)
-SURVEYED: Final = CameraErrors(scale=0.0015, mount_rad=0.0015, mount_m=0.004)
-"""Errors that remain after the survey of a camera on the crane."""
-SURVEYED_BY_GNSS: Final = replace(SURVEYED, pose_rad=0.002, pose_m=0.012)
-"""The same on a vehicle that a dual-antenna RTK receiver localizes."""
 
 
 def surveyed_profile(profile: Profile, truth: Any, name: str, seed: int) -> Profile:

@@ -7,7 +7,7 @@ crane's bus, and the readings of a total station.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,6 +23,7 @@ from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.wire.inprocess import InProcessBus
+from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
@@ -30,7 +31,7 @@ from recorder.recorder import Recorder
 from sim.instruments.total_station import TotalStation, grapple_yaw
 from sim.plant import Plant
 
-MAX_DURATION_S: Final = 420.0
+MAX_DURATION_S: Final = 900.0
 RUN_ON_NS: Final = 500_000_000
 """A run continues this long after its end, so that the last frames are recorded."""
 READY_MODES: Final = (Mode.STANDBY, Mode.ARMED)
@@ -51,13 +52,15 @@ class _Calibrator:
     """The procedure as the planner of the lockstep; it plans with the first report of a machine that is ready."""
 
     def __init__(
-        self, profile: Profile, plant: Plant, seed: int, surveyed: bool, show: Callable[[CalibrationPlan], None]
-    ) -> None:
+        self, profile: Profile, plant: Plant, seed: int, surveyed: bool, chosen: Collection[Joint],
+        show: Callable[[CalibrationPlan], None],
+    ) -> None:  # fmt: skip
         self.calibration: Calibration | None = None
         self.plan: CalibrationPlan | None = None
         self.refused: str | None = None
         self.bus: InProcessBus | None = None
         self._profile, self._plant, self._surveyed, self._show = profile, plant, surveyed, show
+        self._chosen = chosen
         self._station = TotalStation(seed)
         self._frames: list[Frame] = []
 
@@ -75,7 +78,7 @@ class _Calibrator:
 
     def _plan(self, report: StateReport) -> None:
         try:
-            self.plan = make_plan(self._profile, report.position, self._surveyed)
+            self.plan = make_plan(self._profile, report.position, self._surveyed, self._chosen)
         except CalibrationImpossible as error:
             self.refused = str(error)
             return
@@ -89,6 +92,7 @@ def run_lockstep(
     seed: int,
     *,
     surveyed: bool,
+    chosen: Collection[Joint] = JOINTS,
     recorder: Recorder | None = None,
     show: Callable[[CalibrationPlan], None] = lambda plan: None,
     watch: Callable[[Calibration], None] = lambda calibration: None,
@@ -104,7 +108,7 @@ def run_lockstep(
     profile = load_profile(name)
     plant = Plant(profile, seed=seed, truth=truth, logs=0)
     try:
-        planner = _Calibrator(profile, plant, seed, surveyed, show)
+        planner = _Calibrator(profile, plant, seed, surveyed, chosen, show)
         settings = Settings(profile, profile_hash(profile), profile.rate_hz)
         operator = Operator(profile_hash(profile), _on_press, max_stops=0)
         system = Lockstep(settings, build_guard(profile_path(name)), plant, planner, operator, Observer(recorder, []))

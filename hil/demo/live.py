@@ -8,12 +8,12 @@ from typing import Final
 
 from rich.console import Console
 
-from hil.demo.summary import Summary, outcome_sentence
+from hil.demo.summary import Summary, is_settled, outcome_sentence
 from hil.harness.display import Display
 from hil.harness.live import LiveOptions, LiveRun
 from machine.loading.profile_file import load_profile
 
-SETTLE_S: Final = 3.0
+SETTLE_S: Final = 10.0  # a bowed log rocks in the bunk for seconds
 
 
 class OneLogRun(LiveRun[Summary]):
@@ -23,7 +23,7 @@ class OneLogRun(LiveRun[Summary]):
         self._display.event("waiting for the plant's evaluation")
         limit = time.monotonic() + SETTLE_S
         verdict = self._request(sim_port, "verdict")
-        while not verdict["success"] and time.monotonic() < limit:
+        while not is_settled(verdict) and time.monotonic() < limit:
             time.sleep(0.2)
             verdict = self._request(sim_port, "verdict")
         last = self._report
@@ -38,6 +38,7 @@ class OneLogRun(LiveRun[Summary]):
             frames=last.frames_received if last else 0,
             refused_setpoints=last.refused if last else 0,
             grasp=self._grasp,
+            closings=self._closings,
             directory=str(self._options.directory),
         )
 
@@ -54,6 +55,7 @@ def run_live(
     console: Console,
     plc_link: str = "modbus",
     camera: str = "",
+    foxglove_port: int = 0,
 ) -> Summary:
     """Run the job as separate processes in real time.
 
@@ -62,6 +64,8 @@ def run_live(
     """
     profile = load_profile(name)
     directory.mkdir(parents=True, exist_ok=True)
-    options = LiveOptions(name, profile, seed, truth, bus, directory, page, limit_s, max_stops, plc_link, camera)
+    options = LiveOptions(
+        name, profile, seed, truth, bus, directory, page, limit_s, max_stops, plc_link, camera, foxglove_port
+    )
     with Display(console, f"{profile.title}: one log into the bunk, live, seed {seed}") as display:
         return OneLogRun(options, display).run()

@@ -10,13 +10,14 @@ from typing import Final
 from rich.console import Console
 
 from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from can_dbc.messages.crane import OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
-from hil.demo.summary import Summary, outcome_sentence
+from hil.demo.summary import Summary, is_settled, outcome_sentence
 from hil.faults.injector import Injector
 from hil.faults.order import Order
 from hil.harness.display import Display
@@ -32,7 +33,8 @@ from recorder.manifest import describe as describe_run
 from recorder.recorder import Recorder, RecordingRefused
 from sim.plant import Plant
 
-SETTLE_NS: Final = 3_000_000_000
+SETTLE_NS: Final = 10_000_000_000
+"""A bowed log rocks in the bunk for up to five seconds; the evaluation waits for rest, at most this long."""
 
 
 def run_lockstep(
@@ -66,6 +68,7 @@ def run_lockstep(
         with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
             job = _Job(name, profile, plant, recorder, display, detector)
             if orders:
+                job.system.operator.watches = any(order.fault == "operator-off" for order in orders)
                 Injector(job.system, orders)
             return job.run(limit_s, str(directory))
     finally:
@@ -94,6 +97,7 @@ class _Job:
         self._display = display
         self._mode: int = -1
         self._phase = self._grasp = ""
+        self._closings = 0
         self.activity = Activity(profile, profile_hash(profile), grasp_selector=PlannerSelection(SamplingPlanner()))
         self.system = Lockstep(
             settings,
@@ -117,17 +121,18 @@ class _Job:
                 self._display.event(f"grasp: {self._grasp}")
             if activity.phase.name != self._phase:
                 self._phase = activity.phase.name
+                self._closings += activity.phase is Phase.CLOSE
                 self._display.phase(self._phase)
         finished_ns = system.now_ns
         verdict = system.plant.evaluate()
-        while not verdict.success and system.now_ns < finished_ns + SETTLE_NS:
+        while not is_settled(asdict(verdict)) and system.now_ns < finished_ns + SETTLE_NS:
             system.advance()
             verdict = system.plant.evaluate()
-        report = system.report
+        report, late = system.report, "" if activity.done else f"not done within {limit_s:.0f} s"
         return Summary(
             in_bunk=verdict.success,
             verdict=outcome_sentence(asdict(verdict)),
-            failure=activity.failure or ("" if activity.done else f"not done within {limit_s:.0f} s"),
+            failure=activity.failure or system.operator.complaint or late,
             seconds=(finished_ns - START_NS) / 1e9,
             stops=system.operator.stops,
             ticks=system.ticks,
@@ -135,6 +140,7 @@ class _Job:
             frames=system.frames,
             refused_setpoints=report.refused if report else 0,
             grasp=self._grasp,
+            closings=self._closings,
             directory=directory,
         )
 

@@ -14,7 +14,10 @@ from host.exit_codes import ExitCode
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The outcome of one run; ``in_bunk`` and ``verdict`` come from the plant's physics alone."""
+    """The outcome of one run; ``in_bunk`` and ``verdict`` come from the plant's physics alone.
+
+    ``closings``: how often the grapple was closed about the log; a second one is a retry.
+    """
 
     in_bunk: bool
     verdict: str
@@ -26,6 +29,7 @@ class Summary:
     frames: int
     refused_setpoints: int
     grasp: str
+    closings: int
     directory: str
 
     @property
@@ -42,7 +46,8 @@ class Summary:
         if self.failure:
             console.print(f"  the planner failed: {self.failure}", highlight=False, soft_wrap=True)
         if self.grasp:
-            console.print(f"  grasp: {self.grasp}", highlight=False, soft_wrap=True)
+            retries = f"; closed {self.closings} times" if self.closings > 1 else ""
+            console.print(f"  grasp: {self.grasp}{retries}", highlight=False, soft_wrap=True)
         console.print(
             f"  {self.seconds:.1f} s, {self.ticks} control ticks ({self.missed_ticks} missed), "
             f"{self.frames} frames, {self.stops} stops, {self.refused_setpoints} setpoints refused",
@@ -56,6 +61,11 @@ class Summary:
     def save(self, path: Path) -> None:
         """Write it as JSON."""
         path.write_text(json.dumps(asdict(self), indent=2) + "\n")
+
+
+def is_settled(verdict: dict[str, Any]) -> bool:
+    """Whether waiting changes nothing of the evaluation: it is a success, or every log is at rest."""
+    return bool(verdict["success"] or all(log["at_rest"] for log in verdict["logs"]))
 
 
 def outcome_sentence(verdict: dict[str, Any]) -> str:

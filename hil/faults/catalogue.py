@@ -8,6 +8,7 @@ need a start-up, a file or a socket instead of a running machine name the check 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -27,14 +28,14 @@ class Where(StrEnum):
     """In the start of a machine, in lockstep."""
     FILES = "files"
     """On real files, clocks or sockets."""
-    ABSENT = "absent"
-    """The software has no such input or detector: every injection counts as missed."""
 
 
 class Work(StrEnum):
     """What the machine does when the fault comes."""
 
     CRANE = "crane"
+    HOLD = "hold"
+    """The crane has moved, and holds its pose."""
     CARRY = "carry"
     """Carrying a log to the bunk."""
     DRIVE = "drive"
@@ -47,7 +48,9 @@ class Case:
     """One entry.  ``promise``: a needed input is lost, so every function must be neutral within 100 ms.
 
     ``physics``: the fault acts on oil or steel, so the plant with physics runs; otherwise the kinematic machine does.
-    ``blind``: what is not seen, and why, in a sentence for the evidence page.
+    ``blind``: what is not seen, and why, in a sentence for the evidence page.  ``blind_in``: the works in which a miss
+    is that named blind spot, ``blind_as``: the verdicts that are it in every work (`experiments.faults.judgement`),
+    ``blind_most_m``: the greatest harm that it explains [m]; any other miss is unexplained.
     """
 
     number: int
@@ -61,6 +64,9 @@ class Case:
     physics: bool = False
     promise: bool = False
     blind: str = ""
+    blind_in: tuple[Work, ...] = ()
+    blind_as: tuple[str, ...] = ()
+    blind_most_m: float = math.inf
 
     @property
     def label(self) -> str:
@@ -70,18 +76,26 @@ class Case:
 
 _C, _D, _P = Work.CRANE, Work.DRIVE, Work.PLC
 _CRANE, _DRIVE, _BOTH, _ALL, _PATHS = (_C,), (_D,), (_C, _D), (_C, _D, _P), (_C, _P)
-_FILES, _START, _ABSENT = Where.FILES, Where.START, Where.ABSENT
+_FILES, _START = Where.FILES, Where.START
 
 CASES: Final[tuple[Case, ...]] = (
     Case(1, "encoder-frozen", "Encoder frozen while commanded", "H", "300 ms moving", _PATHS, draws.encoder_frozen,
-         physics=True, blind="At rest a frozen encoder looks like a joint that stands still."),
+         physics=True, blind="At rest a frozen encoder looks like a joint that stands still, and one that freezes as "
+         "the joint slows down to turn is told at the next motion. Behind a PLC no spool is measured, and the valve's "
+         "dead time can make it late by 0.1 s.",
+         blind_in=(_P,), blind_as=("late", "undetected"), blind_most_m=0.25),
     Case(2, "encoder-jump", "Encoder jumps", "one refused; three: R1", "10 ms (2 T), third sample", _CRANE,
          draws.encoder_jump),
-    Case(3, "encoder-drift", "Encoder drifts by 0.5 deg/s", "D, then H", "3000 ms", _CRANE, draws.encoder_drift,
-         physics=True),
+    Case(3, "encoder-drift", "Encoder drifts by 0.5 deg/s", "H, at the next hold", "3000 ms of holding",
+         (_C, Work.HOLD), draws.encoder_drift, physics=True, blind_in=(_C,), blind_as=("late",),
+         blind_most_m=0.15, blind="In motion: 0.5 deg/s is 2 to 6 % of a joint's speed, and the flow through a valve "
+         "is known no better. It is seen 0.7 to 3.3 s after the crane holds its pose; until then the tip strays with "
+         "the encoder."),
     Case(4, "encoder-noise", "Encoder noise times ten", "D", "500 ms", _CRANE, draws.encoder_noise),
     Case(5, "encoder-scale", "Encoder sign or scale swapped", "R1", "200 ms, tip travel < 0.15 m", _CRANE,
-         draws.encoder_scale, physics=True),
+         draws.encoder_scale, physics=True, blind_as=("undetected", "late", "far"), blind_most_m=0.25,
+         blind="A joint that slows down to turn shows little of its scale: it is told at its next motion. The way of "
+         "the tip holds that of an ordinary stop from the same speed, which alone can be 15 cm."),
     Case(6, "message-off", "A sensor's frames stop", "R1, brake", "20 ms; on mach0 time-out + T", _ALL,
          draws.message_off, promise=True),
     Case(7, "message-delayed", "A sensor's frames come late", "below 3 P none; beyond: R1", "20 ms", _BOTH,
@@ -100,14 +114,21 @@ CASES: Final[tuple[Case, ...]] = (
     Case(14, "error-passive", "Error-passive", "D", "100 ms", _CRANE, draws.error_passive),
     Case(15, "cable-cut", "Cable cut", "R0 by the node's time-out; we latch (R1)", "30 ms", _ALL,
          draws.cable_cut, promise=True),
-    Case(16, "valve-stuck-closed", "Valve stuck closed", "H", "400 ms", _PATHS, draws.valve_closed, physics=True),
+    Case(16, "valve-stuck-closed", "Valve stuck closed", "H", "400 ms", _PATHS, draws.valve_closed, physics=True,
+         blind_in=(_P,), blind_most_m=0.25,
+         blind="Behind a PLC no spool is measured; the joint is compared with the PLC's output, from a "
+         "tenth of its speed limit on."),
     Case(17, "valve-stuck-open", "Valve stuck open, spool drifts", "R0", "150 ms, tip travel < 0.20 m", _PATHS,
-         draws.valve_open, physics=True),
+         draws.valve_open, physics=True, blind_in=(_P,), blind_as=("late", "far"), blind_most_m=1.2,
+         blind="Behind a PLC no spool is measured: the joint's own motion tells, 0.2 to 0.4 s after the fault. Where "
+         "it is measured, a joint at more than half of its speed goes further than 20 cm until its valve is shut, and "
+         "a spool that sticks within a sixth of its command is told when the command has left it."),
     Case(18, "valve-gain", "Valve gain changed by half", "D", "2000 ms", _CRANE, draws.valve_gain, physics=True),
     Case(19, "node-reset", "The valve node resets", "neutral until a person arms (R1)", "100 ms", _CRANE,
          draws.node_reset, promise=True),
     Case(20, "hose-burst", "Hose burst", "R0", "100 ms", _CRANE, draws.hose_burst, physics=True),
-    Case(21, "overload", "Overload, tip-over moment", "outward and lift blocked (D or harder)", "50 ms", _CRANE,
+    Case(21, "overload", "Overload, tip-over moment", "outward and lift blocked (D or harder)",
+         "50 ms after the machine carries too much", _CRANE,
          draws.overload, physics=True),
     Case(22, "planner-killed", "Planner killed", "H at the end of its lease", "lease + 10 ms", _ALL,
          draws.planner_killed),
@@ -126,8 +147,7 @@ CASES: Final[tuple[Case, ...]] = (
     Case(31, "heading-wrong", "Heading flips or freezes", "stop (H)", "500 ms moving", _DRIVE, draws.heading_wrong),
     Case(32, "emergency-stop", "Emergency stop pressed, or its wire broken", "R0", "20 ms", _ALL, draws.estop,
          promise=True),
-    Case(33, "supervisor-link", "The supervisor's link is lost", "hold", "1000 ms", _CRANE, None, _ABSENT,
-         blind="No link to a supervising person is watched; the machine works on without one."),
+    Case(33, "supervisor-link", "The supervisor's link is lost", "H", "1000 ms", _ALL, draws.supervisor_link),
     Case(34, "control-overrun", "Control loop late", "D; beyond 3 T: H; beyond 50 ms: the valve node", "5/15/200 ms",
          _BOTH, draws.overrun),
     Case(35, "wall-clock", "Wall clock stepped", "none: the same commands", "0", _CRANE, None, _FILES),
@@ -146,8 +166,8 @@ CASES: Final[tuple[Case, ...]] = (
          blind="An opening grapple is seen only by the planner, at the next verification of its grasp."),
     Case(43, "ground-tilts", "Machine tilts", "H while driving", "200 ms", _DRIVE, draws.tilt,
          blind="Roll and pitch are not watched while the crane works."),
-    Case(44, "joystick", "Joystick moved during automatic work", "the person wins", "20 ms", _CRANE, None, _ABSENT,
-         blind="No joystick is connected to the controller; hand levers act on the valves only when it is silent."),
+    Case(44, "joystick", "Hand lever moved during automatic work", "H, neutral at once: the person wins", "20 ms",
+         _BOTH, draws.lever, blind="A machine that does not tell when a lever is out of neutral: see docs/safety.md."),
     Case(45, "forged-command", "Forged or replayed operator command", "refused", "at once", _BOTH, draws.forged),
 )  # fmt: skip
 BY_NAME: Final = {case.name: case for case in CASES}

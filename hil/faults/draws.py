@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from random import Random
 from typing import Final
 
+from controller.crane.inputs import sample_timeout_ns
 from hil.faults.order import Order
 from machine.joints import JOINTS
 from machine.profile import Profile
@@ -20,6 +21,13 @@ REPORT_MS: Final = 20.0
 T_MS: Final = 5.0
 LEASE_MS: Final = 200.0
 """Lease of the setpoints in the campaign: the planner's own (`autonomy`)."""
+SETPOINT_MS: Final = 50.0
+"""Period of the setpoints in the campaign, crane's and carrier's (`autonomy.motion.setpoint_stream`)."""
+REFUSED_LIMIT: Final = 3
+"""So many refused setpoints within a second hold the machine (docs/reference/safety.md cases 24 to 28)."""
+REFUSED_MS: Final = REFUSED_LIMIT * SETPOINT_MS + 10.0
+"""The third bad setpoint comes at most so many periods after the fault, and is met within the 10 ms of the catalogue.
+The lease of the last good one ends 150 to 200 ms after the fault, so a stop by it is later and must not pass here."""
 _DEG: Final = math.pi / 180.0
 _NEEDED_CRANE: Final = ("EstopStat", "ValveFbA", "ValveFbB")
 _NEEDED_DRIVE: Final = ("VehStat", "ArmHeightA", "ArmHeightB")
@@ -50,6 +58,8 @@ class Injection:
     tip_limit_m: float | None = None
     window_s: float = 0.0
     """How long to watch; 0 means the bound and half a second."""
+    after_overload: bool = False
+    """The bound counts from the moment at which the machine carries more than it bears, by the ground truth."""
     aligned: bool = False
     """The moment must be the beginning of a tick, when the controller sends."""
 
@@ -82,6 +92,7 @@ def encoder_jump(random: Random, scene: Scene) -> Injection:
 
 
 def encoder_drift(random: Random, scene: Scene) -> Injection:
+    """The bound is that of the drift monitor for a crane that holds its pose (docs/reference/safety.md case 3)."""
     joint = random.choice(("slew", "lift", "tilt", "ext"))
     rate = random.choice((-1.0, 1.0)) * (0.5 * _DEG if joint != "ext" else 0.01)
     return _one(random, "encoder-drift", "D", 3000.0, joint, rate)
@@ -111,8 +122,11 @@ def _protected(random: Random, scene: Scene) -> str:
 
 
 def _lost_ms(scene: Scene, name: str) -> float:
-    """Bound for the loss of a message: its time-out and one tick."""
-    return max(20.0, message(scene.profile, name)[1].timeout_ns * 1e-6 + T_MS)
+    """Bound for the loss of a message: its time-out and one tick.  A PLC measures the joints in its own period."""
+    timeout_ns = message(scene.profile, name)[1].timeout_ns
+    if scene.plc and name in ENCODER_MESSAGES.values():
+        timeout_ns = sample_timeout_ns(scene.profile)
+    return max(20.0, timeout_ns * 1e-6 + T_MS)
 
 
 def message_off(random: Random, scene: Scene) -> Injection:
@@ -216,7 +230,16 @@ def hose_burst(random: Random, scene: Scene) -> Injection:
 
 
 def overload(random: Random, scene: Scene) -> Injection:
-    return _one(random, "load-overload", "D", 50.0, "", random.uniform(1500.0, 3000.0), window_s=1.5)
+    """A mass appears on the rotator.  The bound counts from the moment at which the machine carries more than it bears.
+
+    A mass that appears falls with the crane: nothing holds it, and nothing presses on the machine, until it has
+    compressed the lift's oil.  The moment about the tipping line exceeds its limit 220 to 240 ms after the mass
+    appears.  50 ms after it there is nothing to judge: 3000 kg have raised the lift's pressure by 7 bar, 200 kg, which
+    the machine bears, by 3.4 bar, and it rises no faster than in ordinary work (40 kNm/s).  A machine that stops before
+    it carries too much is in time: near the crane the larger one never tips, because its lift yields first.
+    """
+    drawn = _one(random, "load-overload", "D", 50.0, "", random.uniform(1500.0, 3000.0), window_s=1.5)
+    return replace(drawn, after_overload=True)
 
 
 def planner_killed(random: Random, scene: Scene) -> Injection:
@@ -228,11 +251,13 @@ def planner_hung(random: Random, scene: Scene) -> Injection:
     return _one(random, "process-stuck", "H", LEASE_MS + 10.0, "planner", length_s=length_s, window_s=1.5)
 
 
-def _some_bad(random: Random, fault: str, hold_ms: float = 160.0) -> Injection:
+def _some_bad(random: Random, fault: str) -> Injection:
     """One bad datagram is refused; from the third in a second on the machine stops."""
     if random.random() < 0.5:
-        return _one(random, fault, "REFUSED", 50.0 + 10.0, length_s=0.05, seen_ms=REPORT_MS, window_s=0.6)
-    return _one(random, fault, "H", hold_ms, window_s=1.0)
+        return _one(
+            random, fault, "REFUSED", SETPOINT_MS + 10.0, length_s=1e-3 * SETPOINT_MS, seen_ms=REPORT_MS, window_s=0.6
+        )
+    return _one(random, fault, "H", REFUSED_MS, window_s=1.0)
 
 
 def planner_nan(random: Random, scene: Scene) -> Injection:
@@ -251,10 +276,9 @@ def planner_replay(random: Random, scene: Scene) -> Injection:
     fault = random.choice(("planner-replay", "planner-future"))
     injection = _some_bad(random, fault)
     if fault == "planner-replay":  # the first datagram is the one that is repeated, and itself good
-        longer = injection.orders[0].length_s + 0.05
-        return replace(
-            injection, orders=(replace(injection.orders[0], length_s=longer),), bound_ms=injection.bound_ms + 50.0
-        )
+        order = injection.orders[0]
+        longer = replace(order, length_s=order.length_s + 1e-3 * SETPOINT_MS)
+        return replace(injection, orders=(longer,), bound_ms=injection.bound_ms + SETPOINT_MS)
     return injection
 
 
@@ -282,6 +306,10 @@ def estop(random: Random, scene: Scene) -> Injection:
     return _one(random, random.choice(("estop-pressed", "estop-wire")), "R0", 20.0)
 
 
+def supervisor_link(random: Random, scene: Scene) -> Injection:
+    return _one(random, "operator-off", "H", float(scene.profile.timeouts.operator_link_ms))
+
+
 def overrun(random: Random, scene: Scene) -> Injection:
     match random.randrange(3):
         case 0:  # one tick late by more than two periods and 10 ms
@@ -303,6 +331,11 @@ def foreign(random: Random, scene: Scene) -> Injection:
 
 def person(random: Random, scene: Scene) -> Injection:
     return _one(random, "person-in-zone", "H", 300.0)
+
+
+def lever(random: Random, scene: Scene) -> Injection:
+    """A lever that is held, or only touched: either ends the automatic work."""
+    return _one(random, "lever-moved", "H", 20.0, length_s=random.choice((math.inf, random.uniform(0.05, 0.5))))
 
 
 def log_slips(random: Random, scene: Scene) -> Injection:

@@ -115,6 +115,18 @@ class Injector:
 
         return end
 
+    def _cut_operator(self) -> Callable[[], None]:
+        """Cut the link of the operator."""
+        operator = self._run.operator
+        if not operator.watches:
+            raise FaultError("fault.not-watched", "no operator watches this run, so a cut link changes nothing here")
+        operator.cut = True
+
+        def end() -> None:
+            operator.cut = False
+
+        return end
+
     def _start(self, running: _Running, now_ns: int) -> Callable[[], None]:
         order = running.order
         match FAULTS[order.fault].edge:
@@ -124,6 +136,8 @@ class Injector:
                 return lambda: self._datagrams.remove(effect)
             case Edge.LINK:
                 return self._cut_link()
+            case Edge.OPERATOR:
+                return self._cut_operator()
             case Edge.PROCESS:
                 self._stalled[order.part] = running.end_ns if order.fault == "process-stuck" else FOREVER_NS
                 return _NOTHING

@@ -43,6 +43,8 @@ class Edge(StrEnum):
     PROCESS = "process"
     LINK = "link"
     """The Ethernet cable of a PLC."""
+    OPERATOR = "operator"
+    """The link of the operator who watches."""
 
 
 class Part(StrEnum):
@@ -102,6 +104,7 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "estop-pressed": FaultKind("estop", Word.OFF, _P, "the button is pressed"),
     "estop-wire": FaultKind("estop", Word.WRONG, _P, "the wire of one contact breaks"),
     "person-in-zone": FaultKind("person", Word.WRONG, _P, "the safety module sees a person"),
+    "lever-moved": FaultKind("lever", Word.WRONG, _P, "a person moves a hand lever"),
     "gnss-off": FaultKind("gnss", Word.OFF, _P, "sends nothing"),
     "gnss-jump": FaultKind("gnss", Word.WRONG, _P, "the position jumps", Part.NOTHING, "", "m", 3.0),
     "gnss-single": FaultKind("gnss", Word.GARBAGE, _P, "from RTK to a single fix"),
@@ -125,6 +128,9 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "planner-delayed": FaultKind("planner", Word.DELAYED, _U, "late", unit="ms", size=150.0, not_live=_WORKS_ALONE),
     "planner-garbage": FaultKind("planner", Word.GARBAGE, _U, "damaged datagrams"),
     "planner-arms": FaultKind("planner", Word.WRONG, _U, "forged ARM and RESET of an operator"),
+    "operator-off": FaultKind(
+        "operator", Word.OFF, Edge.OPERATOR, "link is cut", not_live="cut the network of the browser that watches"
+    ),
     "plc-off": FaultKind("plc", Word.OFF, Edge.LINK, "cable is open", not_live="pull its cable or end its process"),
     "process-off": FaultKind("process", Word.OFF, _S, "is killed", Part.PROCESS, "planner"),
     "process-stuck": FaultKind("process", Word.STUCK, _S, "does not run for a while", Part.PROCESS, "controller"),

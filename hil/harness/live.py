@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
+from autonomy.crane_job.phases import Phase
 from can_dbc.bus.factory import VCAN_NAMES, kernel_has_can
 from can_dbc.messages import datagrams, operator_link
 from can_dbc.messages.crane import OperatorAction, StateReport
@@ -34,11 +35,25 @@ from machine.status.modes import Mode
 
 Outcome = TypeVar("Outcome")
 HOST: Final = "127.0.0.1"
-END_ORDER: Final = ("autonomy", "controller", "guard", "console", "detector", "plc", "sim", "recorder", "wire")
-PORTS: Final = ("control", "planner", "orders", "page", "reports", "sim", "pictures")
+END_ORDER: Final = (
+    "autonomy",
+    "controller",
+    "guard",
+    "console",
+    "faults",
+    "detector",
+    "plc",
+    "sim",
+    "recorder",
+    "wire",
+)
+PORTS: Final = ("control", "planner", "orders", "page", "reports", "sim", "pictures", "detector")
 ADDRESSES: Final = "live.json"
 """File in the directory of a live run with the ports, buses and process ids."""
+AUDIT: Final = "audit.jsonl"
+"""File in the same directory: who commanded what on the page."""
 START_S: Final = 60.0
+"""Patience with a start: a process that cannot start ends at once; on a busy host imports alone take a minute."""
 POLL_S: Final = 0.1
 PLANNER_END_S: Final = 10.0
 """A planner that is ended early waits until crane and machine stand still."""
@@ -50,7 +65,7 @@ timer ticks to a process that wakes with the tick, as the planner does, and dela
 RECORDER_PRIORITY: Final = 30
 """Above the planner, which can occupy a small host for seconds: the recorder then lost a third of the frames, the last
 commands among them (measured).  The bus load bounds its work."""
-NICENESS: Final = {"console": 10, "detector": 5}
+NICENESS: Final = {"console": 10, "faults": 10, "detector": 5}
 """The page can wait; so can the detector, because the crane stands still while it takes pictures."""
 
 
@@ -73,7 +88,7 @@ class LiveOptions:
 
     ``max_stops``: the emulated operator arms again after this many stops.  ``plc_link``, "modbus" or "udp", is used
     when the profile has a PLC.  ``camera`` names the camera that detects the logs; without one the plant reports their
-    true poses.
+    true poses.  ``foxglove_port`` serves the run to Foxglove and Lichtblick, 0: not.
     """
 
     profile_name: str
@@ -87,6 +102,7 @@ class LiveOptions:
     max_stops: int
     plc_link: str = "modbus"
     camera: str = ""
+    foxglove_port: int = 0
 
 
 class LiveRun(ABC, Generic[Outcome]):
@@ -96,6 +112,8 @@ class LiveRun(ABC, Generic[Outcome]):
     """Further arguments of the plant's process."""
     planner_arguments: tuple[object, ...] = ()
     """Further arguments of the planner's process."""
+    detector_arguments: tuple[object, ...] = ()
+    """Further arguments of the detector's process."""
 
     def __init__(self, options: LiveOptions, display: Display) -> None:
         self._options = options
@@ -106,9 +124,11 @@ class LiveRun(ABC, Generic[Outcome]):
         page = default_path().with_name(f"live-{os.getpid()}.timing")
         self._timing, self._ticks = ("--timing", page), page.with_suffix(".ticks")
         self._operators = page.with_suffix(".operator")
+        self._desk = page.with_suffix(".faults")
         self._report: StateReport | None = None
         self._first: StateReport | None = None
         self._failure = self._grasp = ""
+        self._closings = 0
         self._done = False
         self._outcome: dict[str, Any] = {}
         """The planner's final message."""
@@ -139,7 +159,7 @@ class LiveRun(ABC, Generic[Outcome]):
         ports = dict(zip(PORTS, free_udp_ports(len(PORTS)), strict=True))
         bus = self._start_bus()
         self._start_machine(bus, ports)
-        self._start_page_and_planner(ports)
+        self._start_page_and_planner(bus, ports)
         self._start_control(bus, ports)
         self._write_addresses(bus, ports)
         return ports
@@ -173,6 +193,7 @@ class LiveRun(ABC, Generic[Outcome]):
             "recorder", "recorder", *self._profile, *bus, "--out", options.directory, "--seed", options.seed,
             "--no-sync",
             "--ticks", self._ticks, "--report-port", ports["reports"], *self._timing,
+            *(("--pictures", f"{HOST}:{ports['detector']}") if options.camera else ()),
         )  # fmt: skip
         self._processes.await_message("recorder", "ready", START_S)
         self._processes.set_fifo_priority("recorder", RECORDER_PRIORITY)
@@ -196,22 +217,32 @@ class LiveRun(ABC, Generic[Outcome]):
                 "no real-time priority on this host: the machine may stop when the host is busy", "yellow"
             )
 
-    def _start_page_and_planner(self, ports: dict[str, int]) -> None:
+    def _start_page_and_planner(self, bus: list[str], ports: dict[str, int]) -> None:
         """Start them before any process has a deadline: their imports load a small host for seconds."""
         options = self._options
         control, scene = f"{HOST}:{ports['control']}", f"{HOST}:{self._start_detector(ports)}"
         if self._options.console_port:
+            self._start("faults", "hil.faults", "--run", options.directory, "--socket", self._desk)
+            self._processes.await_message("faults", "ready", START_S)
             self._start(
                 "console", "console", *self._profile, "--port", self._options.console_port,
                 "--report-port", ports["page"], "--operator", self._operators, "--planner", f"{HOST}:{ports['orders']}",
-                "--scene", scene, *self._timing,
+                "--scene", scene, *self._timing, *bus, "--faults", self._desk, "--missions", "missions",
+                "--truth", f"{HOST}:{ports['sim']}",
+                *(("--foxglove", options.foxglove_port) if options.foxglove_port else ()),
+                "--audit", options.directory / AUDIT, "--recording", options.directory,
+                "--controller", control, "--commission", options.directory / "commissioning",
             )  # fmt: skip
-            url = self._processes.await_message("console", "url", START_S)["url"]
-            self._display.event(f"operator's page: {url}", "bold")
+            served = self._processes.await_message("console", "url", START_S)
+            self._display.event(f"operator's page: {served['url']}", "bold")
+            if "foxglove" in served:
+                self._display.event(f"Foxglove or Lichtblick: {served['foxglove']}", "bold")
+        told = [ports["page"]] if options.console_port else []
+        told += [ports["reports"]] if options.profile.carrier is not None else []  # the recorder keeps the log map
         self._start(
             "autonomy", "autonomy", *self._profile,
             "--controller", control, "--report-port", ports["planner"], "--scene", scene,
-            "--order-port", ports["orders"], *(("--tell", f"{HOST}:{ports['page']}") if options.console_port else ()),
+            "--order-port", ports["orders"], *(x for port in told for x in ("--tell", f"{HOST}:{port}")),
             *self.planner_arguments,
         )  # fmt: skip
         self._processes.await_message("autonomy", "event", START_S)
@@ -223,7 +254,10 @@ class LiveRun(ABC, Generic[Outcome]):
         if not camera:
             return ports["sim"]
         frames = f"{HOST}:{ports['pictures']}"
-        self._start("detector", "autonomy.perception", *self._profile, "--camera", camera, "--frames", frames)
+        self._start(
+            "detector", "autonomy.perception", *self._profile, "--camera", camera, "--frames", frames,
+            "--port", ports["detector"], *self.detector_arguments,
+        )  # fmt: skip
         self._display.event(f"camera {camera!r} detects the logs")
         return int(self._processes.await_message("detector", "ready", START_S)["ready"])
 
@@ -263,6 +297,7 @@ class LiveRun(ABC, Generic[Outcome]):
                     f"{gone.name} ended during the run: {gone.complaint()}",
                     ExitCode(code) if code in set(ExitCode) and code else ExitCode.SAFETY_STOP,
                 )
+        self._failure = self._failure or self._operator.complaint
 
     def _end_planner(self) -> None:
         """End a planner that still works, and wait for its final message."""
@@ -307,6 +342,7 @@ class LiveRun(ABC, Generic[Outcome]):
         match name, message.get("event"):
             case "autonomy", "phase":
                 self._display.phase(str(message["phase"]))
+                self._closings += message["phase"] == Phase.CLOSE.name
             case "autonomy", "grasp":
                 self._grasp = str(message["reason"])
                 self._display.event(f"grasp: {self._grasp}")

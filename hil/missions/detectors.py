@@ -15,7 +15,8 @@ from autonomy.manager.transition_table import FINAL_STATES, RULES
 from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingLogDetector, PaperBLocalizer
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
-from hil.calibration.camera_survey import SURVEYED_BY_GNSS, surveyed_profile
+from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
+from hil.calibration.camera_survey import surveyed_profile
 from hil.harness.errors import SetupError
 from hil.harness.lockstep import LogDetector
 from hil.plant.camera import RigCamera
@@ -25,6 +26,7 @@ from sim.instruments.ideal_detector import detect_in_view
 from sim.plant import Plant
 
 CAMERA: Final = "front"
+PERFECT: Final = "perfect"
 
 
 class PerfectDetector:
@@ -56,6 +58,16 @@ class FrontCameraDetector:
         return self._front.detect(world.base_at(now_ns), q, world.vehicle.articulation_rad)
 
 
+def check_camera(profile: Profile) -> None:
+    """Raises:
+    SetupError: the machine has no front camera.
+    """
+    if CAMERA not in profile.cameras:
+        raise SetupError(
+            "mission.no-front-camera", f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile"
+        )
+
+
 def make_detector(kind: str, plant: Plant, profile: Profile, manager: ActivityManager, seed: int) -> LogDetector:
     """The detector ``kind`` of the module docstring.
 
@@ -63,12 +75,9 @@ def make_detector(kind: str, plant: Plant, profile: Profile, manager: ActivityMa
         SetupError: the machine has no front camera.
         ValueError: the network's weights are missing.
     """
-    if kind == "perfect":
+    if kind == PERFECT:
         return PerfectDetector(plant)
-    if CAMERA not in profile.cameras:
-        raise SetupError(
-            "mission.no-front-camera", f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile"
-        )
+    check_camera(profile)
     surveyed = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
     source = RigCamera(CameraRig(plant.world, profile, plant.world.truth, seed), CAMERA)
     localizer = CylinderLocalizer(surveyed, SURVEYED_BY_GNSS) if kind == "ours" else PaperBLocalizer()

@@ -1,8 +1,13 @@
-"""A whole mission live: the planner's process runs the activity manager, the plant's process has the site."""
+"""A whole mission live: the planner's process runs the activity manager, the plant's process has the site.
+
+With a detector other than the perfect one, the plant serves its front camera, and a process of its own detects the logs
+in the pictures with the camera's surveyed mount (`hil.missions.detectors` has the same in lockstep).
+"""
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -10,33 +15,79 @@ from typing import Any, Final
 import msgspec
 from rich.console import Console
 
+from autonomy.calibration.profile_file import Change, write_profile
 from autonomy.manager.tally import Load
 from autonomy.missions.model import ForwardingMission
+from controller.guard.__main__ import profile_path
+from hil.calibration.camera_survey import surveyed_profile
 from hil.harness.display import Display
 from hil.harness.live import LiveOptions, LiveRun
+from hil.missions.detectors import CAMERA, PERFECT, check_camera
 from hil.missions.forwarded_report import report_loads
 from hil.missions.site import site_of
 from hil.missions.summary import MissionSummary
 from host.exit_codes import CommandFailed, ExitCode
+from sim.instruments.camera_targets import seen_with
 
 SITE: Final = "site.json"
+SURVEYED_PROFILE: Final = "surveyed.toml"
+LOCALIZERS: Final = {"ours": "ours", "faithful": "paper-b"}
+"""Names of the detectors' methods on the command line of `autonomy.perception`."""
+
+
+def _with_camera(options: LiveOptions, detector: str) -> LiveOptions:
+    """The options with the camera that a detector needs.
+
+    Raises:
+        SetupError: the machine has no front camera.
+    """
+    if detector == PERFECT:
+        return options
+    check_camera(options.profile)
+    return replace(options, camera=CAMERA)
+
+
+def write_surveyed(options: LiveOptions, path: Path) -> Path:
+    """Write the profile with the front camera as a survey before the run finds it; the detector alone gets it.
+
+    Raises:
+        ValueError: the truth cannot be used, or the file cannot be written.
+    """
+    truth = seen_with(options.truth, options.seed, options.profile.name)
+    found = surveyed_profile(options.profile, truth, CAMERA, options.seed).cameras[CAMERA]
+    changed: list[Change] = [
+        (("cameras", CAMERA, "position_m"), [round(v, 5) for v in found.position_m], "surveyed"),
+        (("cameras", CAMERA, "rpy_rad"), [round(v, 6) for v in found.rpy_rad], "surveyed"),
+        (("cameras", CAMERA, "depth_scale"), round(found.depth_scale, 6), "surveyed"),
+    ]
+    path.unlink(missing_ok=True)
+    write_profile(Path(profile_path(options.profile_name)), path, changed, "before the run")
+    return path
 
 
 class LiveMission(LiveRun[MissionSummary]):
     """Runs the mission of ``file``; ``logs`` > 0 lays that many along the route instead of those of the mission.
+
+    ``terrain`` is the kind of ground, one of `sim.ground.terrain.KINDS`, ``detector`` a detector of
+    `hil.missions.detectors`.
 
     Raises:
         SetupError: the machine cannot drive the mission.
     """
 
     def __init__(
-        self, options: LiveOptions, display: Display, file: Path, mission: ForwardingMission, manager: str, logs: int
-    ) -> None:
-        super().__init__(options, display)
+        self, options: LiveOptions, display: Display, file: Path, mission: ForwardingMission, manager: str, logs: int,
+        terrain: str = "flat", detector: str = PERFECT,
+    ) -> None:  # fmt: skip
+        super().__init__(_with_camera(options, detector), display)
         site = options.directory / SITE
-        site_of(mission, options.profile, options.seed, options.truth, logs).save(site)
+        site_of(mission, options.profile, options.seed, options.truth, logs, terrain).save(site)
         self.plant_arguments = ("--site", site)
         self.planner_arguments = ("--mission", file, "--manager", manager)
+        if detector != PERFECT:
+            self.planner_arguments += ("--memory",)
+            surveyed = write_surveyed(options, options.directory / SURVEYED_PROFILE)
+            self.detector_arguments = ("--profile", surveyed, "--driving", "--localizer", LOCALIZERS[detector])
         self._states: list[tuple[float, str]] = []
         self._mission = mission
 
@@ -48,6 +99,8 @@ class LiveMission(LiveRun[MissionSummary]):
                 self._display.event(f"  {message['words']}")
             case "autonomy", "load":
                 self._display.event(f"{message['logs']} logs on board")
+            case "autonomy", "remark":
+                self._display.event(str(message["texts"][-1]), "yellow")
             case "autonomy", "order":
                 refused = f": refused, {message['refused']}" if "refused" in message else ""
                 self._display.event(f"operator command: {message.get('order', 'unknown')}{refused}", "magenta")
@@ -74,12 +127,14 @@ class LiveMission(LiveRun[MissionSummary]):
             refused=self._report.refused if self._report else 0,
             states=tuple(self._states),
             directory=str(self._options.directory),
+            remarks=tuple(map(str, outcome.get("remarks", ()))),
         )
 
 
 def run_live_mission(
-    file: Path, mission: ForwardingMission, options: LiveOptions, manager: str, logs: int, console: Console
-) -> MissionSummary:
+    file: Path, mission: ForwardingMission, options: LiveOptions, manager: str, logs: int, console: Console,
+    terrain: str = "flat", detector: str = PERFECT,
+) -> MissionSummary:  # fmt: skip
     """Run the mission as separate processes in real time.
 
     Raises:
@@ -89,7 +144,7 @@ def run_live_mission(
     title = f"{options.profile.title}: {mission.name or 'a mission'}, live, seed {options.seed}"
     with Display(console, title) as display:
         try:
-            run = LiveMission(options, display, file, mission, manager, logs)
+            run = LiveMission(options, display, file, mission, manager, logs, terrain, detector)
         except ValueError as error:
             raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
         return run.run()

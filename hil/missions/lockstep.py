@@ -19,7 +19,10 @@ from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.transition_table import FINAL_STATES, TABLES, State
 from autonomy.missions.model import ForwardingMission
 from autonomy.perception.log_list.observation import LogObservation
+from autonomy.process.mission_publisher import MissionPublisher
+from autonomy.process.planner_process import REPORT_PERIOD_NS
 from can_dbc.messages.crane import OperatorAction, StateReport
+from can_dbc.messages.mission import encode_mission
 from can_dbc.messages.vehicle import VehicleReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
@@ -60,17 +63,19 @@ def run_mission(
     limit_s: float,
     console: Console,
     detector: str = "perfect",
+    terrain: str = "flat",
 ) -> MissionSummary:
     """Run the mission on virtual time; ``logs`` > 0 lays that many along the route instead of those of the mission.
 
-    ``manager`` names a transition table, ``detector`` a detector of `hil.missions.detectors`.
+    ``manager`` names a transition table, ``detector`` a detector of `hil.missions.detectors`, ``terrain`` a kind of
+    ground of `sim.ground.terrain`.
 
     Raises:
         CommandFailed: profile, truth or mission cannot be used.
     """
     profile = load_profile(name)
     try:
-        site = site_of(mission, profile, seed, truth, logs)
+        site = site_of(mission, profile, seed, truth, logs, terrain)
         plant = site.plant(profile, truth, seed)
         buses = tuple(bus for bus in (profile.crane_bus, profile.machine_bus) if bus)
         recorder = Recorder(directory, profile, describe_run(profile, buses, seed))
@@ -105,6 +110,8 @@ class MissionRun:
         self._display, self._mode = display, -1
         self._vehicle: VehicleReport | None = None
         self._shown: tuple[State | None, str, str, str] = (None, "", "", "")
+        self._told = 0
+        """Remarks on the load that were shown."""
         self.states: list[tuple[float, str]] = []
         code = profile_hash(profile)
         uses_memory = detector != "perfect"
@@ -115,6 +122,11 @@ class MissionRun:
         )  # fmt: skip
         self.manager.auto()
         self.plant = plant
+        self._recorder, self._code = recorder, code
+        self._publisher = MissionPublisher(self.manager, mission)
+        self._published = 0
+        """Mission reports so far: the recorder gets them as those of a live run, and draws their log map."""
+        self._publish_ns = START_NS
         self._layer = LogSupplier(plant, site.places, site.rounds)
         self.system = Lockstep(
             Settings(profile, code, profile.rate_hz),
@@ -131,7 +143,13 @@ class MissionRun:
     ) -> bytes | list[bytes] | None:
         """Pass the inputs of the tick to the manager; its datagrams to the controller."""
         vehicle, self._vehicle = self._vehicle, None
-        return self.manager.step(now_ns, report, vehicle, logs)
+        sent = self.manager.step(now_ns, report, vehicle, logs)
+        if self._recorder is not None and now_ns >= self._publish_ns:
+            self._publish_ns = now_ns + REPORT_PERIOD_NS
+            self._published += 1
+            told = self._publisher.report(now_ns, auto=True)
+            self._recorder.on_report(encode_mission(told, self._published, self._code, now_ns))
+        return sent
 
     def run(self, limit_s: float, directory: str, watch: Callable[[], None] = lambda: None) -> MissionSummary:
         """Run until the manager ends, and `SETTLE_S` longer; ``watch`` is called after every slice."""
@@ -148,7 +166,8 @@ class MissionRun:
             system.advance()
         verdict = self.plant.evaluate()
         report, vehicle = system.report, system.vehicle_report
-        failure = manager.failure or ("" if manager.state is State.DONE else f"not finished within {limit_s:.0f} s")
+        late = "" if manager.state is State.DONE else f"not finished within {limit_s:.0f} s"
+        failure = manager.failure or system.operator.complaint or late
         return MissionSummary(
             finished=manager.state is State.DONE,
             failure=failure,
@@ -162,11 +181,15 @@ class MissionRun:
             refused=(report.refused if report else 0) + (vehicle.refused if vehicle else 0),
             states=tuple(self.states),
             directory=directory,
+            remarks=tuple(remark.text for remark in manager.tally.remarks),
         )
 
     def _show_changes(self) -> None:
         """Show what differs from the last call: state, pause, failure of the crane job."""
         manager = self.manager
+        for remark in manager.tally.remarks[self._told :]:
+            self._told += 1
+            self._display.event(remark.text, "yellow")
         job = manager.activity
         phase, failure = (job.phase.name, job.failure or "") if job is not None else ("", "")
         shown = (manager.state, manager.paused, phase, failure)

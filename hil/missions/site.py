@@ -14,8 +14,12 @@ from sim.site.log_supply import LogPlace, along_route, place_logs
 from sim.site.site_file import Site
 
 
-def site_of(mission: ForwardingMission, profile: Profile, seed: int, truth: str, logs: int = 0) -> Site:
+def site_of(
+    mission: ForwardingMission, profile: Profile, seed: int, truth: str, logs: int = 0, terrain: str = "flat"
+) -> Site:
     """The site; ``logs`` > 0 lays that many along the route instead of those of the mission.
+
+    ``terrain`` is the kind of its ground, one of `sim.ground.terrain.KINDS`.
 
     Raises:
         SetupError: the machine does not drive, or the mission has no route.
@@ -34,7 +38,7 @@ def site_of(mission: ForwardingMission, profile: Profile, seed: int, truth: str,
     origin = LocalPlane(lat, lon)
     if logs:
         route = [origin.local(p.latitude_deg, p.longitude_deg)[:2] for p in mission.waypoints]
-        return Site(lat, lon, along_route(profile, truth, seed, logs, route))
+        return Site(lat, lon, along_route(profile, truth, seed, logs, route), terrain=terrain)
     places = [
         LogPlace(
             *origin.local(log.position.latitude_deg, log.position.longitude_deg)[:2],
@@ -43,4 +47,4 @@ def site_of(mission: ForwardingMission, profile: Profile, seed: int, truth: str,
         for log in mission.logs
     ]  # fmt: skip
     laps = mission.options.laps
-    return Site(lat, lon, place_logs(profile, truth, seed, places, laps), len(places), laps)
+    return Site(lat, lon, place_logs(profile, truth, seed, places, laps), len(places), laps, terrain)

@@ -27,6 +27,8 @@ class MissionSummary:
     refused: int
     states: tuple[tuple[float, str], ...]
     directory: str
+    remarks: tuple[str, ...] = ()
+    """What the machine found out about its load against its expectation, in words."""
 
     @property
     def exit_code(self) -> ExitCode:
@@ -42,6 +44,8 @@ class MissionSummary:
         console.print(f"{mark} {end}. {self.in_bunk} of {self.logs} logs lie in the bunk.", highlight=False)
         for number, why in self.given_up.items():
             console.print(f"  log {number} skipped: {why}", highlight=False, soft_wrap=True)
+        for text in self.remarks:
+            console.print(f"  {text}", highlight=False, soft_wrap=True)
         console.print(
             f"  {self.seconds:.0f} s, {self.driven_m:.0f} m, {self.stops} stops, {self.refused} setpoints refused",
             highlight=False,

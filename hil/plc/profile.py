@@ -1,4 +1,4 @@
-"""The profile of a shipped machine with a PLC between crane0 and its valves."""
+"""The profile of a machine with a PLC between crane0 and its valves."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from controller.guard.__main__ import profile_path
+from machine.loading.beside import carry_envelope
 
 PLC_DELAY_S: Final = 0.04
 """Delay that bridge, exchange and PLC cycle add to every valve: 10 ms each way, and two cycles between."""
@@ -23,4 +24,5 @@ def write_plc_profile(name: str, role: Literal["references", "valves"], director
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"{Path(name).stem}_plc.toml"
     path.write_text(f'{text}\n# The machine PLC on Ethernet\n[plc]\nrole = "{role}"\n')
+    carry_envelope(profile_path(name), directory)
     return path

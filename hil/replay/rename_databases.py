@@ -1,8 +1,9 @@
 """Let a kept recording name the databases of now: ``python -m hil.replay.rename_databases FILE.mcap.xz ...``
 
-Replay refuses a recording whose DBC files have changed.  Where a change only adds messages, every recorded frame means
-what it meant: this command writes the new hashes into the manifest and leaves everything else as it is, and the test
-that replays the recording to the same bytes says whether that was true.  Exit code 0.
+Replay refuses a recording whose DBC files have changed.  Where a change only adds messages, or signals in bits that
+were 0 and mean the same as before, every recorded frame means what it meant: this command writes the new hashes into
+the manifest and leaves everything else as it is, and the test that replays the recording to the same bytes says whether
+that was true.  Exit code 0.
 """
 
 from __future__ import annotations

@@ -59,12 +59,14 @@ def digest_of(outputs: tuple[Any, ...]) -> bytes:
 
 def recorded(place: Path, limit: int) -> tuple[Settings, list[TickRecord]]:
     """Settings and the first ticks of a recording."""
+    from hil.replay import replay
     from hil.replay.recording import files_of, manifest_of
-    from hil.replay.replay import profile_beside, recorded_ticks, settings_for
 
     files = files_of(place)
-    ticks = list(islice(recorded_ticks(files), limit or None))
-    return settings_for(manifest_of(files), ticks[:64], profile_beside(files), None), ticks
+    ticks = list(islice(replay.recorded_ticks(files), limit or None))
+    # This worker runs with the packages of older releases too; before profiles lay beside recordings they had no such.
+    beside = getattr(replay, "profile_beside", None)
+    return replay.settings_for(manifest_of(files), ticks[:64], beside and beside(files), None), ticks
 
 
 def cost(place: Path, limit: int) -> dict[str, Any]:

@@ -1,10 +1,7 @@
-"""The bit rates of the machine's two buses."""
+"""The bit rates of the machine's two buses, as the wire runs them (`can_dbc.bus.bitrates`)."""
 
 from __future__ import annotations
 
-from typing import Final
+from can_dbc.bus.bitrates import BITRATES, CRANE_BITRATE, MACHINE_BITRATE
 
-CRANE_BITRATE: Final = 1_000_000
-MACHINE_BITRATE: Final = 250_000
-BITRATES: Final = {"crane0": CRANE_BITRATE, "mach0": MACHINE_BITRATE}
-"""Logical bus -> bit/s."""
+__all__ = ["BITRATES", "CRANE_BITRATE", "MACHINE_BITRATE"]
