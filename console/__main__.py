@@ -13,23 +13,24 @@ import json
 import signal
 import socket
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
-from machine.loading.profile_file import ProfileError, load_profile, profile_hash
-from runtime.errors import CodedError
+from console.audit import AuditLog
+from console.exposure import Exposure, check_local
+from console.start_error import StartError
+from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
+from machine.profile import Profile
 
+if TYPE_CHECKING:
+    from console.foxglove_server import FoxgloveServer
+    from console.replay import Recording
 
-class StartError(CodedError):
-    """The console cannot start: an error code, one sentence and the exit code of the process."""
-
-    def __init__(self, code: str, sentence: str, exit_code: int) -> None:
-        super().__init__(code, sentence)
-        self.exit_code = exit_code
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.code, str(self), self.exit_code)
+LOCAL: Final = Exposure()
+COMMISSION: Final = Path("commissioning")
+"""Default folder of what commissioning writes."""
 
 
 def serve(
@@ -44,13 +45,24 @@ def serve(
     allow_hosts: Sequence[str] = (),
     key_file: Path | None = None,
     timing: Path | None = None,
+    missions: Path | None = None,
+    buses: Sequence[str] = (),
+    faults: Path | None = None,
+    truth: str | None = None,
+    foxglove: int | None = None,
+    recording: Path | None = None,
+    exposure: Exposure = LOCAL,
+    controller: str | None = None,
+    commission: Path = COMMISSION,
 ) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Raises:
         StartError: the console cannot start.
     """
-    from console.server import Console, create_app
+    from console.console import CommissionOptions, Console
+    from console.foxglove_server import FoxgloveServer
+    from console.server import create_app
 
     try:
         machine = load_profile(profile)
@@ -60,8 +72,19 @@ def serve(
     except OSError as error:
         sentence = f"{key_file} cannot be read ({error.strerror}); give the file with the key"
         raise StartError("console.key-file", sentence, 3) from error
+    setpoints, named = _address(controller, "--controller"), _buses(buses, machine)
+    if setpoints is not None and machine.crane_bus not in named:
+        sentence = f"--controller commissions the crane and needs its bus; give --bus {machine.crane_bus}=ADDRESS"
+        raise StartError("console.commission-bus", sentence, 2)
+    exposure = exposure.with_credentials()
+    accounts = exposure.check(bind)
     page = _listen(socket.SOCK_STREAM, bind, port, "--port")
     reports = _listen(socket.SOCK_DGRAM, "127.0.0.1", report_port, "--report-port")
+    try:
+        live = None if foxglove is None else FoxgloveServer(machine, bind, foxglove)
+    except OSError as error:
+        sentence = f"Foxglove cannot be served on {bind}:{foxglove} ({error}); choose another --foxglove"
+        raise StartError("console.port-in-use", sentence, 4) from error
     console = Console(
         profile=machine,
         profile_hash=profile_hash(machine),
@@ -71,8 +94,46 @@ def serve(
         key=key,
         reports=reports,
         timing_page=timing,
+        missions=missions,
+        buses=named,
+        faults=faults,
+        truth=_address(truth, "--truth"),
+        foxglove=live,
+        recording=recording,
+        commission=None if setpoints is None else CommissionOptions(setpoints, profile_file(profile), commission),
+        accounts=accounts,
+        audit=_audit(exposure.audit),
+        tls=exposure.tls_cert is not None,
     )
-    _run(create_app(console, (*allow_hosts, bind)), page, bind)
+    try:
+        _run(create_app(console, (*allow_hosts, bind)), page, bind, exposure, live)
+    finally:
+        if console.audit is not None:
+            console.audit.close()
+
+
+def serve_replay(
+    recording: Recording,
+    machine: Profile,
+    *,
+    port: int,
+    name: str,
+    note: str = "",
+    at_ns: int | None = None,
+    bind: str = "127.0.0.1",
+    allow_hosts: Sequence[str] = (),
+) -> None:
+    """Serve a recorded run until SIGINT or SIGTERM; ``at_ns`` is where a page begins.
+
+    Raises:
+        StartError: the console cannot start.
+    """
+    from console.replay_server import create_replay_app
+
+    check_local(bind, "a recording")
+    page = _listen(socket.SOCK_STREAM, bind, port, "--port")
+    app = create_replay_app(recording, machine, name=name, note=note, at_ns=at_ns, allow_hosts=(*allow_hosts, bind))
+    _run(app, page, bind)
 
 
 def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: Sequence[str] = ()) -> None:
@@ -83,19 +144,29 @@ def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: 
     """
     from console.plant_view import create_plant_app
 
+    check_local(bind, "the view of a plant")
     address = _address(plant, "--plant")
     assert address is not None
     _run(create_plant_app(address, (*allow_hosts, bind)), _listen(socket.SOCK_STREAM, bind, port, "--port"), bind)
 
 
-def _run(app: Any, page: socket.socket, bind: str) -> None:
-    """Write the page's address to stdout and serve it."""
+def _run(
+    app: Any, page: socket.socket, bind: str, exposure: Exposure = LOCAL, live: FoxgloveServer | None = None
+) -> None:
+    """Write the page's address to stdout, and that for Foxglove, and serve it."""
     import uvicorn
 
     # A page that keeps its websocket open must not delay the shutdown.
-    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1, ws="websockets-sansio")
+    config = uvicorn.Config(
+        app, log_level="warning", timeout_graceful_shutdown=1, ws="websockets-sansio", server_header=False,
+        ssl_certfile=exposure.tls_cert, ssl_keyfile=exposure.tls_key,
+    )  # fmt: skip
+    scheme = "https" if exposure.tls_cert else "http"
     host = f"[{bind}]" if ":" in bind else bind
-    sys.stdout.write(json.dumps({"url": f"http://{host}:{page.getsockname()[1]}/"}) + "\n")
+    addresses = {"url": f"{scheme}://{host}:{page.getsockname()[1]}/"}
+    if live is not None:
+        addresses["foxglove"] = f"ws://{host}:{live.port}"
+    sys.stdout.write(json.dumps(addresses) + "\n")
     sys.stdout.flush()
     uvicorn.Server(config).run(sockets=[page])
 
@@ -116,6 +187,26 @@ def _listen(kind: socket.SocketKind, host: str, port: int, option: str) -> socke
     return s
 
 
+def _audit(path: Path | None) -> AuditLog | None:
+    if path is None:
+        return None
+    try:
+        return AuditLog(path, time.monotonic_ns)
+    except OSError as error:
+        sentence = f"the audit log {path} cannot be written ({error.strerror}); choose another --audit"
+        raise StartError("console.audit", sentence, 3) from error
+
+
+def _buses(texts: Sequence[str], profile: Profile) -> dict[str, str]:
+    found = dict(text.partition("=")[::2] for text in texts)
+    known = [bus for bus in (profile.crane_bus, profile.machine_bus) if bus]
+    for name, address in found.items():
+        if name not in known or not address:
+            sentence = f"--bus {name}={address} is not NAME=ADDRESS with a bus of {profile.name} ({', '.join(known)})"
+            raise StartError("console.bus", sentence, 2)
+    return found
+
+
 def _address(text: str | None, option: str) -> tuple[str, int] | None:
     if text is None:
         return None
@@ -127,8 +218,8 @@ def _address(text: str | None, option: str) -> tuple[str, int] | None:
         raise StartError("console.address", sentence, 2) from None
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the process; returns its exit code."""
+def command_line() -> argparse.ArgumentParser:
+    """The command line of the process."""
     parser = argparse.ArgumentParser(prog="python -m console", description="The operator's web page.")
     parser.add_argument("--port", type=int, default=8471, help="port of the page (default 8471)")
     parser.add_argument("--report-port", type=int, help="UDP port that receives the reports of controller and planner")
@@ -150,6 +241,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
     parser.add_argument("--timing", type=Path, metavar="FILE", help="timing page of the controller to show")
+    parser.add_argument("--missions", type=Path, metavar="DIR", help="folder of the missions planned on the page")
+    parser.add_argument(
+        "--bus",
+        action="append",
+        default=[],
+        metavar="NAME=ADDRESS",
+        help="bus whose frames the page may show, as for the recorder; only listens, and only while a page shows them",
+    )
+    parser.add_argument(
+        "--faults", type=Path, metavar="FILE", help="socket of a live run's desk of faults, given by its harness"
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="HOST:PORT",
+        help="request port of an emulated run's plant, to show its true logs",
+    )
+    parser.add_argument(
+        "--foxglove", type=int, metavar="PORT", help="port that serves the run to Foxglove and Lichtblick, read-only"
+    )
+    parser.add_argument(
+        "--recording",
+        type=Path,
+        metavar="DIR",
+        help="directory of the run's recording, which the page names at its end",
+    )
+    parser.add_argument(
+        "--controller", metavar="HOST:PORT", help="the controller's setpoint port, for the page of commissioning"
+    )
+    parser.add_argument("--commission", type=Path, metavar="DIR", default=COMMISSION, help="folder of what it writes")
+    parser.add_argument("--passwords", type=Path, metavar="FILE", help="accounts of the page's users")
+    parser.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate of the page, PEM")
+    parser.add_argument("--tls-key", type=Path, metavar="FILE", help="its key, PEM")
+    parser.add_argument("--audit", type=Path, metavar="FILE", help="log to which every command is appended")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the process; returns its exit code."""
+    parser = command_line()
     a = parser.parse_args(arguments)
     if (a.report_port is None) == (a.plant is None):
         parser.error("give --report-port (the operator's page) or --plant (the view of a simulated plant)")
@@ -169,6 +299,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             allow_hosts=a.allow_host,
             key_file=a.key_file,
             timing=a.timing,
+            missions=a.missions,
+            buses=a.bus,
+            faults=a.faults,
+            truth=a.truth,
+            foxglove=a.foxglove,
+            recording=a.recording,
+            exposure=Exposure(a.passwords, a.tls_cert, a.tls_key, a.audit),
+            controller=a.controller,
+            commission=a.commission,
         )
     except StartError as error:
         sys.stderr.write(f"console: {error}\n")

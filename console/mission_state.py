@@ -1,7 +1,8 @@
 """The page's state of a mission and its vehicle; pure, like `console.state`.
 
-Map data are in metres east and north of one origin (`console.map_projection`), angles in radians counter-clockwise from
-east.  A mission report is accepted when it is for this machine and newer than the last one; it is shown with its age.
+Map data are in metres east and north of one origin (`machine.geometry.map_projection`), angles in radians
+counter-clockwise from east.  A mission report is accepted when it is for this machine and newer than the last one; it
+is shown with its age.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from typing import Any, Final
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.mission import KnownLog, LatLon, MissionReport, decode_mission
 from can_dbc.messages.vehicle import VEHICLE_INPUTS, Driving, VehicleReport
-from console.map_projection import MapProjection, Metres
+from machine.geometry.carrier import axis_from_antenna
+from machine.geometry.map_projection import MapProjection, Metres
 from machine.profile import Profile
 
 MISSION_TIMEOUT_NS: Final = 2_000_000_000
@@ -46,7 +48,7 @@ INPUT_NAMES: Final = dict(
 
 
 def describe_carrier(profile: Profile) -> dict[str, Any] | None:
-    """Dimensions for map and 3-D view [m, rad]; None for a stationary machine."""
+    """Dimensions for map and 3-D view [m, rad], and how much of its track is kept; None for a stationary machine."""
     c = profile.carrier
     if c is None:
         return None
@@ -54,20 +56,25 @@ def describe_carrier(profile: Profile) -> dict[str, Any] | None:
         "front_axle_m", "rear_axle_m", "track_width_m", "wheel_radius_m", "wheel_width_m", "crane_base_m",
         "crane_yaw_rad", "arm_drop_low_m", "arm_travel_m", "arm_transport_m", "tilt_limit_rad",
     )  # fmt: skip
-    return {name: getattr(c, name) for name in names}
+    return {name: getattr(c, name) for name in names} | {"trail_points": TRAIL_POINTS}
 
 
 class MissionState:
     """Accepts mission and vehicle reports and returns the page's state of them."""
 
-    def __init__(self, profile: Profile, profile_hash: int, key: bytes | None = None) -> None:
+    def __init__(
+        self, profile: Profile, profile_hash: int, key: bytes | None = None, ground: MapProjection | None = None
+    ) -> None:
+        """``ground`` is a projection to share, as the views of one recording do."""
         self.report_count = 0
         """Accepted mission reports: the mission is sent to the page when this has changed."""
+        self.answer = (0, "", "")
+        """Number of the planner's last command or upload, why it was refused, and the code."""
         self.trail: deque[Metres] = deque(maxlen=TRAIL_POINTS)
         """Track of the articulation axis."""
         self._carrier = profile.carrier
         self._hash, self._key = profile_hash, key
-        self._ground = MapProjection()
+        self._ground = ground or MapProjection()
         self._mission: MissionReport | None = None
         self._stamp_ns = self._report_ns = self._received_ns = self._placed_ns = 0
         self._vehicle: VehicleReport | None = None
@@ -82,6 +89,7 @@ class MissionState:
         if profile_hash != self._hash or not self._stamp_ns < stamp_ns <= now_ns + MAX_FUTURE_NS:
             return False
         self._mission, self._stamp_ns, self._report_ns = report, stamp_ns, now_ns
+        self.answer = (report.order, report.refusal, report.refusal_code)
         self.report_count += 1
         return True
 
@@ -95,6 +103,22 @@ class MissionState:
         here = (place["x_m"], place["y_m"])
         if not self.trail or math.dist(here, self.trail[-1]) >= TRAIL_M:
             self.trail.append(here)
+
+    @property
+    def stamp_ns(self) -> int:
+        """When the planner made the newest mission report, 0 before the first."""
+        return self._stamp_ns
+
+    @property
+    def place(self) -> dict[str, float] | None:
+        """Where the vehicle was last known to be; None before that and for a stationary machine."""
+        return self._place
+
+    @property
+    def report(self) -> MissionReport:
+        """The newest mission report; there must have been one."""
+        assert self._mission is not None
+        return self._mission
 
     def alive(self, now_ns: int) -> bool:
         """Whether the planner is connected."""
@@ -148,11 +172,10 @@ class MissionState:
             return None
         east, north = self._ground.metres(r.latitude_deg, r.longitude_deg)
         yaw = 0.5 * math.pi - r.heading_rad
-        ahead, left, _ = self._carrier.antenna_main_m
-        c, s = math.cos(yaw), math.sin(yaw)
+        x, y = axis_from_antenna(self._carrier, (east, north), r.heading_rad)
         return {
-            "x_m": round(east - c * ahead + s * left, 3),
-            "y_m": round(north - s * ahead - c * left, 3),
+            "x_m": round(x, 3),
+            "y_m": round(y, 3),
             "front_rad": round(math.remainder(yaw, math.tau), 4),
             "rear_rad": round(math.remainder(yaw - r.articulation_rad, math.tau), 4),
         }

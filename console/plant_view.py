@@ -24,43 +24,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy, is_loopback
+from console.plant_link import Address, PlantLink
 
 PERIOD_S: Final = 0.05
-RESPONSE_TIMEOUT_S: Final = 1.0
 STATIC: Final = Path(__file__).with_name("static")
-Address = tuple[str, int]
-
-
-class PlantLink(asyncio.DatagramProtocol):
-    """Sends requests to one plant, one at a time."""
-
-    def __init__(self) -> None:
-        self._transport: asyncio.DatagramTransport | None = None
-        self._waiting: asyncio.Future[bytes] | None = None
-        self._lock = asyncio.Lock()
-
-    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
-        self._transport = transport
-
-    def datagram_received(self, data: bytes, addr: Address) -> None:
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(data)
-
-    def close(self) -> None:
-        """Close the link."""
-        if self._transport is not None:
-            self._transport.close()
-
-    async def request(self, query: dict[str, str]) -> bytes | None:
-        """The plant's response (JSON), None after a timeout."""
-        assert self._transport is not None
-        async with self._lock:
-            self._waiting = asyncio.get_running_loop().create_future()
-            self._transport.sendto(msgspec.json.encode(query))
-            try:
-                return await asyncio.wait_for(self._waiting, RESPONSE_TIMEOUT_S)
-            except TimeoutError:
-                return None
 
 
 def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starlette:

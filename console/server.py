@@ -3,11 +3,15 @@
 Inputs: crane and vehicle reports of the controller and mission reports of the planner (UDP, one port), log lists of the
 detector (UDP, requested ten times a second, optional), the controller's timing page (read once a second, optional), and
 commands by POST.  Outputs: the page, ``/ws`` with the state 20 times a second (and the mission after each report),
-``/api/state``, ``/api/trail`` (the vehicle's track), ``/api/machine``, ``/healthz``; one ``OperatorCommand`` datagram
-per command to the controller, one ``MissionCommand`` datagram per mission command to the planner.
+``/api/state``, ``/api/trail`` (the vehicle's track), ``/api/timeline``, ``/api/camera`` (`console.camera`),
+``/api/machine``, ``/healthz``; one
+``OperatorCommand`` datagram per command to the controller, one ``MissionCommand`` datagram per mission command to the
+planner.  Pages that may command answer on ``/ws``, which makes the heartbeats of their watch (`console.page_watch`);
+a page that shows a panel says so there and gets its data (`console.panel`).
 
-STOP is accepted from every page that the console serves; ARM, DISARM, RESET and mission commands only from this machine
-(an ssh tunnel counts as this machine).  All resources are served from the package; no other host is contacted.
+STOP is accepted from every page that the console serves, at once and without more.  Everything else needs a page's
+token and a role, and what can move the machine the control lease as well (`console.access`).  All resources are served
+from the package; no other host is contacted.
 """
 
 from __future__ import annotations
@@ -15,13 +19,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import os
-import socket
-import time
 from collections.abc import AsyncIterator, Callable, Collection
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -31,90 +31,31 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from autonomy.missions.folder import MissionFolder
 from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
-from can_dbc.messages import operator_link
-from can_dbc.messages.crane import OperatorAction, OperatorCommand
-from can_dbc.messages.datagrams import encode
-from can_dbc.messages.mission import MissionAction, MissionCommand, encode_mission_command
+from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction
+from can_dbc.messages.mission import MissionAction
 from can_dbc.timing.page import TimingRefused, read_timing
-from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy, is_loopback
+from console.access import Page
+from console.access_guards import AccessGuards, AuditTrail, page_of, person_of
+from console.access_routes import access_routes
+from console.accounts import Role
+from console.camera import Camera
+from console.console import Address, Console
+from console.fault_desk import fault_routes
+from console.foxglove_server import feed_pictures
+from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy
+from console.panel import Panel, panel_data, panels_of
+from console.plan_api import PlanApi
 from console.state import CraneState, describe_machine
-from machine.profile import Profile
+from console.true_logs import TrueLogs
 
 PERIOD_S: Final = 0.05
 LOG_REQUEST_PERIOD_S: Final = 0.1  # a log in the grapple moves with it
 TIMING_PERIOD_S: Final = 1.0
 STATIC: Final = Path(__file__).with_name("static")
 
-Address = tuple[str, int]
-
-
-@dataclass(slots=True)
-class Console:
-    """Configuration and state of the console.
-
-    ``operator`` None: the page is read-only; ``planner`` None: it sends no mission commands.
-    """
-
-    profile: Profile
-    profile_hash: int
-    operator: Path | None = None
-    scene: Address | None = None
-    key: bytes | None = None
-    reports: socket.socket | None = None
-    """A bound UDP socket on which the reports of controller and planner arrive."""
-    planner: Address | None = None
-    timing_page: Path | None = None
-    clock: Callable[[], int] = time.monotonic_ns
-    crane_state: CraneState = field(init=False)
-    _sequence: int = 0
-
-    def __post_init__(self) -> None:
-        self.crane_state = CraneState(self.profile, self.key, self.profile_hash)
-
-    def command(self, action: OperatorAction) -> None:
-        """Send one operator command.
-
-        Raises:
-            OSError: it cannot be sent.
-        """
-        assert self.operator is not None
-        message = OperatorCommand(self._next(), self.profile_hash, self.clock(), action)
-        operator_link.send(encode(message, self.key), self.operator)
-
-    def mission_command(self, action: MissionAction) -> None:
-        """Send one mission command to the planner.
-
-        Raises:
-            OSError: it cannot be sent.
-        """
-        assert self.planner is not None
-        message = MissionCommand(self._next(), self.profile_hash, self.clock(), action)
-        _send(encode_mission_command(message, self.key), self.planner)
-
-    def _next(self) -> int:
-        # Starts from the clock, so that commands of a restarted console are not taken for a replay.
-        self._sequence = max(self._sequence + 1, self.clock() // 1_000_000 & 0x7FFF_FFFF)
-        return self._sequence
-
-    def state_for(self, peer: str | None) -> dict[str, Any]:
-        """The page's state and the permissions of the viewer at ``peer``."""
-        can = self.operator is not None
-        return {
-            **self.crane_state.state(self.clock()),
-            "may_stop": can,
-            "may_command": can and is_loopback(peer),
-            "may_order": self.planner is not None and is_loopback(peer),
-        }
-
-
-def _send(data: bytes, to: Address) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        out.connect(to)
-        out.send(data)
-        # On loopback the kernel reports at once that nobody listens.
-        if code := out.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            raise OSError(code, os.strerror(code))
+BUTTONS: Final = tuple(action.name for action in OperatorAction if action not in WATCH_ACTIONS)
 
 
 class _Reports(asyncio.DatagramProtocol):
@@ -147,8 +88,29 @@ async def _read_timing(crane_state: CraneState, page: Path) -> None:
         await asyncio.sleep(TIMING_PERIOD_S)
 
 
-def _not_local(name: str) -> Response:
-    return PlainTextResponse(f"{name} is accepted only from the machine that runs the console.", 403)
+async def _send(socket: WebSocket, text: str) -> None:
+    """Send a message; raises WebSocketDisconnect when the page is gone, also if it only answers no ping any more."""
+    try:
+        await socket.send_text(text)
+    except RuntimeError as closed:  # uvicorn's word for a connection that it has closed itself
+        raise WebSocketDisconnect(1006) from closed
+
+
+async def _hear(socket: WebSocket, console: Console, page: Page | None, panel: Panel) -> None:
+    """Take the answers of a page, and which panel it shows, until it is gone."""
+    async with contextlib.AsyncExitStack() as looking:
+        while (message := await socket.receive())["type"] != "websocket.disconnect":
+            text = message.get("text") or ""
+            if not panel.choose(text):
+                console.watch(text, page)
+                continue
+            await looking.aclose()
+            if panel.shown == "can":
+                await looking.enter_async_context(console.can_tap.viewer())
+
+
+FREE_ORDERS: Final = frozenset({MissionAction.PAUSE})
+"""Mission commands that any operator may give: they only stop."""
 
 
 def _respond(send: Callable[[], None], who: str, where: str) -> Response:
@@ -160,15 +122,47 @@ def _respond(send: Callable[[], None], who: str, where: str) -> Response:
     return Response(status_code=204)
 
 
+def _commission_routes(console: Console) -> list[Route]:
+    """Those of the commissioning page; its procedures are imported only where there is one."""
+    told, bus = console.commission, console.buses.get(console.profile.crane_bus)
+    if told is None or bus is None:
+        return []
+    from console.commission_api import CommissionApi
+    from console.commissioning import Commissioning
+
+    work = Commissioning(
+        console.profile, console.profile_hash, told.source, told.folder, told.controller, bus, console.key,
+        lambda: console.crane_state.report,
+    )  # fmt: skip
+    return CommissionApi(work, console.access).routes()
+
+
 def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette:
     """The ASGI application; ``allow_hosts`` are host names to serve in addition to this machine's."""
     page = (STATIC / "index.html").read_text()
     machine = describe_machine(console.profile)
+    plan = PlanApi(
+        console.profile,
+        console.access,
+        None if console.missions is None else MissionFolder(console.missions),
+        None if console.planner is None else console.offer,
+        lambda: console.crane_state.mission_state.answer,
+    )
+
+    camera = Camera(console.scene, console.crane_state, console.clock)
+    true_logs = None if console.truth is None else TrueLogs(console.truth)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
+            await stack.enter_async_context(camera.connected())
+            if console.foxglove is not None:
+                feeding = asyncio.create_task(feed_pictures(console.foxglove, camera))
+                stack.callback(console.foxglove.close)
+                stack.callback(feeding.cancel)
+            if true_logs is not None:
+                await stack.enter_async_context(true_logs.connected())
             if console.reports:
                 reports, _receiver = await loop.create_datagram_endpoint(
                     lambda: _Reports(console), sock=console.reports
@@ -187,14 +181,26 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         return FileResponse(STATIC / "index.html", media_type="text/html")
 
     async def api_machine(_: Request) -> Response:
-        return JSONResponse(machine)
+        commissions = console.commission is not None
+        return JSONResponse(
+            machine
+            | {
+                "commissions": commissions,
+                "run": str(console.recording or ""),
+                "panels": panels_of(console.can_tap, bool(console.timing_page), bool(console.faults)),
+                "truth": console.truth is not None,
+            }
+        )
 
     async def api_state(request: Request) -> Response:
-        state = console.state_for(request.client.host if request.client else None)
+        state = console.state_for(page_of(request), person_of(request))
         return JSONResponse(state | {"mission": console.crane_state.mission_state.mission()})
 
     async def api_trail(_: Request) -> Response:
         return JSONResponse(list(console.crane_state.mission_state.trail))
+
+    async def api_timeline(_: Request) -> Response:
+        return JSONResponse(list(console.crane_state.timeline.entries))
 
     async def healthz(_: Request) -> Response:
         alive = console.crane_state.alive(console.clock())
@@ -202,14 +208,31 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
 
     async def operator(request: Request) -> Response:
         name = request.path_params["action"].upper()
-        if name not in OperatorAction.__members__:
+        if name not in BUTTONS:
             return PlainTextResponse(f"Unknown command {name}.", 404)
+        return press(request, OperatorAction[name])
+
+    def press(request: Request, action: OperatorAction) -> Response:
         if console.operator is None:
             return PlainTextResponse("This console is read-only; start it with --operator FILE.", 409)
-        peer = request.client.host if request.client else None
-        if name != "STOP" and not is_loopback(peer):
-            return _not_local(name)
-        return _respond(lambda: console.command(OperatorAction[name]), "controller", str(console.operator))
+        if action is not OperatorAction.STOP:
+            leased = action in (OperatorAction.ARM, OperatorAction.RESET)
+            if why := console.access.refusal(page_of(request), Role.OPERATOR, leased):
+                return PlainTextResponse(why, 403)
+        if action is OperatorAction.WATCH_END and not console.page_watch.end(
+            request.path_params["page"], console.clock()
+        ):
+            return Response(status_code=204)  # another page watches
+        return _respond(lambda: console.command(action), "controller", str(console.operator))
+
+    async def begin_shift(request: Request) -> Response:
+        if why := console.access.refusal(page_of(request), Role.OPERATOR, False):
+            return PlainTextResponse(why, 403)
+        console.crane_state.shift.begin(console.clock())
+        return Response(status_code=204)
+
+    async def watch_end(request: Request) -> Response:
+        return press(request, OperatorAction.WATCH_END)
 
     async def mission(request: Request) -> Response:
         name = request.path_params["order"].upper().replace("-", "_")
@@ -217,22 +240,28 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             return PlainTextResponse(f"Unknown mission command {name}.", 404)
         if console.planner is None:
             return PlainTextResponse("This console sends no mission commands; start it with --planner HOST:PORT.", 409)
-        if not is_loopback(request.client.host if request.client else None):
-            return _not_local(name)
+        if why := console.access.refusal(page_of(request), Role.OPERATOR, MissionAction[name] not in FREE_ORDERS):
+            return PlainTextResponse(why, 403)
         host, port = console.planner
         return _respond(lambda: console.mission_command(MissionAction[name]), "planner", f"{host}:{port}")
 
     async def ws(socket: WebSocket) -> None:
         await socket.accept()
-        peer = socket.client.host if socket.client else None
-        with contextlib.suppress(WebSocketDisconnect):
+        page, person, panel = page_of(socket), person_of(socket), Panel()
+        hearing = asyncio.create_task(_hear(socket, console, page, panel))
+        with contextlib.suppress(WebSocketDisconnect), console.access.connected(page):
             sent_count = 0
-            while True:
-                state, mission_state = console.state_for(peer), console.crane_state.mission_state
+            while not hearing.done() and console.access.is_valid(page):
+                state, mission_state = console.state_for(page, person), console.crane_state.mission_state
                 if sent_count != mission_state.report_count:
                     sent_count, state["mission"] = mission_state.report_count, mission_state.mission()
-                await socket.send_text(json.dumps(state, separators=(",", ":")))
+                if panel.due(state["sent_ms"]):
+                    state |= panel_data(panel.shown, console.can_tap, console.crane_state)
+                await _send(socket, json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
+            if not hearing.done():
+                await socket.close(1008, "The session has ended.")
+        hearing.cancel()
 
     return Starlette(
         routes=[
@@ -240,14 +269,25 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             Route("/api/machine", api_machine),
             Route("/api/state", api_state),
             Route("/api/trail", api_trail),
+            Route("/api/timeline", api_timeline),
             Route("/api/operator/{action}", operator, methods=["POST"]),
+            Route("/api/watch-end/{page}", watch_end, methods=["POST"]),
             Route("/api/mission/{order}", mission, methods=["POST"]),
+            Route("/api/shift/begin", begin_shift, methods=["POST"]),
+            *plan.routes(),
+            *camera.routes(),
+            *(() if true_logs is None else true_logs.routes()),
             Route("/healthz", healthz),
+            *(fault_routes(console.faults, console.crane_state.fault_watch, console.access) if console.faults else ()),
+            *access_routes(console.access, console.tls),
+            *_commission_routes(console),
             WebSocketRoute("/ws", ws),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))
+            *([Middleware(AuditTrail, log=console.audit)] if console.audit else ()),
+            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page)),
+            Middleware(AccessGuards, access=console.access),
         ],
         lifespan=lifespan,
     )

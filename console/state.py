@@ -8,18 +8,25 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import StateReport
+from can_dbc.messages.crane import LinkWatch, StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.mission import MissionReport
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
+from console.fault_watch import FaultWatch
+from console.grasp_state import GraspState
 from console.mission_state import MissionState, describe_carrier
+from console.shift import Shift
+from console.tick_histogram import histograms
+from console.timeline import Timeline
 from machine.geometry import grapple, kinematics
+from machine.geometry.map_projection import MapProjection
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
 from machine.status import faults
@@ -32,6 +39,7 @@ WINDOW_NS: Final = 1_000_000_000
 TIMING_TIMEOUT_NS: Final = 3_000_000_000
 """The controller writes its timing once a second."""
 
+LINK_WORDS: Final[dict[int, str]] = {LinkWatch.OFF: "not watched", LinkWatch.WATCHED: "watched", LinkWatch.LOST: "lost"}
 PARTS: Final = ("column", "boom", "stick", "telescope", "grapple")
 _NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
 
@@ -57,11 +65,22 @@ def describe_machine(profile: Profile) -> dict[str, Any]:
 
 
 class CraneState:
-    """Accepts reports and log lists and returns the page's state; ``mission_state`` is that of vehicle and mission."""
+    """Accepts reports and log lists and returns the page's state; ``mission_state`` is that of vehicle and mission,
+    ``grasp_state`` the chosen grasp."""
 
-    def __init__(self, profile: Profile, key: bytes | None = None, profile_hash: int = 0) -> None:
+    def __init__(
+        self, profile: Profile, key: bytes | None = None, profile_hash: int = 0, ground: MapProjection | None = None
+    ) -> None:
         self.logs: tuple[LogObservation, ...] = ()
-        self.mission_state = MissionState(profile, profile_hash, key)
+        self.mission_state = MissionState(profile, profile_hash, key, ground)
+        self.timeline = Timeline()
+        self.shift = Shift()
+        self.fault_watch = FaultWatch(profile)
+        self.grasp_state = GraspState(profile, profile_hash, key)
+        self.listener: Callable[[StateReport | VehicleReport], None] | None = None
+        """Called with every report of the controller that is accepted."""
+        self.mission_listener: Callable[[MissionReport, int], None] | None = None
+        """Called with every mission report that is accepted, and when the planner made it [ns]."""
         self._profile = profile
         self._key = key
         self._report: StateReport | None = None
@@ -69,18 +88,34 @@ class CraneState:
         self._recent: deque[tuple[int, StateReport]] = deque()
         self._timing: dict[str, Any] | None = None
         self._timing_ns = 0
+        self._newest_timing: Timing | None = None
 
     def on_report(self, datagram: bytes, now_ns: int) -> bool:
         """Accept a datagram; False when it is not a report that is shown."""
         try:
             report = decode(datagram, self._key)
         except DatagramRefused:
-            return self.mission_state.on_mission(datagram, now_ns)
+            if self.grasp_state.on_grasp(datagram, now_ns):
+                return True
+            if not self.mission_state.on_mission(datagram, now_ns):
+                return False
+            self.timeline.on_mission(self.mission_state.report, now_ns)
+            self.shift.on_mission(self.mission_state.report)
+            if self.mission_listener is not None:
+                self.mission_listener(self.mission_state.report, self.mission_state.stamp_ns)
+            return True
+        return isinstance(report, StateReport | VehicleReport) and self.accept(report, now_ns)
+
+    def accept(self, report: StateReport | VehicleReport, now_ns: int) -> bool:
+        """Accept a report of the controller."""
+        if self.listener is not None:
+            self.listener(report)
         if isinstance(report, VehicleReport):
             self.mission_state.on_vehicle(report, now_ns)
             return True
-        if not isinstance(report, StateReport):
-            return False
+        self.timeline.on_report(report)
+        self.shift.on_report(report, now_ns, self.timeline.stops, self.timeline.lifts)
+        self.fault_watch.on_report(report)
         self._report, self._received_ns = report, now_ns
         self._recent.append((now_ns, report))
         self._forget(now_ns)
@@ -89,6 +124,16 @@ class CraneState:
     def on_timing(self, timing: Timing) -> None:
         """Accept a state of the controller's timing page."""
         self._timing, self._timing_ns = _timing_facts(timing), timing.facts.written_ns
+        self._newest_timing = timing
+
+    @property
+    def report(self) -> StateReport | None:
+        """The controller's newest report."""
+        return self._report
+
+    def histograms(self) -> dict[str, Any] | None:
+        """The histograms of the newest timing page; None before the first."""
+        return None if self._newest_timing is None else histograms(self._newest_timing)
 
     def alive(self, now_ns: int) -> bool:
         """Whether the controller is connected."""
@@ -98,6 +143,9 @@ class CraneState:
         """The state for the page; without crane data before the controller's first report."""
         r = self._report
         base = {"alive": self.alive(now_ns), "logs": [asdict(log) for log in self.logs], "timing": None}
+        base["entries"] = self.timeline.count
+        base["shift"] = self.shift.numbers(now_ns)
+        base["grasp"] = self.grasp_state.shown(now_ns)
         base |= self.mission_state.state(now_ns)
         if self._timing and now_ns - self._timing_ns < TIMING_TIMEOUT_NS:
             base["timing"] = self._timing
@@ -121,6 +169,7 @@ class CraneState:
             "frames_per_s": _rate(window),
             "refused": r.refused,
             "refusal": _sentence(r.refusal) if r.refusal else "",
+            "operator_link": LINK_WORDS.get(r.operator_link, ""),
             "stale": [STALE_INPUT_NAMES.get(b, f"bit {b}") for b in range(16) if r.stale_mask >> b & 1],
             **self._drawing(r),
         }
@@ -164,6 +213,24 @@ def _timing_facts(timing: Timing) -> dict[str, Any]:
         "sample_to_command_ms": found["sample_to_command"].quantile_ns(0.99) / 1e6,
         "oldest_input": oldest,
         "oldest_input_ms": inputs[oldest] / 1e6 if oldest else None,
+    }
+
+
+def timing_of_recording(found: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The same from the timing page as a recording has it: without histograms."""
+    if found is None:
+        return None
+    durations, inputs = found["durations"], found["inputs"]
+    used = {name: age["longest_ns"] for name, age in inputs.items() if age["count"]}
+    oldest = max(used, key=used.__getitem__, default="")
+    return {
+        "ticks": found["ticks"],
+        "missed": found["missed"],
+        "wake_us": durations["wake"]["p99_us"],
+        "cpu_us": durations["cpu"]["p99_us"],
+        "sample_to_command_ms": durations["sample_to_command"]["p99_us"] / 1e3,
+        "oldest_input": oldest,
+        "oldest_input_ms": used[oldest] / 1e6 if oldest else None,
     }
 
 

@@ -1,7 +1,14 @@
 // The operator page: receives the state by websocket, shows it, and sends operator commands by POST.
 
+import { beginAccess, post, socketAddress } from "./access.js";
+import { createHeartbeat } from "./heartbeat.js";
+import { createLease } from "./lease.js";
 import { createMission } from "./mission.js";
+import { createPanels } from "./panels.js";
 import { createPlot, LINES } from "./plot.js";
+import { createReplay } from "./replay.js";
+import { createShift } from "./shift.js";
+import { createTrueLogs } from "./true_logs.js";
 
 const LOST_AFTER_MS = 700;
 const MODE_WORDS = { STOP: "STOPPED" };
@@ -11,18 +18,23 @@ const $ = (id) => document.getElementById(id);
 let machine = null;
 let scene = null;
 let mission = null;
+let panels = null;
+let replay = null;
+let shift = null;
+let lease = null;
 let rows = [];
 let lastMessage = 0;
 let reportAlive = false;
 let alarmUntil = 0;
 let mode = "";
 const plot = createPlot($("plot"));
+const heartbeat = createHeartbeat();
 
 // ---- commands --------------------------------------------------------------------------------------------
 
 async function send(path, name, otherwise) {
   try {
-    const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(2000) });
+    const answer = await post(path, { signal: AbortSignal.timeout(2000) });
     if (!answer.ok) throw new Error((await answer.text()) || answer.statusText);
   } catch (error) {
     alarm(`${name.toUpperCase()} could not be sent (${error.message}). ${otherwise}`, 10000);
@@ -42,9 +54,10 @@ $("confirm-no").addEventListener("click", () => $("confirm").close());
 $("confirm-yes").addEventListener("click", () => { $("confirm").close(); command("arm"); });
 window.addEventListener("keydown", (event) => {
   if (event.key !== "Escape" && event.key !== " ") return;
+  if (replay) return replay.key(event); // nothing can be stopped in a recording
   event.preventDefault();
   event.stopPropagation();
-  for (const id of ["confirm", "end"]) if ($(id).open) $(id).close();
+  for (const open of document.querySelectorAll("dialog[open]")) open.close();
   if (!event.repeat) command("stop");
 }, { capture: true });
 // Releasing the space bar clicks a focused button; here it only means STOP.
@@ -53,16 +66,16 @@ window.addEventListener("keyup", (event) => { if (event.key === " ") event.preve
 // ---- link ------------------------------------------------------------------------------------------------
 
 function connect() {
-  const url = new URL("ws", location.href);
-  url.protocol = location.protocol === "https:" ? "wss:" : "ws:";
-  const socket = new WebSocket(url);
+  const socket = new WebSocket(socketAddress());
   socket.addEventListener("message", (event) => {
     lastMessage = performance.now();
-    show(JSON.parse(event.data));
+    const state = JSON.parse(event.data);
+    show(state);
+    heartbeat.answer(socket, state);
     watch();
   });
-  socket.addEventListener("open", () => mission?.recall());
-  socket.addEventListener("close", () => setTimeout(connect, 500));
+  socket.addEventListener("open", () => { mission?.recall(); panels?.connected(socket); replay?.connected(socket); });
+  socket.addEventListener("close", () => setTimeout(async () => { await beginAccess(); connect(); }, 500));
 }
 
 function watch() {
@@ -73,10 +86,15 @@ function watch() {
   text("mode", known ? (MODE_WORDS[mode] ?? mode) : "NO CONNECTION");
   text("mode-mark", known ? (MODE_MARKS[mode] ?? "?") : "○");
   if (now < alarmUntil) return;
-  if (!linked) alarm("No connection to the console server: the display is outdated.");
+  if (linked && replay) { $("alarm").hidden = known; if (!known) alarm("The recording has no report of the controller at this time."); }
+  else if (!linked) alarm(`No connection to the console server: the display is outdated.${replayHint()}`);
   else if (!mode) alarm("Waiting for the first controller report.");
   else if (!reportAlive) alarm("No report from the controller: the display is outdated.");
   else $("alarm").hidden = true;
+}
+
+function replayHint() {
+  return machine?.run ? ` If the run has ended, replay it: timberhand console --replay ${machine.run}` : "";
 }
 
 function alarm(text, holdMs = 0) {
@@ -89,10 +107,15 @@ function alarm(text, holdMs = 0) {
 
 function show(state) {
   reportAlive = state.alive;
-  for (const id of ["arm", "disarm", "reset"]) $(id).disabled = !state.may_command;
+  for (const id of ["arm", "reset"]) $(id).disabled = !(state.may_command && state.lease.mine);
+  $("disarm").disabled = !state.may_command;
+  lease?.show(state);
   $("stop").disabled = !state.may_stop;
   showTiming(state.timing);
   mission?.show(state);
+  panels?.show(state);
+  replay?.show(state);
+  shift?.show(state);
   if (!state.mode) return;
   document.body.dataset.mode = mode = state.mode;
   text("reason", state.reason);
@@ -107,8 +130,10 @@ function show(state) {
   text("missed", String(state.missed_ticks));
   text("rate", number(state.frames_per_s, 0));
   text("refused", String(state.refused));
+  text("operator-link", state.operator_link);
   text("stale", state.stale.length ? state.stale.join(", ") : "none");
   text("refusal", state.refusal ? `Last refused setpoint: ${state.refusal}` : "");
+  if (state.history) plot.load(state.history);
   if (state.alive) {
     plot.add(state.time_s, state.position.map((q, j) => {
       const r = state.reference[j];
@@ -197,9 +222,17 @@ function build() {
 
 async function start() {
   // STOP is connected above and works even if everything below fails.
+  const me = await beginAccess();
   machine = await (await fetch("api/machine")).json();
   build();
+  $("commission-link").hidden = !machine.commissions;
+  $("plan-link").hidden = !machine.carrier || Boolean(machine.recording);
+  if (machine.recording) replay = createReplay($("replay"), machine.recording);
+  else lease = createLease($("lease"), alarm, me);
+  panels = createPanels(machine, replay?.pick);
   if (machine.carrier) mission = createMission(machine, sendMission, { number, text });
+  if (!machine.recording) shift = createShift(machine, send, { number, text });
+  if (machine.truth) createTrueLogs(() => scene, alarm);
   connect();
   setInterval(watch, 100);
   try {

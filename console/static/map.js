@@ -35,7 +35,7 @@ export function createMap(canvas, machine, onMoved) {
     }
     if (view !== "site" && view !== "machine") return;
     const all = [...(mission?.route ?? []), ...(mission?.fences ?? []).flatMap((f) => f.corners),
-      ...(mission?.landings ?? []).map((l) => l.at), ...(place ? [[place.x_m, place.y_m]] : [])];
+      ...(mission?.landings ?? []).map((l) => l.at), ...(place ? [[place.x_m, place.y_m]] : []), ...(mission ? [] : trail)];
     if (!all.length) return;
     const xs = all.map((p) => p[0]), ys = all.map((p) => p[1]);
     const [w, e, s, n] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
@@ -228,6 +228,7 @@ export function createMap(canvas, machine, onMoved) {
       vehicle = now;
       const p = now?.place, last = trail.at(-1);
       if (p && (!last || Math.hypot(p.x_m - last[0], p.y_m - last[1]) > 0.25)) trail.push([p.x_m, p.y_m]);
+      if (trail.length > carrier.trail_points) trail.splice(0, trail.length - carrier.trail_points);
       draw();
     },
     crane(chain) { points = chain; },

@@ -18,7 +18,7 @@ export function createMission(machine, send, { number, text }) {
 
   function begin() {
     document.body.dataset.mission = "there";
-    for (const id of ["mission", "vehicle", "site"]) $(id).hidden = false;
+    for (const id of ["vehicle", "site"]) $(id).hidden = false;
     const buttons = [...document.querySelectorAll("[data-map]")];
     const press = (name) => buttons.forEach((b) => b.setAttribute("aria-pressed", b.dataset.map === name));
     map = createMap($("map"), machine, () => press(""));
@@ -35,25 +35,31 @@ export function createMission(machine, send, { number, text }) {
   function show(state) {
     if (state.mission) {
       mission = state.mission;
-      if (!map) begin();
-      showMission(mission);
+      $("mission").hidden = false;
     }
-    if (!mission) return;
-    const m = mission, current = state.mission_alive, open = current && !m.ended && state.may_order;
+    // A recording has the vehicle's track, but no mission reports.
+    if (!map && (mission || machine.recording?.moves)) begin();
+    if (!map) return;
+    if (mission) showCommands(state);
+    map.mission(mission, state.mission_alive || !mission);
+    map.crane(state.points ?? null);
+    map.vehicle(state.vehicle);
+    showVehicle(state.vehicle);
+    $("site").classList.toggle("old", !state.mission_alive && !state.vehicle?.place_alive);
+  }
+
+  function showCommands(state) {
+    if (state.mission) showMission(mission);
+    const m = mission, current = state.mission_alive, may = current && !m.ended && state.may_order, open = may && state.lease.mine;
     $("mission").classList.toggle("old", !current);
     text("mission-age", current ? m.name : `last report ${age(state.mission_age_s)} ago`);
     text("mission-note", note(m, current));
     $("auto").disabled = !open || m.auto;
-    $("pause").disabled = !open || !m.auto;
+    $("pause").disabled = !may || !m.auto;
     $("single").disabled = $("abort").disabled = !open;
     $("next-step").disabled = !open || !m.waits_for || !m.auto;
     $("single").setAttribute("aria-pressed", m.single_step);
     if (!open && $("end").open) $("end").close();
-    map.mission(mission, current);
-    map.crane(state.points ?? null);
-    map.vehicle(state.vehicle);
-    showVehicle(state.vehicle);
-    $("site").classList.toggle("old", !current && !state.vehicle?.place_alive);
   }
 
   function showMission(m) {

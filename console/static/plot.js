@@ -4,20 +4,28 @@ const SPAN_S = 20;
 /** Dash pattern of each joint; the colours come from the style sheet. */
 export const LINES = [[], [7, 3], [2, 3], [9, 3, 2, 3], [4, 4]];
 
-/** Keeps samples of `{t, values}` (t in seconds, a value may be null) and draws them; returns `{add}`. */
+/** Keeps samples of `{t, values}` (t in seconds, a value may be null) and draws them; returns `{add, load}`. */
 export function createPlot(canvas) {
   const samples = [];
+  let scheduled = false;
   const style = getComputedStyle(document.documentElement);
   const ink = (name) => style.getPropertyValue(`--${name}`);
 
   function add(t, values) {
+    if (t === samples.at(-1)?.t) return; // the same report again
     if (samples.length && t < samples.at(-1).t) samples.length = 0;
     samples.push({ t, values });
     while (samples[0].t < t - SPAN_S) samples.shift();
-    draw(t);
+    draw();
   }
 
-  function draw(now) {
+  function draw() {
+    if (scheduled) return;
+    scheduled = true;
+    requestAnimationFrame(() => { scheduled = false; if (samples.length) paint(samples.at(-1).t); });
+  }
+
+  function paint(now) {
     const ratio = window.devicePixelRatio || 1;
     const width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width || !height) return;
@@ -62,7 +70,14 @@ export function createPlot(canvas) {
     g.setLineDash([]);
   }
 
-  return { add };
+  /** Replaces the samples by `[t, values]` of a recording. */
+  function load(history) {
+    samples.length = 0;
+    for (const [t, values] of history) samples.push({ t, values });
+    draw();
+  }
+
+  return { add, load };
 }
 
 function niceStep(reach) {

@@ -4,7 +4,7 @@ import * as THREE from "three";
 import { createCarrier } from "./carrier.js";
 import { createViewport } from "./viewport.js";
 
-const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff;
+const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff, GRIP = 0xff9ec4, TRUE = 0x40e0ff;
 const UP = new THREE.Vector3(0, 1, 0);
 /** The views fit a crane of this reach; a longer one is seen from farther away. */
 const VIEWED_M = 6.95;
@@ -128,7 +128,78 @@ function addBunk(scene, machine) {
   scene.add(group);
 }
 
-/** Builds the view into `container`; returns `{update(state), view(name)}`.  Throws without WebGL. */
+/** The chosen grasp: the open jaws' tips, and the pin above them; returns `show(grasp)`. */
+function createGrip(scene) {
+  const group = new THREE.Group(), tips = [0, 1].map(() => ball(group, 0.07, GRIP));
+  const across = new Bar(group, 0.025, GRIP), down = new Bar(group, 0.018, GRIP);
+  group.visible = false;
+  scene.add(group);
+  return (grasp) => {
+    group.visible = Boolean(grasp);
+    if (!grasp) return;
+    const [a, b] = grasp.tips.map(v3), pin = v3(grasp.pin);
+    tips.forEach((tip, i) => tip.position.copy(i ? b : a));
+    across.span(a, b);
+    down.span(pin, a.clone().lerp(b, 0.5));
+  };
+}
+
+const SIDES = 24;
+const ROUND = new THREE.CylinderGeometry(1, 1, 1, SIDES);  // scaled to each log
+
+/** Calls `place(i, matrix)` for every log of a list that is not the one shown; returns `show(list)`. */
+function onChange(begin, place) {
+  let shown = "";
+  const matrix = new THREE.Matrix4(), turn = new THREE.Quaternion(), size = new THREE.Vector3();
+  return (list) => {
+    const key = JSON.stringify(list);
+    if (key === shown) return;
+    shown = key;
+    begin(list.length);
+    list.forEach((log, i) => {
+      turn.setFromUnitVectors(UP, v3(log.axis).normalize());
+      size.set(log.diameter_m / 2, log.length_m, log.diameter_m / 2);
+      place(i, matrix.compose(v3(log.center_m), turn, size));
+    });
+  };
+}
+
+/** Logs of bark and wood, drawn all at once: a heap of 200 costs no more calls than one log. */
+function createLogs(scene) {
+  const materials = [paint(BARK), paint(WOOD), paint(WOOD)];
+  let logs = null;
+  return onChange((count) => {
+    if (count > (logs?.instanceMatrix.count ?? 0)) {
+      if (logs) { scene.remove(logs); logs.dispose(); }
+      logs = new THREE.InstancedMesh(ROUND, materials, 2 * count);
+      logs.frustumCulled = false;
+      scene.add(logs);
+    }
+    if (logs) { logs.count = count; logs.instanceMatrix.needsUpdate = true; }
+  }, (i, matrix) => logs.setMatrixAt(i, matrix));
+}
+
+/** Logs as they are in the plant: edges only, so that what is perceived stays visible in and behind them. */
+function createTrueLogs(scene) {
+  const edges = new THREE.EdgesGeometry(ROUND, 10).getAttribute("position"), end = new THREE.Vector3();
+  const lines = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: TRUE }));
+  lines.frustumCulled = false;
+  scene.add(lines);
+  let points = null;
+  return onChange((count) => {
+    lines.geometry.dispose();
+    lines.geometry = new THREE.BufferGeometry();
+    points = new THREE.BufferAttribute(new Float32Array(3 * count * edges.count), 3);
+    lines.geometry.setAttribute("position", points);
+  }, (i, matrix) => {
+    for (let k = 0; k < edges.count; k++) {
+      end.fromBufferAttribute(edges, k).applyMatrix4(matrix);
+      points.setXYZ(i * edges.count + k, end.x, end.y, end.z);
+    }
+  });
+}
+
+/** Builds the view into `container`; returns `{update(state), view(name), trueLogs(list)}`.  Throws without WebGL. */
 export function createScene(container, machine) {
   const { world: scene, draw, look } = createViewport(container, { nearest: 2, farthest: 30, sight: 80 });
   const sun = new THREE.DirectionalLight(0xffffff, 2.2);
@@ -148,8 +219,7 @@ export function createScene(container, machine) {
   ghost.frustumCulled = false;
   ghost.visible = ghostPin.visible = false;
   scene.add(ghost, ghostPin);
-  const logs = new THREE.Group();
-  scene.add(logs);
+  const grip = createGrip(scene);
 
   function view(name) {
     const [position, target] = VIEWS[name];
@@ -159,21 +229,7 @@ export function createScene(container, machine) {
     look(off.add(at), at);
   }
 
-  let logsShown = "";
-  function showLogs(list) {
-    const key = JSON.stringify(list);
-    if (key === logsShown) return;
-    logsShown = key;
-    for (const old of logs.children) old.geometry.dispose();
-    logs.clear();
-    for (const log of list) {
-      const shape = new THREE.CylinderGeometry(log.diameter_m / 2, log.diameter_m / 2, log.length_m, 24);
-      const mesh = new THREE.Mesh(shape, [paint(BARK), paint(WOOD), paint(WOOD)]);
-      mesh.position.copy(v3(log.center_m));
-      mesh.quaternion.setFromUnitVectors(UP, v3(log.axis).normalize());
-      logs.add(mesh);
-    }
-  }
+  const showLogs = createLogs(scene), showTrueLogs = createTrueLogs(scene);
 
   function update(state) {
     // An unknown pose is not drawn.
@@ -190,9 +246,10 @@ export function createScene(container, machine) {
     }
     carrier?.update(state.vehicle);
     showLogs(state.logs);
+    grip(state.grasp);
     draw();
   }
 
   view("corner");
-  return { update, view };
+  return { update, view, trueLogs(list) { showTrueLogs(list); draw(); } };
 }

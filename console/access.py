@@ -1,0 +1,200 @@
+"""Who is at which page: sign-in, the pages' tokens, roles, and what each may command.
+
+On this machine nobody signs in: whoever reaches the loopback address is a technician.  With accounts everybody signs
+in, and a cookie keeps the session.  Either way a page asks for a token of its own, which every command and the
+websocket must carry: a page of another site cannot read it, so it can command nothing even where the browser adds the
+cookie.  The control lease belongs to one page (`console.lease`).
+
+Pure but for the tokens' randomness; `console.access_routes` and `console.access_guards` are the shell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from console.accounts import Accounts, Person, Role
+from console.guards import is_loopback
+from console.lease import ControlLease
+
+SESSION_NS: Final = 12 * 3600 * 1_000_000_000
+"""A shift: after it a person signs in again."""
+MAX_PAGES: Final = 256
+MAX_SESSIONS: Final = 64
+MAX_FAILURES: Final = 5
+FAILURES_NS: Final = 30_000_000_000
+"""After so many wrong passwords within this time nobody may try one; on this machine STOP and the pages that are open
+go on."""
+LOCAL: Final = Person("this machine", Role.TECHNICIAN)
+VISITOR: Final = Person("", Role.VIEWER)
+TOKEN_BYTES: Final = 32
+
+
+@dataclass(slots=True)
+class Session:
+    """A person who has signed in."""
+
+    person: Person
+    until_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page in one tab of a browser; ``session`` is empty where nobody signs in."""
+
+    number: int
+    token: str
+    person: Person
+    session: str
+
+
+class Access:
+    """``accounts`` None: only this machine is served, and nobody signs in."""
+
+    def __init__(self, accounts: Accounts | None, clock: Callable[[], int]) -> None:
+        self.accounts = accounts
+        self.lease = ControlLease()
+        self._clock = clock
+        self._pages: dict[str, Page] = {}
+        self._sessions: dict[str, Session] = {}
+        self._failures: deque[int] = deque(maxlen=MAX_FAILURES)
+        self._number = 0
+        self._connected: set[int] = set()
+
+    # ---- persons
+
+    def may_try(self) -> bool:
+        """Whether a password may be tried now."""
+        full = len(self._failures) == MAX_FAILURES
+        return not (full and self._clock() - self._failures[0] < FAILURES_NS)
+
+    def signed_in(self, person: Person | None) -> str:
+        """A checked password: the new session of its person; a wrong one counts, and gives none."""
+        if person is None:
+            self._failures.append(self._clock())
+            return ""
+        self._forget()
+        while len(self._sessions) >= MAX_SESSIONS:
+            self.sign_out(next(iter(self._sessions)))
+        session = secrets.token_urlsafe(TOKEN_BYTES)
+        self._sessions[session] = Session(person, self._clock() + SESSION_NS)
+        return session
+
+    def sign_out(self, session: str) -> None:
+        """End a session, with its pages and their lease."""
+        self._sessions.pop(session, None)
+        for page in [p for p in self._pages.values() if p.session == session]:
+            self.lease.give_back(page.number, self._clock())
+            del self._pages[page.token]
+
+    def person(self, session: str, peer: str | None) -> Person | None:
+        """Who sends a request; None: nobody who has signed in."""
+        if self.accounts is None:
+            return LOCAL if is_loopback(peer) else VISITOR
+        self._forget()
+        found = self._sessions.get(session)
+        return None if found is None else found.person
+
+    # ---- pages
+
+    def page(self, token: str, session: str, peer: str | None) -> Page | None:
+        """The page that a token names, if the request is of the person for whom it was made."""
+        page = self._pages.get(token)
+        if page is None or page.person != self.person(session, peer):
+            return None
+        return page if self.accounts is None or page.session == session else None
+
+    def open_page(self, token: str, session: str, peer: str | None) -> Page | None:
+        """The page with this token, or a new one; None: sign in first.
+
+        A token that a page uses already is that of a duplicated tab, which becomes a page of its own.
+        """
+        known = self.page(token, session, peer)
+        person = self.person(session, peer)
+        if person is None:
+            return None
+        if known is not None and known.number not in self._connected:
+            return known
+        holder = self.lease.holder(self._clock())
+        while len(self._pages) >= MAX_PAGES:
+            idle = (p for p in self._pages.values() if p.number != holder and p.number not in self._connected)
+            oldest = next(idle, None) or next(p for p in self._pages.values() if p.number != holder)
+            del self._pages[oldest.token]
+        self._number += 1
+        page = Page(self._number, secrets.token_urlsafe(TOKEN_BYTES), person, session if self.accounts else "")
+        self._pages[page.token] = page
+        return page
+
+    def is_connected(self, token: str) -> bool:
+        """Whether the page with this token has a websocket."""
+        page = self._pages.get(token)
+        return page is not None and page.number in self._connected
+
+    @contextlib.contextmanager
+    def connected(self, page: Page | None) -> Iterator[None]:
+        """While it lasts the page has a websocket."""
+        number = 0 if page is None else page.number
+        self._connected.add(number)
+        try:
+            yield
+        finally:
+            self._connected.discard(number)
+
+    # ---- the lease
+
+    def take(self, page: Page, over: int) -> str:
+        """Take the lease from nobody or from page ``over``; why not, empty when it is taken."""
+        if page.person.role < Role.OPERATOR:
+            return f"{page.person.name or 'This page'} is a viewer; an operator may take control."
+        if self.lease.take(page.number, over, self._clock()):
+            return ""
+        return f"{self._holder_words()} has control; look again, then take it over."
+
+    def refusal(self, page: Page | None, role: Role, leased: bool) -> str:
+        """Why the page may not command something that needs a role, and the lease if ``leased``; empty: it may."""
+        if page is None or page.person.role < role:
+            return f"This needs the role {role.name.lower()}."
+        if leased and self.lease.holder(self._clock()) != page.number:
+            holder = self._holder_words()
+            return f"{holder} has control; take it over first." if holder else "Nobody has control; take control first."
+        return ""
+
+    def is_valid(self, page: Page | None) -> bool:
+        """Whether a page may go on; one that only looks, without a token, may."""
+        self._forget()
+        return page is None or page.token in self._pages
+
+    def give_back(self, page: Page) -> None:
+        """The page does not need the lease any more."""
+        self.lease.give_back(page.number, self._clock())
+
+    def leads(self, page: Page | None) -> bool:
+        """Whether the page has the lease."""
+        return page is not None and self.lease.holder(self._clock()) == page.number
+
+    def state(self, page: Page | None, person: Person) -> dict[str, Any]:
+        """For the page: who it is, and who has control."""
+        holder = self.lease.holder(self._clock())
+        return {
+            "role": person.role.name.lower(),
+            "lease": {
+                "page": holder,
+                "holder": self._holder_words() if holder else "",
+                "mine": page is not None and holder == page.number,
+                "may_take": page is not None and person.role >= Role.OPERATOR,
+            },
+        }
+
+    def _holder_words(self) -> str:
+        number = self.lease.holder(self._clock())
+        page = next((p for p in self._pages.values() if p.number == number), None)
+        return "" if page is None else f"{page.person.name} (page {number})"
+
+    def _forget(self) -> None:
+        now_ns = self._clock()
+        for session in [key for key, found in self._sessions.items() if now_ns >= found.until_ns]:
+            self.sign_out(session)

@@ -1,0 +1,115 @@
+"""The addresses of signing in, of a page's token, and of the control lease."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from console.access import Access
+from console.access_guards import COOKIE, TOKEN_HEADER, page_of, session_of
+
+STATIC: Final = Path(__file__).with_name("static")
+MAX_BODY_BYTES: Final = 2048
+HANDOVER_STEPS, HANDOVER_STEP_S = 10, 0.05
+"""So long a page that is loaded again waits for the end of its former connection; a duplicated tab waits in vain."""
+T = TypeVar("T")
+
+
+class SignIn(msgspec.Struct, forbid_unknown_fields=True):
+    """What the sign-in form sends."""
+
+    name: str
+    password: str
+
+
+class Take(msgspec.Struct, forbid_unknown_fields=True):
+    """``over``: the page from which the lease is taken over, 0 for nobody."""
+
+    over: int
+
+
+def access_routes(access: Access, secure: bool) -> list[Route]:
+    """``secure``: the page is served over TLS, and so is its cookie."""
+    one = asyncio.Lock()
+
+    async def form(_: Request) -> Response:
+        return FileResponse(STATIC / "sign-in.html", media_type="text/html")
+
+    async def sign_in(request: Request) -> Response:
+        if access.accounts is None:
+            return PlainTextResponse("Nobody signs in to this console.", 409)
+        told = await _body(request, SignIn)
+        if told is None:
+            return PlainTextResponse("Send name and password.", 422)
+        request.scope["tried_name"] = told.name[:32]
+        async with one:  # one hash at a time, whoever asks; each may try when it is his turn
+            if not access.may_try():
+                return PlainTextResponse("Too many wrong passwords; wait half a minute.", 429)
+            person = await asyncio.to_thread(access.accounts.check, told.name, told.password)
+            session = access.signed_in(person)
+        if not session:
+            return PlainTextResponse("Name or password is wrong.", 403)
+        answer = Response(status_code=204)
+        answer.set_cookie(COOKIE, session, httponly=True, samesite="strict", secure=secure, path="/")
+        return answer
+
+    async def sign_out(request: Request) -> Response:
+        access.sign_out(session_of(request.headers))
+        answer = Response(status_code=204)
+        answer.delete_cookie(COOKIE, path="/")
+        return answer
+
+    async def session(request: Request) -> Response:
+        peer, token = request.client.host if request.client else None, request.headers.get(TOKEN_HEADER, "")
+        for _ in range(HANDOVER_STEPS):
+            if not access.is_connected(token):
+                break
+            await asyncio.sleep(HANDOVER_STEP_S)
+        page = access.open_page(token, session_of(request.headers), peer)
+        if page is None:
+            return PlainTextResponse("Sign in first.", 401)
+        told: dict[str, Any] = {"token": page.token, "page": page.number, "person": page.person.name}
+        told |= {"role": page.person.role.name.lower(), "signs_in": access.accounts is not None}
+        return JSONResponse(told)
+
+    async def take(request: Request) -> Response:
+        told, page = await _body(request, Take), page_of(request)
+        assert page is not None
+        if told is None:
+            return PlainTextResponse("Send the page from which control is taken over, or 0.", 422)
+        why = access.take(page, told.over)
+        return PlainTextResponse(why, 409) if why else Response(status_code=204)
+
+    async def give_back(request: Request) -> Response:
+        page = page_of(request)
+        assert page is not None
+        access.give_back(page)
+        return Response(status_code=204)
+
+    return [
+        Route("/sign-in", form),
+        Route("/api/sign-in", sign_in, methods=["POST"]),
+        Route("/api/sign-out", sign_out, methods=["POST"]),
+        Route("/api/session", session, methods=["POST"]),
+        Route("/api/lease/take", take, methods=["POST"]),
+        Route("/api/lease/give-back", give_back, methods=["POST"]),
+    ]
+
+
+async def _body(request: Request, kind: type[T]) -> T | None:
+    """The JSON of a small body; None when it is none of this kind."""
+    data = b""
+    try:
+        async for part in request.stream():
+            data += part
+            if len(data) > MAX_BODY_BYTES:
+                return None
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, ClientDisconnect):
+        return None

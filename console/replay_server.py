@@ -1,0 +1,119 @@
+"""Serves a recorded run in the operator's page: the same page, fed from a recording (`console.replay`).
+
+Nothing can be commanded: every POST is refused with a sentence, and the page says that it shows a recording.  Each page
+seeks and plays on its own, by words on its websocket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import Callable, Collection
+from typing import Any, Final
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from console.can_tap import load_databases
+from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy
+from console.replay import Overview, Recording, ReplayView
+from console.server import PERIOD_S, STATIC
+from console.state import describe_machine
+from machine.profile import Profile
+
+REFUSAL: Final = "This page shows a recording: nothing can be commanded."
+MAX_ORDERS: Final = 64
+"""Words of one page that wait; a page that sends more than it can be answered is closed."""
+
+
+def create_replay_app(
+    recording: Recording,
+    profile: Profile,
+    *,
+    name: str = "",
+    note: str = "",
+    at_ns: int | None = None,
+    allow_hosts: Collection[str] = (),
+    clock: Callable[[], int] = time.monotonic_ns,
+) -> Starlette:
+    """The ASGI application; ``name`` and ``note`` are shown, ``at_ns`` is where a page begins."""
+    overview, databases = Overview(recording, profile), load_databases(profile)
+    machine = describe_machine(profile) | {
+        "panels": ["error", "timeline", "can"],
+        "recording": {
+            "name": name, "note": note, "begin_s": recording.begin_ns / 1e9, "end_s": recording.end_ns / 1e9,
+            "moves": bool(overview.trail),
+        },
+    }  # fmt: skip
+    page = (STATIC / "index.html").read_text()
+
+    async def index(_: Request) -> Response:
+        return FileResponse(STATIC / "index.html", media_type="text/html")
+
+    async def api_machine(_: Request) -> Response:
+        return JSONResponse(machine)
+
+    async def api_trail(_: Request) -> Response:
+        return JSONResponse(overview.trail)
+
+    async def api_timeline(_: Request) -> Response:
+        return JSONResponse(overview.entries)
+
+    async def refuse(_: Request) -> Response:
+        return PlainTextResponse(REFUSAL, 409)
+
+    async def ws(socket: WebSocket) -> None:
+        await socket.accept()
+        view = await asyncio.to_thread(ReplayView, recording, profile, overview, databases, at_ns)
+        orders: asyncio.Queue[str] = asyncio.Queue(MAX_ORDERS)
+        hearing = asyncio.create_task(_hear(socket, orders))
+        with contextlib.suppress(WebSocketDisconnect, asyncio.QueueFull):
+            while not hearing.done():
+                state = await asyncio.to_thread(_next, view, _waiting(orders), clock())
+                await socket.send_text(json.dumps(state, separators=(",", ":")))
+                await asyncio.sleep(PERIOD_S)
+        hearing.cancel()
+
+    return Starlette(
+        routes=[
+            Route("/", index),
+            Route("/api/machine", api_machine),
+            Route("/api/trail", api_trail),
+            Route("/api/timeline", api_timeline),
+            Route("/api/{command:path}", refuse, methods=["POST"]),
+            WebSocketRoute("/ws", ws),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ],
+        middleware=[
+            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))
+        ],
+    )
+
+
+async def _hear(socket: WebSocket, orders: asyncio.Queue[str]) -> None:
+    while (message := await socket.receive())["type"] != "websocket.disconnect":
+        orders.put_nowait(message.get("text") or "")
+
+
+def _waiting(orders: asyncio.Queue[str]) -> list[str]:
+    """The orders that wait; of several seeks in a row only the last counts, or dragging would lag behind."""
+    found: list[str] = []
+    while not orders.empty():
+        order = orders.get_nowait()
+        if found and order.startswith("seek ") and found[-1].startswith("seek "):
+            found.pop()
+        found.append(order)
+    return found
+
+
+def _next(view: ReplayView, orders: list[str], now_ns: int) -> dict[str, Any]:
+    for order in orders:
+        view.order(order)
+    return view.step(now_ns)

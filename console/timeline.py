@@ -1,0 +1,124 @@
+"""The timeline: modes, stops with sentence and remedy, and loads, from state reports and mission reports.  Pure.
+
+A stop begins when the mode enters STOP or FAULT from another mode, and when the reason changes while the machine is
+stopped, as in the recorder's files.  A load is what the grapple holds: from its lift, once it has been weighed, until
+the grapple opens.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any, Final
+
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.mission import MissionReport
+from machine.status.explanation import explain
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+
+ENTRIES: Final = 400
+"""The newest entries are kept; of a long run the beginning is in its recording."""
+STOPPED: Final = (Mode.STOP, Mode.FAULT)
+HOLDING: Final = 5
+"""``GrappleStat.State``: stopped by its load."""
+OPEN_STATES: Final = (1, 2)
+"""``GrappleStat.State``: open, opening."""
+
+
+LIFTED_KG: Final = 10.0
+"""Jaws that close empty are stopped, too, and a log on the ground weighs nothing: a load bears at least this."""
+WEIGHED_NS: Final = 1_000_000_000
+"""So long it hangs before its weight is told; lifting takes about as long."""
+
+
+class Timeline:
+    """Takes reports in their order; ``entries`` are dictionaries for JSON, oldest first."""
+
+    def __init__(self, limit: int = ENTRIES) -> None:
+        self.entries: deque[dict[str, Any]] = deque(maxlen=limit)
+        self.count = 0
+        """Entries so far: the page asks again when this has changed."""
+        self.stops = self.lifts = 0
+        """Stops and held loads so far."""
+        self._mode: int | None = None
+        self._reason = 0
+        self._before = "unknown"
+        self._holds = False
+        self._lifted_ns: int | None = None
+        self._mission: MissionReport | None = None
+
+    def on_report(self, report: StateReport) -> None:
+        """Take a state report."""
+        if report.mode != self._mode or report.reason != self._reason:
+            self._on_mode(report)
+        self._on_grapple(report)
+
+    def on_mission(self, report: MissionReport, now_ns: int) -> None:
+        """Take a mission report."""
+        last, self._mission = self._mission, report
+        if last is None or last.name != report.name:
+            self._add(now_ns, "mission", f"Mission {report.name}", "")
+            return
+        if report.loaded > last.loaded:
+            volume = f"{report.on_board_m3:.2f} m³" if math.isfinite(report.on_board_m3) else "unknown volume"
+            self._add(now_ns, "load", "Log loaded", f"{report.on_board} on board, {volume}.")
+        if report.unloaded > last.unloaded:
+            self._add(now_ns, "load", "Log unloaded", f"{report.unloaded} unloaded, {report.on_board} on board.")
+        if report.ended and not last.ended:
+            self._add(now_ns, "mission", "Mission ended", report.failure or "As planned.")
+
+    def _on_mode(self, report: StateReport) -> None:
+        before, mode = self._mode, report.mode
+        changed = report.reason != self._reason
+        self._mode, self._reason = mode, report.reason
+        at_ns = report.since_ns or report.stamp_ns
+        if mode not in STOPPED:
+            if mode != before:
+                self._add(report.stamp_ns, "mode", _name(mode), "", mode=_name(mode))
+                self._before = _name(mode)
+            return
+        if before is None or not (before not in STOPPED or changed):
+            if mode != before:  # the FAULT behind the ramp of its STOP, or stopped before the first report
+                self._add(report.stamp_ns, "mode", _name(mode), "", mode=_name(mode))
+            return
+        self.stops += 1
+        self._add(at_ns, "stop", *stop_words(report), mode=_name(mode), before=self._before)
+
+    def _on_grapple(self, report: StateReport) -> None:
+        if report.grapple_state in OPEN_STATES:
+            self._lifted_ns = None
+            if self._holds:
+                self._holds = False
+                self._add(report.stamp_ns, "grip", "Grapple opens", "")
+        elif report.grapple_state == HOLDING and not self._holds:
+            if report.load_kg < LIFTED_KG:
+                self._lifted_ns = None
+                return
+            if self._lifted_ns is None:
+                self._lifted_ns = report.stamp_ns
+            if math.isnan(report.load_kg) or report.stamp_ns - self._lifted_ns >= WEIGHED_NS:
+                self._holds = True
+                self.lifts += 1
+                weight = "weight not known" if math.isnan(report.load_kg) else f"{report.load_kg:.0f} kg"
+                self._add(self._lifted_ns, "grip", "Grapple holds a load", f"{weight}.")
+
+    def _add(self, at_ns: int, kind: str, title: str, text: str, advice: str = "", **more: Any) -> None:
+        self.count += 1
+        self.entries.append(
+            {"n": self.count, "at_s": at_ns / 1e9, "kind": kind, "title": title, "text": text, "advice": advice, **more}
+        )
+
+
+def stop_words(report: StateReport) -> tuple[str, str, str]:
+    """Code, sentence with what was measured, and remedy of a stop."""
+    if report.reason & 0xFF not in set(Reason):
+        code = f"REASON_{report.reason & 0xFF}"
+        return code, "A reason of another release.", "Run controller and console of one release."
+    found = explain(report.reason, report.numbers)
+    measured = "; ".join(quantity.text for quantity in found.quantities)
+    return found.code, found.sentence + (f" Measured: {measured}." if measured else ""), found.advice
+
+
+def _name(mode: int) -> str:
+    return Mode(mode).name if mode in set(Mode) else f"MODE {mode}"
