@@ -19,13 +19,14 @@ SCRIPT: Final = "install.sh"
 
 
 def install(options: Sequence[str]) -> int:
-    """Run the script; from a wheel it installs that wheel unless ``options`` name another one."""
+    """Run the script; from a wheel it installs that wheel unless ``options`` name another one or a bundle."""
     wheel = next((folder for folder in HERE.parents if folder.is_file()), None)
     if wheel is None:
         return subprocess.call(["sh", str(HERE / SCRIPT), *options])
     with tempfile.TemporaryDirectory(prefix="timberhand-") as folder, zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder, [name for name in archive.namelist() if name.startswith("deploy/")])
-        return subprocess.call(["sh", f"{folder}/deploy/{SCRIPT}", "--wheel", str(wheel), *options])
+        own = () if "--bundle" in options else ("--wheel", str(wheel))
+        return subprocess.call(["sh", f"{folder}/deploy/{SCRIPT}", *own, *options])
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ set -eu
 # qemu-system-x86, cpio: the real-time lab; mbpoll, libmodbus5: Modbus clients that are not ours; chromium: looking at
 # the console's page.
 # For the arm64 wheel: gcc-aarch64-linux-gnu, libc6-dev-arm64-cross, qemu-user-static. For the scripts: shellcheck.
-# valgrind: counting what a tick executes and touches.
-wanted=${*:-user-mode-linux gcc libc6-dev can-utils iproute2 rt-tests stress-ng strace systemd udev python3-venv qemu-system-x86 cpio mbpoll libmodbus5 chromium gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static shellcheck valgrind}
+# valgrind: counting what a tick executes and touches. mmdebstrap: a Debian of its own to install into.
+wanted=${*:-user-mode-linux gcc libc6-dev can-utils iproute2 rt-tests stress-ng strace systemd udev python3-venv qemu-system-x86 cpio mbpoll libmodbus5 chromium gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static shellcheck valgrind mmdebstrap}
 
 if ! command -v apt-get >/dev/null; then
     echo "packages: no apt-get here; these Debian packages are used if present: $wanted" >&2

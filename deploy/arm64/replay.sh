@@ -19,14 +19,16 @@ command -v qemu-aarch64-static >/dev/null || {
 }
 [ -f "$root/.complete" ] || { echo "arm64: no Python for arm64 yet: sh deploy/arm64/build.sh" >&2; exit 3; }
 
-if [ ! -f "$work/site/.complete" ]; then
+packages="python-can cantools canopen msgspec mcap packaging foxglove-sdk"
+if [ "$(cat "$work/site/.complete" 2>/dev/null)" != "$packages" ]; then
+    rm -rf "$work/site"
     "$python" -m pip --disable-pip-version-check --quiet install --target "$work/site" --only-binary=:all: \
         --platform manylinux2014_aarch64 --platform manylinux_2_28_aarch64 --python-version 3.11 --implementation cp \
-        -c constraints.txt python-can cantools canopen msgspec mcap packaging >&2 || {
+        -c constraints.txt $packages >&2 || {
         echo "arm64: the packages for arm64 cannot be fetched" >&2
         exit 3
     }
-    touch "$work/site/.complete"
+    echo "$packages" >"$work/site/.complete"
 fi
 rm -rf "$work/installed"
 "$python" -m zipfile -e "$wheel" "$work/installed"

@@ -21,6 +21,8 @@ _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _UNIT: Final = "timberhand-controller.service"
 _UNIT_FOLDERS: Final = ("etc/systemd/system", "usr/lib/systemd/system")
 _CONF: Final = "etc/timberhand/timberhand.conf"
+_PROCESSOR: Final = f"etc/systemd/system/{_UNIT}.d/50-processor.conf"
+"""What ``timberhand service install --cpu N`` writes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,8 @@ class CanLink:
     up: bool
     state: str
     bitrate: int
+    sample_point: float
+    """Share of the bit time, 0 where the driver does not tell."""
     restart_ms: int
     tx_queue: int
     counters: dict[str, int]
@@ -100,6 +104,8 @@ def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts
     options = _setting(_text(root / _CONF), "CONTROLLER_OPTIONS")
     if control_cpu is None and (found := re.search(r"--cpu[ =](\d+)", options)):
         control_cpu = int(found[1])
+    if control_cpu is None:
+        control_cpu = _number(_setting(_text(root / _PROCESSOR), "CPUAffinity"))
     ours = cpus / f"cpu{control_cpu or 0}"
     limits = _text(root / "proc/self/limits")
     daemons, softirq = _processes(root / "proc")
@@ -163,6 +169,7 @@ def can_links(root: Path, links: str) -> Iterable[CanLink]:
             up="UP" in link.get("flags", ()),
             state=str(data.get("state", "")),
             bitrate=int(data.get("bittiming", {}).get("bitrate", 0)),
+            sample_point=float(data.get("bittiming", {}).get("sample_point", 0.0)),
             restart_ms=int(data.get("restart_ms", 0)),
             tx_queue=int(link.get("txqlen", 0)),
             counters={k: int(v) for k, v in {**info.get("info_xstats", {}), **data.get("berr_counter", {})}.items()},

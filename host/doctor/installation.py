@@ -1,4 +1,4 @@
-"""Checks the installation: Python, packages, the compiled tick, profiles, buses, vcan lab, directories, ports.
+"""Checks the installation: Python, packages, the compiled tick, profiles, buses, vcan lab, directories, ports, key.
 
 Reads the running system.  Only what prevents every run is a FAULT: a missing package, a profile that does not load.
 Packages and versions come from the metadata of the distribution.
@@ -20,7 +20,11 @@ from typing import Final
 from packaging.requirements import Requirement
 
 from can_dbc.bus.factory import kernel_has_can
+from can_dbc.messages.key_file import MIN_KEY_BYTES, SERVICE_KEY
+from controller.guard.__main__ import profile_path
 from host.doctor.finding import Finding, Severity, fine
+from host.release import installed
+from host.release.updater import SIGNER
 from host.vcan_lab import lab_kernel, shim
 from host.vcan_lab.choose import choose, survey
 from host.vcan_lab.spec import LabError, Request
@@ -33,13 +37,15 @@ EXTRAS: Final = {
 """The purpose of each optional group of packages."""
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
 DATA: Final = Path("/var/lib/timberhand")
+KEY_OWNER: Final = 0
 MIN_FREE_MB: Final = 1000
 """Disk space for some hours of recording."""
 
 
 def examine() -> tuple[Finding, ...]:
     """All findings, in the order in which to correct them."""
-    return (python(), *packages(), tick(), *profiles(), *buses(), vcan_lab(), kernel_of_lab(), *places(), ports())
+    before = (python(), *packages(), tick(), *profiles(), *buses(), vcan_lab(), kernel_of_lab())
+    return (*before, *places(), ports(), *key(), *signed())
 
 
 def python() -> Finding:
@@ -169,9 +175,9 @@ def places() -> Iterator[Finding]:
             yield Finding("disk", Severity.CHANGE, f"{near} has {free_mb} MB free", purpose, (f"du -h -d 1 {near}",))
         else:
             yield fine("disk", f"{near}: {free_mb >> 10} GB free for {purpose}")
-    if not os.access("/dev/shm", os.W_OK):
+    if not os.access(shm := "/dev/shm", os.W_OK):  # asked only  # nosec B108
         yield Finding(
-            "disk", Severity.CHANGE, "/dev/shm cannot be written", "the controller's timing page", ("mount | grep shm",)
+            "disk", Severity.CHANGE, f"{shm} cannot be written", "the controller's timing page", ("mount | grep shm",)
         )  # fmt: skip
 
 
@@ -187,6 +193,45 @@ def ports() -> Finding:
             "the processes find their ports", (f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'",),
         )  # fmt: skip
     return fine("ports", f"free: {', '.join(map(str, wanted.values()))}")
+
+
+def key() -> Iterator[Finding]:
+    """The key of the installed services: there, secret, and long enough."""
+    if not CONF.exists():
+        return
+    mend = ("sudo timberhand service install",)
+    try:
+        status = SERVICE_KEY.stat()
+    except OSError:
+        yield Finding("key", Severity.FAULT, f"{SERVICE_KEY} is missing", "the services start", mend)
+        return
+    if status.st_mode & 0o037 or status.st_uid != KEY_OWNER:
+        command = (f"sudo chown root:timberhand-operator {SERVICE_KEY}", f"sudo chmod 0440 {SERVICE_KEY}")
+        gain = "nobody but root and the operators can make a command"
+        yield Finding("key", Severity.FAULT, f"others may read or change {SERVICE_KEY}", gain, command)
+    elif status.st_size < MIN_KEY_BYTES:
+        yield Finding("key", Severity.FAULT, f"{SERVICE_KEY} has {status.st_size} bytes", "the services start", mend)
+    else:
+        yield fine("key", f"{SERVICE_KEY}, for root and the operators")
+
+
+def signed() -> Iterator[Finding]:
+    """Whether an installed release and the machine's own files are what was signed."""
+    tree = installed.tree_of(installed.PROGRAM)
+    if tree is None:
+        return
+    gain = "only what its maker signed runs here"
+    if not SIGNER.is_file():
+        command = f"sudo install -m 0644 signer.pem {SIGNER}"
+        yield Finding("signature", Severity.ADVICE, f"no key of a signer in {SIGNER}", gain, (command,))
+        return
+    chosen = _settings().get("PROFILE")
+    found = list(installed.problems(SIGNER, profile_path(chosen) if chosen else installed.PROGRAM))
+    for problem in found:
+        command = "sudo timberhand service update BUNDLE"
+        yield Finding("signature", Severity.CHANGE, problem.sentence, gain, (command,))
+    if not found:
+        yield fine("signature", f"the release {tree.name} and the machine's files are what was signed")
 
 
 def _free(port: int, stream: bool) -> bool:

@@ -16,6 +16,8 @@ MAX_WAKE_US = 50
 """Acceptable exit latency of an idle processor: a hundredth of the control period."""
 MIN_RT_SHARE = 0.9
 """Smallest share of the time that real-time processes should get."""
+SAMPLE_POINTS = (0.75, 0.9)
+"""Share of the bit time at which a node may sample: CiA 301 asks for 87.5 %, SAE J1939-11 for 80 to 87.5 %."""
 FAST_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "timer", "hyperv_clocksource_tsc_page")
 SETTINGS = "sudo nano /etc/timberhand/timberhand.conf"
 LIMITS = "sudo tee -a /etc/security/limits.d/timberhand.conf  # then log in again"
@@ -101,6 +103,12 @@ def control_core(facts: Facts) -> Finding:
     """A processor for the controller alone: useful only if the kernel keeps it free of everything else."""
     mine = facts.control_cpu
     if mine is None:
+        if free := facts.isolated & facts.online:
+            return Finding(
+                "processor", Severity.CHANGE,
+                f"processor {_list(free)} is isolated, but the controller does not use it",
+                "no other process and no interrupt uses the processor of the loop", _pin(max(free)),
+            )  # fmt: skip
         if len(facts.online) < 4:
             return fine(
                 "processor", f"the controller may use any of {len(facts.online)} processors, too few to isolate one"
@@ -109,18 +117,18 @@ def control_core(facts: Facts) -> Finding:
         return Finding(
             "processor", Severity.ADVICE, "no processor is isolated for the controller",
             "no other process and no interrupt uses the processor of the loop",
-            (*_boot(facts, spare), f"{SETTINGS}  # CONTROLLER_OPTIONS=--cpu {spare}"),
+            (*_boot(facts, spare), *_pin(spare)),
         )  # fmt: skip
     if mine not in facts.online:
         return Finding(
             "processor", Severity.CHANGE, f"the settings name processor {mine}, which does not exist",
-            "the controller runs on the intended processor", (SETTINGS,),
+            "the controller runs on the intended processor", _unpin(facts),
         )  # fmt: skip
     if mine not in facts.isolated:
         return Finding(
             "processor", Severity.CHANGE, f"the controller runs on processor {mine}, which is not isolated",
             "nothing else delays it; pinned to a shared processor it is later than unpinned",
-            (*_boot(facts, mine), f"{SETTINGS}  # or: CONTROLLER_OPTIONS without --cpu"),
+            (*_boot(facts, mine), *_unpin(facts, "or: ")),
         )  # fmt: skip
     ticking = [n for n, s in (("nohz_full", facts.tickless), ("rcu_nocbs", facts.rcu_offloaded)) if mine not in s]
     if ticking:
@@ -285,14 +293,32 @@ def _link(link: CanLink) -> Finding:
             "frames without retransmission: check cable, termination (60 ohms between the wires) and bit rate",
             (f"ip -details -statistics link show {name}", f"candump -e {name},0:0,#FFFFFFFF"),
         )  # fmt: skip
+    if link.sample_point and not SAMPLE_POINTS[0] <= link.sample_point <= SAMPLE_POINTS[1]:
+        return Finding(
+            what, Severity.CHANGE, f"{link.bitrate} bit/s, sampled at {100.0 * link.sample_point:.1f} % of the bit",
+            "the sample point of the other nodes (CiA 301: 87.5 %): no errors from length or temperature",
+            (f"sudo ip link set {name} down",
+             f"sudo ip link set {name} up type can bitrate {link.bitrate} sample-point 0.875 restart-ms 100"),
+        )  # fmt: skip
     if link.restart_ms == 0:
         return Finding(
             what, Severity.ADVICE, f"{link.bitrate} bit/s; no automatic restart after bus-off",
             "the bus restarts after 100 ms; the controller latches its fault before that",
             (f"sudo systemctl restart timberhand-can@{name}",),
         )  # fmt: skip
-    queue = f"{link.bitrate} bit/s, restart after {link.restart_ms} ms, queue of {link.tx_queue} frames"
+    sampled = f" sampled at {100.0 * link.sample_point:.1f} %," if link.sample_point else ""
+    queue = f"{link.bitrate} bit/s,{sampled} restart after {link.restart_ms} ms, queue of {link.tx_queue} frames"
     return fine(what, f"{queue}, no errors")
+
+
+def _pin(cpu: int | str, alternative: str = "") -> tuple[str, ...]:
+    return (f"sudo timberhand service install --cpu {cpu}  # {alternative}the services stopped",)
+
+
+def _unpin(facts: Facts, alternative: str = "") -> tuple[str, ...]:
+    if "--cpu" in facts.options:
+        return (f"{SETTINGS}  # {alternative}CONTROLLER_OPTIONS without --cpu",)
+    return _pin("any", alternative)
 
 
 def _boot(facts: Facts, cpu: int) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ removes the bus.  Everything in the guest runs from the wheel; the checkout is h
 own memory only, never to the host.
 
 - ``host``: builds the wheel, boots the guest, reads its messages.  ``init.sh``: from the kernel to systemd.
+- ``updates``: an update that is refused, one that stays, one that is cut off and comes back.
 - ``guest``: the steps inside, as a service of that systemd.  ``pilot``: arms and moves the machine, observes the bus.
   ``trial``: ends the controller or the guard and measures the reaction.  ``lost_bus``: removes and restores the bus.
 

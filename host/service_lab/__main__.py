@@ -20,7 +20,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m host.service_lab", description=__doc__.split("\n")[0])
     parser.add_argument("--wheel", type=Path, help="wheel to install (default: built from this checkout)")
     parser.add_argument(
-        "--timeout", type=float, default=600.0, metavar="S", help="time limit of the whole test (default 600)"
+        "--timeout", type=float, default=1500.0, metavar="S", help="time limit of the whole test (default 1500)"
     )
     parser.add_argument("--quiet", action="store_true", help="do not print the steps on stderr")
     options = parser.parse_args()

@@ -22,6 +22,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from host.release import bundle
+from host.release.signature import make_keys
 from host.vcan_lab import keeper, shim
 from host.vcan_lab.spec import LabError
 from host.vcan_lab.uml import KERNEL
@@ -127,7 +129,7 @@ def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) 
         zipfile.ZipFile(wheel).extractall(program)
         packages, python = f"/opt/environment/{_packages().relative_to(sys.prefix)}", python_for_services()
         _warm_up(python, f"{program}:{_packages()}")
-        order = {"wheel": str(wheel), "python": python, "environment": "/opt/environment"}
+        order = {"wheel": str(wheel), "python": python, "environment": "/opt/environment", **_bundles(wheel, folder)}
         (folder / "order.json").write_text(json.dumps(order))
         check = CHECK_SERVICE.format(program=program, packages=packages, python=python, order=folder / "order.json")
         (folder / "check.service").write_text(check)
@@ -138,6 +140,22 @@ def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) 
         init = program / "host" / "service_lab" / "init.sh"
         init.chmod(0o755)
         return _boot(init, settings, timeout_s, show_step)
+
+
+def _bundles(wheel: Path, folder: Path) -> dict[str, str]:
+    """Signed bundles for the updates: a release that works, and one whose controller ends at once."""
+    private, public = make_keys(folder / "keys")
+    made = {"signer": str(public)}
+    changes = {"bundle": {}, "broken": {"controller/__main__.py": b"raise SystemExit(1)\n"}}
+    for name, change in changes.items():
+        other = folder / name / wheel.name
+        other.parent.mkdir()
+        with zipfile.ZipFile(wheel) as source, zipfile.ZipFile(other, "w", zipfile.ZIP_DEFLATED) as target:
+            for entry in source.infolist():
+                target.writestr(entry, change.get(entry.filename, source.read(entry)))
+            target.writestr("host/service_lab/variant.txt", name)
+        made[name] = str(bundle.make(other, private, folder, None, None))
+    return made
 
 
 def _packages() -> Path:

@@ -35,4 +35,5 @@ mount --bind "$root$ENVIRONMENT" "$root/opt/environment"
 [ ! "${CHECKOUT-}" ] || mount -t tmpfs -o mode=755 tmpfs "$root$CHECKOUT"
 umount /proc
 cd $root && mount -n --move . /
-exec chroot . /lib/systemd/systemd systemd.show_status=false
+# Shared, as on every machine that systemd boots without a chroot: else a service does not see its credentials.
+exec chroot . /bin/sh -c 'mount -n --make-rshared /; exec /lib/systemd/systemd systemd.show_status=false'

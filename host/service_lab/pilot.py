@@ -47,14 +47,20 @@ class Pilot:
     """`until` runs the loop; ``valves``, ``modes`` and ``gaps`` hold the observations since `clear`."""
 
     def __init__(
-        self, profile_name: str, setpoint_port: int, operator: Path, report_port: int, bus_address: str
+        self,
+        profile_name: str,
+        setpoint_port: int,
+        operator: Path,
+        report_port: int,
+        bus_address: str,
+        key: bytes | None = None,
     ) -> None:
         profile = load_profile(profile_name)
         self.deadband_pct = min(
             min(joint(profile, j).valve.deadband_plus_pct, joint(profile, j).valve.deadband_minus_pct)
             for j in JOINTS[: len(SPOOLS)]
         )
-        self._hash = profile_hash(profile)
+        self._hash, self._key = profile_hash(profile), key
         self._feedback, self._command, self._arm, self._guard = messages = [
             codec.load("crane").message(name) for name in ("ValveFbA", "ValveCmdA", "ValveCmdB", "GuardStat")
         ]
@@ -87,7 +93,8 @@ class Pilot:
         """Press a button of the operator."""
         now_ns = time.monotonic_ns()
         with contextlib.suppress(OSError):  # no controller now
-            operator_link.send(encode(OperatorCommand(next(self._numbers), self._hash, now_ns, action)), self._operator)
+            command = OperatorCommand(next(self._numbers), self._hash, now_ns, action)
+            operator_link.send(encode(command, self._key), self._operator)
 
     def swing(self) -> None:
         """Start to slew the crane slowly from its present position towards the far side."""
@@ -129,7 +136,7 @@ class Pilot:
         self._link_watch.watch(now_ns)
         while True:
             try:
-                message = decode(self._link.recv(2048))
+                message = decode(self._link.recv(2048), self._key)
             except BlockingIOError:
                 break
             except (DatagramRefused, ConnectionRefusedError):
@@ -139,7 +146,7 @@ class Pilot:
                 self.modes.add(Mode(message.mode))
         if self._begin and now_ns >= self._next_ns:
             self._next_ns = now_ns + PERIOD_NS
-            self._send(encode(self._setpoint(now_ns, *self._begin)))
+            self._send(encode(self._setpoint(now_ns, *self._begin), self._key))
 
     def _observe(self, frame: Frame) -> None:
         if frame.key == self._feedback.key:

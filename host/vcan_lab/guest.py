@@ -43,6 +43,7 @@ STRAGGLER_S = 0.5
 _SYS_FINIT_MODULE = 313
 _POWER_OFF = 0x4321_FEDC
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+_MS_REMOUNT, _MS_NOATIME = 32, 1024
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -63,6 +64,9 @@ def main(descriptors: list[str]) -> None:
 
 
 def _first_process() -> NoReturn:
+    # No access times, and the kernel has mounted it read-only: a file read for the first time since it was written
+    # would be written back seconds later, and in simulated time the first run would differ from the next by that.
+    _mount("none", "/", "none", flags=_MS_REMOUNT | _MS_NOATIME)
     _mount("proc", "/proc", "proc")
     _mount("devtmpfs", "/dev", "devtmpfs")  # the kernel may have mounted it
     out, err, control = (os.open(f"/dev/tty{n}", os.O_RDWR | os.O_NOCTTY) for n in (1, 2, 3))
@@ -109,12 +113,12 @@ def _set_up(order: dict[str, Any]) -> None:
     os.umask(0)
     _mount("sysfs", "/sys", "sysfs")
     os.makedirs("/dev/pts", exist_ok=True)
-    os.makedirs("/dev/shm", exist_ok=True)
+    os.makedirs(memory := "/dev/shm", exist_ok=True)  # mounted here, in a machine of its own  # nosec B108
     _mount("devpts", "/dev/pts", "devpts", "ptmxmode=0666")
     if order["host_shm"]:
-        _mount("none", "/dev/shm", "hostfs", "/dev/shm")
+        _mount("none", memory, "hostfs", memory)
     else:
-        _mount("tmpfs", "/dev/shm", "tmpfs", "mode=1777")
+        _mount("tmpfs", memory, "tmpfs", "mode=1777")
     runtime = order["env"]["XDG_RUNTIME_DIR"]
     os.mkdir(runtime, 0o700)
     if order["user"]:
@@ -164,8 +168,8 @@ def _sentence(reason: OSError) -> str:
     return f"{reason.filename}: {reason.strerror}" if reason.filename else str(reason.strerror)
 
 
-def _mount(source: str, target: str, kind: str, options: str = "") -> None:
-    _libc.mount(source.encode(), target.encode(), kind.encode(), 0, options.encode())
+def _mount(source: str, target: str, kind: str, options: str = "", flags: int = 0) -> None:
+    _libc.mount(source.encode(), target.encode(), kind.encode(), flags, options.encode())
 
 
 def _load_module(path: Path) -> None:

@@ -1,0 +1,120 @@
+"""A machine's own profile and envelope, signed, in two places of which a link names the one in use.
+
+::
+
+    /etc/timberhand/machine           -> machine-a or machine-b; PROFILE=/etc/timberhand/machine/profile.toml
+    /etc/timberhand/machine-a/        profile.toml, NAME.envelope.toml, machine.sha256, machine.sha256.sig
+
+New files go to the place that is not in use, are checked there, flushed, and one rename puts them in use; the former
+ones stay for the way back.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Final
+
+from controller.guard.envelope import read_envelope
+from controller.guard.layout import GuardConfigError
+from host.exit_codes import CommandFailed, ExitCode
+from host.release import sums
+from host.release.signature import signature_path, verify
+from host.release.trees import flush_folder
+from machine.loading.profile_file import ProfileError, load_profile
+
+PLACE: Final = Path("/etc/timberhand")
+LINK: Final = "machine"
+PROFILE: Final = "profile.toml"
+SUMS: Final = "machine.sha256"
+SLOTS: Final = ("machine-a", "machine-b")
+
+
+def check(folder: Path, public: Path) -> list[str]:
+    """Check a folder of machine files: signature, hashes, and that controller and guard take them; returns their names.
+
+    Raises:
+        CommandFailed: they are not what somebody with that key signed, or do not fit together.
+    """
+    if not (folder / SUMS).is_file():
+        raise CommandFailed(
+            "machine-files.no-sums",
+            f"{folder} holds no {SUMS}; make it with `sha256sum *.toml > {SUMS}` and sign it: timberhand release sign",
+            ExitCode.CONFIGURATION,
+        )
+    verify(folder / SUMS, public)
+    listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))
+    there = {path.name for path in folder.glob("*.toml")}
+    if wrong := sums.differing(folder, listed) or sorted(there - listed.keys()):
+        raise CommandFailed(
+            "machine-files.changed", f"{folder / wrong[0]} is not what was signed; sign it again, or restore it",
+            ExitCode.CONFIGURATION,
+        )  # fmt: skip
+    if PROFILE not in listed:
+        raise CommandFailed(
+            "machine-files.no-profile", f"{folder} holds no {PROFILE}; name the machine's profile so",
+            ExitCode.CONFIGURATION,
+        )  # fmt: skip
+    try:
+        load_profile(str(folder / PROFILE))
+        read_envelope(folder / PROFILE)
+    except (ProfileError, GuardConfigError) as error:
+        raise CommandFailed(error.code, str(error).splitlines()[0], ExitCode.CONFIGURATION) from error
+    return sorted(listed)
+
+
+def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
+    """Put a folder's machine files in use; returns the profile's path, for the setting PROFILE.
+
+    Raises:
+        CommandFailed: they are refused, or cannot be written; the former ones are in use.
+    """
+    names = check(folder, public)
+    slot = place / SLOTS[_in_use(place) == SLOTS[0]]
+    try:
+        shutil.rmtree(slot, ignore_errors=True)
+        slot.mkdir(mode=0o755)
+        for name in (*names, SUMS, signature_path(Path(SUMS)).name):
+            (slot / name).write_bytes((folder / name).read_bytes())
+        os.sync()
+        check(slot, public)  # what lies there, not what it was copied from
+        _use(place, slot.name)
+    except OSError as error:
+        raise CommandFailed(
+            "machine-files.not-written", f"{slot} cannot be written: {error.strerror}; nothing has changed",
+            ExitCode.CONFIGURATION,
+        ) from None  # fmt: skip
+    return place / LINK / PROFILE
+
+
+def revert(public: Path, place: Path = PLACE) -> Path:
+    """Put the former machine files in use again; returns the profile's path.
+
+    Raises:
+        CommandFailed: there are none, or they are not what was signed.
+    """
+    slot = place / SLOTS[_in_use(place) == SLOTS[0]]
+    if not slot.is_dir():
+        raise CommandFailed(
+            "machine-files.no-former", "there are no former machine files to go back to; apply the ones that you want",
+            ExitCode.CONFIGURATION,
+        )  # fmt: skip
+    check(slot, public)
+    _use(place, slot.name)
+    return place / LINK / PROFILE
+
+
+def _in_use(place: Path) -> str | None:
+    try:
+        return os.readlink(place / LINK)
+    except OSError:
+        return None
+
+
+def _use(place: Path, slot: str) -> None:
+    fresh = place / f"{LINK}.new"
+    fresh.unlink(missing_ok=True)
+    fresh.symlink_to(slot)
+    os.replace(fresh, place / LINK)
+    flush_folder(place)

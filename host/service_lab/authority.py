@@ -1,0 +1,57 @@
+"""Who may command under systemd: the page as an operator with its token and lease, nobody as the planner."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Final
+
+from host.service_lab import trial
+from host.service_lab.updates import Expect
+from host.systemd import show
+
+AUTHORITY_S: Final = 10.0
+TOKEN_HEADER: Final = "X-Timberhand-Page"
+"""The page's token in a request; this test knows it as a foreign client would."""
+OPERATORS: Final = Path("/run/timberhand-operator/controller")
+
+
+def probe(expect: Expect, page: str) -> None:
+    """The page reaches the controller as an operator; the planner's user cannot even see the socket."""
+    origin = page.rstrip("/")
+    _, session = post(origin, "session")
+    token = json.loads(session)["token"]
+    unnamed, _ = post(origin, "operator/reset")
+    expect(unnamed == 403, f"a reset that no page sends was answered {unnamed}")
+    for action, mode in (("stop", "STOP. "), ("reset", "STANDBY. ")):
+        if action != "stop":
+            post(origin, "lease/take", token, {"over": 0})
+        code, told = post(origin, f"operator/{action}", token)
+        expect(code == 204, f"the page's {action} was answered {code}: {told}")
+        limit = time.monotonic() + AUTHORITY_S
+        while not (status := show(trial.CONTROLLER, "StatusText")["StatusText"]).startswith(mode):
+            if time.monotonic() > limit:
+                expect(False, f"after the page's {action} the controller's status is {status!r}")
+                break
+            time.sleep(0.2)
+    send = f"import socket; socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(b'x', '{OPERATORS}')"
+    command = ("setpriv", "--reuid", "timberhand-planner", "--regid", "timberhand-planner", "--init-groups")
+    done = subprocess.run([*command, sys.executable, "-c", send], capture_output=True, text=True)
+    expect("PermissionError" in done.stderr, f"the planner's user sent a command: {done.stderr[-300:]}")
+
+
+def post(origin: str, path: str, token: str = "", body: object = None) -> tuple[int, str]:
+    """Status and text of the page's answer to a command."""
+    headers = {"Origin": origin, "Content-Type": "application/json"} | ({TOKEN_HEADER: token} if token else {})
+    data = b"" if body is None else json.dumps(body).encode()
+    request = urllib.request.Request(f"{origin}/api/{path}", data, headers, method="POST")
+    try:
+        with urllib.request.urlopen(request, timeout=10.0) as answer:  # the page of this lab, http  # nosec B310
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
