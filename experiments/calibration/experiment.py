@@ -1,4 +1,7 @@
-"""The calibration experiment: calibrates many individual machines of both kinds and compares them with their truth."""
+"""The calibration experiment: calibrates many individual machines and compares them with their truth.
+
+Without ``--profile`` these are machines of both shipped kinds; with a profile of one's own, machines of that kind.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from experiments.calibration.metrics import CONCLUSION, INTRODUCTION, MACHINES, METRICS, SECTIONS, metrics_of
+from experiments.calibration.metrics import INTRODUCTION, conclusion, machines_of, metrics_in, metrics_of, sections
 from experiments.calibration.plots import draw
 from experiments.calibration.trial import calibrated
 from experiments.common import pool
@@ -27,33 +30,33 @@ SEEDS_PER_RUN: Final = 1000
 def run(options: Options, console: Console) -> Result:
     """Calibrate every machine; write ``options.out`` and, if requested, the docs."""
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
-    truth = sampled_unless_given(options.truth)
+    truth, machines = sampled_unless_given(options.truth), machines_of(options.profile)
     first = FIRST_SEED + SEEDS_PER_RUN * options.seed
     jobs = [
         Job(f"{short}/{i}", "calibration", first + i, {"profile": name, "truth": truth})
         for i in range(trials)
-        for short, name in MACHINES.items()
+        for short, name in machines.items()
     ]
-    with checkpoint(options, jobs, MACHINES.values(), truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, (), machines.values(), truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(calibrated, jobs, kept, options.workers, "calibrations", console)
-        by_machine = {m: [o for n, o in outcomes.items() if n.startswith(f"{m}/")] for m in MACHINES}
+        by_machine = {m: [o for n, o in outcomes.items() if n.startswith(f"{m}/")] for m in machines}
         metrics: dict[str, float] = {}
         for short, found in by_machine.items():
-            metrics |= metrics_of(short, found)
+            metrics |= metrics_of(short, machines[short], found)
             draw(options.out / f"errors_{short}.png", found)
         result = make_result(
-            "calibration", METRICS, metrics, profile=" and ".join(MACHINES.values()), seed=options.seed,
+            "calibration", metrics_in(metrics), metrics, profile=" and ".join(machines.values()), seed=options.seed,
             trials=trials, more={"truth": truth},
         )  # fmt: skip
         for short, found in by_machine.items():
             for outcome in found:
                 if outcome["failure"] or outcome.get("implausible"):
                     why = outcome["failure"] or "; ".join(outcome["implausible"])
-                    console.print(f"{MACHINES[short]} seed {outcome['seed']}: {why}", highlight=False)
+                    console.print(f"{machines[short]} seed {outcome['seed']}: {why}", highlight=False)
         publish(result, page_of(result, {}), options, console)
     return result
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
-    return Page("Calibration experiment", CONCLUSION, INTRODUCTION, SECTIONS)
+    return Page("Calibration experiment", conclusion(result.metrics), INTRODUCTION, sections(result.metrics))

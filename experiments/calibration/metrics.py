@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from experiments.common.result import Metric, rate
@@ -12,13 +12,14 @@ from experiments.common.worlds import profile_named
 from machine.joints import Joint
 from machine.profile import joint
 
-MACHINES: Final = {"palms": "palms_471", "aoro": "aoro_fc8"}
+SHIPPED: Final = {"palms": "palms_471", "aoro": "aoro_fc8"}
+"""Machines of the published page, by the prefix of their metrics."""
 TIP_EMPTY_MM, TIP_LOADED_MM = 6.0, 20.0
 """Small compared with the centimetres that the crane may be off in total."""
 DEADBAND_PCT, GAIN, DELAY_MS, SECONDS = 1.0, 0.05, 10.0, 240.0
 ROT_DEADBAND_PCT, ROT_QUARTER = 2.5, 0.03
 
-CONCLUSION: Final = (
+_CONCLUSION: Final = (
     "Calibration ends with a plausible profile on {palms_complete} of the PALMS machines and on {aoro_complete} of the "
     "AORO machines.",
     "The largest dead-band error falls from {aoro_deadband_before} to {aoro_deadband_max} on the AORO, and the true "
@@ -27,11 +28,51 @@ CONCLUSION: Final = (
 INTRODUCTION: Final = (
     "`timberhand calibrate` identifies dead-bands, gains, dead times, encoder zeros and sag of a machine through its "
     "bus and writes them into a profile. This experiment runs it on virtual machines with a hidden ground truth and "
-    "compares the profile with that truth."
+    "compares the profile with that truth. With the `sampled` truth these are machines near their profile; valves of "
+    "any kind, about which the profile knows nothing, are tried with `--truth wide_valves`."
 )
 
 
-def _metrics(short: str) -> tuple[Metric, ...]:
+def machines_of(profile: str) -> dict[str, str]:
+    """The machines to calibrate, by the prefix of their metrics: the shipped ones, or the one of a user's profile."""
+    return SHIPPED if profile in SHIPPED.values() else {profile_named(profile).name: profile}
+
+
+def metrics_in(found: Mapping[str, float]) -> tuple[Metric, ...]:
+    """The metrics that a result has, of every machine in it."""
+    return tuple(m for section in sections(found) for m in section.metrics)
+
+
+def conclusion(found: Mapping[str, float]) -> tuple[str, ...]:
+    """The conclusion of a result, as templates."""
+    if all(f"{short}_complete" in found for short in SHIPPED):
+        return _CONCLUSION
+    return tuple(
+        f"Calibration of {s} ends with a plausible profile in {{{s}_complete}} of the runs; the largest dead-band "
+        f"error falls from {{{s}_deadband_before}} to {{{s}_deadband_max}}, and the true pin is at most "
+        f"{{{s}_tip_max}} away from where the calibrated profile places it ({{{s}_tip_before}} before)."
+        for s in _prefixes(found)
+    )
+
+
+def sections(found: Mapping[str, float]) -> tuple[Section, ...]:
+    """One section for every machine in a result."""
+    return tuple(
+        Section(
+            _TITLES.get(s, s), _TEXT, _metrics(s, f"{s}_rot_gain_max" in found),
+            ((f"errors_{s}.png", "Errors of every joint and side, all trials."),),
+        )
+        for s in _prefixes(found)
+    )  # fmt: skip
+
+
+def _prefixes(found: Mapping[str, float]) -> list[str]:
+    """The machines of a result, the shipped ones in their order."""
+    names = [name.removesuffix("_complete") for name in found if name.endswith("_complete")]
+    return [*(s for s in SHIPPED if s in names), *(n for n in names if n not in SHIPPED)]
+
+
+def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
     def m(name: str, *rest: Any, **limits: Any) -> Metric:
         return Metric(f"{short}_{name}", *rest, **limits)
 
@@ -79,13 +120,13 @@ def _metrics(short: str) -> tuple[Metric, ...]:
         m("zero_lift", "Encoder zero of the lift, largest error", "mrad",
           "The same for the boom; a leaning column looks almost like a boom with a wrong zero.", scale=1e3),
         m("zero_ext", "Encoder zero of the telescope, largest error", "mm", "The same for the telescope.", scale=1e3),
-        *(_rotator_metrics(m) if rotator_is_blind(short) else ()),
+        *(_rotator_metrics(m) if blind_rotator else ()),
     )  # fmt: skip
 
 
-def rotator_is_blind(short: str) -> bool:
+def rotator_is_blind(profile: str) -> bool:
     """Whether the rotator of the machine has no encoder."""
-    return joint(profile_named(MACHINES[short]), Joint.ROT).encoder is None
+    return joint(profile_named(profile), Joint.ROT).encoder is None
 
 
 def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
@@ -112,18 +153,13 @@ def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
 _TITLES: Final = {"palms": "PALMS 4.71", "aoro": "AORO, CRANAB FC8"}
 _TEXT: Final = (
     "Every trial uses another individual machine: dead-bands, gains, dead times, zeros, masses, friction and stiffness "
-    "are drawn anew (`sim/truth`, the sampled spread). Calibration knows the shipped profile, the bus and a surveying "
+    "are drawn anew (`sim/truth`). Calibration knows the shipped profile, the bus and a surveying "
     "instrument with 2 mm of noise."
 )
-SECTIONS: Final = tuple(
-    Section(_TITLES[m], _TEXT, _metrics(m), ((f"errors_{m}.png", "Errors of every joint and side, all trials."),))
-    for m in MACHINES
-)
-METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 
-def metrics_of(short: str, outcomes: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Metrics of all trials of one kind of machine."""
+def metrics_of(short: str, profile: str, outcomes: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Metrics of all trials of one kind of machine; their names begin with ``short``."""
     ended = [o for o in outcomes if not o["failure"]]
     good = [o for o in ended if not o["implausible"]]
     joints = [r for o in ended for r in o["joints"].values()]
@@ -150,7 +186,7 @@ def metrics_of(short: str, outcomes: Sequence[dict[str, Any]]) -> dict[str, floa
     values |= {
         f"zero_{n}": _largest(o["zeros"][n] for o in ended if "zeros" in o) for n in ("slew", "lift", "tilt", "ext")
     }
-    if rotator_is_blind(short):
+    if rotator_is_blind(profile):
         blind = [o["rotator"] for o in good if "rotator" in o]
         for name, key in (("deadband", "deadband_pct"), ("gain", "gain"), ("quarter", "quarter")):
             values[f"rot_{name}_max"] = _largest(x for r in blind for x in r[key])

@@ -14,6 +14,7 @@ from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.calibration.crane import run_lockstep
+from machine.loading.beside import carry_envelope
 
 DATE: Final = "2000-01-01"
 """Date written into the calibrated profile; the outcome of a run must not depend on the day."""
@@ -46,10 +47,12 @@ def calibrated(job: Job) -> dict[str, Any]:
 def controller_profile(name: str, text: str | None) -> Iterator[str]:
     """Path of the profile for controller, guard and planner: the shipped one, or a file with the calibrated
     ``text``."""
+    source = profile_path(name)
     if text is None:
-        yield str(profile_path(name))
+        yield str(source)
         return
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{name}.toml"
+        path = Path(folder) / source.name
         path.write_text(text, encoding="utf-8")
+        carry_envelope(source, path.parent)
         yield str(path)

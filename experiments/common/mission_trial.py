@@ -15,6 +15,7 @@ from autonomy.missions.model import ForwardingMission
 from experiments.common.ground_truth_observer import GroundTruthObserver
 from experiments.common.individuals import controller_profile
 from experiments.common.pool import Job
+from experiments.common.recording import recorder_of
 from experiments.common.worlds import profile_named
 from hil.harness.display import Display
 from hil.missions.lockstep import MissionRun
@@ -33,8 +34,8 @@ def run_mission(job: Job, mission: ForwardingMission, site: Site) -> dict[str, A
         profile = load_profile(name)
         plant = site.plant(profile_named(o["profile"]), o["truth"], job.seed)
         try:
-            with Display(Console(quiet=True), job.name) as display:
-                run = MissionRun(mission, name, profile, plant, None, display, o["way"], site, o["eyes"], job.seed)
+            with Display(Console(quiet=True), job.name) as display, recorder_of(job, profile, name) as recorder:
+                run = MissionRun(mission, name, profile, plant, recorder, display, o["way"], site, o["eyes"], job.seed)
                 observer = GroundTruthObserver(run, profile, LocalPlane(site.latitude_deg, site.longitude_deg))
                 summary = run.run(o["limit_s"], "", observer.step)
             evaluation, lying = plant.evaluate(), plant.logs()
@@ -66,5 +67,5 @@ def summary_of(summary: MissionSummary) -> dict[str, Any]:
         "finished": summary.finished, "failure": summary.failure, "loaded": summary.loaded,
         "given_up": {str(k): v for k, v in summary.given_up.items()}, "seconds": summary.seconds,
         "driven_m": round(summary.driven_m, 2), "stops": summary.stops, "refused": summary.refused,
-        "states": [list(s) for s in summary.states],
+        "states": [list(s) for s in summary.states], "remarks": list(summary.remarks),
     }  # fmt: skip

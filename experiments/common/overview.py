@@ -12,21 +12,26 @@ from typing import Final
 
 import msgspec
 
+from experiments.common.published import LATER, PAPER_A, UNSEEN
 from experiments.common.registry import EXPERIMENTS
 from experiments.common.result import Metric, Result
+from experiments.common.standing import Standing, judge
 
 TITLE: Final = "Results at a glance"
 INTRODUCTION: Final = (
     "This page lists every experiment, the question it answers, and how many of its limits are met. The limits were "
     "set before the measurement. Each linked page states how every metric is measured, with which command and on which "
-    "machine. `timberhand report` writes this page from the saved results."
+    "machine. `timberhand report` writes this page from the saved results; `timberhand report --check` names the files "
+    "that make a result stale."
 )
 
 
 def write(docs: Path) -> Path:
     """Write ``results.md`` from ``results/*.json`` in the folder; returns its path."""
     path = docs / "results.md"
-    path.write_text(page(results_in(docs), {p.stem for p in docs.glob("*.md")}))
+    results = results_in(docs)
+    standings = {name: judge(result.commit, EXPERIMENTS[name]).standing for name, result in results.items()}
+    path.write_text(page(results, {p.stem for p in docs.glob("*.md")}, standings))
     return path
 
 
@@ -37,48 +42,92 @@ def results_in(docs: Path) -> dict[str, Result]:
 
 
 def read(path: Path) -> Result:
-    """A saved result; a metric without a number is NaN.
+    """A saved result; a metric without a number is NaN, and "inf" is infinite.
 
     Raises:
         ValueError: the file is not a result.
     """
     document = msgspec.json.decode(path.read_bytes())
-    document["metrics"] = {k: float("nan") if v is None else v for k, v in document["metrics"].items()}
+    document["metrics"] = {k: float("nan" if v is None else v) for k, v in document["metrics"].items()}
     return msgspec.convert(document, Result)
 
 
-def page(results: Mapping[str, Result], pages: Collection[str]) -> str:
+def page(results: Mapping[str, Result], pages: Collection[str], standings: Mapping[str, Standing]) -> str:
     """The page as Markdown; an experiment without one of the ``pages`` is linked to its numbers."""
     links = {n: f"[{n}]({f'{n}.md' if n in pages else f'results/{n}.json'})" for n in results}
-    lines = [f"# {TITLE}", "", _conclusion(results), "", INTRODUCTION, ""]
-    lines += ["| experiment | question | limits met | commit |", "|---|---|---|---|"]
+    lines = [f"# {TITLE}", "", _conclusion(results, standings), "", INTRODUCTION, ""]
+    lines += ["| experiment | question | limits met | commit | |", "|---|---|---|---|---|"]
     for name, result in results.items():
         met = len(result.limits) - len(result.missed) - len(result.inconclusive)
         unsure = f", {len(result.inconclusive)} inconclusive" if result.inconclusive else ""
         lines.append(
             f"| {links[name]} | {EXPERIMENTS[name].sentence} | {met} of {len(result.limits)}{unsure} "
-            f"| `{result.commit}` |"
+            f"| `{result.commit}` | {standings[name]} |"
         )
-    lines += ["", "## Compared with the papers", "", "| | metric | paper | here |", "|---|---|---|---|"]
+    lines += ["", "## Compared with the papers", ""]
+    lines += ["| | metric | paper A | paper B | here | command |", "|---|---|---|---|---|---|"]
     for name, result, metric in metrics_of(results):
         if metric.name in result.paper:
-            here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
-            lines.append(f"| {links[name]} | {metric.title} | {metric.text(result.paper[metric.name])} | {here} |")
+            value = metric.text(result.paper[metric.name])
+            papers = f"{value} | " if (name, metric.name) in PAPER_A else f" | {value}"
+            lines.append(f"| {links[name]} | {metric.title} | {papers} | {_here(result, metric)} | {_command(name)} |")
+    lines += ["", *_later(results, links)]
     lines += ["", "## Missed limits", "", "| | metric | measured | limit |", "|---|---|---|---|"]
     for name, result, metric in metrics_of(results):
         if metric.name in result.missed:
-            here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
-            lines.append(f"| {links[name]} | {metric.title} | {here} | {metric.limit_text()} |")
+            lines.append(f"| {links[name]} | {metric.title} | {_here(result, metric)} | {metric.limit_text()} |")
+    lines += ["", "## What a plant cannot show", "", *(f"- {sentence}" for sentence in UNSEEN)]
     return "\n".join(lines) + "\n"
 
 
-def _conclusion(results: Mapping[str, Result]) -> str:
+def _here(result: Result, metric: Metric) -> str:
+    return metric.text(result.metrics[metric.name]) + result.interval_text(metric)
+
+
+def _command(name: str) -> str:
+    return f"`timberhand experiment {name} --docs docs`"
+
+
+def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]:
+    """The section on later published systems, with our figure that comes nearest to each."""
+    by_name = {(name, metric.name): metric for name, _, metric in metrics_of(results)}
+    lines = [
+        "## Later published systems", "",
+        "Settings differ, so a row compares questions, not machines. Here everything runs on the bus through "
+        "controller and guard, with our own detector and depth camera. "
+        "`timberhand experiment grasp-configs --planner NAME` compares another method with ours on "
+        "the same scenes ([campaigns](how-to/campaigns.md)).", "",
+        "| system | setting | measure | published | nearest here | command |", "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for one in LATER:
+        name, metric = one.nearest[0], by_name.get(one.nearest)
+        if metric is not None:
+            here = f"{links[name]}: {metric.title}, {_here(results[name], metric)}"
+            lines.append(
+                f"| [{one.system}]({one.source}) | {one.setting} | {one.measure} | {one.text()} | {here} "
+                f"| {_command(name)} |"
+            )
+    return [*lines, ""]
+
+
+def _conclusion(results: Mapping[str, Result], standings: Mapping[str, Standing]) -> str:
     total = sum(len(r.limits) for r in results.values())
     missed = sum(len(r.missed) for r in results.values())
     unsure = sum(len(r.inconclusive) for r in results.values())
     return (
         f"{len(results)} experiments set {total} limits: {total - missed - unsure} are met, {missed} are missed and "
-        f"{unsure} are inconclusive."
+        f"{unsure} are inconclusive. {_currency(standings)}"
+    )
+
+
+def _currency(standings: Mapping[str, Standing]) -> str:
+    """How many results are of today's sources."""
+    old, unsure = (sum(s is each for s in standings.values()) for each in (Standing.STALE, Standing.UNVERIFIABLE))
+    if not old and not unsure:
+        return "All results are of the present sources."
+    return (
+        f"{len(standings) - old - unsure} of the results are current; of {old} the sources have changed since, and "
+        f"{unsure} name a commit that cannot be verified."
     )
 
 

@@ -7,7 +7,7 @@ used.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Final
@@ -15,6 +15,7 @@ from typing import Final
 from rich.console import Console
 
 from experiments.common.result import Result
+from experiments.common.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +24,8 @@ class Options:
 
     ``trials``, ``repetitions`` and ``minutes``: None is the default of the experiment.  ``docs``: folder whose page is
     rewritten.  ``bus``: bus of a live experiment (wire or vcan).  ``data``: folder with data to evaluate.
+    ``keeps_trials``: whether the finished trials stay on the disk after a complete run.
+    ``planner``, ``detector``: foreign methods to compare with ours, by entry point (`experiments.common.plugins`).
     """
 
     seed: int
@@ -31,93 +34,157 @@ class Options:
     out: Path
     trials: int | None = None
     quick: bool = False
-    workers: int = 1
+    workers: Workers = field(default_factory=Workers)
     docs: Path | None = None
     minutes: float | None = None
     repetitions: int | None = None
     bus: str = "wire"
     data: Path | None = None
+    keeps_trials: bool = False
+    planner: str = ""
+    detector: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """The question that an experiment answers, and its module."""
+    """The question that an experiment answers, its module, and the folders and files on which its figures depend.
+
+    ``live``: it measures this computer in real time, so it is no campaign and runs alone.  ``clocked``: values of an
+    outcome that depend on the speed of the host; a campaign's table leaves them out.  ``scale``: work of the full run
+    over that of the quick one, by its plan of trials; ``live_s``: duration of a live one [s].
+    """
 
     sentence: str
     module: str
+    sources: tuple[str, ...]
+    live: bool = False
+    clocked: tuple[str, ...] = ()
+    scale: float = 1.0
+    live_s: float = 0.0
+
+
+_PLANT: Final = ("machine", "sim", "can_dbc")
+_MACHINE: Final = (*_PLANT, "autonomy", "controller", "hil")
+"""The whole machine in lockstep."""
+_LIVE: Final = ("machine", "can_dbc", "controller", "runtime", "recorder", "hil")
 
 
 EXPERIMENTS: Final = {
     "plant": Entry(
         "Does the simulated machine behave like steel, oil and wood? Grasps, closed-form physics, endurance, speed.",
         "experiments.plant.experiment",
+        (*_PLANT, "experiments/plant"),
+        scale=40.0,
     ),
     "calibration": Entry(
         "Does calibration recover the hidden truth? Dead-bands, gains, dead times, zeros, sag; many individuals.",
         "experiments.calibration.experiment",
+        (*_PLANT, "autonomy/calibration", "autonomy/motion", "controller", "hil", "experiments/calibration"),
+        scale=20.0,
+    ),
+    "generalization": Entry(
+        "Does it work in a world that it has never seen? Truths at both ends, all drawn; calibration, then logs.",
+        "experiments.generalization.experiment",
+        (*_MACHINE, "experiments/generalization"),
+        scale=35.0,
     ),
     "joint-tracking": Entry(
         "Which joint law tracks best, rests nearest and closes its valves? Four laws, both machines, disturbances.",
         "experiments.joint_tracking.experiment",
+        (*_PLANT, "controller", "hil", "experiments/joint_tracking"),
+        scale=30.0,
     ),
     "crane-accuracy": Entry(
         "How near does the tip come to its goal, by encoders and truly? Paper B's four goals, calibrated machines.",
         "experiments.crane_accuracy.experiment",
+        (*_MACHINE, "experiments/crane_accuracy"),
+        scale=60.0,
     ),
     "timing": Entry(
         "Does the controller wake on time and cost little? Compared with cyclictest and a sleep loop, quiet and "
         "loaded.",
         "experiments.timing.experiment",
+        (*_LIVE, "experiments/timing"),
+        live=True,
+        live_s=900.0,
     ),
     "rates": Entry(
         "Does the whole forwarder run at 1 kHz? Cost against frames and joints, cranes on one processor.",
         "experiments.timing.rates",
+        (*_LIVE, "experiments/timing"),
+        live=True,
+        live_s=900.0,
     ),
     "vcan": Entry(
         "Are live runs on SocketCAN quiet? Demos and missions in a row, with the clock of each and the host's steal.",
         "experiments.vcan.experiment",
+        (*_MACHINE, *_LIVE, "host/vcan_lab", "experiments/vcan"),
+        live=True,
+        live_s=3600.0,
     ),
     "plc": Entry(
         "Does a PLC between crane0 and the valves work as well? Both roles compared with CAN: logs, accuracy, latency.",
         "experiments.plc.experiment",
+        (*_MACHINE, "experiments/plc"),
+        scale=20.0,
     ),
     "grasp-network": Entry(
         "Is it paper A's network, what has it learnt, how fast is it? Parameters, Cornell folds, latency.",
         "experiments.grasp_network.experiment",
+        ("autonomy/grasp", "autonomy/networks", "autonomy/weights", "training", "experiments/grasp_network"),
+        scale=40.0,
     ),
     "detector": Entry(
         "Are logs found in worlds unlike those of the training? mAP of boxes and masks; photographs.",
         "experiments.detector.experiment",
+        ("autonomy/perception", "autonomy/networks", "autonomy/weights", "sim", "training", "experiments/detector"),
+        scale=15.0,
     ),
     "log-localization": Entry(
         "How precisely is a log located? Paper B's approach to logs at 0, 45 and 90 degrees: its pipeline and ours.",
         "experiments.log_localization.experiment",
+        (*_PLANT, "autonomy/perception", "autonomy/networks", "autonomy/weights", "experiments/log_localization"),
+        scale=30.0,
     ),
     "grasp-configs": Entry(
         "How many grasps succeed, how good are they? Paper A's twelve configurations, camera to lift, three planners.",
         "experiments.grasp_configs.experiment",
+        (*_MACHINE, "experiments/grasp_configs"),
+        clocked=("see_ms", "plan_ms"),
+        scale=155.0,
     ),
     "navigation": Entry(
         "Does the machine follow its path? Paper B's four waypoints, six starts, mud, slope; both methods.",
         "experiments.navigation.experiment",
+        (*_MACHINE, "experiments/navigation"),
+        scale=10.0,
     ),
     "forwarding-mission": Entry(
         "Does the forwarder load 24 logs by itself? Paper B's trial by both methods; other fields, other machines.",
         "experiments.forwarding_mission.experiment",
+        (*_MACHINE, "experiments/forwarding_mission"),
+        scale=440.0,
     ),
     "productivity": Entry(
         "How much wood per hour? Single logs, piles, unloading; compared with the shortest possible time and "
         "operators.",
         "experiments.productivity.experiment",
+        (*_MACHINE, "experiments/productivity"),
+        scale=50.0,
     ),
     "faults": Entry(
         "Is every fault of the catalogue answered in time, and does work without faults go on? 45 faults at random "
         "moments; nominal hours.",
         "experiments.faults.experiment",
+        (*_MACHINE, "experiments/faults"),
+        scale=100.0,
     ),
     "soak": Entry(
         "Does memory stay constant and is no frame lost in half an hour at the control rate?",
         "experiments.timing.soak",
+        (*_LIVE, "experiments/timing"),
+        live=True,
+        live_s=1800.0,
     ),
 }
 

@@ -97,10 +97,15 @@ class Result:
         path.write_text(self.json() + "\n")
 
     def json(self) -> str:
-        """result.json as text; a metric without a number is null."""
+        """result.json as text; a metric without a number is null, and one that never ended is "inf"."""
         document = asdict(self)
-        document["metrics"] = {k: v if math.isfinite(v) else None for k, v in sorted(self.metrics.items())}
+        document["metrics"] = {k: _written(v) for k, v in sorted(self.metrics.items())}
         return json.dumps(document, indent=2)
+
+
+def _written(value: float) -> float | str | None:
+    """JSON knows neither infinity nor NaN, and they say different things."""
+    return value if math.isfinite(value) else None if math.isnan(value) else str(value)
 
 
 def evaluate(
@@ -168,10 +173,10 @@ def mean(values: Sequence[float]) -> float:
 
 
 def commit() -> str:
-    """Short hash of the checkout, ``+changes`` when tracked files differ from it; ``unknown`` outside git."""
+    """Short hash of the checkout, ``+changes`` when tracked files beside docs/ differ; ``unknown`` outside git."""
     try:
         head = _git("rev-parse", "--short=12", "HEAD")
-        return head + ("+changes" if _git("status", "--porcelain", "--untracked-files=no") else "")
+        return head + ("+changes" if _git("status", "--porcelain", "--untracked-files=no", ":(exclude)docs") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 
@@ -183,19 +188,24 @@ def _git(*arguments: str) -> str:
 
 def environment() -> dict[str, str]:
     """The host and the packages that measured."""
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "missing"
     return {
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
         "processor": _processor(),
         "cpus": str(len(os.sched_getaffinity(0))),
-        **versions,
+        **versions(PACKAGES),
     }
+
+
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """The installed versions of packages; ``missing`` for one that is not installed."""
+    found = {}
+    for name in packages:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found
 
 
 def _processor() -> str:

@@ -17,8 +17,10 @@ from typing import Final
 from rich.console import Console
 
 from experiments.common import overview
-from experiments.common.registry import Options
+from experiments.common.registry import EXPERIMENTS, Options
 from experiments.common.result import Metric, Result
+from experiments.common.seeds import sealed_seed
+from experiments.common.standing import judge, marked
 
 _FIELD: Final = re.compile(r"\{(paper:)?([^{}]+)\}")
 
@@ -73,7 +75,7 @@ def write(result: Result, page: Page, plots: Path, docs: Path) -> None:
     for section in page.sections:
         for file, _ in section.plots:
             shutil.copyfile(plots / file, folder / file)
-    (docs / f"{name}.md").write_text(markdown(result, page))
+    (docs / f"{name}.md").write_text(marked(markdown(result, page), judge(result.commit, EXPERIMENTS[name])))
     overview.write(docs)
 
 
@@ -143,9 +145,11 @@ def _plot(result: Result, file: str, caption: str) -> tuple[str, ...]:
 
 def _setting(result: Result) -> str:
     e = result.environment
+    drawn = " (sealed: drawn from the commit)" if result.seed == sealed_seed(result.commit, result.experiment) else ""
     return (
-        f"Profile `{result.profile}`, ground truth `{e.get('truth', '')}`, seed {result.seed}, {result.trials} trials "
-        f"of each kind, commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python "
+        f"Profile `{result.profile}`, ground truth `{e.get('truth', '')}`, seed {result.seed}{drawn}, {result.trials} "
+        f"trials of each kind, commit `{result.commit}`. "
+        f"Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python "
         f"{e['python']}, pybullet {e['pybullet']}, numba {e['numba']}."
     )
 

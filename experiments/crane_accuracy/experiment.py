@@ -16,7 +16,6 @@ from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint,
 from experiments.common.worlds import carrier_profile, profile_named
 from experiments.crane_accuracy.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS, gather
 from experiments.crane_accuracy.plan import (
-    GOALS_M,
     OWN,
     REPETITIONS,
     UNCALIBRATED,
@@ -56,7 +55,7 @@ def run(options: Options, console: Console) -> Result:
         Job(f"{i}/calibration", "calibration", s, {"profile": name, "truth": truth}) for i, s in enumerate(seeds)
     ]
     asked = (options.quick, options.repetitions)
-    with checkpoint(options, (calibrations, asked, GOALS_M), [name], truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
         texts = pool.run(perform, calibrations, kept, options.workers, "calibrations", console)
         jobs = motions(calibrations, texts, variants(own_law), *asked)
         outcomes = texts | pool.run(perform, jobs, kept, options.workers, "runs with motions", console)

@@ -55,8 +55,7 @@ def run(options: Options, console: Console) -> Result:
         for machine in MACHINES
         for i in range(trials)
     ]
-    asked = (facts, options.seed, trials)
-    with checkpoint(options, asked, MACHINES, options.truth, ("autonomy/perception", "training")) as kept:
+    with checkpoint(options, facts, MACHINES, options.truth, ("autonomy/perception", "training")) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "test pictures", console)
         metrics = gather(list(outcomes.values()), networks) | on_photos(finder("half"), options)
         draw_plots(list(outcomes.values()), networks, options)

@@ -90,7 +90,9 @@ class Evidence:
         mode, reason = outputs.mode, outputs.reason
         if self._begin_ns is not None:
             reaction = FAULTS[reason].reaction
-            stopped = mode in (Mode.STOP, Mode.FAULT) and self._mode in _OPERATING
+            # A stop that becomes harder for another reason counts: a PLC tells of its supply before the button.
+            harder = mode is Mode.FAULT and self._mode == Mode.STOP and reason != self._reason
+            stopped = (mode in (Mode.STOP, Mode.FAULT) and self._mode in _OPERATING) or harder
             slowed = mode in _OPERATING and reaction is Reaction.DEGRADE and reason != self._reason
             if stopped or slowed:
                 self.reached.setdefault(NAMES.get(reaction, "H"), self._ms(now_ns))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -19,7 +20,9 @@ def judge(outcome: Mapping[str, Any]) -> dict[str, Any]:
     nothing may stop); far (more tip travel than promised).  All but ok count as missed.
     """
     expected, reached = outcome["expected"], outcome["reached"]
-    bound_ms = outcome["bound_ms"] + outcome["seen_ms"] + T_MS  # a fault between two ticks is met by the next
+    due_ms = outcome.get("due_ms", 0.0)
+    # A fault between two ticks is met by the next; where the bound does not begin, any reaction is in time.
+    bound_ms = outcome["bound_ms"] + outcome["seen_ms"] + T_MS + (math.inf if due_ms is None else due_ms)
     stops = [reached[r] for r in STOPS if r in reached]
     match expected:
         case "NONE":

@@ -1,12 +1,14 @@
 """Nominal work without faults: every stop is a false trip.
 
 One job is a stretch of work on one individual machine.  The scenes of the campaign run with sampled truths and on rough
-ground; the log job is that of `timberhand demo`, with another log for every stretch.
+ground; the log job is that of `timberhand demo`, with another log for every stretch, over CAN and through a PLC.
 """
 
 from __future__ import annotations
 
 import gc
+import tempfile
+from pathlib import Path
 from typing import Any, Final
 
 from autonomy.crane_job.activity import Activity
@@ -20,6 +22,8 @@ from experiments.common.pool import Job
 from experiments.faults.running import build
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
+from hil.plc.bridged_plant import BridgedPlant, Transport
+from hil.plc.profile import write_plc_profile
 from machine.status.faults import describe
 from machine.status.modes import Mode
 from machine.status.reasons import pack
@@ -38,6 +42,8 @@ SETTINGS: Final = {
     "drive aoro_fc8 physics": ("sampled", "rough", 0.2),
     "log palms_471": ("sampled", "flat", 0.3),
     "log aoro_fc8": ("sampled", "flat", 0.15),
+    "log palms_471 plc references": ("sampled", "flat", 0.1),
+    "log palms_471 plc valves": ("sampled", "flat", 0.1),
 }
 """Scene to truth, ground, and its part of the hours relative to the others."""
 
@@ -64,7 +70,7 @@ def perform(job: Job) -> dict[str, Any]:
     scene, seconds = job.options["scene"], job.options["seconds"]
     truth, terrain, _ = SETTINGS[scene]
     if scene.startswith("log"):
-        return _log_job(scene.split()[1], job.seed, truth)
+        return _log_job(scene, job.seed, truth)
     machine = build(scene, job.seed, truth, terrain)
     trips = _Trips()
     gc.collect()
@@ -80,21 +86,29 @@ def perform(job: Job) -> dict[str, Any]:
     return _outcome(scene, job.seed, machine.system, trips)
 
 
-def _log_job(name: str, seed: int, truth: str) -> dict[str, Any]:
-    settings = load_settings(profile_path(name))
-    plant = Plant(settings.profile, seed, truth)
+def _log_job(scene: str, seed: int, truth: str) -> dict[str, Any]:
+    name, _, role = scene.removeprefix("log ").partition(" plc ")
+    with tempfile.TemporaryDirectory() as directory:
+        path = profile_path(name)
+        if role:
+            path = write_plc_profile(name, "references" if role == "references" else "valves", Path(directory))
+        settings, guard = load_settings(path), build_guard(path)
+    transport: Transport = "modbus" if role == "references" else "udp"
+    plant: Plant = (
+        BridgedPlant(settings.profile, seed, truth, transport=transport)
+        if role
+        else Plant(settings.profile, seed, truth)
+    )
     trips = _Trips()
     try:
         activity = Activity(settings.profile, settings.profile_hash, grasp_selector=PlannerSelection(SamplingPlanner()))
-        operator = Operator(settings.profile_hash, lambda *_: None)
-        system = Lockstep(
-            settings, build_guard(profile_path(name)), plant, activity, operator, Observer(on_outputs=[trips.outputs])
-        )
+        operator = Operator(settings.profile_hash, lambda *_: None, watches=True)
+        system = Lockstep(settings, guard, plant, activity, operator, Observer(on_outputs=[trips.outputs]))
         while not (activity.done or activity.failure) and system.now_ns < START_NS + round(LOG_LIMIT_S * 1e9):
             system.advance()
     finally:
         plant.close()
-    return _outcome(f"log {name}", seed, system, trips)
+    return _outcome(scene, seed, system, trips)
 
 
 def _outcome(scene: str, seed: int, system: Lockstep, trips: _Trips) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 A scene names machine, work and plant.  The work is a motion that never ends: the crane swings all joints, or the
 carrier follows far waypoints.  Its setpoints are those of a real planner (20 Hz, lease of `draws.LEASE_MS`).  In the
-scenes named carry the real planner carries a log to the bunk.
+scenes named carry the real planner carries a log to the bunk; in those named hold the crane swings for some seconds and
+then holds its pose.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from controller.config import Settings
 from controller.config import load as load_settings
+from controller.crane.load_moment import LoadMoment
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from experiments.common.errors import ExperimentError
@@ -49,6 +51,9 @@ SWING_SHARE: Final = 0.04
 """Amplitude of the swing as a share of the joint's range."""
 SPEED_SHARE: Final = 0.5
 """Share of the joint's speed and acceleration limits that the swing uses."""
+HOLD_AFTER_S, SLOWING_S = 4.0, 1.5
+"""In a hold scene the crane swings for so long, and comes to rest in so long."""
+HELD_NS: Final = 500_000_000
 FAR_M: Final = 80.0
 TURN_RAD: Final = 0.6
 TURN_NS: Final = 5_000_000_000
@@ -63,6 +68,8 @@ KINDS: Final = {
     "crane palms_471 physics": ("palms_471", "physics"),
     "crane aoro_fc8": ("aoro_fc8", "kinematic"),
     "crane aoro_fc8 physics": ("aoro_fc8", "physics"),
+    "hold palms_471 physics": ("palms_471", "physics"),
+    "hold aoro_fc8 physics": ("aoro_fc8", "physics"),
     "carry palms_471": ("palms_471", "physics"),
     "carry aoro_fc8": ("aoro_fc8", "physics"),
     "drive aoro_fc8": ("aoro_fc8", "kinematic"),
@@ -98,13 +105,32 @@ class Swing:
         return q, tuple(half * w * math.sin(w * t) for _, half, w in self._joints)
 
 
-class CranePlanner:
-    """Swings the crane while the machine is armed."""
+class HeldSwing:
+    """A swing that slows down along its path and then holds its pose for ever."""
 
-    def __init__(self, profile: Profile, profile_hash: int) -> None:
-        self._profile = profile
+    duration_s = math.inf
+
+    def __init__(self, swing: Swing) -> None:
+        self._swing = swing
+
+    def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Positions and velocities: the swing's, at a time of its own that stops."""
+        slowing_s = min(max(0.0, time_s - HOLD_AFTER_S), SLOWING_S)
+        share = slowing_s / SLOWING_S
+        # The rate is 1 - 3 share^2 + 2 share^3: no step in speed or acceleration at either end.
+        rate = 1.0 - share * share * (3.0 - 2.0 * share)
+        slowed_s = SLOWING_S * (share - share**3 + 0.5 * share**4)
+        q, v = self._swing.at(min(time_s, HOLD_AFTER_S) + slowed_s)
+        return q, tuple(rate * speed for speed in v)
+
+
+class CranePlanner:
+    """Swings the crane while the machine is armed, or swings it and then holds."""
+
+    def __init__(self, profile: Profile, profile_hash: int, holds: bool = False) -> None:
+        self._profile, self._holds = profile, holds
         self._stream = SetpointStream(profile_hash, LEASE_NS)
-        self._motion: Swing | None = None
+        self._motion: Swing | HeldSwing | None = None
         self._begin_ns = 0
         self._report: StateReport | None = None
 
@@ -117,7 +143,8 @@ class CranePlanner:
         if not self._stream.due(now_ns):
             return None
         if self._motion is None:
-            self._motion, self._begin_ns = Swing(self._profile, self._report.reference), now_ns
+            swing = Swing(self._profile, self._report.reference)
+            self._motion, self._begin_ns = HeldSwing(swing) if self._holds else swing, now_ns
         time_s = (now_ns - self._begin_ns) * 1e-9
         return self._stream.datagram(now_ns, self._motion, time_s, GrappleCommand.NEUTRAL)
 
@@ -164,13 +191,14 @@ class DrivePlanner:
 
 
 class Supervisor(Operator):
-    """The emulated operator, who lets go once ``hands_off`` is set: nothing may start by itself after that."""
+    """The emulated operator, who lets go once ``hands_off`` is set and only watches: nothing may start by itself
+    after that.
+    """
 
     hands_off = False
 
-    def step(self, report: StateReport) -> bytes | None:
-        """The command to send."""
-        return None if self.hands_off else super().step(report)
+    def _press(self, report: StateReport) -> bytes | None:
+        return None if self.hands_off else super()._press(report)
 
 
 class _NoLogs:
@@ -191,6 +219,11 @@ class Running:
     operator: Supervisor
     evidence: Evidence
     injector: Injector
+
+    @property
+    def holds(self) -> bool:
+        """Whether the crane holds its pose, so that neutral valves are no reaction."""
+        return self.name.startswith("hold")
 
     def advance(self) -> None:
         """One slice."""
@@ -214,6 +247,26 @@ class Running:
                 reason = system.report.reason if system.report else -1
                 raise ExperimentError(
                     "experiment.not-moving", f"the machine of scene {self.name!r} does not move: reason {reason}"
+                )
+
+    def until_held(self) -> None:
+        """Run on until the reference has stood for half a second.
+
+        Raises:
+            ExperimentError: it does not.
+        """
+        system, since_ns, before = self.system, 0, None
+        while not since_ns or system.now_ns < since_ns + HELD_NS:
+            self.advance()
+            reference = system.report.reference if system.report is not None else None
+            if reference != before:
+                since_ns = 0
+            elif not since_ns:
+                since_ns = system.now_ns
+            before = reference
+            if system.now_ns > START_NS + WARM_LIMIT_NS:
+                raise ExperimentError(
+                    "experiment.not-holding", f"the machine of scene {self.name!r} does not hold its pose"
                 )
 
     def phase(self) -> Phase | None:
@@ -241,6 +294,20 @@ class Running:
         if self.scene.drives or report is None or not all(map(math.isfinite, report.reference[:4])):
             return 0.0
         return math.dist(pin_position(self.scene.profile.kinematics, report.reference[:4]), self.place())
+
+    def overloaded(self) -> bool:
+        """Whether the machine carries more than it bears (ground truth).
+
+        The force at the hanger pin makes a moment about the tipping line beyond the limit, or the lift's oil is above
+        the pump's relief: the pump cannot lift the load, and a little more opens the port's.
+        """
+        profile, world = self.scene.profile, self.plant.world
+        if profile.stability is None:
+            return False
+        judged = LoadMoment(profile, profile.stability)
+        moment_nm = judged.moment_nm(self.plant.joint_positions(), world.load_kg(), *self.plant.tilt_rad)
+        relief_pa = world.truth.supply.relief_pa
+        return moment_nm > judged.limit_nm or max(world.hydraulics.pressures_pa["lift"]) > relief_pa
 
     def valves_neutral(self) -> bool:
         """Whether the valve node's outputs are neutral now (ground truth; a held grapple counts as neutral)."""
@@ -270,8 +337,8 @@ def build(name: str, seed: int = 0, truth: str = "nominal", terrain: str = "flat
         planner = DrivePlanner(profile, settings.profile_hash)
         vehicle_hooks.append(planner.receive)
     else:
-        planner = CranePlanner(profile, settings.profile_hash)
-    operator = Supervisor(settings.profile_hash, lambda *_: None)
+        planner = CranePlanner(profile, settings.profile_hash, name.startswith("hold"))
+    operator = Supervisor(settings.profile_hash, lambda *_: None, watches=True)
     observer = Observer(None, [], vehicle_hooks)
     system = Lockstep(settings, guard, plant, planner, operator, observer, None if carries else _NoLogs())
     evidence = Evidence(system.cores, profile)
@@ -296,5 +363,7 @@ def warm(name: str) -> Running:
     """The machine of a scene, moving; one per process."""
     machine = build(name)
     machine.until_moving()
+    if machine.holds:
+        machine.until_held()
     machine.operator.hands_off = True
     return machine

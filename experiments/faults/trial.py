@@ -72,11 +72,11 @@ def inject(machine: Running, number: int, seed: str) -> dict[str, Any]:
         machine.injector.order(order, at_ns + round(order.at_s * 1e9))
     evidence.begin(at_ns, machine.scene.drives)
     before_ms = (at_ns - START_NS) * 1e-6
-    travel_m, astray_m, valves_ms, standing = _follow(machine, drawn, at_ns)
+    travel_m, astray_m, valves_ms, standing, due_ms = _follow(machine, drawn, at_ns)
     outcome = {
         "seed": seed, "at_ms": round(before_ms, 3), "orders": [_words(o) for o in drawn.orders],
         "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": drawn.seen_ms,
-        "tip_limit_m": drawn.tip_limit_m,
+        "due_ms": due_ms, "tip_limit_m": drawn.tip_limit_m,
         "reached": evidence.reached, "reason": evidence.reason, "refused_ms": evidence.refused_ms,
         "neutral_ms": evidence.neutral_ms if evidence.frames else None, "valves_ms": valves_ms,
         "travel_m": round(travel_m, 4), "astray_m": round(astray_m, 4), "standing": standing,
@@ -134,12 +134,12 @@ def _wait(machine: Running, random: Random, drawn: Injection) -> None:
         machine.advance()
 
 
-def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, float, float | None, bool]:
+def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, float, float | None, bool, float | None]:
     """Watch until everything stands, or the window is over.
 
     Way of the tip [m]; how far it went astray [m]: its greatest distance from its reference while the machine is
     active, less that at the beginning, and its way after that; time at which the valve node's outputs became
-    neutral for good [ms]; whether it stands.
+    neutral for good [ms]; whether it stands; from when the bound counts [ms], None where that moment did not come.
     """
     system, evidence = machine.system, machine.evidence
     window_ns = at_ns + round((drawn.window_s or drawn.bound_ms * 1e-3 + 0.5) * 1e9)
@@ -147,8 +147,11 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
     travel_m = astray_m = overrun_m = 0.0
     mark, mark_ns, valves_ms, standing = place, system.now_ns, None, False
     stop_ns = 0
+    due_ms = None if drawn.after_overload else 0.0
     while True:
         machine.advance()
+        if due_ms is None and machine.overloaded():
+            due_ms = round((system.now_ns - at_ns) * 1e-6, 3)
         now_ns, here = system.now_ns, machine.place()
         step_m = math.dist(here, place)
         travel_m += step_m
@@ -166,13 +169,14 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
             mark, mark_ns = here, now_ns
         if machine.phase() not in (None, Phase.CARRY, Phase.LOWER):  # the planner gives the carry up
             evidence.reached.setdefault("H", round((now_ns - at_ns) * 1e-6, 3))
-        stopped = any(r in evidence.reached for r in ("H", "R1", "R0")) or evidence.neutral_ms is not None
+        neutral = evidence.neutral_ms is not None and not machine.holds  # a crane that holds is neutral anyway
+        stopped = any(r in evidence.reached for r in ("H", "R1", "R0")) or neutral
         stop_ns = stop_ns or (now_ns if stopped else 0)
         over = now_ns >= window_ns
         if stopped and drawn.expected not in ("NONE", "REFUSED"):
             over = (standing and now_ns >= stop_ns + round(REST_S * 1e9)) or now_ns >= stop_ns + round(MAX_REST_S * 1e9)
         if over:
-            return travel_m, astray_m + overrun_m, valves_ms, standing
+            return travel_m, astray_m + overrun_m, valves_ms, standing, due_ms
 
 
 def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from experiments.common.registry import Options
 from experiments.common.result import ROOT, Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures, sampled_unless_given
+from experiments.common.workers import Trial
 from experiments.common.worlds import carrier_profile
 from experiments.forwarding_mission.metrics import CM, CONCLUSION, INTRODUCTION, METRICS, PAPER, gather, sections
 from experiments.forwarding_mission.plots import draw
@@ -29,6 +30,7 @@ DETECTORS: Final = {"ours": "ours", "paper-b": "faithful"}
 NOMINAL: Final = "machine/nominal"
 LIMIT_S: Final = 5400.0
 FILE: Final = ROOT / "docs" / "examples" / "paper_b.geojson"
+SOURCES: Final = (*LOCKSTEP_SOURCES, "docs/examples/paper_b.geojson")
 PUBLISHED_TRIALS: Final = "results/forwarding-mission/trials.jsonl.xz"
 """Outcomes of all missions, in the docs."""
 
@@ -43,7 +45,7 @@ def run(options: Options, console: Console) -> Result:
     check_truth(name, truth)
     trials = 0 if options.quick else options.trials or TRIALS
     machines = calibrations(options, name, truth, MACHINES if trials else 0)
-    with checkpoint(options, machines, [name], truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as kept:
+    with checkpoint(options, (), [name], truth, SOURCES, PUBLISHED_TRIALS) as kept:
         outcomes = pool.run(perform, machines, kept, options.workers, "calibrations", console)
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
         outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)
@@ -64,6 +66,12 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
         machines=result.environment["machines"], along=CM * ALONG_M, across=CM * ACROSS_M, turn=TURN_DEG
     )
     return Page("Forwarding mission", CONCLUSION, introduction, sections(trials))
+
+
+def failed(trial: Trial) -> bool:
+    """Whether a mission did not end, or left a log neither in the bunk nor at a landing: a campaign records it."""
+    lost = [log for log in trial.outcome.get("logs", ()) if not (log["in_bunk"] or log["landed"])]
+    return trial.job.kind == "mission" and bool(lost or not trial.outcome["finished"])
 
 
 def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[Job]:

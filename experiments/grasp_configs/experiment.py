@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from statistics import fmean, median
@@ -19,18 +20,21 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from experiments.common import overview, pool
+from experiments.common import overview, plugins, pool
+from experiments.common.errors import ExperimentError
 from experiments.common.individuals import calibrated
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, make_result, rate
-from experiments.common.result_page import Page, publish
+from experiments.common.result import Result, evaluate, limits_of, make_result, rate
+from experiments.common.result_page import Page, Section, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint, sampled_unless_given
+from experiments.common.workers import Trial
+from experiments.common.worlds import profile_named
 from experiments.grasp_configs.grasp_categories import ALL_LOGS, PILES
-from experiments.grasp_configs.metrics import CONCLUSION, INTRODUCTION, METRICS, sections
+from experiments.grasp_configs.metrics import CONCLUSION, INTRODUCTION, METRICS, compared, sections
 from experiments.grasp_configs.plots import draw_chain, draw_table
-from experiments.grasp_configs.pose_sources import POSE_SOURCES
-from experiments.grasp_configs.trial import NETWORKS, attempt, weights_of
+from experiments.grasp_configs.pose_sources import CAMERA, POSE_SOURCES, TRUE
+from experiments.grasp_configs.trial import NETWORKS, attempt, planner_named, weights_of
 from sim.scenes.arrangements import CONFIGURATIONS
 
 PAPER: Final = {"paper60_success": 59 / 60, "optimal": 48 / 59}
@@ -62,20 +66,24 @@ def jobs_of(
     pairs: Sequence[tuple[str, str]],
     attempts: int,
     machines: Mapping[str, Any] = MappingProxyType({}),
+    alike: bool = False,
 ) -> list[Job]:
     """Jobs of all attempts: ``attempts`` of each configuration for the first pair, a twentieth for the others.
+
+    ``alike``: every pair gets all attempts, on the same scenes and machines.
 
     ``machines``: the calibrated individuals by the names of their jobs; without any, the nominal machine makes all.
     """
     found = []
     for pair in pairs:
-        count = attempts if pair == pairs[0] else max(min(PAPER_ATTEMPTS, attempts), attempts // SHARE)
+        whole = alike or pair == pairs[0]
+        count = attempts if whole else max(min(PAPER_ATTEMPTS, attempts), attempts // SHARE)
         for number in CONFIGURATIONS:
             for k in range(count):
                 plain = {"profile": options.profile, "truth": options.truth, "configuration": number}
                 plain |= {"poses": pair[0], "planner": pair[1]}
                 seed = FIRST_SEED + 1000 * options.seed + k
-                turn = (k - PAPER_ATTEMPTS) % (MACHINES + 1) if k >= PAPER_ATTEMPTS and pair == pairs[0] else 0
+                turn = (k - PAPER_ATTEMPTS) % (MACHINES + 1) if k >= PAPER_ATTEMPTS and whole else 0
                 machine = machines.get(f"machine/{turn - 1}")
                 if machine is not None and machine["profile"] is not None:
                     plain |= {"truth": sampled_unless_given(options.truth), "text": machine["profile"], "scene": seed}
@@ -84,12 +92,20 @@ def jobs_of(
     return found
 
 
-def pairs_of() -> list[tuple[str, str]]:
-    """Pairs of the ablation whose weights exist; the evaluated pair comes first."""
-    pairs = [(poses, planner) for poses in POSE_SOURCES for planner in PLANNERS]
-    ready = [p for p in pairs if weights_of(*p)]
-    first = BEST if BEST in ready else ("true", "search")
+def pairs_of(profile: str) -> list[tuple[str, str]]:
+    """Pairs of the ablation whose weights exist; the evaluated pair comes first.
+
+    A machine without the camera gets true poses: what is tried then is planning, crane and grapple.
+    """
+    sources = POSE_SOURCES if sees(profile) else (TRUE,)
+    ready = [(poses, planner) for poses in sources for planner in PLANNERS if weights_of(poses, planner)]
+    first = BEST if BEST in ready else (TRUE, "search")
     return [first, *(p for p in ready if p != first)]
+
+
+def sees(profile: str) -> bool:
+    """Whether the machine has the camera that detects the logs."""
+    return CAMERA in profile_named(profile).cameras
 
 
 def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[str, float]:
@@ -106,24 +122,44 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
         metrics |= own
         if pair == ".".join(first):
             metrics |= of_trials([o for _, o in trials], "")
-            sixty = [o["lifted"] > 0 for k, o in trials if k < PAPER_ATTEMPTS]
+            sixty = [succeeded(o) for k, o in trials if k < PAPER_ATTEMPTS]
             metrics |= rate("paper60_success", sum(sixty), len(sixty))
             metrics["success_wilson_low"] = metrics["success_low"]
             for kind, sampled in (("nominal", False), ("individuals", True)):
-                its = [o["lifted"] > 0 for _, o in trials if o["individual"] is sampled]
-                metrics |= rate(f"{kind}.success", sum(its), len(its)) if its else {}
-            metrics["first_closing"] = _mean([float(o["lifted"] > 0 and o["closings"] == 1) for _, o in trials])
+                hits = [succeeded(o) for _, o in trials if o["individual"] is sampled]
+                metrics |= rate(f"{kind}.success", sum(hits), len(hits)) if hits else {}
+            metrics["first_closing"] = _mean([float(succeeded(o) and o["closings"] == 1) for _, o in trials])
+            metrics["stopped"] = float(sum(o["stops"] > 0 for _, o in trials))
             for number in CONFIGURATIONS:
                 its = [o for _, o in trials if o["configuration"] == number]
-                metrics |= rate(f"config{number}.success", sum(o["lifted"] > 0 for o in its), len(its))
+                metrics |= rate(f"config{number}.success", sum(succeeded(o) for o in its), len(its))
                 metrics[f"config{number}.optimal"] = _share(its, "optimal")
                 metrics[f"config{number}.logs"] = _mean([o["lifted"] for o in its])
     return metrics
 
 
+def succeeded(outcome: Mapping[str, Any]) -> bool:
+    """Whether at least one log was lifted and nobody had to arm again: a stop that needs a person is a failure."""
+    return outcome["lifted"] > 0 and not outcome["stops"]
+
+
+def failed(trial: Trial) -> bool:
+    """Whether an attempt failed: a campaign keeps its recording."""
+    return trial.job.kind == "grasp" and not succeeded(trial.outcome)
+
+
+def evaluated_again(result: Result, trials: Mapping[str, Any]) -> Result:
+    """The saved result by today's reading of its published attempts; what was measured stays."""
+    poses, planner = result.environment["judged"].split(" poses, ")
+    metrics = result.metrics | gather(dict(trials), (poses, planner))
+    missed, inconclusive = evaluate(METRICS, metrics, noisy=False)
+    limits = limits_of(METRICS)
+    return replace(result, metrics=metrics, limits=limits, missed=missed, inconclusive=inconclusive)
+
+
 def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]:
     """Success, share of optimal grasps, logs per grasp, and times of some trials."""
-    up = [o for o in trials if o["lifted"] > 0]
+    up = [o for o in trials if succeeded(o)]
     piles = [o["lifted"] for o in trials if o["configuration"] in PILES]
     all_of = [o["lifted"] == o["logs"] for o in trials if o["configuration"] in ALL_LOGS]
     planned = [o for o in trials if math.isfinite(o["plan_ms"])]
@@ -150,7 +186,7 @@ def published_ablation(docs: Path | None, judged_pair: tuple[str, str]) -> tuple
 
 
 def _share(trials: Sequence[dict[str, Any]], category: str) -> float:
-    up = [o for o in trials if o["lifted"] > 0]
+    up = [o for o in trials if succeeded(o)]
     return _mean([float(o["category"] == category) for o in up])
 
 
@@ -163,12 +199,17 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def run(options: Options, console: Console) -> Result:
-    """Run all attempts; write ``options.out`` and, if requested, the docs."""
-    pairs = pairs_of()
+    """Run all attempts; write ``options.out`` and, if requested, the docs.
+
+    Raises:
+        ExperimentError: a foreign planner or detector cannot be used.
+    """
+    if options.planner or options.detector:
+        return compare(options, console)
+    pairs = pairs_of(options.profile)
     attempts = options.trials or (1 if options.quick else ATTEMPTS)
     calibrations = machines_of(options, attempts)
-    asked = (options.seed, pairs)  # a run with more attempts continues one with fewer
-    with checkpoint(options, asked, [options.profile], options.truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as kept:
+    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as kept:
         machines = pool.run(calibrated, calibrations, kept, options.workers, "calibrations", console)
         jobs = jobs_of(options, pairs[:1] if options.quick else pairs, attempts, machines)
         outcomes = machines | pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
@@ -178,11 +219,50 @@ def run(options: Options, console: Console) -> Result:
             "grasp-configs", METRICS, kept_metrics | gather(outcomes, pairs[0]), profile=options.profile,
             seed=options.seed, trials=len(jobs), more=more, paper=PAPER,
         )  # fmt: skip
-        draw_chain(options.out / "chain.png", options.profile, options.truth, FIRST_SEED)
+        if sees(options.profile):
+            draw_chain(options.out / "chain.png", options.profile, options.truth, FIRST_SEED)
         draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
         _print_failures(outcomes, ".".join(pairs[0]), console)
         publish(result, page_of(result, {}), options, console)
         kept.publish()
+    return result
+
+
+def compare(options: Options, console: Console) -> Result:
+    """A foreign planner or detector and ours on the same attempts; the limits, which are for ours, judge neither.
+
+    Raises:
+        ExperimentError: there is no such planner or detector, or a page is asked for, which is that of ours.
+    """
+    if options.detector and not sees(options.profile):
+        raise ExperimentError(
+            "grasp-configs.no-camera",
+            f"{options.profile} has no camera {CAMERA!r} for a detector; leave out --detector",
+        )
+    ours = pairs_of(options.profile)[0]
+    foreign = (options.detector or ours[0], options.planner or ours[1])
+    if options.docs is not None:
+        raise ExperimentError("plugin.no-page", "the page shows our own methods: leave out --docs")
+    if options.planner:
+        planner_named(options.planner)
+    if options.detector and options.detector not in POSE_SOURCES:
+        plugins.load(plugins.LOG_DETECTORS, options.detector)
+    besides = plugins.identity(plugins.GRASP_PLANNERS, options.planner)
+    besides += plugins.identity(plugins.LOG_DETECTORS, options.detector)
+    attempts = options.trials or (1 if options.quick else PAPER_ATTEMPTS)
+    with checkpoint(options, besides, [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
+        machines = pool.run(calibrated, machines_of(options, attempts), kept, options.workers, "calibrations", console)
+        jobs = jobs_of(options, (foreign, ours), attempts, machines, alike=True)
+        outcomes = pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
+        metrics = gather(outcomes, foreign)
+        shown = [m for pair in (foreign, ours) for m in compared(*pair)]
+        result = make_result(
+            "grasp-configs", shown, metrics, profile=options.profile, seed=options.seed, trials=len(jobs),
+            more={"truth": options.truth, "judged": " poses, ".join(foreign)}, paper=PAPER,
+        )  # fmt: skip
+        publish(
+            result, Page("A foreign method", (), "", (Section("Foreign and ours", "", tuple(shown)),)), options, console
+        )
     return result
 
 

@@ -24,13 +24,17 @@ from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
-from hil.calibration.camera_survey import SURVEYED, surveyed_profile
+from autonomy.perception.tracking.log_filter import SURVEYED
+from experiments.common import plugins
+from hil.calibration.camera_survey import surveyed_profile
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
 from sim.plant import Plant
 from sim.wood.logs import LogState
 
 CAMERA: Final = "stick"
+TRUE: Final = "true"
+"""The source that takes the poses from the plant."""
 PICTURE_COUNT: Final = 3
 MIN_MASK_PX: Final = 60
 RATE_NS: Final = 66_666_667
@@ -115,6 +119,27 @@ class PaperPerception:
         return Detection(tuple(logs), time.process_time() - begun)
 
 
+class ForeignPerception:
+    """A foreign detector on one picture; it gets what ours gets: the picture of the surveyed camera."""
+
+    def __init__(self, detector: plugins.LogPictureDetector, plant: Plant, profile: Profile, seed: int) -> None:
+        self._detector, self._camera = detector, _Surveyed(plant, profile, seed)
+
+    def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
+        """The logs in one picture."""
+        seen, begun = self._camera.detect(stamp_ns, q), time.process_time()
+        found, pose = self._detector(seen.frames[0]), seen.pose
+        seconds = time.process_time() - begun
+        logs = [
+            LogObservation(
+                i, _triple(pose.to_base(np.asarray(log.center_m))), _triple(pose.rotation @ np.asarray(log.axis)),
+                log.length_m, log.diameter_m,
+            )
+            for i, log in enumerate(found)
+        ]  # fmt: skip
+        return Detection(tuple(logs), seconds)
+
+
 class PoseSource(Protocol):
     """Detects the logs from the present position of the crane."""
 
@@ -123,11 +148,22 @@ class PoseSource(Protocol):
 
 
 POSE_SOURCES: Final[dict[str, Callable[[Plant, Profile, int], PoseSource]]] = {
-    "true": TruePoses,
+    TRUE: TruePoses,
     "ours": OurPerception,
     "masked": partial(OurPerception, masked=True),
     "faithful": PaperPerception,
 }
+
+
+def pose_source(name: str, plant: Plant, profile: Profile, seed: int) -> PoseSource:
+    """The source with this name: one of ours, or the detector of an entry point.
+
+    Raises:
+        ExperimentError: there is no such detector.
+    """
+    if name in POSE_SOURCES:
+        return POSE_SOURCES[name](plant, profile, seed)
+    return ForeignPerception(plugins.load(plugins.LOG_DETECTORS, name), plant, profile, seed)
 
 
 def misled(truth: Sequence[LogState], seen: Sequence[LogObservation]) -> bool:

@@ -26,14 +26,18 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
+from experiments.common import plugins
 from experiments.common.individuals import controller_profile
 from experiments.common.pool import Job
+from experiments.common.recording import recorder_of
 from experiments.common.worlds import profile_named, wood_of
 from experiments.grasp_configs.grasp_categories import Grip, category, lifted
-from experiments.grasp_configs.pose_sources import DETECTION_NS, POSE_SOURCES, Detection, PoseSource, misled
+from experiments.grasp_configs.pose_sources import DETECTION_NS, Detection, PoseSource, misled, pose_source
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.loading.profile_file import load_profile, profile_hash
+from machine.profile import Profile
+from recorder.recorder import Recorder
 from sim.plant import Plant
 from sim.scenes.arrangements import configuration
 from sim.wood.log_shape import LogSpec
@@ -128,30 +132,35 @@ def weights_of(poses: str, planner: str) -> bool:
 
 
 def planner_named(name: str) -> GraspPlanner:
-    """The planner with this name.
+    """The planner with this name: one of ours, or that of an entry point.
 
     Raises:
         WeightsError: the network's weights are missing or damaged.
+        ExperimentError: there is no such planner.
     """
     if name == "search":
         return SamplingPlanner()
+    if name not in NETWORKS:
+        return plugins.load(plugins.GRASP_PLANNERS, name)  # type: ignore[no-any-return]
     return CnnPlanner(_network(NETWORKS[name]), by_rule=name == "cnn_physical")
 
 
 def attempt(job: Job) -> dict[str, Any]:
     """Run one attempt.
 
-    Options: profile, truth, configuration, poses (of ``pose_sources.POSE_SOURCES``), planner (search, cnn or
-    cnn_physical), scene (its seed; that of the job draws the machine), text (of the calibrated profile; None: as
-    shipped).
+    Options: profile, truth, configuration, poses (of ``pose_sources.POSE_SOURCES``, or a foreign detector), planner
+    (search, cnn, cnn_physical, or a foreign one), scene (its seed; that of the job draws the machine), text (of the
+    calibrated profile; None: as shipped), record (folder of a recording).
     """
     with controller_profile(job.options["profile"], job.options.get("text")) as name:
-        return _attempt(job, name, job.options.get("scene", job.seed))
+        profile = load_profile(name)
+        with recorder_of(job, profile, name) as recorder:
+            return _attempt(job, profile, name, recorder)
 
 
-def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
+def _attempt(job: Job, profile: Profile, name: str, recorder: Recorder | None) -> dict[str, Any]:
     o = job.options
-    profile, number = load_profile(name), o["configuration"]
+    number, field = o["configuration"], o.get("scene", job.seed)
     digest = profile_hash(profile)
     scene = arranged(o["profile"], o["truth"], number, field)
     plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=scene)
@@ -161,11 +170,11 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
         activity = Activity(
             profile, digest, grasp_selector=PlannerSelection(timed), motion_planner=TimeOptimalPlanner(direct=False)
         )
-        planner_run = Attempt(activity, POSE_SOURCES[o["poses"]](plant, profile, field))
+        planner_run = Attempt(activity, pose_source(o["poses"], plant, profile, field))
         operator = Operator(digest, lambda *_: None)
         settings = Settings(profile, digest, profile.rate_hz)
         guard = build_guard(Path(name))
-        system = Lockstep(settings, guard, plant, planner_run, operator, Observer(None, []))
+        system = Lockstep(settings, guard, plant, planner_run, operator, Observer(recorder, []))
         grip, closings = Grip(0.0, 0.0, 0.0), 0
         phase = activity.phase
         while not activity.failure and not operator.gave_up and not planner_run.over(system.now_ns):

@@ -83,7 +83,7 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, trials)
     profiles = machines(options)
-    with checkpoint(options, jobs, profiles.values(), options.truth, ["controller"]) as kept:
+    with checkpoint(options, (), profiles.values(), options.truth, ["controller"]) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "joint-tracking trials", console)
         metrics = gather(outcomes)
         result = make_result(

@@ -48,7 +48,7 @@ def run(options: Options, console: Console) -> Result:
     masks = "network" if (SHIPPED / "logs_rgbd.safetensors").exists() else "true"
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, name, truth, trials, masks)
-    with checkpoint(options, jobs, [name], truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "log-localization trials", console)
         result = make_result(
             "log-localization", METRICS, gather(outcomes), profile=name, seed=options.seed, trials=trials,

@@ -14,11 +14,10 @@ from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.papers import paper_a
 from autonomy.perception.papers.paper_b import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
 from autonomy.perception.pipeline import Perception
-from autonomy.perception.tracking.log_filter import Track
+from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS, Track
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from experiments.log_localization.site import APART_M, STOP_M, Shape, Shot, Site
-from hil.calibration.camera_survey import SURVEYED_BY_GNSS
 
 MAX_RANGE_M: Final = 10.0  # beyond it a log is less than 6 px wide in the detector's picture
 STEP_M: Final = 0.55  # between two positions of the approach

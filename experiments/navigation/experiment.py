@@ -14,6 +14,7 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, sampled_unless_given
+from experiments.common.workers import Trial
 from experiments.common.worlds import carrier_profile, profile_named
 from experiments.navigation.metrics import CONCLUSION, GROUNDS, INTRODUCTION, LAP, METRICS, PAPER, SECTIONS, gather
 from experiments.navigation.plots import draw
@@ -52,7 +53,7 @@ def run(options: Options, console: Console) -> Result:
     trials = 1 if options.quick else options.trials or TRIALS
     points = list(CORNERS[:2]) if options.quick else list(CORNERS) * LAPS
     jobs = plan(options, name, truth, trials, points)
-    with checkpoint(options, jobs, [name], truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "navigation drives", console)
         result = make_result(
             "navigation", METRICS, gather(outcomes, points, carrier, LAP), profile=name, seed=options.seed,
@@ -61,6 +62,11 @@ def run(options: Options, console: Console) -> Result:
         draw(outcomes, points, carrier, options.out)
         publish(result, page_of(result, {}), options, console)
     return result
+
+
+def failed(trial: Trial) -> bool:
+    """Whether a drive did not arrive, or somebody had to arm again: a campaign keeps its recording."""
+    return not trial.outcome["arrived"] or trial.outcome["stops"] > 0
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:

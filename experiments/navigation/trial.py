@@ -25,12 +25,14 @@ from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
+from experiments.common.recording import recorder_of
 from experiments.common.worlds import profile_named
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
+from recorder.recorder import Recorder
 from sim.mechanics.carrier import PARKED
 from sim.plant import Plant
 
@@ -115,8 +117,13 @@ class NavigationPlanner:
 
 def perform(job: Job) -> dict[str, Any]:
     """One drive; ``options``: profile, truth, terrain, way, pose (x, y, yaw of the front axle), points."""
+    profile = profile_named(job.options["profile"])
+    with recorder_of(job, profile, profile_path(job.options["profile"])) as recorder:
+        return _driven(job, profile, recorder)
+
+
+def _driven(job: Job, profile: Profile, recorder: Recorder | None) -> dict[str, Any]:
     o = job.options
-    profile = profile_named(o["profile"])
     carrier = profile.carrier
     assert carrier is not None
     settings = Settings(profile, profile_hash(profile), profile.rate_hz)
@@ -127,7 +134,7 @@ def perform(job: Job) -> dict[str, Any]:
         planner = NavigationPlanner(profile, plane, [(x, y) for x, y in o["points"]], o["way"])
         planner.truth = plant.world.carrier
         operator = Operator(profile_hash(profile), lambda *_: None)
-        observer = Observer(None, [], [planner.receive])
+        observer = Observer(recorder, [], [planner.receive])
         system = Lockstep(settings, build_guard(profile_path(o["profile"])), plant, planner, operator, observer)
         while not planner.over and not operator.gave_up and system.now_ns < START_NS + LIMIT_NS:
             system.advance()

@@ -89,7 +89,7 @@ def run(options: Options, console: Console) -> Result:
     check_truth(options.profile, options.truth)
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, trials)
-    with checkpoint(options, jobs, [options.profile], options.truth) as kept:
+    with checkpoint(options, (), [options.profile], options.truth) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "plant trials", console)
         metrics, traces = gather(outcomes)
         metrics["repeat_equal"] = float(_repeats(options))

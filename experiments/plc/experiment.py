@@ -13,6 +13,7 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
+from experiments.common.workers import Trial
 from experiments.common.worlds import profile_named
 from experiments.plc.metrics import CONCLUSION, INTRODUCTION, METRICS, PATHS, SECTIONS, gather
 from experiments.plc.trial import perform
@@ -26,7 +27,7 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     common = {"profile": options.profile, "truth": options.truth}
     jobs = [Job(f"{path}-{i}", path, options.seed + i, common) for i in range(trials) for path in PATHS]
-    with checkpoint(options, jobs, [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "plc trials", console)
         result = make_result(
             "plc", METRICS, gather(outcomes), profile=profile_named(options.profile).name, seed=options.seed,
@@ -34,6 +35,11 @@ def run(options: Options, console: Console) -> Result:
         )  # fmt: skip
         publish(result, page_of(result, {}), options, console)
     return result
+
+
+def failed(trial: Trial) -> bool:
+    """Whether the log is not in the bunk, or somebody had to arm again: a campaign keeps its recording."""
+    return not trial.outcome["success"] or trial.outcome["stops"] > 0
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:

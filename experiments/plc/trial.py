@@ -10,10 +10,13 @@ from typing import Any, Final
 
 from autonomy.crane_job.activity import Activity
 from can_dbc.messages.crane import StateReport
+from controller.config import Settings
 from controller.config import load as load_settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
+from controller.guard.guard import Guard
 from experiments.common.pool import Job
+from experiments.common.recording import recorder_of
 from experiments.common.result import mean
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
@@ -21,6 +24,7 @@ from hil.plc.bridged_plant import BridgedPlant
 from hil.plc.profile import write_plc_profile
 from machine.geometry.kinematics import pin_position
 from machine.status.modes import Mode
+from recorder.recorder import Recorder
 from sim.plant import Plant
 
 LIMIT_NS: Final = 150_000_000_000
@@ -85,7 +89,7 @@ class PathObserver:
 
 def perform(job: Job) -> dict[str, Any]:
     """Run one job on the path ``job.kind``."""
-    path_name, name, truth = job.kind, job.options["profile"], job.options["truth"]
+    path_name, name = job.kind, job.options["profile"]
     with tempfile.TemporaryDirectory() as directory:
         path = profile_path(name)
         if path_name == "references":
@@ -93,7 +97,12 @@ def perform(job: Job) -> dict[str, Any]:
         elif path_name == "valves":
             path = write_plc_profile(name, "valves", Path(directory))
         settings, guard = load_settings(path), build_guard(path)
-    profile = settings.profile
+        with recorder_of(job, settings.profile, path) as recorder:
+            return _performed(job, settings, guard, recorder)
+
+
+def _performed(job: Job, settings: Settings, guard: Guard, recorder: Recorder | None) -> dict[str, Any]:
+    path_name, profile, truth = job.kind, settings.profile, job.options["truth"]
     if path_name == "can":
         plant = Plant(profile, job.seed, truth)
     else:
@@ -102,7 +111,7 @@ def perform(job: Job) -> dict[str, Any]:
         activity = Activity(profile, settings.profile_hash)
         reports: list[Any] = []
         operator = Operator(settings.profile_hash, lambda *_: None)
-        system = Lockstep(settings, guard, plant, activity, operator, Observer(None, reports))
+        system = Lockstep(settings, guard, plant, activity, operator, Observer(recorder, reports))
         observer = PathObserver(system, plant)
         reports.append(observer.report)
         while not (activity.done or activity.failure or operator.gave_up) and system.now_ns < START_NS + LIMIT_NS:

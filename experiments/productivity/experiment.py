@@ -13,6 +13,7 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures
+from experiments.common.workers import Trial
 from experiments.common.worlds import carrier_profile, profile_named
 from experiments.productivity.metrics import CONCLUSION, INTRODUCTION, METRICS, gather, sections
 from experiments.productivity.plots import draw
@@ -40,7 +41,7 @@ def run(options: Options, console: Console) -> Result:
     grapple_s = grapple.close_time_s + grapple.open_time_s
     trials = 1 if options.quick else options.trials or TRIALS
     jobs = plan(options, name, trials)
-    with checkpoint(options, jobs, [name], options.truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, (), [name], options.truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "runs", console)
         result = make_result(
             "productivity", METRICS, gather(outcomes, grapple_s), profile=name, seed=options.seed, trials=trials,
@@ -55,6 +56,11 @@ def run(options: Options, console: Console) -> Result:
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
     return Page("Productivity", CONCLUSION, INTRODUCTION, sections())
+
+
+def failed(trial: Trial) -> bool:
+    """Whether a run did not end: a campaign keeps its recording."""
+    return not trial.outcome["finished"]
 
 
 def plan(options: Options, profile: str, trials: int) -> list[Job]:

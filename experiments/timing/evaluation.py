@@ -61,9 +61,23 @@ def compared_windows(windows: Sequence[MeasurementWindow]) -> tuple[list[Measure
 
 
 def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWindow]:
-    """The quietest quarter, at least one, by cyclictest's p99 alone: the controller's own times choose nothing."""
-    ordered = sorted(windows, key=lambda w: (w.cyclictest.quantile_ns(0.99), w.host.steal_ms))
+    """The quietest quarter, at least one, by the sleep loop's processor time alone: our own times choose nothing.
+
+    The loop does the same in every cycle, on the same processor in the same seconds.  What makes it dear, other
+    machines' work in the shared caches, makes a tick dear; cyclictest's lateness does not tell these windows apart.
+    """
+    ordered = sorted(windows, key=lambda w: w.sleep_loop.cpu_us)
     return ordered[: max(1, math.ceil(COST_WINDOW_SHARE * len(ordered)))]
+
+
+def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
+    """Processor time of the sleep loop's cycle [us], and the tick's median in such cycles: the median window's."""
+    in_cycles = [w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.sleep_loop.cpu_us for w in windows]
+    return {
+        "plain_cpu_us": float(np.median([w.sleep_loop.cpu_us for w in quietest_windows(windows)])),
+        "plain_cpu_all_us": float(np.median([w.sleep_loop.cpu_us for w in windows])),
+        "tick_cpu_in_plain": float(np.median(in_cycles)),
+    }
 
 
 def still(window: MeasurementWindow) -> bool:

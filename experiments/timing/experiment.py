@@ -230,6 +230,7 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
         everywhere = evaluation.spread_us(name, pooled([w.durations["cpu"] for w in windows]))
         metrics |= {k.replace("cpu_", "cpu_all_"): v for k, v in everywhere.items()}
         metrics[f"{name}_host_still"] = float(all(map(evaluation.still, judged)))
+    metrics |= evaluation.host_speed(slow.quiet)
     metrics |= evaluation.spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in compared]))
     metrics |= evaluation.wakeups("", compared)
     ours, theirs = [w.durations["wake"] for w in compared], [w.cyclictest for w in compared]

@@ -28,12 +28,13 @@ OWN: Final = Section(
     "Page faults, garbage collection and system calls do not depend on the host's noise, so their limits hold on any "
     "host. CPU time does: other work replaces the tick's data in the caches, and what the hypervisor takes in the "
     "middle of a tick counts as the tick's. It is therefore judged in the quietest quarter of the windows, chosen by "
-    "cyclictest's p99 alone, and a missed limit is *inconclusive* if even these were noisy. Two figures see a "
-    "regression on any host: the instructions of a tick, where the host counts them, and the ratios of interpreter "
-    "and compiled tick, measured in turn. A lost frame or a stop counts against the controller unless a witness, a "
-    "process with nothing to do and the highest priority of its processor, saw that processor stand still just "
-    "before. The whole forwarder is on both buses and moves with every control law active; reports and a "
-    "record of every tick leave the process as on the machine.",
+    "the processor time of the sleep loop alone, and a missed limit is *inconclusive* if cyclictest was late even in "
+    "these. Three figures see a regression on any host: the tick's median in cycles of the sleep loop, which does the "
+    "same each time on the same processor in the same seconds, the instructions of a tick, where the host counts "
+    "them, and the ratios of interpreter and compiled tick, measured in turn. A lost frame or a stop counts against "
+    "the controller unless a witness, a process with nothing to do and the highest priority of its processor, saw "
+    "that processor stand still just before. The whole forwarder is on both buses and moves with every control law "
+    "active; reports and a record of every tick leave the process as on the machine.",
     (
         Metric("tick_cpu_p50_us", "CPU time of a tick, median", "us",
                "The thread's own clock (CLOCK_THREAD_CPUTIME_ID) around the tick, 200 Hz, quietest windows.",
@@ -41,6 +42,13 @@ OWN: Final = Section(
         Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us", "The limit is 6 % of the period.", most=300.0),
         Metric("tick_cpu_all_p50_us", "CPU time of a tick in all windows, median", "us", "Noisy windows included."),
         Metric("tick_cpu_all_p99_us", "CPU time of a tick in all windows, p99", "us", "Noisy windows included."),
+        Metric("tick_cpu_in_plain", "CPU time of a tick in cycles of the sleep loop", "x",
+               "Medians of the same window; the median of all windows. It says what the controller costs, whatever "
+               "the host's speed."),
+        Metric("plain_cpu_us", "CPU time of a cycle of the sleep loop, quietest windows", "us",
+               "How fast the host was: waking, reading the clock three times, counting."),
+        Metric("plain_cpu_all_us", "CPU time of a cycle of the sleep loop, all windows", "us",
+               "The same, the median of all windows."),
         Metric("tick_p50_us", "Tick by the wall clock, median", "us", "From its first to its last stage."),
         Metric("tick_p99_us", "Tick by the wall clock, p99", "us", "As for the median."),
         Metric("tick_cpu_max_us", "CPU time of a tick, longest", "us", "Quietest windows."),

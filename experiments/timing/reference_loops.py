@@ -61,10 +61,11 @@ def read_cyclictest(report: str) -> Durations:
 
 @dataclass(frozen=True, slots=True)
 class SleepLoopReport:
-    """Lateness and missed deadlines of the sleep loop."""
+    """Lateness and missed deadlines of the sleep loop; processor time of one of its cycles [us]."""
 
     lateness: Durations
     missed: int
+    cpu_us: float
 
 
 def start_sleep_loop(family: ProcessGroup, period_ns: int, seconds: float, cpu: int) -> Child:
@@ -81,7 +82,7 @@ def read_sleep_loop(output: dict[str, Any]) -> SleepLoopReport:
     lateness = Durations(longest_ns=output["longest_ns"])
     for i, n in output["bins"].items():
         lateness.bins[int(i)] = n
-    return SleepLoopReport(lateness, output["missed"])
+    return SleepLoopReport(lateness, output["missed"], output["cpu_us"])
 
 
 def start_load(family: ProcessGroup, seconds: float) -> Child:

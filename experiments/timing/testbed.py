@@ -42,7 +42,7 @@ END_ORDER: Final = ("setpoints", "controller", "guard", "observer", "machine", "
 START_S: Final = 60.0
 ACTIVE_S: Final = 60.0
 HELPER_ENDS_S: Final = 60.0
-MEMORY: Final = Path("/dev/shm")
+MEMORY: Final = Path("/dev/shm")  # only mkdtemp makes names in it  # nosec B108
 """The timing page lies in memory: a write to a page of a disk file can fault and wait for the disk."""
 
 

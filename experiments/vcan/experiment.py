@@ -14,6 +14,7 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
+from experiments.common.workers import Workers
 from experiments.common.worlds import profile_named
 from experiments.vcan.metrics import CONCLUSION, INTRODUCTION, KINDS, METRICS, SECTIONS, gather, seed_table
 from experiments.vcan.trial import perform
@@ -32,8 +33,8 @@ def run(options: Options, console: Console) -> Result:
     kinds = list(KINDS)[: 1 if options.quick else None]
     common = {"out": str(options.out.resolve())}
     jobs = [Job(f"{kind}-{options.seed + i}", kind, options.seed + i, common) for kind in kinds for i in range(trials)]
-    with checkpoint(options, jobs, ["palms_471", "aoro_fc8"], options.truth, (*LOCKSTEP_SOURCES, "host")) as kept:
-        outcomes = pool.run(perform, jobs, kept, 1, "vcan runs", console)
+    with checkpoint(options, (), ["palms_471", "aoro_fc8"], options.truth, (*LOCKSTEP_SOURCES, "host")) as kept:
+        outcomes = pool.run(perform, jobs, kept, Workers(1), "vcan runs", console)
         result = make_result(
             "vcan", METRICS, gather(outcomes), profile=profile_named(options.profile).name, seed=options.seed,
             trials=trials, more=environment_of(outcomes), noisy=noisy(outcomes),

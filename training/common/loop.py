@@ -90,7 +90,7 @@ def train(
     with progress_bar(console, TextColumn("{task.fields[loss]}")) as progress:
         task = progress.add_task(title, total=schedule.steps, completed=len(losses), loss="")
         smooth = losses[-1] if losses else None
-        with _deferred_interrupt() as interrupted:
+        with deferred_interrupt() as interrupted:
             for step in range(len(losses), schedule.steps):
                 value = _step(net, optimiser, batch(step), loss, schedule, step)
                 if not math.isfinite(value):
@@ -132,7 +132,7 @@ def stacked(rows: Sequence[tuple[np.ndarray, ...]]) -> tuple[torch.Tensor, ...]:
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[list[int]]:
+def deferred_interrupt() -> Iterator[list[int]]:
     """Collects Ctrl-C instead of raising it in the middle of a step, where the weights are half updated."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():

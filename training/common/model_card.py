@@ -31,13 +31,20 @@ class Card:
     command: str
 
 
-def write(path: Path, network: Network, arrays: Mapping[str, np.ndarray], card: Card, facts: Mapping[str, str]) -> Path:
+def write(
+    path: Path,
+    network: Network,
+    arrays: Mapping[str, np.ndarray],
+    card: Card,
+    facts: Mapping[str, str],
+    half: bool = False,
+) -> Path:
     """Write the weights to ``path`` and the card beside them; returns the card's path.
 
-    ``facts`` are written to the weight file's header with data, command, seed and metrics.
+    ``facts`` are written to the weight file's header with data, command, seed and metrics; ``half`` as in ``save``.
     """
     header = {"data": card.data, "seed": str(card.seed), "command": card.command}
-    save(path, network, arrays, {**header, **card.metrics, **facts})
+    save(path, network, arrays, {**header, **card.metrics, **facts}, half)
     beside = path.with_suffix(".md")
     beside.write_text(text(path, network, card))
     return beside

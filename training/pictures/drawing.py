@@ -41,10 +41,10 @@ def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
     """A picture of ``pile``, drawn from ``seed``; deterministic."""
     rng = random.Random(f"frame {pile.machine} {pile.number} {seed}")
     held = rng.random() < HELD_SHARE
-    scene, keep = _scene(pile, rng, held)
+    scene, keep = bare_scene(pile, rng, held)
     camera = rng.choice(list(profile_of(pile.machine).cameras))
-    view = _view(pile, keep, camera, rng, size_px, scene.ground)
-    boxes = _steel(pile, keep, view, rng, held)
+    view = random_view(pile, keep, camera, rng, size_px, scene.ground)
+    boxes = steel_around(pile, keep, view, rng, held)
     scene = replace(scene, boxes=boxes, rods=scene.rods + _clutter(pile, keep, rng))
     conditions = ImagingConditions.random(rng.getrandbits(31))
     picture = render(scene, view, conditions, rng.getrandbits(16))
@@ -112,7 +112,7 @@ def _row(u: np.ndarray, v: np.ndarray, view: View, log: LogPose, shape: tuple[in
     return (*centre, *ends, *seen, math.atan2(axis[1], axis[0]) % math.pi, elongation(extent, wide))
 
 
-def _scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple[LogPose, ...]]:
+def bare_scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple[LogPose, ...]]:
     """The pile without the logs already removed from the top; when one is held, the topmost log is in the air."""
     logs = sorted(pile.logs, key=lambda log: log.position_m[2])
     if len(logs) > 1 and rng.random() < 0.4:
@@ -139,7 +139,9 @@ def _pinhole(pile: Pile, camera: str, rng: random.Random, size_px: int) -> Intri
     return zoomed.crop(round(left), round(top), size_px, size_px)
 
 
-def _view(pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random, size_px: int, ground: Ground) -> View:
+def random_view(
+    pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random, size_px: int, ground: Ground
+) -> View:
     """A view of some of the logs from where a machine's cameras can be."""
     pin = _pinhole(pile, camera, rng, size_px)
     mark = rng.choice(logs)
@@ -184,7 +186,7 @@ def _clear_of_logs(eye: np.ndarray, logs: tuple[LogPose, ...]) -> bool:
     return all(np.linalg.norm(log.spine(12)[0] - eye, axis=1).min() > 1.2 for log in logs)
 
 
-def _steel(pile: Pile, logs: tuple[LogPose, ...], view: View, rng: random.Random, held: bool) -> Boxes:
+def steel_around(pile: Pile, logs: tuple[LogPose, ...], view: View, rng: random.Random, held: bool) -> Boxes:
     steel, profile = Steel(rng), profile_of(rng.choice(MACHINES))
     mark = np.asarray(rng.choice(logs).position_m)
     if pile.kind == "bunk":

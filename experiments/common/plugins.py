@@ -1,0 +1,75 @@
+"""Foreign methods, found by entry point: a package that names one in its pyproject.toml is compared with ours.
+
+Group ``timberhand.grasp_planners``: a factory without arguments that returns a grasp planner (`GraspPlanner` of
+`autonomy.grasp.planner`).  Group ``timberhand.log_detectors``: a factory without arguments that returns a
+`LogPictureDetector`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from autonomy.perception.camera.frame import RgbdFrame
+from experiments.common.errors import ExperimentError
+
+GRASP_PLANNERS: Final = "timberhand.grasp_planners"
+LOG_DETECTORS: Final = "timberhand.log_detectors"
+NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class SeenLog:
+    """A log in the optical frame (z forward, x right, y down): middle [m], unit axis, length and diameter [m]."""
+
+    center_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    length_m: float
+    diameter_m: float
+
+
+class LogPictureDetector(Protocol):
+    """Finds the logs of one picture with depth; it has no memory."""
+
+    def __call__(self, frame: RgbdFrame) -> Sequence[SeenLog]:
+        """The logs in this picture."""
+
+
+def identity(group: str, name: str) -> tuple[str, ...]:
+    """What decides the outcome of a foreign method: package, version and the module's content; nothing for none."""
+    its = [point for point in entry_points(group=group) if point.name == name]
+    if len(its) != 1:
+        return ()
+    source = find_spec(its[0].module)
+    content = Path(source.origin).read_bytes() if source is not None and source.origin else b""
+    package = its[0].dist.name + its[0].dist.version if its[0].dist is not None else ""
+    return package, its[0].value, hashlib.sha256(content).hexdigest()
+
+
+def load(group: str, name: str) -> Any:
+    """What the entry point's factory makes.
+
+    Raises:
+        ExperimentError: no installed package has such an entry point, several have, or it cannot be loaded.
+    """
+    found = entry_points(group=group)
+    its = [point for point in found if point.name == name]
+    if len(its) != 1 or not NAME.fullmatch(name):
+        known = ", ".join(sorted(point.name for point in found)) or "none"
+        raise ExperimentError(
+            "plugin.unknown",
+            f"{len(its)} installed packages have an entry point {name!r} in {group} (installed: {known}); exactly one "
+            "must, with a name of small letters, digits, - and _",
+        )
+    try:
+        return its[0].load()()
+    except Exception as error:
+        raise ExperimentError(
+            "plugin.unusable", f"the entry point {its[0].value} of {group} cannot be loaded: {error!r}"
+        ) from error

@@ -1,0 +1,135 @@
+"""Whether a saved result still speaks for the sources of today.
+
+A result names the commit that measured it, the registry the sources on its path.  It is *stale* when one of them has
+changed since, *unverifiable* when its commit is not in the history or had changes that nobody committed.  A change of
+comments, docstrings or the layout of Python code is none: its syntax tree stays the same.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from experiments.common.registry import Entry
+from experiments.common.result import ROOT
+
+SUFFIXES: Final = (".py", ".toml", ".dbc", ".eds", ".safetensors", ".geojson")
+"""Files on which a measurement depends."""
+CHANGES: Final = "+changes"
+UNKNOWN: Final = "unknown"
+"""The end of the commit of a checkout with changes, and the commit outside git (`experiments.common.result.commit`)."""
+
+
+class Standing(StrEnum):
+    """What a result is worth today; in words."""
+
+    CURRENT = "current"
+    STALE = "stale"
+    UNVERIFIABLE = "unverifiable"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A standing, one sentence that says why (empty for a current result), and the files that changed."""
+
+    standing: Standing
+    why: str = ""
+    changed: tuple[str, ...] = ()
+
+
+def judge(commit: str, entry: Entry, root: Path = ROOT) -> Verdict:
+    """The standing of a result measured at ``commit``, by the git history of the checkout ``root``."""
+    if commit.endswith(CHANGES):
+        return Verdict(Standing.UNVERIFIABLE, f"It was measured at `{commit}`, with changes that nobody committed.")
+    changed = changed_since(commit, entry.sources, root)
+    if changed is None:
+        return Verdict(Standing.UNVERIFIABLE, f"Its commit `{commit}` is not in the history.")
+    if not changed:
+        return Verdict(Standing.CURRENT)
+    return Verdict(Standing.STALE, f"Sources on its path have changed since its commit `{commit}`.", changed)
+
+
+@cache
+def changed_since(commit: str, sources: tuple[str, ...], root: Path) -> tuple[str, ...] | None:
+    """Files of ``sources`` whose meaning differs from that at ``commit``; None if the history does not hold it."""
+    if _git(root, "merge-base", "--is-ancestor", commit, "HEAD") is None:
+        return None
+    listed = _git(root, "diff", "--name-only", "--no-renames", "-z", commit, "--", *sources)
+    names = [name for name in (listed or b"").decode().split("\0") if name.endswith(SUFFIXES)]
+    then = _contents(root, commit, names)
+    return tuple(n for n, old in zip(names, then, strict=True) if _differs(n, old, root / n))
+
+
+def _contents(root: Path, commit: str, names: Sequence[str]) -> list[bytes | None]:
+    """The files as they were at a commit; None for one that it does not hold."""
+    wanted = "".join(f"{commit}:{name}\n" for name in names).encode()
+    told = _git(root, "cat-file", "--batch", given=wanted) or b""
+    found: list[bytes | None] = []
+    for _ in names:
+        head, _, told = told.partition(b"\n")
+        if head.endswith(b" missing"):
+            found.append(None)
+            continue
+        size = int(head.rsplit(b" ", 1)[1])
+        found.append(told[:size])
+        told = told[size + 1 :]
+    return found
+
+
+def _differs(name: str, then: bytes | None, path: Path) -> bool:
+    now = path.read_bytes() if path.is_file() else None
+    if then is None or now is None or not name.endswith(".py"):
+        return then != now
+    return meaning(then) != meaning(now)
+
+
+@cache
+def meaning(source: bytes) -> str:
+    """The syntax tree of Python code without docstrings and positions, as text."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            # A string that stands alone is a docstring, or the documentation of the constant above it.
+            node.body = [s for s in body if not _is_text(s)]  # type: ignore[attr-defined]
+    return ast.dump(tree)
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    value = statement.value if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
+
+
+def _git(root: Path, *arguments: str, given: bytes = b"") -> bytes | None:
+    """What git prints for the standard input ``given``; None when it fails or is missing."""
+    command = ["git", "-C", str(root), *arguments]
+    try:
+        return subprocess.run(command, input=given, capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def marked(page: str, verdict: Verdict) -> str:
+    """The page with a sentence on its standing below the title; without one when it is current.
+
+    The sentence does not name the files that changed, so that a page is written anew once and not with every commit.
+    """
+    if verdict.standing is Standing.CURRENT:
+        return page
+    title, _, rest = page.partition("\n\n")
+    hint = "`timberhand report --check` says more."
+    return f"{title}\n\n> **{verdict.standing.capitalize()}.** {verdict.why} The figures are of then; {hint}\n\n{rest}"
+
+
+def has_history(root: Path = ROOT) -> bool:
+    """Whether the checkout has its git history, without which nothing can be said: neither cut off, nor a copy of the
+    files in a commit of their own.
+    """
+    whole = (_git(root, "rev-parse", "--is-shallow-repository") or b"").strip() == b"false"
+    return whole and _git(root, "rev-parse", "--verify", "-q", "HEAD^") is not None

@@ -1,0 +1,151 @@
+"""What a tick does while nobody looks at the console's pages and while ten of them are open, in turn, in one run.
+
+Controller, guard, emulated machine and console are processes on the wire (`experiments.timing.testbed`).  The system
+calls of a tick and the frames that it sends are counts: no other load of the computer changes them.  Instructions are
+counted where the host lets us.  Processor time is a time, so it is a ratio to the windows without pages, with its
+interval: other load and shared caches change it.
+"""
+
+from __future__ import annotations
+
+import platform
+import statistics
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from can_dbc.timing.page import Facts
+from experiments.timing import host_activity
+from experiments.timing.measurement import system_calls
+from experiments.timing.testbed import HOST, START_S, TestbedConfig, TimingTestbed
+from hil.harness.processes import free_udp_ports
+from hil.tick.instructions import INSTRUCTIONS, count, open_counter
+from hil.tick.ratio import compared
+
+PROFILE: Final = "palms_471"
+RATE_HZ: Final = 200
+MIN_RATIO: Final = 0.9
+"""Processor time of a tick without pages over that with pages, at least: they share the caches of a small computer."""
+SAME: Final = 0.02
+"""Counts of a tick that differ by less are the same: a window begins and ends within some tick, and the setpoint source
+sends by its own clock."""
+SETTLE_S: Final = 1.0
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Some seconds of the controller: ``calls`` is the number of system calls of a tick, ``instructions`` that of
+    instructions (None: not counted here), ``frames`` that of frames sent; ``states`` went to the pages meanwhile."""
+
+    ticks: int
+    missed: int
+    cpu_us: float
+    frames: float
+    instructions: float | None
+    calls: float | None
+    states: int
+
+
+def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: Progress) -> dict[str, list[Window]]:
+    """Windows without pages and with ``pages``, in turn; ``directory`` keeps what the processes write to stderr.
+
+    Raises:
+        CommandFailed: a process does not start or ends.
+    """
+    reports, port = free_udp_ports(2)
+    setting = TestbedConfig(PROFILE, RATE_HZ, arguments=("--report", f"{HOST}:{reports}"))
+    found: dict[str, list[Window]] = {"none": [], "open": []}
+    with TimingTestbed(setting, directory) as testbed:
+        testbed.helpers.environment = testbed.family.environment  # the console listens on the same wire
+        testbed.helpers.start(
+            "console", "console", "--profile", PROFILE, "--port", port, "--report-port", reports, "--timing",
+            testbed.page, "--bus", "crane0=wire:crane0",
+        )  # fmt: skip
+        testbed.helpers.await_message("console", "url", START_S)
+        for number in range(rounds):
+            order = ("none", "open") if number % 2 == 0 else ("open", "none")
+            for side in order:
+                progress(f"round {number + 1} of {rounds}: {pages if side == 'open' else 'no'} pages")
+                with _opened(testbed, port, pages if side == "open" else 0) as states:
+                    found[side].append(_window(testbed, seconds, directory, states))
+    return found
+
+
+@contextmanager
+def _opened(testbed: TimingTestbed, port: int, pages: int) -> Iterator[Callable[[], int]]:
+    """So many open pages; call it once to close them and get the number of states that they got."""
+    if not pages:
+        testbed.wait(SETTLE_S)
+        yield lambda: 0
+        return
+    testbed.helpers.start(
+        "viewers", "experiments.timing.page_viewers", f"ws://{HOST}:{port}/ws", "--pages", pages
+    )  # fmt: skip
+    testbed.helpers.await_message("viewers", "ready", START_S)
+    testbed.wait(SETTLE_S)
+
+    def close() -> int:
+        testbed.helpers.children["viewers"].process.terminate()
+        return int(testbed.await_end("viewers", START_S)["states"])
+
+    try:
+        yield close
+    finally:
+        testbed.helpers.stop("viewers")
+
+
+def _window(testbed: TimingTestbed, seconds: float, directory: Path, close: Callable[[], int]) -> Window:
+    counter = open_counter(testbed.family.children["controller"].process.pid, INSTRUCTIONS)
+    begin = testbed.fresh_timing().facts
+    counted = None if counter is None else count(counter)
+    testbed.wait(seconds)
+    end = testbed.fresh_timing().facts
+    executed = None if counter is None or counted is None else count(counter) - counted
+    traced = system_calls(testbed, seconds, directory)
+    states, ticks = close(), end.ticks - begin.ticks
+    return Window(
+        ticks=ticks, missed=end.missed - begin.missed, cpu_us=(end.process.cpu_ns - begin.process.cpu_ns) / ticks / 1e3,
+        frames=(_sent(end) - _sent(begin)) / ticks, instructions=None if executed is None else executed / ticks,
+        calls=None if traced is None else sum(traced[0].values()) / traced[1], states=states,
+    )  # fmt: skip
+
+
+def _sent(facts: Facts) -> int:
+    return sum(bus.sent for bus in facts.buses)
+
+
+def judge(found: dict[str, list[Window]]) -> dict[str, Any]:
+    """The figures: medians of each side, whether its counts are the same, and the ratio of the processor times.
+
+    ``same`` of a count is None where it was not counted.  ``reached`` is false when a count differs or the ratio is
+    certainly missed; a ratio whose interval holds the limit is inconclusive, and no failure.
+    """
+    counts = {name: _compared(found, name) for name in ("calls", "frames", "instructions")}
+    ratio = compared([w.cpu_us for w in found["none"]], [w.cpu_us for w in found["open"]], MIN_RATIO)
+    return {
+        "counts": counts,
+        "cpu": {side: round(statistics.median(w.cpu_us for w in found[side]), 1) for side in found} | ratio,
+        "missed": {side: sum(w.missed for w in found[side]) for side in found},
+        "ticks": {side: sum(w.ticks for w in found[side]) for side in found},
+        "states": sum(w.states for w in found["open"]),
+        "reached": ratio["verdict"] != "missed" and all(c["same"] is not False for c in counts.values()),
+    }
+
+
+def _compared(found: dict[str, list[Window]], name: str) -> dict[str, Any]:
+    sides: dict[str, float] = {}
+    for side, windows in found.items():
+        values = [value for w in windows if (value := getattr(w, name)) is not None]
+        if not values:
+            return {"none": None, "open": None, "same": None}
+        sides[side] = statistics.median(values)
+    same = abs(sides["open"] - sides["none"]) <= SAME * sides["none"]
+    return {side: round(value, 2) for side, value in sides.items()} | {"same": same}
+
+
+def environment() -> dict[str, str]:
+    """What the figures depend on."""
+    return {"python": platform.python_version(), "machine": platform.machine()} | host_activity.describe()

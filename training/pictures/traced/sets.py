@@ -1,0 +1,146 @@
+"""The picture sets of the mask network: path-traced by the own tracer or by Blender, analytic, and by pybullet."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from training.common.dataset_error import DatasetError
+from training.pictures import meshed
+from training.pictures.piles import MACHINES, Pile, chunk
+from training.pictures.samples import write
+from training.pictures.traced.production import DRAWN_OF_A_FILE, finished, produce
+from training.pictures.traced.scenes import Assets, Format, describe
+from training.pictures.traced.tracer import compiler, library
+
+OWN, BLENDER, ANY = "own", "blender", "any"
+RENDERERS: Final = (ANY, OWN, BLENDER)
+NUMBERS_OF_A_SEED: Final = 100_000
+STEREO_SHARE: Final = 0.22
+BLENDER_SAMPLES: Final = 10
+WORKER: Final = "training.pictures.traced.blender.worker"
+
+
+@dataclass(frozen=True, slots=True)
+class SetPlan:
+    """How much of which set: traced scenes of ``views`` pictures, analytic and pybullet pictures, their side [px],
+    chunks of piles of each machine, and the seed."""
+
+    scenes: int = 707
+    drawn: int = 1080
+    meshed: int = 250
+    seed: int = 0
+    size_px: int = 512
+    views: int = 2
+    chunks: int = 2
+
+    def numbers(self, pictures: int, of_a_file: int = 1) -> range:
+        """The numbers of the files that hold so many pictures."""
+        first = self.seed * NUMBERS_OF_A_SEED
+        return range(first, first + -(-pictures // of_a_file))
+
+
+def renderer(asked: str, blender_python: Path | None = None) -> str:
+    """The path tracer to use: the one that is asked for, otherwise the first that is installed.
+
+    Raises:
+        DatasetError: it is not installed.
+    """
+    own = compiler() is not None
+    blender = blender_python is not None or find_spec("bpy") is not None
+    if asked in (OWN, ANY) and own:
+        return OWN
+    if asked in (BLENDER, ANY) and blender:
+        return BLENDER
+    needs = {
+        OWN: "the own path tracer needs a compiler: install g++ (or CUDA's nvcc beside a GPU)",
+        BLENDER: "Blender's path tracer needs its Python package: pip install bpy==4.2.0 in an environment of its own, "
+        "then --blender-python ITS/bin/python",
+        ANY: "no path tracer is installed: install g++ (or CUDA's nvcc beside a GPU), or Blender's Python package "
+        "bpy==4.2.0 in an environment of its own, then --blender-python ITS/bin/python",
+    }
+    raise DatasetError("dataset.no-renderer", needs[asked])
+
+
+def produce_sets(
+    folder: Path, plan: SetPlan, which: str, workers: int, blender_python: Path | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> None:  # fmt: skip
+    """Draw what is missing of the sets in ``folder``; what is there is not drawn again.
+
+    Raises:
+        DatasetError: the renderer is not installed or failed, or the piles cannot be read.
+    """
+    chosen = renderer(which, blender_python)
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = range(plan.chunks)
+    piles = [pile for machine in MACHINES for n in numbers for pile in chunk(machine, n, tick=lambda: tell("pile"))]
+    own = chosen == OWN
+    if own and plan.scenes:
+        try:
+            library(folder / "compiled")  # here, so that an error is told once and not by each process
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise DatasetError("dataset.tracer-not-compiled", f"the path tracer was not compiled: {error}") from None
+    form = Format(plan.size_px, 0 if own else BLENDER_SAMPLES, plan.views, STEREO_SHARE)
+    drawn = plan.numbers(plan.drawn, DRAWN_OF_A_FILE)
+    chunks = dict.fromkeys(MACHINES, numbers)
+    produce(folder, plan.numbers(plan.scenes) if own else (), drawn, chunks, form, workers, tell)
+    if not own:
+        blender_files(folder, plan, piles, form, workers, blender_python or Path(sys.executable), tell)
+    for k in plan.numbers(plan.meshed, meshed.PER_FILE):
+        tell(meshed.one_file(folder, k, piles, plan.size_px).name)
+
+
+def blender_files(
+    folder: Path, plan: SetPlan, piles: list[Pile], form: Format, workers: int, python: Path,
+    tell: Callable[[str], None],
+) -> None:  # fmt: skip
+    """The traced files, drawn by Blender in processes of their own: ``bpy`` is never imported here."""
+    wanted = [k for k in plan.numbers(plan.scenes) if not (folder / f"traced{k:05d}.npz").is_file()]
+    work = folder / "blender"
+    (work / "scenes").mkdir(parents=True, exist_ok=True)
+    for k in wanted:
+        scene = describe(random.Random(f"traced set {k}").choice(piles), k, Assets(), form)
+        (work / "scenes" / f"{k:05d}.json").write_text(json.dumps(scene))
+    root = Path(__file__).parents[3]
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    running = [
+        subprocess.Popen([str(python), "-m", WORKER, str(work), str(threads), str(n), str(workers)], env=environment)
+        for n in range(workers if wanted else 0)
+    ]
+    try:
+        failed = [one for one in running if one.wait()]
+    finally:
+        for one in running:
+            one.terminate()
+    if failed:
+        raise DatasetError(
+            "dataset.blender-failed", f"{len(failed)} of {workers} Blender processes failed; what they said is above"
+        )
+    for k in wanted:
+        write(folder / f"traced{k:05d}.npz", list(blender_views(work, k)), compressed=False)
+        (work / "scenes" / f"{k:05d}.json").unlink()
+        tell(f"traced{k:05d}.npz")
+    shutil.rmtree(work)
+
+
+def blender_views(work: Path, number: int) -> Iterator[Any]:
+    """The samples of a scene that Blender's worker drew in ``work``."""
+    scene = json.loads((work / "scenes" / f"{number:05d}.json").read_text())
+    for j, view in enumerate(scene["views"]):
+        with np.load(work / "pictures" / f"{number:05d}-{j}.npz", allow_pickle=False) as kept:
+            matched = kept["matched_m"] if "matched_m" in kept.files else None
+            light = kept["light"].astype(np.float32)
+            yield finished(light, kept["depth_m"], kept["ids"], scene, view, matched)

@@ -1,0 +1,180 @@
+"""The project's own path tracer (``kernel/``): the same scenes as Blender draws, hundreds of times faster on a GPU.
+
+It knows no photographs and no skies but its own; in exchange it draws barks and soils that nobody named.  The library
+is compiled on first use: by nvcc for a GPU, by g++ for the processor.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from training.pictures.traced.packing import packed_look
+from training.pictures.traced.staging import pieces
+
+GPU: Final = Path("/dev/nvidiactl")
+SOURCES: Final = Path(__file__).parent / "kernel"
+FINE: Final = np.dtype([("normals", "f4", (3, 3)), ("look", "i4"), ("body", "i4"), ("end", "i4")])
+BODY: Final = np.dtype([("turn", "f4", 9), ("at", "f4", 3), ("number", "i4")])
+LAMP: Final = np.dtype([("at", "f4", 3), ("way", "f4", 3), ("tone", "f4", 3), ("edge", "f4")])
+LIGHT: Final = np.dtype([
+    ("zenith", "f4", 3), ("horizon", "f4", 3), ("below", "f4", 3), ("sun_way", "f4", 3), ("sun_tone", "f4", 3),
+    ("sun_edge", "f4"), ("glow", "f4"), ("backdrop", "f4"), ("backdrop_height", "f4"), ("backdrop_seed", "f4"),
+    ("trees", "f4", 3), ("lamps", "f4"), ("lamp", LAMP, 4),
+])  # fmt: skip
+VIEW: Final = np.dtype([
+    ("eye", "f4", 3), ("right", "f4", 3), ("down", "f4", 3), ("ahead", "f4", 3), ("lens", "f4", 4), ("size", "i4", 2),
+    ("samples", "i4"), ("seed", "u4"),
+])  # fmt: skip
+
+
+def compiler() -> str | None:
+    """The compiler of the tracer: nvcc beside a GPU, otherwise g++, None without either."""
+    nvcc = shutil.which("nvcc", path=f"{os.environ.get('PATH', '')}:/usr/local/cuda/bin") if GPU.exists() else None
+    return nvcc or shutil.which("g++")
+
+
+def library(folder: Path) -> ctypes.CDLL:
+    """The compiled tracer, kept in ``folder``."""
+    text = b"".join((SOURCES / name).read_bytes() for name in ("vector.h", "surfaces.h", "tracer.cu"))
+    found_compiler = compiler() or "g++"
+    nvcc = Path(found_compiler).name == "nvcc"
+    kind = "gpu" if nvcc else "cpu"
+    file = folder / f"tracer-{kind}-{hashlib.sha256(text).hexdigest()[:12]}.so"
+    if not file.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        draft = file.with_suffix(f".{os.getpid()}.part")
+        if nvcc:
+            command = [found_compiler, "-O3", "--use_fast_math", "-arch=native", "-Xcompiler", "-fPIC"]
+        else:
+            command = [
+                found_compiler,
+                "-x",
+                "c++",
+                "-O3",
+                "-ffast-math",
+                "-fno-finite-math-only",
+                "-march=native",
+                "-fPIC",
+            ]
+        subprocess.run([*command, "-shared", "-o", str(draft), str(SOURCES / "tracer.cu")], check=True)
+        draft.replace(file)
+    found = ctypes.CDLL(str(file))
+    found.scene_new.restype = ctypes.c_void_p
+    return found
+
+
+class Tracer:
+    """One scene ready to be drawn; ``close`` frees it."""
+
+    def __init__(self, code: ctypes.CDLL, scene: Mapping[str, Any]) -> None:
+        self._code = code
+        tris, fine, bodies, looks = packed(scene)
+        self._scene = ctypes.c_void_p(code.scene_new(
+            _at(tris), _at(fine), len(tris), _at(bodies), len(bodies), _at(looks), len(looks)))  # fmt: skip
+
+    def close(self) -> None:
+        """Free the scene."""
+        if self._scene:
+            self._code.scene_free(self._scene)
+            self._scene = ctypes.c_void_p()
+
+    def draw(
+        self, view: Mapping[str, Any], samples: int, shift_m: float = 0.0, seed: int = 0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Linear light (H, W, 3), optical depth (H, W) [m], NaN for the sky, and numbers (H, W) uint8 of a view."""
+        turn, one = np.array(view["turn"]), np.zeros((), VIEW)
+        one["eye"] = np.array(view["eye_m"]) + shift_m * turn[:, 0]
+        one["right"], one["down"], one["ahead"] = turn.T
+        one["lens"] = view["focal_px"], view["focal_px"], view["cx_px"], view["cy_px"]
+        one["size"], one["samples"], one["seed"] = (view["width_px"], view["height_px"]), samples, view["seed"] + seed
+        shape = (view["height_px"], view["width_px"])
+        light, depth, ids = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8)
+        lit = packed_light(view["light"])
+        if self._code.render(self._scene, _at(lit), _at(one), _at(light), _at(depth), _at(ids)):
+            raise RuntimeError("the tracer failed on the GPU")
+        return light, depth, ids
+
+
+def _at(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def packed(scene: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles (N, 3, 3), their details (N,), bodies (B,) and looks (L, floats) of a scene."""
+    tris: list[np.ndarray] = []
+    fine: list[np.ndarray] = []
+    bodies: list[Any] = []
+    looks: list[np.ndarray] = []
+    known: dict[str, int] = {}
+    cut: dict[int, tuple[Any, ...]] = {}
+    for piece in pieces(scene):
+        if id(piece.shape) not in cut:
+            cut[id(piece.shape)] = (piece.shape, *_triangles(piece.shape))
+        _, corners, normals, slots = cut[id(piece.shape)]
+        numbers = []
+        for look in piece.looks:
+            name = repr(look)
+            if name not in known:
+                known[name] = len(looks)
+                looks.append(packed_look(look))
+            numbers.append(known[name])
+        turn = np.asarray(piece.turn)
+        detail = np.zeros(len(corners), FINE)
+        detail["normals"] = normals @ turn.T
+        detail["look"] = np.array(numbers)[np.minimum(slots, len(numbers) - 1)]
+        detail["body"] = len(bodies)
+        detail["end"] = [look["what"] == "end" for look in piece.looks] and np.array(
+            [look["what"] == "end" for look in piece.looks])[np.minimum(slots, len(numbers) - 1)]  # fmt: skip
+        tris.append((piece.scale * corners @ turn.T + piece.position_m).astype(np.float32))
+        fine.append(detail)
+        bodies.append((turn.T.ravel(), piece.position_m, piece.number))
+    return np.concatenate(tris), np.concatenate(fine), np.array(bodies, BODY), np.stack(looks)
+
+
+def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners (N, 3, 3), normals (N, 3, 3) and slots (N,) of a shape's triangles."""
+    quad = shape.faces[:, 3] >= 0
+    rows = np.concatenate([shape.faces[:, :3], shape.faces[quad][:, [0, 2, 3]]])
+    slots, smooth = (np.concatenate([a, a[quad]]) for a in (shape.slot, shape.smooth))
+    corners = shape.vertices[rows]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.repeat(flat[:, None], 3, axis=1)
+    if smooth.any():
+        sums = np.zeros_like(shape.vertices)
+        np.add.at(sums, rows[smooth].ravel(), np.repeat(flat[smooth], 3, axis=0))
+        if shape.uv is not None:  # the seam of a stem is one place
+            _, same = np.unique(shape.vertices.round(6), axis=0, return_inverse=True)
+            joined = np.zeros((same.max() + 1, 3))
+            np.add.at(joined, same.ravel(), sums)
+            sums = joined[same.ravel()]
+        normals[smooth] = sums[rows[smooth]]
+    size = np.linalg.norm(normals, axis=2, keepdims=True)
+    return corners, normals / np.maximum(size, 1e-12), slots
+
+
+def packed_light(look: Mapping[str, Any]) -> np.ndarray:
+    """The light of a view for the kernel."""
+    one = np.zeros((), LIGHT)
+    own = look["own"]
+    for name in ("zenith", "horizon", "below", "sun_tone", "trees"):
+        one[name] = own[name]
+    for name in ("sun_edge", "glow", "backdrop", "backdrop_height", "backdrop_seed"):
+        one[name] = own[name]
+    up, way = look["elevation_rad"], look["azimuth_rad"]
+    one["sun_way"] = np.cos(up) * np.cos(way), np.cos(up) * np.sin(way), np.sin(up)
+    lamps: Sequence[Any] = look["lamps"][:4]
+    one["lamps"] = len(lamps)
+    for k, lamp in enumerate(lamps):
+        ahead = np.array(lamp["target_m"]) - lamp["at_m"]
+        one["lamp"][k]["at"], one["lamp"][k]["way"] = lamp["at_m"], ahead / np.linalg.norm(ahead)
+        one["lamp"][k]["tone"], one["lamp"][k]["edge"] = np.array(lamp["tone"]) * lamp["watts"] * 0.025, 0.62
+    return one
