@@ -6,10 +6,11 @@ Every command group lives in a module of ``timberhand.commands`` that imports no
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,7 +19,9 @@ from runtime.errors import CodedError
 from timberhand.commands import (
     bench,
     calibrate,
+    campaign,
     compile_tick,
+    config,
     console,
     dbc,
     demo,
@@ -26,11 +29,14 @@ from timberhand.commands import (
     experiment,
     hil,
     inject,
+    machine,
     mission,
+    operator,
     plan,
     plan_learn,
     record,
     recording,
+    release,
     replay,
     report,
     service,
@@ -40,6 +46,9 @@ from timberhand.commands import (
     why,
 )
 from timberhand.deprecated import current_spelling
+
+if TYPE_CHECKING:
+    from controller.guard.layout import GuardConfigError
 
 SENTENCE = "Autonomous control of a log-loading forestry machine: crane control over CAN, planning, physics plant."
 app = typer.Typer(
@@ -74,6 +83,7 @@ app.command("demo")(demo.demo)
 app.command("calibrate")(calibrate.calibrate)
 app.command("survey-camera")(survey_camera.survey_camera)
 app.command("experiment")(experiment.experiment)
+app.command("campaign")(campaign.campaign)
 app.command("report")(report.report)
 app.command("inject")(inject.inject)
 app.command("replay")(replay.replay)
@@ -82,16 +92,20 @@ app.command("record")(record.record)
 app.command("console")(console.console)
 app.command("doctor")(doctor.doctor)
 app.command("compile")(compile_tick.compile_tick)
+app.add_typer(config.app, name="config")
+app.add_typer(machine.app, name="machine")
 app.add_typer(dbc.app, name="dbc")
 app.add_typer(recording.app, name="recording")
 app.add_typer(plan.app, name="plan")
 plan.app.command("learn")(plan_learn.learn)
 plan.app.command("demonstrate")(plan_learn.demonstrate)
 app.add_typer(mission.app, name="mission")
+app.add_typer(operator.app, name="operator")
 app.add_typer(bench.app, name="bench")
 app.add_typer(hil.app, name="hil")
 app.add_typer(sim.app, name="sim")
 app.add_typer(service.app, name="service")
+app.add_typer(release.app, name="release")
 app.add_typer(train.app, name="train")
 
 
@@ -110,14 +124,61 @@ def main() -> None:
     for note in notes:
         print(f"timberhand: {note}", file=sys.stderr)
     sys.argv[1:] = arguments
+    if "--help" in arguments:
+        from timberhand import option_help
+
+        option_help.install()
     try:
-        app()
+        _run()
     except CommandFailed as failure:
         print(f"timberhand: {failure}{f' [{failure.code}]' if failure.code else ''}", file=sys.stderr)
         sys.exit(failure.exit_code)
-    except CodedError as error:
+    except Exception as error:  # not an exit: after a removal there is nothing left to import
+        if not isinstance(error, _coded_errors()):
+            raise
         print(f"timberhand: {error} [{error.code}]", file=sys.stderr)
         sys.exit(ExitCode.CONFIGURATION)
+
+
+def _run() -> None:
+    """The command; one whose packages are not installed here says which.
+
+    Raises:
+        CommandFailed: an optional package is missing.
+    """
+    try:
+        app()
+    except ModuleNotFoundError as error:
+        if (extra := _extra_with(error.name or "")) is None:
+            raise
+        bundle = ", or install a bundle that was made with --with-plant" if extra == "sim" else ""
+        raise CommandFailed(
+            "package.missing",
+            f"{error.name} is missing, which this command needs: pip install 'timberhand[{extra}]'{bundle}",
+            ExitCode.CONFIGURATION,
+        ) from None
+
+
+def _extra_with(module: str) -> str | None:
+    """The optional group of packages that brings a module, which is named as its package; None when none does."""
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        groups = metadata.metadata("timberhand").get_all("Provides-Extra") or []
+        for need in map(Requirement, metadata.requires("timberhand") or ()):
+            if need.marker and canonicalize_name(need.name) == canonicalize_name(module.partition(".")[0]):
+                return next((group for group in groups if need.marker.evaluate({"extra": group})), None)
+    return None
+
+
+def _coded_errors() -> tuple[type[CodedError], type[GuardConfigError]]:
+    """Errors whose sentence is for the user; the guard, which shares no code with us, has one of its own."""
+    from controller.guard.layout import GuardConfigError
+
+    return CodedError, GuardConfigError
 
 
 if __name__ == "__main__":

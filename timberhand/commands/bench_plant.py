@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from timberhand.commands.options import JsonOption, ProfileOption, TruthOption
+from timberhand.commands.options import JsonOption, ProfileOption, TruthOption, truth_of
 
 
 def plant(
@@ -30,7 +30,7 @@ def plant(
     from host.exit_codes import ExitCode
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
-    metrics, noisy, _ = measure(profile, truth, quick, screen)
+    metrics, noisy, _ = measure(profile, truth_of(profile, truth), quick, screen)
     missed, inconclusive = evaluate(METRICS, metrics, noisy)
     if as_json:
         verdict = {"missed": missed, "inconclusive": inconclusive, "noisy": noisy}

@@ -67,6 +67,8 @@ def tick(
     def progress(text: str) -> None:
         print(f"bench: {text}", file=sys.stderr, flush=True)
 
+    if against and (random or counted):
+        raise typer.BadParameter("--against compares costs; leave --random and --count out")
     key = compare.need_build()
     with tempfile.TemporaryDirectory() as folder:
         places = recordings or compare.kept_recordings(Path(folder))

@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands.options import truth_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection, Sequence
 
     from rich.console import Console
 
     from autonomy.calibration.live import Surveyor
     from autonomy.calibration.plan import CalibrationPlan
     from autonomy.calibration.procedure import Calibration
+    from machine.joints import Joint
     from machine.profile import Profile
 
 
@@ -31,6 +33,9 @@ def calibrate(
     survey: Annotated[
         str | None, typer.Option(help="HOST:PORT of a total station, or 'ask' to type its readings.")
     ] = None,
+    joint: Annotated[
+        list[str] | None, typer.Option(help="Test this joint only, after its valve was replaced; may be repeated.")
+    ] = None,
     controller: Annotated[str, typer.Option(help="HOST:PORT of the controller's setpoint port.")] = "127.0.0.1:47001",
     report_port: Annotated[int, typer.Option(help="Local UDP port for the state reports.")] = 47002,
     bus: Annotated[str, typer.Option(help="Bus of the crane, as in socketcan:can0; read only.")] = "wire:crane0",
@@ -39,7 +44,7 @@ def calibrate(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation before the machine moves.")] = False,
     lockstep: Annotated[bool, typer.Option(help="Calibrate a virtual machine in virtual time.")] = False,
     truth: Annotated[
-        str, typer.Option(help="With --lockstep: ground truth: nominal, sampled, or a TOML file.")
+        str, typer.Option(help="With --lockstep: ground truth: nominal, sampled, wide_valves, or a TOML file.")
     ] = "sampled",
     seed: Annotated[int, typer.Option(help="With --lockstep: chooses the virtual machine.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report's result.json on stdout.")] = False,
@@ -54,13 +59,16 @@ def calibrate(
 
       timberhand calibrate --profile palms_471 --bus socketcan:can0 --survey ask
 
+      timberhand calibrate --profile palms_471 --joint lift      under a minute
+
       timberhand calibrate --profile palms_471 --lockstep --survey sim
     """
     from rich.console import Console
 
-    from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
+    from autonomy.calibration.profile_file import ProfileNotWritten, lowered_gains, profile_changes, write_profile
     from autonomy.calibration.report import result_document, write_report
     from autonomy.calibration.result import identify
+    from machine.loading.beside import carry_envelope
     from machine.loading.profile_file import ProfileError, load_profile
 
     try:
@@ -71,15 +79,17 @@ def calibrate(
         raise CommandFailed(
             "calibrate.output-exists", f"{out} exists and is not overwritten; choose another --out", ExitCode.USAGE
         )
-    folder = report or out.with_suffix("")
+    folder, chosen = report or out.with_suffix(""), _chosen(joint)
     screen = Console(stderr=True)
     if lockstep:
-        calibration = _lockstep(profile, known, truth, seed, survey is not None, folder, screen)
+        truth = truth_of(profile, truth)
+        calibration = _lockstep(profile, known, truth, seed, survey is not None, chosen, folder, screen)
     else:
         calibration = _live(
             known,
             (controller, report_port, bus, key_file, lease_ms),
             survey,
+            chosen,
             lambda plan: _confirm(known, plan, yes),
             screen,
         )
@@ -87,6 +97,7 @@ def calibrate(
         result = identify(known, calibration.found)
     changed = profile_changes(known, result)
     facts: dict[str, Any] = {"profile": known.name, "date": _today(), "seconds": calibration.elapsed_s}
+    facts["repeated_tests"] = calibration.resumptions
     facts |= {"lockstep": {"truth": truth, "seed": seed}} if lockstep else {}
     write_report(folder, result, facts, changed)
     if as_json:
@@ -101,13 +112,29 @@ def calibrate(
         )
     try:
         write_profile(_source(profile), out, changed, facts["date"])
+        carry_envelope(_source(profile), out.parent)
     except ProfileNotWritten as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
+    if calibration.resumptions:
+        screen.print(f"tests repeated after a stop: {calibration.resumptions}", highlight=False)
     if result.survey is None:
         screen.print("zeros and sag are unchanged, because nothing was surveyed (--survey)", highlight=False)
-    for sentence in result.kept:
+    for sentence in (*lowered_gains(changed), *result.kept):
         screen.print(sentence, highlight=False)
+
+
+def _chosen(names: Sequence[str] | None) -> tuple[Joint, ...]:
+    """The named joints, or all."""
+    from machine.joints import JOINTS, Joint
+
+    try:
+        return tuple(Joint[name.upper()] for name in names) if names else tuple(JOINTS)
+    except KeyError as error:
+        known = ", ".join(j.name.lower() for j in JOINTS)
+        raise CommandFailed(
+            "calibrate.joint", f"--joint {error.args[0].lower()}: there are {known}", ExitCode.USAGE
+        ) from None
 
 
 def _today() -> str:
@@ -135,8 +162,9 @@ def _confirm(profile: Profile, plan: CalibrationPlan, yes: bool) -> None:
 
 
 def _lockstep(
-    name: str, profile: Profile, truth: str, seed: int, surveyed: bool, folder: Path, screen: Console
-) -> Calibration:
+    name: str, profile: Profile, truth: str, seed: int, surveyed: bool, chosen: Collection[Joint], folder: Path,
+    screen: Console,
+) -> Calibration:  # fmt: skip
     from hil.calibration.crane import run_lockstep
     from recorder.manifest import describe
     from recorder.recorder import Recorder, RecordingRefused
@@ -149,7 +177,7 @@ def _lockstep(
         recorder = Recorder(folder / "log", profile, describe(profile, buses, seed))
         with _Progress(screen) as progress:
             outcome = run_lockstep(
-                name, truth, seed, surveyed=surveyed, recorder=recorder,
+                name, truth, seed, surveyed=surveyed, chosen=chosen, recorder=recorder,
                 show=lambda plan: _confirm(profile, plan, yes=True), watch=progress.show,
                 aborted=lambda: bool(interrupts),
             )  # fmt: skip
@@ -176,13 +204,15 @@ def _live(
     profile: Profile,
     link_options: tuple[str, int, str, Path | None, int],
     survey: str | None,
+    chosen: Collection[Joint],
     confirm: Callable[[CalibrationPlan], None],
     screen: Console,
 ) -> Calibration:
     from autonomy.calibration import live
     from autonomy.calibration.plan import CalibrationImpossible, make_plan
     from autonomy.calibration.procedure import Calibration
-    from autonomy.calibration.procedure_state import READING_COUNT
+    from autonomy.calibration.procedure_state import PATIENCE_S, READING_COUNT
+    from autonomy.process.controller_link import ControllerLink
     from can_dbc.bus.base import BusError
     from can_dbc.bus.factory import open_bus
     from can_dbc.dbc.codec import load
@@ -202,7 +232,7 @@ def _live(
         where = udp_address(controller)
         reader = _surveyor(survey, screen)
         key = key_file.read_bytes().strip() if key_file else None
-        link = live.ControllerLink(where, report_port, profile_hash(profile), key)
+        link = ControllerLink(where, report_port, profile_hash(profile), key)
     except ValueError as error:
         raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     except OSError as error:
@@ -223,10 +253,13 @@ def _live(
                 f"no controller in STANDBY reports on port {report_port} within 10 s; start it",
                 ExitCode.BUS,
             )
-        plan = make_plan(profile, report.position, survey is not None)
+        plan = make_plan(profile, report.position, survey is not None, chosen)
         confirm(plan)
         readings = 1 if survey == "ask" else READING_COUNT
-        run = Calibration(profile, profile_hash(profile), plan, load("crane"), lease_ms * 1_000_000, key, readings)
+        lease_ns = lease_ms * 1_000_000
+        run = Calibration(
+            profile, profile_hash(profile), plan, load("crane"), lease_ns, key, readings, patience_s=PATIENCE_S
+        )
         before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
         try:
             with (
@@ -237,7 +270,7 @@ def _live(
                 def watch(calibration: Calibration) -> None:
                     if interrupts:
                         calibration.abort("interrupted")
-                        calibration.idle = calibration.idle or calibration.begun_ns is None
+                        calibration.idle = calibration.idle or calibration.waiting is not None
                     shown.show(calibration)
 
                 live.run(run, link, bus_frames, reader, watch)
@@ -320,33 +353,17 @@ class _Progress:
 
     def show(self, calibration: Calibration) -> None:
         """Show the present state of the run."""
+        from autonomy.calibration.tasks import task_name
+
         left = calibration.remaining_s()
-        if calibration.waiting and calibration.begun_ns is None and calibration.waiting != self._waiting:
+        if calibration.waiting != self._waiting:
             self._waiting = calibration.waiting
-            self._screen.print(f"waiting for ARM: {self._waiting}", highlight=False)
+            if self._waiting is not None:
+                self._screen.print(f"waiting for ARM: {self._waiting}", highlight=False)
         whole = max(calibration.elapsed_s + left, 1.0)
         self._bar.update(
-            self._task, completed=calibration.elapsed_s / whole, description=_task_name(calibration), left=left
+            self._task, completed=calibration.elapsed_s / whole, description=task_name(calibration.task), left=left
         )
-
-
-def _task_name(calibration: Calibration) -> str:
-    from autonomy.calibration.tasks import GrappleTask, MoveTask, PinReadingTask, PulseTask, SpoolTask, YawReadingTask
-
-    match calibration.task:
-        case SpoolTask(joint=j, side=side, kind=kind):
-            return f"{j.name.lower()} {'+' if side > 0 else '-'} {kind}"
-        case MoveTask(why=why):
-            return f"travels {why}"
-        case GrappleTask(command=command):
-            return f"grapple: {command.name.lower()}"
-        case PinReadingTask(number=number):
-            return f"survey pose {number + 1}"
-        case PulseTask(joint=j, side=side):
-            return f"{j.name.lower()} {'+' if side > 0 else '-'} turn"
-        case YawReadingTask(number=number):
-            return f"direction of the grapple {number + 1}"
-    return "waiting"
 
 
 def _show(result: Any, screen: Console) -> None:

@@ -12,12 +12,14 @@ import typer
 
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
+    FoxglovePortOption,
     MaxStopsOption,
     PageOption,
     PagePortOption,
     ProfileOption,
     SummaryOption,
     TruthOption,
+    truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
 
@@ -50,6 +52,7 @@ def demo(
     ] = None,
     console: PageOption = True,
     console_port: PagePortOption = 8471,
+    foxglove: FoxglovePortOption = 0,
     limit_s: Annotated[float, typer.Option(help="Time limit of the job in seconds.")] = 300.0,
     max_stops: MaxStopsOption = 20,
     plc: Annotated[bool, typer.Option(help="Drive the valves through a PLC on Ethernet, as in paper A.")] = False,
@@ -91,7 +94,7 @@ def demo(
     from machine.loading.profile_file import ProfileError, load_profile
 
     if not lockstep:
-        enter_lab(bus, clock)
+        enter_lab(bus, clock, detects=bool(camera))
     try:
         cameras = load_profile(profile).cameras
     except ProfileError as error:
@@ -114,6 +117,7 @@ def demo(
             "--inject needs --lockstep; in a live run use `timberhand inject` from another terminal",
             ExitCode.USAGE,
         )
+    truth = truth_of(profile, truth)
     directory = out or new_directory(f"{'lockstep' if lockstep else bus.value}{'-plc' if plc else ''}-seed{seed}")
     if plc:
         from hil.plc.profile import write_plc_profile
@@ -135,7 +139,18 @@ def demo(
 
         page = console_port if console else 0
         summary = run_live(
-            profile, seed, truth, bus.value, directory, page, limit_s, max_stops, screen, plc_link.value, camera
+            profile,
+            seed,
+            truth,
+            bus.value,
+            directory,
+            page,
+            limit_s,
+            max_stops,
+            screen,
+            plc_link.value,
+            camera,
+            foxglove,
         )
     summary.show(screen)
     summary.save(directory / "summary.json")

@@ -6,17 +6,26 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from experiments.common.registry import EXPERIMENTS
-from timberhand.commands.options import ProfileOption, TruthOption
+from timberhand.commands.options import (
+    DetectorOption,
+    PlannerOption,
+    ProfileOption,
+    TruthOption,
+    check_foreign,
+    truth_of,
+)
+
+ALL: Final = "all"
 
 if TYPE_CHECKING:
     Name = StrEnum("Name", "NAME")
 else:
-    Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
+    Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in (*EXPERIMENTS, ALL)})
 
 
 class Bus(StrEnum):
@@ -28,12 +37,22 @@ class Bus(StrEnum):
 
 def experiment(
     name: Annotated[
-        Name, typer.Argument(metavar="NAME", help="; ".join(f"{n}: {e.sentence}" for n, e in EXPERIMENTS.items()))
+        Name,
+        typer.Argument(
+            metavar="NAME",
+            help="; ".join(
+                (*(f"{n}: {e.sentence}" for n, e in EXPERIMENTS.items()), "all: every experiment, after an estimate.")
+            ),
+        ),
     ],
     trials: Annotated[
         int | None, typer.Option(min=1, help="Trials of each kind (default: as in the experiment).")
     ] = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same figures, except timings.")] = 1,
+    sealed: Annotated[
+        bool,
+        typer.Option("--sealed", help="Draw the seed from the commit's hash, so that nobody can have tuned on it."),
+    ] = False,
     truth: TruthOption = "nominal",
     profile: ProfileOption = "palms_471",
     out: Annotated[Path | None, typer.Option(help="Directory of the results (default: runs/NAME).")] = None,
@@ -56,6 +75,8 @@ def experiment(
         Path | None,
         typer.Option(help="grasp-network: folder of Cornell samples on which to evaluate the shipped weights."),
     ] = None,
+    planner: PlannerOption = "",
+    detector: DetectorOption = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")] = False,
 ) -> None:
     """Run an experiment, evaluate its figures, and write result.json and plots.
@@ -71,6 +92,10 @@ def experiment(
 
       timberhand experiment plant --truth sampled --seed 7
 
+      timberhand experiment navigation --sealed       trials that nobody has seen
+
+      timberhand experiment all --quick               everything once, those in real time left out
+
       sudo timberhand experiment timing       on a quiet computer, 15 minutes
 
       timberhand experiment soak --bus vcan --minutes 30
@@ -78,30 +103,47 @@ def experiment(
     from rich.console import Console
 
     from experiments.common.registry import Options, load
+    from experiments.common.result import ROOT, commit
+    from experiments.common.seeds import sealed_seed
+    from experiments.common.standing import CHANGES, UNKNOWN
+    from experiments.common.workers import Workers
     from host.exit_codes import CommandFailed, ExitCode
-    from machine.loading.profile_file import ProfileError, load_profile
 
     if bus is Bus.VCAN and "TIMBERHAND_LAB" not in os.environ:
         from host.vcan_lab.__main__ import vcan
 
         vcan([sys.executable, "-m", "timberhand", *sys.argv[1:]])
-    try:
-        load_profile(profile)
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    truth = truth_of(profile, truth)
+    into_checkout = docs is not None and docs.resolve().is_relative_to(ROOT)
+    if (into_checkout or sealed) and (commit().endswith(CHANGES) or commit() == UNKNOWN):
+        raise CommandFailed(
+            "experiment.uncommitted",
+            "the sources are not those of a commit; a page must name one, and a sealed seed is drawn from one: commit "
+            "the changes first, or leave out --sealed and write to a folder outside the checkout with --docs",
+            ExitCode.CONFIGURATION,
+        )
+    if name.value == ALL:
+        if any((sealed, as_json, planner, detector, trials, minutes, repetitions, data)) or bus is not Bus.WIRE:
+            raise typer.BadParameter("all takes --quick, --seed, --truth, --profile, --workers, --docs and --out only")
+        common = ["--seed", str(seed), "--truth", truth, "--profile", profile]
+        _all(quick, workers, common, docs, out or Path("runs") / ALL)
+        return
+    check_foreign(name.value, planner, detector)
     options = Options(
-        seed=seed,
+        seed=sealed_seed(commit(), name.value) if sealed else seed,
         truth=truth,
         profile=profile,
         out=out or Path("runs") / name.value,
         trials=trials,
         quick=quick,
-        workers=workers or len(os.sched_getaffinity(0)),
+        workers=Workers(workers or len(os.sched_getaffinity(0))),
         docs=docs,
         minutes=minutes,
         repetitions=repetitions,
         bus=bus.value,
         data=data,
+        planner=planner,
+        detector=detector,
     )
     screen = Console(stderr=True)
     try:
@@ -119,4 +161,39 @@ def experiment(
             "experiment.figure-missed",
             f"figures missed: {', '.join(result.missed)}; see {options.out / 'result.json'}",
             ExitCode.FIGURE_MISSED,
+        )
+
+
+def _all(quick: bool, workers: int | None, common: list[str], docs: Path | None, out: Path) -> None:
+    """Every experiment: the quick pass, and unless that was asked for, the estimate and the full runs."""
+    from rich.console import Console
+
+    from experiments.common import all_experiments as every
+    from host.exit_codes import CommandFailed, ExitCode
+
+    screen, count = Console(stderr=True), workers or len(os.sched_getaffinity(0))
+    common = ["--workers", str(count), *common]
+    try:
+        found = every.perform(True, common, out / "quick", screen)
+        if not quick:
+            every.show_estimate(every.estimate_h(found, count), screen)
+            found = every.perform(False, [*common, *(["--docs", str(docs)] if docs else [])], out, screen)
+    except KeyboardInterrupt:
+        raise CommandFailed(
+            "experiment.interrupted",
+            f"interrupted; finished trials are kept in {out}, the same command continues",
+            ExitCode.INTERRUPTED,
+        ) from None
+    every.show(found, screen)
+    failed = [one.name for one in found if one.code not in (ExitCode.OK, ExitCode.FIGURE_MISSED)]
+    if failed:
+        raise CommandFailed(
+            "experiment.failed",
+            f"{', '.join(failed)} did not end with a result; run them one by one: timberhand experiment NAME",
+            ExitCode.CONFIGURATION,
+        )
+    missed = [one.name for one in found if one.code == ExitCode.FIGURE_MISSED]
+    if missed and not quick:
+        raise CommandFailed(
+            "experiment.figure-missed", f"figures missed in: {', '.join(missed)}; see {out}", ExitCode.FIGURE_MISSED
         )

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.commands.options import ProfileOption, TruthOption
+from timberhand.commands.options import ProfileOption, TruthOption, truth_of
 
 
 def inject(
@@ -63,7 +63,7 @@ def inject(
             math.nan if size is None else size, seed,
         )  # fmt: skip
         if lockstep:
-            _in_lockstep(profile, seed, truth, order)
+            _in_lockstep(profile, seed, truth_of(profile, truth), order)
             return
         from hil.faults.live import LiveTarget
         from hil.faults.live import inject as inject_live

@@ -11,12 +11,16 @@ import typer
 
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
+    FoxglovePortOption,
     MaxStopsOption,
     PageOption,
     PagePortOption,
     ProfileOption,
     SummaryOption,
+    Terrain,
+    TerrainOption,
     TruthOption,
+    truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
 
@@ -56,13 +60,14 @@ def run(
     ] = ManagerKind.OWN,
     detector: Annotated[
         DetectorKind,
-        typer.Option(help="Log detector: perfect, or the front camera with paper B's or our own pipeline (lockstep)."),
+        typer.Option(help="Log detector: perfect, or the front camera with paper B's or our own pipeline."),
     ] = DetectorKind.PERFECT,
     logs: Annotated[
         int, typer.Option(min=0, help="Lay this many logs along the route instead of those of the mission.")
     ] = 0,
     profile: ProfileOption = "aoro_fc8",
     truth: TruthOption = "nominal",
+    terrain: TerrainOption = Terrain.FLAT,
     out: Annotated[
         Path | None, typer.Option(help="Directory of the recording (default: a new one below runs/).")
     ] = None,
@@ -70,6 +75,7 @@ def run(
     clock: ClockOption = ClockChoice.AUTO,
     console: PageOption = True,
     console_port: PagePortOption = 8471,
+    foxglove: FoxglovePortOption = 0,
     max_stops: MaxStopsOption = 20,
     limit_s: Annotated[float, typer.Option(help="Time limit of the mission in seconds of machine time.")] = 7200.0,
     as_json: SummaryOption = False,
@@ -83,7 +89,11 @@ def run(
 
       timberhand mission run docs/examples/paper_b.geojson --lockstep
 
+      timberhand mission run docs/examples/paper_b.geojson --lockstep --terrain drawn
+
       timberhand mission run docs/examples/paper_b.geojson --bus vcan
+
+      timberhand mission run docs/examples/paper_b.geojson --detector own
 
       timberhand mission run docs/examples/paper_b.geojson --manager paper-b
     """
@@ -96,7 +106,7 @@ def run(
     from machine.loading.profile_file import ProfileError, load_profile
 
     if not lockstep:
-        enter_lab(bus, clock)
+        enter_lab(bus, clock, detects=detector is not DetectorKind.PERFECT)
     try:
         machine = load_profile(profile)
         carrier = machine.carrier
@@ -104,21 +114,27 @@ def run(
         mission = load_mission(file, route_wanted=True, site=site).mission
     except (MissionError, ProfileError) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    truth = truth_of(profile, truth)
     directory = out or new_directory(f"mission-{file.stem}-{manager.value}-seed{seed}")
     screen = Console(stderr=as_json)
     if lockstep:
         from hil.missions.lockstep import run_mission
 
         summary = run_mission(
-            mission, profile, seed, truth, TABLES[manager], logs, directory, limit_s, screen, DETECTORS[detector]
-        )
+            mission, profile, seed, truth, TABLES[manager], logs, directory, limit_s, screen, DETECTORS[detector],
+            terrain.value,
+        )  # fmt: skip
     else:
         from hil.harness.live import LiveOptions
         from hil.missions.live import run_live_mission
 
         page = console_port if console else 0
-        options = LiveOptions(profile, machine, seed, truth, bus.value, directory, page, limit_s, max_stops)
-        summary = run_live_mission(file, mission, options, TABLES[manager], logs, screen)
+        options = LiveOptions(
+            profile, machine, seed, truth, bus.value, directory, page, limit_s, max_stops, foxglove_port=foxglove
+        )
+        summary = run_live_mission(
+            file, mission, options, TABLES[manager], logs, screen, terrain.value, DETECTORS[detector]
+        )
     summary.show(screen)
     summary.save(directory / "summary.json")
     if as_json:

@@ -2,18 +2,75 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
+
+
+class Terrain(StrEnum):
+    """The ground under the machine."""
+
+    FLAT = "flat"
+    ROUGH = "rough"
+    SLOPE = "slope"
+    HILL = "hill"
+    MUD = "mud"
+    DRAWN = "drawn"
+
+
+TerrainOption = Annotated[
+    Terrain,
+    typer.Option("--terrain", help="Ground: drawn is a slope with ruts, stones and stumps, which follow the seed."),
+]
 ProfileOption = Annotated[str, typer.Option("--profile", help="Machine profile: a shipped name or a TOML file.")]
 TruthOption = Annotated[
-    str, typer.Option("--truth", help="Hidden ground truth of the plant: nominal, sampled, or a TOML file.")
+    str,
+    typer.Option(
+        "--truth",
+        help="Hidden ground truth of the plant: nominal, sampled or wide_valves, of a TOML file as in sampled:FILE; "
+        "NAME.truth.toml beside the profile is used by itself.",
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
 PageOption = Annotated[bool, typer.Option("--console/--no-console", help="Serve the operator's page (live).")]
 PagePortOption = Annotated[int, typer.Option("--console-port", help="Port of the operator's page on localhost.")]
+FoxglovePortOption = Annotated[
+    int,
+    typer.Option(
+        "--foxglove", metavar="PORT", help="Also serve the run to Foxglove and Lichtblick, read-only (live; 0: not)."
+    ),
+]
 MaxStopsOption = Annotated[
     int, typer.Option("--max-stops", help="Stops after which the emulated operator gives up (live).")
 ]
+PlannerOption = Annotated[
+    str, typer.Option("--planner", help="grasp-configs: a foreign grasp planner, by entry point, compared with ours.")
+]
+DetectorOption = Annotated[
+    str, typer.Option("--detector", help="grasp-configs: a foreign log detector, by entry point, compared with ours.")
+]
+
+
+def check_foreign(experiment: str, planner: str, detector: str) -> None:
+    """Refuse a foreign method where nothing would use it."""
+    if (planner or detector) and experiment != "grasp-configs":
+        raise typer.BadParameter("--planner and --detector are options of grasp-configs")
+
+
+def truth_of(profile: str, truth: str) -> str:
+    """The choice of ``--truth`` for the machine of ``--profile``: with the file beside a profile of one's own.
+
+    Raises:
+        CommandFailed: the profile cannot be used.
+    """
+    from machine.loading.profile_file import ProfileError, load_profile
+    from sim.individual import beside
+
+    try:
+        return beside(profile, load_profile(profile).name, truth)
+    except ProfileError as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None

@@ -70,34 +70,40 @@ def check(
 @app.command()
 def convert(
     file: File,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="GeoJSON file to write.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .geojson, .plan, .gpx or .kml.")],
     logs: Logs = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Convert a mission to GeoJSON, the native format, which can hold every property of a mission.
+    """Convert a mission; GeoJSON, the native format, holds every property, the others say what they leave out.
 
     [bold]Examples[/bold]
 
       timberhand plan convert route.plan mission.geojson
 
       timberhand plan convert route.kml mission.geojson --logs harvest.hpr
+
+      timberhand plan convert mission.geojson route.plan
     """
     import json
 
-    from autonomy.missions.mission_file import load_mission, save_mission
+    from autonomy.missions.export import FORMATS, export
+    from autonomy.missions.mission_file import load_mission, save_bytes
     from autonomy.missions.model import MissionError
 
-    if out.suffix.lower() not in (".geojson", ".json"):
+    kind = {"json": "geojson"}.get(out.suffix.lower()[1:], out.suffix.lower()[1:])
+    if kind not in FORMATS:
         raise CommandFailed(
             "plan.output-format",
-            f"{out}: missions are written as GeoJSON; name it {out.with_suffix('.geojson')}",
+            f"{out}: missions are written as {', '.join(FORMATS)}; name it {out.with_suffix('.geojson')}",
             ExitCode.USAGE,
         )
     try:
         draft = load_mission(file, logs=logs)
-        save_mission(out, draft.mission)
+        exported = export(draft.mission, kind)
+        save_bytes(out, exported.data)
     except MissionError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    draft.notes += [f"{what} not in {out.name}: {kind} does not hold it" for what in exported.left_out]
     if as_json:
         typer.echo(json.dumps(_facts(file, draft, None) | {"out": str(out)}, indent=2))
         return

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.commands.options import ProfileOption, TruthOption
+from timberhand.commands.options import ProfileOption, TruthOption, truth_of
 
 
 def learn(
@@ -113,7 +113,7 @@ def demonstrate(
                 profile,
                 seed,
                 targets,
-                truth,
+                truth_of(profile, truth),
                 recorder,
                 lambda done, total: bar.update(task, completed=done, total=total),
             )

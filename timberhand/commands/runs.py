@@ -7,9 +7,14 @@ import sys
 from enum import StrEnum
 from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
+
+NO_WAIT = "TIMBERHAND_NO_WAIT"
+"""This variable starts a live run at once, whatever is being compiled."""
+ENOUGH_PROCESSORS = 4
+"""From so many on a compiler of the lowest priority does not disturb a live run."""
 
 
 class Backend(StrEnum):
@@ -44,16 +49,33 @@ ClockOption = Annotated[
 ]
 
 
-def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO) -> None:
-    """For vcan outside the lab: run this command again inside it, and exit with its code.
+DETECTOR_MEM_MB: Final = 3072
+"""Memory of a user-mode kernel with a detector: with less, the network's weights and the renderer drive each other out
+of it, and every process waits for them to be read again."""
 
-    Where that is user-mode Linux, the clock is chosen by the processor time that the host leaves, and announced.
+
+def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool = False) -> None:
+    """Prepare a live run.  For vcan outside the lab: run this command again inside it, and exit with its code.
+
+    On a machine of few processors it waits for a compiler that the set-up left in the background.  Where the lab is
+    user-mode Linux, the clock is chosen by the processor time that the host leaves, and announced; ``detects``: a
+    camera's detector runs in it.
     """
-    if bus is Backend.VCAN and "TIMBERHAND_LAB" not in os.environ:
+    if "TIMBERHAND_LAB" in os.environ:
+        return
+    if NO_WAIT not in os.environ and len(os.sched_getaffinity(0)) < ENOUGH_PROCESSORS:
+        from host.compiled.build import await_builder
+
+        await_builder(lambda words: print(words, file=sys.stderr))
+    if bus is Backend.VCAN:
         from host.vcan_lab.__main__ import vcan
+        from host.vcan_lab.spec import DEFAULT_MEM_MB
 
         simulated = clock is ClockChoice.SIMULATED or (clock is ClockChoice.AUTO and _simulates())
-        vcan([sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])], time_travel=simulated)
+        vcan(
+            [sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])], time_travel=simulated,
+            mem=DETECTOR_MEM_MB if detects else DEFAULT_MEM_MB,
+        )  # fmt: skip
 
 
 def _simulates() -> bool:

@@ -10,19 +10,9 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.commands.options import ProfileOption, TruthOption
+from timberhand.commands.options import ProfileOption, Terrain, TerrainOption, TruthOption, truth_of
 
 app = typer.Typer(no_args_is_help=True, help="View the simulated plant live, or write a picture of it.")
-
-
-class Terrain(StrEnum):
-    """The terrain."""
-
-    FLAT = "flat"
-    ROUGH = "rough"
-    SLOPE = "slope"
-    HILL = "hill"
-    MUD = "mud"
 
 
 class Scene(StrEnum):
@@ -39,7 +29,6 @@ class Scene(StrEnum):
 
 SeedOption = Annotated[int, typer.Option("--seed", help="Chooses the logs and their poses.")]
 LogsOption = Annotated[int, typer.Option("--logs", min=0, max=200, help="Number of logs.")]
-TerrainOption = Annotated[Terrain, typer.Option("--terrain", help="Terrain.")]
 SceneOption = Annotated[Scene, typer.Option("--scene", help="Arrangement of the logs.")]
 
 
@@ -72,7 +61,7 @@ def view(
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     options = ["--seed", str(seed), "--logs", str(logs), "--scene", scene.value, "--terrain", terrain.value]
     with tempfile.TemporaryDirectory(prefix="timberhand-view-") as directory:
-        run_view(machine, profile, [*options, "--truth", truth], port, Path(directory), Console())
+        run_view(machine, profile, [*options, "--truth", truth_of(profile, truth)], port, Path(directory), Console())
 
 
 @app.command()
@@ -104,7 +93,8 @@ def picture(
     from machine.loading.profile_file import ProfileError, load_profile
 
     request = PictureRequest(
-        logs=logs, scene=scene.value, seed=seed, terrain=terrain.value, truth=truth, camera=camera, depth=depth,
+        logs=logs, scene=scene.value, seed=seed, terrain=terrain.value, truth=truth_of(profile, truth),
+        camera=camera, depth=depth,
         azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, distance_m=distance_m,
     )  # fmt: skip
     try:

@@ -12,6 +12,7 @@ import typer
 from host.exit_codes import CommandFailed, ExitCode
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.console import Console
 
 app = typer.Typer(no_args_is_help=True, help="Train a network and write its weights with a model card.")
@@ -210,6 +211,134 @@ def scorers(
     from training.detection.scorer_weights import produce
 
     _train_on_pictures(out, folder, lambda kept, screen: produce(pictures, seed, kept, out, weights, screen))
+
+
+class Renderer(StrEnum):
+    """The path tracers."""
+
+    ANY = "any"
+    OWN = "own"
+    BLENDER = "blender"
+
+
+class Device(StrEnum):
+    """Where the mask network is trained."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+TracedFolder = Annotated[Path, typer.Argument(help="Folder of the picture sets of the mask network.")]
+
+
+@app.command("traced-pictures")
+def traced_pictures(
+    folder: TracedFolder,
+    scenes: Annotated[int, typer.Option(min=0, help="Path-traced scenes of two pictures each.")] = 707,
+    drawn: Annotated[int, typer.Option(min=0, help="Pictures by the analytic renderer, in files of 8.")] = 1080,
+    meshed: Annotated[int, typer.Option(min=0, help="Pictures by pybullet's renderer, in files of 10.")] = 250,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other scenes.")] = 0,
+    size: Annotated[int, typer.Option(min=48, help="Side of the pictures in px.")] = 512,
+    chunks: Annotated[int, typer.Option(min=1, help="Chunks of 64 settled piles of each machine.")] = 2,
+    renderer: Annotated[Renderer, typer.Option(help="The own tracer (GPU or CPU), or Blender's.")] = Renderer.ANY,
+    blender_python: Annotated[
+        Path | None, typer.Option(help="Python of the environment in which bpy is installed.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 1,
+) -> None:
+    """Draw the pictures of the mask network: path-traced, analytic, and by pybullet.
+
+    What is there is kept: the same command continues an interrupted one. The own
+    tracer is compiled on first use, by nvcc beside a GPU, otherwise by g++.
+
+    [bold]Examples[/bold]
+
+      timberhand train traced-pictures pictures --workers 16
+
+      timberhand train traced-pictures pictures --renderer blender --blender-python blender/bin/python
+    """
+    from rich.console import Console
+
+    from training.common.dataset_error import DatasetError
+    from training.pictures.traced.sets import SetPlan, produce_sets
+
+    screen = Console(stderr=True)
+    plan = SetPlan(scenes, drawn, meshed, seed, size, chunks=chunks)
+    try:
+        produce_sets(folder, plan, renderer.value, workers, blender_python, lambda name: screen.print(name, end=" "))
+    except KeyboardInterrupt:
+        raise CommandFailed(
+            "train.interrupted", "interrupted; the same command continues", ExitCode.INTERRUPTED
+        ) from None
+    except DatasetError as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    screen.print(f"\n{folder}", highlight=False)
+
+
+@app.command()
+def masks(
+    folder: TracedFolder,
+    out: Out = Path("logs.safetensors"),
+    trunk: Annotated[
+        Path | None, typer.Option(help="ImageNet weights, torchvision's mobilenet_v2-b0353104.pth (default: random).")
+    ] = None,
+    photographs: Annotated[
+        bool, typer.Option(help="Also the photographs in TIMBERHAND_DATA whose scenes are not judged.")
+    ] = False,
+    device: Annotated[Device, typer.Option(help="auto is cuda where there is one.")] = Device.AUTO,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.01, help="Time of the training (default: 530 s, unlimited with --steps).")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Most training batches.")] = None,
+    batch: Annotated[int, typer.Option(min=2, help="Windows of a batch.")] = 64,
+    side: Annotated[int, typer.Option(min=64, help="Side of a window in px, a multiple of 64.")] = 320,
+    seed: Annotated[int, typer.Option(help="With --steps the same seed gives the same weights on a CPU.")] = 7,
+) -> None:
+    """Train the mask network on the pictures of [bold]train traced-pictures[/bold].
+
+    Writes weights, card and a log (.jsonl). Ctrl-C keeps the last checkpoint;
+    the same command continues from there.
+
+    [bold]Examples[/bold]
+
+      timberhand train masks pictures --trunk mobilenet_v2-b0353104.pth --photographs
+
+      timberhand train masks pictures --device cpu --steps 2 --batch 2 --side 64     a short trial
+    """
+    prepare_torch()
+    import math
+
+    from training.detection.masks.mask_weights import produce
+    from training.detection.masks.run import Run
+
+    if side % 64:
+        raise CommandFailed("train.bad-side", f"--side {side} is not a multiple of 64", ExitCode.USAGE)
+    seconds = 60.0 * minutes if minutes else math.inf if steps else 530.0
+    run = Run(batch=batch, side_px=side, seconds=seconds, steps=steps or 1_000_000, seed=seed)
+    limits = (f" --minutes {minutes:g}" if minutes else "") + (f" --steps {steps}" if steps else "")
+    command = (
+        f"timberhand train masks FOLDER{f' --trunk {trunk.name}' if trunk else ''}"
+        f"{' --photographs' if photographs else ''}{limits} --batch {batch} --side {side} "
+        f"--seed {seed} --out {out.name}"
+    )
+    shots = _photographs() if photographs else []
+    _train_on_pictures(
+        out, folder, lambda kept, screen: produce(kept, run, trunk, shots, device.value, out, command, screen)
+    )
+
+
+def _photographs() -> list[tuple[np.ndarray, np.ndarray]]:
+    """The photographs that may be trained on, and their wood."""
+    from experiments.detector.photos import folder, photos
+    from experiments.detector.traced import TRAINED_SCENES
+
+    found = [(shot.rgb, shot.wood) for shot in photos(folder()) if shot.name in TRAINED_SCENES]
+    if not found:
+        raise CommandFailed(
+            "train.no-photographs", f"{folder()} holds no photographs; leave out --photographs", ExitCode.CONFIGURATION
+        )
+    return found
 
 
 def _train_on_pictures(weights: Path, folder: Path | None, make: Callable[[Path, Console], Path]) -> None:

@@ -10,6 +10,7 @@ import typer
 from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
+    from host.exit_codes import CommandFailed
     from timberhand.why.stops import FoundStop
 
 
@@ -24,6 +25,10 @@ def why(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw the newest stop: 10 s before it and 5 s after it.")
     ] = None,
+    page: Annotated[
+        bool, typer.Option("--page", help="Show the newest stop in the operator's page, from 10 s before it.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="Port of the page.")] = 8471,
     key_file: Annotated[Path | None, typer.Option(help="Key file of a run with authenticated datagrams.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -31,8 +36,9 @@ def why(
 
     Without RUN it takes the newest stop on this computer, of the runs below
     runs/ and of the service (/var/lib/timberhand/stops; needs the rights to
-    read it). Exit code 0, also when the machine did not stop; 3 when there is
-    no recording, or none that this release can read.
+    read it), and tells of a service that has failed since then. Exit code 0,
+    also when the machine did not stop; 3 when there is no recording, or none
+    that this release can read.
 
     [bold]Examples[/bold]
 
@@ -41,10 +47,15 @@ def why(
       timberhand why runs/LAST --all
 
       timberhand why runs/LAST --plot why.png
+
+      timberhand why --page
     """
     import json
 
+    import msgspec
+
     from host.exit_codes import CommandFailed, ExitCode
+    from timberhand.why.failures import newest_failure
     from timberhand.why.stops import SERVICE_STOPS
 
     try:
@@ -53,22 +64,33 @@ def why(
         raise CommandFailed(
             "why.key-unreadable", f"{key_file} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
         ) from error
+    if page:
+        _open_page(run, key, port)
+        return
     stops: list[dict[str, object]] | None = [] if as_json else None
     try:
-        count = _explain(run, every, plot, key, stops)
+        count, newest_utc_ns = _explain(run, every, plot, key, stops)
     except (OSError, ValueError) as error:
         raise CommandFailed(
             "why.unusable", f"{run or 'the newest stop'} cannot be shown: {error}", ExitCode.CONFIGURATION
         ) from error
-    if not count and run is None:
-        raise CommandFailed(
-            "why.no-stop",
-            f"there is no stop below runs/, and none in {SERVICE_STOPS} that you may read; name a run",
-            ExitCode.CONFIGURATION,
-        )
+    failed = newest_failure(newest_utc_ns) if run is None else None
+    if not count and run is None and failed is None:
+        raise _no_stop(f"below runs/, and none in {SERVICE_STOPS} that you may read")
     if as_json:
-        typer.echo(json.dumps({"stops": stops, "plot": str(plot) if plot and count else None}, allow_nan=False))
-    elif not count:
+        failure = None if failed is None else msgspec.to_builtins(failed[0]) | {"times": failed[1]}
+        answer = {"stops": stops, "plot": str(plot) if plot and count else None, "failure": failure}
+        typer.echo(json.dumps(answer, allow_nan=False))
+        return
+    if failed is not None:
+        failure, times = failed
+        typer.echo(f"{failure.sentence}{f', {times} times since the last stop' if times > 1 else ''}")
+        typer.echo(
+            f"  what to do  See journalctl -u {failure.unit}; it comes back disarmed by itself unless it says no."
+        )
+    if not count and run is None:
+        return  # a failure is all there is
+    if not count:
         typer.echo(f"{run}: the machine did not stop in this recording")
     elif plot is not None:
         typer.echo(f"plot: {plot}")
@@ -76,21 +98,40 @@ def why(
         typer.echo("plot: add --plot FILE.png")
 
 
+def _open_page(run: Path | None, key: bytes | None, port: int) -> None:
+    """Serve the page of the newest stop: of its whole run where that is recorded, else of the stop's file."""
+    from recorder.recover import run_files
+    from timberhand.replay_page import show_recording
+    from timberhand.why.stops import find_stops
+
+    found = next(iter(find_stops(run, key, newest=True)), None)
+    if found is None:
+        raise _no_stop(f"in {run or 'runs/'}")
+    place = found.source if found.source.is_dir() else found.source.parent.parent
+    show_recording(place if run_files(place) else found.source, None, port, key, stop_ns=found.stop.at_ns)
+
+
+def _no_stop(where: str) -> CommandFailed:
+    from host.exit_codes import CommandFailed, ExitCode
+
+    return CommandFailed("why.no-stop", f"there is no stop {where}; name a run", ExitCode.CONFIGURATION)
+
+
 def _explain(
     run: Path | None, every: bool, plot: Path | None, key: bytes | None, stops: list[dict[str, object]] | None
-) -> int:
-    """Show the stops, or add them to ``stops``, one at a time; draw the last one; return their number."""
+) -> tuple[int, int | None]:
+    """Show the stops, or add them to ``stops``, one at a time; draw the last one; return their number, and its time."""
     from rich.console import Console
 
     from timberhand.why.screen import as_dict, show
-    from timberhand.why.stops import find_stops
+    from timberhand.why.stops import find_stops, key_for
     from timberhand.why.timeline import events_of
 
     console, count = Console(highlight=False), 0
     newest: FoundStop | None = None
     for found in find_stops(run, key, newest=not every):
         count, newest = count + 1, found
-        events = events_of(found.ticks, found.stop.at_ns, key)
+        events = events_of(found.ticks, found.stop.at_ns, key_for(found.source, key))
         if stops is not None:
             stops.append(as_dict(found, events))
         else:
@@ -99,5 +140,5 @@ def _explain(
     if plot is not None and newest is not None:
         from timberhand.why.plot import draw
 
-        draw(newest, plot, key)
-    return count
+        draw(newest, plot, key_for(newest.source, key))
+    return count, newest.stop.utc_ns if newest is not None else None

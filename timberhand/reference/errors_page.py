@@ -12,7 +12,7 @@ from timberhand.reference.markdown import generated, table
 
 PACKAGES = (
     "autonomy", "can_dbc", "console", "controller", "deploy", "experiments", "hil", "host", "machine", "recorder",
-    "runtime", "sim", "timberhand", "training",
+    "ros2", "runtime", "sim", "timberhand", "training",
 )  # fmt: skip
 CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*(\.[a-z0-9]+(-[a-z0-9]+)*)+")
 

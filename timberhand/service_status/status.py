@@ -15,7 +15,7 @@ from can_dbc.timing.page import InputAge, Timing, TimingRefused, default_path, r
 from host.exit_codes import ExitCode
 from host.systemd import last_journal_line, show_all
 
-NAMES: Final = ("controller", "guard", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0")
+NAMES: Final = ("controller", "guard", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0", "update")
 PROPERTIES: Final = (
     "Id", "Type", "LoadState", "ActiveState", "SubState", "Result", "ExecMainStatus", "NRestarts", "StatusText",
     "StateChangeTimestampMonotonic", "ExecMainExitTimestampMonotonic",
@@ -111,12 +111,17 @@ def _state(found: dict[str, str]) -> str:
 
 
 def _why(found: dict[str, str]) -> str:
-    result, status = found.get("Result", ""), int(found.get("ExecMainStatus") or 0)
+    return ending(found.get("Result", ""), found.get("ExecMainStatus") or "0")
+
+
+def ending(result: str, status: str) -> str:
+    """How a service ended, from systemd's result and the exit status or signal of its main process."""
     match result:
         case "success":
             return ""
         case "exit-code":
-            return f"exit status {status}" + (f", {ExitCode(status).words}" if status in set(ExitCode) else "")
+            known = int(status) in set(ExitCode) if status.isdecimal() else False
+            return f"exit status {status}" + (f", {ExitCode(int(status)).words}" if known else "")
         case "signal":
             return f"killed by signal {status}"
         case "watchdog":

@@ -18,6 +18,7 @@ import msgspec
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.key_file import service_key
 from can_dbc.messages.tick_record import RecordRefused, TickRecord
 from hil.replay.recording import files_of, manifest_of, messages
 from hil.replay.replay import recorded_ticks
@@ -28,7 +29,8 @@ from recorder.stop import TOPIC, Stop, StopDetector, stop_from
 from recorder.stop_files import files_in, parts_in
 from recorder.stop_recorder import AFTER_NS, BEFORE_NS
 
-SERVICE_STOPS: Final = Path("/var/lib/timberhand") / STOPS_NAME
+SERVICE_RECORDINGS: Final = Path("/var/lib/timberhand")
+SERVICE_STOPS: Final = SERVICE_RECORDINGS / STOPS_NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ def find_stops(run: Path | None, key: bytes | None = None, newest: bool = False)
         for path in paths[-1:] if newest else paths:
             yield from read_stop(path)
     elif run is not None:
-        found = stops_in_recording(_recording(run), key)
+        found = stops_in_recording(_recording(run), key_for(run, key))
         yield from deque(found, maxlen=1) if newest else found
 
 
@@ -62,6 +64,11 @@ def read_stop(path: Path) -> Iterator[FoundStop]:
     if stop is not None:
         ticks = tuple(recorded_ticks([path]))
         yield FoundStop(msgspec.json.decode(stop, type=Stop), manifest_of([path]), ticks, path)
+
+
+def key_for(place: Path, key: bytes | None) -> bytes | None:
+    """The given key, or without one that of the services for what they recorded."""
+    return service_key() if key is None and place.resolve().is_relative_to(SERVICE_RECORDINGS) else key
 
 
 def stops_in_recording(files: list[Path], key: bytes | None) -> Iterator[FoundStop]:

@@ -12,7 +12,14 @@ from typing import Any, Final, NamedTuple
 from can_dbc.bus.base import BusState
 from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.messages import datagrams
-from can_dbc.messages.crane import CraneSetpoint, OperatorCommand, SpoolTest, StateReport
+from can_dbc.messages.crane import (
+    WATCH_PERIOD_NS,
+    CraneSetpoint,
+    OperatorAction,
+    OperatorCommand,
+    SpoolTest,
+    StateReport,
+)
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import BusReading, TickRecord
 from can_dbc.messages.vehicle import DriveSetpoint
@@ -28,8 +35,9 @@ from recorder.stop import STOPPED
 BEFORE_S: Final = 2.0
 """Events of this time before the stop are listed."""
 SETPOINT_SILENCE_NS: Final = 150_000_000
+BEAT_SILENCE_NS: Final = 5 * WATCH_PERIOD_NS // 2
 WATCHED: Final = {
-    "EstopStat": ("ChannelA", "ChannelB", "Person", "ResetReq"),
+    "EstopStat": ("ChannelA", "ChannelB", "Person", "Lever", "ResetReq"),
     "GuardStat": ("Enable", "Verdict"),
     "ValveFbA": ("State",),
     "ValveFbB": ("ExitCode",),
@@ -178,6 +186,11 @@ class _Silences(_Watcher):
             yield stamp_ns, f"{name} back after {(stamp_ns - self._last_ns[name]) / 1e6:.0f} ms"
         self._last_ns[name], self._timeouts_ns[name] = stamp_ns, timeout_ns
 
+    def forget(self) -> None:
+        """What came so far has ended on purpose."""
+        self._last_ns.clear()
+        self._silent.clear()
+
     def pass_time(self, now_ns: int) -> Iterator[tuple[int, str]]:
         """Which messages are silent now; their event is at the last one."""
         for name, last_ns in self._last_ns.items():
@@ -191,7 +204,7 @@ class _Requests(_Watcher):
 
     def __init__(self, key: bytes | None) -> None:
         self._key = key
-        self._setpoints = _Silences()
+        self._setpoints, self._beats = _Silences(), _Silences()
 
     def step(self, tick: TickRecord) -> Iterator[tuple[int, str]]:
         for data in (*tick.operator, *tick.datagrams):
@@ -200,10 +213,16 @@ class _Requests(_Watcher):
             except DatagramRefused:
                 continue
             if isinstance(message, OperatorCommand):
+                if message.action is OperatorAction.WATCH:  # five a second
+                    yield from self._beats.came("heartbeats of the operator", tick.now_ns, BEAT_SILENCE_NS)
+                    continue
+                if message.action is OperatorAction.WATCH_END:
+                    self._beats.forget()
                 yield tick.now_ns, f"operator: {message.action.name}"
             elif isinstance(message, CraneSetpoint | DriveSetpoint | SpoolTest):
                 yield from self._setpoints.came("setpoints of the planner", tick.now_ns, SETPOINT_SILENCE_NS)
         yield from self._setpoints.pass_time(tick.now_ns)
+        yield from self._beats.pass_time(tick.now_ns)
 
 
 class _Buses(_Watcher):

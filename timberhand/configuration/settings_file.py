@@ -1,0 +1,105 @@
+"""Reads ``timberhand.conf``: names and values with their lines, against the settings that this release knows.
+
+Pure but for `read`.  The shipped file is the list of what exists: its names, their values and the words about them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Final
+
+from runtime.errors import CodedError
+
+INSTALLED: Final = Path("/etc/timberhand/timberhand.conf")
+SHIPPED: Final = Path(__file__).parents[2] / "deploy" / "timberhand.conf"
+RETIRED: Final = {
+    "KEY_OPTIONS": "the installation makes /etc/timberhand/key, and systemd hands it to the services",
+}
+"""Names of former releases, and what became of them."""
+_LINE: Final = re.compile(r"([A-Z][A-Z0-9_]*)=(.*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A value and its line, counted from 1."""
+
+    value: str
+    line: int
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What is wrong where, and what to do; ``line`` 0: about the file as a whole.
+
+    ``note``: the services run with it all the same.
+    """
+
+    line: int
+    sentence: str
+    note: bool = False
+
+
+class SettingsError(CodedError, ValueError):
+    """The file cannot be read at all."""
+
+
+def read(path: Path) -> str:
+    """The text of a settings file; raises SettingsError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SettingsError("settings.unreadable", f"{path} cannot be read: {error.strerror}; name a file") from None
+    except UnicodeDecodeError as error:
+        raise SettingsError("settings.not-utf8", f"{path} is not UTF-8 text at byte {error.start}") from None
+
+
+def parse(text: str, problems: list[Problem]) -> dict[str, Setting]:
+    """Name -> setting; appends what is no setting, and what stands twice (the last one counts, as for systemd)."""
+    found: dict[str, Setting] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith(("#", ";")):
+            continue
+        match = _LINE.fullmatch(line.rstrip())
+        if match is None:
+            problems.append(Problem(number, f"{line.strip()[:60]!r} is no setting; write NAME=value without spaces"))
+            continue
+        name, value = match.groups()
+        if name in found:
+            problems.append(Problem(number, f"{name} stands in line {found[name].line}, too; remove one of them"))
+        found[name] = Setting(value, number)
+    return found
+
+
+def unknown(settings: dict[str, Setting], known: dict[str, Setting]) -> Iterator[Problem]:
+    """Names that this release does not have, and those that the file lacks."""
+    for name, setting in settings.items():
+        if name in RETIRED:
+            yield Problem(setting.line, f"{name} is no longer a setting: {RETIRED[name]}; timberhand config migrate")
+        elif name not in known:
+            near = get_close_matches(name, known, 1)
+            hint = f"; did you mean {near[0]}?" if near else "; remove it"
+            yield Problem(setting.line, f"there is no setting {name}{hint}")
+    for name in known:
+        if name not in settings:
+            sentence = f"{name} is missing, so it is as this release ships it; timberhand config migrate adds it"
+            yield Problem(0, sentence, note=True)
+
+
+def migrated(text: str, shipped: str) -> tuple[str, list[str]]:
+    """The shipped file with the values of ``text``, and what was done about names that it does not have."""
+    ours = parse(text, [])
+    known = parse(shipped, [])
+    lines = shipped.splitlines()
+    notes = []
+    for name, setting in known.items():
+        if name in ours:
+            lines[setting.line - 1] = f"{name}={ours[name].value}"
+        else:
+            notes.append(f"{name} is new: {setting.value or 'empty'}")
+    for name in ours.keys() - known.keys():
+        notes.append(f"{name}={ours[name].value} is gone: {RETIRED.get(name, 'no release of this family has it')}")
+    return "\n".join(lines) + "\n", sorted(notes)
