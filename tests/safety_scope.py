@@ -41,12 +41,14 @@ class Scope:
 SCOPES = (
     Scope(
         "supervisor",
-        ("controller/supervisor.py", "controller/transitions.py"),
+        ("controller/supervisor.py", "controller/transitions.py", "controller/operator_link.py"),
         (
             "tests/controller/test_transition_table.py",
             "tests/controller/test_mode_model.py",
             "tests/controller/test_supervisor*.py",
             "tests/controller/test_joint_watch.py",
+            "tests/controller/test_pressure_monitor.py",
+            "tests/controller/test_load_moment.py",
             "tests/controller/test_faults.py",
             "tests/controller/test_vehicle_faults.py",
             "tests/controller/test_bus_faults.py",

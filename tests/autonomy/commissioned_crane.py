@@ -1,4 +1,5 @@
-"""A crane whose valves are exactly as its profile says, its controller and its bus: for tests of the procedure.
+"""A crane whose valves are as its profile says, or as ``valves`` says, its controller and its bus: for tests of the
+procedure.
 
 It obeys setpoints and spool tests without judging them, and says on the bus what it does.  Faults by name:
 ``backward`` and ``stuck`` joints, a controller that ``refuses``, a ``mode``, an instrument that is ``no_compass``: it
@@ -21,10 +22,11 @@ from machine.geometry.grapple import grapple_yaw
 from machine.geometry.sag import true_pin
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.profile import Profile, Sag, joint
+from machine.profile import Profile, Sag, Valve, joint
 from machine.sensing.encoder import counts_from_position
 from machine.sensing.weighing import empty_moment_nm, lever_share
 from machine.status.modes import Mode
+from machine.status.reasons import Reason
 
 DATABASE = load("crane")
 STEP_S = 0.01
@@ -42,9 +44,13 @@ class Crane:
     mode: Mode = Mode.ARMED
     backward: set[Joint] = field(default_factory=set)
     stuck: set[Joint] = field(default_factory=set)
+    valves: dict[Joint, Valve] = field(default_factory=dict)
     no_compass: bool = False
     only_turns: bool = False
     refuses: int = 0
+    reason: Reason = Reason.NONE
+    chosen: tuple[Joint, ...] = tuple(JOINTS)
+    patience_s: float = 0.0
     now_ns: int = 5_000_000_000
     said: SpoolTest | CraneSetpoint | None = None
     heard: list[SpoolTest | CraneSetpoint] = field(default_factory=list)
@@ -55,12 +61,18 @@ class Crane:
         self.q = [0.0 if p != p else p for p in HOME[self.name]]
         self.v = [0.0] * len(JOINTS)
         self.opening = 100.0
-        self.lines = [deque([0.0] * round(joint(self.profile, j).valve.delay_s / STEP_S)) for j in JOINTS]
+        self.lines = [deque([0.0] * round(self.valve(j).delay_s / STEP_S)) for j in JOINTS]
         self.ticks = 0
-        self.plan: CalibrationPlan = make_plan(self.profile, HOME[self.name], self.surveyed)
+        self.plan: CalibrationPlan = make_plan(self.profile, HOME[self.name], self.surveyed, self.chosen)
         if self.only_turns:
             self.plan = replace(self.plan, joints=(), survey=())
-        self.calibration = Calibration(self.profile, profile_hash(self.profile), self.plan, DATABASE)
+        self.calibration = Calibration(
+            self.profile, profile_hash(self.profile), self.plan, DATABASE, patience_s=self.patience_s
+        )
+
+    def valve(self, j: Joint) -> Valve:
+        """The true valve of a joint."""
+        return self.valves.get(j) or joint(self.profile, j).valve
 
     def run(self, until_s: float = 400.0, done=lambda crane: False) -> Calibration:
         """Until the procedure is over, ``done`` says so or time is up."""
@@ -111,7 +123,7 @@ class Crane:
 
     def _move(self, j: Joint, spool: float) -> None:
         spec = joint(self.profile, j)
-        valve, line = spec.valve, self.lines[j]
+        valve, line = self.valve(j), self.lines[j]
         line.append(spool)
         spool = line.popleft()
         full, deadband = (
@@ -131,7 +143,7 @@ class Crane:
     def _report(self) -> StateReport:
         sensed = tuple(q if joint(self.profile, j).encoder else nan for j, q in zip(JOINTS, self.q, strict=True))
         return StateReport(
-            0, profile_hash(self.profile), self.now_ns, self.mode, 0, 0, 0, 119, self.refuses, 0, sensed,
+            0, profile_hash(self.profile), self.now_ns, self.mode, 0, self.reason, 0, 119, self.refuses, 0, sensed,
             tuple(self.v), sensed, self.opening, 0.0, 0.0, 0, 0, 0, 0,
         )  # fmt: skip
 

@@ -131,7 +131,7 @@ class StandIn:
         assert self.mode in (Mode.ARMED, Mode.ACTIVE), f"a setpoint in {self.mode.name}"
         if self.setpoint is not None:
             assert new.sequence > self.setpoint.sequence and new.stamp_ns > self.setpoint.stamp_ns
-        assert not new.final or not any(new.knots[-1].velocity)
+        assert not new.final or max(map(abs, new.knots[-1].velocity)) < 1e-9
         old = self._knot_at(self.now_ns).velocity if self.setpoint else (0.0,) * 5
         for j, spec in enumerate(joint(self.profile, j) for j in JOINTS):
             for k in new.knots:

@@ -225,6 +225,17 @@ def test_nothing_is_aimed_at_below_the_ground() -> None:
     assert lower.pose.z_m == pytest.approx(grasp.pose.z_m + lower.support_z_m - grasp.support_z_m)
 
 
+def test_a_log_on_the_ground_that_is_measured_higher_is_gripped_where_it_lies() -> None:
+    arm = Arm(PROFILE)
+    x, y, z = GROUND_LOG.center_m
+    grasp = replace(plan_single_log_grasp(arm, GROUND_LOG, 0.0), support_z_m=PROFILE.workspace.ground_z_m)
+    higher = corrected_grasp(arm, grasp, [replace(GROUND_LOG, center_m=(x + 0.03, y, z + 0.1))])
+    assert higher.support_z_m == grasp.support_z_m and higher.pose.z_m == pytest.approx(grasp.pose.z_m)
+    assert higher.log.center_m[0] == x + 0.03, "beside it, it is corrected"
+    stacked = replace(grasp, support_z_m=PROFILE.workspace.ground_z_m + 0.2)
+    assert corrected_grasp(arm, stacked, [higher.log]).support_z_m == pytest.approx(stacked.support_z_m + 0.1)
+
+
 def test_a_log_at_its_place_is_released_at_once() -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=90.0)

@@ -71,6 +71,7 @@ def test_a_machine_outside_its_fence_stops(keep_out: bool) -> None:
 @pytest.mark.parametrize(("y_m", "yaw", "hit"), [(1.1, 0.0, True), (-1.4, 1.4, True), (0.0, 0.0, False)])
 def test_a_machine_stops_before_a_log_in_its_wheel_path(y_m: float, yaw: float, hit: bool) -> None:
     forwarder, manager = begin(((1, 15.0, y_m, yaw),), end_m=20.0)
+    manager.tally.brimful = True  # no room for it on board
     forwarder.run(manager, ended)
     if not hit:  # it passes below the machine, between the wheels
         assert manager.failure_code != "mission.log-before-wheel"
@@ -79,6 +80,28 @@ def test_a_machine_stops_before_a_log_in_its_wheel_path(y_m: float, yaw: float, 
     for _ in range(60):
         forwarder.step(manager)
     assert forwarder.speed_m_s == 0.0 and forwarder.x_m + CARRIER.wheel_radius_m < 15.0
+
+
+@whole
+@pytest.mark.parametrize(("y_m", "yaw"), [(1.1, 0.0), (-1.3, 1.4)])
+def test_a_log_in_the_wheel_path_that_the_crane_reaches_is_loaded_first(y_m: float, yaw: float) -> None:
+    forwarder, manager = begin(((1, 15.0, y_m, yaw),))
+    forwarder.run(manager, at(State.STOP))
+    forwarder.run(manager, at(State.COLLECT))
+    assert forwarder.x_m + CARRIER.wheel_radius_m < 15.0, "it stands before the log"
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and manager.tally.loaded == forwarder.in_bunk == 1
+    steps = "RAISE SEARCH STOP CHECK LOWER COLLECT CHECK STOW RAISE SEARCH DONE"
+    assert " ".join(state.name for state in states(manager)) == steps
+
+
+@whole
+def test_a_log_in_the_wheel_path_that_the_crane_cannot_lift_past_the_front_ends_the_mission() -> None:
+    forwarder, manager = begin(((1, 15.0, 0.4, 1.57),))
+    forwarder.run(manager, ended)
+    assert manager.state is State.FAILED and manager.failure_code == "mission.log-before-wheel"
+    assert State.STOP in states(manager), "it tried"
+    assert forwarder.x_m + CARRIER.wheel_radius_m < 15.0
 
 
 @whole
@@ -327,6 +350,23 @@ def test_a_grasp_that_is_stopped_repeatedly_is_given_up() -> None:
             forwarder.crane.mode = Mode.ARMED
     assert manager.state is State.DONE and manager.tally.missed == 1
     assert list(manager.tally.given_up.values()) == [f"the controller stopped the crane {MAX_STOPS} times"]
+
+
+@whole
+def test_a_log_in_the_jaws_is_laid_down_after_three_stops() -> None:
+    """Its job was aborted, and the mission finished with the log in the jaws."""
+    forwarder, manager = begin(LOGS[:1], OURS)
+    forwarder.run(manager, lambda m: ended(m) or forwarder.crane.held is not None)
+    for _ in range(MAX_STOPS):
+        for _ in range(30):
+            forwarder.step(manager)
+        forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
+        forwarder.step(manager)
+        forwarder.crane.mode = Mode.ARMED
+    assert forwarder.crane.held is not None
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.crane.held is None
+    assert (manager.tally.missed, len(manager.tally.given_up)) == (0, 0) and manager.tally.on_board == 1
 
 
 def test_paper_b_drives_on_when_the_log_is_not_detected_again() -> None:

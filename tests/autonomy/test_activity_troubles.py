@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.activity import Phase
+from autonomy.crane_job.cycle import HIGHER_M, MAX_HIGHER
 from autonomy.crane_job.grasp_verification import is_between_jaws
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
@@ -256,3 +257,41 @@ def test_an_abort_stops_smoothly_and_ends_with_a_hold() -> None:
     assert crane.step(planner) is None
     planner.abort("again")
     assert planner.failure_code == "activity.aborted"
+
+
+@pytest.mark.parametrize(("times", "done"), [(1, True), (10_000, False)])
+def test_jaws_in_whose_way_something_lies_open_higher_and_not_for_ever(
+    times: int, done: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    run_until(crane, planner, Phase.OPEN)
+    low_m, left = planner._cycle.place.z_m, [times]
+
+    def in_the_way(_: object) -> bool:
+        left[0] -= 1
+        return left[0] >= 0
+
+    monkeypatch.setattr(planner._grapple, "must_open_higher", in_the_way)
+    monkeypatch.setattr(planner._grapple, "has_released", lambda *_: left[0] <= 0)
+    crane.run(planner)
+    assert planner.done is done
+    assert planner._cycle.place.z_m - low_m == pytest.approx(HIGHER_M * min(times, MAX_HIGHER))
+    assert done or planner.failure_code == "activity.open-timeout"
+
+
+@pytest.mark.parametrize("low", [True, False])
+def test_a_load_that_rests_above_its_place_is_released_there(low: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What lies in the bunk may lie higher than a camera that only looks ahead lets it know."""
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    run_until(crane, planner, Phase.CARRY)
+    while planner.phase is Phase.CARRY and planner._cycle.is_close_above_place(planner._position()) is not low:
+        crane.step(planner)
+    assert planner.phase is Phase.CARRY
+    above_m = planner._cycle._arm.pose(planner._position()).z_m - planner._cycle.place.z_m
+    monkeypatch.setattr(type(planner._grapple), "load_rests", True)
+    for _ in range(40):
+        crane.step(planner)
+        if planner.phase is Phase.OPEN:
+            break
+    stands_m = planner._cycle._arm.pose(planner._position()).z_m - planner._cycle.place.z_m
+    assert (planner.phase is Phase.OPEN and 0.1 < stands_m < above_m) is low

@@ -60,7 +60,7 @@ class World:
                 self.setpoints.append(message)
                 self.crane.q = message.knots[0].position
             while question := _took(self._scene):
-                self.joints = decode_request(question[0])
+                self.joints = decode_request(question[0]).q
                 self._scene.sendto(json.dumps(LOGS).encode(), question[1])
             if enough and len(self.setpoints) >= enough:
                 return

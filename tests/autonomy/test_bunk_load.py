@@ -39,6 +39,17 @@ def test_in_an_empty_bunk_it_lies_on_the_floor_in_the_middle() -> None:
     assert (rest.across_m, rest.support_z_m, rest.rest_z_m) == (0.0, FLOOR_M, FLOOR_M + R_M)
 
 
+def test_on_a_slope_it_rolls_to_the_lower_stakes_and_is_laid_near_them() -> None:
+    down = (0.0, 0.15)
+    slope = BunkLoad(BUNK, (), D_M, L_M, down)
+    assert slope.resting_point(0.0)[0] == pytest.approx(HALF_M - R_M, abs=GRID_M)
+    assert slope.lowest_place(REACH_M).across_m > 0.5 * REACH_M
+    laid = settled_in_bunk(BUNK, lying(0.0, FLOOR_M + 0.5), (), down)
+    assert log_in_bunk(BUNK, laid)[1] == pytest.approx(HALF_M - R_M, abs=GRID_M)
+    barely = BunkLoad(BUNK, (), D_M, L_M, (0.0, 0.03))
+    assert barely.resting_point(0.0)[0] == 0.0, "friction holds it"
+
+
 def test_the_second_lies_by_the_stakes_clear_of_the_first() -> None:
     rest = heap(lying(0.0, FLOOR_M + R_M)).lowest_place(REACH_M)
     assert abs(rest.across_m) == pytest.approx(REACH_M, abs=GRID_M)

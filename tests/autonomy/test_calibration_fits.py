@@ -54,6 +54,21 @@ def test_the_valve_is_found(machine: StandIn) -> None:
     assert fit.errors["deadband_plus"] < 0.008 and fit.errors["full_plus"] < 0.04 * fit.full_speeds[0]
 
 
+@pytest.mark.slow
+def test_a_fast_valve_is_known_where_it_is_driven() -> None:
+    """Nobody opens it fully: the speed limit takes a quarter of its stroke."""
+    fast = StandIn(full_speeds=(1.4, 0.3), exponent=1.04)
+    fit = fit_valve(measured(fast), SLEW)
+    assert fit.errors["speed_plus"] < 0.6 * fit.errors["full_plus"] / fit.full_speeds[0]
+    assert fit.errors["speed_minus"] == pytest.approx(fit.errors["full_minus"] / fit.full_speeds[1]), (
+        "all of its stroke"
+    )
+    opening = (SLEW.speed_limit / fast.full_speeds[0]) ** (1.0 / fast.exponent)
+    spool = fast.deadbands[0] + opening * (1.0 - fast.deadbands[0])
+    found = fit.full_speeds[0] * ((spool - fit.deadbands[0]) / (1.0 - fit.deadbands[0])) ** fit.exponent
+    assert found == pytest.approx(SLEW.speed_limit, rel=3.0 * fit.errors["speed_plus"] + 0.01)
+
+
 @pytest.mark.parametrize("machine", MACHINES, ids=["near the profile", "far from it"])
 def test_dead_time_and_lag_are_found_to_milliseconds(machine: StandIn) -> None:
     stairs = [t for t in measured(machine) if t.kind == "staircase"]
@@ -165,11 +180,11 @@ def test_a_good_run_is_plausible() -> None:
 @pytest.mark.parametrize(
     ("machine", "code"),
     [
-        (StandIn(full_speeds=(0.2, 0.22)), "implausible.out-of-range"),
+        (StandIn(deadbands=(0.37, 0.37)), "implausible.out-of-range"),
         (StandIn(hysteresis=0.09, deadbands=(0.12, 0.12)), "implausible.hysteresis"),
-        (StandIn(full_speeds=(0.75, 0.26)), "implausible.sides-differ"),
+        (StandIn(full_speeds=(0.45, 0.04)), "implausible.out-of-range"),
     ],
-    ids=["slow", "sticking", "one-sided"],
+    ids=["wide", "sticking", "one-sided"],
 )
 def test_implausible_values_are_reported(machine: StandIn, code: str) -> None:
     result = identify(PALMS, found(measured(machine)))

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from autonomy.calibration.live import SURVEY_REQUEST, ControllerLink, SurveyInstrument, first_report
+from autonomy.calibration.live import SURVEY_REQUEST, SurveyInstrument, first_report
+from autonomy.process.controller_link import ControllerLink
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from machine.status.modes import Mode

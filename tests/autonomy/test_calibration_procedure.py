@@ -27,6 +27,7 @@ from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from tests.autonomy.commissioned_crane import HOME, SAG, Crane
 from tests.codes import coded
 
@@ -108,6 +109,24 @@ def test_every_joint_is_wiggled_before_anything_travels() -> None:
     assert all(abs(a - b) < 0.03 for a, b in zip(crane.q, HOME["palms_471"], strict=True)), "a wiggle is small"
 
 
+@pytest.mark.parametrize(
+    ("change", "sweeps"),
+    [
+        ({}, {1: 1, -1: 1}),
+        ({"full_speed_minus": 0.5}, {1: 1, -1: 2}),
+        ({"deadband_plus_pct": 0.25}, {1: 2, -1: 1}),
+    ],
+)
+def test_a_side_that_is_slow_or_narrow_is_swept_twice(change: dict[str, float], sweeps: dict[int, int]) -> None:
+    """One sweep left the dead-band of a lift uncertain by 1 % of the stroke."""
+    shipped = load_profile("aoro_fc8").joints["lift"].valve
+    valve = msgspec.structs.replace(shipped, **{key: share * getattr(shipped, key) for key, share in change.items()})
+    run = Crane("aoro_fc8", valves={Joint.LIFT: valve}, chosen=(Joint.LIFT,)).run()
+    assert run.done
+    found = [test.side for test in run.found.tests if test.kind == "sweep"]
+    assert {side: found.count(side) for side in (1, -1)} == sweeps
+
+
 @pytest.mark.parametrize("joint", [Joint.SLEW, Joint.EXT])
 def test_a_joint_that_moves_the_wrong_way_ends_the_run_at_once(joint: Joint) -> None:
     crane = Crane(backward={joint})
@@ -163,6 +182,74 @@ def test_a_stop_ends_the_run_and_nothing_is_sent_after_it() -> None:
         and "STOP" in (run.failure or "")
         and len(crane.heard) == sent
     )
+
+
+def interrupted(crane: Crane, reason: Reason, for_s: float = 20.0) -> None:
+    """The crane stops for a reason; a person resets, looks round, and arms again."""
+    crane.mode, crane.reason = Mode.STOP, reason
+    crane.run(5.0)
+    crane.mode, crane.reason = Mode.STANDBY, Reason.NONE
+    crane.run(for_s - 5.0)
+    crane.mode = Mode.ARMED
+
+
+def test_a_run_of_one_joint_repeats_the_tests_that_a_lost_message_and_a_person_interrupted() -> None:
+    crane = Crane(surveyed=False, chosen=(Joint.TILT,), patience_s=60.0)
+    crane.run(done=lambda c: isinstance(t := c.calibration.task, SpoolTask) and t.kind == "sweep")
+    began_at = crane.q[Joint.TILT]
+    crane.run(3.0)
+    interrupted(crane, Reason.ENCODER_LOST)
+    assert crane.calibration.failure is None and "reset and arm within 60 s" in (crane.calibration.waiting or "")
+    crane.q[Joint.TILT] += 0.1  # it has sunk
+    crane.run(0.1)
+    assert isinstance(crane.calibration.task, MoveTask)
+    crane.run(done=lambda c: isinstance(t := c.calibration.task, SpoolTask) and t.kind == "sweep")
+    assert crane.q[Joint.TILT] == pytest.approx(began_at, abs=0.05), "it begins the test where it began it before"
+    crane.run(done=lambda c: isinstance(t := c.calibration.task, SpoolTask) and t.kind == "staircase")
+    crane.run(1.0)
+    interrupted(crane, Reason.PERSON_IN_ZONE)
+    run = crane.run()
+    assert run.failure is None and run.done and run.resumptions == 2 and run.waiting is None
+    kinds = [(test.joint, test.side, test.kind) for test in run.found.tests]
+    assert kinds == [(Joint.TILT, side, kind) for side in (1, -1) for kind in ("sweep", "staircase")]
+    changed = profile_changes(crane.profile, identify(crane.profile, run.found))
+    assert changed and all(path[:2] == ("joints", "tilt") for path, _, _ in changed)
+
+
+@pytest.mark.parametrize("reason", [Reason.OPERATOR_STOP, Reason.JOINT_STUCK, Reason.ESTOP_PRESSED, Reason.NONE])
+def test_what_a_person_or_the_joint_has_stopped_does_not_go_on(reason: Reason) -> None:
+    crane = Crane(patience_s=60.0)
+    crane.run(8.0)
+    interrupted(crane, reason)
+    assert crane.calibration.idle and crane.calibration.failure_code == "calibration.controller-mode"
+
+
+@pytest.mark.parametrize("second", [Reason.OPERATOR_STOP, None])
+def test_an_interruption_ends_the_run_after_its_time_or_at_the_operators_stop(second: Reason | None) -> None:
+    crane = Crane(patience_s=60.0)
+    crane.run(8.0)
+    interrupted(crane, Reason.LOOP_LATE, for_s=50.0)
+    crane.mode, crane.reason = (Mode.STANDBY, Reason.NONE) if second is None else (Mode.STOP, second)
+    crane.run(9.0)
+    assert crane.calibration.idle == (second is not None)
+    crane.run(2.0)
+    assert crane.calibration.idle and crane.calibration.failure
+
+
+def test_a_rotator_without_encoder_does_not_go_on_after_a_stop() -> None:
+    crane = Crane("aoro_fc8", only_turns=True, patience_s=60.0)
+    crane.run(6.0)
+    interrupted(crane, Reason.ENCODER_LOST)
+    assert crane.calibration.idle and "the controller is in STOP" in (crane.calibration.failure or "")
+
+
+def test_a_joint_without_encoder_cannot_be_chosen_alone() -> None:
+    profile = load_profile("aoro_fc8")
+    with pytest.raises(CalibrationImpossible, check=coded("calibration.no-encoder")):
+        make_plan(profile, HOME["aoro_fc8"], surveyed=False, chosen=(Joint.ROT,))
+    plan = make_plan(profile, HOME["aoro_fc8"], surveyed=False, chosen=(Joint.ROT, Joint.LIFT))
+    assert [p.joint for p in plan.joints] == [Joint.LIFT] and not plan.grapple
+    assert not any("grapple" in line for line in plan_summary(profile, plan))
 
 
 def test_a_refused_setpoint_ends_the_run() -> None:
@@ -230,7 +317,8 @@ def test_a_program_starts_from_its_beginning_however_late_the_tick_is() -> None:
     crane.now_ns += 90_000_000  # this host had something else to do
     crane.run(0.2)
     first = crane.heard[0]
-    assert isinstance(first, SpoolTest) and first.knots[0].percent == 0.0 and first.knots[1].after_ns == 5_000_000
+    assert isinstance(first, SpoolTest) and first.knots[0].percent == 0.0
+    assert (first.knots[1].after_ns, first.knots[1].percent) == (500_000_000, 5.0), "10 % per second from its beginning"
 
 
 def test_a_task_describes_itself() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import nan
 from types import SimpleNamespace
 
@@ -77,6 +78,50 @@ def test_jaws_tell_that_they_have_missed(
     assert sequence_at(opening_pct, state).has_missed(grasp) is missed
 
 
+@pytest.mark.parametrize(("load_kg", "missed"), [(57.0, False), (4.0, True), (nan, True)])
+def test_what_the_load_cell_weighs_in_fully_closed_jaws_was_not_missed(load_kg: float, missed: bool) -> None:
+    """A log of 19 cm was measured as 21 cm, which leaves a gap: these jaws are full."""
+    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.21)
+    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)
+    tongs = sequence_at(0.0, 4, load_kg)
+    for _ in range(20):
+        tongs.apply(GrappleCommand.CLOSE, 0.05)
+    assert tongs.has_missed(grasp) is missed
+
+
+@pytest.mark.parametrize(("loads_kg", "nothing"), [((0.0, 16.0, 13.0, 14.0), False), ((6.0, 0.0, 0.0, 3.0), True)])
+def test_the_mean_of_noisy_readings_tells_a_thin_log_from_nothing(loads_kg: tuple[float, ...], nothing: bool) -> None:
+    """Measured: a log of 12 cm reads 0 to 16 kg while it swings, empty jaws 0 to 6 kg."""
+    tongs = sequence_at(0.0, 4, nan)
+    for k in range(60):
+        tongs._inbox.report.load_kg = loads_kg[k // 3 % len(loads_kg)]
+        tongs.apply(GrappleCommand.HOLD, 0.05)
+        assert k < 40 or tongs.lifts_nothing is nothing, k
+
+
+@pytest.mark.parametrize(
+    ("loads_kg", "diameter_m", "lost"),
+    [
+        ([0.0, 5.0, 11.0] * 8, 0.25, True),
+        ([0.0, 5.0, 30.0] * 8, 0.25, False),  # it swings
+        ([0.0] * 15, 0.25, False),  # not for long enough
+        ([0.0, 5.0, 11.0] * 8, 0.15, False),  # a thin one weighs little
+        ([nan] * 24, 0.25, False),  # no load cell
+        ([0.0, 5.0, 7.0] * 8 + [2.0] * 24, 0.25, False),  # estimated while the crane stood, and then kept
+    ],
+)
+def test_a_thick_load_that_weighs_nothing_for_a_second_was_lost(
+    loads_kg: list[float], diameter_m: float, lost: bool
+) -> None:
+    """Also where the jaws have not closed fully: they pressed on a log, slid off, and still close."""
+    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
+    sequence = sequence_at(40.0, 3)
+    for load_kg in loads_kg:
+        sequence._inbox.report.load_kg = load_kg
+        sequence.apply(GrappleCommand.CLOSE, 0.05)
+    assert sequence.has_lost(Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)) is lost
+
+
 @pytest.mark.parametrize(
     ("state", "load_kg", "nothing"), [(4, 2.0, True), (4, 15.0, False), (5, 2.0, False), (4, nan, False)]
 )
@@ -120,6 +165,40 @@ def test_opening_jaws_that_bear_a_load_push(loads_kg: tuple[float, ...], pushed:
         assert sequence.has_released(grasp, 0.3)
     sequence.apply(GrappleCommand.CLOSE, 0.05)
     assert not sequence.is_obstructed
+
+
+@pytest.mark.parametrize(
+    ("opening_pct", "others", "higher"), [(30.0, 0, True), (95.0, 0, False), (30.0, 1, False), (nan, 0, False)]
+)
+def test_jaws_that_pushed_and_still_enclose_the_log_must_open_higher(
+    opening_pct: float, others: int, higher: bool
+) -> None:
+    """Risen, they would lift the log again, and drop it when they open above the stakes."""
+    sequence = sequence_at(opening_pct)
+    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
+    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, others=(replace(log, id=1),) * others)
+    for load_kg in (80.0, 10.0, 400.0):
+        sequence._inbox.report.load_kg = load_kg
+        sequence.apply(GrappleCommand.OPEN, 0.05)
+    assert sequence.is_obstructed and not sequence.must_open_higher(grasp), "they still push"
+    sequence._inbox.report.load_kg = 90.0
+    for _ in range(20):
+        sequence.release(0.05)
+    assert sequence.must_open_higher(grasp) is higher
+    assert sequence.has_released(grasp, 10.0) is not higher
+
+
+@pytest.mark.parametrize(
+    ("laden_kg", "read_kg", "rests"), [(120.0, 30.0, True), (120.0, 60.0, False), (30.0, 0.0, False)]
+)
+def test_a_load_that_weighs_little_on_the_way_down_rests(laden_kg: float, read_kg: float, rests: bool) -> None:
+    sequence = sequence_at(20.0, load_kg=read_kg)
+    sequence.laden_kg = laden_kg
+    sequence.apply(GrappleCommand.HOLD, 0.05)
+    assert not sequence.load_rests, "a single reading"
+    for _ in range(3):
+        sequence.apply(GrappleCommand.HOLD, 0.05)
+    assert sequence.load_rests is rests
 
 
 def sequence_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> GrappleSequence:

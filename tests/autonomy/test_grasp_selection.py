@@ -200,3 +200,15 @@ def test_a_log_that_hangs_askew_is_turned_along_the_bunk(skew):
     place = plan_place(ARM, CraneJob(), grasp, [seen], held_yaw)
     laid = hangs + (place.slew_rad + place.rot_rad - held_yaw)
     assert remainder(laid - BUNK.yaw_rad, pi) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("stands", "turn"), [(-0.2, 0.0), (2.3, pi), (1.2, pi), (0.8, 0.0)])
+def test_of_two_turns_it_makes_the_shorter_one_from_where_the_rotator_stands(stands: float, turn: float) -> None:
+    """The grasp's angle may be nearer to the other one, half a turn away: a thin log would not follow so far."""
+    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
+    held_yaw = 0.9
+    hangs = held_yaw - pi / 2 + 0.6
+    seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
+    first, second = (plan_place(ARM, CraneJob(), grasp, [seen], held_yaw, at) for at in (-0.6, stands))
+    assert first.rot_rad == pytest.approx(-0.6, abs=0.01)
+    assert second.rot_rad - first.rot_rad == pytest.approx(turn, abs=1e-6)

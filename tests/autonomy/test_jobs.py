@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from autonomy.manager.transition_table import State
-from autonomy.process.jobs import STOPPING_TIMEOUT_NS
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.process.jobs import STOPPING_TIMEOUT_NS, ForwardingJob
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
 from can_dbc.messages.vehicle import DriveSetpoint
+from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.forwarding_jobs import begin, command, run
 from tests.autonomy.manager_missions import LOGS
 
@@ -81,3 +86,47 @@ def test_pause_stops_the_crane_smoothly_and_auto_resumes_with_the_log(phase: str
     assert job.execute(command(2, MissionAction.AUTO)) == ""
     run(forwarder, job, lambda j: j.idle)
     assert job.done and manager.tally.loaded == 1 and forwarder.in_bunk == 1
+
+
+def ahead(forwarder: Forwarder, job: ForwardingJob) -> None:
+    """Make the forwarder's detector one that looks ahead: its lists are in the plane, and it is asked first."""
+    near = forwarder.seen
+
+    def seen() -> tuple[LogObservation, ...]:
+        if job.standpoint(forwarder.crane.now_ns) is None:
+            return ()
+        base = forwarder.base()
+        return tuple(
+            replace(
+                log,
+                center_m=tuple(base.to_base(np.asarray(log.center_m)).tolist()),
+                axis=tuple((base.rotation @ np.asarray(log.axis)).tolist()),
+            )
+            for log in near()
+        )
+
+    forwarder.seen = seen  # type: ignore[method-assign]
+
+
+def test_logs_seen_ahead_are_mapped_where_they_lie() -> None:
+    forwarder, job, manager = begin(LOGS[0], uses_memory=True)
+    assert job.drives
+    ahead(forwarder, job)
+    run(forwarder, job, lambda j: bool(manager.world.log_map.logs) and forwarder.speed_m_s > 0.3)
+    (log,) = manager.world.log_map.logs
+    (lies,) = forwarder.field.values()
+    assert log.center_m[:2] == pytest.approx(lies.center_m[:2], abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_no_picture_is_asked_for_and_none_counts_while_the_crane_works() -> None:
+    forwarder, job, manager = begin(LOGS[0], uses_memory=True)
+    ahead(forwarder, job)
+    run(forwarder, job, lambda j: manager.state is State.COLLECT)
+    assert job.standpoint(forwarder.crane.now_ns) is None
+    before = manager.world.log_map.logs
+    late = (LogObservation(7, (30.0, 2.0, 0.1), (1.0, 0.0, 0.0), 2.0, 0.2),)
+    job.step(forwarder.crane.now_ns, None, None, late)
+    assert [log.number for log in manager.world.log_map.logs] == [log.number for log in before]
+    assert manager.world.log_map.get(7) is None and manager.world.log_map.next_number == 2

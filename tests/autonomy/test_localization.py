@@ -283,6 +283,26 @@ def test_unknown_roll_and_height_are_taken_as_level() -> None:
     assert last.usable and last.roll_rad == 0.0 and np.hypot(*drive.off(last)[:2]) < 0.1
 
 
+def test_a_machine_that_turns_while_its_frame_sinks_on_a_hill_stays_located() -> None:
+    """The braked wheels of one side creep farther than those of the other, and no wheel tells."""
+    drive = Drive(bend_rad=0.0)
+    drive.speed_m_s = 0.0
+    drive.on(4.0)
+    assert drive.report is not None
+    begun_ns, turn_rad = drive.report.stamp_ns, 0.05
+
+    def sunk(report: VehicleReport) -> VehicleReport:
+        share = min(1.0, (report.stamp_ns - begun_ns) * 1e-9 / 3.5)
+        heading = report.heading_rad - share * turn_rad
+        return replace(report, heading_rad=heading, heights_m=(0.35 * (1.0 - share),) * 4)
+
+    drive.tamper = sunk
+    before = drive.localizer.rejected
+    on_the_way = drive.on(6.0)
+    assert all(location.usable for location in on_the_way) and drive.localizer.rejected <= before + 2
+    assert drive.off(on_the_way[-1])[2] == pytest.approx(turn_rad, abs=0.02)
+
+
 def test_a_worse_fix_has_less_weight() -> None:
     good, poor = Drive().on(5.0)[-1], Drive(own=Individual(fix=5, white_m=0.05, wander_m=0.25))
     assert poor.on(5.0)[-1].sigma_m > 5.0 * good.sigma_m

@@ -68,8 +68,8 @@ def test_an_error_reply_is_raised() -> None:
 
 
 def test_a_request_carries_the_joints_which_are_nan_when_missing() -> None:
-    assert decode_request(encode_request((0.5, -1.0, 2.25, 0.125, math.nan)))[:4] == (0.5, -1.0, 2.25, 0.125)
-    assert all(math.isnan(value) for value in decode_request(encode_request(())))
+    assert decode_request(encode_request((0.5, -1.0, 2.25, 0.125, math.nan))).q[:4] == (0.5, -1.0, 2.25, 0.125)
+    assert all(math.isnan(value) for value in decode_request(encode_request(())).q)
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b'{"op":"state"}', b'{"op":"logs","q":"1 2"}', b'{"op":"logs","q":"a"}'])

@@ -113,9 +113,9 @@ class Hiding(Weighed):
         return super().seen()[self.gripped :]
 
 
-@pytest.mark.parametrize(("weighs_kg", "follows"), [(20.0, Phase.CARRY), (9.0, Phase.LOOK), (nan, Phase.LOOK)])
+@pytest.mark.parametrize(("weighs_kg", "follows"), [(12.0, Phase.LOWER), (4.0, Phase.LOOK), (nan, Phase.LOOK)])
 def test_a_thin_log_hidden_in_closed_jaws_is_carried_on_where_it_weighs(weighs_kg: float, follows: Phase) -> None:
-    """The controller reports a held load from 30 kg on; a log of 20 kg was sometimes released again."""
+    """The controller reports a held load from 30 kg on; a log of 12 kg was sometimes released again."""
     thin = replace(pair()[0], diameter_m=0.12)
     x, y, z = thin.center_m
     aside = replace(thin, id=thin.id + 7, center_m=(x, y - 2.0, z))
@@ -123,7 +123,7 @@ def test_a_thin_log_hidden_in_closed_jaws_is_carried_on_where_it_weighs(weighs_k
     crane.empty_kg = weighs_kg
     planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
     crane.until(planner, Phase.LIFT)
-    while planner.phase is Phase.LIFT:
+    while planner.phase in (Phase.LIFT, Phase.CARRY):
         crane.step(planner)
     assert planner.phase is follows
 

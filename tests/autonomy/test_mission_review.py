@@ -11,6 +11,7 @@ import pytest
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, MissionError, Options, Point
 from autonomy.missions.review import LOG_S, MIN_SWITCH_M, Review, review
+from autonomy.missions.validation import SWAPPED_HINT
 from machine.geometry.carrier import turning_radius_m
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mission_texts import FENCE, at
@@ -112,5 +113,15 @@ def test_an_assortment_without_logs() -> None:
 def test_another_country_and_a_machine_that_does_not_drive() -> None:
     chile = ForwardingMission("", (Point(-38.0, -72.0), Point(-38.0, -72.001)), (), (), ())
     assert review(chile, AORO).warnings[0].code == "mission.far-from-site"
+    swapped = ForwardingMission("", (Point(15.0, 60.0), Point(15.0, 60.001)), (), (), ())  # 15 E, 60 N is in Sweden
+    (warning, *_) = review(swapped, AORO).warnings
+    assert warning.code == "mission.swapped-axes" and SWAPPED_HINT in warning.sentence
     with pytest.raises(MissionError, check=coded("mission.stationary-machine")):
         review(chile, load_profile("palms_471"))
+
+
+def test_a_warning_names_the_part_that_it_is_about() -> None:
+    found = Way([(0, 0), (30, 0), (0, 1)]).review(KnownLog(at(0, 30)), fences=())
+    assert [(w.code.removeprefix("mission."), w.key) for w in found.warnings] == [
+        ("turn-on-the-spot", ("waypoint", 1)), ("no-fence", None), ("log-out-of-reach", ("log", 0)),
+    ]  # fmt: skip

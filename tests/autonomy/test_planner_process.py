@@ -12,6 +12,7 @@ import pytest
 
 from autonomy.process.command_line import arguments
 from autonomy.process.planner_process import PlannerProcess
+from can_dbc.messages.grasp import ChosenGrasp, decode_grasp
 from can_dbc.messages.mission import (
     MissionAction,
     MissionCommand,
@@ -27,14 +28,18 @@ HASH, KEY = 77, b"key"
 class Jobless:
     """A job that refuses Pause and executes all other commands."""
 
-    idle = done = False
+    idle = done = drives = False
     failure = None
 
     def __init__(self) -> None:
         self.executed: list[MissionAction] = []
+        self.grasp: ChosenGrasp | None = None
 
     def step(self, *_: object) -> list[bytes]:
         return []
+
+    def standpoint(self, now_ns: int) -> None:
+        """No camera ahead."""
 
     def events(self) -> Iterator[Any]:
         return iter(())
@@ -45,6 +50,9 @@ class Jobless:
 
     def report(self, now_ns: int) -> MissionReport:
         return MISSION_REPORT
+
+    def chosen_grasp(self) -> ChosenGrasp | None:
+        return self.grasp
 
 
 @pytest.fixture
@@ -114,3 +122,14 @@ def test_reports_are_sent_twice_a_second_and_after_a_command(process, watcher) -
 
 def test_the_command_port_is_bound_to_loopback(process) -> None:
     assert process[0]._commands.getsockname()[0] == "127.0.0.1"
+
+
+def test_a_chosen_grasp_is_sent_while_there_is_one(process, watcher) -> None:
+    made, job = process
+    job.grasp = ChosenGrasp(1, (0.1, 4.0, 0.4), 1.2, (3,), "log 3 alone")
+    made.step(time.monotonic_ns())
+    assert decode_grasp(watcher.recv(65536), KEY)[::2] == (HASH, job.grasp)
+    assert decode_mission(watcher.recv(65536), KEY)[2].name == MISSION_REPORT.name
+    job.grasp = None
+    made.step(time.monotonic_ns() + 600_000_000)
+    assert decode_mission(watcher.recv(65536), KEY)[2].name == MISSION_REPORT.name

@@ -76,8 +76,17 @@ def test_a_goal_at_a_stop_is_refused_but_a_start_there_is_not() -> None:
 def test_a_turn_is_added_to_the_rotator_alone_and_smoothly() -> None:
     still = hold((0.1, 0.2, -1.0, 0.5, 0.3))
     motion = Trajectory([still.position[0]] * 151, [still.velocity[0]] * 151)
-    more = with_rotation(motion, 1.0, 0.2)
+    more = with_rotation(AORO, motion, 1.0, 0.2)
+    assert more is not None
     q, v = np.array(more.position), np.array(more.velocity)
     assert np.array_equal(q[:, : Joint.ROT], np.array(motion.position)[:, : Joint.ROT])
     assert np.all(q[:51, Joint.ROT] == 0.3) and q[-1, Joint.ROT] == pytest.approx(0.5)
     assert np.gradient(q[:, Joint.ROT], 0.02)[1:-1] == pytest.approx(v[1:-1, Joint.ROT], abs=2e-3)
+
+
+@pytest.mark.parametrize(("from_s", "by_rad"), [(2.9, 0.2), (3.0, 0.2), (3.2, 0.01), (2.0, 2.0)])
+def test_no_turn_is_added_that_the_rest_of_the_motion_is_too_short_for(from_s: float, by_rad: float) -> None:
+    """It would be a jump of the setpoint, which the controller refuses."""
+    still = hold((0.1, 0.2, -1.0, 0.5, 0.3))
+    motion = Trajectory([still.position[0]] * 151, [still.velocity[0]] * 151)
+    assert with_rotation(AORO, motion, from_s, by_rad) is None

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from autonomy.calibration.result import identify
-from autonomy.calibration.spool_program import PULSES
+from autonomy.calibration.rotator_turns import MIN_FIRST_TURN_RAD
+from autonomy.calibration.spool_program import PULSES, TURN_TOPS_PCT, allowed_by, turn_search
 from autonomy.calibration.tasks import Findings
-from autonomy.calibration.turn_fit import YAW_SIGMA_RAD, Turn, TurnFit, fit_turns, pulse_to
+from autonomy.calibration.turn_fit import YAW_SIGMA_RAD, SideFit, Turn, TurnFit, fit_turns, pulse_to
+from controller.crane.spool_test_run import MAX_OPEN_UNSENSED_NS
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from tests.autonomy.valve_stand_in import StandIn
@@ -24,7 +26,9 @@ SLOW_MINUS = StandIn(deadbands=(0.083, 0.12), full_speeds=(2.4, 1.6), hysteresis
 FAR_OFF = StandIn(deadbands=(0.14, 0.07), full_speeds=(3.2, 1.3))
 
 
-def surveyed(machine: StandIn, seed: int = 3, readings: int = READINGS) -> tuple[list[Turn], list[float]]:
+def surveyed(
+    machine: StandIn, seed: int = 3, readings: int = READINGS, searched: bool = False
+) -> tuple[list[Turn], list[float]]:
     """The turns of a calibration, and where the rotator stood after each [rad]."""
     rng = np.random.default_rng(seed)
 
@@ -33,6 +37,15 @@ def surveyed(machine: StandIn, seed: int = 3, readings: int = READINGS) -> tuple
 
     angle, turns, stood = 0.0, [], []
     before = read()
+    for side in (1, -1) if searched else ():
+        for top_pct in TURN_TOPS_PCT:  # rising ramps until one turns it, as the procedure does
+            record = machine.run(Joint.ROT, side, "search", turn_search(ROT, side, top_pct, allowed_by(ROT)), angle)
+            turned, angle = abs(float(record.position[-1]) - angle), float(record.position[-1])
+            after = read()
+            turns.append(Turn(record, before, after, readings))
+            before = after
+            if turned > MIN_FIRST_TURN_RAD:
+                break
     for share, far in PULSES:
         for side, goal in ((1, far), (-1, 0.0)):
             program = pulse_to(ROT, fit_turns(turns, ROT), side, share, goal)
@@ -79,10 +92,17 @@ def test_half_turns_are_not_mistaken_on_a_machine_far_from_its_profile() -> None
 
 
 def test_single_readings_of_a_person_are_plausible() -> None:
-    turns, _ = surveyed(SLOW_PLUS, readings=1)
+    turns, _ = surveyed(SLOW_PLUS, readings=1, searched=True)
     result = identify(AORO, Findings(turns=turns))
     assert result.turns is not None and result.implausible == ()
     assert max(errors(result.turns, SLOW_PLUS)[1]) < 0.1
+
+
+@pytest.mark.parametrize(("deadband", "full"), [(0.03, 0.67), (0.18, 0.67), (0.3, 0.67), (0.3, 6.0)])
+def test_no_pulse_lasts_longer_than_the_controller_lets_one(deadband: float, full: float) -> None:
+    slow = SideFit(deadband, full, (0.01, 0.1))
+    for share, far in PULSES:
+        assert pulse_to(ROT, TurnFit(slow, slow), 1, share, far).duration_s < 1e-9 * MAX_OPEN_UNSENSED_NS
 
 
 def test_without_turns_a_side_keeps_the_profiles_values() -> None:
@@ -96,6 +116,6 @@ def test_implausible_turns_are_reported() -> None:
     wrong = [*turns[:-2], replace(turns[-2], after_rad=turns[-2].after_rad + 0.9), turns[-1]]
     problems = identify(AORO, Findings(turns=wrong)).implausible
     assert any("rot plus" in problem.sentence for problem in problems), problems
-    crawling, _ = surveyed(replace(SLOW_PLUS, full_speeds=(0.8, 2.35)))
+    crawling, _ = surveyed(replace(SLOW_PLUS, full_speeds=(0.3, 2.35)))
     problems = identify(AORO, Findings(turns=crawling)).implausible
-    assert {"implausible.out-of-range", "implausible.sides-differ"} <= {problem.code for problem in problems}, problems
+    assert "implausible.out-of-range" in {problem.code for problem in problems}, problems

@@ -20,7 +20,7 @@ CATALOGUE = [
     (
         "EstopStat", 0x181, 8, 10, 30,
         {"Crc": 0, "Counter": 8, "ChannelA": 12, "ChannelB": 14, "Source": 16, "ResetReq": 24, "PilotSupply": 26,
-         "Person": 28, "PilotPress": 32, "EventSeq": 44},
+         "Person": 28, "Lever": 30, "PilotPress": 32, "EventSeq": 44},
     ),
     ("EncSlew", 0x182, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
     ("EncLift", 0x183, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
@@ -76,6 +76,7 @@ CATALOGUE = [
         "PlcStatus", 0x490, 8, 20, 100,
         {"Crc": 0, "Counter": 8, "Mode": 12, "WatchdogCounter": 16, "LongestCycle": 24, "FaultBits": 40},
     ),
+    ("PlcOut", 0x491, 8, 10, 50, {"Crc": 0, "Counter": 8, "Slew": 12, "Lift": 22, "Tilt": 32, "Ext": 42, "Rot": 52}),
     (
         "CtrlStatus", 0x4FE, 8, 20, 100,
         {"Crc": 0, "Counter": 8, "Mode": 12, "SafeState": 16, "Reason": 20, "StaleMask": 28, "LoopLate": 44,
@@ -133,8 +134,11 @@ def test_swing_arms_are_commanded_as_spools_and_reported_as_heights() -> None:
         "ArmHeightB": [*header, "State", "FloatFront", "FloatRear", "Roll", "Pitch"],
     }
     for name, signals in layouts.items():
-        assert [s.name for s in MACHINE.messages[name].signals] == signals
-        assert MACHINE.messages[name].cycle_time_ns == 20_000_000 and MACHINE.messages[name].timeout_ns == 100_000_000
+        message = MACHINE.messages[name]
+        assert [s.name for s in message.signals] == signals
+        assert message.cycle_time_ns == 20_000_000
+        # A receiver must be neutral 100 ms after the last command; it looks every few milliseconds.
+        assert message.timeout_ns == (90_000_000 if name.startswith("ArmCmd") else 100_000_000)
     spool, height = MACHINE.messages["ArmCmdA"].signals[3], MACHINE.messages["ArmHeightA"].signals[3]
     assert (spool.scale, spool.minimum, spool.maximum, spool.unit, spool.policy) == (
         0.05, -100, 100, "%", codec.Policy.REFUSE,
@@ -159,7 +163,7 @@ def test_physical_units() -> None:
 
 def test_data_ids_distinguish_messages() -> None:
     lists = [m.data_ids for m in chain(CRANE.messages.values(), MACHINE.messages.values()) if m.data_ids]
-    assert len(lists) == 25
+    assert len(lists) == 26
     for counter in range(16):
         assert len({ids[counter] for ids in lists}) == len(lists)
 

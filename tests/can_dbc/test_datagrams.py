@@ -7,6 +7,7 @@ import dataclasses
 import math
 import struct
 import zlib
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,6 +19,7 @@ from can_dbc.messages.crane import (
     CraneSetpoint,
     GrappleCommand,
     Knot,
+    LinkWatch,
     OperatorAction,
     OperatorCommand,
     SpoolKnot,
@@ -69,6 +71,7 @@ operator_commands = st.builds(OperatorCommand, u32, u32, stamps, st.sampled_from
 reports = st.builds(
     StateReport, u32, u32, stamps, u8, u8, u16, u32, u16, u16, u16,
     known_or_nan, known_or_nan, known_or_nan, finite, finite, finite, u32, u32, u32, u32,
+    operator_link=st.integers(0, len(LinkWatch) - 1),
 )  # fmt: skip
 maybe = st.floats(allow_infinity=False)
 vehicle_reports = st.builds(
@@ -327,8 +330,24 @@ def test_a_report_carries_the_evidence_of_its_reason_only_while_there_is_one() -
     assert decode(encode(plain)) == plain and decode(encode(stopped)) == stopped
     assert len(encode(stopped)) == len(encode(plain)) + 32
     body = encode(stopped)[:-4]
-    for cut in (1, 8, 31):
+    for cut in (1, 8, 30, 31):
         data = body[:-cut]
+        with pytest.raises(DatagramRefused) as refused:
+            decode(data + struct.pack("<I", zlib.crc32(data)))
+        assert refused.value.fault is DatagramFault.LENGTH
+
+
+@pytest.mark.parametrize("link", [LinkWatch.WATCHED, LinkWatch.LOST])
+@pytest.mark.parametrize("evidence", [{}, {"since_ns": 77, "numbers": (20.0, 15.0, 4.0)}])
+def test_a_report_tells_of_the_operators_link_only_while_it_is_watched(
+    link: LinkWatch, evidence: dict[str, Any]
+) -> None:
+    known = (1.0,) * 5
+    plain = StateReport(1, 2, 3, 2, 0, 0, 0, 0, 0, 0, known, known, known, 0.0, 0.0, 0.0, 1, 2, 3, 4, **evidence)
+    told = dataclasses.replace(plain, operator_link=link)
+    assert decode(encode(told)) == told and len(encode(told)) == len(encode(plain)) + 1
+    for unknown in (0, 3, 255):
+        data = encode(told)[:-5] + bytes((unknown,))
         with pytest.raises(DatagramRefused) as refused:
             decode(data + struct.pack("<I", zlib.crc32(data)))
         assert refused.value.fault is DatagramFault.LENGTH

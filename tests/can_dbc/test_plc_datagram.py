@@ -65,21 +65,22 @@ def test_a_reply_survives_the_round_trip(
         9,
         ESTOP,
         header.echo & 0xFFFF,
+        (0.5, -0.5, 0.001, 1.0, -1.0, 0.0, 0.0),
     )
     data = encode_reply(header, feedback)
-    assert len(data) == REPLY_BYTES == 132
+    assert len(data) == REPLY_BYTES == 144
     assert decode_reply(data) == (header, feedback)
 
 
 def test_the_layout_is_that_of_the_table() -> None:
     """Read with plain offsets, little-endian: header 32, seven pairs, end."""
     data = encode_command(Header(77, 5, 1_000_000, 3), COMMAND)
-    assert struct.unpack_from("<4sHHIIQIHH", data) == (b"CRN1", 2, 1, 77, 5, 1_000_000, 3, 1, 0x5AA5)
+    assert struct.unpack_from("<4sHHIIQIHH", data) == (b"CRN1", 3, 1, 77, 5, 1_000_000, 3, 1, 0x5AA5)
     assert struct.unpack_from("<ii", data, 32) == (100_000, 10_000)
     assert struct.unpack_from("<4H", data, 88) == (2, 100, 50, 1)
     assert struct.unpack_from("<I", data, 96)[0] == zlib.crc32(data[:96])
     reply = encode_reply(Header(77, 7, 8, 9), FEEDBACK)
-    assert struct.unpack_from("<4sHHIIQIHH", reply) == (b"CRN1", 2, 2, 77, 7, 8, 9, 2, 0x5AA5)
+    assert struct.unpack_from("<4sHHIIQIHH", reply) == (b"CRN1", 3, 2, 77, 7, 8, 9, 2, 0x5AA5)
     assert struct.unpack_from("<8h6H8sH", reply, 88) == (*(-15,) * 8, 7, 1, 2, 444, 250, 120, ESTOP, 54321)
 
 

@@ -61,6 +61,7 @@ FEEDBACKS = st.builds(
     load_kg=U16,
     estop_frame=st.binary(min_size=8, max_size=8),
     sampled_us=U16,
+    output=st.tuples(*[MILLIS] * N_AXES),
 )
 
 
@@ -82,18 +83,20 @@ def test_a_status_survives_the_round_trip(feedback: Feedback, watchdog_ms: int, 
 
 
 def test_the_addresses_are_those_of_the_map() -> None:
-    """Addresses 0-47 and 100-131 as documented, with a distinct value in each register."""
+    """Addresses 0-55 and 100-131 as documented, with a distinct value in each register."""
     feedback = Feedback(
         heartbeat=11, state=State.EXECUTE, fault=1, fault_axis=3, estop=7, accepted=21, longest_cycle_us=31,
         position=(0.065537, -0.000001, 0.0, 0.0, 0.0, 0.0, 0.0), velocity=(0.001, -0.001, 0.0, 0.0, 0.0, 0.0, 0.007),
         pressure_bar=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), opening=0.5, load_kg=77,
         estop_frame=bytes(range(1, 9)), sampled_us=0xABCD,
+        output=(1.0, -1.0, 0.001, 0.0, 0.0, 0.25, 0.0),
     )  # fmt: skip
     status = status_registers(feedback, 300, WordOrder.HIGH_FIRST)
-    assert status[:12] == [0x4352, 2, 0x0102, 0x0304, 11, 2, 1, 3, 7, 21, 31, 300]
+    assert status[:12] == [0x4352, 3, 0x0102, 0x0304, 11, 2, 1, 3, 7, 21, 31, 300]
     assert status[12:16] == [1, 1, 0xFFFF, 0xFFFF]
     assert (status[26], status[27], status[32]) == (1, 0xFFFF, 7)
     assert status[33:48] == [1, 2, 3, 4, 5, 6, 7, 8, 500, 77, 0x0102, 0x0304, 0x0506, 0x0708, 0xABCD]
+    assert status[48:] == [1000, 0xFC18, 1, 0, 0, 250, 0, 0]
     low = status_registers(feedback, 300, WordOrder.LOW_FIRST)
     assert (low[2:4], low[12:14]) == ([0x0304, 0x0102], [1, 1])
     command = Command(

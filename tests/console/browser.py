@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from websockets.sync.client import connect
 
@@ -22,6 +22,14 @@ PATIENCE_S = 30.0
 def installed() -> str | None:
     """The browser's program, if there is one."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Memory(NamedTuple):
+    """What a page holds."""
+
+    heap_bytes: int
+    nodes: int
+    listeners: int
 
 
 class Browser:
@@ -69,6 +77,12 @@ class Browser:
         self._ask("Page.navigate", url=url)
         self.until("document.readyState === 'complete' && location.protocol === 'http:'")
 
+    def draw_every(self, period_ms: int) -> None:
+        """Pages that are opened from now on draw so seldom: what software renders takes the processor from scripts."""
+        script = f"window.requestAnimationFrame = f => setTimeout(() => f(performance.now()), {period_ms});"
+        self._ask("Page.enable")
+        self._ask("Page.addScriptToEvaluateOnNewDocument", source=script)
+
     def value(self, script: str) -> Any:
         """What an expression of the page is worth; raises AssertionError when it throws."""
         answer = self._ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
@@ -80,13 +94,68 @@ class Browser:
         return str(self.value(f"(e => e?.checkVisibility() ? e.innerText : '')(document.getElementById({element!r}))"))
 
     def click(self, element: str) -> None:
-        """A real click on its centre; an element that covers it receives the click."""
+        """A real click on its centre, when the page no longer moves it; an element that covers it gets it."""
         box = self.value(
-            f"(() => {{ const e = document.getElementById({element!r}); e.scrollIntoView({{block: 'center'}});"
-            " const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+            f"(async () => {{ const e = document.getElementById({element!r}); let last;"
+            " for (let still = 0; still < 3; await new Promise(done => setTimeout(done, 30))) {"
+            " e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
+            " const now = [b.x + b.width / 2, b.y + b.height / 2]; still = `${now}` === `${last}` ? still + 1 : 0;"
+            " last = now; } return last; })()"
         )
         for kind in ("mousePressed", "mouseReleased"):
             self._ask("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
+
+    def click_on(self, selector: str, words: str) -> None:
+        """A real click on the first element of a selector whose text begins with words."""
+        found = f"[...document.querySelectorAll({selector!r})].find(e => e.innerText.startsWith({words!r}))"
+        self.until(f"Boolean({found})")
+        x, y = self.value(
+            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
+            f" return [b.x + b.width / 2, b.y + b.height / 2]; }})({found})"
+        )
+        self.press(x, y)
+
+    def mouse(self, kind: str, x: float, y: float, count: int = 1) -> None:
+        """A real event at a place of the window: "mousePressed", "mouseReleased" or "mouseMoved" (with the button)."""
+        self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=count)
+
+    def press(self, x: float, y: float, count: int = 1) -> None:
+        """A real click at a place of the window."""
+        self._ask("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.mouse(kind, x, y, count)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """A real drag, in steps as a hand makes them."""
+        self._ask("Input.dispatchMouseEvent", type="mouseMoved", x=start[0], y=start[1])
+        self.mouse("mousePressed", *start)
+        for k in range(1, 6):
+            self.mouse("mouseMoved", *(a + (b - a) * k / 5 for a, b in zip(start, end, strict=True)))
+        self.mouse("mouseReleased", *end)
+
+    def keys(self, text: str) -> None:
+        """Type a text where the focus is, or press one key by its name, as in "Enter"."""
+        if len(text) > 1 and text.isalpha():
+            for kind in ("rawKeyDown", "keyUp"):
+                self._ask("Input.dispatchKeyEvent", type=kind, key=text, code=text)
+        else:
+            self._ask("Input.insertText", text=text)
+
+    def choose_file(self, element: str, file: Path) -> None:
+        """Choose a file in a file input."""
+        found = self._ask("Runtime.evaluate", expression=f"document.getElementById({element!r})")["result"]["objectId"]
+        self._ask("DOM.setFileInputFiles", files=[str(file)], objectId=found)
+
+    def memory(self) -> Memory:
+        """What the page holds after a forced collection: the least of three readings."""
+        self._ask("Performance.enable")
+        found = []
+        for _ in range(3):
+            self._ask("HeapProfiler.collectGarbage")
+            told = {each["name"]: int(each["value"]) for each in self._ask("Performance.getMetrics")["metrics"]}
+            found.append(Memory(told["JSHeapUsedSize"], told["Nodes"], told["JSEventListeners"]))
+            time.sleep(0.3)
+        return Memory(*(min(values) for values in zip(*found, strict=True)))
 
     def picture(self, path: Path) -> None:
         """Save a screenshot as PNG."""

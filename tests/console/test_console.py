@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import re
@@ -12,45 +13,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from autonomy.perception.log_list.datagrams import decode_logs, decode_request
-from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.timing.page import TimingWriter
-from console.server import STATIC, Console, create_app
+from console import server
+from console.console import Console
+from console.server import STATIC
 from console.state import REPORT_TIMEOUT_NS, TIMING_TIMEOUT_NS, CraneState, describe_machine
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status import faults
 from machine.status.modes import Mode
-from machine.status.reasons import Reason, pack
+from tests.console.page_client import HERE, page_client, socket_of
+from tests.console.state_reports import REPORT
 
 PROFILE = load_profile("palms_471")
-HERE = "http://127.0.0.1:8471"
-REPORT = StateReport(
-    sequence=7,
-    profile_hash=profile_hash(PROFILE),
-    stamp_ns=5_000_000_000,
-    mode=Mode.ACTIVE,
-    grapple_state=4,
-    reason=pack(Reason.JOINT_STUCK, 2),
-    setpoint_sequence=3,
-    refusal=0,
-    refused=4,
-    stale_mask=1 << 4 | 1,
-    position=(0.1, 0.2, -1.0, 0.5, 0.3),
-    velocity=(0.0,) * 5,
-    reference=(0.2, 0.2, -1.0, 0.5, 0.3),
-    opening_pct=60.0,
-    clamp_bar=120.0,
-    load_kg=200.0,
-    tick_ns=600_000,
-    late_ns=80_000,
-    missed_ticks=2,
-    frames_received=1000,
-)
 
 
 @pytest.fixture
@@ -76,7 +56,8 @@ def console(operator_socket):
 
 
 def client_of(console, peer="127.0.0.1", **options):
-    return TestClient(create_app(console, **options), base_url=HERE, client=(peer, 40000))
+    """A page there; on this machine it has the control lease."""
+    return page_client(console, peer, leads=peer == "127.0.0.1", **options)
 
 
 @pytest.fixture
@@ -149,7 +130,7 @@ def test_foreign_origin_is_refused(client, operator_socket, origin):
         operator_socket.recv(100)
 
 
-@pytest.mark.parametrize("action", list(OperatorAction))
+@pytest.mark.parametrize("action", [a for a in OperatorAction if a not in WATCH_ACTIONS])
 def test_command_sends_its_datagram(client, operator_socket, action):
     answer = client.post(f"/api/operator/{action.name.lower()}", headers={"origin": HERE})
     assert answer.status_code == 204
@@ -199,7 +180,7 @@ def test_a_console_without_a_controller_is_read_only():
 
 def test_state_flows_over_the_websocket(console, client):
     console.crane_state.on_report(encode(REPORT), 10**10)
-    with client.websocket_connect("ws://127.0.0.1:8471/ws", headers={"origin": HERE}) as ws:
+    with client.websocket_connect(socket_of(client), headers={"origin": HERE}) as ws:
         state = ws.receive_json()
         assert state["mode"] == "ACTIVE" and state["alive"] and state["may_command"]
         console.crane_state.on_report(encode(replace(REPORT, mode=Mode.FAULT)), 10**10)
@@ -228,7 +209,7 @@ def test_logs_of_a_detector_are_shown(controller_socket):
     (known,) = decode_logs(answer)
     with client_of(console) as client:
         question, peer = controller_socket.recvfrom(100)
-        assert all(value != value for value in decode_request(question)), "the request has no joints"
+        assert all(value != value for value in decode_request(question).q), "the request has no joints"
         controller_socket.sendto(b'{"nonsense": 1}', peer)
         controller_socket.sendto(answer, peer)
         with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
@@ -363,7 +344,20 @@ def test_start_errors_are_one_sentence_with_an_exit_code():
             (4, "--port", 0, "--report-port", port),
             (3, "--port", 0, "--report-port", 0, "--profile", "palms"),
             (2, "--port", 0, "--report-port", 0, "--planner", "nowhere"),
+            (2, "--port", 0, "--report-port", 0, "--bus", "crane9=wire:crane9"),
         ]
         for code, *arguments in cases:
             done = run_console(*arguments)
             assert (done.returncode, done.stderr.count("\n"), "Traceback" in done.stderr) == (code, 1, False)
+
+
+def test_a_page_that_the_server_has_given_up_counts_as_gone() -> None:
+    """It answered no ping: uvicorn has closed the connection, and says so with a RuntimeError when more is sent."""
+
+    class Closed:
+        async def send_text(self, _text: str) -> None:
+            raise RuntimeError("Unexpected ASGI message 'websocket.send', after sending 'websocket.close'.")
+
+    with pytest.raises(WebSocketDisconnect) as gone:
+        asyncio.run(server._send(Closed(), "{}"))  # type: ignore[arg-type]
+    assert gone.value.code == 1006

@@ -6,22 +6,26 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass
 from math import nan
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import msgspec
 import pytest
-import uvicorn
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import MissionAction, MissionReport, decode_mission_command, encode_mission
-from console.server import Console, create_app
+from console.console import Console
+from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.console.browser import MISSING, Browser, installed
+from tests.console.control import take_control
+from tests.console.served_page import served
 from tests.console.vehicle_reports import VEHICLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(installed() is None, reason=MISSING)]
@@ -48,32 +52,26 @@ class Stage:
     mission: MissionReport | None = MISSION_REPORT
     speaks: bool = True
     over: bool = False
-    _threads: list[threading.Thread] = field(default_factory=list)
 
     def begin(self) -> None:
         profile = load_profile(self.profile)
         self.hash = profile_hash(profile)
-        reports, page = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), socket.socket()
-        for each in (reports, page):
-            each.bind(("127.0.0.1", 0))
-            each.setblocking(False)
-        self._to, self.port = reports.getsockname(), page.getsockname()[1]
+        reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        reports.bind(("127.0.0.1", 0))
+        reports.setblocking(False)
+        self._to = reports.getsockname()
         console = Console(
             profile, self.hash, ("127.0.0.1", 9), reports=reports, planner=self.orders.getsockname()
         )  # fmt: skip
-        config = uvicorn.Config(
-            create_app(console), log_level="error", timeout_graceful_shutdown=1, ws="websockets-sansio"
-        )
-        self.server = uvicorn.Server(config)
-        self._threads = [threading.Thread(target=self.server.run, kwargs={"sockets": [page]}),
-                         threading.Thread(target=self._feed)]  # fmt: skip
-        for thread in self._threads:
-            thread.start()
+        self._serving = ExitStack()
+        self.port = urlsplit(self._serving.enter_context(served(create_app(console)))).port or 0
+        self._thread = threading.Thread(target=self._feed)
+        self._thread.start()
 
     def end(self) -> None:
-        self.over = self.server.should_exit = True
-        for thread in self._threads:
-            thread.join()
+        self.over = True
+        self._thread.join()
+        self._serving.close()
 
     def ordered(self) -> MissionAction:
         return decode_mission_command(self.orders.recv(100)).action
@@ -157,6 +155,8 @@ def test_a_click_sends_the_command(
 ) -> None:
     stage.mission = msgspec.structs.replace(MISSION_REPORT, state="SEARCH", words="is another", **before)
     shows(browser, "mission-words", "is another")
+    if button != "pause":  # which only stops
+        take_control(browser)
     browser.until(f"!document.getElementById('{button}').disabled")
     browser.click(button)
     assert stage.ordered() is order
@@ -164,6 +164,8 @@ def test_a_click_sends_the_command(
 
 def test_an_abort_must_be_confirmed(stage: Stage, browser: Browser) -> None:
     browser.until("document.getElementById('abort').checkVisibility()")
+    assert browser.value("document.getElementById('abort').disabled"), "nobody has control yet"
+    take_control(browser)
     browser.until("!document.getElementById('abort').disabled")
     browser.click("abort")
     shows(browser, "end", "Abort the mission?")

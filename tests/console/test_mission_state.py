@@ -14,15 +14,15 @@ from starlette.testclient import TestClient
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import MissionAction, MissionCommand, decode_mission_command, encode_mission
 from can_dbc.messages.vehicle import VEHICLE_INPUTS, Driving
-from console.map_projection import MapProjection
+from console.console import Console
 from console.mission_state import DRIVING, FIXES, INPUT_NAMES, MISSION_TIMEOUT_NS, TRAIL_M, VEHICLE_TIMEOUT_NS
-from console.server import Console, create_app
 from console.state import CraneState, describe_machine
+from machine.geometry.map_projection import MapProjection
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.can_dbc.example_mission_report import HERE, MISSION_REPORT
+from tests.console.page_client import HERE as PAGE
+from tests.console.page_client import page_client
 from tests.console.vehicle_reports import HASH, PROFILE, VEHICLE
-
-BASE = "http://127.0.0.1:8471"
 
 
 def crane_state(profile=PROFILE, key=None) -> CraneState:
@@ -148,7 +148,7 @@ def planner():
 
 
 def client_of(console: Console, peer: str = "127.0.0.1") -> TestClient:
-    return TestClient(create_app(console), base_url=BASE, client=(peer, 40000))
+    return page_client(console, peer, leads=peer == "127.0.0.1")
 
 
 def console_of(planner=None, key=None) -> Console:
@@ -160,7 +160,7 @@ def test_a_mission_command_sends_its_datagram(planner, order) -> None:
     client = client_of(console_of(planner, b"key"))
     for _ in range(2):
         name = order.name.lower().replace("_", "-")
-        assert client.post(f"/api/mission/{name}", headers={"origin": BASE}).status_code == 204
+        assert client.post(f"/api/mission/{name}", headers={"origin": PAGE}).status_code == 204
     first, second = (decode_mission_command(planner.recv(100), b"key") for _ in range(2))
     assert first == MissionCommand(first.sequence, HASH, 10**10, order) and second.sequence > first.sequence
 

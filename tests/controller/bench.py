@@ -50,7 +50,7 @@ SPECS = [joint(PROFILE, j) for j in JOINTS]
 T = SETTINGS.period_ns
 MS = 1_000_000
 HOME = (0.0, 0.5, -1.2, 0.6, 0.0)
-PERIOD_MS = {"EstopStat": 10, "GuardStat": 10, "PressC": 20, "GrappleStat": 20, "PlcStatus": 20}
+PERIOD_MS = {"EstopStat": 10, "GuardStat": 10, "PressC": 20, "GrappleStat": 20, "PlcStatus": 20, "PlcOut": 10}
 VALUES: dict[str, dict[str, float]] = {
     "EstopStat": {"ChannelA": 1, "ChannelB": 1, "PilotSupply": 1, "PilotPress": 30.0},
     "GuardStat": {"Enable": 0xA},
@@ -60,6 +60,7 @@ VALUES: dict[str, dict[str, float]] = {
     "PressB": {},
     "PressC": {"Pump": 180.0},
     "PlcStatus": {"Mode": 2},
+    "PlcOut": {},
     "GrappleStat": {"Opening": 100.0},
 }
 MACHINE_PERIOD_MS = {
@@ -140,11 +141,19 @@ class Bench:
         self.encoder_drift: dict[int, float] = {}
         """How fast an encoder's zero moves [rad/s, m/s]."""
         self.encoder_error: dict[int, float] = {}
+        self.spool_stuck: dict[int, float] = {}
+        """Spools that stay where they are put [%]."""
+        self.spool_gain: dict[int, float] = {}
+        self.spools_measured = True
+        """Whether the valve node has position sensors on its spools."""
         self.specs = [joint(settings.profile, j) for j in JOINTS]
         self.carrier = settings.profile.carrier
         self.articulation_rad = 0.0
         self.valves = [ValveMap(s.valve) for s in self.specs]
         self.spools = [0.0] * N_JOINTS
+        self.plc_outputs = [0.0] * N_JOINTS
+        """What a PLC drives the spools with; it passes the commands on, or does as told by ``plc_output``."""
+        self.plc_output: dict[int, float] = {}
         self.openings = [0.0] * N_JOINTS
         self.lines = [deque([0.0] * max(1, round(s.valve.delay_s * 1e9 / T))) for s in self.specs]
         self.senders = {n: Sender(m.data_ids) for n, m in CODECS.items() if m.data_ids}
@@ -231,8 +240,10 @@ class Bench:
                     values["TimeStamp"] = self.count & 0xFFFF
                 frames.append(self._frame(encoder.message, values))
         for name, values in VALUES.items():
+            if name == "PlcOut" and self.settings.profile.plc is None:
+                continue
             if (self.count * 5) % PERIOD_MS.get(name, 5) == 0 and name not in self.dropped:
-                more = {"EchoCounter": self.echo} if name == "ValveFbB" else {}
+                more = self._feedback(name) if name in ("ValveFbA", "ValveFbB", "PlcOut") else {}
                 frames.append(self._frame(name, {**values, **more}))
         if self.count % 20 == 0:
             states = {**self.nodes, **{n: e.state for n, e in self.encoders.items()}}
@@ -240,6 +251,19 @@ class Bench:
         frames += self.extra
         self.extra = []
         return frames
+
+    def _feedback(self, name: str) -> dict[str, float]:
+        """The valve node follows while it is armed, and measures its spools; a PLC reports its outputs to them."""
+        if name == "PlcOut":
+            return {joint.name.capitalize(): 100.0 * self.plc_outputs[joint] for joint in JOINTS}
+        measured = [100.0 * spool if self.spools_measured else None for spool in self.spools]
+        if name == "ValveFbB":
+            return {"EchoCounter": self.echo, "SpoolRot": measured[4]}
+        state = 1 if self.commands_b.get("ArmKey") == 0xA else 0
+        return {
+            "State": state,
+            **dict(zip(("SpoolSlew", "SpoolLift", "SpoolTilt", "SpoolExt"), measured, strict=False)),
+        }
 
     def _counts(self, place: int, encoder: Any) -> int:
         if place in self.frozen_counts:
@@ -297,9 +321,11 @@ class Bench:
         for j, spec in enumerate(self.specs):
             valve = spec.valve
             command = {**self.commands_a, **self.commands_b}[valve.signal] / 100.0
+            command = self.plc_outputs[j] = self.plc_output.get(j, command)
             self.lines[j].append(command)
             lag = 1.0 - math.exp(-T * 1e-9 / valve.lag_s) if valve.lag_s else 1.0
-            self.spools[j] += lag * (self.lines[j].popleft() - self.spools[j])
+            wanted = self.lines[j].popleft() * self.spool_gain.get(j, 1.0)
+            self.spools[j] += lag * (self.spool_stuck.get(j, 100.0 * wanted) / 100.0 - self.spools[j])
             half, made = valve.hysteresis_pct / 200.0, self.valves[j]
             opening = max(self.spools[j] - half, min(self.spools[j] + half, self.openings[j]))
             self.openings[j] = opening

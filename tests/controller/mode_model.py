@@ -17,6 +17,14 @@ from controller.transitions import OPERATING, TRANSITIONS, Event
 from machine.status.modes import Mode
 
 
+class Link(Enum):
+    """The link of an operator who watches."""
+
+    OFF = auto()
+    WATCHED = auto()
+    LOST = auto()
+
+
 class Broken(Enum):
     """What is wrong for the guard now."""
 
@@ -49,6 +57,7 @@ class State:
     locked: bool = False
     armed: bool = False
     reset_pressed: bool = True
+    link: Link = Link.OFF
 
     @property
     def armed_key(self) -> bool:
@@ -101,6 +110,8 @@ def settled(state: State) -> State:
         state = applied(state, Event.CUT)  # the controller sees that the guard refuses, or is gone
     elif state.armed_key and state.cause is not None:
         state = applied(state, state.cause)
+    elif state.armed_key and state.link is Link.LOST:
+        state = applied(state, Event.HOLD)
     if was_active and not (state.pilot_on and state.enabled):
         state = replace(state, locked=True)
     if not state.armed_key:
@@ -126,6 +137,7 @@ def time_passes(state: State) -> State:
 def arm(state: State) -> State:
     """The operator's ARM, refused unless the machine is ready."""
     ready = not state.ramping and not state.pressed and state.cause is None and state.enabled and state.pilot_on
+    ready = ready and state.link is not Link.LOST
     return applied(state, Event.ARM) if ready and state.mode is not Mode.FAULT else state
 
 
@@ -153,6 +165,8 @@ PERSON: dict[str, Callable[[State], State]] = {
     "RESET": reset,
     "reset button": press_reset,
     "release": lambda s: replace(s, pressed=False),
+    "WATCH": lambda s: replace(s, link=Link.WATCHED),
+    "WATCH_END": lambda s: replace(s, link=Link.OFF),
 }
 """What a person does to start."""
 STOPS: dict[str, Callable[[State], State]] = {
@@ -164,6 +178,7 @@ MACHINE: dict[str, Callable[[State], State]] = {
     "time": time_passes,
     "setpoint": lambda s: applied(s, Event.SETPOINT) if s.mode in OPERATING else s,
     "done": lambda s: applied(s, Event.DONE) if s.mode is Mode.ACTIVE else s,
+    "link lost": lambda s: replace(s, link=Link.LOST) if s.link is Link.WATCHED else s,
     "cause gone": lambda s: replace(s, cause=None),
     "rules hold": lambda s: replace(s, broken=Broken.NOTHING),
     "silence": lambda s: replace(s, broken=Broken.SILENCE),

@@ -135,6 +135,32 @@ def test_three_refusals_within_a_second_stop_a_driving_machine():
     assert bench.mode is Mode.STOP and bench.reason == Reason.SETPOINTS_REFUSED
 
 
+def test_three_unreadable_datagrams_within_a_second_stop_a_driving_machine():
+    """Nobody can tell for whom they were: they count for whatever moves.  The lease would stop it 50 ms later."""
+    bench = DriveBench().under_way(120)
+    for sent in (b"", b"rubbish"):
+        bench.tick([sent])
+        bench.run(9)
+    assert bench.mode is Mode.ACTIVE
+    bench.tick([bench.to(50, 0, math.nan)])
+    assert bench.mode is Mode.STOP and bench.reason == Reason.SETPOINTS_REFUSED
+    assert bench.vehicle.gate.refused == bench.controller.gate.refused == 3
+
+
+def test_what_an_operator_sends_is_no_refused_drive_setpoint():
+    bench = DriveBench().under_way(120)
+    for _ in range(3):
+        bench.tick_with([bench.to(50, 0)], [b"rubbish"])
+    assert bench.mode is Mode.ACTIVE and bench.vehicle.gate.refused == 0
+
+
+def test_refused_crane_setpoints_do_not_stop_a_driving_machine():
+    bench = DriveBench().under_way(120)
+    for _ in range(3):
+        bench.tick([bench.to(50, 0), crane_to(bench, 0.1)])
+    assert bench.mode is Mode.ACTIVE and bench.controller.gate.refused == 3
+
+
 def test_lease_that_ends_while_driving_stops_smoothly_and_nothing_starts_again():
     bench = DriveBench().under_way(300)
     assert bench.speed_m_s == pytest.approx(0.6, abs=0.01)

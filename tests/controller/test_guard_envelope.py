@@ -76,7 +76,7 @@ def test_what_calibration_finds_is_taken_from_the_profile(files):
         text.replace("zero_counts = 8192 ", "zero_counts = 8100 ", 1).replace("upper = 1.74533", "upper = 1.7")
     )
     slew = read_envelope(profile).axes[0]
-    assert (slew.deadband_pct, slew.zero_counts, slew.upper) == (9.0, 8100, 1.74533)
+    assert (slew.deadbands_pct, slew.zero_counts, slew.upper) == ((12.0, 9.0), 8100, 1.74533)
 
 
 def test_a_machine_without_an_envelope_does_not_start(files, capsys):

@@ -154,7 +154,24 @@ def test_the_pin_may_leave_a_forbidden_place_and_not_go_deeper():
     traffic.a = {"Mode": 2, "Slew": 13.0}
     assert traffic.tick(20) is Verdict.GOOD, "no deeper"
     traffic.a = {"Mode": 2, "Ext": 13.0}
+    traffic.tick()
     assert traffic.tick() is Verdict.REACH
+
+
+@pytest.mark.parametrize("place", ["EncLift", "EncTilt"])
+def test_one_sample_that_jumps_is_no_place(place):
+    """The controller refuses the sample and goes on; so does the guard."""
+    traffic = Traffic()
+    traffic.good()
+    traffic.a = {"Mode": 2, "Lift": -13.0, "Tilt": -13.0}
+    before = traffic.encoder.get(place, CENTRE)
+    traffic.encoder[place] = before - round(3.0 / RAD)
+    assert traffic.tick() is Verdict.GOOD
+    traffic.encoder[place] = before
+    assert traffic.tick(3) is Verdict.GOOD
+    traffic.encoder[place] = before - round(3.0 / RAD)
+    traffic.tick()
+    assert traffic.tick() in (Verdict.OUTSIDE, Verdict.REACH)
 
 
 def test_the_pin_may_not_enter_a_box():

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from can_dbc.bus.base import BusError
+from can_dbc.frame import EXTENDED
 from controller.guard import __main__ as process
-from controller.guard.__main__ import main, profile_path
+from controller.guard.__main__ import build, main, profile_path
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
 from tests.controller.bench import DATABASE, MS
@@ -78,7 +79,7 @@ def test_it_sends_its_status_every_10_ms_until_it_is_ended(monkeypatch, capsys, 
     status = DATABASE.message("GuardStat").key
     assert 48 <= sent.count(status) <= 52
     assert sent.count(0x77D) == 5
-    assert "not granted: FIFO" in capsys.readouterr().err
+    assert "not granted: FIFO 85" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("handlers")
@@ -155,5 +156,85 @@ def test_a_profile_is_found_by_its_name_or_its_path(tmp_path):
 
 def test_a_negative_rate_is_a_usage_error(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
-        run_guard(monkeypatch, World(1), "--rate", "-5")
-    assert ended.value.code == 2 and "--rate -5: write the controller's rate in Hz" in capsys.readouterr().err
+        run_guard(monkeypatch, World(1), "--rate", "-1")
+    assert ended.value.code == 2 and "--rate -1: write the controller's rate in Hz" in capsys.readouterr().err
+
+
+def test_without_a_profile_it_does_not_start(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--bus", "crane0=here"])
+    assert ended.value.code == 2 and "--profile" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize(("options", "rate_hz"), [((), 0), (("--rate", "500"), 500)])
+def test_the_rate_is_that_of_the_profile_or_the_option(monkeypatch, options, rate_hz):
+    asked = []
+    monkeypatch.setattr(
+        process, "build", lambda _path, rate_hz: asked.append(rate_hz) or build(profile_path("palms_471"))
+    )
+    assert run_guard(monkeypatch, World(2), *options) == 0
+    assert asked == [rate_hz]
+
+
+def test_commands_at_another_rate_have_its_period(monkeypatch):
+    monkeypatch.setattr(process, "Guard", lambda envelope, _layouts: envelope)
+    assert build(profile_path("palms_471")).period_ns == 5_000_000
+    assert build(profile_path("palms_471"), rate_hz=1000).period_ns == 1_000_000
+
+
+@pytest.mark.usefixtures("handlers")
+def test_it_keeps_its_memory_and_stops_the_collector(monkeypatch):
+    called = []
+    world = World(2)
+    monkeypatch.setattr(process, "open_bus", world.open_bus)
+    monkeypatch.setattr(process, "sleep_until", world.sleep_until)
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: world.now_ns))
+    for name in ("stop_garbage_collection", "keep_memory"):
+        monkeypatch.setattr(process, name, lambda name=name: called.append(name))
+    buses = ("--bus", "crane0=here", "--bus", "mach0=there")
+    assert main(["--profile", "aoro_fc8", "--no-realtime", *buses]) == 0
+    assert called == ["keep_memory", "stop_garbage_collection"] and set(world.cores) == {"here", "there"}
+
+
+def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch):
+    brought = {"crane0": [[(1, 0x181, b"a")], [(2, 0x182, b"b")], []], "mach0": [[], [(3, 0x8CFF_0000, b"c")], []]}
+    judged, watched, sent = [], [], []
+
+    class Link:
+        def __init__(self, bus: str) -> None:
+            self.bus = bus
+
+        def receive(self, frames, _reading) -> None:
+            frames[:] = brought[self.bus].pop(0)
+
+        def send(self, frames) -> None:
+            sent.append((self.bus, frames))
+
+        def watch(self, now_ns) -> None:
+            watched.append((self.bus, now_ns))
+
+    class Judge:
+        def step(self, _now_ns, frames):
+            judged.append(list(frames))
+            return [(0x77F, b""), (0x18FF_0000 | EXTENDED, b"")]
+
+    ended, deadlines, punctual = [], [], []
+
+    def sleep_until(deadline_ns) -> None:
+        deadlines.append(deadline_ns)
+        clock[0] = deadline_ns + (T if len(deadlines) == 2 else 0)
+        if len(deadlines) == 3:
+            ended.append(signal.SIGTERM)
+
+    clock = [0]
+    monkeypatch.setattr(process, "BusLink", Link)
+    monkeypatch.setattr(process, "sleep_until", sleep_until)
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: clock[0]))
+    notifier = SimpleNamespace(tick_done=lambda _now, in_time: punctual.append(in_time), stopping=lambda: None)
+    process.run(Judge(), ["crane0", "mach0"], ended, notifier)
+    assert judged == [[(1, 0x181, b"a")], [(2, 0x182, b"b"), (3, 0x8CFF_0000, b"c")], []]
+    assert [bus for bus, _ in watched] == ["crane0", "mach0"] * 3
+    assert sent[:2] == [("crane0", [(0x77F, b"")]), ("mach0", [(0x18FF_0000 | EXTENDED, b"")])]
+    assert deadlines == [T, 2 * T, 4 * T], "a whole period late: that period is left out"
+    assert punctual == [True, False, True]

@@ -1,12 +1,14 @@
 """Joints that move without a command in every mode, frozen and noisy encoders: reaction, bound, and who may go on."""
 
+import itertools
 import random
 
 import msgspec
 import pytest
 
-from can_dbc.messages.crane import OperatorAction
+from can_dbc.messages.crane import GrappleCommand, OperatorAction
 from controller.config import Settings
+from controller.crane.motion import Crane
 from machine.joints import Joint
 from machine.loading.profile_file import profile_hash
 from machine.profile import Plc
@@ -44,6 +46,18 @@ def test_slow_motion_without_a_command_cuts_while_armed(j, share):
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, j)
     assert k * T <= (SLOW_MS if share < 0.25 else 150) * MS
     assert bench.neutral and bench.commands_b["ArmKey"] == 0
+
+
+@pytest.mark.parametrize(("output_pct", "cut"), [(9.0, False), (0.0, True)])
+def test_slow_motion_is_a_correction_where_a_plc_closes_the_loop_and_says_that_it_does_something(output_pct, cut):
+    """Our own law rests then: its reference stands, and the joint is within its stop band."""
+    profile = msgspec.structs.replace(PROFILE, plc=Plc("references"))
+    bench = dithering(Bench(Settings(profile, profile_hash(profile), profile.rate_hz))).armed()
+    bench.run(500)
+    bench.plc_output[0] = output_pct / 100.0
+    drifts(bench, 0, 0.03)
+    bench.run(150)
+    assert (bench.reason is Reason.JOINT_RUNAWAY) is cut
 
 
 @pytest.mark.parametrize("share", [0.03, 0.5, 1.0])
@@ -209,6 +223,24 @@ def test_ten_times_the_noise_halves_the_speed_in_time():
     assert bench.controller.supervisor.half_speed and bench.controller.supervisor.detail == 2
 
 
+@pytest.mark.parametrize(
+    ("j", "tilt_rad", "seen"), [(Joint.SLEW, 0.17, False), (Joint.SLEW, 0.0, True), (Joint.LIFT, 0.17, True)],
+    ids=["slew on a slope", "slew on level ground", "lift on a slope"],
+)  # fmt: skip
+def test_only_the_slew_on_a_slope_yields_to_a_load_that_changes(j, tilt_rad, seen, monkeypatch):
+    loads = itertools.cycle((20.0, 120.0))
+
+    def estimate_load(crane: Crane, *_: object) -> None:
+        crane.load_kg, crane.roll_rad = next(loads), tilt_rad
+
+    monkeypatch.setattr(Crane, "estimate_load", estimate_load)
+    bench = dithering(Bench()).armed()
+    hold(bench, 400)
+    bench.encoder_drift[j] = 0.00873
+    hold(bench, 700)
+    assert (bench.reason in (Reason.ENCODER_DRIFT, Reason.JOINT_RUNAWAY)) is seen
+
+
 @pytest.mark.parametrize("j", [Joint.SLEW, Joint.TILT])
 def test_a_drifting_encoder_holds_although_the_law_follows_it(j):
     """Half a degree per second, while the crane holds its place."""
@@ -233,6 +265,19 @@ def test_a_reversed_joint_keeps_its_cause_through_the_ramp():
     assert bench.reason == Reason.JOINT_REVERSED
 
 
+@pytest.mark.parametrize("grapple", [GrappleCommand.NEUTRAL, GrappleCommand.CLOSE])
+def test_a_rotator_that_logs_between_the_tongs_turn_back_is_not_reversed(grapple):
+    bench = dithering(Bench()).armed()
+    bench.tick([bench.hold(grapple=grapple)])
+    bench.backward.add(4)
+    for k in range(60):
+        at_work = bench.mode in (Mode.ARMED, Mode.ACTIVE)
+        bench.tick([bench.moving(4, 0.4, grapple=grapple)] if k % 10 == 0 and at_work else ())
+    told = bench.reason == Reason.JOINT_REVERSED
+    assert told is (grapple is GrappleCommand.NEUTRAL)
+    assert bench.mode is (Mode.FAULT if told else Mode.ACTIVE)
+
+
 def hold(bench: Bench, ticks: int) -> int:
     """The planner keeps the crane where it is; ticks until the machine stops."""
     start = list(bench.controller.reference_position)
@@ -242,3 +287,30 @@ def hold(bench: Bench, ticks: int) -> int:
         if bench.mode in (Mode.STOP, Mode.FAULT):
             return k
     return ticks
+
+
+@pytest.mark.parametrize("after", ["", "disarm"])
+def test_a_person_who_took_over_by_hand_lever_moves_the_machine(after):
+    """Levers need the pilot supply: a motion that the machine explains is shown, and cuts nothing."""
+    bench = dithering(Bench()).active()
+    bench.changed["EstopStat"] = {"Lever": 1}
+    bench.run(2)
+    if after:
+        bench.tick([bench.operator(OperatorAction.DISARM)])
+    bench.moves_alone[0] = 0.15
+    bench.run(200)
+    assert bench.mode is (Mode.STANDBY if after else Mode.STOP)
+    assert bench.controller.supervisor.moving_joint == 0
+    del bench.changed["EstopStat"]
+    bench.run(60)  # the oil moves on for a while
+    assert bench.mode is (Mode.STANDBY if after else Mode.STOP)
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.controller.gate.refusal is Reason.JOINT_MOVES
+
+
+def test_motion_in_a_stop_that_no_lever_explains_is_cut():
+    bench = dithering(Bench()).active()
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.moves_alone[0] = 0.15
+    bench.run(200)
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.MOVES_WHILE_STOPPED

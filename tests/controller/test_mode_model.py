@@ -16,7 +16,7 @@ from sim.nodes.valve import ValveInputs, ValveNode, ValveState
 from tests.controller import mode_model
 from tests.controller.bench import DATABASE, Bench
 from tests.controller.guard_traffic import MOVING, Traffic
-from tests.controller.mode_model import Broken, State, after, reachable, settled, transitions, way
+from tests.controller.mode_model import Broken, Link, State, after, reachable, settled, transitions, way
 
 FOUND = reachable()
 
@@ -60,11 +60,21 @@ def test_motion_ends_with_every_stop() -> None:
     for state in FOUND:
         for name in ("emergency stop", "silence", "rule broken", "cause CUT"):
             assert not after(state, name).may_move, [*way(FOUND, state), name]
-        for name in ("STOP", "DISARM", "cause HOLD", "cause RAMP"):
+        lost = ["link lost"] if state.link is Link.WATCHED else []
+        for name in ("STOP", "DISARM", "cause HOLD", "cause RAMP", *lost):
             ended = after(after(state, name), "time")
             if ended.mode in OPERATING:  # DISARM or a fault's end of a machine that was not moving
                 assert (name == "DISARM" and state.ramping) or not state.armed_key, [*way(FOUND, state), name]
             assert not (state.mode is Mode.ACTIVE and ended.may_move)
+
+
+def test_nothing_works_while_a_watched_link_is_lost_and_its_return_starts_nothing() -> None:
+    for before, name, now in transitions(FOUND):
+        if now.link is Link.LOST:
+            assert now.mode not in OPERATING, [*way(FOUND, before), name]
+        if name in ("WATCH", "WATCH_END"):
+            assert now.mode is before.mode, [*way(FOUND, before), name]
+    assert {state.link for state in FOUND if state.may_move} == {Link.OFF, Link.WATCHED, Link.LOST}, "lost: the ramp"
 
 
 def test_a_person_gets_from_everywhere_to_armed_once_the_causes_are_gone() -> None:

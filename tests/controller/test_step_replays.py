@@ -167,12 +167,15 @@ def test_tick_keeps_no_memory(settings_):
     tracemalloc.start(1)
     ticks(200)
     gc.collect()  # also empties the interpreter's free lists, which count as memory
-    before, _ = tracemalloc.get_traced_memory()
-    ticks(2000)
-    gc.collect()
-    after, _ = tracemalloc.get_traced_memory()
+    kept = []
+    for _ in range(3):  # what a tick keeps shows in every window; what other threads of the test run keep, in one
+        before, _ = tracemalloc.get_traced_memory()
+        ticks(2000)
+        gc.collect()
+        after, _ = tracemalloc.get_traced_memory()
+        kept.append(after - before)
     tracemalloc.stop()
-    assert after - before < 2048, "bytes kept by 2000 ticks"
+    assert min(kept) < 2048, "bytes kept by 2000 ticks"
     gc.collect()
     gc.disable()
     try:

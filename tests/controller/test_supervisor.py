@@ -159,6 +159,8 @@ ARMING = [
     ("valve fault", {"changed": {"ValveFbA": {"State": 4}}}, Reason.VALVE_NODE_NOT_READY),
     ("PLC fault", {"changed": {"PlcStatus": {"FaultBits": 2}}}, Reason.PLC_FAULT),
     ("person", {"changed": {"EstopStat": {"Person": 1}}}, Reason.PERSON_IN_ZONE),
+    ("hand lever", {"changed": {"EstopStat": {"Lever": 1}}}, Reason.LEVER_MOVED),
+    ("hand lever's switch", {"changed": {"EstopStat": {"Lever": 2}}}, Reason.LEVER_MOVED),
     ("valve node silent", {"silent_nodes": {0x10}}, Reason.NODE_NOT_OPERATIONAL),
     ("guard node silent", {"silent_nodes": {0x7D}}, Reason.NODE_NOT_OPERATIONAL),
     ("encoder alarm", {"changed": {"EncLift": {"Alarms": 1}}}, Reason.ENCODER_ALARM),
@@ -182,6 +184,39 @@ def test_arming_is_refused(what, fault, reason):
     bench.run(60)
     bench.tick([bench.operator(OperatorAction.ARM)])
     assert bench.mode is Mode.ARMED
+
+
+@pytest.mark.parametrize("value", [1, 2])
+def test_a_moved_hand_lever_ends_automatic_work_at_once_and_for_good(value):
+    """The person wins: no ramp, and no work after the lever is back."""
+    bench = Bench().active()
+    assert not bench.neutral
+    bench.changed["EstopStat"] = {"Lever": value}
+    bench.run(2)
+    assert bench.mode is Mode.STOP and bench.reason == Reason.LEVER_MOVED, "within the period of EstopStat"
+    assert bench.neutral and bench.commands_b["ArmKey"] == 0 and not bench.controller.supervisor.ramping
+    del bench.changed["EstopStat"]
+    for _ in range(40):
+        bench.tick([bench.hold()])
+        assert bench.mode is Mode.STOP and bench.neutral
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_a_moved_hand_lever_disarms_a_machine_that_stands():
+    bench = Bench().armed()
+    bench.changed["EstopStat"] = {"Lever": 1}
+    bench.run(2)
+    assert bench.mode is Mode.STOP and bench.reason == Reason.LEVER_MOVED
+
+
+@pytest.mark.parametrize("value", [0, None])
+def test_a_machine_that_does_not_tell_about_its_levers_works_as_before(value):
+    bench = Bench()
+    bench.changed["EstopStat"] = {"Lever": value}
+    bench.active()
+    bench.run(10)
+    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
 
 
 def test_arming_with_the_emergency_stop_in_error_is_refused():

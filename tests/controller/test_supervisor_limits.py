@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 
 from can_dbc.messages.crane import OperatorAction
+from controller.config import Settings
 from controller.supervisor import (
     DEGRADE_NS,
     LATE_NS,
@@ -14,11 +16,14 @@ from controller.supervisor import (
     MAX_ECHO_NS,
     MAX_ECHO_TICKS,
     NO_JOINT,
+    PLC_RAMP_NS,
     RAMP_NS,
     RANGE_MARGIN_UNITS,
     STALLED_NS,
 )
 from controller.transitions import Event
+from machine.loading.profile_file import profile_hash
+from machine.profile import Plc, Profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.controller.bench import AORO, MACHINE, MS, PROFILE, SPECS, Bench, T
@@ -26,14 +31,14 @@ from tests.controller.bench import AORO, MACHINE, MS, PROFILE, SPECS, Bench, T
 NOW = 100 * 10**9
 
 
-def supervisor_in(mode: Mode):
-    made = Bench().controller.supervisor
+def supervisor_in(mode: Mode, profile: Profile = PROFILE):
+    made = Bench(Settings(profile, profile_hash(profile), profile.rate_hz)).controller.supervisor
     made.mode = mode
     return made
 
 
 def test_the_limits_are_those_of_the_documentation() -> None:
-    assert (RAMP_NS, DEGRADE_NS, LATE_NS, LATE_WINDOW_NS, STALLED_NS) == (60 * MS, 10**9, 10 * MS, 10**9, 50 * MS)
+    assert (RAMP_NS, DEGRADE_NS, LATE_NS, LATE_WINDOW_NS, STALLED_NS) == (50 * MS, 10**9, 10 * MS, 10**9, 50 * MS)
     assert (MAX_ECHO_TICKS, MAX_ECHO_NS, RANGE_MARGIN_UNITS) == (4, 20 * MS, 0.05)
 
 
@@ -98,6 +103,12 @@ def test_a_finding_reacts_only_while_armed_unless_it_always_does(reason: Reason,
     assert supervisor.mode is after
     if after is not mode:
         assert (supervisor.reason, supervisor.detail) == (reason, 3)
+
+
+def test_before_a_plc_which_adds_its_own_ramp_the_latched_one_is_short() -> None:
+    supervisor = supervisor_in(Mode.ACTIVE, msgspec.structs.replace(PROFILE, plc=Plc("valves")))
+    supervisor.apply(Event.RAMP, Reason.ENCODER_LOST, 2, NOW)
+    assert supervisor.ramp_ns == PLC_RAMP_NS == 10 * MS
 
 
 @pytest.mark.parametrize(
@@ -192,7 +203,7 @@ def test_the_range_ends_with_its_margin(j: int) -> None:
     for position, found in ((lower, False), (lower - 1e-9, True), (upper, False), (upper + 1e-9, True)):
         estimator.position = position
         supervisor.worst = Reason.NONE
-        supervisor._check_values()
+        supervisor._check_values(bench.now_ns)
         assert (supervisor.worst is Reason.POSITION_OUTSIDE) is found, (position, supervisor.worst)
         assert not found or supervisor.worst_detail == j
 

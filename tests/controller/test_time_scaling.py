@@ -122,6 +122,50 @@ def test_trajectory_keeps_past_knots_only_while_behind():
     assert old._n <= HISTORY_KNOTS + 9 and old.end_ns == 10**9 + 59 * 50 * MS + 400 * MS
 
 
+@pytest.mark.parametrize("late_us", [1, 300, 20_000])
+def test_setpoints_of_a_planner_that_is_not_punctual_join_without_a_speed_that_no_joint_has(late_us):
+    """Its clock goes on in whole periods: each setpoint begins a little off the last one's path."""
+    made, velocity = follower(1.0e-4), [0.2, 0.1, -0.1, 0.1, 0.0]
+    now_ns, due_ns, k = 10**9, 10**9, 0
+    for _ in range(800):
+        if now_ns >= due_ns:
+            off_s = 0.004 * (-1) ** k
+            ahead = [[v * (k * 0.05 + off_s + 0.05 * i) for v in velocity] for i in range(9)]
+            made.candidate.load(setpoint(now_ns - T + late_us * 1000, ahead, velocity))
+            made.accept(now_ns, True)
+            due_ns, k = due_ns + 50 * MS + late_us * 1000, k + 1
+        made.follow(now_ns, 1.0)
+        for v, lead, most in zip(made.velocity, made.lead_velocity, velocity, strict=True):
+            assert max(abs(v), abs(lead)) <= 1.05 * abs(most) + 1e-12
+        now_ns += T
+    assert made.behind_ns >= MAX_BEHIND_NS
+
+
+def test_a_curve_that_is_continued_stays_what_it_was_and_then_steps():
+    old, same, new = Trajectory(), Trajectory(), Trajectory()
+    for each in (old, same):
+        each.load(setpoint(10**9, [[0.1 * i * i] * 5 for i in range(4)], [0.5] * 5))
+    step_ns = 10**9 + 120 * MS
+    new.load(setpoint(step_ns, [[2.0 + i] * 5 for i in range(3)], [20.0] * 5))
+    old.extend(new, 10**9)
+    found, wanted, v, w = ([0.0] * 5 for _ in range(4))
+    for at_ns in range(10**9, step_ns + 100 * MS, 7 * MS // 3):
+        old.fill(range(5), at_ns, found, v)
+        (same if at_ns <= step_ns else new).fill(range(5), at_ns, wanted, w)
+        assert found == pytest.approx(wanted) and v == pytest.approx(w), at_ns
+
+
+def test_a_curve_that_ended_rests_until_it_is_continued():
+    old, new = Trajectory(), Trajectory()
+    old.load(setpoint(10**9, [[0.0] * 5, [0.1] * 5], [2.0] * 5))
+    new.load(setpoint(10**9 + 90 * MS, [[0.2] * 5, [0.3] * 5], [2.0] * 5))
+    old.extend(new, 10**9)
+    q, v = [0.0] * 5, [0.0] * 5
+    for ms, place, speed in ((51, 0.1, 0.0), (89, 0.1, 0.0), (91, 0.202, 2.0), (140, 0.3, 2.0)):
+        old.fill(range(5), 10**9 + ms * MS, q, v)
+        assert q == pytest.approx([place] * 5, abs=1e-4) and v == pytest.approx([speed] * 5, abs=0.01), ms
+
+
 # -- in the controller
 
 

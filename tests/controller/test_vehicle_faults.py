@@ -223,6 +223,14 @@ def test_swapped_antennas_are_detected_in_motion():
     assert elapsed_ms <= FAULTS[Reason.HEADING_REVERSED].bound_ms
 
 
+def test_a_machine_that_slips_back_on_spinning_wheels_is_no_antenna_fault():
+    """A forwarder on two diagonal wheels slid backwards at half the speed of its wheels; its mast rocked."""
+    bench = straight()
+    bench.lies["CogSogRapidUpdate"] = {"Cog": 3 * math.pi / 2, "Sog": 0.7 * bench.speed_m_s}
+    go(bench, 400)
+    assert bench.mode is Mode.ACTIVE
+
+
 def test_rtk_float_slows_only_waypoint_driving():
     bench = straight()
     bench.lies["GnssPositionData"] = {"Method": 5}
@@ -296,3 +304,13 @@ def test_every_fault_of_the_carrier_is_tried():
     assert {reason for reason, _, _ in CASES.values()} | elsewhere == {
         r for r in Reason if Reason.POSITION_LOST <= r <= Reason.STEERING_RUNAWAY
     }
+
+
+def test_a_moved_hand_lever_stops_a_driving_carrier_softly():
+    bench = DriveBench().under_way(300)
+    bench.changed["EstopStat"] = {"Lever": 1}
+    bench.run(2)
+    assert bench.mode is Mode.STOP and bench.reason == Reason.LEVER_MOVED
+    assert bench.vehicle.driving is Driving.BRAKING
+    bench.run(400)
+    assert bench.mode is Mode.STOP and bench.vehicle.driving is Driving.STANDING

@@ -102,6 +102,10 @@ def test_every_refusal_is_one_sentence(can_up, bus, link, settings, status, sent
 
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is missing (apt-get install shellcheck)")
-@pytest.mark.parametrize("name", ["install.sh", "system/can-up", "../host/service_lab/init.sh"])
+@pytest.mark.parametrize(
+    "name",
+    ["install.sh", "audit.sh", "system/can-up", "system/service-ended", "deb/build.sh", "deb/postinst", "deb/prerm",
+     "../host/service_lab/init.sh"],
+)  # fmt: skip
 def test_scripts_are_clean(name: str) -> None:
     subprocess.run(["shellcheck", str(SCRIPT.parents[1] / name)], check=True)

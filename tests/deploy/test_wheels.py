@@ -34,8 +34,17 @@ print(compiled.running().kind, bool(AHEAD_OF_TIME), len(outputs.frames), outputs
 
 def install(tmp_path: Path, compiled: str) -> tuple[Path, Path]:
     """The wheel, and the folder that it is installed into."""
-    source, wheels, target = tmp_path / "source", tmp_path / "wheels", tmp_path / "installed"
-    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*LEFT_OUT))
+    wheel, target = build(tmp_path, compiled), tmp_path / "installed"
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    subprocess.run([*pip, "install", "--no-deps", "--target", target, wheel], check=True, capture_output=True)
+    return wheel, target
+
+
+def build(tmp_path: Path, compiled: str) -> Path:
+    """A wheel of a copy of the sources."""
+    source, wheels = tmp_path / "source", tmp_path / "wheels"
+    # Every copy has times of its own.
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*LEFT_OUT), copy_function=shutil.copy)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     environment = os.environ | {"TIMBERHAND_COMPILE": compiled}
     made = subprocess.run(
@@ -44,8 +53,7 @@ def install(tmp_path: Path, compiled: str) -> tuple[Path, Path]:
     )  # fmt: skip
     assert made.returncode == 0, made.stderr[-2000:]
     (wheel,) = wheels.iterdir()
-    subprocess.run([*pip, "install", "--no-deps", "--target", target, wheel], check=True, capture_output=True)
-    return wheel, target
+    return wheel
 
 
 def answer(target: Path, **environment: str) -> list[str]:
@@ -58,10 +66,11 @@ def answer(target: Path, **environment: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_the_pure_wheel_runs_on_the_interpreter(tmp_path: Path) -> None:
+def test_the_pure_wheel_runs_on_the_interpreter_and_a_second_one_is_the_same_to_the_byte(tmp_path: Path) -> None:
     wheel, target = install(tmp_path, "0")
     assert wheel.name.endswith("py3-none-any.whl")
     assert answer(target, HOME=str(tmp_path))[0] == "interpreter"
+    assert build(tmp_path / "again", "0").read_bytes() == wheel.read_bytes()
 
 
 def test_the_compiled_wheel_runs_compiled_and_the_switch_turns_it_off(tmp_path: Path) -> None:

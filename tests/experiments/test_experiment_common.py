@@ -13,11 +13,14 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments.common import pool
+from experiments.common.fingerprint import ALL_SOURCES, SOURCES, source_hash
+from experiments.common.overview import read
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
 from experiments.common.result import ROOT, Metric, Result, evaluate, limits_of, rate, wilson
 from experiments.common.result_page import Page, Section, markdown
-from experiments.common.trials import LOCKSTEP_SOURCES, SOURCES, check_truth, checkpoint, source_hash
+from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint
+from experiments.common.workers import Workers
 from experiments.plant.signals import ringing
 from host.exit_codes import CommandFailed
 
@@ -79,7 +82,7 @@ def test_the_number_of_workers_changes_nothing(tmp_path):
     outcomes = []
     for workers in (1, 2):
         with Checkpoint(tmp_path / f"{workers}.jsonl", "run") as checkpoint:
-            outcomes.append(pool.run(square, jobs(7), checkpoint, workers, "trials", QUIET))
+            outcomes.append(pool.run(square, jobs(7), checkpoint, Workers(workers), "trials", QUIET))
     one, two = outcomes
     assert list(one) == list(two) == [job.name for job in jobs(7)]
     assert [o["square"] for o in one.values()] == [o["square"] for o in two.values()]
@@ -90,12 +93,12 @@ def test_the_number_of_workers_changes_nothing(tmp_path):
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path):
     path = tmp_path / "trials.jsonl"
     with pytest.raises(KeyboardInterrupt), Checkpoint(path, "run") as checkpoint:
-        pool.run(interrupted, jobs(6), checkpoint, 1, "trials", QUIET)
+        pool.run(interrupted, jobs(6), checkpoint, Workers(), "trials", QUIET)
     path.write_text(path.read_text() + '["square/5", {"squ')  # cut off while writing
     ran = []
     with Checkpoint(path, "run") as again:
         assert sorted(again.done) == ["square/0", "square/1", "square/2"]
-        outcomes = pool.run(lambda job: ran.append(job.seed) or square(job), jobs(6), again, 1, "trials", QUIET)
+        outcomes = pool.run(lambda job: ran.append(job.seed) or square(job), jobs(6), again, Workers(), "trials", QUIET)
     assert ran == [3, 4, 5] and [o["square"] for o in outcomes.values()] == [0, 1, 4, 9, 16, 25]
     assert not path.exists()
 
@@ -150,7 +153,7 @@ def test_an_unusable_truth_stops_before_any_trial(tmp_path):
 def test_an_error_names_the_trial(tmp_path):
     checkpoint = Checkpoint(tmp_path / "trials.jsonl", "run")
     with pytest.raises(ZeroDivisionError) as caught:
-        pool.run(failing, jobs(1), checkpoint, 1, "trials", QUIET)
+        pool.run(failing, jobs(1), checkpoint, Workers(), "trials", QUIET)
     assert "in trial square/0" in caught.value.__notes__
 
 
@@ -173,6 +176,12 @@ def made(metrics: dict[str, float], missed: tuple[str, ...] = ()) -> Result:
     return Result(
         "thing", "abc", "palms_471", 1, 5, metrics, {"speed": 3.0}, environment, limits_of((SPEED, SHARE)), missed
     )
+
+
+def test_a_saved_result_tells_never_from_not_measured(tmp_path):
+    made({"speed": math.inf, "broken": math.nan}).save(tmp_path / "result.json")
+    metrics = read(tmp_path / "result.json").metrics
+    assert metrics["speed"] == math.inf and math.isnan(metrics["broken"])
 
 
 def test_result_json_is_flat_and_without_nan(tmp_path):
@@ -202,5 +211,5 @@ def test_a_page_shows_the_limits_against_which_its_result_was_judged():
 
 
 def test_every_source_of_a_fingerprint_exists_and_a_missing_one_does_not_fail():
-    assert all((ROOT / folder).is_dir() for folder in (*SOURCES, *LOCKSTEP_SOURCES))
+    assert all((ROOT / folder).is_dir() for folder in (*SOURCES, *ALL_SOURCES, *LOCKSTEP_SOURCES))
     assert source_hash("moved/elsewhere") == source_hash() != source_hash("controller")

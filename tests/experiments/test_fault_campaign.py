@@ -5,22 +5,30 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from controller.config import load as load_settings
 from experiments.common.errors import ExperimentError
 from experiments.common.pool import Checkpoint, Job
-from experiments.faults import files
-from experiments.faults.experiment import _absent, _limited, nominal_plan, plan, scenes_of
+from experiments.common.registry import Options
+from experiments.faults import experiment, files
+from experiments.faults.evidence import Evidence
+from experiments.faults.experiment import _limited, nominal_plan, plan, scenes_of
 from experiments.faults.judgement import judge
-from experiments.faults.metrics import METRICS, gather
-from experiments.faults.pages import evidence, table
-from experiments.faults.running import build, warm
+from experiments.faults.metrics import METRICS, gather, is_blind
+from experiments.faults.pages import _example, blind_spots, evidence, table
+from experiments.faults.running import HeldSwing, Swing, build, warm
 from experiments.faults.trial import in_child, inject
-from hil.faults.catalogue import BY_NAME, CASES, Where
+from hil.faults.catalogue import BY_NAME, CASES
 from hil.faults.order import parse
 from hil.faults.table import FaultError
+from machine.loading.profile_file import load_profile
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from tests.codes import coded
 
 
@@ -42,6 +50,10 @@ def outcome(**changed: Any) -> dict[str, Any]:
         ({"reached": {"D": 3.0}}, "weak", 3.0),
         ({"reached": {}}, "undetected", None),
         ({"reached": {"R0": 2.0}, "tip_limit_m": 0.01}, "far", 2.0),
+        ({"reached": {"R1": 260.0}, "due_ms": 236.0}, "ok", 260.0),
+        ({"reached": {"R1": 262.0}, "due_ms": 236.0}, "late", 262.0),
+        ({"reached": {"R1": 900.0}, "due_ms": None}, "ok", 900.0),
+        ({"reached": {}, "due_ms": None}, "undetected", None),
         ({"expected": "NONE"}, "tripped", 15.0),
         ({"expected": "NONE", "reached": {"D": 1.0}}, "ok", None),
         ({"expected": "REFUSED", "reached": {}, "refused_ms": 10.0}, "ok", 10.0),
@@ -61,21 +73,52 @@ def test_a_verdict_is_the_promise_kept_or_how_it_was_broken(
 def test_a_missed_injection_is_counted_and_a_blind_spot_is_told_apart() -> None:
     rows = [outcome(), outcome(reached={}, neutral_ms=None, valves_ms=None, travel_m=0.4, astray_m=0.4)]
     everything = {c.name: {"case": c.number, "scene": "crane", "outcomes": rows} for c in CASES if c.draw}
-    everything |= {c.name: _absent(c, 2) for c in CASES if c.where is Where.ABSENT}
     everything["n"] = {"scene": "x", "seconds": 7200.0, "trips": [(1.0, "why")]}
     metrics = gather(everything)
     assert {m.name for m in METRICS} <= metrics.keys()
-    with_draw, absent = sum(c.draw is not None for c in CASES), sum(c.where is Where.ABSENT for c in CASES)
-    assert metrics["injections"] == 2 * (with_draw + absent)
-    assert metrics["missed"] == with_draw + 2 * absent
-    assert (metrics["blind_missed"], metrics["unexplained"]) == (2 * absent, with_draw)
+    with_draw = sum(c.draw is not None for c in CASES)
+    assert metrics["injections"] == 2 * with_draw and metrics["missed"] == with_draw
+    named = 0  # 0.4 m are more than a drift or a scale explains
+    assert (metrics["blind_missed"], metrics["unexplained"]) == (named, with_draw - named)
     assert math.isinf(metrics["neutral_max_ms"]), "valves that never became neutral"
     assert (metrics["nominal_hours"], metrics["false_trips"]) == (2.0, 1.0)
     assert metrics["c06_harm_m"] == 0.4 and metrics["c06_max_ms"] == 15.0
+    far, near = {"travel_m": 0.9, "astray_m": 0.4}, {"travel_m": 0.9, "astray_m": 0.1}
+    crane, behind_plc = {"scene": "crane palms_471 physics"}, {"scene": "plc valves palms_471"}
+    assert is_blind(BY_NAME["valve-stuck-open"], behind_plc | far | {"verdict": "weak"})
+    assert is_blind(BY_NAME["valve-stuck-open"], crane | far | {"verdict": "far"})
+    assert not is_blind(BY_NAME["valve-stuck-open"], crane | near | {"verdict": "undetected"})
+    assert is_blind(BY_NAME["encoder-scale"], crane | near | {"verdict": "undetected"})
+    assert not is_blind(BY_NAME["encoder-scale"], crane | far | {"verdict": "undetected"}), "more harm than it explains"
     case = BY_NAME["message-off"]
     page = evidence(case, [row | {"scene": "crane"} for row in rows], metrics)
     assert "Missed: 1 of 2." in page and "never" in page and page.startswith("---\norphan: true")
     assert table(metrics).count("\n") == len(CASES) + 1
+
+
+def test_a_miss_is_a_named_blind_spot_only_in_the_works_that_the_catalogue_names() -> None:
+    case = BY_NAME["encoder-drift"]
+    missed = outcome(reached={}, expected="D", travel_m=0.3, astray_m=0.08)
+    for scene, blind in (("crane palms_471 physics", 1.0), ("hold palms_471 physics", 0.0)):
+        metrics = gather({scene: {"case": case.number, "scene": scene, "outcomes": [missed, outcome()]}})
+        assert (metrics["c03_missed"], metrics["c03_blind_missed"], metrics["blind_missed"]) == (1.0, blind, blind)
+        assert metrics["unexplained"] == 1.0 - blind
+        said = blind_spots(metrics)
+        assert f"1 missed ({blind:.0f} of them in a named blind spot), the tip up to 8.0 cm astray. In motion:" in said
+        assert "The supervisor's link" not in said, "nothing missed, and no blind spot"
+    assert all(case.blind for case in CASES if case.blind_in)
+
+
+def test_a_held_swing_ends_at_rest_without_a_step() -> None:
+    profile = load_settings("palms_471").profile
+    motion = HeldSwing(Swing(profile, (0.0, 0.5, -1.2, 0.6, 0.0)))
+    step_s = 0.001
+    for k in range(1, 8000):
+        (q0, v0), (q1, v1) = motion.at((k - 1) * step_s), motion.at(k * step_s)
+        for a, b, va, vb in zip(q0, q1, v0, v1, strict=True):
+            assert b - a == pytest.approx(0.5 * (va + vb) * step_s, abs=1e-7)
+    assert motion.at(5.5) == motion.at(1000.0) and not any(motion.at(5.5)[1])
+    assert any(motion.at(4.0)[1])
 
 
 def test_the_plan_spreads_the_trials_over_the_scenes_and_leaves_none_out() -> None:
@@ -83,7 +126,7 @@ def test_the_plan_spreads_the_trials_over_the_scenes_and_leaves_none_out() -> No
     counts: dict[int, int] = {}
     for job in jobs:
         counts[job.options["case"]] = counts.get(job.options["case"], 0) + job.options["count"]
-    assert counts == {c.number: 100 for c in CASES if c.where is not Where.ABSENT}
+    assert counts == {c.number: 100 for c in CASES}
     assert len({job.name for job in jobs}) == len(jobs)
     assert len(scenes_of(BY_NAME["message-off"])) == 5
     assert sum(j.options["seconds"] for j in nominal_plan(1, 36_000.0)) == pytest.approx(36_000.0)
@@ -97,6 +140,24 @@ def test_the_time_limit_ends_a_run_and_keeps_what_is_done(tmp_path: Path) -> Non
         kept.add("a", {"x": 1})
         time.sleep(10.0)
     assert Checkpoint(tmp_path / "trials.jsonl", "run").done == {"a": {"x": 1}}
+
+
+def test_injections_without_all_hours_of_work_give_a_page_and_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def over(_f: Any, jobs: Any, kept: Checkpoint, *_: Any) -> None:
+        for job in jobs[:done]:
+            kept.add(job.name, {"case": job.options["case"], "scene": job.options["scene"], "outcomes": [outcome()]})
+        raise ExperimentError(experiment.TIME_OVER, "over")
+
+    monkeypatch.setattr(experiment.pool, "run", over)
+    options, console = Options(3, "nominal", "palms_471", tmp_path, quick=True), Console(quiet=True)
+    done = len(plan(3, experiment.QUICK_TRIALS)) - 1
+    for pages in (0, 1):
+        with pytest.raises(ExperimentError, check=coded("experiment.time-over")):
+            experiment.run(options, console)
+        assert len(list(tmp_path.glob("result.json"))) == pages and (tmp_path / "trials.jsonl").is_file()
+        done += 1
 
 
 def test_a_child_answers_and_its_failure_is_told() -> None:
@@ -133,6 +194,21 @@ def test_an_injection_in_a_forked_child_is_that_of_a_fresh_machine_and_of_its_re
 
 @pytest.mark.slow
 @pytest.mark.computed
+def test_burst_and_overload_of_a_machine_with_physics_are_answered_in_time() -> None:
+    machine = warm("crane palms_471 physics")
+    burst = in_child(lambda: inject(machine, BY_NAME["hose-burst"].number, "a seed"))
+    assert (burst["verdict"], burst["reason"], burst["due_ms"]) == ("ok", "HOSE_BURST", 0.0)
+    assert "R0" in burst["reached"]
+    load = in_child(lambda: inject(machine, BY_NAME["overload"].number, "a seed"))
+    assert load["verdict"] == "ok" and load["reason"] in ("OVERLOAD", "OVERLOADED", "JOINT_RUNAWAY"), (
+        "a lift that yields"
+    )
+    assert 150.0 < load["due_ms"] < 300.0 and load["detect_ms"] < load["due_ms"]
+    assert "overload at" in "".join(_example({**load, "scene": "crane"}))
+
+
+@pytest.mark.slow
+@pytest.mark.computed
 def test_a_fault_at_every_edge_is_answered_and_named() -> None:
     for scene, text, reaction, reason in (
         ("crane palms_471", "estop-pressed", "R0", "ESTOP_PRESSED"),
@@ -160,3 +236,17 @@ def _injected(scene: str, text: str) -> dict[str, Any]:
     while machine.system.now_ns < at_ns + 900_000_000:
         machine.advance()
     return {"reached": machine.evidence.reached, "reason": machine.evidence.reason}
+
+
+def test_a_stop_that_becomes_harder_for_another_reason_is_seen() -> None:
+    watched = Evidence([], load_profile("palms_471"))
+    watched.begin(0, drives=False)
+    seen = [(Mode.ACTIVE, Reason.NONE), (Mode.STOP, Reason.VALVE_NODE_FAULT), (Mode.FAULT, Reason.VALVE_NODE_FAULT)]
+    for k, (mode, reason) in enumerate([*seen, (Mode.FAULT, Reason.ESTOP_PRESSED)]):
+        watched.outputs(SimpleNamespace(mode=mode, reason=reason, detail=0), k * 1_000_000)  # type: ignore[arg-type]
+    assert watched.reached == {"R1": 1.0}, "the end of its own ramp is no other reaction"
+    watched = Evidence([], load_profile("palms_471"))
+    watched.begin(0, drives=False)
+    for k, (mode, reason) in enumerate([*seen[:2], (Mode.FAULT, Reason.ESTOP_PRESSED)]):
+        watched.outputs(SimpleNamespace(mode=mode, reason=reason, detail=0), k * 1_000_000)  # type: ignore[arg-type]
+    assert watched.reached == {"R1": 1.0, "R0": 2.0} and watched.reason == "VALVE_NODE_FAULT"

@@ -8,25 +8,33 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from autonomy.perception.log_list.observation import LogObservation
+from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import make_result
 from experiments.grasp_configs.experiment import (
+    BEST,
     MACHINES,
     PAPER_ATTEMPTS,
+    compare,
+    evaluated_again,
     gather,
     jobs_of,
     machines_of,
+    pairs_of,
     published_ablation,
 )
 from experiments.grasp_configs.grasp_categories import Grip, category, lies_on, lifted
 from experiments.grasp_configs.metrics import METRICS, SECTIONS, sections
-from experiments.grasp_configs.pose_sources import misled
+from experiments.grasp_configs.pose_sources import TRUE, misled
 from experiments.grasp_configs.trial import attempt
 from sim.scenes.arrangements import CONFIGURATIONS
 from sim.wood.logs import LogState
+from tests.codes import coded
+from tests.machine.own_machine import NAME, made
 
 GROUND = -1.39
 OPTIONS = Options(0, "nominal", "palms_471", Path("unused"))
@@ -93,8 +101,21 @@ def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str,
     return {
         "configuration": number, "category": word, "lifted": up, "logs": CONFIGURATIONS[number][1], "plan_ms": plan_ms,
         "individual": number % 2 > 0, "closings": 2 if number == 4 else 1, "see_ms": 50.0, "failure": None,
-        "reason": "",
+        "reason": "", "stops": 0,
     }  # fmt: skip
+
+
+def test_a_lifted_log_after_a_stop_that_needed_a_person_is_a_failure() -> None:
+    found = {f"ours.search/{number}/0": outcome(number, "optimal", 1) for number in CONFIGURATIONS}
+    found["ours.search/3/0"]["stops"] = 1
+    metrics = gather(found, ("ours", "search"))
+    assert metrics["success"] == pytest.approx(11 / 12) and metrics["config3.success"] == 0.0
+    assert metrics["stopped"] == 1.0 and metrics["first_closing"] == pytest.approx(10 / 12)
+    saved = make_result("grasp-configs", METRICS, {"success": 1.0}, profile="palms_471", seed=1, trials=12,
+                        more={"judged": "ours poses, search"})  # fmt: skip
+    again = evaluated_again(saved, found)
+    assert again.metrics["success"] == pytest.approx(11 / 12) and "success" in again.missed
+    assert again.commit == saved.commit and "first_closing" in again.missed
 
 
 def test_the_evaluated_pair_has_plain_names_and_every_pair_has_a_prefix() -> None:
@@ -116,7 +137,7 @@ def test_the_evaluated_pair_has_plain_names_and_every_pair_has_a_prefix() -> Non
     shown = SECTIONS[0].metrics + SECTIONS[1].metrics
     assert {f.name for f in shown} <= metrics.keys()
     assert [f.name for f in METRICS if f.name in metrics and not f.holds(metrics[f.name])] == [
-        "success", "success_wilson_low"
+        "success", "first_closing", "success_wilson_low"
     ]  # fmt: skip
 
 
@@ -162,3 +183,23 @@ def test_a_small_pile_is_lifted_completely_over_the_bus() -> None:
     found = attempt(Job("one", "grasp", 7000, options))
     assert found["category"] == "optimal" and found["up"] == [0, 1, 2] and found["stops"] == 0
     assert set(found["expected"]) == {0, 1, 2} and math.dist(found["grip"][:2], found["asked"][:2]) < 0.06
+
+
+def test_a_machine_without_the_camera_gets_true_poses_and_no_detector(tmp_path: Path) -> None:
+    loader = str(made(tmp_path))
+    assert {poses for poses, _ in pairs_of(loader)} == {TRUE} and pairs_of(loader)[0] == (TRUE, "search")
+    assert pairs_of("palms_471")[0] == BEST
+    with pytest.raises(ExperimentError, check=coded("grasp-configs.no-camera")):
+        compare(replace(OPTIONS, profile=loader, detector="ours"), Console())
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_the_third_machine_lifts_a_small_pile_from_data_alone(tmp_path: Path) -> None:
+    loader = made(tmp_path)
+    options = {
+        "profile": str(loader), "truth": str(loader.with_name(f"{NAME}.truth.toml")), "configuration": 7,
+        "poses": TRUE, "planner": "search",
+    }  # fmt: skip
+    found = attempt(Job("one", "grasp", 7000, options))
+    assert found["lifted"] == 3 and found["stops"] == 0 and found["closings"] == 1

@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 from experiments.common.overview import page, read, results_in, write
 from experiments.common.pages import rewrite
+from experiments.common.published import LATER
 from experiments.common.registry import EXPERIMENTS
 from experiments.common.result_page import conclusion
+from experiments.common.standing import Standing, has_history, judge
 from experiments.loop_design import page as loop_design
 
 DOCS = Path(__file__).parents[2] / "docs"
+needs_history = pytest.mark.skipif(not has_history(), reason="the checkout has no git history, or a part of it only")
 
 
+def standings(names: Iterable[str]) -> dict[str, Standing]:
+    results = results_in(DOCS)
+    return {name: judge(results[name].commit, EXPERIMENTS[name]).standing for name in names}
+
+
+@needs_history
 def test_the_committed_overview_is_that_of_the_saved_results() -> None:
-    pages = {p.stem for p in DOCS.glob("*.md")}
-    assert (DOCS / "results.md").read_text() == page(results_in(DOCS), pages), "timberhand report writes it"
+    pages, results = {p.stem for p in DOCS.glob("*.md")}, results_in(DOCS)
+    assert (DOCS / "results.md").read_text() == page(results, pages, standings(results)), "timberhand report writes it"
 
 
 def test_the_overview_links_to_the_pages_that_exist(tmp_path: Path) -> None:
@@ -34,13 +46,30 @@ def test_the_overview_links_to_the_pages_that_exist(tmp_path: Path) -> None:
 def test_missed_and_inconclusive_limits_are_not_met_and_paper_values_are_shown() -> None:
     result = read(DOCS / "results" / "navigation.json")
     broken = {**result.metrics, "lateral_p95_m": 0.5, "stop_max_m": float("nan")}
-    text = page({"navigation": replace(result, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))}, ())
-    asks, papers, missed = text.split("## ")
+    text = page({"navigation": replace(result, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))}, (),
+                {"navigation": Standing.STALE})  # fmt: skip
+    asks, papers, later, missed, unseen = text.split("## ")
     assert f"| {len(result.limits) - 2} of {len(result.limits)}, 1 inconclusive |" in asks
     assert "9 deg/m" in papers and "50 cm" not in papers
+    assert "1 inconclusive" in asks and "of 1 the sources have changed since" in asks
     assert "50 cm" in missed and "at most 8" in missed and missed.count("\n| [") == 1
+    assert later.count("\n| [") == 0, "without our figure there is nothing to compare with"
+    assert "simulation" in unseen
 
 
+def test_a_later_system_stands_beside_the_nearest_figure_with_its_interval_and_command() -> None:
+    names = ("grasp-configs", "forwarding-mission")
+    text = page({n: read(DOCS / "results" / f"{n}.json") for n in names}, names, dict.fromkeys(names, Standing.STALE))
+    later = text.split("## ")[2]
+    assert later.count("\n| [") == len(LATER)
+    (kurinov,) = (line for line in later.splitlines() if "Kurinov" in line)
+    assert "94% (92.4 to 95.3, n = 1024)" in kurinov and "98.81% (97.4 to 99.5, n = 504)" in kurinov
+    assert kurinov.endswith("| `timberhand experiment forwarding-mission --docs docs` |")
+    papers = text.split("## ")[1]
+    assert "98.33% |  | 100%" in papers and "|  | 87.5% | 98.81%" in papers, "paper A and paper B have their columns"
+
+
+@needs_history
 def test_the_committed_pages_are_those_of_the_saved_results(tmp_path: Path) -> None:
     shutil.copytree(DOCS / "results", tmp_path / "results", ignore=shutil.ignore_patterns("*.png"))
     pages = [p for p in DOCS.glob("*.md") if (DOCS / "results" / f"{p.stem}.json").exists()]

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from experiments.common.pool import Job
 from experiments.common.registry import EXPERIMENTS, Options, load
+from experiments.common.workers import Workers
 from experiments.plant import endurance, experiment, physics, rolling, trial
 from experiments.plant.metrics import METRICS, SECTIONS
 from timberhand.cli import app
@@ -92,7 +93,7 @@ def test_an_unusable_truth_file_is_named(tmp_path):
 @pytest.mark.timeout(900)
 def test_the_quick_run_meets_its_limits_and_writes_everything(tmp_path):
     result = experiment.run(
-        options(tmp_path / "out", quick=True, workers=2, docs=tmp_path / "docs"), Console(quiet=True)
+        options(tmp_path / "out", quick=True, workers=Workers(2), docs=tmp_path / "docs"), Console(quiet=True)
     )
     clocked = {f.name for f in METRICS if f.clocked}
     assert set(result.missed) <= clocked

@@ -51,6 +51,7 @@ def window(
     steal_ms: float = 0.0,
     faults: int = 0,
     cpu_us: float = 100.0,
+    loop_us: float = 20.0,
 ) -> MeasurementWindow:
     """``ticks`` wake-ups that cycle through ``late``, and as many of cyclictest's."""
     durations = {name: histogram(cpu_us, times=ticks) for name in STAGES}
@@ -60,7 +61,7 @@ def window(
         facts(at + ticks, missed, faults),
         durations,
         histogram(*theirs, times=max(1, ticks // len(theirs))),
-        plain or SleepLoopReport(histogram(400.0, times=ticks), 0),
+        plain or SleepLoopReport(histogram(400.0, times=ticks), 0, loop_us),
         HostActivity(10.0, steal_ms, 0.1, 0.5),
     )
 
@@ -112,7 +113,8 @@ def test_cyclictests_report_becomes_a_histogram():
 
 
 def test_the_output_of_the_sleep_loop_becomes_a_histogram():
-    plain = reference_loops.read_sleep_loop({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4})
+    plain = reference_loops.read_sleep_loop({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4, "cpu_us": 21.5})
+    assert plain.cpu_us == 21.5
     assert plain.lateness.count == 3 and plain.missed == 4
 
 
@@ -169,7 +171,7 @@ def test_a_ratio_compares_quantiles_and_has_an_interval():
 
 def test_a_long_quiet_run_is_evaluated_and_a_slow_loop_misses_its_limits():
     quiet = [window(late=[60.0], ticks=6000, at=6000 * i) for i in range(20)]
-    loaded = [window(plain=SleepLoopReport(histogram(9000.0), 500))]
+    loaded = [window(plain=SleepLoopReport(histogram(9000.0), 500, 20.0))]
     metrics = metrics_of(quiet, loaded)
     assert metrics["host_verdict"] == 1.0 and metrics["judged_cycles"] == 120_000
     found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
@@ -216,7 +218,7 @@ def test_a_deadline_missed_in_a_quiet_window_counts():
     ],
 )
 def test_missed_deadlines_under_load_are_compared_with_the_sleep_loop(ours, plain, theirs, outcome):
-    pressed = window(theirs=[theirs], plain=SleepLoopReport(histogram(9000.0), plain), missed=ours)
+    pressed = window(theirs=[theirs], plain=SleepLoopReport(histogram(9000.0), plain, 20.0), missed=ours)
     metrics = metrics_of([window()], [pressed])
     found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     name = "missed_loaded_share"
@@ -224,10 +226,12 @@ def test_missed_deadlines_under_load_are_compared_with_the_sleep_loop(ours, plai
 
 
 def test_the_cost_of_a_tick_is_judged_in_the_quietest_windows_whatever_it_is_there():
-    noisy = [window(theirs=[400.0], cpu_us=500.0, at=2000 * i) for i in range(6)]
-    good = [window(theirs=[30.0], cpu_us=170.0), window(theirs=[20.0], cpu_us=180.0)]
+    noisy = [window(theirs=[10.0], cpu_us=500.0, loop_us=50.0, at=2000 * i) for i in range(6)]
+    good = [window(theirs=[30.0], cpu_us=170.0, loop_us=20.0), window(theirs=[20.0], cpu_us=180.0, loop_us=21.0)]
     metrics = metrics_of([*noisy, *good], [window()])
     assert metrics["tick_cpu_p50_us"] == pytest.approx(175.0, abs=10.0) and metrics["tick_cpu_all_p50_us"] > 450.0
+    assert metrics["plain_cpu_us"] == pytest.approx(20.5) and metrics["plain_cpu_all_us"] == pytest.approx(50.0)
+    assert metrics["tick_cpu_in_plain"] == pytest.approx(10.0, abs=0.5)
     assert "tick_cpu_p50_us" in evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics)).missed
 
 

@@ -21,6 +21,7 @@ from can_dbc.messages.crane import (
 )
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused, is_operator_command
+from can_dbc.messages.grasp import ChosenGrasp, decode_grasp, encode_grasp
 from can_dbc.messages.mission import (
     MissionAction,
     MissionCommand,
@@ -29,6 +30,7 @@ from can_dbc.messages.mission import (
     encode_mission,
     encode_mission_command,
 )
+from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload, encode_mission_upload
 from can_dbc.messages.record_ring import MAGIC as RING_MAGIC
 from can_dbc.messages.record_ring import RecordRing, RingReader
 from can_dbc.messages.rgbd import RgbdError
@@ -74,16 +76,23 @@ def datagrams() -> list[bytes]:
 
 
 def missions() -> list[bytes]:
-    """Mission report and commands."""
+    """Mission report, grasp, commands and an upload."""
     commands = [MissionCommand(3, HASH, NOW_NS, action) for action in MissionAction]
-    return [encode_mission(MISSION_REPORT, 1, HASH, NOW_NS), *map(encode_mission_command, commands)]
+    grasp = ChosenGrasp(1, (0.1, 4.0, 0.5), 1.2, (3, 8), "two logs")
+    upload = MissionUpload(3, HASH, NOW_NS, "a mission.geojson", bytes(32))
+    return [
+        encode_mission(MISSION_REPORT, 1, HASH, NOW_NS),
+        encode_grasp(grasp, 1, HASH, NOW_NS),
+        *map(encode_mission_command, commands),
+        encode_mission_upload(upload),
+    ]
 
 
 def start_decode() -> Run:
     def run(data: bytes) -> tuple[int, Hashable]:
         is_operator_command(data)
         outcome: list[Hashable] = []
-        for what in (decode, decode_mission, decode_mission_command):
+        for what in (decode, decode_mission, decode_mission_command, decode_mission_upload, decode_grasp):
             try:
                 message = what(data)
                 outcome.append(type(message).__name__)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from random import Random
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,9 +14,11 @@ from can_dbc.messages.envelope import DatagramFault, DatagramRefused
 from hil.faults.catalogue import BY_NAME, CASES, Where
 from hil.faults.datagrams import effect_of
 from hil.faults.draws import Scene
+from hil.faults.injector import Injector
 from hil.faults.order import Order, make, parse
 from hil.faults.table import FAULTS, Edge, FaultError, Word, find
 from hil.faults.wire_faults import wire_fault
+from hil.harness.operator import Operator
 from hil.wire.faults import Kind
 from machine.loading.profile_file import load_profile
 from sim.plant_faults import BEGINNERS
@@ -118,3 +121,22 @@ def test_a_number_that_is_none_arrives_with_a_right_checksum_and_damage_does_not
         (broken,) = effect_of(make("planner-garbage", seed=seed))(0, [setpoint()])
         with pytest.raises(DatagramRefused):
             decode(broken)
+
+
+def test_the_link_of_an_operator_who_watches_is_cut_for_a_while() -> None:
+    operator = Operator(7, lambda *_: None, watches=True)
+    injector = Injector(SimpleNamespace(operator=operator))  # type: ignore[arg-type]
+    injector.order(make("operator-off", length_s=1.0), 1000)
+    injector.begin(999)
+    assert not operator.cut
+    injector.begin(1000)
+    assert operator.cut
+    injector.begin(1_000_001_000)
+    assert not operator.cut
+
+
+def test_the_link_of_an_operator_who_does_not_watch_cannot_be_cut() -> None:
+    injector = Injector(SimpleNamespace(operator=Operator(7, lambda *_: None)))  # type: ignore[arg-type]
+    injector.order(make("operator-off"), 1000)
+    with pytest.raises(FaultError, check=coded("fault.not-watched")):
+        injector.begin(1000)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from host.exit_codes import ExitCode
@@ -41,3 +42,7 @@ def test_a_log_beside_the_route_is_brought_to_its_end(tmp_path: Path, manager: s
     assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 1
     assert told["stops"] == told["refused"] == 0
     assert told["states"][-1][1] == "DONE"
+    with (tmp_path / "run" / "run.mcap").open("rb") as file:
+        maps = [message for _, _, message in make_reader(file).iter_messages(["/logs"])]
+    assert len(maps) > told["seconds"] / 3, "the log map, as in a live run"
+    assert len(maps[0].data) < max(len(found.data) for found in maps), "the log is found on the way"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
-from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
+import pytest
+
+from can_dbc.messages.crane import WATCH_PERIOD_NS, OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode
-from hil.harness.operator import MAX_STOPS, REACTION_NS, REPEAT_NS, Operator
+from hil.harness.operator import MAX_PRESSES, MAX_STOPS, REACTION_NS, REPEAT_NS, Operator
 from machine.status.modes import Mode
 
 UNKNOWN = (math.nan,) * 5
@@ -52,8 +54,43 @@ def test_the_operator_resets_and_rearms_until_there_are_too_many_stops() -> None
         action = pressed(operator, Mode.FAULT if number % 2 else Mode.STOP, now_ns + REACTION_NS)
         assert operator.stops == number
         if number > MAX_STOPS:
-            assert operator.gave_up
+            assert operator.gave_up and "21 times" in operator.complaint
             assert action is None
         else:
             assert action is (OperatorAction.RESET if number % 2 else OperatorAction.ARM)
         pressed(operator, Mode.ACTIVE, now_ns + 2 * REACTION_NS)
+
+
+@pytest.mark.parametrize(("mode", "button"), [(Mode.STANDBY, OperatorAction.ARM), (Mode.FAULT, OperatorAction.RESET)])
+def test_the_operator_gives_up_presses_without_effect(mode: Mode, button: OperatorAction) -> None:
+    """A latched guard refuses every ARM until a person presses the safety module's reset: a run would never end."""
+    operator = Operator(7, lambda *_: None)
+    pressed(operator, mode, REPEAT_NS)
+    for number in range(2, MAX_PRESSES + 2):
+        assert pressed(operator, mode, number * REPEAT_NS) is button and not operator.gave_up
+    pressed(operator, Mode.ARMED, (MAX_PRESSES + 2) * REPEAT_NS)
+    last = MAX_PRESSES + 3
+    for number in range(last, last + MAX_PRESSES + 1):
+        assert not operator.gave_up, "armed in between: counted anew"
+        pressed(operator, mode, number * REPEAT_NS)
+    assert pressed(operator, mode, (last + MAX_PRESSES + 1) * REPEAT_NS) is None
+    assert operator.gave_up and f"{mode.name} after 90 presses of {button.name}" in operator.complaint
+
+
+def test_an_operator_who_watches_sends_heartbeats_and_still_presses() -> None:
+    operator = Operator(7, lambda *_: None, watches=True)
+    start_ns, found = 10 * REACTION_NS, []
+    for k in range(101):
+        found.append(pressed(operator, Mode.STANDBY if k > 90 else Mode.ACTIVE, start_ns + k * WATCH_PERIOD_NS // 10))
+    assert [k for k, action in enumerate(found) if action is OperatorAction.WATCH] == list(range(0, 101, 10))
+    late_ns = start_ns + 101 * WATCH_PERIOD_NS // 10 + REACTION_NS
+    assert pressed(operator, Mode.STANDBY, late_ns) is OperatorAction.ARM, "a button before a heartbeat"
+    assert pressed(operator, Mode.STANDBY, late_ns + 1) is OperatorAction.WATCH
+
+
+def test_of_an_operator_whose_link_is_cut_nothing_arrives() -> None:
+    operator = Operator(7, lambda *_: None, watches=True)
+    operator.cut = True
+    assert pressed(operator, Mode.ACTIVE, 10 * REACTION_NS) is None
+    operator.cut = False
+    assert pressed(operator, Mode.ACTIVE, 11 * REACTION_NS) is OperatorAction.WATCH

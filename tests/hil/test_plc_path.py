@@ -95,6 +95,21 @@ def test_a_log_lands_in_the_bunk(role: RoleName, transport: Transport, tmp_path:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_machine_that_is_slowed_again_and_again_works_on(seed: int, tmp_path: Path) -> None:
+    """The PLC's loop answers a change of speed a quarter of a second late: that is no joint gone wrong."""
+    run, due_ns = Run("references", "modbus", tmp_path, seed), START_NS + 5 * S
+    while not run.activity.done and not run.activity.failure and run.system.now_ns < START_NS + 120 * S:
+        run.system.advance()
+        if run.system.now_ns >= due_ns:
+            run.system._controller.supervisor.react_to(Reason.BUS_PASSIVE, 0, run.system.now_ns)
+            due_ns += 1800 * MS
+    assert run.activity.done, run.activity.failure
+    assert run.system.operator.stops == 0
+    assert run.plant.bridge.gate.refused == 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("role", "transport"), [("references", "udp"), ("valves", "modbus")])
 def test_a_cut_cable_stops_the_machine_within_100_ms_and_it_stays_stopped(
     role: RoleName, transport: Transport, tmp_path: Path

@@ -10,11 +10,13 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from hil.tick import counted, release
 from hil.tick.ratio import compared, median_interval, verdict
 from host.exit_codes import CommandFailed
 from tests.codes import coded
+from timberhand.cli import app
 
 
 def test_the_interval_holds_the_median_as_often_as_it_says() -> None:
@@ -87,3 +89,9 @@ def test_what_valgrind_counted_is_told_for_one_tick():
         counted._per_tick('{"tick": "interpreter", "counted": 20}', told.replace("2000", "0"))
     with pytest.raises(CommandFailed, check=coded("tick.not-counted")):
         counted._per_tick("", "valgrind: command not found")
+
+
+@pytest.mark.parametrize("other", ["--count", "--random=10"])
+def test_an_option_that_would_be_ignored_is_refused(other: str) -> None:
+    done = CliRunner().invoke(app, ["bench", "tick", other, "--against", "HEAD"])
+    assert done.exit_code == 2 and "--against compares costs" in done.output

@@ -137,6 +137,7 @@ def test_the_preemption_model_is_read_from_the_kernel(
 
 
 # ------------------------------------------------------------------------------- findings
+PINNED = "etc__systemd__system__timberhand-controller.service.d__50-processor.conf"
 CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
     ("priority", {"proc__self__limits": "Max realtime priority  0  0\n"}, Severity.CHANGE, "FIFO 0", "rtprio 90"),
     ("memory", {"proc__self__limits": "Max locked memory  65536  65536\n"}, Severity.CHANGE, "64 kB", "memlock"),
@@ -149,8 +150,14 @@ CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
      "isolcpus=managed_irq,domain,3"),
     ("processor", {"sys__devices__system__cpu__nohz_full": "", "proc__cmdline": "rcu_nocbs=3"}, Severity.ADVICE,
      "nohz_full", "nohz_full=3"),
-    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n"}, Severity.ADVICE, "",
-     "CONTROLLER_OPTIONS=--cpu 3"),
+    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n",
+                   "sys__devices__system__cpu__isolated": ""}, Severity.ADVICE, "no processor is isolated",
+     "service install --cpu 3"),
+    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n"}, Severity.CHANGE,
+     "processor 3 is isolated, but the controller does not use it", "service install --cpu 3"),
+    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n",
+                   PINNED: "[Service]\nCPUAffinity=2\n"}, Severity.CHANGE, "processor 2, which is not isolated",
+     "service install --cpu any"),
     ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "processor 9",
      "nano"),
     ("sibling", {"sys__devices__system__cpu__cpu3__topology__thread_siblings_list": "1,3"}, Severity.ADVICE,
@@ -205,6 +212,9 @@ def test_what_is_granted_by_other_means_is_fine(tree: Tree, changes: dict[str, s
         ({"state": "ERROR-PASSIVE"}, Severity.CHANGE, "ERROR-PASSIVE"),
         ({"counters": {"bus_off": 2}}, Severity.CHANGE, "bus_off 2"),
         ({"restart_ms": 0}, Severity.ADVICE, "bus-off"),
+        ({"sample_point": 0.6}, Severity.CHANGE, "sampled at 60.0 %"),
+        ({"sample_point": 0.875}, Severity.FINE, "sampled at 87.5 %"),
+        ({"sample_point": 0.0}, Severity.FINE, "no errors"),
         ({"virtual": True}, Severity.FINE, "virtual"),
     ],
 )
@@ -232,6 +242,31 @@ def test_a_profile_that_does_not_load_is_a_fault(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(installation, "load_profile", broken)
     assert {f.severity for f in installation.profiles()} == {Severity.FAULT}
+
+
+@pytest.mark.parametrize(
+    ("mode", "secret", "severity", "sentence"),
+    [
+        (0o440, b"s" * 44, Severity.FINE, "operators"),
+        (0o444, b"s" * 44, Severity.FAULT, "others may"),
+        (0o460, b"s" * 44, Severity.FAULT, "others may"),
+        (0o440, b"short", Severity.FAULT, "5 bytes"),
+        (0o440, None, Severity.FAULT, "missing"),
+    ],
+)
+def test_the_key_of_the_services_is_there_and_secret(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, mode: int, secret: bytes | None, severity: Severity, sentence: str
+) -> None:
+    monkeypatch.setattr(installation, "CONF", tmp_path / "timberhand.conf")
+    monkeypatch.setattr(installation, "SERVICE_KEY", tmp_path / "key")
+    monkeypatch.setattr(installation, "KEY_OWNER", tmp_path.stat().st_uid)
+    assert list(installation.key()) == []
+    (tmp_path / "timberhand.conf").touch()
+    if secret is not None:
+        (tmp_path / "key").write_bytes(secret)
+        (tmp_path / "key").chmod(mode)
+    (found,) = installation.key()
+    assert (found.severity, sentence in found.sentence) == (severity, True)
 
 
 def test_a_missing_package_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,8 @@ import host.vcan_lab.__main__ as lab_command
 from host.vcan_lab import choose, clock, lab_kernel
 from host.vcan_lab.choose import Method
 from host.vcan_lab.clock import MAX_GAP_NS, MAX_LOST_SHARE, LostTime, choose_clock
-from timberhand.commands.runs import Backend, ClockChoice, enter_lab
+from host.vcan_lab.spec import DEFAULT_MEM_MB
+from timberhand.commands.runs import DETECTOR_MEM_MB, Backend, ClockChoice, enter_lab
 
 QUIET = LostTime(0.01, 2_000_000, 0.0)
 KERNEL = "/cache/linux"
@@ -80,7 +81,7 @@ def test_the_command_enters_the_lab_with_that_clock_and_says_so(
     monkeypatch.setattr(lab_kernel, "find", lambda _: KERNEL)
     monkeypatch.setattr(clock, "measure", lambda: lost)
     enter_lab(Backend.VCAN, choice)
-    assert [more for _, more in entered] == [{"time_travel": simulated}]
+    assert [more for _, more in entered] == [{"time_travel": simulated, "mem": DEFAULT_MEM_MB}]
     said = capsys.readouterr().err
     kind = "simulated" if simulated else "real"
     assert said.startswith(f"vcan lab: {kind} time: ") if choice is ClockChoice.AUTO else said == ""
@@ -94,4 +95,12 @@ def test_a_kernel_with_vcan_keeps_its_own_time(
     monkeypatch.setattr(lab_command, "vcan", lambda words, **more: entered.append(more))
     monkeypatch.setattr(choose, "choose", lambda *_: Method("existing", "up"))
     enter_lab(Backend.VCAN)
-    assert entered == [{"time_travel": False}] and capsys.readouterr().err == ""
+    assert entered == [{"time_travel": False, "mem": DEFAULT_MEM_MB}] and capsys.readouterr().err == ""
+
+
+def test_a_detector_gets_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    entered: list[dict[str, Any]] = []
+    monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
+    monkeypatch.setattr(lab_command, "vcan", lambda words, **more: entered.append(more))
+    enter_lab(Backend.VCAN, ClockChoice.SIMULATED, detects=True)
+    assert entered == [{"time_travel": True, "mem": DETECTOR_MEM_MB}] and DETECTOR_MEM_MB > DEFAULT_MEM_MB

@@ -126,11 +126,21 @@ def test_no_shipped_machine_has_an_imu_and_missing_late_sections_are_not_hashed(
         assert profile.imu is None
         early = msgspec.structs.replace(profile, stability=None, keep_out={})
         content = msgspec.json.decode(msgspec.json.encode(early, order="deterministic"))
-        del content["imu"], content["stability"], content["keep_out"]
+        del content["imu"], content["stability"], content["keep_out"], content["timeouts"]["operator_link_ms"]
         assert profile_hash(early) == zlib.crc32(msgspec.json.encode(content)) != profile_hash(profile)
     sensing = load_profile(write(tmp_path, {"imu": IMU}, AORO))
     assert sensing.imu == Imu(**IMU)
     assert profile_hash(sensing) != profile_hash(load_profile("aoro_fc8"))
+
+
+def test_the_limit_of_the_operators_link_is_a_second_unless_a_machine_says_otherwise(tmp_path):
+    shipped = load_profile("palms_471")
+    early = load_profile(write(tmp_path, {"timeouts.operator_link_ms": DELETE}))
+    assert early.timeouts.operator_link_ms == shipped.timeouts.operator_link_ms == 1000
+    assert profile_hash(early) == profile_hash(shipped)
+    for limit_ms in (0, 500, 999):
+        other = load_profile(write(tmp_path, {"timeouts.operator_link_ms": limit_ms}))
+        assert other.timeouts.operator_link_ms == limit_ms and profile_hash(other) != profile_hash(shipped)
 
 
 def test_unknown_name_lists_the_shipped_profiles():

@@ -49,6 +49,12 @@ def test_the_joints_for_a_true_point_bring_the_true_pin_there(sag, q, load_kg):
     assert dist(true_pin(sag, KIN, (*found, q[Joint.EXT]), load_kg), point) < 2e-6
 
 
+def test_a_point_that_the_lean_carries_past_the_mast_is_refused():
+    sag, q = Sag(0.0078125, 0.0, 0.0, 0.0), (1.5, -0.25, -3.0, 0.78125, 0.0)
+    with pytest.raises(Unreachable, match="too near the mast"):
+        aim(sag, KIN, LIMITS, *true_pin(sag, KIN, q), q[Joint.EXT])
+
+
 @given(GIVES, INSIDE, LOADS)
 @settings(max_examples=50, deadline=None)
 def test_a_given_extension_works_as_well(sag, q, load_kg):

@@ -25,12 +25,11 @@ from typing import Any
 
 from tests.mutation.mutators import Module, Mutant
 from tests.mutation.runner import (
-    CPU_EXTRA_S,
-    CPU_FACTOR,
     KILLED,
     SURVIVED,
     TIMEOUT,
     UNUSABLE,
+    Baseline,
     Outcome,
     TestsFail,
     collect_and_run,
@@ -110,8 +109,9 @@ def run_scope(scope: Scope, modules: dict[str, Module], only: str, jobs: int) ->
     if child == 0:
         code = 3
         try:
-            left, seconds = collect_and_run(scope, list(modules.values()), wanted, jobs, tell)
-            left_path.write_text(json.dumps({"left": [(m.module, m.number) for m in left], "seconds": seconds}))
+            left, baseline = collect_and_run(scope, list(modules.values()), wanted, jobs, tell)
+            entry = {"left": [(m.module, m.number) for m in left], "cpu_s": baseline.cpu_s, "long": baseline.long}
+            left_path.write_text(json.dumps(entry))
             code = 0
         except TestsFail as error:
             print(f"mutants: {scope.name}: {error}", file=sys.stderr, flush=True)
@@ -122,7 +122,7 @@ def run_scope(scope: Scope, modules: dict[str, Module], only: str, jobs: int) ->
     found = json.loads(left_path.read_text())
     left = [modules[name].mutants[number] for name, number in found["left"]]
     done = len(kept.read()) - len(before)
-    run_imported(scope, modules, left, CPU_FACTOR * found["seconds"] + CPU_EXTRA_S, jobs, tell)
+    run_imported(scope, modules, left, Baseline(found["cpu_s"], tuple(found["long"])), jobs, tell)
     return kept.read()
 
 
@@ -156,7 +156,7 @@ def figures(modules: dict[str, Module], results: dict[tuple[str, int], tuple[str
                 elif status == UNUSABLE:
                     unusable.append(entry | {"why": by})
     killed = counts[KILLED] + counts[TIMEOUT]
-    judged = killed + counts[SURVIVED]
+    judged = killed + counts[SURVIVED] + unknown  # one that has not run yet is not killed
     return {
         "score": round(killed / judged, 4) if judged else 0.0,
         "raw": round(killed / (judged + counts["equivalent"]), 4) if judged else 0.0,
@@ -175,6 +175,15 @@ def commit() -> str:
 
     dirty = git("status", "--porcelain", "--untracked-files=no", "controller", "tests")
     return git("rev-parse", "--short=12", "HEAD") + ("+" if dirty else "")
+
+
+def write_result(found: dict[str, dict[str, Any]]) -> None:
+    """Write the figures of the scopes that ran, each with its commit; what another run found of the others stays."""
+    kept = json.loads(RESULT.read_text())["scopes"] if RESULT.exists() else {}
+    scopes = kept | {name: {"commit": commit(), **numbers} for name, numbers in found.items()}
+    scores = {name: numbers["score"] for name, numbers in scopes.items()}
+    result = {"command": "make mutants", "wanted": WANTED_SCORE, **scores, "scopes": scopes}
+    RESULT.write_text(json.dumps(result, indent=1) + "\n")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -208,10 +217,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{name}: score {numbers['score']:.4f} (raw {numbers['raw']:.4f}); " + ", ".join(
             f"{numbers[key]} {key}" for key in ("mutants", "killed", "timeouts", "survived", "equivalent", "unusable",
                                                 "not_run")))  # fmt: skip
-    if not options.module and not options.scope:
-        scores = {name: numbers["score"] for name, numbers in found.items()}
-        result = {"command": "make mutants", "commit": commit(), "wanted": WANTED_SCORE, **scores, "scopes": found}
-        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    if not options.module:
+        write_result(found)
         print(f"written: {RESULT.relative_to(ROOT)}")
     return 0 if all(numbers["score"] >= WANTED_SCORE for numbers in found.values()) else 1
 

@@ -5,9 +5,9 @@ limits are statements of the module, not of a function, and the present tools ei
 interpreter for every mutant.  Here a mutant in a function replaces that function's code in a fork, and a mutant of a
 statement of the module is imported anew in a fork that has not collected yet.
 
-A mutant is *killed* when a test fails, *timeout* when it needs ten times the processor time of its tests, *survived*
-when all of them pass.  A mutant that Python refuses, that cannot be imported, or whose process ends in any other way is
-*unusable* and counts for nothing.
+A mutant is *killed* when a test fails, *timeout* when it needs ten times the processor time of its tests or waits for
+`IDLE_S` without using any, *survived* when all of them pass.  A mutant that Python refuses, that cannot be imported, or
+whose process ends in any other way is *unusable* and counts for nothing.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ from tests.safety_scope import Scope
 
 PYTEST = ["-q", "-x", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "-o", "timeout=0", "-m", "not slow"]
 CPU_FACTOR, CPU_EXTRA_S = 10.0, 20.0
-WALL_FACTOR, WALL_EXTRA_S = 20.0, 120.0
+LONG_S = 15.0
+"""A test that needs more processor time, with its lines counted, is left out: what only it finds counts as survived."""
+IDLE_S = 60.0
+"""A child that sleeps so long waits for what never comes; no test of the scopes waits longer for anything."""
 MEMORY_BYTES = 4 << 30
 PURGED = ("controller", "tests", "hil", "sim", "recorder")
 """Packages that may hold objects of a mutated module; a mutant of a module's own statements imports them anew."""
@@ -52,6 +55,14 @@ class Outcome:
     mutant: Mutant
     status: str
     by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """The unchanged tests: the processor time of all of them [s], and the names of those beyond `LONG_S`."""
+
+    cpu_s: float
+    long: tuple[str, ...]
 
 
 @dataclass(slots=True)
@@ -82,7 +93,9 @@ class Forks:
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
-        self._running: dict[int, tuple[Any, int, float]] = {}
+        self._running: dict[int, tuple[Any, int]] = {}
+        self._idle: dict[int, tuple[int, float]] = {}
+        """Of each child its processor time [clock ticks] and until when it may stay there [s]."""
 
     def start(self, what: Any, cpu_s: float, work: Callable[[int], int]) -> Iterator[tuple[Any, int | None, str]]:
         """Run ``work(pipe)`` in a child; yields (what, exit code or None for a time-out, words) of those that ended."""
@@ -94,7 +107,7 @@ class Forks:
             os.close(read)
             _run_child(write, cpu_s, work)
         os.close(write)
-        self._running[child] = (what, read, time.monotonic() + WALL_FACTOR * cpu_s + WALL_EXTRA_S)
+        self._running[child] = (what, read)
 
     def finish(self) -> Iterator[tuple[Any, int | None, str]]:
         """Wait for all of them."""
@@ -103,22 +116,36 @@ class Forks:
 
     def _wait(self) -> Iterator[tuple[Any, int | None, str]]:
         select.select([entry[1] for entry in self._running.values()], [], [], 0.5)
-        for child, (what, read, until) in list(self._running.items()):
+        for child, (what, read) in list(self._running.items()):
             ended, status = os.waitpid(child, os.WNOHANG)
-            if not ended and time.monotonic() > until:
+            waits = not ended and self._waits(child)
+            if waits:
                 os.kill(child, signal.SIGKILL)
                 ended, status = os.waitpid(child, 0)
             if not ended:
                 continue
             del self._running[child]
+            self._idle.pop(child, None)
             with os.fdopen(read, "rb") as pipe:
                 words = pipe.read().decode(errors="replace")
-            if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
+            if waits:
+                yield what, None, f"its tests slept for {IDLE_S:g} s"
+            elif os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
                 yield what, None, "the processor time of its tests was not enough"
             elif os.WIFSIGNALED(status):
                 yield what, -os.WTERMSIG(status), f"ended by signal {os.WTERMSIG(status)}"
             else:
                 yield what, os.WEXITSTATUS(status), words
+
+    def _waits(self, child: int) -> bool:
+        """Whether a child has slept for `IDLE_S`.  One that a busy computer keeps waiting does not sleep."""
+        state, *fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+        used, now_s = int(fields[10]) + int(fields[11]), time.monotonic()
+        before, until_s = self._idle.get(child, (-1, now_s))
+        if used != before or state == "R":
+            self._idle[child] = (used, now_s + IDLE_S)
+            return False
+        return now_s > until_s
 
 
 def _run_child(pipe: int, cpu_s: float, work: Callable[[int], int]) -> None:
@@ -192,6 +219,7 @@ class FunctionMutants:
                  tell: Callable[[Outcome], None]) -> None:  # fmt: skip
         self._modules, self._wanted, self._jobs, self._tell = modules, wanted, jobs, tell
         self.covered = Covered()
+        self.tests: list[str] = []
         self.left: list[Mutant] = []
         """Mutants that need a new import."""
         self.problem = ""
@@ -210,6 +238,7 @@ class FunctionMutants:
             self.problem = "the tests cannot be collected"
             return True
         items = session.items
+        self.tests = [item.nodeid for item in items]
         self.covered = self._measure(items)
         forks = Forks(self._jobs)
         for module in self._modules:
@@ -242,8 +271,11 @@ class FunctionMutants:
     def _tests_of(self, name: str, mutant: Mutant) -> list[int]:
         """The tests that run a mutant's lines: first those that killed its neighbours, then the quickest."""
         lines = self.covered.lines.get(name, {})
-        found = {i for at in range(mutant.lines[0], mutant.lines[1] + 1) for i in lines.get(at, ())}
-        return sorted(found, key=lambda i: (-self._kills.get((mutant.function, i), 0), self.covered.seconds[i], i))
+        seconds = self.covered.seconds
+        found = {
+            i for at in range(mutant.lines[0], mutant.lines[1] + 1) for i in lines.get(at, ()) if seconds[i] <= LONG_S
+        }
+        return sorted(found, key=lambda i: (-self._kills.get((mutant.function, i), 0), seconds[i], i))
 
     def _work(
         self, module: Module, mutant: Mutant, function: FunctionType, items: list[Any], numbers: list[int]
@@ -342,10 +374,11 @@ class _FirstFailure:
 
 
 def run_imported(
-    scope: Scope, modules: dict[str, Module], mutants: Sequence[Mutant], cpu_s: float, jobs: int,
+    scope: Scope, modules: dict[str, Module], mutants: Sequence[Mutant], baseline: Baseline, jobs: int,
     tell: Callable[[Outcome], None],
 ) -> None:  # fmt: skip
     """Run mutants that change what an import makes; call it before pytest has collected anything in this process."""
+    long = [f"--deselect={name}" for name in baseline.long]
     forks = Forks(jobs)
 
     def work_on(mutant: Mutant) -> Callable[[int], int]:
@@ -358,7 +391,7 @@ def run_imported(
             importlib.import_module(module.name)
             for path in scope.tests():  # one after the other: most mutants end in the first file
                 seen = _FirstFailure()
-                code = int(pytest.main([*PYTEST, str(path)], plugins=[seen]))
+                code = int(pytest.main([*PYTEST, *long, str(path)], plugins=[seen]))
                 if finder.failed or code not in (0, 5):  # 5: no test of this file is wanted
                     os.write(pipe, (finder.failed or seen.failed or f"pytest ended with {code}").encode())
                     return 10 if code == 1 and not finder.failed else 1
@@ -367,7 +400,7 @@ def run_imported(
         return work
 
     for mutant in mutants:
-        for what, code, words in forks.start(mutant, cpu_s, work_on(mutant)):
+        for what, code, words in forks.start(mutant, CPU_FACTOR * baseline.cpu_s + CPU_EXTRA_S, work_on(mutant)):
             tell(_outcome(what, code, words))
     for what, code, words in forks.finish():
         tell(_outcome(what, code, words))
@@ -376,8 +409,8 @@ def run_imported(
 def collect_and_run(
     scope: Scope, modules: Sequence[Module], wanted: Callable[[Mutant], bool], jobs: int,
     tell: Callable[[Outcome], None],
-) -> tuple[list[Mutant], float]:  # fmt: skip
-    """Run the mutants in functions; returns those that need an import, and the processor time of all tests [s].
+) -> tuple[list[Mutant], Baseline]:  # fmt: skip
+    """Run the mutants in functions; returns those that need an import, and what the unchanged tests need.
 
     Raises:
         TestsFail: the tests fail without a mutant, or cannot be collected.
@@ -386,4 +419,6 @@ def collect_and_run(
     pytest.main([*PYTEST, *map(str, scope.tests())], plugins=[plugin])
     if plugin.problem:
         raise TestsFail(plugin.problem)
-    return plugin.left, sum(plugin.covered.seconds)
+    needed = dict(zip(plugin.tests, plugin.covered.seconds, strict=True))
+    long = tuple(name for name, seconds in needed.items() if seconds > LONG_S)
+    return plugin.left, Baseline(sum(needed.values()), long)

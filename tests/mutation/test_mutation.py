@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from tests.mutation import runner
 from tests.mutation.__main__ import equivalents
 from tests.mutation.mutators import Module
 from tests.mutation.runner import Forks, code_within, function_of
@@ -118,6 +120,13 @@ def test_a_fork_without_end_is_a_time_out() -> None:
 
     forks = Forks(1)
     assert [status for _, status, _ in [*forks.start("mutant", 0.0, work), *forks.finish()]] == [None]
+
+
+def test_a_fork_that_waits_for_nothing_is_a_time_out(monkeypatch) -> None:
+    monkeypatch.setattr(runner, "IDLE_S", 1.0)
+    forks = Forks(1)
+    ended = [*forks.start("mutant", 5.0, lambda pipe: time.sleep(100.0) or 10), *forks.finish()]
+    assert [(status, words) for _, status, words in ended] == [(None, "its tests slept for 1 s")]
 
 
 def test_every_excused_mutant_exists_and_has_a_reason() -> None:

@@ -7,15 +7,12 @@ import math
 import random
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from machine.geometry.kinematics import pin_position, solve
 from machine.loading.profile_file import load_profile
-from sim.errors import PlantError
 from sim.truth.load import load_truth
-from sim.world import HOME_POSE, World
-from tests.codes import coded
+from sim.world import World, home_pose
 
 MACHINES = ("palms_471", "aoro_fc8")
 ROOT = Path(__file__).parents[2]
@@ -111,7 +108,7 @@ def test_the_grapple_collides_only_with_the_bunk():
 
 def test_the_column_is_plumb_and_still_at_home(world):
     w = World(world.profile, world.truth, 0, ())
-    for joint, value in HOME_POSE[world.profile.name].items():
+    for joint, value in home_pose(world.profile).items():
         assert w.q[joint] == pytest.approx(value, abs=2e-3)
     before = w.tip()
     for _ in range(400):
@@ -120,12 +117,6 @@ def test_the_column_is_plumb_and_still_at_home(world):
     assert math.dist(w.tip(), w.rigid_tip()) < 2e-3
     assert w.load_kg() < 2.0
     w.close()
-
-
-def test_a_machine_without_steel_dimensions_is_refused(world):
-    stranger = msgspec.structs.replace(world.profile, name="tractor")
-    with pytest.raises(PlantError, check=coded("plant.unknown-machine")):
-        World(stranger, world.truth, 0, ())
 
 
 def test_equal_inputs_give_bit_identical_motion(world):

@@ -8,7 +8,7 @@ import pytest
 
 from machine.loading.profile_file import load_profile
 from sim.truth.load import load_truth
-from sim.world import HOME_POSE, STEP_S, World
+from sim.world import STEP_S, World, home_pose
 
 PROFILE = load_profile("palms_471")
 NOMINAL = load_truth("nominal", 0, "palms_471")
@@ -19,7 +19,7 @@ def crane():
     worlds = []
 
     def make(**home: float) -> World:
-        worlds.append(World(PROFILE, NOMINAL, 0, (), home=HOME_POSE["palms_471"] | home))
+        worlds.append(World(PROFILE, NOMINAL, 0, (), home=home_pose(PROFILE) | home))
         return worlds[-1]
 
     yield make

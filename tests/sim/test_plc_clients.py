@@ -20,12 +20,12 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from pyModbusTCP.client import ModbusClient as OtherClient
 from pyModbusTCP.server import ModbusServer as OtherServer
 
-from can_dbc.plc.map import Feedback, State, WordOrder, read_status, status_registers
+from can_dbc.plc.map import MAGIC, MAP_VERSION, STATUS_COUNT, Feedback, State, WordOrder, read_status, status_registers
 from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
 from tests.codes import coded
 from tests.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
 
-IDENTITY = [0x4352, 2, 0x0102, 0x0304]
+IDENTITY = [MAGIC, MAP_VERSION, 0x0102, 0x0304]
 
 pytestmark = pytest.mark.slow
 
@@ -38,18 +38,18 @@ def plc() -> Iterator[ServedPlc]:
 
 def test_pymodbus_with_every_function_code(plc: ServedPlc) -> None:
     with ModbusTcpClient(LOOPBACK, port=plc.port) as client:
-        holding = client.read_holding_registers(0, count=48, device_id=1).registers
+        holding = client.read_holding_registers(0, count=STATUS_COUNT, device_id=1).registers
         assert holding[:4] == IDENTITY
         assert client.read_input_registers(0, count=4, device_id=1).registers == IDENTITY
         answer = client.readwrite_registers(
-            read_address=0, read_count=48, write_address=100, values=block(1), device_id=1
+            read_address=0, read_count=STATUS_COUNT, write_address=100, values=block(1), device_id=1
         )
         assert answer.registers[9] == 1
         assert not client.write_registers(100, block(2), device_id=1).isError()
         assert not client.write_register(11, 200, device_id=1).isError()
         assert client.write_register(11, 20, device_id=1).exception_code == 3
         assert client.write_register(5, 2, device_id=1).exception_code == 2
-        assert client.read_holding_registers(47, count=2, device_id=1).exception_code == 2
+        assert client.read_holding_registers(STATUS_COUNT - 1, count=2, device_id=1).exception_code == 2
         assert client.read_coils(0, count=1, device_id=1).exception_code == 1
         assert client.read_holding_registers(0, count=4, device_id=9).exception_code == 11
         assert client.read_holding_registers(100, count=32, device_id=1).registers == block(2)
@@ -66,7 +66,7 @@ def test_pymodbustcp_splits_the_block_and_commits(plc: ServedPlc) -> None:
     assert (plc.program.arbiter.accepted, plc.program.arbiter.command) == (1, MOVE)
     assert not client.write_single_register(102, 9) and client.last_except == 3
     assert plc.program.arbiter.accepted == 1 and client.read_holding_registers(6, 1) is not None
-    assert client.write_read_multiple_registers(100, block(6), 0, 48)[9] == 6  # type: ignore[index]
+    assert client.write_read_multiple_registers(100, block(6), 0, STATUS_COUNT)[9] == 6  # type: ignore[index]
     client.close()
 
 
@@ -80,9 +80,9 @@ def mbpoll(plc: ServedPlc, *arguments: str) -> str:
 
 
 def test_mbpoll_reads_and_writes(plc: ServedPlc) -> None:
-    shown = mbpoll(plc, "-r", "0", "-c", "48", "-t", "4", LOOPBACK)
+    shown = mbpoll(plc, "-r", "0", "-c", str(STATUS_COUNT), "-t", "4", LOOPBACK)
     registers = {int(a): int(v) for a, v in re.findall(r"\[(\d+)\]:\s+(\d+)", shown)}
-    assert [registers[i] for i in range(4)] == IDENTITY and len(registers) == 48
+    assert [registers[i] for i in range(4)] == IDENTITY and len(registers) == STATUS_COUNT
     assert "17234" in mbpoll(plc, "-r", "0", "-c", "1", "-t", "3", LOOPBACK)
     assert "Written 32" in mbpoll(plc, "-r", "100", "-t", "4", LOOPBACK, *map(str, block(1)))
     assert plc.program.arbiter.command == MOVE
@@ -103,16 +103,19 @@ def test_libmodbus_exchanges_in_one_request(plc: ServedPlc) -> None:
     context = ctypes.c_void_p(library.modbus_new_tcp(LOOPBACK.encode(), plc.port))
     try:
         assert library.modbus_set_slave(context, 1) == 0 and library.modbus_connect(context) == 0
-        status = (ctypes.c_uint16 * 48)()
+        status = (ctypes.c_uint16 * STATUS_COUNT)()
         for sequence in range(1, 21):
             words = (ctypes.c_uint16 * 32)(*block(sequence))
-            assert library.modbus_write_and_read_registers(context, 100, 32, words, 0, 48, status) == 48
+            assert (
+                library.modbus_write_and_read_registers(context, 100, 32, words, 0, STATUS_COUNT, status)
+                == STATUS_COUNT
+            )
             assert status[9] == sequence
         words[2] = 9
         words[1] = 21
         assert library.modbus_write_registers(context, 100, 32, words) == -1
         assert ctypes.get_errno() == 112345678 + 3, "illegal data value"
-        assert library.modbus_read_input_registers(context, 0, 48, status) == 48
+        assert library.modbus_read_input_registers(context, 0, STATUS_COUNT, status) == STATUS_COUNT
         assert (status[6], status[9]) == (1, 20) or status[9] == 20
     finally:
         library.modbus_close(context)
@@ -122,7 +125,7 @@ def test_libmodbus_exchanges_in_one_request(plc: ServedPlc) -> None:
 
 def test_low_word_first_is_a_setting() -> None:
     with ServedPlc(WordOrder.LOW_FIRST) as plc, ModbusTcpClient(LOOPBACK, port=plc.port) as client:
-        registers = client.read_holding_registers(0, count=48, device_id=1).registers
+        registers = client.read_holding_registers(0, count=STATUS_COUNT, device_id=1).registers
         assert registers[2:4] == [0x0304, 0x0102]
         assert read_status(registers, WordOrder.LOW_FIRST)[0].position[2] == pytest.approx(-1.6, abs=1e-3)
         client.write_registers(100, block(1, MOVE, WordOrder.LOW_FIRST), device_id=1)
@@ -160,7 +163,7 @@ def test_our_client_with_pymodbus_own_server() -> None:
     async def run() -> None:
         data = [
             SimData(0, values=STATUS, datatype=DataType.REGISTERS),
-            SimData(48, count=100, values=0, datatype=DataType.REGISTERS),
+            SimData(STATUS_COUNT, count=148 - STATUS_COUNT, values=0, datatype=DataType.REGISTERS),
         ]
         server = ModbusTcpServer(SimDevice(1, data), address=(LOOPBACK, 0))
         await server.serve_forever(background=True)

@@ -55,6 +55,32 @@ def test_rough_terrain_follows_its_seed_and_has_the_stated_roughness():
     assert 0.03 < steepness.mean() < 0.12 and steepness.max() < 0.4
 
 
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "flat"])
+def test_a_wider_ground_is_the_same_nearer_by_and_reaches_farther(kind):
+    near, wide = Terrain(kind, 3), Terrain(kind, 3, 0.0, 71.0)
+    rng = random.Random(2)
+    for _ in range(200):
+        x, y = rng.uniform(-38.0, 38.0), rng.uniform(-38.0, 38.0)
+        assert wide.height(x, y) == pytest.approx(near.height(x, y), abs=1e-6)
+    client = new_client()
+    wide.add_to(client, 0.9)
+    for x, y in ((70.0, 3.0), (-70.0, 3.0), (3.0, 70.0), (3.0, -70.0)):
+        (hit,) = client.rayTestBatch([[x, y, 20.0]], [[x, y, -20.0]])
+        assert hit[0] == wide.body and hit[3][2] == pytest.approx(wide.height(x, y), abs=1e-4)
+    client.disconnect()
+
+
+def test_drawn_ground_has_obstacles_and_ruts_and_leaves_the_machines_first_place_free():
+    for seed in range(4):
+        ground = Terrain("drawn", seed)
+        x = (np.arange(len(ground.heights)) - len(ground.heights) // 2) * ground.cell_m
+        away = np.hypot(x[:, None], x[None, :])
+        steep = np.hypot(*np.gradient(ground.heights, ground.cell_m))
+        assert steep[away < 3.5].max() < 0.35 < steep[away > 6.0].max(), "stones and stumps are steep"
+        assert ground.height(0.0, 0.0) == 0.0 and np.abs(ground.heights).max() < 6.0
+    assert not np.array_equal(Terrain("drawn", 1).heights, Terrain("drawn", 2).heights)
+
+
 def test_a_box_comes_to_rest_on_rough_ground():
     terrain, client = Terrain("rough", 4), new_client()
     client.setGravity(0.0, 0.0, -9.81)

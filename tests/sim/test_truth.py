@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import statistics
 import subprocess
 import sys
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 import sim.truth
 from machine.loading.profile_file import load_profile
 from sim.errors import PlantError
-from sim.truth.load import load_truth
+from sim.individual import another_for_every_seed, beside
+from sim.truth.load import FILES, load_truth
 from tests.codes import coded
 
 MACHINES = ("palms_471", "aoro_fc8")
@@ -83,7 +85,7 @@ def test_the_same_seed_makes_the_same_individual(machine, seed):
 
 
 def test_another_process_draws_the_same_individual():
-    code = "from sim.truth.load import load_truth; print(load_truth('sampled', 7, 'aoro_fc8'))"
+    code = "from sim.truth.load import FILES, load_truth; print(load_truth('sampled', 7, 'aoro_fc8'))"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert other.stdout.strip() == str(load_truth("sampled", 7, "aoro_fc8")), other.stderr
 
@@ -120,3 +122,65 @@ def test_a_users_truth_file_is_read_and_a_bad_one_refused(tmp_path):
     with pytest.raises(PlantError, check=coded("truth.unreadable")) as refused:
         load_truth(str(tmp_path / "missing.toml"), 0, "palms_471")
     assert "missing.toml" in str(refused.value)
+
+
+@machines
+def test_a_truth_file_of_a_shipped_machine_need_not_repeat_its_steel_and_home(machine, tmp_path):
+    shipped = Path(sim.truth.__file__).with_name(FILES[machine]).read_text()
+    without = re.sub(r"\[(home|steel)\]\n(?:.+\n)*", "", shipped)
+    assert "[home]" not in without and "[steel]" not in without
+    file = tmp_path / "old.toml"
+    file.write_text(without)
+    assert load_truth(str(file), 0, machine) == load_truth("nominal", 0, machine)
+    file.write_text(without.replace(f'machine = "{machine}"', 'machine = "mine"'))
+    with pytest.raises(PlantError, match="home"):
+        load_truth(str(file), 0, "mine")
+
+
+def test_individuals_are_drawn_around_a_users_truth_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    text = Path(sim.truth.__file__).with_name("nominal.toml").read_text()
+    path.write_text(text.replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))
+    one = load_truth(f"sampled:{path}", 5, "palms_471")
+    assert one.supply.relief_pa == 18.0e6 and one.functions == load_truth("sampled", 5, "palms_471").functions
+    assert one != load_truth(f"sampled:{path}", 6, "palms_471")
+    assert load_truth(f"nominal:{path}", 5, "palms_471") == load_truth(str(path), 0, "palms_471")
+
+
+def test_the_truth_beside_a_profile_of_ones_own_is_chosen_by_itself(tmp_path):
+    profile, own = str(tmp_path / "changed.toml"), tmp_path / "loader.truth.toml"
+    assert beside(profile, "loader", "nominal") == "nominal", "there is no such file"
+    own.touch()
+    assert beside(profile, "loader", "nominal") == f"nominal:{own}"
+    assert beside(profile, "loader", "sampled") == f"sampled:{own}"
+    assert beside(profile, "loader", "other.toml") == "other.toml"
+    assert beside("palms_471", "palms_471", "nominal") == "nominal", "a shipped machine has no folder"
+
+
+def test_trials_on_many_machines_draw_each_unless_the_caller_named_one():
+    assert [another_for_every_seed(text) for text in ("nominal", "wide_valves", "nominal:a.toml", "a.toml")] == [
+        "sampled", "wide_valves", "sampled:a.toml", "a.toml",
+    ]  # fmt: skip
+
+
+@machines
+@settings(max_examples=40, deadline=None)
+@given(seed=SEEDS)
+def test_wide_valves_are_any_valve_on_an_ordinary_individual(machine, seed):
+    nominal, one = load_truth("nominal", 0, machine), load_truth("wide_valves", seed, machine)
+    ordinary = load_truth("sampled", seed, machine)
+    assert one.links == ordinary.links and one.encoders == ordinary.encoders
+    assert one.functions["grapple"] == ordinary.functions["grapple"]
+    for name in ("slew", "lift", "tilt", "ext", "rot"):
+        v, ratio = one.functions[name].valve, ratios(one.functions[name].valve, nominal.functions[name].valve)
+        assert 0.020 <= v.delay_s <= 0.250
+        assert min(v.deadband_plus, v.deadband_minus) >= 0.03 and max(v.deadband_plus, v.deadband_minus) <= 0.30
+        assert all(1.0 / 3.0 - 1e-9 <= ratio[f"full_speed_{side}"] <= 3.0 + 1e-9 for side in ("plus", "minus"))
+
+
+def test_wide_valves_fill_their_range_evenly_by_ratio():
+    valves = [load_truth("wide_valves", seed, "palms_471").functions["lift"].valve for seed in range(300)]
+    edges = [math.log(v.deadband_plus / 0.03) / math.log(10.0) for v in valves]
+    assert statistics.mean(edges) == pytest.approx(0.5, abs=0.06) and min(edges) < 0.05 and max(edges) > 0.95
+    apart = [abs(math.log(v.deadband_plus / v.deadband_minus)) for v in valves]
+    assert max(apart) > 1.5, "each side is drawn for itself"

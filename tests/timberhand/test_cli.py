@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from experiments.common.seeds import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.cli import app
 
@@ -36,6 +37,18 @@ def test_matrix_products_use_one_thread_unless_the_environment_says_otherwise(gi
     assert done.stdout.splitlines()[-1] == f"threads {threads}"
 
 
+@pytest.mark.parametrize("words", [["demo"], ["mission", "run"], ["plan", "check"], ["experiment"]])
+def test_help_at_80_columns_has_each_option_on_a_line_and_its_words_below(words: list[str]) -> None:
+    environment = {**os.environ, "COLUMNS": "80", "TERMINAL_WIDTH": "80"}
+    command = [sys.executable, "-m", "timberhand", *words, "--help"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    lines = [line.strip("│ ") for line in done.stdout.splitlines()]
+    options = [k for k, line in enumerate(lines) if line.startswith("--")]
+    assert len(options) > 2
+    for k in options:
+        assert len(lines[k]) < 76 and len(lines[k + 1].split()) >= 3, lines[k]
+
+
 def test_the_report_is_written_from_saved_results_and_an_empty_or_broken_folder_is_refused(tmp_path: Path) -> None:
     runner = CliRunner()
     refused = runner.invoke(app, ["report", "--docs", str(tmp_path)])
@@ -47,9 +60,28 @@ def test_the_report_is_written_from_saved_results_and_an_empty_or_broken_folder_
     done = runner.invoke(app, ["report", "--docs", str(tmp_path)])
     assert done.exit_code == 0 and "2 experiments" in done.stdout
     assert "[navigation]" in (tmp_path / "results.md").read_text()
+    checked = runner.invoke(app, ["report", "--check", "--docs", str(tmp_path)])
+    assert isinstance(checked.exception, CommandFailed) and checked.exception.exit_code is ExitCode.FIGURE_MISSED
+    assert "navigation: " in checked.stdout and "2 of 2 results" in str(checked.exception)
     (tmp_path / "results" / "navigation.json").write_text("{")
     broken = runner.invoke(app, ["report", "--docs", str(tmp_path)])
     assert isinstance(broken.exception, CommandFailed) and broken.exception.code == "report.results-unusable"
+
+
+def test_a_page_of_the_checkout_is_refused_while_sources_are_not_committed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("experiments.common.result.commit", lambda: "0123456789ab+changes")
+    refused = CliRunner().invoke(app, ["experiment", "plant", "--quick", "--docs", str(DOCS)])
+    assert isinstance(refused.exception, CommandFailed) and refused.exception.code == "experiment.uncommitted"
+    sealed = CliRunner().invoke(app, ["experiment", "plant", "--quick", "--sealed"])
+    assert isinstance(sealed.exception, CommandFailed) and sealed.exception.code == "experiment.uncommitted"
+
+
+def test_a_sealed_run_gets_the_seed_of_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+    monkeypatch.setattr("experiments.common.result.commit", lambda: "0123456789ab")
+    monkeypatch.setattr("experiments.common.registry.load", lambda _: lambda options, _: given.append(options.seed))
+    CliRunner().invoke(app, ["experiment", "plant", "--sealed"])
+    assert given == [sealed_seed("0123456789ab", "plant")]
 
 
 def test_the_version_is_that_of_the_package() -> None:
@@ -69,3 +101,37 @@ def test_a_command_failure_crosses_process_boundaries() -> None:
     failure = CommandFailed("area.what", "a sentence", ExitCode.BUS)
     copy = pickle.loads(pickle.dumps(failure))
     assert (copy.code, str(copy), copy.exit_code) == ("area.what", "a sentence", ExitCode.BUS)
+
+
+WITHOUT = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "{0}":
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+sys.argv = ["timberhand", *{1}]
+from timberhand.cli import main
+main()
+"""
+
+
+def without(module: str, arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """A command on a computer that lacks a package."""
+    command = [sys.executable, "-c", WITHOUT.format(module, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_a_package_that_is_missing_is_one_sentence_and_one_of_ours_is_a_fault(tmp_path: Path) -> None:
+    """As on a machine's computer, whose bundle brings no plant."""
+
+    done = without("pybullet", ["demo", "--lockstep"], tmp_path)
+    assert done.returncode == ExitCode.CONFIGURATION and done.stderr.count("\n") == 1, done.stderr
+    assert "timberhand[sim]" in done.stderr and "--with-plant" in done.stderr and "[package.missing]" in done.stderr
+    assert "Traceback" in without("sim", ["demo", "--lockstep"], tmp_path).stderr
+
+
+def test_an_exit_imports_nothing(tmp_path: Path) -> None:
+    """`timberhand service uninstall` has removed the program when it ends."""
+    done = without("controller", ["--version"], tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -71,8 +71,17 @@ def test_convert_with_a_harvest(tmp_path: Path) -> None:
     said = run("convert", EXAMPLES / "site.kml", out, "--logs", EXAMPLES / "harvest.hpr").output
     assert "3 waypoints, 2 fences, 1 landing, 7 logs" in said
     assert json.loads(run("check", out, "--json").output)["logs"] == 7
-    assert failure("convert", PAPER_B, tmp_path / "m.kml").exit_code == ExitCode.USAGE
+    assert failure("convert", PAPER_B, tmp_path / "m.dxf").exit_code == ExitCode.USAGE
     assert failure("convert", PAPER_B, tmp_path / "no" / "m.geojson").code == "mission.not-written"
+
+
+@pytest.mark.parametrize(
+    ("kind", "lost"), [("plan", "note logs not in m.plan"), ("gpx", "fences"), ("kml", "option laps")]
+)
+def test_convert_to_other_programs_says_what_is_lost(kind: str, lost: str, tmp_path: Path) -> None:
+    out = tmp_path / f"m.{kind}"
+    assert lost in run("convert", PAPER_B, out).output
+    assert json.loads(run("check", out, "--json").output)["waypoints"] == 4
 
 
 def test_show_draws_everything(tmp_path: Path) -> None:

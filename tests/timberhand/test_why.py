@@ -16,8 +16,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from can_dbc.messages.crane import OperatorAction
+from can_dbc.messages.tick_record import TickRecord, decode
 from controller.process.tick_recording import record
 from host.exit_codes import CommandFailed, ExitCode
+from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from recorder.stop_files import files_in
 from tests.controller.bench import SETTINGS, Bench
@@ -119,7 +121,7 @@ def test_a_recording_without_stop_files_tells_the_same(run: Path, tmp_path: Path
 def test_an_old_recording_is_read(name: str, tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(lzma.decompress((KEPT / f"{name}.mcap.xz").read_bytes()))
     assert "did not stop" in invoke(tmp_path)
-    assert json.loads(invoke(tmp_path, "--json")) == {"stops": [], "plot": None}
+    assert json.loads(invoke(tmp_path, "--json")) == {"stops": [], "plot": None, "failure": None}
 
 
 def test_without_a_run_the_newest_stop_of_all_runs_is_taken(
@@ -209,3 +211,33 @@ def test_missing_numbers_are_explained(run: Path, reason: Reason, numbers: tuple
     text = io.StringIO()
     show(Console(file=text, width=120), replace(found, stop=stop), [])
     assert f"  measured    {line}\n" in text.getvalue()
+
+
+def test_heartbeats_of_an_operator_are_an_event_only_when_they_stop(tmp_path: Path) -> None:
+    recorder = recorder_in(tmp_path)
+    bench = RecordedBench([recorder])
+    bench.active(ticks=40)
+    for k in range(400):
+        sent = [bench.moving(0, 0.01)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else []
+        bench.tick([*sent, bench.operator(OperatorAction.WATCH)] if k % 40 == 0 and k < 160 else sent)
+    recorder.close()
+    (found,) = find_stops(tmp_path)
+    texts = [event.text for event in events_of(found.ticks, found.stop.at_ns)]
+    assert found.stop.code == "OPERATOR_LINK_LOST"
+    assert "heartbeats of the operator silent from here for more than 500 ms" in texts
+    assert not any("WATCH" in text for text in texts)
+
+
+def test_a_watch_that_ends_on_purpose_is_no_silence() -> None:
+    def tick(bench: Bench, *sent: OperatorAction) -> TickRecord:
+        outputs = bench.tick([bench.operator(action) for action in sent])
+        return decode(record(bench.inputs, outputs, bench.now_ns))
+
+    bench = Bench().boot()
+    ticks = [
+        tick(bench, OperatorAction.WATCH),
+        tick(bench, OperatorAction.WATCH_END),
+        *[tick(bench) for _ in range(200)],
+    ]
+    texts = [event.text for event in events_of(ticks, bench.now_ns)]
+    assert "operator: WATCH_END" in texts and not any("heartbeats" in text for text in texts)

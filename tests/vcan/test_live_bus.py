@@ -17,6 +17,7 @@ import pytest
 from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame
+from controller.guard.can_socket import GuardSocket
 
 RAW = struct.Struct("=IB3x8s")
 TIMEOUT_S = 10.0
@@ -59,6 +60,21 @@ def test_python_can_and_our_bus_read_each_other(extended: bool) -> None:
         message = theirs.recv(TIMEOUT_S)
         assert message is not None
         assert (message.arbitration_id, message.is_extended_id, bytes(message.data)) == (0x123, extended, b"to them")
+
+
+def test_the_guards_own_socket_hears_what_it_watches_and_not_itself() -> None:
+    watched = (0x181, 0x18F00400 | EXTENDED)
+    with GuardSocket("vcan0", watched) as guard, open_bus("socketcan:vcan0") as ours:
+        before_ns = time.monotonic_ns()
+        for key in (0x182, 0x181, 0x0CF00400 | EXTENDED, 0x18F00400 | EXTENDED):
+            assert ours.send(key, b"12345")
+        after_ns = time.monotonic_ns()
+        assert guard.send_all([(0x181, b"own"), (0x77D, b"\x05")]) == 2
+        frames = wait_for(guard, 2)
+        assert [(f.key, f.data) for f in frames] == [(key, b"12345") for key in watched]
+        assert all(before_ns - CYCLE_NS <= f.stamp_ns <= after_ns + 4 * CYCLE_NS for f in frames)
+        assert [(f.key, f.data) for f in wait_for(ours, 2)] == [(0x181, b"own"), (0x77D, b"\x05")]
+        assert guard.drain([]) == 0
 
 
 def test_the_kernel_sends_a_cyclic_frame_by_itself() -> None:

@@ -1,0 +1,51 @@
+"""A crane on the bench without a planner: wire, plant, guard, controller and console, as processes in real time."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from hil.harness.live import HARDWARE_PRIORITY
+from hil.harness.processes import ProcessGroup, free_udp_ports
+from hil.wire.bitrates import BITRATES
+
+START_S = 60.0
+
+
+@contextlib.contextmanager
+def bench(folder: Path, profile: str = "palms_471") -> Iterator[str]:
+    """The address of its page; ``folder`` gets what the processes write."""
+    (folder / "wire").mkdir()
+    group = ProcessGroup(folder, environment={"TIMBERHAND_WIRE_DIR": str(folder / "wire")})
+    setpoints, reports, sim = free_udp_ports(3)
+    named, bus = ("--profile", profile), ("--bus", "crane0=wire:crane0")
+    operator = folder / "operator"
+    try:
+        group.start("wire", "hil.wire.daemon", "--bus", f"crane0:{BITRATES['crane0']}")
+        group.await_message("wire", "ready", START_S)
+        group.start("sim", "sim", *named, "--seed", 1, "--truth", "nominal", "--port", sim, *bus)
+        group.await_message("sim", "ready", START_S)
+        for name, priority in HARDWARE_PRIORITY.items():
+            group.set_fifo_priority(name, priority)
+        group.start(
+            "console", "console", *named, "--port", 0, "--report-port", reports, "--operator", operator, *bus,
+            "--controller", f"127.0.0.1:{setpoints}", "--commission", folder / "kept",
+            "--audit", folder / "audit.jsonl",
+        )  # fmt: skip
+        url = str(group.await_message("console", "url", START_S)["url"])
+        group.start("guard", "controller.guard", *named, *bus)
+        group.start(
+            "controller", "controller", *named, *bus, "--setpoint-port", setpoints, "--operator", operator,
+            "--timing", folder / "timing", "--report", f"127.0.0.1:{reports}",
+        )  # fmt: skip
+        yield url
+    finally:
+        group.stop_all(("controller", "guard", "console", "sim", "wire"))
+
+
+def audited(folder: Path) -> list[str]:
+    """What was commanded on its page and done."""
+    lines = map(json.loads, (folder / "audit.jsonl").read_text().splitlines())
+    return [line["what"] for line in lines if line["result"] < 400]

@@ -1,0 +1,130 @@
+"""A recording in the page: it plays, pauses and seeks, and nothing can be commanded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from console.can_tap import load_databases
+from console.replay import Overview, ReplayView
+from console.replay_server import REFUSAL, create_replay_app
+from machine.status.explanation import explain
+from machine.status.reasons import Reason, pack
+from tests.console.browser import MISSING, Browser, installed
+from tests.console.recorded_run import BEGIN_NS, LENGTH_S, PROFILE, STOP_S, RecordedRun
+from tests.console.served_page import served
+
+S = 10**9
+BEGIN_S = BEGIN_NS / 1e9
+HERE = "http://127.0.0.1:8471"
+
+
+@pytest.fixture
+def view() -> ReplayView:
+    run = RecordedRun()
+    return ReplayView(run, PROFILE, Overview(run, PROFILE), load_databases(PROFILE), BEGIN_NS + 10 * S)
+
+
+def at_s(state: dict) -> float:
+    return state["replay"]["at_s"] - BEGIN_S
+
+
+def test_a_page_begins_where_it_is_told_and_stands_still(view: ReplayView) -> None:
+    first = view.step(0)
+    json.dumps(first, allow_nan=False)
+    assert at_s(first) == 10 and first["mode"] == "ACTIVE" and first["alive"]
+    assert first["position"][0] == pytest.approx(0.1, abs=0.001)
+    assert at_s(view.step(100 * S)) == 10
+
+
+def test_it_plays_at_its_speed_and_stands_at_the_end(view: ReplayView) -> None:
+    view.step(0)
+    assert view.order("play") and view.order("speed 4")
+    later = view.step(S)
+    assert at_s(later) == 14 and later["position"][0] == pytest.approx(0.14, abs=0.001)
+    view.order("pause")
+    assert at_s(view.step(3 * S)) == 14
+    view.order("play")
+    last = view.step(90 * S)
+    assert at_s(last) == LENGTH_S and not last["replay"]["playing"]
+    view.order("play")
+    assert at_s(view.step(91 * S)) == pytest.approx(4)  # from the beginning again
+
+
+def test_a_seek_shows_the_state_and_the_plot_of_then(view: ReplayView) -> None:
+    view.step(0)
+    view.order(f"seek {BEGIN_S + STOP_S + 1}")
+    stopped = view.step(0)
+    assert stopped["mode"] == "STOP" and explain(pack(Reason.JOINT_STUCK, 1)).sentence[:-1] in stopped["reason"]
+    times = [t for t, _ in stopped["history"]]
+    assert times[0] == pytest.approx(BEGIN_S + STOP_S - 19) and len(times) == 200
+    assert stopped["history"][0][1][0] == pytest.approx(10.0)  # mrad
+    assert "history" not in view.step(0)
+    view.order(f"seek {BEGIN_S + 3}")
+    assert view.step(0)["mode"] == "ACTIVE"
+    for beyond, nearer in ((-1e6, 0), (1e6, LENGTH_S)):
+        view.order(f"seek {beyond:.1f}")
+        assert at_s(view.step(0)) == nearer
+
+
+@pytest.mark.parametrize(
+    "text", ["", "seek", "play 3", "seek nan", "seek 1e9", "speed", "arm", "seek 1 2", "panel  can"]
+)
+def test_other_words_change_nothing(view: ReplayView, text: str) -> None:
+    assert not view.order(text)
+    assert at_s(view.step(0)) == 10
+
+
+def test_the_can_table_is_that_of_then(view: ReplayView) -> None:
+    view.step(0)
+    view.order("panel can")
+    (crane,) = view.step(S)["can"]
+    assert [row["name"] for row in crane["rows"]] == ["EncLift"]
+    assert crane["rows"][0]["rate_hz"] in (49, 50) and crane["load_pct"] > 0
+
+
+def test_every_command_is_refused_and_foreign_names_too() -> None:
+    client = TestClient(create_replay_app(RecordedRun(), PROFILE), base_url=HERE, client=("127.0.0.1", 40000))
+    for path in ("operator/stop", "operator/arm", "mission/pause", "watch-end/x", "faults/encoder"):
+        answer = client.post(f"/api/{path}")
+        assert (answer.status_code, answer.text) == (409, REFUSAL)
+    assert client.get("/api/machine", headers={"host": "evil.example"}).status_code == 403
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect("/ws", headers={"origin": "http://evil.example"}):
+        pass
+    with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
+        state = ws.receive_json()
+        assert not (state["may_stop"] or state["may_command"] or state["may_order"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(installed() is None, reason=MISSING)
+def test_a_stop_opens_ten_seconds_before_it(tmp_path: Path) -> None:
+    app = create_replay_app(RecordedRun(), PROFILE, name="runs/demo-1")
+    with served(app) as url:
+        browser = Browser(tmp_path, (1280, 800))
+        try:
+            browser.open(url)
+            browser.wait(lambda: "runs/demo-1" in browser.text("replay"), "the recording's name")
+            assert browser.text("stop") == "" and browser.text("arm") == ""
+            browser.click("tab-timeline")
+            browser.wait(lambda: "JOINT_STUCK" in browser.text("panel-timeline"), "the stop")
+            browser.value("document.querySelector('.of-stop button').click()")
+            browser.wait(lambda: "Pause" in browser.text("replay"), "it plays")
+            clock = "parseFloat(document.querySelector('.clock').value)"
+            browser.wait(lambda: STOP_S - 10 < browser.value(clock) < STOP_S, "ten seconds before the stop")
+            assert browser.text("mode") == "ACTIVE"
+            # Space means pause here, and nothing is sent that a machine would hear.
+            key = "new KeyboardEvent('keydown', {key: ' ', bubbles: true, cancelable: true})"
+            assert browser.value(f"document.body.dispatchEvent({key})") is False
+            browser.wait(lambda: "Play" in browser.text("replay"), "it pauses")
+            assert browser.text("alarm") == ""
+            browser.value(
+                "(b => { b.value = 50; b.dispatchEvent(new Event('change')); })(document.querySelector('.scrub'))"
+            )
+            browser.wait(lambda: browser.text("mode") == "STOPPED", "the state after the stop")
+        finally:
+            browser.close()

@@ -1,0 +1,323 @@
+"""Every limit of the guard's parts: what is still allowed at it, and what is not just beyond it."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+
+import pytest
+
+from can_dbc.frame import Frame
+from controller.guard.__main__ import DATABASES, profile_path
+from controller.guard.envelope import CarrierLimits, Envelope, Kinematics, _axis, read_envelope
+from controller.guard.joints import CommandedAxis, MeasuredJoint, RateCredit
+from controller.guard.layout import Field, Layout, read_layouts
+from controller.guard.motion import MotionWatch
+from controller.guard.reach import Reach
+from controller.guard.verdicts import FINE, Verdict
+from tests.controller.bench import MS
+from tests.controller.guard_parts import AXIS, ENCODER, PERCENT, POSITION, resting, spool
+
+# -- fields ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_field_reads_its_own_bits_and_both_signs() -> None:
+    field = Field(4, 8, True, 0.5, -64.0, 63.5)
+    assert [field.raw(value << 4 | 0xF00F) for value in (0, 0x7F, 0x80, 0xFF)] == [0, 127, -128, -1]
+    assert Field(4, 8, False, 1.0, 0.0, 255.0).raw(0xFF0) == 255
+    assert field.put(0x1A5) == 0xA50
+
+
+def test_a_value_at_the_end_of_its_range_is_inside() -> None:
+    assert PERCENT.inside(1000) and PERCENT.inside(-1000)
+    assert not PERCENT.inside(1001) and not PERCENT.inside(-1001)
+    exact = Field(0, 16, True, 1.0, -10.0, 10.0)
+    assert [exact.inside(v) for v in (-11, -10, 10, 11)] == [False, True, True, False]
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_command_may_grow_by_its_credit_and_then_by_its_rate() -> None:
+    credit = RateCredit(100.0)  # 0.04 s of the rate and 3 %: 7 %
+    assert not credit.spent(7.0, 0.0)
+    assert credit.spent(7.1, 0.0)
+    assert not credit.spent(8.0, 0.0095)
+    assert credit.spent(9.1, 0.01), "1 % in 0.01 s, and no more"
+
+
+def test_a_long_pause_gives_no_more_credit_than_the_first_one() -> None:
+    credit = RateCredit(100.0)
+    assert credit.spent(7.5, 10.0)
+    credit = RateCredit(100.0)
+    assert not credit.spent(-7.0, 10.0)
+
+
+def test_closing_costs_nothing_and_the_other_side_costs_all_of_it() -> None:
+    credit = RateCredit(100.0)
+    assert not credit.spent(6.0, 0.0) and not credit.spent(2.0, 0.0) and not credit.spent(3.0, 0.0)
+    assert credit.spent(-1.0, 0.0), "nothing is left: 6 and 1 of 7 % are spent"
+    credit = RateCredit(100.0)
+    assert not credit.spent(3.0, 0.0)
+    assert not credit.spent(-4.0, 0.0)
+    assert not credit.spent(-4.0, 0.0)
+    assert credit.spent(-4.5, 0.0)
+    assert not credit.spent(0.0, 0.0)
+
+
+def test_growth_that_is_refused_leaves_no_debt() -> None:
+    credit = RateCredit(100.0)
+    assert credit.spent(50.0, 0.0)
+    assert not credit.spent(51.0, 0.0101)
+
+
+def axis(percent: float, elapsed_s: float = 1.0) -> tuple[Verdict, CommandedAxis]:
+    command = CommandedAxis(AXIS, PERCENT)
+    return command.receive(round(percent * 10.0) & 0xFFFF, elapsed_s), command
+
+
+def test_the_opening_is_the_part_of_a_command_past_the_dead_band_of_its_side() -> None:
+    verdict, command = axis(24.0)
+    assert (verdict, command.percent, command.opening) == (Verdict.GOOD, 24.0, pytest.approx(5.0))
+    assert command.speed == pytest.approx(0.05 * 0.4 * -1)
+    verdict, command = axis(-14.5)
+    assert (verdict, command.opening) == (Verdict.GOOD, pytest.approx(-5.0))
+    assert command.speed == pytest.approx(-0.05 * 0.2 * -1)
+    assert axis(20.0)[1].opening == axis(15.0)[1].opening == axis(0.0)[1].opening == 0.0
+    assert axis(-10.0)[1].opening == axis(-5.0)[1].opening == 0.0
+
+
+def test_a_command_outside_its_range_or_too_fast_is_told() -> None:
+    assert axis(100.1)[0] is Verdict.RANGE
+    assert axis(60.0)[0] is Verdict.RATE
+    assert axis(25.5)[0] is Verdict.GOOD, "7 % past the dead-band"
+    assert axis(25.7)[0] is Verdict.RATE
+
+
+# -- encoders ----------------------------------------------------------------------------------------------------------
+
+
+def encoder_frame(position: int, stamp: int, at_ns: int, length: int = 4) -> Frame:
+    return Frame(at_ns, 0x181, (position | stamp << 16).to_bytes(4, "little")[:length])
+
+
+def test_an_encoder_is_silent_from_the_start_and_after_90_ms() -> None:
+    joint = MeasuredJoint(AXIS, ENCODER)
+    assert joint.silent(1) and not joint.silent(0)
+    joint.receive(encoder_frame(8192 + 100, 1, 1000 * MS), 1001 * MS)
+    assert joint.position == pytest.approx(-0.1) and joint.stamp_ns == 1000 * MS
+    assert not joint.silent(1090 * MS) and joint.silent(1090 * MS + 1)
+
+
+def test_an_encoder_whose_time_stands_still_or_whose_frame_is_short_counts_as_silent() -> None:
+    joint = MeasuredJoint(AXIS, ENCODER)
+    joint.receive(encoder_frame(8192, 0, 10 * MS), 10 * MS)
+    assert joint.stamp_ns == 10 * MS, "its first stamp may be 0"
+    joint.receive(encoder_frame(9000, 0, 20 * MS), 20 * MS)
+    joint.receive(encoder_frame(9000, 5, 30 * MS, 3), 30 * MS)
+    assert (joint.position, joint.stamp_ns) == (0.0, 10 * MS)
+
+
+def test_a_frame_from_the_future_has_the_present_time() -> None:
+    joint = MeasuredJoint(AXIS, ENCODER)
+    joint.receive(encoder_frame(8192, 1, 99 * MS), 20 * MS)
+    assert joint.stamp_ns == 20 * MS
+
+
+@pytest.mark.parametrize(("counts", "offset"), [(8192 + 8191, 8191), (8192 - 8192, -8192), (100, 100 - 8192)])
+def test_a_rotary_encoder_counts_half_a_turn_to_either_side(counts: int, offset: int) -> None:
+    joint = MeasuredJoint(AXIS, ENCODER)
+    joint.receive(encoder_frame(counts, 1, MS), MS)
+    assert joint.position == pytest.approx(-0.001 * offset)
+    far = MeasuredJoint(AXIS._replace(zero_counts=100), ENCODER)
+    far.receive(encoder_frame(16383, 1, MS), MS)
+    assert far.position == pytest.approx(-0.001 * -101)
+
+
+def test_a_linear_encoder_has_neither_turns_nor_a_time() -> None:
+    layout = Layout(0x185, 2, {"Position": POSITION["Position"]}, b"", 0)
+    joint = MeasuredJoint(AXIS._replace(total_counts=0, zero_counts=0, unit=1e-4), layout)
+    for at_ns in (MS, 2 * MS):
+        joint.receive(Frame(at_ns, 0x185, (60_000).to_bytes(2, "little")), at_ns)
+    assert joint.position == pytest.approx(6.0) and joint.stamp_ns == 2 * MS
+
+
+# -- motion ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("percent", "told"), [(12.0, False), (12.1, True), (-12.0, False), (-12.1, True)])
+def test_a_spool_may_open_as_far_as_its_dead_band_without_a_command(percent: float, told: bool) -> None:
+    watch = MotionWatch(3, PERCENT, 12.0, 50 * MS)
+    assert (watch.check(0.0, spool(percent), 1000 * MS, 0.005) == (Verdict.SPOOL, 3)) is told
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_spool_may_take_its_time_to_close_on_the_commanded_side_only(side: float) -> None:
+    def told(seen: float, after_ns: int) -> bool:
+        watch = MotionWatch(3, PERCENT, 12.0, 50 * MS)
+        assert watch.check(side * 30.0, spool(0.0), 1000 * MS, 0.005) is FINE
+        return watch.check(0.0, spool(seen), 1000 * MS + after_ns, 0.005) is not FINE
+
+    assert not told(side * 40.0, 50 * MS) and told(side * 40.0, 50 * MS + 1)
+    assert told(-side * 40.0, 5 * MS)
+
+
+def test_a_spool_outside_its_range_or_unknown_tells_nothing() -> None:
+    watch = MotionWatch(3, PERCENT, 12.0, 50 * MS)
+    assert watch.check(0.0, spool(100.1), 1000 * MS, 0.005) is FINE
+    assert watch.check(0.0, None, 1000 * MS, 0.005) is FINE
+
+
+@pytest.mark.parametrize(("number", "limit"), [(1, 0.02), (4, 0.2)])
+def test_a_joint_at_rest_may_be_away_from_its_place_for_two_steps(number: int, limit: float) -> None:
+    for moved, verdict in ((limit - 1e-6, None), (limit + 1e-3, Verdict.MOVING)):
+        watch, joint = resting(number)
+        joint.position = moved
+        found = [watch.check(0.0, None, 1505 * MS + k, 0.0) for k in range(4)]
+        assert found == ([FINE] * 4 if verdict is None else [FINE, FINE, (verdict, number), FINE])
+
+
+def test_one_sample_that_jumps_is_no_motion() -> None:
+    watch, joint = resting()
+    for k in range(9):
+        joint.position = 0.0 if k % 3 == 2 else 0.5
+        assert watch.check(0.0, None, 1505 * MS + k, 0.0) is FINE
+
+
+def test_a_joint_rests_half_a_second_after_its_command() -> None:
+    watch, joint = resting()
+    for after_ns in (0, 500 * MS):
+        watch.check(5.0, None, 2000 * MS, 0.0)
+        joint.position = 0.3
+        assert watch.check(0.0, None, 2000 * MS + after_ns, 0.0) is FINE
+    joint.position = 0.6
+    found = [watch.check(0.0, None, 2501 * MS + k, 0.0) for k in range(3)]
+    assert found[-1] == (Verdict.MOVING, 1)
+
+
+def test_the_place_follows_a_creeping_joint() -> None:
+    creep = 0.05 * AXIS.speed_limit  # 0.01 rad/s
+    for rate, verdict in ((creep, None), (-creep, None), (3.0 * creep, Verdict.MOVING), (-3.0 * creep, Verdict.MOVING)):
+        watch, joint = resting()
+        found = []
+        for k in range(1, 1001):
+            joint.position = rate * 0.005 * k
+            found.append(watch.check(0.0, None, 1505 * MS + k * 5 * MS, 0.005))
+        assert ((Verdict.MOVING, 1) in found) is (verdict is not None)
+        if verdict:
+            assert found.index((Verdict.MOVING, 1)) == pytest.approx(0.02 / (2.0 * creep) / 0.005, abs=4)
+
+
+def test_a_silent_encoder_forgets_the_place() -> None:
+    watch, joint = resting()
+    joint.quiet = True
+    assert watch.check(0.0, None, 1505 * MS, 0.0) is FINE
+    joint.quiet, joint.position = False, 5.0
+    assert [watch.check(0.0, None, 1506 * MS + k, 0.0) for k in range(5)] == [FINE] * 5
+    joint.position = 5.5
+    assert (Verdict.MOVING, 1) in [watch.check(0.0, None, 1516 * MS + k, 0.0) for k in range(3)]
+
+
+# -- reach -------------------------------------------------------------------------------------------------------------
+
+ARM = Kinematics(1.0, 0.1, 0.3, 3.0, 0.2, 0.15, -0.1, 1.5)
+BOX = ((2.0, -1.0, -0.5), (4.0, 1.0, 0.5))
+
+
+def reach(ground_m: float = -1.0, boxes=()) -> Reach:
+    return Reach(Envelope((), 5 * MS, ARM, ground_m, boxes, None))
+
+
+def test_the_pin_is_the_sum_of_boom_telescope_axis_and_stick() -> None:
+    slew, lift, tilt, ext = 0.4, 0.5, -0.6, 0.7
+    boom, stick = 0.7, 0.0  # angles with their offsets
+    r = 0.1 + 3.0 * math.cos(boom) + 0.15 * math.cos(stick) + 2.2 * math.sin(stick)
+    z = 1.0 + 3.0 * math.sin(boom) + 0.15 * math.sin(stick) - 2.2 * math.cos(stick)
+    assert reach().pin(slew, lift, tilt, ext) == pytest.approx((r * math.cos(0.7), r * math.sin(0.7), z))
+    x, y, z = reach().pin(0.0, 0.1, 0.9, 0.2)
+    r = 0.1 + 3.0 * math.cos(0.3) + 0.15 * math.cos(1.1) + 1.7 * math.sin(1.1)
+    assert z == pytest.approx(1.0 + 3.0 * math.sin(0.3) + 0.15 * math.sin(1.1) - 1.7 * math.cos(1.1))
+    assert (x, y) == pytest.approx((r * math.cos(0.3), r * math.sin(0.3)))
+
+
+def test_the_depth_is_that_below_the_ground_or_in_the_deepest_box(monkeypatch) -> None:
+    checked = reach(-1.0, (BOX, ((2.5, -1.0, -0.5), (2.6, 1.0, 0.5))))
+    at = {"pin": (0.0, 0.0, 0.0)}
+    monkeypatch.setattr(Reach, "pin", lambda self, *_q: at["pin"])
+    for pin, depth_m in (
+        ((0.0, 0.0, -1.25), 0.25), ((0.0, 0.0, -0.75), -0.25), ((3.0, 0.0, 0.1), 0.4), ((3.9, 0.0, 0.0), 0.1),
+        ((2.1, 0.0, 0.0), 0.1), ((3.0, 0.95, 0.0), 0.05), ((3.0, -0.95, 0.0), 0.05), ((3.0, 0.0, -0.45), 0.05),
+        ((3.0, 0.0, 0.45), 0.05), ((5.0, 0.0, 0.45), -1.0),
+    ):  # fmt: skip
+        at["pin"] = pin
+        assert checked.depth_m([0.0] * 4) == pytest.approx(depth_m)
+
+
+def test_only_a_command_that_leads_deeper_is_refused(monkeypatch) -> None:
+    checked = reach()
+    monkeypatch.setattr(Reach, "depth_m", lambda self, q: q[0])
+    rest = [0.0, 0.0, 0.0]
+    assert not checked.deeper([-0.1, *rest], [0.9, *rest]), "not there within 0.1 s"
+    assert not checked.deeper([-0.1, *rest], [1.0, *rest]), "at the ground is not below it"
+    assert checked.deeper([-0.1, *rest], [1.1, *rest])
+    assert checked.deeper([0.2, *rest], [0.1, *rest])
+    assert not checked.deeper([0.2, *rest], [0.0, *rest]) and not checked.deeper([0.2, *rest], [-0.1, *rest])
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_axes_of_the_forwarder_are_those_of_its_files() -> None:
+    """Worked out by hand from aoro_fc8.toml and its envelope."""
+    path = profile_path("aoro_fc8")
+    profile = tomllib.loads(path.read_text())
+    limits = tomllib.loads(path.with_name("aoro_fc8.envelope.toml").read_text())
+    envelope = read_envelope(path)
+    assert envelope.period_ns == 1_000_000_000 // profile["rate_hz"]
+    assert envelope.carrier == CarrierLimits(**limits["carrier"])
+    for number, name in enumerate(("slew", "lift", "tilt", "ext", "rot")):
+        joint, most, its = profile["joints"][name], limits["joints"][name], envelope.axes[number]
+        valve, encoder = joint["valve"], joint.get("encoder")
+        order = ("minus", "plus") if valve["sign"] > 0 else ("plus", "minus")
+        fulls = tuple(valve[f"full_speed_{side}"] for side in order)
+        assert (its.number, its.signal, its.sign) == (number, valve["signal"], valve["sign"])
+        assert its.deadbands_pct == tuple(valve[f"deadband_{side}_pct"] for side in order)
+        assert its.full_speeds == fulls
+        assert its.rate_pct_s == pytest.approx(600.0 * most["acceleration_limit"] / min(fulls))
+        assert its.closing_ns == pytest.approx((1.5 * valve["delay_s"] + 3.0 * valve["lag_s"]) * 1e9, abs=2)
+        assert (its.lower, its.upper, its.speed_limit) == (most["lower"], most["upper"], most["speed_limit"])
+        if encoder is None:
+            assert (its.message, its.total_counts, its.zero_counts, its.unit) == ("", 0, 0, 0.0)
+            continue
+        turns = encoder["total_counts"] if encoder["kind"] != "linear" else 0
+        assert (its.message, its.total_counts, its.zero_counts) == (encoder["message"], turns, encoder["zero_counts"])
+        assert its.unit == encoder["unit_per_count"] * encoder["direction"]
+
+
+@pytest.mark.parametrize("changed", [{"sign": -1, "lag_s": 0.0}, {"sign": 1, "delay_s": 0.0}])
+def test_a_valve_of_the_other_sign_swaps_its_sides(changed: dict) -> None:
+    valve = {
+        "signal": "Tilt", "deadband_plus_pct": 12.0, "deadband_minus_pct": 7.0, "full_speed_plus": 0.5,
+        "full_speed_minus": 0.25, "delay_s": 0.1, "lag_s": 0.01, "sign": 1,
+    } | changed  # fmt: skip
+    limits = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
+    encoder = {
+        "kind": "rotary", "message": "EncTilt", "total_counts": 16384, "zero_counts": 5, "unit_per_count": 0.5,
+        "direction": -1,
+    }  # fmt: skip
+    axis = _axis(2, {"valve": valve, "encoder": encoder}, limits)
+    plus_first = changed["sign"] < 0
+    assert axis.deadbands_pct == ((12.0, 7.0) if plus_first else (7.0, 12.0))
+    assert axis.full_speeds == ((0.5, 0.25) if plus_first else (0.25, 0.5))
+    assert axis.rate_pct_s == pytest.approx(100.0 * 6.0 * 0.5 / 0.25)
+    assert axis.closing_ns == (150 * MS if "lag_s" in changed else 30 * MS)
+    assert (axis.total_counts, axis.zero_counts, axis.unit) == (16384, 5, -0.5)
+    linear = _axis(3, {"valve": valve, "encoder": encoder | {"kind": "linear"}}, limits)
+    assert (linear.total_counts, linear.message) == (0, "EncTilt")
+
+
+def test_layouts_are_those_of_the_database() -> None:
+    layouts = read_layouts(DATABASES / "crane.dbc", ["ValveCmdA", "EncSlew"])
+    command = layouts["ValveCmdA"]
+    assert len(command.data_ids) == 16 and command.timeout_ns == 50 * MS and command.length == 8
+    assert layouts["EncSlew"].data_ids == b""

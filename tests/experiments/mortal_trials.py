@@ -1,0 +1,59 @@
+"""Trials for tests of workers: pieces of the plant experiment, and trials whose process is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from experiments.common.pool import Job
+from experiments.plant.experiment import perform
+
+KINDS = ("sag", "pendulum", "sharing", "cylinder")
+"""Kinds of the plant experiment that take about a second each."""
+
+
+def plant_jobs() -> list[Job]:
+    return [Job(kind, kind, 7, {"profile": "palms_471", "truth": "nominal", "quick": True}) for kind in KINDS]
+
+
+def killed_once(marker: Path, job: Job) -> Any:
+    """The trial; the first process that performs `pendulum` is killed, as the kernel does when memory runs out."""
+    if job.name == "pendulum":
+        kill_unless(marker)
+    return perform(job)
+
+
+def kill_unless(marker: Path) -> None:
+    """Kill this process unless the marker exists, which it then does."""
+    try:
+        marker.touch(exist_ok=False)
+    except FileExistsError:
+        return
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def always_killed(job: Job) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def slow_square(job: Job) -> int:
+    time.sleep(0.5)
+    return job.seed**2
+
+
+def square_jobs(count: int) -> list[Job]:
+    return [Job(f"square/{i}", "square", i, {}) for i in range(count)]
+
+
+def mortal(marker: Path) -> Any:
+    """`killed_once` with its marker, as a function of a job."""
+    return partial(killed_once, marker)
+
+
+def process_id() -> str:
+    """An installation that no other process has."""
+    return str(os.getpid())

@@ -1,0 +1,136 @@
+"""A machine from answers: what is derived is right, and answers that make no machine are refused in sentences."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from machine.draft.answers import AnswersError, answers_of
+from machine.draft.from_urdf import answers_from_urdf
+from machine.draft.profile_text import profile_text
+from machine.draft.questions import Question, answers_text, example, merged, put, questions
+from machine.loading.profile_file import load_profile
+from machine.profile import Profile
+from sim.draft.least_inertia import least_inertia
+from sim.draft.urdf import crane_urdf
+from sim.truth.load import load_truth
+from tests.codes import coded
+from tests.machine.own_machine import answers
+
+MESSAGES = {2: "EncSlew", 3: "EncLift", 4: "EncTilt", 5: "EncExt", 6: "EncRot"}
+
+
+def drafted(folder: Path, text: str) -> Profile:
+    path = folder / "drafted.toml"
+    path.write_text(text)
+    return load_profile(path)
+
+
+def test_the_profile_has_what_follows_from_the_answers(tmp_path: Path) -> None:
+    profile = drafted(tmp_path, profile_text(example(), MESSAGES))
+    lift, slew = profile.joints["lift"], profile.joints["slew"]
+    assert lift.valve.flow_plus == pytest.approx(math.pi / 4 * 0.11**2 * 0.40)
+    assert lift.valve.flow_minus == pytest.approx(math.pi / 4 * (0.11**2 - 0.07**2) * 0.40)
+    assert lift.valve.lever[2] == pytest.approx(0.43 / 0.40, abs=1e-4)
+    assert slew.encoder is not None
+    assert (slew.encoder.message, slew.encoder.direction, slew.encoder.zero_counts) == ("EncRot", -1, 65536)
+    assert slew.encoder.unit_per_count * 131072 == pytest.approx(2 * math.pi)
+    jaws = profile.grapple.jaws
+    assert (jaws.half_gap_m[0], jaws.half_gap_m[-1] < 0.0) == (0.70, True)
+    assert profile.stability is not None and profile.stability.pin_kg == pytest.approx(200.0 + 60.0 + 39.1, abs=0.1)
+
+
+def test_a_slow_valve_gets_a_lower_gain(tmp_path: Path) -> None:
+    slow = answers_of(answers(("joints.ext.delay_s", 0.16)), "answers")
+    profile = drafted(tmp_path, profile_text(slow, MESSAGES))
+    assert profile.joints["ext"].law.kp_1_s == pytest.approx(0.2 / 0.16)
+
+
+def test_all_answers_are_written_with_their_questions_and_read_again() -> None:
+    text = answers_text(example())
+    assert answers_of(tomllib.loads(text), "again") == example()
+    assert "# boom pin to stick pin" in text
+
+
+def test_the_questionnaire_asks_for_everything_and_checks_what_is_typed() -> None:
+    raw: dict[str, object] = {"keep_out": answers()["keep_out"]}
+    asked = questions(example())
+    for question in asked:
+        put(raw, question.path, question.proposal)
+    assert answers_of(raw, "asked") == example()
+    length = next(q for q in asked if q.path == ("kinematics", "a2_m"))
+    assert length.parse("3.1") == 3.1
+    for typed in ("long", "-3.1", "-"):
+        with pytest.raises(ValueError, match=r"."):
+            length.parse(typed)
+    assert Question((), "", float | None, 1.0).parse("-") is None
+
+
+@pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
+def test_a_urdf_gives_the_geometry_back(tmp_path: Path, name: str) -> None:
+    profile, path = load_profile(name), tmp_path / "crane.urdf"
+    path.write_text(crane_urdf(profile, load_truth("nominal", 0, name)))
+    found = answers_from_urdf(path, {})
+    for key, value in found["kinematics"].items():
+        assert value == pytest.approx(getattr(profile.kinematics, key), abs=1e-9), key
+    assert {n: (j["lower"], j["upper"]) for n, j in found["joints"].items()} == {
+        n: (j.lower, j.upper) for n, j in profile.joints.items()
+    }
+
+
+def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path) -> None:
+    path = tmp_path / "crane.urdf"
+    text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
+    path.write_text(text.replace('joint name="lift"', 'joint name="q2"'))
+    with pytest.raises(AnswersError, match="--urdf-joints lift=NAME", check=coded("answers.urdf-joint")):
+        answers_from_urdf(path, {})
+    given = answers(("kinematics", None), ("joints.lift.lower", None))
+    both = answers_of(merged(given, answers_from_urdf(path, {"lift": "q2"})), "answers")
+    assert both.kinematics.a2_m == pytest.approx(3.049046907101)
+    assert (both.joints.lift.lower, both.joints.lift.upper) == (-0.383972, 1.35), "an answer counts before the URDF"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -1"/>', "slew axis does not point straight up"),
+        ("</robot>", "", "not a URDF file"),
+    ],
+)
+def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+    path = tmp_path / "crane.urdf"
+    text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(AnswersError, match=words):
+        answers_from_urdf(path, {})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("kinematics.a2_m", None), "kinematics.a2_m: missing"),
+        (("kinematics.a2_m", "long"), "kinematics.a2_m: expected"),
+        (("kinematics.a2_mm", 3300), 'write "a2_m"'),
+        (("name", "../loader"), "name: "),
+        (("joints.lift.drive.rod_m", 0.2), "thinner than the bore"),
+        (("joints.slew.drive.bore_m", 0.1), "either bore_m and rod_m"),
+        (("joints.lift.drive.levers_m", [0.3]), "one for each lever_at"),
+        (("joints.lift.drive.lever_m", 0.0), "greater than 0"),
+        (("joints.ext.encoder.unit_m", None), "needs unit_m"),
+        (("grapple.opening_m", 2.0), "less than 1.78 m"),
+    ],
+)
+def test_answers_that_make_no_machine_are_refused_in_a_sentence(change: tuple[str, object], words: str) -> None:
+    with pytest.raises(AnswersError, match=r"^here: ", check=coded("answers.wrong")) as refused:
+        answers_of(answers(change), "here")
+    assert words in str(refused.value)
+
+
+def test_the_least_inertia_is_that_of_the_shipped_truth() -> None:
+    truth = load_truth("nominal", 0, "palms_471")
+    for name, found in least_inertia(load_profile("palms_471"), truth).items():
+        assert found == pytest.approx(truth.functions[name].cylinder.least_inertia, rel=0.25), name
