@@ -2,12 +2,15 @@
 PYTHON ?= python3.11
 VENV   := .venv
 BIN    := $(VENV)/bin
+KEY    ?= $(HOME)/.config/timberhand/signing-key.pem
+WHEEL  ?=
+export WHEEL
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 # Kept bytecode halves pytest's collection (25 s to 13 s of CPU per worker); an environment may forbid it, this one does not.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup wheel wheel-arm64 demo test test-live test-long test-all check lint docs coverage mutants fuzz bench soak lab-kernel clean
+.PHONY: help setup wheel wheel-arm64 bundle deb sbom lock audit demo test check lint docs coverage mutants fuzz bench results soak lab-kernel clean
 
 help:  ## show this list
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -15,8 +18,9 @@ help:  ## show this list
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
 	@touch $@
+	@sh deploy/compile_in_background.sh $(VENV)
 
-setup: $(VENV)/.ready  ## create the virtual environment
+setup: $(VENV)/.ready  ## create the virtual environment; compiles the tick in the background
 
 wheel: setup  ## a wheel for this platform with the compiled tick, in dist/
 	@TIMBERHAND_COMPILE=1 $(BIN)/python -m pip wheel --no-deps --no-build-isolation -w dist .
@@ -25,31 +29,36 @@ wheel-arm64: setup  ## the same for arm64, cross-compiled
 	@sh deploy/debian_packages.sh gcc-aarch64-linux-gnu libc6-dev-arm64-cross
 	@sh deploy/arm64/build.sh dist
 
+bundle: setup  ## a signed release without need of a network, in dist/; KEY=FILE signs, WHEEL=FILE takes another wheel
+	@[ "$(WHEEL)" ] || $(MAKE) wheel
+	@$(BIN)/timberhand release bundle "$${WHEEL:-$$(ls -t dist/timberhand-*-linux_x86_64.whl | head -n 1)}" --key "$(KEY)" $(ARGS)
+
+deb: setup  ## a Debian package of the newest bundle in dist/; KEY=FILE as for the bundle
+	@bundle=$$(ls -t dist/timberhand-*.tar 2>/dev/null | head -n 1); \
+	    sh deploy/deb/build.sh "$$bundle" "$(dir $(KEY))signer.pem"
+
+sbom: setup  ## every package of this environment with its licence, as CycloneDX, in dist/
+	@mkdir -p dist
+	@$(BIN)/python -m cyclonedx_py environment $(VENV) --pyproject pyproject.toml --output-reproducible -o dist/sbom.cdx.json
+	@echo dist/sbom.cdx.json
+
+lock: setup  ## versions and hashes of what an installation fetches, from constraints.txt, into deploy/lock
+	@sh deploy/lock.sh $(BIN)/python
+
+audit: setup  ## insecure code (bandit), and published weaknesses of the packages (pip-audit, asks PyPI)
+	@sh deploy/audit.sh $(BIN)/python
+
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)
 
-# Fast tests that start a process or hold a limit by the real clock: they run with the live ones.
-TIMED := $(addprefix tests/,autonomy/test_autonomy_process.py autonomy/test_calibration_live.py autonomy/test_planner_process.py \
-    can_dbc/test_bus_fast_path.py console/test_console.py console/test_mission_state.py console/test_plant_view.py \
-    hil/test_bus_contract.py hil/test_bus_daemon.py hil/test_wire_daemon.py hil/test_wirebus.py recorder/test_recover.py \
-    recorder/test_stop_process.py runtime/test_allocator.py runtime/test_huge_pages.py sim/test_camera_server.py sim/test_plant_process.py)
-FAST  := -m "not slow" -n 2 --dist worksteal $(addprefix --ignore=,$(TIMED))
-
-test: lint  ## lint, types, architecture and the tests that no other load can disturb; before every push
-	@$(BIN)/pytest $(FAST) $(ARGS)
-
-test-live: setup  ## every test that starts processes: runs on the wire and on vcan, services, the real-time kernel
+test: lint docs coverage  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
-	@$(BIN)/pytest -m "not slow" $(TIMED) $(ARGS) || [ $$? -eq 5 ]
-	@$(BIN)/pytest -m "slow and not computed" $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
-
-test-long: setup docs coverage  ## long runs in virtual time, the documentation site, branch coverage of supervisor and guard
-	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal $(ARGS)
-
-test-all: test test-long test-live  ## the three
+	@$(BIN)/pytest -m "not slow" -n 2 --dist worksteal --durations=15 --durations-min=10 $(ARGS) || [ $$? -eq 5 ]
+	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal --durations=40 --durations-min=30 $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
+	@$(BIN)/pytest -m "slow and not computed" --durations=40 --durations-min=20 $(ARGS) || [ $$? -eq 5 ]
 
 check: lint  ## lint, types, architecture and the fast tests
-	@$(BIN)/pytest -q $(FAST) $(ARGS)
+	@$(BIN)/pytest -q -m "not slow" -n 2 --dist worksteal $(ARGS)
 
 lint: setup  ## style, types and the three floors
 	@$(BIN)/ruff check .
@@ -76,6 +85,9 @@ bench: setup  ## measure: codecs beside cantools, the tick compiled and not, the
 	@$(BIN)/timberhand bench tick
 	@$(BIN)/timberhand bench bus $(ARGS)
 	@$(BIN)/timberhand bench plant $(ARGS)
+
+results: setup  ## every experiment anew, with its page; says first how many hours; ARGS="--workers 8"
+	@$(BIN)/timberhand experiment all --docs docs $(ARGS)
 
 soak: setup  ## half an hour at the control rate on vcan: nothing may grow, no frame may be lost
 	@sh deploy/debian_packages.sh

@@ -1,6 +1,7 @@
 """Adds the compiled tick to a wheel: ``TIMBERHAND_COMPILE=1 pip wheel .``; without it the wheel is pure.
 
-Everything else is in pyproject.toml.
+Everything else is in pyproject.toml.  Two wheels of one commit are the same bytes: the files in them carry the time of
+the commit, and without a history that of the first day that an archive knows.
 """
 
 from __future__ import annotations
@@ -8,11 +9,28 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 from setuptools import setup
 
+FIRST_DAY_S = "315532800"
+"""1980-01-01: a ZIP archive knows no earlier time."""
+
+
+def commit_time_s() -> str:
+    """When this commit was made, as seconds since 1970."""
+    here = Path(__file__).resolve().parent
+    command = ["git", "-C", str(here), "log", "-1", "--format=%ct", "--", "."]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return FIRST_DAY_S
+    return found if (here / ".git").exists() and found else FIRST_DAY_S
+
+
+os.environ.setdefault("SOURCE_DATE_EPOCH", commit_time_s())
 if os.environ.get("TIMBERHAND_COMPILE") != "1":
     setup()
 elif importlib.util.find_spec("mypyc") is None:
