@@ -134,6 +134,13 @@ class Evidence:
             return age_ms, lost.timeout_ns * _MS, float(lost.refused)
         if reason in _LATE:
             return self._lateness(reason, inputs.late_ns)
+        if reason is Reason.COMPUTER_STALLED:
+            count = sum(state.values is None for state in self._inputs.needed)
+            return self._supervisor.stall_ns * _MS, _NAN, float(count)
+        if reason is Reason.BUS_SILENT:
+            vehicle = self._vehicle
+            heard_ns = self._inputs.heard_ns if detail == 0 or vehicle is None else vehicle.bus.inputs.heard_ns
+            return (now_ns - heard_ns) * _MS, _NAN, _NAN
         if reason in _BUS_STATES or reason is Reason.SEND_REFUSED:
             reading = inputs.machine_bus if detail else inputs.bus
             if reason is Reason.SEND_REFUSED:

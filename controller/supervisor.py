@@ -10,10 +10,11 @@ ACTIVE.  The supervisor never clips: it refuses, slows or stops.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 from controller.bus_io.bus_monitor import BusMonitor
-from controller.bus_io.message_state import Signal
+from controller.bus_io.message_state import MessageState, Signal
 from controller.carrier.bus import CarrierBus
 from controller.carrier.inputs import CarrierInputs
 from controller.crane.inputs import CraneInputs
@@ -54,6 +55,10 @@ LATE_NS: Final = 10_000_000
 LATE_LIMIT_COUNT: Final = 3
 LATE_WINDOW_NS: Final = 1_000_000_000
 STALLED_NS: Final = 50_000_000
+STALL_NS: Final = 5_000_000
+"""A tick that begins later than this may itself be why inputs are missing: without its SYNC no encoder samples."""
+STALL_MEMORY_NS: Final = 30_000_000
+"""For so long after such a tick a loss of several inputs is its work: the time-out of an encoder, and three ticks."""
 _RELEASED: Final = 1
 _PRESSED: Final = 0
 _YES: Final = 1
@@ -87,6 +92,7 @@ class Supervisor:
         "_reset_button",
         "_reset_pressed",
         "_slow_end_ns",
+        "_stall_end_ns",
         "_startup",
         "_stop_ramp_ns",
         "_valve_state",
@@ -103,6 +109,7 @@ class Supervisor:
         "ramp_end_ns",
         "ramp_ns",
         "reason",
+        "stall_ns",
         "worst",
         "worst_detail",
     )  # fmt: skip
@@ -161,6 +168,9 @@ class Supervisor:
         self._late_stamps = [-LATE_WINDOW_NS] * LATE_LIMIT_COUNT
         self.late = 0
         """Ticks that began more than `LATE_PERIODS` and `LATE_NS` late."""
+        self.stall_ns = 0
+        """The lateness to which a loss of several inputs is put down."""
+        self._stall_end_ns = 0
         self._echo: Any = None
         self._echo_ticks = 0
         self._reset_pressed = True
@@ -255,7 +265,7 @@ class Supervisor:
         self._check_values(now_ns)
         self._collect(*received.nodes.worst_finding(now_ns))
         if carrier is not None:
-            self._check_carrier(carrier)
+            self._check_carrier(carrier, now_ns)
         reacts = FAULTS[self.worst].reaction >= Reaction.HOLD
         return (self.worst, self.worst_detail) if reacts else (Reason.NONE, 0)
 
@@ -271,15 +281,16 @@ class Supervisor:
         if carrier is not None and carrier.foreign:
             self._collect(Reason.FOREIGN_CONTROLLER, 1)
         self._check_estop()
+        self._note_stall(late_ns, now_ns)
         if self.armed:
             if self.crane_inputs.stale_mask:
-                self._check_stale()
+                self._check_stale(now_ns)
             self._check_values(now_ns)
             reason, node = self.crane_inputs.nodes.worst_finding(now_ns)
             self._collect(reason, node)
             self._check_echo(period_ns)
             if carrier is not None:
-                self._check_carrier(carrier)
+                self._check_carrier(carrier, now_ns)
         self._check_lateness(late_ns, period_ns, now_ns)
         self._react(now_ns)
         if self.mode is _BOOT and self._startup.complete:
@@ -356,8 +367,27 @@ class Supervisor:
         known = all(channel in (_RELEASED, _PRESSED) for channel in channels)
         self._collect(Reason.ESTOP_PRESSED if known else Reason.ESTOP_CHANNELS)
 
-    def _check_stale(self) -> None:
+    def _note_stall(self, late_ns: int, now_ns: int) -> None:
+        """Remember how late this tick is, for inputs that are lost by it."""
+        if late_ns > STALL_NS:
+            self.stall_ns = max(late_ns, self.stall_ns) if now_ns < self._stall_end_ns else late_ns
+            self._stall_end_ns = now_ns + STALL_MEMORY_NS
+
+    def _lost_together(self, needed: Sequence[MessageState], heard_ns: int, now_ns: int) -> Reason:
+        """The common cause of what is lost on one bus: this computer, or the bus; NONE where each loss is its own."""
+        lost = [state for state in needed if state.values is None]
+        if len(lost) > 1 and now_ns < self._stall_end_ns:
+            return Reason.COMPUTER_STALLED
+        silent = any(2 * (now_ns - heard_ns) > state.timeout_ns for state in lost)
+        return Reason.BUS_SILENT if silent else _NONE
+
+    def _check_stale(self, now_ns: int) -> None:
         received = self.crane_inputs
+        if all(state.values is not None for state in received.plc_states):
+            common = self._lost_together(received.needed, received.heard_ns, now_ns)
+            if common:
+                self._collect(common, 0)
+                return
         if received.estop.values is None:
             self._collect(Reason.ESTOP_LOST)
         if received.guard.values is None:
@@ -402,9 +432,12 @@ class Supervisor:
             if estimator.known and not lower <= estimator.position <= upper:
                 self._collect(Reason.POSITION_OUTSIDE, j)
 
-    def _check_carrier(self, carrier: CarrierInputs) -> None:
+    def _check_carrier(self, carrier: CarrierInputs, now_ns: int) -> None:
         """The carrier's own frames arrive, and the controller owns its address on mach0."""
         if carrier.stale_mask:
+            common = self._lost_together(carrier.needed, carrier.heard_ns, now_ns)
+            if common:
+                self._collect(common, 0 if common is Reason.COMPUTER_STALLED else 1)
             if carrier.vehicle.values is None:
                 self._collect(Reason.CARRIER_LOST)
             if carrier.arms_a.values is None or carrier.arms_b.values is None:

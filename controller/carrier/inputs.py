@@ -43,6 +43,8 @@ class CarrierInputs:
         self.stale_mask = age_out(self.messages, 0)
         self.foreign = False
         """Another node sent one of the controller's own frames in this tick."""
+        self.heard_ns = 0
+        """When the newest frame came, whatever it was."""
         self.unknown = self.count = 0
 
     def filters(self) -> list[int | tuple[int, int]]:
@@ -83,6 +85,8 @@ class CarrierInputs:
             else:
                 self.unknown += 1
         self.count += len(frames)
+        if frames:
+            self.heard_ns = min(frames[-1][0], now_ns)
         self.stale_mask = age_out(self.needed, now_ns)
         age_out(self._helpful, now_ns)
 

@@ -64,6 +64,8 @@ class CraneInputs:
         self.stale_mask = age_out(self._masked, 0)
         self.foreign = False
         """Another node sent one of the controller's own frames in this tick."""
+        self.heard_ns = 0
+        """When the newest frame came, whatever it was."""
         self.unknown = self.count = 0
 
     def filters(self) -> list[int]:
@@ -95,6 +97,8 @@ class CraneInputs:
             elif not (nodes.receive(frame, now_ns) or sdo(key, frame[2])):
                 self.unknown += 1
         self.count += len(frames)
+        if frames:
+            self.heard_ns = min(frames[-1][0], now_ns)
         self.stale_mask = age_out(self._masked, now_ns)
         if self.imu is not None:
             age_out((self.imu,), now_ns)

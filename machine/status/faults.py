@@ -230,6 +230,14 @@ FAULTS: Final[dict[Reason, Fault]] = {
     Reason.BUS_DOWN: Fault(
         Reaction.CUT, 20, _B, "The CAN interface of {} is down", "Bring the interface up, then reset and arm.", True
     ),
+    Reason.BUS_SILENT: Fault(
+        Reaction.CUT,
+        20,
+        _B,
+        "Nothing is received on {} any more",
+        "Check its plug and supply, or, where this computer emulates the machine, run `timberhand doctor --rt`; "
+        "then reset and arm.",
+    ),
     Reason.BUS_PASSIVE: Fault(
         Reaction.DEGRADE, 100, _B, "{} is error-passive; half speed", "Check cable, termination and bit rate."
     ),
@@ -268,6 +276,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
         _N,
         "The control loop was late three times in a second, or by more than 50 ms",
         "Free the processor; see docs/how-to/real-time.md; then arm.",
+    ),
+    Reason.COMPUTER_STALLED: Fault(
+        Reaction.CUT,
+        20,
+        _N,
+        "This computer stood still, so that inputs were lost",
+        "Run `timberhand doctor --rt`, end what else runs here, then reset and arm.",
     ),
     Reason.LEASE_LOST: Fault(Reaction.HOLD, 10, _N, "The planner's setpoints ended while moving", PLANNER),
     Reason.SETPOINTS_REFUSED: Fault(Reaction.HOLD, 10, _N, "Three setpoints were refused within a second", PLANNER),

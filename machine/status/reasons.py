@@ -100,6 +100,7 @@ class Reason(IntEnum):
     FOREIGN_CONTROLLER = 54
     ADDRESS_LOST = 55
     LEVER_MOVED = 56
+    BUS_SILENT = 57
 
     LOOP_LATE = 60
     LOOP_STALLED = 61
@@ -107,6 +108,7 @@ class Reason(IntEnum):
     SPOOL_SHUT = 63
     SPOOL_WRONG = 64
     SPEED_WRONG = 65
+    COMPUTER_STALLED = 66
 
     LEASE_LOST = 70
     SETPOINTS_REFUSED = 71

@@ -1,0 +1,109 @@
+"""Several inputs that are lost at once are put down to what they have in common: this computer, or the bus."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from machine.status.faults import FAULTS, describe
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import AORO, MACHINE_PERIOD_MS, MS, VALUES, Bench, T
+
+SAMPLED = ("EncSlew", "EncLift", "EncTilt", "EncExt", "EncRot")
+"""Sent in answer to SYNC."""
+
+
+def stalled(bench: Bench, stall_ns: int, lost: tuple[str, ...] = SAMPLED) -> None:
+    """The loop stands still: its periods are skipped, no SYNC goes out meanwhile, and the next tick is late."""
+    bench.dropped.update(lost)
+    bench.now_ns += stall_ns // T * T
+    bench.tick(late_ns=stall_ns)
+    bench.dropped.difference_update(lost)
+
+
+def silent(bench: Bench, ticks: int) -> int:
+    """Nothing comes on crane0; returns after how many ticks the machine stopped."""
+    bench.dropped.update([*VALUES, *SAMPLED])
+    bench.silent_nodes.update([*bench.nodes, *bench.encoders])
+    for k in range(1, ticks + 1):
+        bench.tick()
+        if bench.mode is not Mode.ACTIVE:
+            return k
+    raise AssertionError("it did not stop")
+
+
+def test_a_stalled_loop_blames_the_computer_and_not_a_cable() -> None:
+    bench = Bench().active()
+    stalled(bench, 23 * MS)
+    assert (bench.mode, bench.reason) == (Mode.FAULT, Reason.COMPUTER_STALLED)
+    assert bench.neutral
+    stood_ms, limit, lost = bench.controller.evidence.numbers
+    assert (stood_ms, lost) == (23.0, 5.0) and math.isnan(limit)
+    assert "stood still for 23.0 ms" in describe(bench.reason, numbers=bench.controller.evidence.numbers)
+    bench.run(200)
+    assert (bench.mode, bench.reason) == (Mode.FAULT, Reason.COMPUTER_STALLED), "a person resets it"
+
+
+def test_inputs_that_are_lost_just_after_a_stall_are_its_work() -> None:
+    bench = Bench().active()
+    bench.tick(late_ns=9 * MS)
+    bench.tick(late_ns=6 * MS)
+    bench.dropped.update(SAMPLED)
+    bench.run(3)
+    assert bench.reason == Reason.COMPUTER_STALLED
+    assert bench.controller.evidence.numbers[0] == 9.0, "the longest"
+
+
+@pytest.mark.parametrize("late_ns", [0, 4 * MS])
+def test_a_silent_bus_is_no_encoder_s_fault(late_ns: int) -> None:
+    bench = Bench().active()
+    bench.tick(late_ns=late_ns)
+    ticks = silent(bench, 10)
+    assert ticks * T <= FAULTS[Reason.BUS_SILENT].bound_ms * MS
+    assert (bench.mode, bench.reason, bench.controller.supervisor.detail) == (Mode.FAULT, Reason.BUS_SILENT, 0)
+    assert 10.0 <= bench.controller.evidence.numbers[0] <= 20.0
+
+
+@pytest.mark.parametrize("late_ns", [0, 4 * MS, 12 * MS])
+def test_one_cut_cable_is_the_encoder_s_fault(late_ns: int) -> None:
+    bench = Bench().active()
+    bench.dropped.add("EncLift")
+    bench.tick(late_ns=late_ns)
+    bench.run(4)
+    assert (bench.reason, bench.controller.supervisor.detail) == (Reason.ENCODER_LOST, 1)
+
+
+def test_long_after_a_stall_two_cut_cables_are_two_cut_cables() -> None:
+    bench = Bench().active()
+    bench.tick(late_ns=9 * MS)
+    bench.run(6)
+    bench.dropped.update(("EncLift", "EncTilt"))
+    bench.run(4)
+    assert bench.reason == Reason.ENCODER_LOST
+
+
+def test_a_silent_machine_bus_is_named() -> None:
+    bench = Bench(AORO).active()
+    bench.dropped.update(MACHINE_PERIOD_MS)
+    for _ in range(30):
+        bench.tick()
+    assert (bench.reason, bench.controller.supervisor.detail) == (Reason.BUS_SILENT, 1)
+    assert bench.controller.evidence.numbers[0] > 15.0
+
+
+def test_the_carrier_alone_is_the_carrier_s_fault() -> None:
+    bench = Bench(AORO).active()
+    bench.dropped.add("VehStat")
+    for _ in range(30):
+        bench.tick()
+    assert bench.reason == Reason.CARRIER_LOST
+
+
+def test_a_stall_that_the_machine_bus_feels_is_the_computer_s() -> None:
+    bench = Bench(AORO).active()
+    bench.dropped.update(("VehStat", "ArmHeightA", "ArmHeightB"))
+    for _ in range(30):
+        bench.tick(late_ns=8 * MS)
+    assert bench.reason == Reason.COMPUTER_STALLED
