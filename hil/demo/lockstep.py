@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from rich.console import Console
 
@@ -17,12 +17,13 @@ from can_dbc.messages.crane import OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
+from controller.tick import Outputs
 from hil.demo.summary import Summary, is_settled, outcome_sentence
 from hil.faults.injector import Injector
 from hil.faults.order import Order
 from hil.harness.display import Display
 from hil.harness.lockstep import START_NS, Lockstep, LogDetector, Observer
-from hil.harness.operator import Operator
+from hil.harness.operator import MAX_STOPS, Operator
 from hil.plc.bridged_plant import BridgedPlant
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
@@ -37,6 +38,19 @@ SETTLE_NS: Final = 10_000_000_000
 """A bowed log rocks in the bunk for up to five seconds; the evaluation waits for rest, at most this long."""
 
 
+class Companion(Protocol):
+    """What goes along with a run and changes nothing of it by itself; `hil.demo.paced` is one."""
+
+    def begin(self, system: Lockstep, activity: Activity, display: Display) -> None:
+        """The run is about to begin."""
+
+    def go_along(self, system: Lockstep) -> None:
+        """Called before every slice."""
+
+    def on_outputs(self, outputs: Outputs, now_ns: int) -> None:
+        """Called after every tick."""
+
+
 def run_lockstep(
     name: str,
     seed: int,
@@ -46,11 +60,13 @@ def run_lockstep(
     console: Console,
     camera: str = "",
     orders: Sequence[Order] = (),
+    max_stops: int = MAX_STOPS,
+    companion: Companion | None = None,
 ) -> Summary:
     """Run the job in one process on virtual time; the same seed leaves the same bytes in ``directory``.
 
     With ``camera`` the planner gets the logs detected through it, without it their true poses.  ``orders``:
-    faults to inject.
+    faults to inject.  ``max_stops``: as in `Operator`.
 
     Raises:
         CommandFailed: profile, truth, camera or directory cannot be used.
@@ -65,8 +81,9 @@ def run_lockstep(
     except (ValueError, RecordingRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
-        with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
-            job = _Job(name, profile, plant, recorder, display, detector)
+        time = "lockstep" if companion is None else "paced"
+        with Display(console, f"{profile.title}: one log into the bunk, {time}, seed {seed}") as display:
+            job = _Job(name, profile, plant, recorder, display, detector, max_stops, companion)
             if orders:
                 job.system.operator.watches = any(order.fault == "operator-off" for order in orders)
                 Injector(job.system, orders)
@@ -92,9 +109,11 @@ class _Job:
         recorder: Recorder | None,
         display: Display,
         detector: LogDetector | None,
+        max_stops: int,
+        companion: Companion | None,
     ) -> None:
         settings = Settings(profile, profile_hash(profile), profile.rate_hz)
-        self._display = display
+        self._display, self._companion = display, companion
         self._mode: int = -1
         self._phase = self._grasp = ""
         self._closings = 0
@@ -104,16 +123,18 @@ class _Job:
             build_guard(profile_path(name)),
             plant,
             self.activity,
-            Operator(profile_hash(profile), self._on_press),
-            Observer(recorder, [self._on_report]),
+            Operator(profile_hash(profile), self._on_press, max_stops),
+            Observer(recorder, [self._on_report], on_outputs=[] if companion is None else [companion.on_outputs]),
             detector,
         )
 
     def run(self, limit_s: float, directory: str) -> Summary:
         system, activity = self.system, self.activity
         limit_ns = START_NS + int(limit_s * 1e9)
+        if self._companion is not None:
+            self._companion.begin(system, activity, self._display)
         while not activity.done and not activity.failure and system.now_ns < limit_ns:
-            system.advance()
+            self._advance()
             if system.operator.gave_up:
                 break
             if activity.grasp is not None and activity.grasp.reason != self._grasp:
@@ -126,7 +147,7 @@ class _Job:
         finished_ns = system.now_ns
         verdict = system.plant.evaluate()
         while not is_settled(asdict(verdict)) and system.now_ns < finished_ns + SETTLE_NS:
-            system.advance()
+            self._advance()
             verdict = system.plant.evaluate()
         report, late = system.report, "" if activity.done else f"not done within {limit_s:.0f} s"
         return Summary(
@@ -143,6 +164,11 @@ class _Job:
             closings=self._closings,
             directory=directory,
         )
+
+    def _advance(self) -> None:
+        if self._companion is not None:
+            self._companion.go_along(self.system)
+        self.system.advance()
 
     def _on_report(self, report: StateReport) -> None:
         if report.mode != self._mode:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console
 
+from hil.harness.display import say
 from host.exit_codes import ExitCode
+
+SHOWN_S: Final = 0.1
+"""A smaller loss of time is not worth a word."""
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
     """The outcome of one run; ``in_bunk`` and ``verdict`` come from the plant's physics alone.
 
-    ``closings``: how often the grapple was closed about the log; a second one is a retry.
+    ``closings``: how often the grapple was closed about the log; a second one is a retry.  ``paced``: the run was in
+    paced virtual time, which fell ``behind_s`` behind the wall clock.
     """
 
     in_bunk: bool
@@ -31,6 +36,8 @@ class Summary:
     grasp: str
     closings: int
     directory: str
+    paced: bool = False
+    behind_s: float = 0.0
 
     @property
     def exit_code(self) -> ExitCode:
@@ -41,22 +48,25 @@ class Summary:
 
     def show(self, console: Console) -> None:
         """Print it for a person."""
-        mark = "[green]✔[/green]" if self.in_bunk else "[red]✘[/red]"
-        console.print(f"{mark} {self.verdict}", highlight=False, soft_wrap=True)
+        say(console, "[green]✔[/green] " if self.in_bunk else "[red]✘[/red] ", self.verdict)
         if self.failure:
-            console.print(f"  the planner failed: {self.failure}", highlight=False, soft_wrap=True)
+            say(console, "  ", f"the planner failed: {self.failure}")
         if self.grasp:
             retries = f"; closed {self.closings} times" if self.closings > 1 else ""
-            console.print(f"  grasp: {self.grasp}{retries}", highlight=False, soft_wrap=True)
-        console.print(
-            f"  {self.seconds:.1f} s, {self.ticks} control ticks ({self.missed_ticks} missed), "
-            f"{self.frames} frames, {self.stops} stops, {self.refused_setpoints} setpoints refused",
-            highlight=False,
-            soft_wrap=True,
+            say(console, "  ", f"grasp: {self.grasp}{retries}")
+        say(
+            console,
+            "  ",
+            f"{self.seconds:.1f} s, {self.ticks} control ticks ({self.missed_ticks} missed), "
+            f"{self.frames} frames, {self.stops} {'stop' if self.stops == 1 else 'stops'}, "
+            f"{self.refused_setpoints} setpoints refused",
         )
-        console.print(f"  recording: {self.directory}", highlight=False, soft_wrap=True)
+        if self.paced:
+            lost = f", which fell {self.behind_s:.1f} s behind the clock" if self.behind_s >= SHOWN_S else ""
+            say(console, "  ", f"in paced virtual time{lost}: no evidence of real time")
+        say(console, "  ", f"recording: {self.directory}")
         if self.stops:
-            console.print(f"  why it stopped: timberhand why {self.directory}", highlight=False, soft_wrap=True)
+            say(console, "  ", f"why it stopped: timberhand why {self.directory}")
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""

@@ -11,6 +11,7 @@ import math
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from can_dbc.messages.crane import StateReport
 from machine.joints import JOINTS, Joint
@@ -18,6 +19,18 @@ from machine.status.modes import Mode
 
 _LINE_EVERY_NS = 1_000_000_000
 _DRAW_EVERY_NS = 100_000_000
+_ROOM_MIN = 20
+
+
+def say(console: Console, lead: str, text: str, style: str = "") -> None:
+    """Print ``text`` after ``lead``: on a terminal broken between words and indented, elsewhere in one line."""
+    head, body = Text.from_markup(lead), Text.from_markup(text)
+    room = max(console.width - head.cell_len, _ROOM_MIN) if console.is_terminal else max(body.cell_len, 1)
+    for line in body.wrap(console, room):
+        line.rstrip()
+        # Soft wrapping would reach the table of a `Live` too, which is drawn again below the line.
+        console.print(head + line, style=style or None, highlight=False, soft_wrap=not console.is_terminal)
+        head = Text(" " * head.cell_len)
 
 
 class Display:
@@ -49,8 +62,7 @@ class Display:
 
     def event(self, text: str, style: str = "") -> None:
         """Print one event; it stays on the screen."""
-        at = f"{self._elapsed_s():6.1f} s  " if self._start_ns is not None else "          "
-        self._console.print(f"{at}{text}", style=style or None, highlight=False, soft_wrap=True)
+        say(self._console, f"{self._elapsed_s():6.1f} s  " if self._start_ns is not None else " " * 10, text, style)
 
     def phase(self, name: str) -> None:
         """Show the planner's new phase."""
@@ -108,7 +120,7 @@ class Display:
                 _value_text(j, report.reference[j]),
                 _value_text(j, error),
             )
-        table.add_row("grapple", f"{report.opening_pct:.0f} % open", f"{report.clamp_bar:.0f} bar", "")
+        table.add_row("grapple", _whole_text(report.opening_pct, "% open"), _whole_text(report.clamp_bar, "bar"), "")
         table.caption = (
             f"{self._elapsed_s():.1f} s   bus {self._rate_hz:.0f} frames/s   longest tick "
             f"{self._tick_ns / 1e6:.2f} ms   longest delay {self._late_ns / 1e6:.2f} ms   "
@@ -123,3 +135,8 @@ def _value_text(joint: Joint, value: float) -> str:
     if math.isnan(value):
         return "–".rjust(7)
     return f"{value:6.3f} m" if joint is Joint.EXT else f"{math.degrees(value):6.1f}°"
+
+
+def _whole_text(value: float, unit: str) -> str:
+    """A value without decimals; a dash for an unknown one."""
+    return "–" if math.isnan(value) else f"{value:.0f} {unit}"

@@ -82,6 +82,11 @@ def _address(name: str, backend: str) -> str:
             return _address(name, "vcan" if there else "wire")
 
 
+def uses_wire(profile: Profile, backend: str) -> bool:
+    """Whether a live run of this machine has the wire, in processes of this computer, for its buses."""
+    return _address(profile.crane_bus, backend).startswith("wire:")
+
+
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
     """Options of a live run; ``bus`` is "wire", "vcan" or "auto"; ``console_port`` 0 means no page.

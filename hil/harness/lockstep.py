@@ -104,6 +104,8 @@ class Lockstep:
         self.frames = 0
         self.report: StateReport | None = None
         self.vehicle_report: VehicleReport | None = None
+        self.logs: tuple[LogObservation, ...] = ()
+        """The last list of logs that was not empty."""
         self.plant, self.activity, self.operator = plant, activity, operator
         self.disturbance: Disturbance | None = None
         self._detector = detector
@@ -143,6 +145,10 @@ class Lockstep:
     def period_ns(self) -> int:
         """The tick period."""
         return self._period_ns
+
+    def press(self, command: bytes) -> None:
+        """Hand an operator's command, a datagram, to the next tick of the controller."""
+        self._pressed.append(command)
 
     def advance(self) -> None:
         """Advance the whole system by one slice."""
@@ -221,11 +227,11 @@ class Lockstep:
         if self.ticks % (self._settings.rate_hz // 4):
             return ()
         if self._detector is not None:
-            return self._detector.detect(self.report.position, self.now_ns) or () if self.report else ()
-        return tuple(
-            LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m)
-            for i, log in enumerate(detect(self.plant))
-        )
+            found = self._detector.detect(self.report.position, self.now_ns) or () if self.report else ()
+        else:
+            found = true_logs(self.plant)
+        self.logs = found or self.logs
+        return found
 
     def _record_buses(self) -> None:
         recorder = self._observer.recorder
@@ -234,6 +240,13 @@ class Lockstep:
             if recorder:
                 for frame in frames:
                     recorder.on_frame(bus.name, frame)
+
+
+def true_logs(plant: Plant) -> tuple[LogObservation, ...]:
+    """The logs of a plant as they truly are."""
+    return tuple(
+        LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(detect(plant))
+    )
 
 
 def _drained(bus: InProcessBus) -> list[Frame]:

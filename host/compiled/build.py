@@ -10,7 +10,6 @@ import contextlib
 import fcntl
 import importlib.util
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -34,10 +33,6 @@ KEPT_BUILDS: Final = 3
 """The newest builds stay, so that a change of branch and back costs nothing."""
 LOCK: Final = ".lock"
 """Held by a builder."""
-BACKGROUND_LOCK: Final = ".lock-background"
-"""Held by the builder that `make setup` starts, from its first moment (deploy/compile_in_background.sh)."""
-WAIT_LIMIT_S: Final = 600.0
-TELL_PERIOD_S: Final = 15.0
 Progress = Callable[[str], None]
 
 
@@ -60,40 +55,6 @@ def compile_tick(progress: Progress, force: bool = False, root: Path | None = No
                 _remove_old(folder, key)
                 return _answer(key, folder, begin_s, True)
     return _answer(found.key, folder, begin_s, False)
-
-
-def await_builder(progress: Progress, root: Path | None = None, limit_s: float = WAIT_LIMIT_S) -> bool:
-    """Wait while the set-up compiles in the background: on a small machine a live run beside it loses frames.
-
-    Returns whether there was something to wait for.  After ``limit_s`` the caller goes on all the same.
-    """
-    folder = compiled.builds_folder(root or compiled.source_root())
-    begin_s, told_s = time.monotonic(), -math.inf
-    while _held(folder / BACKGROUND_LOCK) or _held(folder / LOCK):
-        waited_s = time.monotonic() - begin_s
-        if waited_s >= limit_s:
-            progress(f"still compiling after {waited_s:.0f} s; going on")
-            return True
-        if waited_s >= told_s + TELL_PERIOD_S:
-            told_s = waited_s
-            progress(
-                f"waiting until the set-up has compiled the tick, once, one to four minutes ({waited_s:.0f} s); "
-                "TIMBERHAND_NO_WAIT=1 starts at once"
-            )
-        time.sleep(0.2)
-    return told_s >= 0.0
-
-
-def _held(path: Path) -> bool:
-    """Whether another process holds this lock."""
-    try:
-        with path.open() as lock:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except BlockingIOError:
-        return True
-    return False
 
 
 def check_tools() -> None:

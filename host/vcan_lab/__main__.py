@@ -63,7 +63,7 @@ def vcan(
 
       timberhand hil vcan -- candump -n 1 vcan0
 
-      timberhand hil vcan --timeout 120 -v -- python -m pytest tests/vcan
+      timberhand hil vcan --timeout 120 -v -- python -m pytest tests/live/vcan
 
       timberhand hil vcan --link crane0 --link mach0 -- ip -brief link
 

@@ -11,22 +11,17 @@ takes place in simulated time, which shows what the processes do and not what th
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
-import msgspec
-
+from host.real_time import LOOK_S, run_probe
 from host.vcan_lab import choose, lab_kernel, lost_time, shim
 from host.vcan_lab.spec import LabError, Request
 
-MEASURE_S: Final = 2.0
 MAX_LOST_SHARE: Final = 0.08
 """The guest has about a tenth to spare."""
 MAX_GAP_NS: Final = 25_000_000
 """Half of a motion input's time-out of 50 ms: the guest needs the other half to catch up."""
-_TIMEOUT_S: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,18 +64,13 @@ def choose_clock(lost: LostTime, kernel: str | None) -> Clock:
     return Clock("simulated", busy)
 
 
-def measure(seconds: float = MEASURE_S) -> LostTime:
+def measure(seconds: float = LOOK_S) -> LostTime:
     """Spin beside everything else on the processor and with the share that the lab would get.
 
     Raises:
         subprocess.SubprocessError: the probe fails.
     """
-    done = subprocess.run(
-        [sys.executable, "-ISB", lost_time.__file__, str(seconds)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True, timeout=_TIMEOUT_S + seconds,
-        start_new_session=True,
-    )  # fmt: skip
-    found: dict[str, Any] = msgspec.json.decode(done.stdout)
+    found = run_probe(lost_time.__file__, seconds)
     return LostTime(found["share"], found["longest_ns"], found["steal_share"])
 
 

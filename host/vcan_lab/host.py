@@ -7,6 +7,7 @@ once more, with a message.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import re
@@ -32,6 +33,7 @@ BOOTS = 2
 GRACE_S = 5.0
 """Time from SIGTERM to SIGKILL after the time limit, from there to the end of the guest, and from exit to halt."""
 
+_PR_SET_PDEATHSIG = 1
 _CHUNK = select.PIPE_BUF
 """A pipe that polls as writable accepts this much without blocking."""
 _LOG_LINES = 12
@@ -40,7 +42,12 @@ _NOISE = re.compile("umid|SELinux|mmapper_init|ubd device|^reboot:")
 
 
 def run(request: Request, method: Method, verbose: bool = False) -> int:
-    """Run the command until it and the guest have ended.  Main thread only, because it handles signals."""
+    """Run the command until it and the guest have ended.  Main thread only, because it handles signals.
+
+    When the caller dies, the command is told by SIGHUP, as by a terminal that is closed; under nohup it goes on.
+    """
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGHUP)
     for boots_left in reversed(range(BOOTS)):
         lab = Lab(request, method)
         try:

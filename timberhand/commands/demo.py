@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +23,9 @@ from timberhand.commands.options import (
     truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
 
 
 class PlcRole(StrEnum):
@@ -42,6 +46,13 @@ def demo(
     lockstep: Annotated[
         bool, typer.Option(help="Run in virtual time in one process; a seed gives the same bytes every time.")
     ] = False,
+    live: Annotated[
+        bool | None,
+        typer.Option(
+            "--live/--no-live",
+            help="In real time, or in paced virtual time with the page (default: on the wire, as this computer can).",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Chooses the log and its pose.")] = 1,
     bus: BusOption = Backend.AUTO,
     clock: ClockOption = ClockChoice.AUTO,
@@ -75,13 +86,16 @@ def demo(
     """Lay one log from the ground into the bunk, over CAN.
 
     Exit code 0 only when the log lies in the bunk according to the plant's
-    physics.
+    physics. On a computer that does not hold the period of a live run the demo
+    runs in paced virtual time, and says so.
 
     [bold]Examples[/bold]
 
       timberhand demo                        live, with the operator's page
 
       timberhand demo --bus vcan --seed 3    live on SocketCAN
+
+      timberhand demo --live                 live, however busy this computer is
 
       timberhand demo --lockstep --seed 3    the same job in virtual time
 
@@ -93,10 +107,13 @@ def demo(
 
     from machine.loading.profile_file import ProfileError, load_profile
 
+    if refused := refusal(live, lockstep, bus, plc and plc_link is PlcLink.UDP):
+        raise refused
     if not lockstep:
         enter_lab(bus, clock, detects=bool(camera))
     try:
-        cameras = load_profile(profile).cameras
+        machine = load_profile(profile)
+        cameras = machine.cameras
     except ProfileError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if camera and plc:
@@ -118,12 +135,21 @@ def demo(
             ExitCode.USAGE,
         )
     truth = truth_of(profile, truth)
-    directory = out or new_directory(f"{'lockstep' if lockstep else bus.value}{'-plc' if plc else ''}-seed{seed}")
+    screen = Console(stderr=as_json)
+    if lockstep or live is not None:
+        paced = live is False
+    else:
+        from hil.harness.live import uses_wire
+
+        on_wire = "TIMBERHAND_LAB" not in os.environ and uses_wire(machine, bus.value)
+        paced = on_wire and _paces(screen, plc and plc_link is PlcLink.UDP)
+    kind = "lockstep" if lockstep else "paced" if paced else bus.value
+    directory = out or new_directory(f"{kind}{'-plc' if plc else ''}-seed{seed}")
     if plc:
         from hil.plc.profile import write_plc_profile
 
         profile = str(write_plc_profile(profile, plc_role.value, directory))
-    screen = Console(stderr=as_json)
+    page = console_port if console else 0
     if lockstep:
         from hil.demo.lockstep import run_lockstep
         from hil.faults.order import parse
@@ -134,10 +160,15 @@ def demo(
             summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera, orders)
         except FaultError as error:
             raise CommandFailed.from_error(error, ExitCode.USAGE) from None
+    elif paced:
+        from hil.demo.paced import run_paced
+
+        summary = run_paced(
+            profile, seed, truth, directory, page, limit_s, max_stops, screen, camera, foxglove if page else 0
+        )
     else:
         from hil.demo.live import run_live
 
-        page = console_port if console else 0
         summary = run_live(
             profile,
             seed,
@@ -157,3 +188,60 @@ def demo(
     if as_json:
         print(json.dumps(asdict(summary)))
     raise typer.Exit(summary.exit_code)
+
+
+def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> CommandFailed | None:
+    """Why ``--live`` or ``--no-live`` cannot be followed; None when it can.  ``udp``: a PLC is linked by datagrams."""
+    if live is None:
+        return None
+    option = "--live" if live else "--no-live"
+    if lockstep:
+        return CommandFailed(
+            "demo.live-lockstep",
+            f"{option}: a run with --lockstep has no other time than its own; use one of the two",
+            ExitCode.USAGE,
+        )
+    if bus is Backend.VCAN:
+        return CommandFailed(
+            "demo.live-vcan",
+            f"{option} is for the wire; on vcan use --clock real or --clock simulated",
+            ExitCode.USAGE,
+        )
+    if udp and not live:
+        return CommandFailed(
+            "demo.paced-udp",
+            "--no-live: the PLC's cyclic datagrams exist in a live run alone; use --plc-link modbus",
+            ExitCode.USAGE,
+        )
+    return None
+
+
+def paced_or_live(longest_ns: int, live_only: bool) -> tuple[bool, str]:
+    """Whether the demo is paced on a computer that stood still for up to ``longest_ns`` [ns], and what to say.
+
+    ``live_only``: what was asked for exists in a live run alone.
+    """
+    from host.real_time import BEARABLE_NS, LOOK_S, holds
+
+    if holds(longest_ns):
+        return False, ""
+    found = (
+        f"This computer stood still for up to {longest_ns / 1e6:.1f} ms in a look of {LOOK_S:.0f} s, "
+        f"and a live run bears {BEARABLE_NS / 1e6:.1f} ms: "
+    )
+    if live_only:
+        return False, f"{found}the machine may stop, and --plc-link udp exists live alone."
+    return True, f"{found}the demo runs in paced virtual time instead; --live insists."
+
+
+def _paces(screen: RichConsole, live_only: bool) -> bool:
+    """Look at this computer, and tell the user what that means where it cannot hold a live run."""
+    from hil.harness.display import say
+    from host.real_time import look
+
+    with screen.status("Does this computer hold the period of a live run?"):
+        longest_ns = look()
+    paced, sentence = paced_or_live(longest_ns, live_only)
+    if sentence:
+        say(screen, "", sentence, "yellow")
+    return paced

@@ -11,11 +11,6 @@ from typing import Annotated, Final
 
 import typer
 
-NO_WAIT = "TIMBERHAND_NO_WAIT"
-"""This variable starts a live run at once, whatever is being compiled."""
-ENOUGH_PROCESSORS = 4
-"""From so many on a compiler of the lowest priority does not disturb a live run."""
-
 
 class Backend(StrEnum):
     """The bus that carries the frames."""
@@ -57,16 +52,11 @@ of it, and every process waits for them to be read again."""
 def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool = False) -> None:
     """Prepare a live run.  For vcan outside the lab: run this command again inside it, and exit with its code.
 
-    On a machine of few processors it waits for a compiler that the set-up left in the background.  Where the lab is
-    user-mode Linux, the clock is chosen by the processor time that the host leaves, and announced; ``detects``: a
-    camera's detector runs in it.
+    Where the lab is user-mode Linux, the clock is chosen by the processor time that the host leaves, and announced;
+    ``detects``: a camera's detector runs in it.
     """
     if "TIMBERHAND_LAB" in os.environ:
         return
-    if NO_WAIT not in os.environ and len(os.sched_getaffinity(0)) < ENOUGH_PROCESSORS:
-        from host.compiled.build import await_builder
-
-        await_builder(lambda words: print(words, file=sys.stderr))
     if bus is Backend.VCAN:
         from host.vcan_lab.__main__ import vcan
         from host.vcan_lab.spec import DEFAULT_MEM_MB
