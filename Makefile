@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Kept bytecode halves pytest's collection (25 s to 13 s of CPU per worker); an environment may forbid it, this one does not.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup wheel wheel-arm64 bundle deb sbom lock audit demo test check lint docs coverage mutants fuzz bench results soak lab-kernel clean
+.PHONY: help setup wheel wheel-arm64 bundle deb sbom lock audit demo test check test-live test-long test-all lint docs mutants fuzz bench results soak lab-kernel clean
 
 help:  ## show this list
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -18,9 +18,8 @@ help:  ## show this list
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
 	@touch $@
-	@sh deploy/compile_in_background.sh $(VENV)
 
-setup: $(VENV)/.ready  ## create the virtual environment; compiles the tick in the background
+setup: $(VENV)/.ready  ## create the virtual environment
 
 wheel: setup  ## a wheel for this platform with the compiled tick, in dist/
 	@TIMBERHAND_COMPILE=1 $(BIN)/python -m pip wheel --no-deps --no-build-isolation -w dist .
@@ -51,27 +50,27 @@ audit: setup  ## insecure code (bandit), and published weaknesses of the package
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)
 
-test: lint docs coverage  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
-	@sh deploy/debian_packages.sh
-	@$(BIN)/pytest -m "not slow" -n 2 --dist worksteal --durations=15 --durations-min=10 $(ARGS) || [ $$? -eq 5 ]
-	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal --durations=40 --durations-min=30 $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
-	@$(BIN)/pytest -m "slow and not computed" --durations=40 --durations-min=20 $(ARGS) || [ $$? -eq 5 ]
+test: setup  ## lint, types, architecture, and every test that no load on this computer can disturb; before every push
+	@sh deploy/phases.sh $(BIN) test $(ARGS)
 
-check: lint  ## lint, types, architecture and the fast tests
-	@$(BIN)/pytest -q -m "not slow" -n 2 --dist worksteal $(ARGS)
+check: setup  ## the same without the pages of the documentation and without coverage: before every commit
+	@sh deploy/phases.sh $(BIN) check $(ARGS)
+
+test-live: setup lab-kernel  ## every test that starts processes: runs on the wire and on vcan, services, browser, real time
+	@sh deploy/debian_packages.sh
+	@sh deploy/phases.sh $(BIN) live $(ARGS)
+
+test-long: setup  ## long runs in virtual time, fuzzing, and mutants of the safety layer
+	@sh deploy/phases.sh $(BIN) long $(ARGS)
+
+test-all: test test-long test-live  ## the three
 
 lint: setup  ## style, types and the three floors
-	@$(BIN)/ruff check .
-	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy
-	@$(BIN)/lint-imports --no-cache
+	@sh deploy/phases.sh $(BIN) lint
 
 docs: setup  ## build the site into docs/_build; broken links and stale reference pages are errors
 	@$(BIN)/python -m timberhand.reference --check
 	@$(BIN)/sphinx-build -W --keep-going -q docs docs/_build && echo "docs/_build/index.html"
-
-coverage: setup  ## branch coverage of supervisor and guard by their own tests; below 100 % is an error
-	@$(BIN)/python -m tests.branch_coverage
 
 mutants: setup  ## change supervisor and guard a thousand times, see their tests fail, write docs/results/mutants.json
 	@$(BIN)/python -m tests.mutation $(ARGS)

@@ -1,34 +1,84 @@
-"""Branch coverage of the supervisor and the guard by their own tests: ``python -m tests.branch_coverage [SCOPE]``.
+"""Branch coverage of supervisor and guard by their own tests, in the run that tests them: ``pytest --branch-coverage``.
 
-Every branch must be taken.  Exit codes: 0 all of them are, 1 a test fails, 2 a branch is not taken.
+Only the tests of `tests.safety_scope` count: a line that a run of the whole machine happens to pass is not tested by
+that.  A branch that none of them takes fails the run.  Every worker measures its share; the run adds them up.
 """
 
 from __future__ import annotations
 
-import sys
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 
+import pytest
 from coverage import Coverage
 
 from tests.safety_scope import SCOPES
 
-
-def main(names: list[str]) -> int:
-    """Run the tests, print the lines and branches that they leave out; returns the exit code."""
-    scopes = [scope for scope in SCOPES if not names or scope.name in names]
-    sources = [str(path) for scope in scopes for path in scope.sources().values()]
-    measured = Coverage(data_file=None, branch=True, include=sources)
-    measured.exclude(r"if __name__ == .__main__.:")
-    measured.start()
-    import pytest  # after the start: importing the tests runs the modules' own statements
-
-    tests = dict.fromkeys(str(path) for scope in scopes for path in scope.tests())
-    code = pytest.main(["-q", "-p", "no:cacheprovider", "-o", "timeout=0", "-m", "not slow", *tests])
-    measured.stop()
-    share = measured.report(show_missing=True, include=sources)
-    if code != 0:
-        return 1
-    return 0 if share == 100.0 else 2
+OPTION = "--branch-coverage"
+_TESTS = {path for scope in SCOPES for path in scope.tests()}
+_SOURCES = [str(path) for scope in SCOPES for path in scope.sources().values()]
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+class Measurement:
+    """Measures while a test of the scope runs, and while modules are imported: they run statements of their own."""
+
+    def __init__(self, data: Path) -> None:
+        self._coverage = Coverage(data_file=str(data), data_suffix=True, branch=True, include=_SOURCES)
+        self._coverage.start()
+
+    def pytest_collection_finish(self) -> None:
+        self._coverage.stop()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        if item.path not in _TESTS:
+            return (yield)
+        self._coverage.start()
+        try:
+            return (yield)
+        finally:
+            self._coverage.stop()
+
+    def pytest_sessionfinish(self) -> None:
+        self._coverage.stop()
+        self._coverage.save()
+
+
+class Verdict:
+    """Adds up what the workers measured, prints the lines and branches left out, and fails the run for them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._share = 0.0
+
+    def pytest_configure_node(self, node: object) -> None:
+        """A worker of pytest-xdist is told where to put its share."""
+        node.workerinput["branch_coverage"] = str(self._folder)  # type: ignore[attr-defined]
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        whole = Coverage(data_file=str(self._folder / "share"), branch=True, include=_SOURCES)
+        whole.exclude(r"if __name__ == .__main__.:")
+        whole.combine([str(self._folder)])
+        self._share = whole.report(show_missing=True, skip_covered=True)
+        shutil.rmtree(self._folder)
+        if self._share < 100.0 and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: object) -> None:
+        line = f"branches of supervisor and guard taken by their own tests: {self._share:.1f} %, 100 % wanted"
+        terminalreporter.write_line(line)  # type: ignore[attr-defined]
+
+
+def configure(config: pytest.Config) -> None:
+    """Measure in this process, or in its workers."""
+    given = getattr(config, "workerinput", {}).get("branch_coverage")
+    if given is None and not config.getoption(OPTION):
+        return
+    folder = Path(given or tempfile.mkdtemp(prefix="branch-coverage-"))
+    if given is None:
+        config.pluginmanager.register(Verdict(folder))
+    if given is not None or not config.getoption("numprocesses", None):
+        config.pluginmanager.register(Measurement(folder / "share"))

@@ -46,6 +46,7 @@ SCOPES = (
             "tests/controller/test_transition_table.py",
             "tests/controller/test_mode_model.py",
             "tests/controller/test_supervisor*.py",
+            "tests/controller/test_stalls.py",
             "tests/controller/test_joint_watch.py",
             "tests/controller/test_pressure_monitor.py",
             "tests/controller/test_load_moment.py",

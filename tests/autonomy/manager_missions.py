@@ -40,7 +40,7 @@ def begin(
 
 def whole(test):
     """A mission with crane work: seconds of planning."""
-    return pytest.mark.timeout(400)(pytest.mark.slow(pytest.mark.computed(test)))
+    return pytest.mark.timeout(400)(pytest.mark.long(test))
 
 
 def ended(manager: ActivityManager) -> bool:

@@ -43,6 +43,7 @@ def test_a_mission_ends_on_the_spot_once_it_has_the_wanted_logs() -> None:
     assert forwarder.x_m < 24.0 and forwarder.speed_m_s == 0.0
 
 
+@pytest.mark.long
 def test_the_machine_stops_at_a_listed_log_before_it_is_detected() -> None:
     listed = KnownLog(place(15.0, 4.2), bearing_deg=80.0, length_m=2.4)
     forwarder, manager = begin((), known=(listed,), logs="listed")

@@ -28,7 +28,7 @@ SLEW = PALMS.joints["slew"]
 OTHER = StandIn(deadbands=(0.105, 0.142), hysteresis=0.026, full_speeds=(0.6, 0.42), delay_s=0.131)
 
 
-MACHINES = [StandIn(), pytest.param(OTHER, marks=pytest.mark.slow)]
+MACHINES = [StandIn(), pytest.param(OTHER, marks=pytest.mark.long)]
 
 
 @cache
@@ -54,7 +54,7 @@ def test_the_valve_is_found(machine: StandIn) -> None:
     assert fit.errors["deadband_plus"] < 0.008 and fit.errors["full_plus"] < 0.04 * fit.full_speeds[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fast_valve_is_known_where_it_is_driven() -> None:
     """Nobody opens it fully: the speed limit takes a quarter of its stroke."""
     fast = StandIn(full_speeds=(1.4, 0.3), exponent=1.04)
@@ -87,7 +87,7 @@ def test_a_valve_node_without_spool_sensors_gives_no_dead_time() -> None:
     assert fit_delay(dead) is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_repetition_agrees_and_another_valve_does_not() -> None:
     fit = fit_valve(measured(StandIn()), SLEW)
     program = wiggle(SLEW, 1)
@@ -171,12 +171,12 @@ def found(tests: tuple[SpoolTestRecord, ...]) -> Findings:
     return Findings(wiggles=wiggles, tests=list(tests))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_good_run_is_plausible() -> None:
     assert identify(PALMS, found(measured(StandIn()))).implausible == ()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("machine", "code"),
     [
@@ -191,7 +191,7 @@ def test_implausible_values_are_reported(machine: StandIn, code: str) -> None:
     assert any(problem.code == code for problem in result.implausible), result.implausible
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_joint_that_was_held_does_not_fit_a_valve() -> None:
     tests = list(measured(StandIn()))
     held = tests[1].position.copy()

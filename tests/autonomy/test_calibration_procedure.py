@@ -34,7 +34,7 @@ from tests.codes import coded
 PALMS = load_profile("palms_471")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 def test_a_good_machine_takes_under_four_minutes(name: str) -> None:
     crane = Crane(name)
@@ -117,6 +117,7 @@ def test_every_joint_is_wiggled_before_anything_travels() -> None:
         ({"deadband_plus_pct": 0.25}, {1: 2, -1: 1}),
     ],
 )
+@pytest.mark.long
 def test_a_side_that_is_slow_or_narrow_is_swept_twice(change: dict[str, float], sweeps: dict[int, int]) -> None:
     """One sweep left the dead-band of a lift uncertain by 1 % of the stroke."""
     shipped = load_profile("aoro_fc8").joints["lift"].valve

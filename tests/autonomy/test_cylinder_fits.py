@@ -50,6 +50,7 @@ def fits_of(*logs, exact: bool = True, **options):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 55.0, 90.0])
+@pytest.mark.long
 def test_outline_and_depth_agree_with_the_renderer(degrees: float) -> None:
     log, view = lying(1, 4.6, 0.2, degrees), view_from()
     picture = seen(scene_of(log), view)

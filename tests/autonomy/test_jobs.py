@@ -18,8 +18,7 @@ from tests.autonomy.forwarding_jobs import begin, command, run
 from tests.autonomy.manager_missions import LOGS
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_a_mission_emits_its_states_grasps_and_load_and_ends_idle() -> None:
     forwarder, job, _ = begin(LOGS[0])
     said = run(forwarder, job, lambda j: j.idle)
@@ -67,8 +66,7 @@ def test_an_ended_job_sends_no_speed() -> None:
     assert all(isinstance(s, DriveSetpoint) and s.speed_m_s == 0.0 for s in sent) and sent
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.parametrize("phase", ["ABOVE", "DESCEND", "CLOSE", "CARRY", "LOWER", "OPEN"])
 def test_pause_stops_the_crane_smoothly_and_auto_resumes_with_the_log(phase: str) -> None:
     forwarder, job, manager = begin(LOGS[0])
@@ -118,8 +116,7 @@ def test_logs_seen_ahead_are_mapped_where_they_lie() -> None:
     assert log.center_m[:2] == pytest.approx(lies.center_m[:2], abs=0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_no_picture_is_asked_for_and_none_counts_while_the_crane_works() -> None:
     forwarder, job, manager = begin(LOGS[0], uses_memory=True)
     ahead(forwarder, job)

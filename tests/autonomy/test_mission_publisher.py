@@ -34,8 +34,7 @@ def near(place, x_m, y_m, within_m=0.15) -> bool:
     return math.dist(PLANE.local(*place)[:2], (x_m, y_m)) < within_m
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_report_has_the_machine_position_and_the_mapped_logs() -> None:
     forwarder, job, manager = begin(LOGS[0])
     run(forwarder, job, lambda j: manager.state is State.APPROACH)
@@ -54,8 +53,7 @@ def test_the_report_has_the_machine_position_and_the_mapped_logs() -> None:
     assert log.age_s < 1.0 and not log.given_up
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_targets_are_the_logs_of_the_grasp() -> None:
     """It may begin with another log than the one that the machine stopped for."""
     forwarder, job, manager = begin(LOGS[0], (9, LOGS[0][1], -LOGS[0][2], 0.0))
@@ -68,8 +66,7 @@ def test_the_targets_are_the_logs_of_the_grasp() -> None:
     assert told.crane == CRANE_PHASES[Phase.ABOVE] and len(told.logs) == 2
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_commands_are_executed_and_reported() -> None:
     forwarder, job, manager = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
@@ -139,8 +136,7 @@ def test_a_single_log_job_only_accepts_abort() -> None:
     assert job.report(0) is None
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_longest_mission_fits_in_a_datagram() -> None:
     corners = tuple(Point(*PLANE.geodetic(9e3 * math.cos(a), 9e3 * math.sin(a))[:2]) for a in np.linspace(0, 6, 2000))
     mission = ForwardingMission(

@@ -186,8 +186,7 @@ def undisturbed_m() -> float:
     return machine.driven_m
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.parametrize(("after_m", "to_come"), [(35.0, 6), (90.0, 3)])
 def test_the_remaining_waypoints_of_all_laps_are_counted(
     after_m: float, to_come: int, undisturbed_m: float, tmp_path: Path

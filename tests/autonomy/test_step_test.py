@@ -61,8 +61,7 @@ def run(test: StepTest, seconds: float = 30.0, each: Callable[[Lockstep], None] 
         plant.close()
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("which", "amount"), [(Joint.SLEW, 0.3), (Joint.LIFT, 0.12), (Joint.EXT, 0.2)])
 def test_a_joint_steps_out_and_back_and_all_of_it_is_seen(which: Joint, amount: float) -> None:
     test = StepTest(PROFILE, HASH, which, amount, load("crane"))
@@ -80,8 +79,7 @@ def test_a_joint_steps_out_and_back_and_all_of_it_is_seen(which: Joint, amount: 
     assert np.ptp(found.series["pressure_a"]) > 1.0, "its pressures move with it"
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_abort_brakes_on_the_path_and_a_stop_ends_it() -> None:
     test = StepTest(PROFILE, HASH, Joint.SLEW, 0.5, load("crane"))
 

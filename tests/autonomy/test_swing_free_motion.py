@@ -109,8 +109,7 @@ def test_the_law_without_swing_takes_little_longer_than_the_fastest(goal: tuple[
     assert fastest.duration_s < shaped.duration_s < 1.13 * fastest.duration_s
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CRANES)
 @settings(deadline=None, max_examples=20)
 @given(slew=st.floats(-1.2, 1.2), near=st.floats(3.4, 4.2), far=st.floats(4.2, 6.0), z=st.floats(0.8, 1.6))

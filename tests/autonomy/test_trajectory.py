@@ -86,8 +86,7 @@ def test_progress_goes_from_0_to_1_with_rest_up_to_the_jerk_at_both_ends() -> No
     assert np.max(np.abs(np.diff(jerk))) < 0.05 * np.max(np.abs(jerk))  # no step in it
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 @settings(deadline=None, max_examples=20)
 @given(poses(), poses())
 def test_a_travel_keeps_the_limits_and_ends_at_the_goal(start: Pose, goal: Pose) -> None:

@@ -7,8 +7,6 @@ import json
 import math
 import re
 import socket
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -325,30 +323,6 @@ def test_machine_description_names_every_joint_once():
 
 
 # ---- the process ------------------------------------------------------------------------------------------------
-
-
-def run_console(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "console", *map(str, arguments)], capture_output=True, text=True, timeout=30
-    )
-
-
-def test_start_errors_are_one_sentence_with_an_exit_code():
-    with socket.socket() as page, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reports:
-        page.bind(("127.0.0.1", 0))
-        page.listen()
-        reports.bind(("127.0.0.1", 0))
-        busy, port = page.getsockname()[1], reports.getsockname()[1]
-        cases = [
-            (4, "--port", busy, "--report-port", 0),
-            (4, "--port", 0, "--report-port", port),
-            (3, "--port", 0, "--report-port", 0, "--profile", "palms"),
-            (2, "--port", 0, "--report-port", 0, "--planner", "nowhere"),
-            (2, "--port", 0, "--report-port", 0, "--bus", "crane9=wire:crane9"),
-        ]
-        for code, *arguments in cases:
-            done = run_console(*arguments)
-            assert (done.returncode, done.stderr.count("\n"), "Traceback" in done.stderr) == (code, 1, False)
 
 
 def test_a_page_that_the_server_has_given_up_counts_as_gone() -> None:

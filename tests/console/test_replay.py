@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
@@ -14,9 +13,7 @@ from console.replay import Overview, ReplayView
 from console.replay_server import REFUSAL, create_replay_app
 from machine.status.explanation import explain
 from machine.status.reasons import Reason, pack
-from tests.console.browser import MISSING, Browser, installed
 from tests.console.recorded_run import BEGIN_NS, LENGTH_S, PROFILE, STOP_S, RecordedRun
-from tests.console.served_page import served
 
 S = 10**9
 BEGIN_S = BEGIN_NS / 1e9
@@ -98,33 +95,3 @@ def test_every_command_is_refused_and_foreign_names_too() -> None:
     with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
         state = ws.receive_json()
         assert not (state["may_stop"] or state["may_command"] or state["may_order"])
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(installed() is None, reason=MISSING)
-def test_a_stop_opens_ten_seconds_before_it(tmp_path: Path) -> None:
-    app = create_replay_app(RecordedRun(), PROFILE, name="runs/demo-1")
-    with served(app) as url:
-        browser = Browser(tmp_path, (1280, 800))
-        try:
-            browser.open(url)
-            browser.wait(lambda: "runs/demo-1" in browser.text("replay"), "the recording's name")
-            assert browser.text("stop") == "" and browser.text("arm") == ""
-            browser.click("tab-timeline")
-            browser.wait(lambda: "JOINT_STUCK" in browser.text("panel-timeline"), "the stop")
-            browser.value("document.querySelector('.of-stop button').click()")
-            browser.wait(lambda: "Pause" in browser.text("replay"), "it plays")
-            clock = "parseFloat(document.querySelector('.clock').value)"
-            browser.wait(lambda: STOP_S - 10 < browser.value(clock) < STOP_S, "ten seconds before the stop")
-            assert browser.text("mode") == "ACTIVE"
-            # Space means pause here, and nothing is sent that a machine would hear.
-            key = "new KeyboardEvent('keydown', {key: ' ', bubbles: true, cancelable: true})"
-            assert browser.value(f"document.body.dispatchEvent({key})") is False
-            browser.wait(lambda: "Play" in browser.text("replay"), "it pauses")
-            assert browser.text("alarm") == ""
-            browser.value(
-                "(b => { b.value = 50; b.dispatchEvent(new Event('change')); })(document.querySelector('.scrub'))"
-            )
-            browser.wait(lambda: browser.text("mode") == "STOPPED", "the state after the stop")
-        finally:
-            browser.close()

@@ -374,8 +374,7 @@ def test_random_input_never_raises_or_leaves_the_envelope_of_the_carrier(script)
                 assert bench.braked and drive["ArmKey"] == 0 and floats["FloatFront"] == floats["FloatRear"] == 0
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_driving_keeps_no_memory():
     """Repeat the same inputs on a second controller and measure its memory."""
     bench = DriveBench().armed()

@@ -131,6 +131,7 @@ DRIVES = TRUTH | {"drive": DRIVING | {"ArticRate": 0.1}}
 @example([TRUTH, DRIVES, DRIVES | {"vehicle": {"Articulation": 0.7}}, TRUTH | {"reset": True}, DRIVES])
 @example([TRUTH, DRIVES | {"gone": {"VehStat"}}, TRUTH, DRIVES | {"slew": 60.0}])
 @settings(max_examples=150, deadline=None)
+@pytest.mark.long
 def test_a_controller_that_lies_on_both_buses_moves_nothing_outside_the_promise(episodes):
     """While the guard enables, what the nodes would do is judged from the sent values alone, by rules written here."""
     traffic, since_state = Traffic("aoro_fc8"), 0

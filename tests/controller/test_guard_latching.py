@@ -113,6 +113,7 @@ NEUTRAL_LIE = {"a": dict(GOOD_A), "b": dict(GOOD_B), "ticks": 60, "channels": (1
 @given(st.lists(st.one_of(lies, st.just(NEUTRAL_LIE)), max_size=12))
 @example([NEUTRAL_LIE, NEUTRAL_LIE | {"channels": (0, 0)}, NEUTRAL_LIE, NEUTRAL_LIE])
 @settings(max_examples=150, deadline=None)
+@pytest.mark.long
 def test_a_controller_that_lies_in_every_field_moves_nothing_outside_the_promise(episodes):
     """What the valve node would do is judged from the sent values alone, by rules written here."""
     traffic, stopped, before, since_encoder = Traffic(), False, True, 0

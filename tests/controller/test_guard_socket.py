@@ -1,7 +1,7 @@
 """The guard's own socket: frames, their times, error frames, and a link that goes and comes; on any kernel.
 
 A pair of AF_UNIX sockets carries the same struct can_frame; the options that only a CAN socket knows are noted.  The
-real interface is in tests/vcan.
+real interface is in tests/live/vcan.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import errno
 import select
 import socket
 import struct
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -24,13 +23,31 @@ from controller.guard.can_socket import MOST_FRAMES, GuardSocket
 FRAME = struct.Struct("=IB3x8s")
 ERROR = 0x2000_0000
 UP, RUNNING = 0x1, 0x40
+MS = 1_000_000
+STAMP = struct.Struct("@qq")
+SO_TIMESTAMPNS = 35
 KEYS = (0x181, 0x18F0_0400 | EXTENDED, (0x0CFF_2300 | EXTENDED, 0x00FF_FF00))
 
 
-class Kernel:
-    """Gives out sockets whose far ends the test holds."""
+class Clock:
+    """The two clocks of a computer; they move when a test says so."""
 
     def __init__(self) -> None:
+        self.now_ns, self.ahead_ns = 10**12, 17 * 10**17
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        return self.now_ns + self.ahead_ns
+
+
+class Kernel:
+    """Gives out sockets whose far ends the test holds, and notes when a frame came."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.came_ns: list[int] = []
         self.flags, self.refuses = UP | RUNNING, 0
         self.far: socket.socket | None = None
         self.options: dict[tuple[int, int], int | bytes] = {}
@@ -56,6 +73,7 @@ class Kernel:
     def send(self, key: int, data: bytes = b"", length: int | None = None) -> None:
         assert self.far is not None
         self.far.send(FRAME.pack(key, len(data) if length is None else length, data))
+        self.came_ns.append(self.clock.time_ns())
 
     def error(self, key: int, flags: int = 0) -> None:
         self.send(ERROR | key, bytes((0, flags, 0, 0, 0, 0, 0, 0)))
@@ -72,7 +90,7 @@ class Link:
 
     def setsockopt(self, level: int, option: int, value: int | bytes) -> None:
         self.kernel.options[level, option] = value
-        if level == socket.SOL_SOCKET:
+        if level == socket.SOL_SOCKET and option != SO_TIMESTAMPNS:
             self.near.setsockopt(level, option, value)
 
     def bind(self, address: tuple[str]) -> None:
@@ -86,8 +104,10 @@ class Link:
     def recvmsg(self, size: int, control: int) -> tuple:
         if self.fails:
             raise OSError(self.fails, "no")
-        datagram, told, flags, address = self.near.recvmsg(size, control)
-        return datagram, [*self.told, *(told if self.stamps else ())], flags, address
+        datagram, _, flags, address = self.near.recvmsg(size, control)
+        came = STAMP.pack(*divmod(self.kernel.came_ns.pop(0), 10**9))
+        told = [(socket.SOL_SOCKET, SO_TIMESTAMPNS, came)] if self.stamps else []
+        return datagram, [*self.told, *told], flags, address
 
     def __getattr__(self, name: str):
         return getattr(self.near, name)
@@ -98,6 +118,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     made = Kernel()
     monkeypatch.setattr(can_socket, "socket", SimpleNamespace(**{**vars(socket), "socket": made.socket}))
     monkeypatch.setattr(can_socket, "fcntl", SimpleNamespace(ioctl=made.ioctl))
+    monkeypatch.setattr(can_socket, "time", made.clock)
     return made
 
 
@@ -109,18 +130,17 @@ def drained(bus: GuardSocket) -> list[Frame]:
 
 def test_frames_go_both_ways_with_their_length_and_their_time(kernel: Kernel) -> None:
     with GuardSocket("can0", KEYS) as bus:
-        before_ns = time.monotonic_ns()
+        kernel.clock.now_ns += MS
+        came_ns = kernel.clock.now_ns
         kernel.send(0x181, b"abc")
-        after_ns = time.monotonic_ns()
-        time.sleep(0.1)
+        kernel.clock.now_ns += 100 * MS
         kernel.send(0x18F0_0400 | EXTENDED, b"12345678")
         assert select.select([bus.fileno()], [], [], 1.0)[0]
         first, second = drained(bus)
         assert first[1:] == (0x181, b"abc") and second[1:] == (0x18F0_0400 | EXTENDED, b"12345678")
-        assert before_ns - 1_000_000 <= first.stamp_ns <= after_ns + 1_000_000, (
-            "the kernel's time, not that of the look"
-        )
-        assert second.stamp_ns - first.stamp_ns > 15_000_000
+        kernel.clock.now_ns += MS
+        assert first.stamp_ns == came_ns, "the kernel's time, not that of the look"
+        assert second.stamp_ns == came_ns + 100 * MS
         assert bus.send_all([(0x77F, b"\x05"), (0x381, b"")]) == 2 and bus.send(0x1, b"x")
         assert kernel.far is not None
         assert [FRAME.unpack(kernel.far.recv(16))[:2] for _ in range(3)] == [(0x77F, 1), (0x381, 0), (0x1, 1)]
@@ -153,17 +173,16 @@ def test_frames_are_added_to_those_that_are_there_and_only_they_are_counted(kern
 
 
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0])
-def test_a_step_of_the_wall_clock_moves_no_time_by_more_than_one_look(
-    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, step_s: float
-) -> None:
+def test_a_step_of_the_wall_clock_moves_no_time_by_more_than_one_look(kernel: Kernel, step_s: float) -> None:
     with GuardSocket("can0", KEYS) as bus:
         drained(bus)
-        looked_ns = time.monotonic_ns()
+        looked_ns = kernel.clock.now_ns
+        kernel.clock.now_ns += MS
         kernel.send(0x181, b"a")
-        stepped = SimpleNamespace(monotonic_ns=time.monotonic_ns, time_ns=lambda: time.time_ns() + round(step_s * 1e9))
-        monkeypatch.setattr(can_socket, "time", stepped)
+        kernel.clock.ahead_ns += round(step_s * 1e9)
+        kernel.clock.now_ns += MS
         (frame,) = drained(bus)
-        assert looked_ns - 10_000_000 <= frame.stamp_ns <= time.monotonic_ns()
+        assert looked_ns <= frame.stamp_ns <= kernel.clock.now_ns
 
 
 def test_the_clocks_are_read_again_after_a_pause_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,10 +251,12 @@ def test_one_look_reads_a_bounded_number_of_frames(kernel: Kernel, monkeypatch: 
 def test_other_words_of_the_kernel_about_a_frame_are_no_time(kernel: Kernel) -> None:
     with GuardSocket("can0", KEYS) as bus:
         bus._socket.told = [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_CAN_RAW, 35, bytes(16))]
-        before_ns = time.monotonic_ns()
+        kernel.clock.now_ns += MS
+        came_ns = kernel.clock.now_ns
         kernel.send(0x181, b"a")
+        kernel.clock.now_ns += MS
         (frame,) = drained(bus)
-        assert before_ns - 50_000_000 <= frame.stamp_ns <= time.monotonic_ns()
+        assert frame.stamp_ns == came_ns
 
 
 def test_without_a_time_of_the_kernel_a_frame_has_that_of_the_look(kernel: Kernel) -> None:
@@ -243,10 +264,9 @@ def test_without_a_time_of_the_kernel_a_frame_has_that_of_the_look(kernel: Kerne
         link = kernel.links[0]
         link.stamps, link.told = False, [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_CAN_RAW, 35, bytes(16))]
         kernel.send(0x181, b"a")
-        time.sleep(0.002)
-        before_ns = time.monotonic_ns()
+        kernel.clock.now_ns += 2 * MS
         (frame,) = drained(bus)
-        assert before_ns <= frame.stamp_ns <= time.monotonic_ns()
+        assert frame.stamp_ns == kernel.clock.now_ns
 
 
 def test_no_frame_is_older_than_the_last_look_or_the_opening(kernel: Kernel) -> None:
@@ -255,20 +275,22 @@ def test_no_frame_is_older_than_the_last_look_or_the_opening(kernel: Kernel) -> 
         kernel.send(0x181, b"a")
 
     with GuardSocket("can0", KEYS) as bus:
-        time.sleep(0.002)
-        before_ns = time.monotonic_ns()
+        kernel.clock.now_ns += 2 * MS
+        looked_ns = kernel.clock.now_ns
         drained(bus)
         old(kernel.links[0])
+        kernel.clock.now_ns += 2 * MS
         (frame,) = drained(bus)
-        assert frame.stamp_ns >= before_ns
+        assert frame.stamp_ns == looked_ns
         kernel.links[0].fails = errno.ENETDOWN
         drained(bus)
-        time.sleep(0.002)
-        opened_ns = time.monotonic_ns()
+        kernel.clock.now_ns += 2 * MS
+        opened_ns = kernel.clock.now_ns
         assert bus.reopen()
         old(kernel.links[1])
+        kernel.clock.now_ns += 2 * MS
         (frame,) = drained(bus)
-        assert frame.stamp_ns >= opened_ns
+        assert frame.stamp_ns == opened_ns
 
 
 def test_a_lost_link_may_be_closed(kernel: Kernel) -> None:

@@ -252,7 +252,7 @@ def test_levelling_raises_the_low_side_until_the_frame_is_level(roll, pitch):
     ("yaw", "place"),
     [
         (0.0, (6.0, 1.5)),
-        *(pytest.param(yaw, (20.0, 6.0), marks=[pytest.mark.slow, pytest.mark.computed]) for yaw in (1.6, 3.1, -2.0)),
+        *(pytest.param(yaw, (20.0, 6.0), marks=pytest.mark.long) for yaw in (1.6, 3.1, -2.0)),
     ],
 )
 def test_waypoint_is_reached_from_any_heading(yaw, place):

@@ -19,7 +19,6 @@ from can_dbc.timing.page import TimingWriter, read_timing
 from controller.carrier.vehicle import Vehicle
 from controller.config import load
 from controller.process.loop import DATAGRAM_BYTES, MAX_DATAGRAMS, Loop
-from controller.process.realtime import make_sleep, sleep_until
 from controller.process.timing import LoopTiming, ProcessReader
 from controller.process.warm_up import NullBus, warm_up
 from controller.requests.operator_socket import OperatorSocket
@@ -320,17 +319,6 @@ def test_reports_that_nobody_receives_are_counted(udp):
 def test_an_address_without_a_way_to_it_is_named(udp):
     with pytest.raises(BusError, match=r"255.255.255.255:5006", check=coded("udp.unreachable")):
         build(udp, Clock(), reports=("255.255.255.255", 5006))
-
-
-def test_sleep_until_returns_for_the_past_and_reaches_the_future():
-    import time
-
-    sleep_until(0)
-    for sleep in (sleep_until, make_sleep(0), make_sleep(200_000)):
-        until_ns = time.monotonic_ns() + 3 * MS
-        sleep(until_ns)
-        assert time.monotonic_ns() >= until_ns
-    assert make_sleep(0) is sleep_until
 
 
 @pytest.mark.parametrize("profile", ["palms_471", "aoro_fc8"])

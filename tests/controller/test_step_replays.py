@@ -20,8 +20,6 @@ from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.status.modes import Mode
 from tests.controller.bench import AORO, DATABASE, GNSS, MACHINE, MS, SETTINGS, SPECS, Bench, T
 
-pytestmark = pytest.mark.computed
-
 CLAIM = MACHINE.message("AddressClaim")
 KNOWN_KEYS = [m.key for m in DATABASE.messages.values()]
 frames = st.lists(
@@ -144,7 +142,7 @@ def test_record_of_a_whole_run_replays_to_the_same_bytes(settings_):
     assert bool(sent) is (settings_ is AORO)
 
 
-@pytest.mark.parametrize("settings_", [SETTINGS, pytest.param(AORO, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("settings_", [SETTINGS, pytest.param(AORO, marks=pytest.mark.long)])
 def test_tick_keeps_no_memory(settings_):
     bench = Bench(settings_).active()
     planned = []

@@ -281,8 +281,7 @@ def test_arm_stuck():
     assert "front right arm" in describe(Reason.ARM_STUCK, 1)
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_long_drive_raises_no_fault():
     bench = DriveBench().armed()
     bench.run(40)

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from pathlib import Path
-
-import pytest
 
 from machine.status.explanation import message_id
 from machine.status.faults import FAULTS
@@ -30,22 +26,3 @@ def test_the_catalog_names_only_fields_that_an_entry_has() -> None:
     )  # fmt: skip
     wanted = set(re.findall(r"@(\w+)@", CATALOG.read_text()))
     assert wanted and wanted <= set(stop_fields(stop, Path("file")))
-
-
-@pytest.mark.skipif(shutil.which("journalctl") is None, reason="journalctl is missing (apt-get install systemd)")
-def test_systemd_reads_the_catalog(tmp_path: Path) -> None:
-    folder = tmp_path / "usr/lib/systemd/catalog"
-    folder.mkdir(parents=True)
-    (tmp_path / "var/lib/systemd/catalog").mkdir(parents=True)
-    shutil.copy(CATALOG, folder)
-
-    def journalctl(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            ["journalctl", f"--root={tmp_path}", *words], capture_output=True, text=True, check=False
-        )  # fmt: skip
-
-    made = journalctl("--update-catalog")
-    assert made.returncode == 0 and not made.stderr, made.stderr
-    shown = journalctl("--dump-catalog", message_id(Reason.ENCODER_LOST))
-    assert "Subject: ENCODER_LOST: The encoder of @TIMBERHAND_PART@ is no longer received" in shown.stdout, shown.stderr
-    assert "What to do: Check its cable, then reset and arm." in shown.stdout

@@ -41,7 +41,7 @@ def always_killed(job: Job) -> None:
 
 
 def slow_square(job: Job) -> int:
-    time.sleep(0.5)
+    time.sleep(0.5)  # noqa: TID251  in the processes of a live test
     return job.seed**2
 
 

@@ -22,8 +22,6 @@ from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, CaseSet, c
 from machine.geometry.carrier import heading_rate_rad_s
 from machine.loading.profile_file import load_profile
 
-pytestmark = pytest.mark.computed
-
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier
 assert CARRIER is not None
@@ -139,7 +137,7 @@ def test_twice_the_gains_lose_their_margins():
     assert margins(FREQUENCY_RAD_S, late).phase_deg < margins(FREQUENCY_RAD_S, arm_loop(CARRIER, VALVE)).phase_deg
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_shows_the_carrier(tmp_path):
     few = replace(case_set("aoro_fc8"), delays_s=(0.08,), gains=(1.0,))
     assert write([(PROFILE, study(PROFILE, few) + loops.studies(PROFILE, few), few)], tmp_path)

@@ -278,8 +278,7 @@ def test_repetitions_are_those_of_the_profiles_own_law_alone():
         assert [len(job.options["visits"]) for job in jobs] == [4 * own, 4]
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_the_experiment_calibrates_moves_and_writes_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "QUICK_GOALS", (2,))

@@ -78,18 +78,6 @@ def test_no_trials_make_no_rate():
     assert math.isnan(rate("share", 0, 0)["share"])
 
 
-def test_the_number_of_workers_changes_nothing(tmp_path):
-    outcomes = []
-    for workers in (1, 2):
-        with Checkpoint(tmp_path / f"{workers}.jsonl", "run") as checkpoint:
-            outcomes.append(pool.run(square, jobs(7), checkpoint, Workers(workers), "trials", QUIET))
-    one, two = outcomes
-    assert list(one) == list(two) == [job.name for job in jobs(7)]
-    assert [o["square"] for o in one.values()] == [o["square"] for o in two.values()]
-    assert {o["process"] for o in one.values()} == {os.getpid()}
-    assert os.getpid() not in {o["process"] for o in two.values()}
-
-
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path):
     path = tmp_path / "trials.jsonl"
     with pytest.raises(KeyboardInterrupt), Checkpoint(path, "run") as checkpoint:

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import math
-import time
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from controller.config import load as load_settings
-from experiments.common.errors import ExperimentError
-from experiments.common.pool import Checkpoint, Job
-from experiments.common.registry import Options
-from experiments.faults import experiment, files
 from experiments.faults.evidence import Evidence
-from experiments.faults.experiment import _limited, nominal_plan, plan, scenes_of
+from experiments.faults.experiment import nominal_plan, plan, scenes_of
 from experiments.faults.judgement import judge
 from experiments.faults.metrics import METRICS, gather, is_blind
 from experiments.faults.pages import _example, blind_spots, evidence, table
@@ -132,48 +125,7 @@ def test_the_plan_spreads_the_trials_over_the_scenes_and_leaves_none_out() -> No
     assert sum(j.options["seconds"] for j in nominal_plan(1, 36_000.0)) == pytest.approx(36_000.0)
 
 
-def test_the_time_limit_ends_a_run_and_keeps_what_is_done(tmp_path: Path) -> None:
-    with Checkpoint(tmp_path / "trials.jsonl", "run") as kept, _limited(None, kept, 2):
-        kept.add("a", {})
-    over = pytest.raises(ExperimentError, check=coded("experiment.time-over"))
-    with over, Checkpoint(tmp_path / "trials.jsonl", "run") as kept, _limited(0.002, kept, 2):
-        kept.add("a", {"x": 1})
-        time.sleep(10.0)
-    assert Checkpoint(tmp_path / "trials.jsonl", "run").done == {"a": {"x": 1}}
-
-
-def test_injections_without_all_hours_of_work_give_a_page_and_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def over(_f: Any, jobs: Any, kept: Checkpoint, *_: Any) -> None:
-        for job in jobs[:done]:
-            kept.add(job.name, {"case": job.options["case"], "scene": job.options["scene"], "outcomes": [outcome()]})
-        raise ExperimentError(experiment.TIME_OVER, "over")
-
-    monkeypatch.setattr(experiment.pool, "run", over)
-    options, console = Options(3, "nominal", "palms_471", tmp_path, quick=True), Console(quiet=True)
-    done = len(plan(3, experiment.QUICK_TRIALS)) - 1
-    for pages in (0, 1):
-        with pytest.raises(ExperimentError, check=coded("experiment.time-over")):
-            experiment.run(options, console)
-        assert len(list(tmp_path.glob("result.json"))) == pages and (tmp_path / "trials.jsonl").is_file()
-        done += 1
-
-
-def test_a_child_answers_and_its_failure_is_told() -> None:
-    assert in_child(lambda: {"a": 1}) == {"a": 1}
-    with pytest.raises(ExperimentError, check=coded("experiment.injection-failed")):
-        in_child(lambda: {"a": 1 // 0})
-
-
-@pytest.mark.parametrize("name", sorted(files.CHECKS))
-def test_files_and_clocks_keep_their_promise(name: str) -> None:
-    found = files.perform(Job("j", "files", 1, {"case": BY_NAME[name].number, "count": 3}))
-    assert [o["verdict"] for o in found["outcomes"]] == ["ok"] * 3, found["outcomes"]
-
-
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_an_injection_in_a_forked_child_is_that_of_a_fresh_machine_and_of_its_repetition() -> None:
     def machine() -> Any:
         made = build("crane palms_471")
@@ -192,8 +144,7 @@ def test_an_injection_in_a_forked_child_is_that_of_a_fresh_machine_and_of_its_re
     assert first["verdict"] == "ok" and first["neutral_ms"] <= 100.0
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_burst_and_overload_of_a_machine_with_physics_are_answered_in_time() -> None:
     machine = warm("crane palms_471 physics")
     burst = in_child(lambda: inject(machine, BY_NAME["hose-burst"].number, "a seed"))
@@ -207,8 +158,7 @@ def test_burst_and_overload_of_a_machine_with_physics_are_answered_in_time() -> 
     assert "overload at" in "".join(_example({**load, "scene": "crane"}))
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_a_fault_at_every_edge_is_answered_and_named() -> None:
     for scene, text, reaction, reason in (
         ("crane palms_471", "estop-pressed", "R0", "ESTOP_PRESSED"),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
-import platform
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +13,6 @@ from experiments.timing.fitness_measurement import Measured
 from experiments.timing.fitness_report import REMOVED, data_of, private_words, read_data, text_of, without_private
 from host.doctor import computer, facts
 from host.doctor.computer import interrupt_counts
-from host.exit_codes import ExitCode
 from timberhand.cli import app
 
 GOOD = Figures(
@@ -109,24 +106,6 @@ def test_facts_of_the_computer_from_a_test_tree(tmp_path: Path) -> None:
     )
     assert interrupt_counts(counts, 1) == {"can0": 20, "LOC": 6}
     assert interrupt_counts(counts, 2) == {}
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(300)
-def test_the_command_measures_and_writes_a_report_without_names(tmp_path: Path) -> None:
-    out = tmp_path / "report.md"
-    arguments = ["doctor", "--rt", "--report", "--seconds", "3", "--bus", "wire", "--out", str(out)]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code in (ExitCode.OK, ExitCode.FIGURE_MISSED), done.output
-    text = out.read_text()
-    data = read_data(text)
-    figures = data["measured"]["figures"]
-    assert figures["ticks"] + figures["missed"] > 500 and figures["tick_p50_us"] > 0
-    assert data["settings"]["release"] == platform.release()
-    assert {j["topic"] for j in data["judgements"]} == {"rights", "wake-ups", "tick", "frames", "memory", "stops"}
-    assert str(tmp_path) not in text
-    words = private_words(platform.node(), getpass.getuser())
-    assert without_private(data, words) == data
 
 
 def test_a_report_that_cannot_be_written_is_refused_before_the_measurement(tmp_path: Path) -> None:

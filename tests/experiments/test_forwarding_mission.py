@@ -155,8 +155,7 @@ def test_plots_are_drawn(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"map.png", "offsets.png"}
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_an_observed_mission_of_one_log() -> None:
     job = trial(SimpleNamespace(seed=1, quick=True), "aoro_fc8", {})[0]

@@ -174,8 +174,7 @@ def test_after_the_papers_attempts_machines_alternate_on_their_own_scenes() -> N
     assert by_machine == {f"text machine/{i}": calibrations[i].seed for i in (0, 1, 3, 4)}
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_a_small_pile_is_lifted_completely_over_the_bus() -> None:
     options = {
         "profile": "palms_471", "truth": "nominal", "configuration": 7, "poses": "true", "planner": "search",
@@ -193,8 +192,7 @@ def test_a_machine_without_the_camera_gets_true_poses_and_no_detector(tmp_path: 
         compare(replace(OPTIONS, profile=loader, detector="ours"), Console())
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_third_machine_lifts_a_small_pile_from_data_alone(tmp_path: Path) -> None:
     loader = made(tmp_path)
     options = {

@@ -126,8 +126,7 @@ def test_train_needs_data() -> None:
     assert done.exception.code == "dataset.no-samples" and "/nowhere" in str(done.exception)
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_train_writes_weights_and_card(tmp_path: Path) -> None:
     folder = layout(tmp_path / "data", (7, 8))
     made = []
@@ -144,7 +143,7 @@ def test_train_writes_weights_and_card(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.checkpoint"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_whole_experiment_on_a_folder(tmp_path: Path) -> None:
     folder = layout(tmp_path / "mine", (200, 201))
     result = experiment.run(options(tmp_path / "out", data=folder, docs=tmp_path / "docs"), QUIET)

@@ -17,8 +17,6 @@ from experiments.joint_tracking.testbed import NAMES, Calibration
 from experiments.joint_tracking.trial import _slow, perform
 from machine.loading.profile_file import load_profile
 
-pytestmark = pytest.mark.computed
-
 PALMS = load_profile("palms_471")
 START = [0.0, 0.4, -1.2, 0.6, 0.0]
 
@@ -127,7 +125,7 @@ def test_a_mean_over_a_window_is_the_mean_of_its_values():
     assert slow[0] == pytest.approx(np.mean([values[0]] * 3 + values[1:3]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["cycle", "pump", "pick_up", "wide", "dip"])
 def test_a_calibrated_machine_rests_near_and_closes_its_valves(kind):
     law = PALMS.joints["slew"].law.kind
@@ -138,7 +136,7 @@ def test_a_calibrated_machine_rests_near_and_closes_its_valves(kind):
     assert (found["behind_s"] > 0.1) == (kind == "pump")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_no_law_diverges_in_the_worst_corner_of_twice_the_spread(law):
     """Every joint 205 ms late and 1.4 times as fast as its profile says, with a load."""
@@ -147,7 +145,7 @@ def test_no_law_diverges_in_the_worst_corner_of_twice_the_spread(law):
     assert not perform(Job("t", "corner", 3, what))["diverged"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_law_without_margins_diverges_there(monkeypatch):
     """Five times the budget: the figure can fail."""
     real = individuals.controller_profile
@@ -163,7 +161,7 @@ def test_a_law_without_margins_diverges_there(monkeypatch):
     assert perform(Job("t", "corner", 3, what))["diverged"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_the_experiment_writes_its_result_plots_and_page(tmp_path):
     result = experiment.run(options(tmp_path / "out", quick=True, docs=tmp_path / "docs"), Console(quiet=True))

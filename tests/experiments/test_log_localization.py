@@ -79,8 +79,7 @@ def test_plots_are_drawn_from_few_trials(tmp_path: Path) -> None:
     assert all((tmp_path / f"{name}.png").stat().st_size > 5000 for name in ("errors", "curve"))
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_site_is_as_paper_b_describes_it_and_the_survey_finds_the_camera() -> None:
     site = Site(profile_named("aoro_fc8"), "sampled", 5, 45.0)
     try:
@@ -106,8 +105,7 @@ def test_the_site_is_as_paper_b_describes_it_and_the_survey_finds_the_camera() -
         site.close()
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_the_command_evaluates_draws_and_writes_the_page(tmp_path: Path) -> None:
     arguments = ["--quick", "--seed", "3", "--out", str(tmp_path / "out"), "--docs", str(tmp_path / "docs")]

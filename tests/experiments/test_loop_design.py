@@ -27,8 +27,6 @@ from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 from timberhand.cli import app
 
-pytestmark = pytest.mark.computed
-
 T_S, LEAD_S = 0.005, 0.0025
 S = 1j * FREQUENCY_RAD_S
 KINDS = ("pd", "sliding_mode", "super_twisting", "pid")
@@ -123,7 +121,7 @@ def test_inertia_and_springs_are_those_of_a_hand_calculation():
         assert loaded.swinging > slew.swinging and loaded.pendulum_rad_s < slew.pendulum_rad_s
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_longer_delay_costs_phase_and_a_higher_gain_costs_gain(works):
     spec, work = spec_of(name="lift"), works["palms_471"]
     made, valve = work.places["lift"][0][1], work.valves["lift"]
@@ -139,7 +137,7 @@ def test_a_longer_delay_costs_phase_and_a_higher_gain_costs_gain(works):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 def test_the_shipped_gains_keep_their_margins_over_all_machines(works, name):
     for joint in study(load_profile(name), works[name]):
@@ -147,7 +145,7 @@ def test_the_shipped_gains_keep_their_margins_over_all_machines(works, name):
         assert len(joint.cases) == 360
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_old_gains_lose_their_margins(works):
     """3 1/s on every joint: what the bound of the dead time alone allows."""
     profile = load_profile("palms_471")
@@ -159,7 +157,7 @@ def test_the_old_gains_lose_their_margins(works):
     assert {j.name for j in studies if not j.holds} >= {"slew", "lift"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_law_keeps_the_margins_with_the_same_gain(works, name, kind):
@@ -167,7 +165,7 @@ def test_every_law_keeps_the_margins_with_the_same_gain(works, name, kind):
         assert joint.holds, (joint.name, joint.phase_deg, joint.gain_db, joint.worst)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 @pytest.mark.parametrize("delay_s", [0.04, 0.15])
 def test_a_profile_calibrated_to_either_end_of_the_spread_keeps_its_margins(works, name, delay_s):
@@ -181,7 +179,7 @@ def test_a_profile_calibrated_to_either_end_of_the_spread_keeps_its_margins(work
         assert joint.holds, (joint.name, joint.phase_deg, joint.gain_db, joint.worst)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_has_every_law_of_every_joint(works, tmp_path):
     profile = load_profile("palms_471")
     few = replace(works["palms_471"], delays_s=(0.08,), gains=(1.0,))
@@ -204,7 +202,7 @@ def test_the_page_has_every_law_of_every_joint(works, tmp_path):
     assert "**missed**" in (tmp_path / "loop-design.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_prints_draws_and_fails(tmp_path):
     done = CliRunner().invoke(app, ["bench", "loop-design", "--profile", "palms_471", "--out", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.output

@@ -30,8 +30,7 @@ def test_no_motion_gives_empty_metrics() -> None:
     assert metrics["motions"] == 0 and metrics["cpu_p95_ms"] != metrics["cpu_p95_ms"]
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_benchmark_plans_every_motion_and_is_faster_on_average() -> None:
     result = CliRunner().invoke(app, ["bench", "motion", "--seeds", "1", "--profile", "aoro_fc8", "--json"])
     assert result.exit_code == 0

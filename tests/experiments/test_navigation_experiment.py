@@ -160,8 +160,7 @@ def test_plots_are_drawn(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == names
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["ours", "faithful"])
 def test_the_machine_drives_round_a_corner_in_mud_over_the_bus(way: str) -> None:
     options = SimpleNamespace(seed=0, quick=True)

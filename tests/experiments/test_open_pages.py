@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import socket
 from pathlib import Path
-
-import pytest
-from typer.testing import CliRunner
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import decode
@@ -18,7 +14,6 @@ from controller.process.warm_up import NullBus
 from controller.step import Controller
 from experiments.timing.open_pages import Window, judge
 from tests.controller.bench import DATABASE, SETTINGS, T
-from timberhand.cli import app
 
 TICKS = 3000
 SECOND_NS = 10**9
@@ -100,14 +95,3 @@ def test_a_loud_host_decides_no_time_and_still_counts() -> None:
     assert found["cpu"]["verdict"] == "inconclusive" and found["reached"]
     untraced = judge({"none": [window(calls=None)], "open": [window(calls=None)]})
     assert untraced["counts"]["calls"]["same"] is None and untraced["reached"]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(400)
-def test_a_tick_beside_open_pages_makes_the_same_calls_and_sends_the_same_frames() -> None:
-    """The command, shortened; its times decide nothing in one round."""
-    done = CliRunner().invoke(app, ["bench", "pages", "--rounds", "1", "--seconds", "2", "--json"])
-    assert done.exit_code == 0, (done.output, done.exception)
-    told = json.loads(done.stdout)
-    assert told["states"] > 100 and told["counts"]["frames"]["same"] and told["counts"]["calls"]["same"] is not False
-    assert told["cpu"]["verdict"] == "inconclusive" and told["environment"]["kernel"]

@@ -16,8 +16,6 @@ from experiments.plant import endurance, experiment, physics, rolling, trial
 from experiments.plant.metrics import METRICS, SECTIONS
 from timberhand.cli import app
 
-pytestmark = pytest.mark.computed
-
 COMMON = {"profile": "palms_471", "truth": "nominal", "quick": True}
 
 
@@ -58,7 +56,7 @@ def test_a_circle_is_found_from_an_arc():
     assert centre == pytest.approx((3.0, -2.0), abs=1e-6) and radius == pytest.approx(6.3, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_log_is_lifted_and_laid_into_the_bunk():
     t = grasp("single", 100_001)
     assert t["held"] == t["raised"] == t["in_bunk"] == 1
@@ -75,7 +73,7 @@ def test_the_oil_spring_has_its_closed_form_frequency():
     assert physics.cylinder_spring(Job("cylinder", "cylinder", 1, COMMON))["metrics"]["cylinder_hz_error"] < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_seed_is_another_grasp():
     jobs = [Job("repeat", "repeat", seed, {**COMMON, "scene": "single", "logs": 1}) for seed in (1, 1, 2)]
     first, same, other = map(endurance.fingerprint, jobs)
@@ -89,7 +87,7 @@ def test_an_unusable_truth_file_is_named(tmp_path):
     assert "no.toml" in str(done.exception) and done.exception.exit_code == 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_the_quick_run_meets_its_limits_and_writes_everything(tmp_path):
     result = experiment.run(

@@ -9,7 +9,6 @@ import pytest
 from experiments.timing import evaluation, rates
 from experiments.timing.losses import Loss, Stall, Stop
 from experiments.timing.rates import METRICS, CranePoint, RatePoint
-from hil.tick.compare import kept_recordings
 from machine.status.reasons import Reason
 
 
@@ -67,10 +66,3 @@ def test_a_loss_or_a_stop_counts_unless_a_witness_saw_the_host_stall(stalls, ope
     found = evaluation.evaluate(METRICS, metrics, rates.undecided(metrics, made))
     assert ({"frames_lost", "stops"} <= found.inconclusive.keys()) is open_
     assert ({"frames_lost", "stops", "stops_unexplained"} <= {*found.missed}) is not open_
-
-
-@pytest.mark.slow
-def test_replayed_controllers_share_a_processor_and_give_the_recorded_bytes(tmp_path):
-    recording = kept_recordings(tmp_path)[-1]
-    found = rates.run_cranes(recording, 2, 200, tmp_path)
-    assert (found.cranes, found.ticks, found.differing) == (2, 400, 0) and found.cpu_us > 0.0

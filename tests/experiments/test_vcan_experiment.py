@@ -6,13 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from experiments.common.result import evaluate, make_result
 from experiments.common.result_page import markdown
 from experiments.vcan.experiment import environment_of, noisy, page_of
 from experiments.vcan.metrics import METRICS, gather
-from experiments.vcan.stolen_time import StolenTime, steal_ms
 from experiments.vcan.trial import command, read_output, read_summary
 from machine.status.faults import describe
 from machine.status.reasons import Reason
@@ -83,11 +80,3 @@ def test_the_command_is_the_one_that_a_user_types() -> None:
         "mission", "run", "docs/examples/paper_b.geojson", "--logs", "3", "--bus", "vcan", "--seed", "4",
         "--no-console", "--out", "x",
     ]  # fmt: skip
-
-
-def test_steal_is_read_where_it_is_reported_and_the_probe_measures() -> None:
-    assert steal_ms("cpu 1 2 3 4 5 6 7 250 0 0\n") == pytest.approx(2500.0)
-    assert steal_ms("cpu 1 2 3 4\n") == 0.0
-    with StolenTime() as stolen:
-        pass
-    assert stolen.lost_ms >= stolen.longest_ms >= 0.0

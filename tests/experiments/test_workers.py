@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import signal
-import socket
-import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,32 +17,16 @@ from experiments.common.checkpoint import Checkpoint
 from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.trial_cost import TrialCost, overhead_s
-from experiments.common.workers import Trial, Workers
+from experiments.common.workers import Workers
 from experiments.plant.experiment import perform
 from tests.codes import coded
 from tests.experiments.mortal_trials import (
-    always_killed,
     mortal,
     plant_jobs,
-    process_id,
-    slow_square,
     square_jobs,
 )
 
 QUIET = Console(quiet=True)
-ROOT = Path(__file__).parents[2]
-INTERRUPTED = """
-import sys
-from pathlib import Path
-from rich.console import Console
-from experiments.common import pool, ray_workers
-from experiments.common.checkpoint import Checkpoint
-from experiments.common.workers import Workers
-from tests.experiments.mortal_trials import slow_square, square_jobs
-if __name__ == "__main__":
-    with Checkpoint(Path(sys.argv[1]), "run") as kept:
-        pool.run(slow_square, square_jobs(200), kept, Workers(2), "squares", Console(quiet=True))
-"""
 
 
 def table(path: Path, function: Any, workers: Workers, jobs: list[Job]) -> bytes:
@@ -64,40 +41,10 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return table(tmp_path_factory.mktemp("alone") / "trials.jsonl", perform, Workers(), plant_jobs())
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_two_processes_of_which_one_is_killed_give_the_same_table(tmp_path: Path, alone: bytes) -> None:
     there = table(tmp_path / "trials.jsonl", mortal(tmp_path / "marker"), Workers(2), plant_jobs())
     assert (tmp_path / "marker").exists() and there == alone
-
-
-def test_workers_that_are_killed_again_and_again_end_the_run_with_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, check=coded("experiment.worker-killed")):
-        table(tmp_path / "trials.jsonl", always_killed, Workers(2), square_jobs(3))
-
-
-def test_ctrl_c_keeps_the_finished_trials_and_leaves_no_process(tmp_path: Path) -> None:
-    kept = tmp_path / "trials.jsonl"
-    command = [sys.executable, "-c", INTERRUPTED, str(kept)]
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, start_new_session=True) as process:
-        while process.poll() is None and (not kept.exists() or kept.read_bytes().count(b"\n") < 3):
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers, too
-        assert process.wait(timeout=30) != 0
-        assert process.stderr is not None
-        told = process.stderr.read().decode()
-    assert told.count("Traceback") == 1 and told.rstrip().endswith("KeyboardInterrupt"), told
-    with pytest.raises(ProcessLookupError):  # nobody is left in the session
-        for _ in range(100):
-            os.killpg(process.pid, 0)
-            time.sleep(0.1)
-    ran: list[int] = []
-    with Checkpoint(kept, "run") as again:
-        done = len(again.done)
-        outcomes = pool.run(
-            lambda job: ran.append(job.seed) or job.seed**2, square_jobs(20), again, Workers(), "", QUIET
-        )
-    assert done >= 3 and len(ran) == 20 - done and list(outcomes.values()) == [i * i for i in range(20)]
 
 
 def test_a_run_with_more_trials_or_sources_changed_back_loses_none(tmp_path: Path) -> None:
@@ -127,28 +74,10 @@ def test_two_runs_do_not_write_the_same_trials(tmp_path: Path) -> None:
         Checkpoint(tmp_path / "file" / "trials.jsonl", "one")
 
 
-def test_every_trial_comes_with_its_cost_and_a_kept_one_with_that_of_then(tmp_path: Path) -> None:
-    first: list[Trial] = []
-    with Checkpoint(tmp_path / "trials.jsonl", "run", stays=True) as kept:
-        pool.run(slow_square, square_jobs(2), kept, Workers(2, trials=first), "trials", QUIET)
-    assert [t.outcome for t in first] == [0, 1] and all(t.cost and 0.5 <= t.cost.seconds < 5.0 for t in first)
-    second: list[Trial] = []
-    with Checkpoint(tmp_path / "trials.jsonl", "run", stays=True) as kept:
-        pool.run(slow_square, square_jobs(2), kept, Workers(2, trials=second), "trials", QUIET)
-    assert second == first
-    assert all(t.cost and t.cost.peak_bytes > 2**20 for t in second)
-
-
 def test_the_overhead_is_the_time_between_two_trials_of_a_worker() -> None:
     costs = [TrialCost("a", 0.0, 1.0, 0), TrialCost("b", 0.5, 9.0, 0), TrialCost("a", 1.25, 1.0, 0)]
     assert overhead_s(costs) == pytest.approx(0.25)
     assert overhead_s(costs[:2]) != overhead_s(costs[:2])
-
-
-def test_without_ray_the_sentence_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ExperimentError, check=coded("experiment.ray-missing")):
-        table(tmp_path / "trials.jsonl", slow_square, Workers(ray="auto"), square_jobs(1))
 
 
 class StandInRay:
@@ -229,70 +158,3 @@ def test_a_trial_that_fails_on_a_cluster_raises_its_own_error_and_the_others_are
 def test_a_worker_with_other_sources_refuses_its_trial() -> None:
     with pytest.raises(ExperimentError, match="theirs", check=coded("experiment.node-differs")):
         ray_workers._on_node(lambda: 1, lambda: "theirs", "ours")
-
-
-needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra cluster)")
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
-    """A cluster of two nodes on this computer, one processor each."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    # On a busy host a node needs longer than Ray waits by itself.
-    os.environ.update({"RAY_raylet_start_wait_time_s": "240", "RAY_agent_register_timeout_ms": "240000"})
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    import ray
-    from ray.cluster_utils import Cluster
-
-    node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
-    try:
-        made = Cluster(initialize_head=True, head_node_args={**node, **free_ports(), "include_dashboard": False})
-        made.add_node(**node, **free_ports())
-    except Exception as error:
-        if "timed out during startup" not in str(error):
-            raise
-        pytest.skip("Ray did not start: its agent gets 15 s by Ray's own limit, and this host is too busy for that")
-    yield made
-    ray.shutdown()
-    made.shutdown()
-
-
-def free_ports() -> dict[str, int]:
-    """Ports for a node: one that is given is not waited for."""
-    names = ("metrics_agent_port", "runtime_env_agent_port", "dashboard_agent_listen_port")
-    found = [socket.socket() for _ in names]
-    for each in found:
-        each.bind(("127.0.0.1", 0))
-    ports = {name: each.getsockname()[1] for name, each in zip(names, found, strict=True)}
-    for each in found:
-        each.close()
-    return ports
-
-
-def meet(folder: Path, name: str) -> str:
-    """Wait until two have begun; the node of this one."""
-    import ray
-
-    (folder / f"met-{name}").touch()
-    limit = time.monotonic() + 60.0
-    while len(list(folder.glob("met-*"))) < 2:
-        assert time.monotonic() < limit, "nobody else works"
-        time.sleep(0.05)
-    return str(ray.get_runtime_context().get_node_id())
-
-
-@needs_ray
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_a_cluster_of_two_nodes_gives_the_same_bytes_with_a_worker_killed_on_the_way(
-    tmp_path: Path, alone: bytes, cluster: Any
-) -> None:
-    trials: list[Trial] = []
-    there = table(
-        tmp_path / "a.jsonl", mortal(tmp_path / "marker"), Workers(ray=cluster.address, trials=trials), plant_jobs()
-    )
-    assert (tmp_path / "marker").exists() and there == alone
-    met = ray_workers.completed({name: partial(meet, tmp_path, name) for name in "ab"}, cluster.address, lambda: "ours")
-    assert len({node for _, node in met}) == 2, "each node works, at the same time"
-    with pytest.raises(ExperimentError, check=coded("experiment.node-differs")):
-        list(ray_workers.completed({"a": partial(slow_square, square_jobs(1)[0])}, cluster.address, process_id))

@@ -8,7 +8,9 @@ time.  A broken contract is saved as by `tests.fuzz`.  Exit codes: 0 the contrac
 from __future__ import annotations
 
 import argparse
+import atexit
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -45,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"there is no target {options.target}; choose one of {', '.join(TARGETS)}")
     target = TARGETS[options.target]
     known = Path(tempfile.mkdtemp(prefix="timberhand-fuzz-"))
+    atexit.register(shutil.rmtree, known, ignore_errors=True)
     for number, data in enumerate(target.seeds()):
         (known / f"seed{number}").write_bytes(data)
     run, since = target.start(), []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import shutil
 import struct
 import tempfile
 import zlib
@@ -188,8 +190,9 @@ def pictures() -> list[bytes]:
 
 
 def in_file(name: str) -> Path:
-    """A file in a folder of this process, in memory where the system has one."""
+    """A file in a folder of this process, in memory where the system has one; it ends with the process."""
     folder = Path(tempfile.mkdtemp(prefix="timberhand-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder / name
 
 

@@ -22,12 +22,10 @@ from recorder.manifest import describe
 from recorder.recorder import Recorder
 from timberhand.cli import app
 
-pytestmark = pytest.mark.computed
-
 SHIPPED = Path(machine.__file__).parent
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("profile", ["palms_471", "aoro_fc8"])
 def test_the_hidden_truth_is_recovered_in_four_minutes(profile: str) -> None:
@@ -48,7 +46,7 @@ def test_the_hidden_truth_is_recovered_in_four_minutes(profile: str) -> None:
         its_rotator_is_found(found["rotator"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_the_nominal_forwarder_turns_exactly_after_a_survey_of_its_rotator() -> None:
     found = calibrated(Job("one", "calibration", 1, {"profile": "aoro_fc8", "truth": "nominal"}))
@@ -91,7 +89,7 @@ def test_an_abort_leaves_the_valves_neutral_and_the_run_replays(tmp_path: Path) 
     assert replay(files_of(tmp_path / "log")).agrees
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_records_every_bus_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.calibration.crane.MAX_DURATION_S", 3.0)
     asked = ["calibrate", "--profile", "aoro_fc8", "--lockstep", "--out", str(tmp_path / "mine.toml")]

@@ -11,7 +11,7 @@ from rich.console import Console
 from hil.demo.lockstep import run_lockstep
 from host.exit_codes import ExitCode
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

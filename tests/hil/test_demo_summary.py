@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import re
+from dataclasses import replace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
-from hil.demo.summary import is_settled, outcome_sentence
+from hil.demo.summary import Summary, is_settled, outcome_sentence
 
 
 def verdict(**its: bool) -> dict[str, Any]:
@@ -29,3 +33,29 @@ def test_the_sentence_names_all_that_is_wrong() -> None:
     assert "lies in the bunk" in outcome_sentence(verdict())
     said = outcome_sentence(verdict(in_bunk=False, at_rest=False))
     assert "it is not in the bunk" in said and "it still moves" in said
+
+
+SUMMARY = Summary(
+    True, outcome_sentence(verdict()), "", 26.5, 1, 5300, 0, 62160, 0, "1 log (0) of 1 at once, all draws hold it", 1,
+    "runs/paced-seed3-1", paced=True, behind_s=10.5,
+)  # fmt: skip
+
+
+def shown(summary: Summary, terminal: bool) -> list[str]:
+    out = io.StringIO()
+    summary.show(Console(file=out, force_terminal=terminal, width=80, no_color=True, highlight=False))
+    return re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).splitlines()
+
+
+def test_a_terminal_gets_lines_of_its_width_broken_between_words_and_a_pipe_gets_whole_ones() -> None:
+    narrow, whole = shown(SUMMARY, True), shown(SUMMARY, False)
+    assert max(map(len, narrow)) <= 80 < max(map(len, whole)) and len(narrow) > len(whole)
+    assert " ".join(" ".join(narrow).split()) == " ".join(" ".join(whole).split())
+    assert all(line.startswith("  ") for line in narrow[1:])
+
+
+def test_a_paced_run_says_so_and_how_much_it_lost() -> None:
+    live = shown(replace(SUMMARY, paced=False), False)
+    (paced,) = set(shown(SUMMARY, False)) - set(live)
+    (steady,) = set(shown(replace(SUMMARY, behind_s=0.01), False)) - set(live)
+    assert "10.5" in paced and len(steady) < len(paced)

@@ -36,8 +36,7 @@ class FrameByFrame:
         return sent
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_mission_with_a_step_of_the_guard_for_every_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Driving, swing arms and crane: the keys and the motions of a tick are in several frames."""

@@ -13,7 +13,7 @@ from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
 from sim.plant import Plant
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 SETTINGS = load_settings("palms_471")
 VALVE_NS = 150_000_000
 """Dead time and lag of a valve that closes."""

@@ -77,8 +77,7 @@ def test_a_file_without_motions_is_refused(tmp_path: Path, name: str, text: str 
         motions_in(SHOWN, "palms_471")
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_a_recording_of_hands_on_the_levers_is_learned_from(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run", PROFILE, describe(PROFILE, ("crane0", "mach0"), 2))
     frames = demonstrate("aoro_fc8", seed=2, targets=1, recorder=recorder)

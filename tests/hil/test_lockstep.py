@@ -15,7 +15,7 @@ from hil.replay.recording import files_of
 from hil.replay.replay import replay
 from host.exit_codes import ExitCode
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 
 
 def job(seed: int, directory: Path, limit_s: float = 120.0, machine: str = "palms_471") -> Summary:

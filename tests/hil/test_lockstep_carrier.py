@@ -25,7 +25,7 @@ from recorder.manifest import describe
 from recorder.recorder import Recorder
 from sim.plant import Plant
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 MS = 1_000_000
 SETTINGS = load_settings("aoro_fc8")
 PROFILE = SETTINGS.profile

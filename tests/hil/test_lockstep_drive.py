@@ -30,7 +30,7 @@ from sim.geometry.geodesy import LocalFrame
 from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 MS = 1_000_000
 SETTINGS = load_settings("aoro_fc8")
 PROFILE = SETTINGS.profile

@@ -29,8 +29,7 @@ def test_a_machine_without_a_carrier_drives_no_mission(tmp_path: Path) -> None:
     assert getattr(result.exception, "code", "") == "mission.stationary-machine"
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("manager", ["own", "paper-b"])
 def test_a_log_beside_the_route_is_brought_to_its_end(tmp_path: Path, manager: str) -> None:

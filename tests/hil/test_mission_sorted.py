@@ -33,8 +33,7 @@ class Silent:
         """Nothing is sent."""
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_each_assortment_reaches_its_landing_although_the_planner_restarts(tmp_path: Path) -> None:
     known = tuple(KnownLog(point(x, y), "", 90.0, 2.0, 0.25, "", kind) for kind, x, y in LIE)

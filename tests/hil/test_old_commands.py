@@ -25,7 +25,7 @@ from machine.status.modes import Mode
 from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 
 MS = 1_000_000
 S = 1_000 * MS

@@ -14,7 +14,7 @@ from hil.replay.replay import replay
 from sim.individual import beside
 from tests.machine.own_machine import NAME, made
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 
 
 def test_the_log_lands_in_the_bunk_and_the_recording_replays(tmp_path: Path) -> None:

@@ -23,8 +23,6 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from sim.plc.program import Inputs
 
-pytestmark = pytest.mark.computed
-
 S = 1_000_000_000
 MS = 1_000_000
 RoleName = Literal["references", "valves"]
@@ -77,7 +75,7 @@ class Run:
         return (self.system.now_ns - began_ns) / MS
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("role", "transport"), [("references", "modbus"), ("valves", "udp")])
 def test_a_log_lands_in_the_bunk(role: RoleName, transport: Transport, tmp_path: Path) -> None:
     run = Run(role, transport, tmp_path)
@@ -94,7 +92,7 @@ def test_a_log_lands_in_the_bunk(role: RoleName, transport: Transport, tmp_path:
     assert gate.accepted >= shake.sent - 2, "every command was a new one and was taken"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 5])
 def test_a_machine_that_is_slowed_again_and_again_works_on(seed: int, tmp_path: Path) -> None:
     """The PLC's loop answers a change of speed a quarter of a second late: that is no joint gone wrong."""
@@ -109,7 +107,7 @@ def test_a_machine_that_is_slowed_again_and_again_works_on(seed: int, tmp_path: 
     assert run.plant.bridge.gate.refused == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("role", "transport"), [("references", "udp"), ("valves", "modbus")])
 def test_a_cut_cable_stops_the_machine_within_100_ms_and_it_stays_stopped(
     role: RoleName, transport: Transport, tmp_path: Path
@@ -140,7 +138,7 @@ def test_a_cut_cable_stops_the_machine_within_100_ms_and_it_stays_stopped(
         run.system.advance()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_emergency_stop_behind_the_plc_stops_and_latches(tmp_path: Path) -> None:
     run = Run("references", "modbus", tmp_path)
     run.until(Mode.ACTIVE)
@@ -159,7 +157,7 @@ def test_the_emergency_stop_behind_the_plc_stops_and_latches(tmp_path: Path) -> 
     assert not run.moving()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fault_of_the_plc_stops_the_controller(tmp_path: Path) -> None:
     """The PLC holds and reports its fault; the controller stops with PLC_FAULT."""
     run = Run("references", "modbus", tmp_path)
@@ -203,7 +201,7 @@ class Damage:
         bridge.step = damaged  # type: ignore[method-assign]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["silent", "repeated", "altered"])
 def test_controller_and_guard_both_catch_a_state_of_the_emergency_stop_that_is_not_the_safety_modules_own(
     kind: str, tmp_path: Path
@@ -220,7 +218,7 @@ def test_controller_and_guard_both_catch_a_state_of_the_emergency_stop_that_is_n
     assert not run.moving()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("role", "transport"), [("references", "udp"), ("valves", "modbus")])
 def test_encoders_that_the_plc_only_repeats_are_lost(role: RoleName, transport: Transport, tmp_path: Path) -> None:
     """Its cycle and its heartbeat run on; the samples do not."""

@@ -12,7 +12,7 @@ from hil.wire.faults import Kind
 from machine.status.modes import Mode
 from tests.hil.promised_machine import NEEDED, PromiseBroken, PromisedMachine
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 MESSAGES = st.sampled_from(sorted(NEEDED))
 
 

@@ -16,7 +16,7 @@ from hil.wire.faults import Fault, Kind
 from host.exit_codes import ExitCode
 from timberhand.cli import app
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 LOST_NS = (6_000_000_000, 6_400_000_000)
 
 

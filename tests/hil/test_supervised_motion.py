@@ -16,7 +16,7 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.hil.sweep import LEASE_NS, Hold, Quiet, Sweep, Watched, watched
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 MS = 1_000_000
 NAMES = ("palms_471", "aoro_fc8")
 

@@ -12,7 +12,7 @@ from machine.status.modes import Mode
 from sim.plant import Plant
 from tests.hil.swinging_grapple import SHIPPED, sensing_profile, stop_at
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 
 GOAL_M = (4.27, 1.86, 1.0)
 PERIOD_S = 1.8

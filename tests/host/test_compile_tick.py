@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -42,18 +41,3 @@ def test_without_mypyc_the_command_names_the_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(CommandFailed, check=coded("compile.no-mypyc")):
         build.check_tools()
-
-
-def test_a_live_run_waits_for_the_compiler_of_the_set_up_and_says_so(tmp_path: Path) -> None:
-    folder = build.compiled.builds_folder(tmp_path)
-    folder.mkdir(parents=True)
-    said: list[str] = []
-    assert not build.await_builder(said.append, tmp_path) and not said
-    lock = folder / build.BACKGROUND_LOCK
-    with subprocess.Popen(["flock", lock, "sh", "-c", "echo; read line"], stdin=-1, stdout=-1) as builder:
-        assert builder.stdin is not None and builder.stdout is not None
-        builder.stdout.readline()
-        assert build.await_builder(said.append, tmp_path, limit_s=0.5)
-        assert len(said) == 2 and "waiting" in said[0] and "going on" in said[1]
-        builder.stdin.close()
-    assert not build.await_builder(said.append, tmp_path)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,8 +18,6 @@ from host.doctor.show import conclusion, show
 from host.doctor.timing import evaluate
 from machine.loading.profile_file import ProfileError
 
-ROOT = Path(__file__).parents[2]
-TUNE = ROOT / "deploy/tune.sh"
 GOOD = {
     "proc/version": "Linux version 6.1.0-rt7 (gcc) #1 SMP PREEMPT_RT Debian",
     "proc/sys/kernel/osrelease": "6.1.0-rt7",
@@ -231,11 +226,6 @@ def test_the_greatest_gain_comes_first(tree: Tree) -> None:
     assert names[-1] == "CAN crane0"
 
 
-# ------------------------------------------------------------------------------- installation
-def test_this_installation_has_no_fault() -> None:
-    assert [f for f in installation.examine() if f.severity is Severity.FAULT] == []
-
-
 def test_a_profile_that_does_not_load_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(name: str) -> None:
         raise ProfileError("profile.wrong-structure", f"{name}: rate_hz: missing")
@@ -299,111 +289,3 @@ def test_the_terminal_shows_what_to_change_before_what_is_fine(capsys: pytest.Ca
 )
 def test_the_last_line_counts_the_findings_of_the_worst_severity(severities: list[Severity], words: str) -> None:
     assert words in conclusion([Finding("x", severity, "y") for severity in severities])
-
-
-@pytest.mark.slow
-def test_the_command_answers_in_json() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "timberhand", "doctor", "--rt", "--json"], cwd=ROOT, capture_output=True, text=True
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert set(told) == {"installation", "timing"}
-    assert {f["severity"] for group in told.values() for f in group} <= {"fine", "advice", "change"}
-    assert set(told["timing"][0]) == {"what", "severity", "sentence", "gain", "commands"}
-
-
-# ------------------------------------------------------------------------------- tune.sh
-@pytest.fixture
-def computer(tmp_path: Path) -> Path:
-    """A made-up tree that can be tuned."""
-    files = {
-        **{f"sys/devices/system/cpu/cpu{n}/cpufreq/scaling_governor": "powersave" for n in range(4)},
-        "sys/devices/system/cpu/online": "0-3",
-        "sys/devices/system/cpu/isolated": "",
-        "sys/devices/system/cpu/cpu3/cpuidle/state0/latency": "2",
-        "sys/devices/system/cpu/cpu3/cpuidle/state0/disable": "0",
-        "sys/devices/system/cpu/cpu3/cpuidle/state1/latency": "890",
-        "sys/devices/system/cpu/cpu3/cpuidle/state1/disable": "0",
-        "sys/kernel/mm/transparent_hugepage/enabled": "[always] madvise never",
-        "sys/devices/virtual/workqueue/cpumask": "0f",
-        "proc/sys/kernel/sched_rt_runtime_us": "500000",
-        "proc/irq/130/smp_affinity_list": "0-3",
-        "proc/irq/131/smp_affinity_list": "1",
-        "run/.keep": "",
-    }
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text + "\n")
-    return tmp_path
-
-
-def tune(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["sh", str(TUNE), "--root", str(root), *words], capture_output=True, text=True)
-
-
-def contents(root: Path) -> dict[str, str]:
-    return {str(p.relative_to(root)): p.read_text() for p in root.rglob("*") if p.is_file()}
-
-
-@pytest.mark.slow
-def test_tuning_is_shown_applied_once_and_undone(computer: Path) -> None:
-    before = contents(computer)
-    shown = tune(computer, "--cpu", "3")
-    assert shown.returncode == 0, shown.stderr
-    assert contents(computer) == before
-    assert "cpu3/cpufreq/scaling_governor: powersave -> performance" in shown.stdout
-    assert "isolcpus=managed_irq,domain,3 nohz_full=3 rcu_nocbs=3 irqaffinity=0-2" in shown.stdout
-    assert "not PREEMPT_RT" in shown.stderr
-
-    assert tune(computer, "--cpu", "3", "--apply").returncode == 0
-    after = contents(computer)
-    changed = {name: text.strip() for name, text in after.items() if before.get(name) != text}
-    del changed["run/timberhand-tune"]
-    assert changed == {
-        "sys/devices/system/cpu/cpu3/cpufreq/scaling_governor": "performance",
-        "sys/devices/system/cpu/cpu3/cpuidle/state1/disable": "1",
-        "sys/kernel/mm/transparent_hugepage/enabled": "madvise",
-        "sys/devices/virtual/workqueue/cpumask": "07",
-        "proc/sys/kernel/sched_rt_runtime_us": "950000",
-        "proc/irq/130/smp_affinity_list": "0-2",
-        "proc/irq/131/smp_affinity_list": "0-2",
-    }
-    again = tune(computer, "--cpu", "3", "--apply")
-    assert "is now" not in again.stderr
-    assert contents(computer) == after
-
-    (computer / "proc/irq/130/smp_affinity_list").write_text("1\n")  # somebody moves it: what was first is kept
-    assert tune(computer, "--cpu", "3", "--apply").returncode == 0
-    assert tune(computer, "--undo").returncode == 0
-    undone = contents(computer)
-    name = "sys/kernel/mm/transparent_hugepage/enabled"  # the kernel takes the word alone and shows it in brackets
-    assert (undone.pop(name), before.pop(name)) == ("always\n", "[always] madvise never\n")
-    assert undone == before
-    assert "nothing was changed" in tune(computer, "--undo").stderr
-
-
-@pytest.mark.slow
-def test_without_a_processor_only_global_settings_change(computer: Path) -> None:
-    assert tune(computer, "--apply").returncode == 0
-    governors = [p.read_text() for p in sorted(computer.glob("sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"))]
-    assert governors == ["performance\n"] * 4
-    assert (computer / "proc/irq/130/smp_affinity_list").read_text() == "0-3\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [(["--cpu", "9"], "there is no processor 9"), (["--cpu", "x"], "no number"), (["--fast"], "no option --fast")],
-)
-def test_what_cannot_be_tuned_is_refused(computer: Path, words: list[str], sentence: str) -> None:
-    done = tune(computer, *words)
-    assert (done.returncode, sentence in done.stderr) == (2, True)
-
-
-@pytest.mark.slow
-def test_the_scripts_are_clean() -> None:
-    if not any(Path(folder, "shellcheck").exists() for folder in os.get_exec_path()):
-        pytest.skip("shellcheck is missing (apt-get install shellcheck)")
-    scripts = [TUNE, ROOT / "deploy/lab_kernel/build.sh"]
-    done = subprocess.run(["shellcheck", *scripts], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout

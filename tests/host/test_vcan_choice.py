@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from host.vcan_lab import guest, lab_kernel, shim
+from host.vcan_lab import guest, shim
 from host.vcan_lab.choose import HostFacts, choose
 from host.vcan_lab.spec import LabError
 from tests.codes import coded
@@ -62,34 +61,10 @@ def test_a_requested_kernel_is_the_only_method() -> None:
         choose(BARE, "lab")
 
 
-def test_only_a_kernel_of_the_present_configuration_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = tmp_path / "lab.config"
-    config.write_text("CONFIG_CAN=y\n")
-    monkeypatch.setattr(lab_kernel, "CONFIG", config)
-    digest = subprocess.run(["sha256sum", config], capture_output=True, text=True, check=True).stdout[:12]
-    assert lab_kernel.find(tmp_path) is None
-    for number, name in enumerate([f"linux-6.12.2-{digest}", f"linux-6.12.9-{digest}", "linux-6.12.10-other"]):
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (number, number))
-    assert lab_kernel.find(tmp_path) == str(tmp_path / f"linux-6.12.9-{digest}")
-    config.unlink()
-    assert lab_kernel.find(tmp_path) is None
-
-
 def test_only_a_cpu_with_amx_needs_the_shim() -> None:
     assert shim.needed("model\t: x\nflags\t\t: fpu amx_tile avx\nbugs\t: y\n")
     assert not shim.needed("flags\t\t: fpu avx512f\nbugs\t: amx_tile\n")
     assert not shim.needed("")
-
-
-def test_the_shim_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not any(Path(folder, "cc").exists() for folder in os.get_exec_path()):
-        pytest.skip("no C compiler")
-    built = shim.library(tmp_path / "cache")
-    assert built.read_bytes().startswith(b"\x7fELF")
-    monkeypatch.setenv("PATH", "/nowhere")
-    assert shim.library(tmp_path / "cache") == built
-    assert os.listdir(built.parent) == [built.name]
 
 
 def test_without_a_compiler_the_shim_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from host.vcan_lab.spec import LabError, Request, kernel_arguments, link_fault, order
 from tests.codes import coded
-from tests.host.lab_runs import REQUEST
+from tests.host.vcan_request import REQUEST
 
 
 def test_the_order_contains_the_caller_and_the_lab() -> None:

@@ -35,7 +35,7 @@ from hypothesis import Phase, settings
 from tests.mutation.mutators import Module, Mutant
 from tests.safety_scope import Scope
 
-PYTEST = ["-q", "-x", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "-o", "timeout=0", "-m", "not slow"]
+PYTEST = ["-q", "-x", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "-o", "timeout=0", "-m", "not long"]
 CPU_FACTOR, CPU_EXTRA_S = 10.0, 20.0
 LONG_S = 15.0
 """A test that needs more processor time, with its lines counted, is left out: what only it finds counts as survived."""

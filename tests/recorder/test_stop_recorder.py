@@ -6,9 +6,6 @@ import errno
 import itertools
 import os
 import random
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -217,33 +214,6 @@ def test_a_file_that_is_still_written_is_left_alone_and_can_be_read(tmp_path: Pa
     assert stop_of(part).code == "ENCODER_LOST" and times_s(part)[-1] > 0.3
     recorder.close()
     assert not parts_in(tmp_path / "stops") and len(files_in(tmp_path / "stops")) == 1
-
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from tests.recorder.stopped_run import RecordedBench, recorder_in
-recorder = recorder_in(Path(sys.argv[1]), stops=Path(sys.argv[2]))
-bench = RecordedBench([recorder])
-bench.active(ticks=200)
-bench.lose("EncLift", int(sys.argv[3]))
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_a_killed_recorder_leaves_the_stop_and_the_next_one_repairs_it(tmp_path: Path) -> None:
-    stops = tmp_path / "stops"
-    run_with_a_stop(tmp_path / "first", after=20, stops=stops)
-    (earlier,) = files_in(stops)
-    before = earlier.read_bytes()
-    command = [sys.executable, "-c", KILLED, str(tmp_path / "second"), str(stops), "120"]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], check=False)
-    assert done.returncode == -signal.SIGKILL and len(parts_in(stops)) == 1
-    run_with_a_stop(tmp_path / "third", after=20, stops=stops)
-    assert [stop_of(path).number for path in files_in(stops)] == [1, 2, 3] and not parts_in(stops)
-    assert earlier.read_bytes() == before
-    killed = files_in(stops)[1]
-    assert times_s(killed)[-1] > 0.3, "what was committed after the stop is there too"
 
 
 def test_a_full_disk_costs_the_file_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

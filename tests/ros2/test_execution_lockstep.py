@@ -22,7 +22,7 @@ from ros2.interfaces.control import ErrorCode, Goal
 from sim.plant import Plant
 from tests.ros2.goals import goal
 
-pytestmark = [pytest.mark.slow, pytest.mark.computed]
+pytestmark = pytest.mark.long
 SETTINGS = load_settings("palms_471")
 GONE = Outcome(Status.ABORTED, Reason.LEASE_LOST, "gone")
 

@@ -6,8 +6,6 @@ import pytest
 
 from sim.bullet.client import new_client
 
-pytestmark = pytest.mark.computed
-
 
 def test_a_closed_client_does_not_reach_a_later_one():
     first = new_client()

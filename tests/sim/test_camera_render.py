@@ -1,10 +1,6 @@
 """The analytic renderer against closed forms, against pybullet's renderer, and against itself."""
 
-import hashlib
 import math
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -216,19 +212,3 @@ def test_ground_cover_is_fixed_and_hides_logs() -> None:
     low = look_at((-2.5, -3.0, 0.4), (0.0, 0.0, 0.1), LENS)
     bare, wild = render(b, low), render(scene, low)
     assert np.count_nonzero((bare.mask == 1) & (wild.mask == COVER)) > 20
-
-
-DIGEST = """
-import hashlib
-from tests.sim.camera_scenes import ABOVE, site
-from sim.camera.render import ImagingConditions, render
-p = render(site(10), ABOVE, ImagingConditions.random(3), 7)
-print(hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).hexdigest())
-"""
-
-
-def test_two_processes_render_the_same_bytes() -> None:
-    root = Path(__file__).parents[2]
-    run = subprocess.run([sys.executable, "-c", DIGEST], cwd=root, capture_output=True, text=True, check=True)
-    p = render(site(10), ABOVE, ImagingConditions.random(3), 7)
-    assert run.stdout.strip() == hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).hexdigest()

@@ -3,7 +3,6 @@
 import contextlib
 import socket
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -47,30 +46,6 @@ def answer(client: socket.socket) -> RgbdMessage:
         assert chunk
         data += chunk
     return decode(data)
-
-
-def test_a_picture_is_rendered_on_request_only() -> None:
-    rig = Rig()
-    server = CameraServer(rig, 0)
-    server.serve(1)
-    assert rig.drawn == []
-    with asked(server, "front") as client:
-        client.settimeout(0.01)
-        got = b""
-        for now_ns in range(2, 2000):
-            server.serve(now_ns)
-            try:
-                got = client.recv(HEADER_BYTES)
-                break
-            except TimeoutError:
-                time.sleep(0.001)
-        client.settimeout(10.0)
-        got += client.recv(4096)
-    frame = decode(got)
-    assert len(rig.drawn) == 1 and rig.drawn[0] == ("FRONT", frame.stamp_ns)
-    assert (frame.camera, frame.width_px, frame.fx_px) == ("front", 4, 3.0)
-    assert np.frombuffer(frame.depth_mm, "<u2").tolist() == [1000, 0, 2000, 65535, 300, 5000, 6000, 7000]
-    server.close()
 
 
 def test_an_unknown_camera_is_refused() -> None:

@@ -14,8 +14,6 @@ from sim.mechanics.carrier import PARKED, Drive, carrier_links
 from sim.truth.load import load_truth
 from tests.sim.carrier_rig import GRAVITY, PROFILE, STEP_S, Rig, carrier_truth
 
-pytestmark = pytest.mark.computed
-
 C = PROFILE.carrier
 CRUISE = Drive(C.cruise_speed_m_s)
 
@@ -144,7 +142,7 @@ def test_coasting_only_loses_speed_to_rolling_resistance(rig):
     assert (speeds[0] - speeds[2]) / (400 * STEP_S) == pytest.approx(wanted, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parked_machine_stays(rig):
     r = rig()
     r.run(6.0)
@@ -174,7 +172,7 @@ def _slew(r: Rig, seconds: float, since: float) -> None:
         r.step()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parked_machine_creeps_less_than_a_twentieth_of_a_millimetre_a_second_while_the_crane_slews(rig):
     r, cycle = rig(), 2 * math.pi / 0.8
     r.run(2.0)
@@ -235,7 +233,7 @@ def test_swing_arms_lift_and_level_the_frame(rig):
     assert tilted.carrier.tip_margin_m > 0.95
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("floating", [False, True])
 def test_thirty_seconds_on_rough_ground_with_a_weaving_course(rig, floating):
     r = rig(Terrain("rough", 3))

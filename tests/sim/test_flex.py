@@ -131,8 +131,7 @@ def test_the_empty_grapple_swings_with_the_period_and_damping_of_its_mass():
     w.close()
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_held_log_lengthens_the_pendulum():
     scene = random_scene(PROFILE, NOMINAL.wood, 403, 1)
     w = World(PROFILE, NOMINAL, 403, scene)

@@ -29,8 +29,7 @@ def attempt(seed: int, across_m: float = 0.0, turned_rad: float = 0.0):
     return w, evaluator, driver
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_log_is_grasped_carried_and_placed_in_the_bunk():
     w, evaluator, driver = attempt(403)
     held = evaluator.evaluate()
@@ -45,8 +44,7 @@ def test_a_log_is_grasped_carried_and_placed_in_the_bunk():
     w.close()
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "least_m", "most_m"), [(423, 0.0, 0.13), (2, 0.29, 0.31)])
 def test_thin_and_thick_logs_are_grasped_held_and_released(seed, least_m, most_m):
     w, evaluator, driver = attempt(seed)

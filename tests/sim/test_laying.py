@@ -107,8 +107,7 @@ def test_a_later_lap_lies_on_the_slope_and_not_in_the_air() -> None:
     plant.close()
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 @pytest.mark.parametrize("logs", [0, 24])
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("kind", KINDS)

@@ -19,8 +19,6 @@ from sim.wood.log_shape import LogSpec, mass_of
 from sim.wood.logs import LogBodies
 from tests.codes import coded
 
-pytestmark = pytest.mark.computed
-
 MACHINES = ("palms_471", "aoro_fc8")
 PROFILES = {name: load_profile(name) for name in MACHINES}
 TRUTHS = {name: load_truth("nominal", 0, name) for name in MACHINES}
@@ -101,7 +99,7 @@ def test_a_pile_is_stable_without_sleep(stands):
     assert stand.fastest(3.0) < 5e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "logs"), [("separate", 3), ("pile", 6), ("bunk", 20)])
 def test_logs_rest_for_a_minute(stands, kind, logs):
     stand = Stand(of(kind, 1, logs))
@@ -184,7 +182,7 @@ def test_sleeping_ground_carries_logs_like_awake_ground(stands):
     assert ways[0] == ways[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("machine", MACHINES)
 def test_a_full_bunk_holds_its_logs(stands, machine):
     stand = Stand(of("bunk", 1, 20, machine), machine)
@@ -198,7 +196,7 @@ def test_a_full_bunk_holds_its_logs(stands, machine):
         assert b.floor_z_m + log.diameter_m / 2 - 0.02 < z < b.floor_z_m + b.stake_height_m
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["rough", "slope"])
 def test_logs_lie_on_uneven_ground(stands, kind):
     stand = Stand(of("row", 0, 3, "aoro_fc8"), "aoro_fc8", kind)

@@ -293,8 +293,7 @@ def test_the_answers_for_the_page_fit_into_a_datagram(terrain):
     bench.plant.close()
 
 
-@pytest.mark.computed
-@pytest.mark.slow
+@pytest.mark.long
 def test_equal_seeds_give_equal_bytes():
     def digest(seed):
         b = Bench(seed)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
 from random import Random
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,6 +18,7 @@ from sim.faults.spool_faults import SpoolFaults
 from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
 from sim.plant_faults import BEGINNERS, PlantFault, begin, database, message
+from sim.process import live_plant
 from sim.process.live_plant import LivePlant
 from tests.codes import coded
 
@@ -166,15 +167,17 @@ def test_every_fault_begins_and_ends_on_a_machine_that_drives() -> None:
     assert math.isfinite(plant.encoders["lift"].measure(1_000_000_000))
 
 
-def test_a_live_plant_begins_a_fault_on_request_and_ends_it_in_time() -> None:
+def test_a_live_plant_begins_a_fault_on_request_and_ends_it_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = Plant(PROFILE, scene=())
+    now_ns = 5_000 * MS
+    monkeypatch.setattr(live_plant, "time", SimpleNamespace(monotonic_ns=lambda: now_ns))
     try:
         live = LivePlant(plant, {}, None)
         assert live._reply({"op": "fault", "name": "encoder-stuck", "part": "lift", "for_s": "0.5"}) == {"ok": True}
         assert plant.encoders["lift"].fault is not None
-        live._on_step(time.monotonic_ns())
+        live._on_step(now_ns + 499 * MS)
         assert plant.encoders["lift"].fault is not None, "not before its time"
-        live._on_step(time.monotonic_ns() + 600 * MS)
+        live._on_step(now_ns + 501 * MS)
         assert plant.encoders["lift"].fault is None
         with pytest.raises(PlantError, check=coded("fault.not-a-number")):
             live._reply({"op": "fault", "name": "encoder-jump", "part": "lift", "size": "much"})

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import re
 import statistics
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -82,12 +80,6 @@ def test_the_same_seed_makes_the_same_individual(machine, seed):
     one = load_truth("sampled", seed, machine)
     assert one == load_truth("sampled", seed, machine) != load_truth("sampled", seed + 1, machine)
     assert load_truth("nominal", seed, machine) == load_truth("nominal", 0, machine) != one
-
-
-def test_another_process_draws_the_same_individual():
-    code = "from sim.truth.load import FILES, load_truth; print(load_truth('sampled', 7, 'aoro_fc8'))"
-    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert other.stdout.strip() == str(load_truth("sampled", 7, "aoro_fc8")), other.stderr
 
 
 def test_individuals_differ_and_average_near_the_nominal_machine():

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 from timberhand.deprecated import RENAMED, current_spelling
@@ -36,10 +33,3 @@ def test_an_old_spelling_becomes_todays(old: list[str], new: list[str]) -> None:
 )
 def test_todays_spelling_and_words_of_other_programs_stay(arguments: list[str]) -> None:
     assert current_spelling(arguments) == (arguments, [])
-
-
-def test_the_command_notes_the_new_spelling_on_stderr() -> None:
-    command = [sys.executable, "-m", "timberhand", "log", "decode", "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "recording decode" in done.stdout
-    assert done.stderr.splitlines() == ["timberhand: `log` is now `recording`"]

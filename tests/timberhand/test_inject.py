@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import select
-import signal
 import socket
-import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -15,14 +11,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from can_dbc.bus.factory import open_bus
-from can_dbc.frame import Frame
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import make
 from hil.faults.table import FAULTS, FaultError
-from hil.faults.wire_faults import BABBLE_KEY
 from hil.harness.live import ADDRESSES
-from hil.wire.launch import wire_daemon
 from host.exit_codes import CommandFailed
 from machine.loading.profile_file import load_profile
 from tests.codes import coded
@@ -73,15 +65,6 @@ def test_a_real_bus_is_left_alone() -> None:
             inject(order, target())
 
 
-def test_a_process_is_stopped_for_a_while_and_killed() -> None:
-    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
-        there = target(pids={"autonomy": process.pid})
-        assert "stopped for" in inject(make("process-stuck", part="planner", length_s=0.05), there)
-        assert process.poll() is None
-        inject(make("process-off", part="planner"), there)
-        assert process.wait(10) == -signal.SIGKILL
-
-
 def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plant:
         plant.bind(("127.0.0.1", 0))
@@ -106,23 +89,3 @@ def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None
     assert asked[0] == {
         "op": "fault", "name": "encoder-stuck", "part": "lift", "size": "0.0", "seed": "0", "for_s": "0.5",
     }  # fmt: skip
-
-
-def test_forged_datagrams_reach_the_controllers_port() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
-        controller.bind(("127.0.0.1", 0))
-        there = target(ports={"control": controller.getsockname()[1]})
-        for fault in ("planner-garbage", "planner-arms", "planner-replay"):
-            assert "sent" in inject(make(fault, length_s=0.03), there)
-            assert controller.recv(2048)
-
-
-def test_the_wire_damages_frames_of_a_live_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
-    there = target(buses={"crane0": "wire:crane0"})
-    with wire_daemon({"crane0": 1_000_000}), open_bus("wire:crane0") as listener:
-        assert "begun" in inject(make("bus-babble", length_s=0.02), there)
-        frames: list[Frame] = []
-        assert select.select([listener], [], [], 10.0)[0]
-        listener.drain(frames)
-    assert {frame.key for frame in frames} == {BABBLE_KEY}

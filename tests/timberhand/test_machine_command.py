@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -163,14 +160,3 @@ def test_the_shipped_machines_pass(name: str) -> None:
     told = RUNNER.invoke(app, ["machine", "check", name, "--json"])
     assert told.exit_code == ExitCode.OK
     assert all(finding["note"] for finding in json.loads(told.stdout)["findings"])
-
-
-def test_an_envelope_without_a_seal_stops_a_run_with_one_sentence(profile: Path, tmp_path: Path) -> None:
-    envelope = profile.with_name(f"{NAME}.envelope.toml")
-    envelope.write_text(re.sub(r"# sha256: .*", "", envelope.read_text()))
-    done = subprocess.run(
-        [sys.executable, "-m", "timberhand", "demo", "--lockstep", "--profile", profile, "--out", tmp_path / "run"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == ExitCode.CONFIGURATION, done.stderr
-    assert "Traceback" not in done.stderr and "controller.guard.seal" in done.stderr and "[guard." in done.stderr

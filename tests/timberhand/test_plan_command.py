@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -95,10 +93,3 @@ def test_show_draws_everything(tmp_path: Path) -> None:
 
 def test_show_of_logs_alone(tmp_path: Path) -> None:
     assert run("show", EXAMPLES / "harvest.hpr", "--png", tmp_path / "logs.png").exit_code == 0
-
-
-def test_help_loads_nothing_heavy() -> None:
-    heavy = ("numpy", "pymap3d", "matplotlib", "msgspec")
-    code = f"import sys, timberhand.cli; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

@@ -2,24 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from experiments.common.standing import has_history
 from runtime.errors import CodedError
 from timberhand.reference import errors_page
-from timberhand.reference.__main__ import REPOSITORY, stale
-
-
-def test_no_generated_page_is_stale() -> None:
-    assert [path.name for path in stale()] == []
-
-
-def test_a_changed_page_is_noticed(tmp_path: Path) -> None:
-    (tmp_path / "README.md").write_text((REPOSITORY / "README.md").read_text())
-    pages = {"cli", "errors", "faults", "frames", "transitions", "timberhand"} | (
-        {"README"} if has_history() else set()
-    )
-    assert {path.stem for path in stale(tmp_path)} == pages
+from timberhand.reference.__main__ import REPOSITORY
 
 
 def test_a_code_belongs_to_one_area_of_the_program() -> None:

@@ -64,6 +64,7 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
     assert parameter_count(box_net()) < 500_000
 
 
+@pytest.mark.long
 def test_a_few_steps_reduce_the_loss(monkeypatch):
     monkeypatch.setattr(boxes, "CROPS", ((64, 1.0),))
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 60, 14), size=160) for i in range(4)]

@@ -54,8 +54,7 @@ def poses(w: Cylinders) -> list[LogPose]:
     return found
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_virtual_camera_sees_what_the_simulations_renderer_sees() -> None:
     w = world(1)
     camera = Camera(np.array([0.0, 0.0, GROUND + 3.1]))
@@ -137,8 +136,7 @@ def test_frames_become_examples_of_equation_5() -> None:
     assert float(loss) == pytest.approx(explicit, rel=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
     from training.grasp import physical_weights

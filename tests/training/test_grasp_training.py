@@ -229,8 +229,7 @@ def bar(number: int, theta: float) -> Sample:
     return Sample(number, depth, (Rectangle(320.0, 240.0, theta, 40.0, 100.0),), Path())
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_the_network_learns_a_few_bars() -> None:
     torch.set_num_threads(1)
     samples = [bar(i, a) for i, a in enumerate((0.0, 0.8, -0.8, 1.5))]

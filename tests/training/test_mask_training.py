@@ -2,7 +2,6 @@
 
 import math
 import shutil
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from tests.codes import coded
 from timberhand.commands.train import app
 from training.common.dataset_error import DatasetError
 from training.pictures import piles
-from training.pictures.samples import read, sample, write
+from training.pictures.samples import sample, write
 from training.pictures.traced import sets
 
 torch = pytest.importorskip("torch")
@@ -67,6 +66,7 @@ def test_without_compiler_and_blender_the_error_says_what_to_install(monkeypatch
             sets.renderer(asked)
 
 
+@pytest.mark.long
 def test_the_command_writes_weights_card_and_checkpoint(folder):
     out = folder / "made.safetensors"
     few = ["--device", "cpu", "--steps", "1", "--batch", "2", "--side", str(SIDE), "--out", str(out)]
@@ -101,7 +101,7 @@ def test_an_interrupted_training_continues_to_the_same_weights(folder):
     assert all(np.array_equal(whole[name], again[name]) for name in whole)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("g++") is None, reason="the tracer needs g++")
 def test_the_sets_are_drawn_and_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -129,36 +129,3 @@ def test_the_sets_are_drawn_and_kept(tmp_path, monkeypatch):
     assert sorted(before) == ["meshed00000.npz", "traced00000.npz"]
     assert CliRunner().invoke(app, few).exit_code == 0
     assert before == {file.name: file.stat().st_mtime_ns for file in out.glob("*.npz")}
-
-
-STAND_IN = """#!{python}
-import json, sys
-from pathlib import Path
-import numpy as np
-work = Path(sys.argv[3])
-(work / "pictures").mkdir()
-for file in (work / "scenes").glob("*.json"):
-    for k, view in enumerate(json.loads(file.read_text())["views"]):
-        shape = view["height_px"], view["width_px"]
-        np.savez(work / "pictures" / f"{{file.stem}}-{{k}}.npz", light=np.ones((*shape, 3), np.float16),
-                 depth_m=np.full(shape, 2.0, np.float32), ids=np.zeros(shape, np.uint8))
-"""
-
-
-def test_what_blender_drew_becomes_samples(tmp_path):
-    """Blender's worker writes light, depth and numbers; a stand-in does so here."""
-    worker = tmp_path / "python"
-    worker.write_text(STAND_IN.format(python=sys.executable))
-    worker.chmod(0o755)
-    plan = sets.SetPlan(scenes=1, size_px=48)
-    out = tmp_path / "pictures"
-    out.mkdir()
-    settled = [piles.settle("palms_471", 5)]
-    form = sets.Format(48, 1, 2, 0.0)
-    for _ in range(2):  # the second time nothing is missing
-        sets.blender_files(out, plan, settled, form, 1, worker, lambda _: None)
-    back = read(out / "traced00000.npz")
-    assert back["rgb"].shape == (2, 48, 48, 3) and (back["depth_mm"] == 2000).all()
-    worker.write_text("#!/bin/sh\nexit 3\n")
-    with pytest.raises(DatasetError, check=coded("dataset.blender-failed")):
-        sets.blender_files(tmp_path, plan, settled, form, 1, worker, lambda _: None)

@@ -1,7 +1,5 @@
 """Path-traced pictures: scenes from piles, shapes, the own tracer, samples on disk."""
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from training.pictures.traced import shapes
 from training.pictures.traced.packing import FLOATS
 from training.pictures.traced.scenes import Assets, Format, describe, log_poses
 from training.pictures.traced.staging import pieces
-from training.pictures.traced.tracer import Tracer, library, packed
+from training.pictures.traced.tracer import packed
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +41,6 @@ def test_looks_fit_the_kernel(scene):
     corners, detail, bodies, looks = packed(scene)
     assert looks.shape[1] == FLOATS and len(corners) == len(detail) and np.isfinite(looks).all()
     assert detail["look"].max() < len(looks) and detail["body"].max() < len(bodies)
-
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="the tracer needs g++")
-def test_the_tracer_draws_light_depth_and_numbers(scene, tmp_path):
-    tracer = Tracer(library(tmp_path), scene)
-    light, depth, ids = tracer.draw(scene["views"][0], 1)
-    tracer.close()
-    assert np.isfinite(light).all() and np.nanmin(depth) > 0.3
-    assert set(np.unique(ids)) <= {0, *(log["number"] for log in scene["logs"])} and ids.any()
 
 
 def test_samples_come_back_as_written(tmp_path):

@@ -60,7 +60,7 @@ def stopped_at(step: int):
     return give
 
 
-@pytest.mark.slow  # signals go to the main thread, where tests that run side by side are not
+@pytest.mark.long
 def test_ctrl_c_finishes_the_step_and_the_same_call_resumes(tmp_path: Path) -> None:
     path = tmp_path / "kept.pt"
     whole, losses = run(None)
@@ -80,7 +80,7 @@ def test_ctrl_c_finishes_the_step_and_the_same_call_resumes(tmp_path: Path) -> N
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow  # signals go to the main thread, where tests that run side by side are not
+@pytest.mark.long
 def test_a_checkpoint_of_another_run_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "kept.pt"
     with pytest.raises(KeyboardInterrupt):

@@ -155,8 +155,7 @@ def test_a_damaged_shard_is_refused(few):
         shard(few, 0, 96)
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_weights_are_written_with_a_card(few, monkeypatch):
     monkeypatch.setattr(detector_weights, "BATCH", 2)
     monkeypatch.setattr(detector_weights, "TEST_PICTURES", 2)
@@ -201,8 +200,7 @@ def test_small_and_large_pictures_alternate(few):
     )
 
 
-@pytest.mark.slow
-@pytest.mark.computed
+@pytest.mark.long
 def test_scorers_are_written_with_their_cards(few, monkeypatch):
     monkeypatch.setattr(scorer_weights, "STEPS", 40)
     monkeypatch.setattr(scorer_weights, "SIZE_PX", 304)

@@ -1,0 +1,72 @@
+"""The look whether this computer holds the period of a live run: what is judged, and by which limit."""
+
+from __future__ import annotations
+
+import subprocess  # noqa: TID251  one of its exceptions
+from typing import Any
+
+import pytest
+
+from can_dbc.dbc.codec import load
+from host import lateness, real_time
+from host.real_time import SHORTEST_TIMEOUT_NS, holds, look
+
+
+def test_a_live_run_bears_half_of_the_shortest_time_out_of_an_input() -> None:
+    shortest_ns = min(
+        m.timeout_ns for name in ("crane", "machine") for m in load(name).messages.values() if m.timeout_ns
+    )
+    assert shortest_ns == SHORTEST_TIMEOUT_NS
+    assert holds(shortest_ns // 2) and not holds(shortest_ns // 2 + 1)
+
+
+def test_a_probe_that_does_not_come_to_its_end_is_a_computer_that_stands_still(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def silent(*_: Any, **__: Any) -> None:
+        raise subprocess.TimeoutExpired("probe", 32.0)
+
+    monkeypatch.setattr(real_time, "run_probe", silent)
+    assert not holds(look())
+
+
+class Computer:
+    """Clocks of a computer that stands still once, while its process sleeps or while it works."""
+
+    def __init__(self, still_at_ns: int, still_ns: int, asleep: bool) -> None:
+        self.now_ns, self.used_ns = 1_000_000_000, 0
+        self.still_at_ns, self.still_ns, self.asleep = self.now_ns + still_at_ns, still_ns, asleep
+
+    def _stand_still(self) -> None:
+        if self.now_ns >= self.still_at_ns:
+            self.now_ns += self.still_ns
+            self.still_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def thread_time_ns(self) -> int:
+        self.used_ns += 10_000
+        self.now_ns += 10_000
+        if not self.asleep:
+            self._stand_still()
+        return self.used_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+        if self.asleep:
+            self._stand_still()
+
+
+@pytest.mark.parametrize("asleep", [True, False])
+@pytest.mark.parametrize("still_ns", [0, 5_000_000, 34_000_000])
+def test_the_probe_finds_the_longest_standstill_asleep_or_at_work(
+    still_ns: int, asleep: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lateness, "time", Computer(50_300_000, still_ns, asleep))
+    assert lateness.longest_ns(200_000_000, 250_000) == pytest.approx(still_ns, abs=100_000)
+
+
+def test_the_probe_works_as_much_as_a_live_run_and_leaves_something() -> None:
+    assert lateness.work_ns(1) == lateness.work_ns(2) == 750_000
+    assert 10 * lateness.work_ns(10) == 1_500_000

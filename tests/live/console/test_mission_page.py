@@ -1,0 +1,214 @@
+"""The page in a browser: mission and map show the report, and a click sends its command."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import nan
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import msgspec
+import pytest
+
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.mission import MissionAction, MissionReport, decode_mission_command, encode_mission
+from console.console import Console
+from console.server import create_app
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
+from tests.can_dbc.example_mission_report import MISSION_REPORT
+from tests.console.vehicle_reports import VEHICLE
+from tests.live.console.browser import MISSING, Browser, installed
+from tests.live.console.control import take_control
+from tests.live.console.served_page import served
+
+pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
+INK = """(name => {
+  const canvas = document.getElementById('map'), g = canvas.getContext('2d');
+  const probe = document.createElement('canvas').getContext('2d');
+  probe.fillStyle = getComputedStyle(document.documentElement).getPropertyValue('--' + name);
+  probe.fillRect(0, 0, 1, 1);
+  const [r, k, b] = probe.getImageData(0, 0, 1, 1).data, all = g.getImageData(0, 0, canvas.width, canvas.height).data;
+  let n = 0;
+  for (let i = 0; i < all.length; i += 4) n += all[i] === r && all[i + 1] === k && all[i + 2] === b && all[i + 3] > 250;
+  return n;
+})"""
+"""How many pixels of the map have a colour of the style sheet."""
+
+
+@dataclass
+class Stage:
+    """A console in a thread, fed by us in place of controller and planner, and the orders that it sends."""
+
+    profile: str
+    orders: socket.socket
+    port: int = 0
+    mission: MissionReport | None = MISSION_REPORT
+    speaks: bool = True
+    over: bool = False
+
+    def begin(self) -> None:
+        profile = load_profile(self.profile)
+        self.hash = profile_hash(profile)
+        reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        reports.bind(("127.0.0.1", 0))
+        reports.setblocking(False)
+        self._to = reports.getsockname()
+        console = Console(
+            profile, self.hash, ("127.0.0.1", 9), reports=reports, planner=self.orders.getsockname()
+        )  # fmt: skip
+        self._serving = ExitStack()
+        self.port = urlsplit(self._serving.enter_context(served(create_app(console)))).port or 0
+        self._thread = threading.Thread(target=self._feed)
+        self._thread.start()
+
+    def end(self) -> None:
+        self.over = True
+        self._thread.join()
+        self._serving.close()
+
+    def ordered(self) -> MissionAction:
+        return decode_mission_command(self.orders.recv(100)).action
+
+    def _feed(self) -> None:
+        q = (0.4, 0.9, -1.6, 0.5, 0.0)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            while not self.over:
+                now = time.monotonic_ns()
+                state = StateReport(1, self.hash, now, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, q, (0.0,) * 5, q, nan, nan, nan,
+                                    0, 0, 0, 0)  # fmt: skip
+                out.sendto(encode(state), self._to)
+                out.sendto(encode(VEHICLE), self._to)
+                if self.mission is not None and self.speaks:
+                    out.sendto(encode_mission(self.mission, 1, self.hash, now), self._to)
+                time.sleep(0.1)
+
+
+@pytest.fixture
+def stage(request) -> Iterator[Stage]:
+    orders = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    orders.bind(("127.0.0.1", 0))
+    orders.settimeout(10)
+    profile, told = getattr(request, "param", ("aoro_fc8", MISSION_REPORT))
+    made = Stage(profile, orders, mission=told)
+    made.begin()
+    yield made
+    made.end()
+    orders.close()
+
+
+@pytest.fixture
+def browser(stage: Stage, tmp_path: Path) -> Iterator[Browser]:
+    made = Browser(tmp_path)
+    made.open(f"http://127.0.0.1:{stage.port}/")
+    yield made
+    made.close()
+
+
+def shows(browser: Browser, element: str, words: str) -> None:
+    browser.wait(lambda: words in browser.text(element), f"{element}: {words}")
+
+
+def test_mission_and_vehicle_are_shown_as_text(stage: Stage, browser: Browser) -> None:
+    shows(browser, "mission-words", "The machine drives up to the log.")
+    told = {
+        "mission-age": "Test field",
+        "on-board": "3 · 0.29 m³",
+        "loaded": "4",
+        "target": "log 7",
+        "unloaded": "1",
+        "missed-grasps": "2",
+        "known": "1",
+        "driven": "42 m",
+        "given-up": "Log 9 given up: log 9 was missed 3 times.",
+    }
+    for element, words in told.items():
+        assert browser.text(element) == words, element
+    shows(browser, "speed", "2.3 km/h")
+    assert browser.text("heading") == "90°" and browser.text("bend") == "11.5° left"
+    assert browser.text("roll") == "1.1° right" and browser.text("pitch") == "1.7° down"
+    assert browser.text("fix") == "RTK fixed, ±1 cm" and browser.text("arm-3") == "32 cm"
+
+
+def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Browser) -> None:
+    shows(browser, "mission-words", "drives up")
+    for name in ("route", "log", "target", "good"):
+        browser.wait(lambda name=name: browser.value(f"{INK}('{name}')") > 15, name)
+    stage.mission = msgspec.structs.replace(MISSION_REPORT, targets=(), logs=(), landings=())
+    browser.until(f"{INK}('target') === 0 && {INK}('log') === 0 && {INK}('route') > 15")
+
+
+@pytest.mark.parametrize(
+    ("button", "before", "order"),
+    [("pause", {}, MissionAction.PAUSE), ("auto", {"auto": False}, MissionAction.AUTO),
+     ("single", {}, MissionAction.SINGLE_STEP), ("single", {"single_step": True}, MissionAction.RUN_THROUGH),
+     ("next-step", {"single_step": True, "waits_for": "a log is near"}, MissionAction.NEXT_STEP)],
+)  # fmt: skip
+def test_a_click_sends_the_command(
+    stage: Stage, browser: Browser, button: str, before: dict, order: MissionAction
+) -> None:
+    stage.mission = msgspec.structs.replace(MISSION_REPORT, state="SEARCH", words="is another", **before)
+    shows(browser, "mission-words", "is another")
+    if button != "pause":  # which only stops
+        take_control(browser)
+    browser.until(f"!document.getElementById('{button}').disabled")
+    browser.click(button)
+    assert stage.ordered() is order
+
+
+def test_an_abort_must_be_confirmed(stage: Stage, browser: Browser) -> None:
+    browser.until("document.getElementById('abort').checkVisibility()")
+    assert browser.value("document.getElementById('abort').disabled"), "nobody has control yet"
+    take_control(browser)
+    browser.until("!document.getElementById('abort').disabled")
+    browser.click("abort")
+    shows(browser, "end", "Abort the mission?")
+    browser.click("end-no")
+    browser.until("!document.getElementById('end').open")
+    browser.click("abort")
+    browser.until("document.getElementById('end').open")
+    browser.click("end-yes")
+    browser.click("pause")
+    assert [stage.ordered(), stage.ordered()] == [MissionAction.ABORT, MissionAction.PAUSE], (
+        "and the first click ordered nothing"
+    )
+
+
+def test_the_note_gives_the_reason_of_a_pause(stage: Stage, browser: Browser) -> None:
+    for fields, words in (
+        ({"auto": False, "paused": "the switch is at Idle"}, "Auto"),
+        ({"paused": "the controller is silent"}, "the controller is silent"),
+        ({"waits_for": "a log is near"}, "a log is near"),
+        ({"refusal": "nothing waits for the next step"}, "nothing waits"),
+        ({"ended": True, "failure": "aborted by the operator"}, "aborted by the operator"),
+    ):
+        stage.mission = msgspec.structs.replace(MISSION_REPORT, **fields)
+        shows(browser, "mission-note", words)
+    browser.until("['auto', 'pause', 'single', 'next-step', 'abort'].every(b => document.getElementById(b).disabled)")
+
+
+def test_an_outdated_mission_is_grey_and_accepts_no_commands(stage: Stage, browser: Browser) -> None:
+    browser.until("document.getElementById('mission').checkVisibility()")
+    browser.until("!document.getElementById('pause').disabled")
+    assert not browser.value("document.getElementById('mission').classList.contains('old')")
+    stage.speaks = False
+    browser.until("document.getElementById('mission').classList.contains('old')")
+    assert browser.text("mission-age") != MISSION_REPORT.name and browser.text("mission-note")
+    assert browser.value("document.getElementById('pause').disabled")
+    assert browser.value("getComputedStyle(document.getElementById('mission')).filter") == "grayscale(1)"
+    assert not browser.value("document.getElementById('stop').disabled"), "STOP stays enabled"
+
+
+@pytest.mark.parametrize("stage", [("palms_471", MISSION_REPORT), ("aoro_fc8", None)], indirect=True)
+def test_without_a_mission_or_a_carrier_their_cards_are_hidden(stage: Stage, browser: Browser) -> None:
+    shows(browser, "mode", "ACTIVE")
+    for element in ("mission", "vehicle", "site"):
+        assert not browser.text(element) and not browser.value(
+            f"document.getElementById('{element}').checkVisibility()"
+        )

@@ -1,0 +1,43 @@
+"""A mission as processes with the machine's own camera, in simulated time: the plant serves pictures, a detector of its
+own measures the logs in them while the machine drives, and the planner works from memory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from host.vcan_lab import lab_kernel, shim
+from tests.hil.short_missions import mission_file
+
+ROOT = Path(__file__).parents[3]
+LOGS = ((7.0, 3.6, 80.0), (9.5, -3.7, 100.0), (12.5, 3.4, 75.0))
+
+
+@pytest.mark.timeout(1500)
+def test_three_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path) -> None:
+    """On the wire: a mission on vcan differs by its bus only, and takes as long again."""
+    if lab_kernel.find(shim.user_cache()) is None:
+        pytest.skip(lab_kernel.MISSING)
+    path, out = mission_file(tmp_path / "mission.geojson", *LOGS), tmp_path / "run"
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "host.vcan_lab", "--time-travel", "--mem", "3072", "--",
+            sys.executable, "-m", "timberhand", "mission", "run", path, "--bus", "wire", "--detector", "own",
+            "--no-console", "--out", out,
+        ],
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])
+    told = json.loads((out / "summary.json").read_text())
+    assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 3
+    assert told["stops"] == told["refused"] == 0 and not told["given_up"] and not told["remarks"]
+    lines = done.stdout.splitlines()
+    assert any("camera 'front' detects the logs" in line for line in lines)
+    assert not any("detector:" in line for line in lines), "every picture could be used"
+    assert not (out / "detector.err").read_text() and "cameras.front" in (out / "surveyed.toml").read_text()

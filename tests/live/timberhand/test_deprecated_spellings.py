@@ -1,0 +1,13 @@
+"""Former spellings of commands and options keep working, with one note each on stderr."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+
+def test_the_command_notes_the_new_spelling_on_stderr() -> None:
+    command = [sys.executable, "-m", "timberhand", "log", "decode", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "recording decode" in done.stdout
+    assert done.stderr.splitlines() == ["timberhand: `log` is now `recording`"]

@@ -1,0 +1,97 @@
+"""``timberhand demo``: which run it is, decided from options and from a look at the computer; what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from hil.demo.summary import Summary
+from host.exit_codes import CommandFailed, ExitCode
+from host.real_time import BEARABLE_NS
+from timberhand.cli import app
+from timberhand.commands.demo import paced_or_live
+
+BUSY_NS = BEARABLE_NS + 1
+
+
+def test_a_computer_that_stands_still_too_long_gets_a_paced_run_where_there_is_one() -> None:
+    assert paced_or_live(BEARABLE_NS, live_only=False) == (False, "")
+    paced, sentence = paced_or_live(BUSY_NS, live_only=False)
+    assert paced and sentence
+    paced, sentence = paced_or_live(BUSY_NS, live_only=True)
+    assert not paced and sentence
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The looks and runs of the command, none of which takes place."""
+    done: list[str] = []
+
+    def look() -> int:
+        done.append("look")
+        return BUSY_NS
+
+    def run(kind: str) -> object:
+        def take_place(*_: object, **__: object) -> Summary:
+            done.append(kind)
+            return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
+
+        return take_place
+
+    monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
+    monkeypatch.setattr("host.real_time.look", look)
+    for kind in ("live", "lockstep", "paced"):
+        monkeypatch.setattr(f"hil.demo.{kind}.run_{kind}", run(kind))
+    return done
+
+
+@pytest.mark.parametrize(
+    ("words", "kinds"),
+    [
+        ("--bus wire", ["look", "paced"]),
+        ("--bus wire --camera stick", ["look", "paced"]),
+        ("--bus wire --plc", ["look", "paced"]),
+        ("--bus wire --plc --plc-link udp", ["look", "live"]),
+        ("--bus wire --live", ["live"]),
+        ("--no-live", ["paced"]),
+        ("--lockstep", ["lockstep"]),
+    ],
+)
+def test_the_look_is_taken_only_where_it_decides(words: str, kinds: list[str], ran: list[str], tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["demo", *words.split(), "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert ran == kinds
+
+
+def test_inside_the_lab_no_look_is_taken(ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("TIMBERHAND_LAB", "uml")
+    CliRunner().invoke(app, ["demo", "--bus", "wire", "--out", str(tmp_path)])
+    assert ran == ["live"]
+
+
+def test_a_computer_that_holds_the_period_runs_live(
+    ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("host.real_time.look", lambda: BEARABLE_NS)
+    CliRunner().invoke(app, ["demo", "--bus", "wire", "--out", str(tmp_path)])
+    assert ran == ["live"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ("--lockstep --live", "demo.live-lockstep"),
+        ("--lockstep --no-live", "demo.live-lockstep"),
+        ("--bus vcan --live", "demo.live-vcan"),
+        ("--bus vcan --no-live", "demo.live-vcan"),
+        ("--no-live --plc --plc-link udp", "demo.paced-udp"),
+        ("--no-live --inject encoder-lift:stuck@1s", "demo.inject-live"),
+    ],
+)
+def test_what_would_be_ignored_is_refused(words: str, code: str, ran: list[str], tmp_path: Path) -> None:
+    refused = CliRunner().invoke(app, ["demo", *words.split(), "--out", str(tmp_path / "run")])
+    assert isinstance(refused.exception, CommandFailed)
+    assert (refused.exception.code, refused.exception.exit_code) == (code, ExitCode.USAGE)
+    assert ran == [] and not (tmp_path / "run").exists()
