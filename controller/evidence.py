@@ -135,12 +135,10 @@ class Evidence:
         if reason in _LATE:
             return self._lateness(reason, inputs.late_ns)
         if reason is Reason.COMPUTER_STALLED:
-            count = sum(state.values is None for state in self._inputs.needed)
-            return self._supervisor.stall_ns * _MS, _NAN, float(count)
-        if reason is Reason.BUS_SILENT:
-            vehicle = self._vehicle
-            heard_ns = self._inputs.heard_ns if detail == 0 or vehicle is None else vehicle.bus.inputs.heard_ns
-            return (now_ns - heard_ns) * _MS, _NAN, _NAN
+            return self._supervisor.stall_ns * _MS, _NAN, self._lost_count(self._inputs.needed)
+        if reason is Reason.INPUTS_LOST:
+            bus = self._inputs if detail == 0 or self._vehicle is None else self._vehicle.bus.inputs
+            return (now_ns - bus.heard_ns) * _MS, _NAN, self._lost_count(bus.needed)
         if reason in _BUS_STATES or reason is Reason.SEND_REFUSED:
             reading = inputs.machine_bus if detail else inputs.bus
             if reason is Reason.SEND_REFUSED:
@@ -178,6 +176,9 @@ class Evidence:
             if state.values is None and (silent is None or state.stamp_ns < silent.stamp_ns):
                 silent = state
         return silent
+
+    def _lost_count(self, needed: Sequence[MessageState]) -> float:
+        return float(sum(state.values is None for state in needed))
 
     def _lateness(self, reason: Reason, late_ns: int) -> Numbers:
         limit_ns = max(LATE_PERIODS * self._period_ns, LATE_NS)

@@ -75,8 +75,10 @@ class Supervisor:
         "_alarms",
         "_axes",
         "_bus_monitors",
+        "_carrier_nodes",
         "_channel_a",
         "_channel_b",
+        "_crane_nodes",
         "_degraded_until_ns",
         "_echo",
         "_echo_counter",
@@ -149,6 +151,12 @@ class Supervisor:
             for j in JOINTS
             if (spec := joint(profile, j)).encoder is not None
         )
+        self._crane_nodes = (
+            (inputs.estop,), (inputs.guard,), (inputs.valve_a, inputs.valve_b),
+            *((state,) for state in sensed if state is not None),
+        )  # fmt: skip
+        """The needed inputs, by the node that sends them."""
+        self._carrier_nodes = () if carrier is None else ((carrier.vehicle,), (carrier.arms_a, carrier.arms_b))
         self._latch_ramp_ns = RAMP_NS if profile.plc is None else PLC_RAMP_NS
         self._stop_ramp_ns = profile.timeouts.stop_ramp_ms * 1_000_000
         self.mode = Mode.BOOT
@@ -373,18 +381,22 @@ class Supervisor:
             self.stall_ns = max(late_ns, self.stall_ns) if now_ns < self._stall_end_ns else late_ns
             self._stall_end_ns = now_ns + STALL_MEMORY_NS
 
-    def _lost_together(self, needed: Sequence[MessageState], heard_ns: int, now_ns: int) -> Reason:
-        """The common cause of what is lost on one bus: this computer, or the bus; NONE where each loss is its own."""
-        lost = [state for state in needed if state.values is None]
-        if len(lost) > 1 and now_ns < self._stall_end_ns:
+    def _lost_together(self, nodes: Sequence[Sequence[MessageState]], heard_ns: int, now_ns: int) -> Reason:
+        """The common cause of what is lost on one bus: this computer, or what several nodes share; else NONE.
+
+        The first of them to be missed may stand alone for a moment: then nothing else is heard either.
+        """
+        lost = [state for node in nodes for state in node if state.values is None]
+        several = sum(any(state.values is None for state in node) for node in nodes) > 1
+        if several and now_ns < self._stall_end_ns:
             return Reason.COMPUTER_STALLED
-        silent = any(2 * (now_ns - heard_ns) > state.timeout_ns for state in lost)
-        return Reason.BUS_SILENT if silent else _NONE
+        several = several or any(2 * (now_ns - heard_ns) > state.timeout_ns for state in lost)
+        return Reason.INPUTS_LOST if several else _NONE
 
     def _check_stale(self, now_ns: int) -> None:
         received = self.crane_inputs
-        if all(state.values is not None for state in received.plc_states):
-            common = self._lost_together(received.needed, received.heard_ns, now_ns)
+        if not received.plc_outputs:  # behind a PLC all inputs come through it
+            common = self._lost_together(self._crane_nodes, received.heard_ns, now_ns)
             if common:
                 self._collect(common, 0)
                 return
@@ -435,7 +447,7 @@ class Supervisor:
     def _check_carrier(self, carrier: CarrierInputs, now_ns: int) -> None:
         """The carrier's own frames arrive, and the controller owns its address on mach0."""
         if carrier.stale_mask:
-            common = self._lost_together(carrier.needed, carrier.heard_ns, now_ns)
+            common = self._lost_together(self._carrier_nodes, carrier.heard_ns, now_ns)
             if common:
                 self._collect(common, 0 if common is Reason.COMPUTER_STALLED else 1)
             if carrier.vehicle.values is None:

@@ -35,7 +35,7 @@ LATENESS_REASONS: Final = frozenset({
     Reason.ESTOP_LOST, Reason.GUARD_LOST, Reason.GUARD_REFUSES, Reason.ENCODER_LOST, Reason.VALVE_FEEDBACK_LOST,
     Reason.PRESSURE_LOST, Reason.CARRIER_LOST, Reason.SWING_ARMS_LOST, Reason.GNSS_LOST, Reason.ENGINE_LOST,
     Reason.SAFETY_NODE_LOST, Reason.ENCODER_NODE_LOST, Reason.PRESSURE_NODE_LOST, Reason.LOOP_LATE,
-    Reason.LOOP_STALLED, Reason.COMPUTER_STALLED, Reason.BUS_SILENT, Reason.LEASE_LOST,
+    Reason.LOOP_STALLED, Reason.COMPUTER_STALLED, Reason.INPUTS_LOST, Reason.LEASE_LOST,
 })  # fmt: skip
 """Reasons for a stop because something was late; if no frame is lost, the host stalled one of the processes."""
 LOSSES: Final = ("gaps", "gaps_rig", "unanswered", "frames_lost", "records_lost")

@@ -92,7 +92,7 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.BUS_OFF: _BUS,
     Reason.BUS_DOWN: _BUS,
     Reason.BUS_PASSIVE: _BUS,
-    Reason.BUS_SILENT: _age("the last frame"),
+    Reason.INPUTS_LOST: Measurement("age of the newest frame on the bus", _MS, "", "inputs lost"),
     Reason.SEND_REFUSED: Measurement("frames that the bus refused since the start", _COUNT, ""),
     Reason.LOOP_LATE: Measurement("lateness", _MS, "limit", "late ticks since the start"),
     Reason.LOOP_STALLED: Measurement("lateness", _MS, "limit", "late ticks since the start"),

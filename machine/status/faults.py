@@ -230,13 +230,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
     Reason.BUS_DOWN: Fault(
         Reaction.CUT, 20, _B, "The CAN interface of {} is down", "Bring the interface up, then reset and arm.", True
     ),
-    Reason.BUS_SILENT: Fault(
+    Reason.INPUTS_LOST: Fault(
         Reaction.CUT,
         20,
         _B,
-        "Nothing is received on {} any more",
-        "Check its plug and supply, or, where this computer emulates the machine, run `timberhand doctor --rt`; "
-        "then reset and arm.",
+        "Several inputs on {} are lost at the same moment",
+        "Check the plug and the supply that they share, or, where this computer emulates the machine, run "
+        "`timberhand doctor --rt`; then reset and arm.",
     ),
     Reason.BUS_PASSIVE: Fault(
         Reaction.DEGRADE, 100, _B, "{} is error-passive; half speed", "Check cable, termination and bit rate."

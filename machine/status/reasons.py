@@ -100,7 +100,7 @@ class Reason(IntEnum):
     FOREIGN_CONTROLLER = 54
     ADDRESS_LOST = 55
     LEVER_MOVED = 56
-    BUS_SILENT = 57
+    INPUTS_LOST = 57
 
     LOOP_LATE = 60
     LOOP_STALLED = 61

@@ -165,7 +165,7 @@ def test_a_fault_at_every_edge_is_answered_and_named() -> None:
         ("crane palms_471", "bus-stub/crane0", "R1", "BUS_PASSIVE"),
         ("crane palms_471", "process-off/planner", "H", "LEASE_LOST"),
         ("crane palms_471", "process-off/guard", "R0", "GUARD_LOST"),
-        ("crane palms_471", "process-stuck/controller+30ms", "R1", "ENCODER_LOST"),  # no SYNC meanwhile
+        ("crane palms_471", "process-stuck/controller+30ms", "R0", "COMPUTER_STALLED"),  # no SYNC meanwhile
         ("crane palms_471", "planner-nan", "H", "SETPOINTS_REFUSED"),
         ("drive aoro_fc8", "message-off/VehStat", "R0", "CARRIER_LOST"),
         ("drive aoro_fc8", "gnss-off", "H", "HEADING_LOST"),
