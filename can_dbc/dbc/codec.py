@@ -16,6 +16,7 @@ A file that cannot be used raises ``DbcError`` with file, line if known, and rea
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import Counter
 from collections.abc import Mapping
@@ -108,8 +109,16 @@ def resolve(name_or_path: str | Path) -> Path:
 
 
 def load(name_or_path: str | Path) -> Database:
-    """Reads and compiles a database: one of ``SHIPPED`` or a path to a DBC or KCD file; raises DbcError."""
-    path = resolve(name_or_path)
+    """Reads and compiles a database: one of ``SHIPPED`` (once in a process) or a DBC or KCD file; raises DbcError."""
+    return _shipped(str(name_or_path)) if str(name_or_path) in SHIPPED else _read(resolve(name_or_path))
+
+
+@functools.cache
+def _shipped(name: str) -> Database:
+    return _read(resolve(name))
+
+
+def _read(path: Path) -> Database:
     messages = [usable(message, path) for message in parse(path).messages]
     for what, counts in (
         ("name", Counter(m.name for m in messages)),

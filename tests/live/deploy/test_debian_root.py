@@ -23,7 +23,7 @@ from host.release import bundle as bundles
 from host.release import sums
 from host.release.signature import make_keys
 from host.service_lab.host import build_wheel
-from tests.deploy import debian_root
+from tests.live.deploy import debian_root
 from tests.live.deploy.debian_root import DebianRoot
 
 pytestmark = [
