@@ -1,7 +1,8 @@
-"""How tests recognize an error: by its code, never by its sentence."""
+"""How tests recognize an error: by its code, never by its sentence, and the numbers that a sentence alone carries."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 from runtime.errors import CodedError
@@ -10,3 +11,8 @@ from runtime.errors import CodedError
 def coded(code: str) -> Callable[[CodedError], bool]:
     """For ``pytest.raises(..., check=coded("profile.unknown-key"))``."""
     return lambda error: error.code == code
+
+
+def numbers_in(text: str) -> list[float]:
+    """The numbers of a text in their order, where it alone carries them; its words are not compared."""
+    return [float(number) for number in re.findall(r"(?<!\w)(?<!\d\.)-?\d+(?:\.\d+)?", text)]

@@ -30,7 +30,7 @@ def test_only_a_whole_passed_and_signed_protocol_is_accepted() -> None:
         assert judged(told)[0] is Verdict.INCOMPLETE
         told["entries"][k]["result"] = "fail"
         verdict, reasons = judged(told)
-        assert verdict is Verdict.REFUSED and "failed" in reasons[0]
+        assert verdict is Verdict.REFUSED and len(reasons) == 1
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{}", json.dumps(form(verdict="accepted")).encode(),

@@ -23,6 +23,7 @@ from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.joints import Joint
 from tests.autonomy.crane_stand_in import GROUND_LOG, TICK_NS, StandIn
 from tests.autonomy.test_activity import PROFILE, activity, phases
+from tests.codes import numbers_in
 
 THIN = replace(GROUND_LOG, id=1, center_m=(-1.8, 4.4, -1.32), diameter_m=0.14, covariance=(1e-6,) * TRIANGLE)
 THICK = replace(THIN, center_m=(-1.8, 4.4, -1.28), diameter_m=0.22)
@@ -206,7 +207,7 @@ def test_a_log_that_has_spun_on_above_its_place_is_turned_back(spins: int) -> No
 def test_a_log_that_spins_for_ever_is_laid_down_and_never_called_done_across_the_stakes() -> None:
     crane, planner = spun(99, 0.8)
     assert crane.spins == 99 - MAX_FURTHER_TURNS - 1 and lies_across_stakes(PROFILE.bunk, crane.logs[0])
-    assert planner.failure_code == "activity.log-misplaced" and "across the stakes" in (planner.failure or "")
+    assert planner.failure_code == "activity.log-misplaced"
 
 
 class Remembering(Twisting):
@@ -287,4 +288,4 @@ def test_a_recognized_log_that_falls_beside_the_bunk_is_reported() -> None:
     crane.until(planner, Phase.RETREAT)
     crane.logs = [replace(crane.logs[0], center_m=(3.0, 3.0, -1.32))]
     crane.run(planner)
-    assert planner.failure_code == "activity.log-misplaced" and f"log {FOUND} " in (planner.failure or "")
+    assert planner.failure_code == "activity.log-misplaced" and FOUND in numbers_in(planner.failure or "")

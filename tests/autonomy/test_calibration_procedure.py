@@ -29,7 +29,7 @@ from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.autonomy.commissioned_crane import HOME, SAG, Crane
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 
 PALMS = load_profile("palms_471")
 
@@ -200,7 +200,7 @@ def test_a_run_of_one_joint_repeats_the_tests_that_a_lost_message_and_a_person_i
     began_at = crane.q[Joint.TILT]
     crane.run(3.0)
     interrupted(crane, Reason.ENCODER_LOST)
-    assert crane.calibration.failure is None and "reset and arm within 60 s" in (crane.calibration.waiting or "")
+    assert crane.calibration.failure is None and 60 in numbers_in(crane.calibration.waiting or "")
     crane.q[Joint.TILT] += 0.1  # it has sunk
     crane.run(0.1)
     assert isinstance(crane.calibration.task, MoveTask)
@@ -241,7 +241,7 @@ def test_a_rotator_without_encoder_does_not_go_on_after_a_stop() -> None:
     crane = Crane("aoro_fc8", only_turns=True, patience_s=60.0)
     crane.run(6.0)
     interrupted(crane, Reason.ENCODER_LOST)
-    assert crane.calibration.idle and "the controller is in STOP" in (crane.calibration.failure or "")
+    assert crane.calibration.idle and crane.calibration.failure_code == "calibration.controller-mode"
 
 
 def test_a_joint_without_encoder_cannot_be_chosen_alone() -> None:
@@ -250,7 +250,6 @@ def test_a_joint_without_encoder_cannot_be_chosen_alone() -> None:
         make_plan(profile, HOME["aoro_fc8"], surveyed=False, chosen=(Joint.ROT,))
     plan = make_plan(profile, HOME["aoro_fc8"], surveyed=False, chosen=(Joint.ROT, Joint.LIFT))
     assert [p.joint for p in plan.joints] == [Joint.LIFT] and not plan.grapple
-    assert not any("grapple" in line for line in plan_summary(profile, plan))
 
 
 def test_a_refused_setpoint_ends_the_run() -> None:

@@ -17,6 +17,7 @@ from autonomy.manager.tally import LoadedLog
 from autonomy.missions.model import ForwardingMission, Point
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mapped_logs import base, lying
+from tests.codes import numbers_in
 
 PROFILE = load_profile("aoro_fc8")
 BUNK = PROFILE.bunk
@@ -75,4 +76,4 @@ def test_a_log_that_fell_off_is_booked_and_said() -> None:
     tally = load.tally
     assert (tally.loaded, tally.on_board) == (2, 2)
     (remark,) = tally.remarks
-    assert remark.at_ns == 30 and "log 1 lies where the loaded machine has been" in remark.text
+    assert remark.at_ns == 30 and 1 in numbers_in(remark.text)

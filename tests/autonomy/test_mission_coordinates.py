@@ -20,6 +20,7 @@ from tests.autonomy.mission_texts import (
     lon_lat,
     polygon,
 )
+from tests.codes import numbers_in
 
 # -- swapped axes -----------------------------------------------------------------------------------------------
 
@@ -38,7 +39,7 @@ def test_swapped_route_beside_a_right_fence() -> None:
 
 def test_one_swapped_waypoint() -> None:
     (problem,) = refused(collection(line([ROUTE[0], SWAPPED_ROUTE[1], ROUTE[2]]))).problems
-    assert problem.code == "mission.swapped-axes" and "waypoint 2" in problem.sentence
+    assert problem.code == "mission.swapped-axes" and 2 in numbers_in(problem.sentence)
 
 
 def test_swapped_near_the_diagonal_shows_at_the_fence() -> None:
@@ -66,7 +67,7 @@ def test_a_mission_swapped_as_a_whole_shows_at_the_machines_site() -> None:
 def test_waypoint_outside_of_the_fence() -> None:
     (problem,) = refused(collection(line([*ROUTE, at(36, 12)]), polygon())).problems
     assert problem.code == "mission.waypoint-outside-fence"
-    assert "waypoint 4" in problem.sentence and "6.0 m" in problem.sentence
+    assert {4, 6.0} <= set(numbers_in(problem.sentence))
 
 
 def test_leg_outside_of_the_fence() -> None:
@@ -77,21 +78,21 @@ def test_leg_outside_of_the_fence() -> None:
 def test_leg_through_a_keep_out() -> None:
     keep_out = polygon([at(-2, -14), at(2, -14), at(2, -10), at(-2, -10)], role="keep-out")
     error = refused(collection(line(), polygon(), keep_out))
-    assert error.code == "mission.leg-leaves-fence" and "2.0 m" in str(error)
+    assert error.code == "mission.leg-leaves-fence" and 2.0 in numbers_in(str(error))
 
 
 def test_the_closing_leg_of_laps_counts() -> None:
     keep_out = polygon([at(-2, -2), at(2, -2), at(2, 2), at(-2, 2)], role="keep-out")
     laps = {"timberhand": {"schema": 1, "options": {"laps": 2}}}
     error = refused(collection(line(), polygon(), keep_out, **laps))
-    assert error.code == "mission.leg-leaves-fence" and "from waypoint 3 to waypoint 1" in str(error)
+    assert error.code == "mission.leg-leaves-fence" and {3, 1} <= set(numbers_in(str(error)))
     good(collection(line(), polygon(), keep_out))
 
 
 def test_landing_outside_of_the_fence() -> None:
     landing = feature("Point", lon_lat([at(0, 31)])[0], role="landing")
     error = refused(collection(line(), polygon(), landing))
-    assert error.code == "mission.landing-outside-fence" and "6.0 m" in str(error)
+    assert error.code == "mission.landing-outside-fence" and 6.0 in numbers_in(str(error))
 
 
 def test_self_crossing_fence() -> None:
@@ -170,7 +171,7 @@ def test_empty_files_and_empty_missions() -> None:
 
 def test_duplicated_waypoints() -> None:
     (problem,) = refused(collection(line([ROUTE[0], ROUTE[1], ROUTE[1], ROUTE[2]]))).problems
-    assert problem.code == "mission.duplicate-waypoint" and "waypoint 3" in problem.sentence
+    assert problem.code == "mission.duplicate-waypoint" and 3 in numbers_in(problem.sentence)
     good(collection(line([*ROUTE, ROUTE[0]])))  # a closed lap has none
 
 
@@ -179,4 +180,4 @@ def test_two_routes_and_a_route_beside_waypoints() -> None:
     beside = feature("Point", lon_lat(ROUTE)[0], role="waypoint")
     assert codes(collection(line(), beside)) == ["waypoint-beside-route"]
     draft = good(collection(line(), feature("Point", lon_lat(ROUTE)[0])))
-    assert len(draft.notes) == 1 and "1 point" in draft.notes[0]
+    assert [numbers_in(note) for note in draft.notes] == [[1]]

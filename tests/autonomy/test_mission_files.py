@@ -25,7 +25,7 @@ from tests.autonomy.mission_texts import (
     lon_lat,
     polygon,
 )
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 
 NEWLINE = b"\n"
 
@@ -108,7 +108,7 @@ def test_byte_order_mark_and_crlf() -> None:
     wrong = collection(line([*ROUTE, Point(95.0, 100.0)])).replace(b"\n", b"\r\n")
     before = wrong[: wrong.index(b"95.0")].count(b"\n")  # its position begins two lines before, lines count from 1
     (problem,) = refused(wrong).problems
-    assert problem.place == f"m:{before - 1}" and "waypoint 4" in problem.sentence
+    assert problem.place == f"m:{before - 1}" and 4 in numbers_in(problem.sentence)
 
 
 def test_not_utf_8() -> None:
@@ -238,4 +238,4 @@ def test_the_line_of_every_kind_of_problem() -> None:
 def test_many_problems_are_counted() -> None:
     away = [at(100 + 3 * i, 0) for i in range(40)]
     error = refused(collection(line(away), polygon()))
-    assert len(error.problems) == 10 and "30 more" in str(error).splitlines()[-1]
+    assert len(error.problems) == 10 and 30 in numbers_in(str(error).splitlines()[-1])

@@ -15,7 +15,7 @@ from autonomy.missions.validation import SWAPPED_HINT
 from machine.geometry.carrier import turning_radius_m
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mission_texts import FENCE, at
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 
 AORO = load_profile("aoro_fc8")
 assert AORO.carrier is not None
@@ -65,20 +65,20 @@ def test_gentle_corners_are_switched_at_the_least_distance() -> None:
 def test_legs_too_short_for_their_corners() -> None:
     (warning,) = Way([(0, 0), (30, 0), (30, 10), (0, 10)]).review().warnings
     assert warning.code == "mission.short-leg"
-    assert all(part in warning.sentence for part in ("leg 2 to 3", "10.0 m", f"{2 * RADIUS:.1f} m", f"{RADIUS:.1f} m"))
+    assert {2, 3, 10.0, round(2 * RADIUS, 1), round(RADIUS, 1)} <= set(numbers_in(warning.sentence))
     assert not Way([(0, 0), (30, 0), (30, 2 * RADIUS + 0.1), (0, 2 * RADIUS + 0.1)]).review().warnings
 
 
 def test_a_turn_on_the_spot() -> None:
     (warning,) = Way([(0, 0), (30, 0), (0, 1)]).review().warnings
     assert warning.code == "mission.turn-on-the-spot"
-    assert all(part in warning.sentence for part in ("waypoint 2", "178 degrees", f"{RADIUS:.1f} m"))
+    assert {2, 178, round(RADIUS, 1)} <= set(numbers_in(warning.sentence))
 
 
 def test_near_the_fence_without_a_fence_and_too_fast() -> None:
     edge = Way([(-20, -24), (20, -24)]).review(fences=(Fence(tuple(FENCE)),))
     assert edge.warnings[0].code == "mission.close-to-fence"
-    assert "waypoint 1 is 1.0 m" in edge.warnings[0].sentence and "2.7 m" in edge.warnings[0].sentence
+    assert {1, 2.7} <= set(numbers_in(edge.warnings[0].sentence))
     assert Way(SQUARE).review(fences=()).warnings[0].code == "mission.no-fence"
     assert Way(SQUARE).review(speed_m_s=2.0).warnings[0].code == "mission.speed-limit"
     assert Way(SQUARE).review(transport_height_m=0.9).warnings[0].code == "mission.height-limit"
@@ -88,10 +88,10 @@ def test_logs_out_of_reach_and_under_the_wheels() -> None:
     far, under, vague = KnownLog(at(0, 0)), KnownLog(at(0, -14.5)), KnownLog(at(0, -14.5), sigma_m=4.0)
     warnings = Way(SQUARE).review(far, under, vague).warnings
     assert [w.code for w in warnings] == ["mission.log-out-of-reach", "mission.log-on-route"]
-    assert all(part in warnings[0].sentence for part in ("log 1", "15.0 m", "9.0 m"))
-    assert "log 2" in warnings[1].sentence
+    assert {1, 15.0, 9.0} <= set(numbers_in(warnings[0].sentence))
+    assert 2 in numbers_in(warnings[1].sentence)
     many = Way(SQUARE).review(*[far] * 20).warnings
-    assert len(many) == 6 and "15 more" in many[-1].sentence
+    assert len(many) == 6 and 15 in numbers_in(many[-1].sentence)
 
 
 def test_the_number_of_logs_to_collect() -> None:

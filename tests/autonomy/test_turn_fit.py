@@ -115,7 +115,7 @@ def test_implausible_turns_are_reported() -> None:
     turns, _ = surveyed(SLOW_PLUS)
     wrong = [*turns[:-2], replace(turns[-2], after_rad=turns[-2].after_rad + 0.9), turns[-1]]
     problems = identify(AORO, Findings(turns=wrong)).implausible
-    assert any("rot plus" in problem.sentence for problem in problems), problems
+    assert "implausible.turn-residual" in {problem.code for problem in problems}, problems
     crawling, _ = surveyed(replace(SLOW_PLUS, full_speeds=(0.3, 2.35)))
     problems = identify(AORO, Findings(turns=crawling)).implausible
     assert "implausible.out-of-range" in {problem.code for problem in problems}, problems

@@ -8,6 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
+from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame
 from can_dbc.trace.candump import MalformedRecord, parse_line, read_trace
 from can_dbc.trace.decoder import Decoder
@@ -137,7 +138,9 @@ def test_decoder_counts_everything() -> None:
     ]
     decoder = Decoder(["crane"])
     entries = list(decoder.run(records))
-    assert [e.fault for e in entries] == ["", "bad CRC", "PressA: wrong length", "Slew: value out of range"]
+    assert [bool(e.fault) for e in entries] == [False, True, True, True]
+    assert entries[2].fault == str(FrameRefused(Refusal.LENGTH, "PressA"))
+    assert entries[3].fault == str(FrameRefused(Refusal.RANGE, "Slew"))
     assert entries[0].values["LiftB"] == 2.0 and "TiltA" not in entries[0].values
     assert entries[0].text().startswith("Crc=")
     assert "LiftB=2 bar" in entries[0].text() and "Status=Ok" in entries[0].text()

@@ -133,7 +133,7 @@ def test_sdo_values() -> None:
     sdo = co.Sdo(co.SdoKind.UPLOAD, 5, 0x6004, 0, b"\xff\xff", 0)
     assert sdo.unsigned == 65535
     for bad in (b"", b"12345"):
-        with pytest.raises(ValueError, match="1 to 4 bytes"):
+        with pytest.raises(ValueError):
             co.download_request(1, 0x1017, 0, bad)
 
 

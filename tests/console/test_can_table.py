@@ -6,8 +6,8 @@ import json
 
 from can_dbc.dbc.codec import load
 from can_dbc.frame import EXTENDED, Frame
-from can_dbc.protocols.e2e import Sender
-from console.can_table import MAX_ROWS, WINDOW_NS, CanTable
+from can_dbc.protocols.e2e import Sender, Status
+from console.can_table import _STATUS_WORDS, MAX_ROWS, WINDOW_NS, CanTable
 
 CRANE = load("crane")
 ESTOP, VALVE, LIFT = (CRANE.message(name) for name in ("EstopStat", "ValveFbA", "EncLift"))
@@ -55,7 +55,7 @@ def test_checksum_counter_and_length_are_refused_and_named() -> None:
     broken = good[5]._replace(data=bytes([good[5].data[0] ^ 1, *good[5].data[1:]]))
     table.on_frames([*good[:3], good[4], broken, good[6]._replace(data=b"\0"), good[6], good[6]])
     row = rows_of(table, 200 * MS)["EstopStat"]
-    assert (row["lost"], row["refused"], row["why"]) == (2, 3, "repeated counter")
+    assert (row["lost"], row["refused"], row["why"]) == (2, 3, _STATUS_WORDS[Status.REPEATED])
     assert row["e2e"]
 
 

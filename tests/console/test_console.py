@@ -21,10 +21,11 @@ from console import server
 from console.console import Console
 from console.server import STATIC
 from console.state import REPORT_TIMEOUT_NS, TIMING_TIMEOUT_NS, CraneState, describe_machine
-from machine.joints import JOINTS
+from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status import faults
 from machine.status.modes import Mode
+from machine.status.stale_inputs import CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
 from tests.console.page_client import HERE, page_client, socket_of
 from tests.console.state_reports import REPORT
 
@@ -65,7 +66,7 @@ def client(console):
 
 def test_page_and_every_file_it_names_are_served_from_here(client):
     page = client.get("/")
-    assert page.status_code == 200 and "STOP" in page.text
+    assert page.status_code == 200 and 'id="stop"' in page.text
     assert "http://" not in page.text and "https://" not in page.text
     for name in ("app.js", "scene.js", "carrier.js", "plot.js", "style.css", "icon.svg", "vendor/three.module.min.js",
                  "vendor/three.core.min.js", "vendor/OrbitControls.js", "vendor/three.LICENSE.txt"):  # fmt: skip
@@ -230,7 +231,10 @@ def watched(report=REPORT, at_ns=0, seen_ns=0):
 def test_the_state_has_the_reason_and_the_stale_inputs():
     state = watched()
     assert state["reason"] == faults.describe(REPORT.reason)
-    assert state["stale"] == ["emergency stop", "tilt encoder"]
+    assert state["stale"] == [
+        STALE_INPUT_NAMES[CRANE_INPUT_BITS["EstopStat"]],
+        STALE_INPUT_NAMES[ENCODER_BIT + Joint.TILT],
+    ]
     assert state["refused"] == 4 and state["refusal"] == ""
 
 

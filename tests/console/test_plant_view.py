@@ -43,7 +43,7 @@ def plant() -> Iterator[tuple[tuple[str, int], list[dict[str, str]]]]:
 
 def test_the_page_and_the_constant_data_are_served(plant) -> None:
     with TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page:
-        assert "simulated plant" in page.get("/plant").text
+        assert 'id="scene"' in page.get("/plant").text
         assert page.get("/api/plant").json() == {"title": "a plant"}
 
 

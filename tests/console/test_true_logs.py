@@ -70,4 +70,4 @@ def test_a_silent_plant_is_said_to_be_silent() -> None:
         deaf.bind(("127.0.0.1", 0))
         with client_of(deaf.getsockname()) as client:
             answer = client.get("/api/true-logs")
-            assert answer.status_code == 504 and "does not answer" in answer.text
+            assert answer.status_code == 504

@@ -4,9 +4,9 @@ import pytest
 
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.canopen import heartbeat_frame
-from machine.status.faults import FAULTS, describe
+from machine.status.faults import FAULTS, describe, part_of
 from machine.status.modes import Mode
-from machine.status.reasons import Reaction, Reason
+from machine.status.reasons import DetailKind, Reaction, Reason
 from tests.controller.bench import AORO, MACHINE, MS, Bench, T
 
 PROMISE_NS = 100 * MS
@@ -84,7 +84,7 @@ def test_foreign_controller_on_mach0_is_detected_in_every_mode():
         bench.tick()
         assert bench.mode is Mode.FAULT and bench.reason == Reason.FOREIGN_CONTROLLER and bench.neutral
         assert bench.controller.supervisor.detail == 1
-    assert "the machine bus" in describe(Reason.FOREIGN_CONTROLLER, 1)
+    assert part_of(DetailKind.BUS, 1) in describe(Reason.FOREIGN_CONTROLLER, 1)
 
 
 def test_lost_address_stops_the_machine():
@@ -240,7 +240,7 @@ def test_three_recoveries_within_a_minute_refuse_arming_for_a_minute(settings, w
         assert bench.reason == (Reason.BUS_UNSTABLE if k == 3 else Reason.NONE)
     last_ns = bench.now_ns - 152 * T
     assert bench.controller.supervisor.detail == bus
-    assert "the crane bus" in describe(Reason.BUS_UNSTABLE, 0)
+    assert part_of(DetailKind.BUS, 0) in describe(Reason.BUS_UNSTABLE, 0)
     bench.tick([bench.operator(OperatorAction.ARM)])
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.BUS_UNSTABLE
     monitor = bench.controller.supervisor._bus_monitors[bus]

@@ -5,7 +5,7 @@ import pytest
 from can_dbc.messages.udp_address import address_argument
 from controller.config import ConfigError, load
 from controller.process.command import bus_address, listen, main, parser
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 from tests.controller.bench import MS
 
 
@@ -32,7 +32,7 @@ def test_busy_port_is_one_sentence_and_exit_4(capsys, udp):
     port = udp[0].getsockname()[1]
     arguments = ["--profile", "palms_471", "--setpoint-port", str(port), "--bus", "crane0=virtual:busy"]
     assert main(arguments) == 4
-    assert f"UDP port {port} cannot be used" in capsys.readouterr().err
+    assert port in numbers_in(capsys.readouterr().err)
 
 
 def test_setpoint_socket_is_on_loopback_only():

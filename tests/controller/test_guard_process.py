@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from can_dbc.bus.base import BusError
+from can_dbc.bus.base import BusError, BusState
 from can_dbc.frame import EXTENDED
 from controller.guard import __main__ as process
 from controller.guard.__main__ import build, main, profile_path
+from controller.guard.verdicts import Verdict
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
 from tests.controller.bench import DATABASE, MS
@@ -79,13 +80,13 @@ def test_it_sends_its_status_every_10_ms_until_it_is_ended(monkeypatch, capsys, 
     status = DATABASE.message("GuardStat").key
     assert 48 <= sent.count(status) <= 52
     assert sent.count(0x77D) == 5
-    assert "not granted: FIFO 85" in capsys.readouterr().err
+    assert "FIFO 85" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("handlers")
 def test_without_real_time_it_asks_for_nothing(monkeypatch, capsys):
     assert run_guard(monkeypatch, World(3), "--no-realtime") == 0
-    assert "not granted" not in capsys.readouterr().err
+    assert "FIFO" not in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("handlers")
@@ -112,7 +113,7 @@ def test_its_status_text_names_verdict_and_bus(monkeypatch):
 
     monkeypatch.setattr(process, "Notifier", Notifier)
     assert run_guard(monkeypatch, World(4, late_ticks={2: 2 * T})) == 0
-    assert seen[0] == ("Valves not enabled: NO_COMMAND. The bus is ACTIVE.", True) or "not enabled" in seen[0][0]
+    assert Verdict.ESTOP_LOST.name in seen[0][0] and BusState.ACTIVE.name in seen[0][0]
     assert [punctual for _, punctual in seen] == [True, False, True, True, True]
     assert seen[-1][0] == "stopping"
 
@@ -120,12 +121,12 @@ def test_its_status_text_names_verdict_and_bus(monkeypatch):
 @pytest.mark.usefixtures("handlers")
 def test_a_bus_that_cannot_be_opened_ends_it(monkeypatch, capsys):
     def refuses(address, **_options):
-        raise BusError("bus.no-such", f"{address} is not there; plug it in.")
+        raise BusError("bus.no-such", f"no {address}")
 
     world = World(1)
     monkeypatch.setattr(world, "open_bus", refuses)
     assert run_guard(monkeypatch, world) == 4
-    assert "plug it in" in capsys.readouterr().err
+    assert "no here" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given", ["crane1=x", "crane0=", "crane0"])
@@ -133,7 +134,7 @@ def test_a_bus_without_name_or_address_is_a_usage_error(capsys, given):
     with pytest.raises(SystemExit) as ended:
         main(["--profile", "palms_471", "--bus", given])
     assert ended.value.code == 2
-    assert "crane0=ADDRESS" in capsys.readouterr().err
+    assert given in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("handlers")
@@ -157,7 +158,7 @@ def test_a_profile_is_found_by_its_name_or_its_path(tmp_path):
 def test_a_negative_rate_is_a_usage_error(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         run_guard(monkeypatch, World(1), "--rate", "-1")
-    assert ended.value.code == 2 and "--rate -1: write the controller's rate in Hz" in capsys.readouterr().err
+    assert ended.value.code == 2 and "--rate -1" in capsys.readouterr().err
 
 
 def test_without_a_profile_it_does_not_start(capsys):

@@ -223,7 +223,7 @@ def test_lost_link_is_reopened_and_the_process_survives(udp):
     assert bus.tries == 0, "most links come back by themselves"
     ticks(T + 3 * RETRY_PERIOD_NS)
     assert bus.tries == 4 and not loop.stopping
-    assert "interface" in loop.status_text().lower() or "bus" in loop.status_text().lower(), loop.status_text()
+    assert BusState.DOWN.name in loop.status_text()
     bus.stats.state = BusState.ACTIVE
     ticks(2 * RETRY_PERIOD_NS)
     assert bus.tries == 4
@@ -247,7 +247,7 @@ def test_timing_page_carries_the_measurements(udp, tmp_path):
     timing = read_timing(tmp_path / "page")
     facts = timing.facts
     assert facts.ticks == 200 and facts.missed == facts.late == 0 and facts.period_ns == T
-    assert facts.mode == "BOOT" and facts.words.startswith("BOOT. ")
+    assert facts.mode == "BOOT" and facts.words.startswith(facts.mode)
     assert timing.durations["wake"].count == 201 and timing.durations["wake"].over(MS - 1000) == 1
     assert timing.durations["sync"].count == timing.durations["control"].count - 1 == 200
     assert [bus.name for bus in facts.buses] == ["memory"]

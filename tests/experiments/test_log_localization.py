@@ -16,6 +16,7 @@ from experiments.log_localization.plots import draw
 from experiments.log_localization.site import APART_M, STOP_M, Site
 from experiments.log_localization.trial import RANGES_M, detected, true_masks
 from host.exit_codes import CommandFailed, ExitCode
+from tests.codes import numbers_in
 from timberhand.cli import app
 
 
@@ -59,8 +60,7 @@ def test_every_metric_is_computed() -> None:
 
 
 def test_the_explanation_has_the_numbers_of_the_set_up() -> None:
-    text = explanation()
-    assert "harmonic mean" in text and "4.47 m" in text
+    assert 4.47 in numbers_in(explanation())
 
 
 def test_jobs_are_paired_over_angles_and_named_once() -> None:
@@ -121,6 +121,6 @@ def test_the_command_evaluates_draws_and_writes_the_page(tmp_path: Path) -> None
         assert metrics[f"deg{degrees}.median_m"] < 0.12 < metrics["faithful.deg90.median_m"]
     assert metrics["faithful.deg90.median_m"] > metrics["faithful.deg0.median_m"]
     page = (tmp_path / "docs" / "log-localization.md").read_text()
-    assert "harmonic mean" in page and "timberhand experiment log-localization --docs docs" in page
+    assert "timberhand experiment log-localization --docs docs" in page
     for name in ("errors", "curve", "overlay"):
         assert (tmp_path / "docs" / "results" / "log-localization" / f"{name}.png").stat().st_size > 5000

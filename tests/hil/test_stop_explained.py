@@ -14,6 +14,7 @@ from can_dbc.dbc.codec import load
 from hil.demo import lockstep
 from hil.wire.faults import Fault, Kind
 from host.exit_codes import ExitCode
+from tests.codes import numbers_in
 from timberhand.cli import app
 
 pytestmark = pytest.mark.long
@@ -40,15 +41,10 @@ def test_the_stop_of_a_demo_is_explained_and_the_operator_goes_on(
     assert (stop["code"], stop["detail"], stop["mode_before"]) == ("ENCODER_LOST", 1, "ACTIVE")
     assert LOST_NS[0] < stop["monotonic_ns"] < LOST_NS[0] + 40_000_000
     texts = [event["text"] for event in stop["events"]]
-    for expected in (
-        "EncLift silent from here for more than 15 ms",
-        "mode ACTIVE → STOP: ENCODER_LOST",
-        "mode STOP → FAULT",
-        "operator: RESET",
-        "operator: ARM",
-    ):
-        assert expected in texts, texts
-    assert sum(text.startswith("EncLift back after") for text in texts) == 1
+    for expected in ("ACTIVE → STOP: ENCODER_LOST", "STOP → FAULT", "RESET", "ARM"):
+        assert any(text.endswith(expected) for text in texts), texts
+    silent, _back = (text for text in texts if "EncLift" in text)
+    assert 15 in numbers_in(silent)
     shown = screen.file.getvalue()  # type: ignore[attr-defined]
     assert f"STOP: {stop['text']}" in shown, "the terminal shows the same text"
     assert f"timberhand why {tmp_path / 'run'}" in shown

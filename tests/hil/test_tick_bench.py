@@ -73,4 +73,4 @@ def test_what_valgrind_counted_is_told_for_one_tick():
 @pytest.mark.parametrize("other", ["--count", "--random=10"])
 def test_an_option_that_would_be_ignored_is_refused(other: str) -> None:
     done = CliRunner().invoke(app, ["bench", "tick", other, "--against", "HEAD"])
-    assert done.exit_code == 2 and "--against compares costs" in done.output
+    assert done.exit_code == 2 and "--against" in done.output

@@ -86,7 +86,7 @@ def test_the_forwarder_reaches_9_m_backward_and_not_ahead():
     assert max_reach_m(profile) == pytest.approx(9.0, abs=0.01)
     assert hypot(*pin_position(profile.kinematics, (0.0, 0.0, -0.0873, 2.5))[:2]) == pytest.approx(9.0, abs=0.03)
     assert pin_position(profile.kinematics, (0.0, 0.0, -1.0, 1.0))[0] > 4.0
-    with pytest.raises(Unreachable, match=r"180\.0 deg", check=coded("reach.slew")):
+    with pytest.raises(Unreachable, match=r"180\.0", check=coded("reach.slew")):
         solve(profile, -4.0, 0.0, 1.0)
     assert abs(solve(profile, 0.0, 4.0, 1.0)[Joint.SLEW]) == pytest.approx(pi / 2)
 

@@ -52,7 +52,7 @@ def test_a_slow_valve_gets_a_lower_gain(tmp_path: Path) -> None:
 def test_all_answers_are_written_with_their_questions_and_read_again() -> None:
     text = answers_text(example())
     assert answers_of(tomllib.loads(text), "again") == example()
-    assert "# boom pin to stick pin" in text
+    assert all(question.text in text for question in questions(example()) if question.proposal is not None)
 
 
 def test_the_questionnaire_asks_for_everything_and_checks_what_is_typed() -> None:
@@ -85,7 +85,7 @@ def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path
     path = tmp_path / "crane.urdf"
     text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
     path.write_text(text.replace('joint name="lift"', 'joint name="q2"'))
-    with pytest.raises(AnswersError, match="--urdf-joints lift=NAME", check=coded("answers.urdf-joint")):
+    with pytest.raises(AnswersError, match="--urdf-joints lift", check=coded("answers.urdf-joint")):
         answers_from_urdf(path, {})
     given = answers(("kinematics", None), ("joints.lift.lower", None))
     both = answers_of(merged(given, answers_from_urdf(path, {"lift": "q2"})), "answers")
@@ -94,40 +94,40 @@ def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "code"),
     [
-        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -1"/>', "slew axis does not point straight up"),
-        ("</robot>", "", "not a URDF file"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -1"/>', "answers.urdf-chain"),
+        ("</robot>", "", "answers.urdf-broken"),
     ],
 )
-def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str, code: str) -> None:
     path = tmp_path / "crane.urdf"
     text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
     assert old in text
     path.write_text(text.replace(old, new))
-    with pytest.raises(AnswersError, match=words):
+    with pytest.raises(AnswersError, check=coded(code)):
         answers_from_urdf(path, {})
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "named"),
     [
-        (("kinematics.a2_m", None), "kinematics.a2_m: missing"),
-        (("kinematics.a2_m", "long"), "kinematics.a2_m: expected"),
-        (("kinematics.a2_mm", 3300), 'write "a2_m"'),
-        (("name", "../loader"), "name: "),
-        (("joints.lift.drive.rod_m", 0.2), "thinner than the bore"),
-        (("joints.slew.drive.bore_m", 0.1), "either bore_m and rod_m"),
-        (("joints.lift.drive.levers_m", [0.3]), "one for each lever_at"),
-        (("joints.lift.drive.lever_m", 0.0), "greater than 0"),
-        (("joints.ext.encoder.unit_m", None), "needs unit_m"),
-        (("grapple.opening_m", 2.0), "less than 1.78 m"),
+        (("kinematics.a2_m", None), "kinematics.a2_m"),
+        (("kinematics.a2_m", "long"), "kinematics.a2_m"),
+        (("kinematics.a2_mm", 3300), '"a2_m"'),
+        (("name", "../loader"), "name"),
+        (("joints.lift.drive.rod_m", 0.2), "joints.lift.drive"),
+        (("joints.slew.drive.bore_m", 0.1), "joints.slew.drive"),
+        (("joints.lift.drive.levers_m", [0.3]), "lever_at"),
+        (("joints.lift.drive.lever_m", 0.0), "joints.lift.drive"),
+        (("joints.ext.encoder.unit_m", None), "unit_m"),
+        (("grapple.opening_m", 2.0), "1.78"),
     ],
 )
-def test_answers_that_make_no_machine_are_refused_in_a_sentence(change: tuple[str, object], words: str) -> None:
+def test_answers_that_make_no_machine_are_refused_in_a_sentence(change: tuple[str, object], named: str) -> None:
     with pytest.raises(AnswersError, match=r"^here: ", check=coded("answers.wrong")) as refused:
         answers_of(answers(change), "here")
-    assert words in str(refused.value)
+    assert named in str(refused.value)
 
 
 def test_the_least_inertia_is_that_of_the_shipped_truth() -> None:

@@ -9,36 +9,41 @@ import pytest
 from machine.joints import Joint
 from machine.status.evidence import EVIDENCE, numbers_text, quantities
 from machine.status.explanation import explain, message_id, priority
-from machine.status.faults import FAULTS, describe
+from machine.status.faults import FAULTS, describe, sentence_of
 from machine.status.reasons import DetailKind, Reaction, Reason, pack
+from tests.codes import numbers_in
 
 
 def test_numbers_have_their_names_and_units() -> None:
     text = numbers_text(Reason.ENCODER_LOST, Joint.LIFT, (20.04, 15.0, 4.0))
-    assert text == "age of its last good sample 20.0 ms, limit 15.0 ms, frames refused since the start 4"
+    assert numbers_in(text) == [20.0, 15.0, 4]
+    assert text == ", ".join(
+        quantity.text for quantity in quantities(Reason.ENCODER_LOST, Joint.LIFT, (20.04, 15.0, 4.0))
+    )
 
 
 @pytest.mark.parametrize(
-    ("detail", "text"),
+    ("detail", "shown"),
     [
-        (Joint.LIFT, "position 90.00°, limit 80.00°"),
-        (Joint.EXT, "position 1.571 m, limit 1.396 m"),
+        (Joint.LIFT, ("90.00°", "80.00°")),
+        (Joint.EXT, ("1.571 m", "1.396 m")),
     ],
 )
-def test_the_unit_of_a_joint_is_degrees_or_metres(detail: int, text: str) -> None:
-    assert numbers_text(Reason.POSITION_OUTSIDE, detail, (math.pi / 2, math.radians(80), math.nan)) == text
+def test_the_unit_of_a_joint_is_degrees_or_metres(detail: int, shown: tuple[str, ...]) -> None:
+    text = numbers_text(Reason.POSITION_OUTSIDE, detail, (math.pi / 2, math.radians(80), math.nan))
+    assert all(value in text for value in shown)
 
 
 def test_unknown_numbers_are_left_out() -> None:
-    assert numbers_text(Reason.GUARD_LOST, 0, (math.nan, 50.0, None)) == "limit 50.0 ms"
+    assert numbers_in(numbers_text(Reason.GUARD_LOST, 0, (math.nan, 50.0, None))) == [50.0]
     assert numbers_text(Reason.GUARD_LOST, 0, ()) == ""
     assert numbers_text(Reason.OPERATOR_STOP, 0, (1.0, 2.0, 3.0)) == ""
 
 
 def test_bits_and_reasons_are_readable() -> None:
-    assert numbers_text(Reason.PLC_FAULT, 0, (0x21, math.nan, math.nan)) == "fault bits 0021h"
+    assert "0021h" in numbers_text(Reason.PLC_FAULT, 0, (0x21, math.nan, math.nan))
     text = numbers_text(Reason.SETPOINTS_REFUSED, 0, (7.0, math.nan, float(pack(Reason.JOINT_SPEED, 2))))
-    assert text == "setpoints refused since the start 7, the last one for JOINT_SPEED"
+    assert numbers_in(text) == [7] and Reason.JOINT_SPEED.name in text
 
 
 def test_values_stay_in_si_units_for_programs() -> None:
@@ -48,14 +53,14 @@ def test_values_stay_in_si_units_for_programs() -> None:
 
 def test_the_one_text_has_sentence_numbers_advice_and_code() -> None:
     reason = pack(Reason.ENCODER_LOST, Joint.LIFT)
-    assert describe(reason, numbers=(20.0, 15.0, 0.0)) == (
-        "The encoder of joint lift is no longer received (age of its last good sample 20.0 ms, limit 15.0 ms, frames "
-        "refused since the start 0). Check its cable, then reset and arm. [ENCODER_LOST]"
-    )
-    assert describe(Reason.NONE) == "All is well. Nothing to do."
+    sentence, advice = sentence_of(Reason.ENCODER_LOST, Joint.LIFT), FAULTS[Reason.ENCODER_LOST].advice
+    measured = numbers_text(Reason.ENCODER_LOST, Joint.LIFT, (20.0, 15.0, 0.0))
+    assert "lift" in sentence and numbers_in(measured) == [20.0, 15.0, 0]
+    assert describe(reason, numbers=(20.0, 15.0, 0.0)) == f"{sentence} ({measured}). {advice} [ENCODER_LOST]"
+    assert describe(Reason.NONE) == f"{sentence_of(Reason.NONE)}. {FAULTS[Reason.NONE].advice}"
     found = explain(reason, (20.0, 15.0, 0.0))
     assert found.text == describe(reason, numbers=(20.0, 15.0, 0.0))
-    assert (found.code, found.sentence) == ("ENCODER_LOST", "The encoder of joint lift is no longer received.")
+    assert (found.code, found.sentence) == ("ENCODER_LOST", f"{sentence}.")
 
 
 def test_every_text_is_made_for_every_reason_and_detail() -> None:

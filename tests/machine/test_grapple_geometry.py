@@ -22,6 +22,7 @@ from machine.geometry.grapple import (
 )
 from machine.geometry.kinematics import Unreachable, pin_position
 from machine.loading.profile_file import load_profile
+from tests.codes import numbers_in
 
 PALMS = load_profile("palms_471")
 TONGS = PALMS.grapple.jaws
@@ -67,9 +68,7 @@ def test_a_rotator_with_a_small_range_is_reported():
     assert rotator_for_yaw(stiff, 1.0, 1.1) == pytest.approx(0.1)
     with pytest.raises(Unreachable) as caught:
         rotator_for_yaw(stiff, 0.0, pi / 2)
-    assert str(caught.value) == (
-        "grapple yaw 90.0 deg at slew 0.0 deg is out of reach: the rotator turns only -11.5..11.5 deg"
-    )
+    assert numbers_in(str(caught.value)) == [90.0, 0.0, -11.5, 11.5]
 
 
 def tip(tong_rad: float) -> tuple[float, float]:

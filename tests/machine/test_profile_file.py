@@ -12,7 +12,7 @@ import pytest
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash, shipped_profiles
 from machine.profile import Imu, Profile, Sag, joint, joint_limits
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 from tests.machine.changed_profiles import AORO, DELETE, FOLDER, IMU, RAW, SAG, SHIPPED, the_problem, write
 
 
@@ -157,12 +157,12 @@ def test_unreadable_files_are_named(tmp_path):
     gone = tmp_path / "gone.toml"
     with pytest.raises(ProfileError, check=coded("profile.unreadable")) as caught:
         load_profile(str(gone))
-    assert str(gone) in str(caught.value) and "No such file or directory" in str(caught.value)
+    assert str(gone) in str(caught.value)
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"a = 1\n\xff\xfe")
     with pytest.raises(ProfileError, check=coded("profile.not-utf8")) as caught:
         load_profile(binary)
-    assert str(binary) in str(caught.value) and "byte 6" in str(caught.value)
+    assert str(binary) in str(caught.value) and 6 in numbers_in(str(caught.value).replace(str(binary), ""))
 
 
 def test_broken_toml_names_the_line(tmp_path):
@@ -170,7 +170,8 @@ def test_broken_toml_names_the_line(tmp_path):
     broken.write_text('schema = 1\nname = "x"\nrate_hz = = 3\n')
     with pytest.raises(ProfileError, check=coded("profile.broken-toml")) as caught:
         load_profile(broken)
-    assert str(broken) in str(caught.value) and "line 3, column 11" in str(caught.value)
+    assert str(broken) in str(caught.value)
+    assert numbers_in(str(caught.value).replace(str(broken), "")) == [3, 11]
 
 
 def test_an_error_keeps_its_problems_between_processes(tmp_path):

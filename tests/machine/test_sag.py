@@ -51,7 +51,7 @@ def test_the_joints_for_a_true_point_bring_the_true_pin_there(sag, q, load_kg):
 
 def test_a_point_that_the_lean_carries_past_the_mast_is_refused():
     sag, q = Sag(0.0078125, 0.0, 0.0, 0.0), (1.5, -0.25, -3.0, 0.78125, 0.0)
-    with pytest.raises(Unreachable, match="too near the mast"):
+    with pytest.raises(Unreachable):
         aim(sag, KIN, LIMITS, *true_pin(sag, KIN, q), q[Joint.EXT])
 
 

@@ -230,7 +230,7 @@ class FullDisk:
 
 def test_full_disk_at_start_is_refused(tmp_path, monkeypatch):
     FullDisk(monkeypatch).full = True
-    with pytest.raises(RecordingRefused, match="No space left on device", check=coded("recording.cannot-write")):
+    with pytest.raises(RecordingRefused, match=os.strerror(errno.ENOSPC), check=coded("recording.cannot-write")):
         Recorder(tmp_path, PROFILE, manifest())
 
 

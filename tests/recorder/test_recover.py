@@ -19,7 +19,7 @@ from recorder.__main__ import InputCollector, udp_socket, write_all
 from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, Recorder
 from recorder.recover import recover
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 from tests.recorder.recordings import PROFILE, T_NS, feed, manifest, record, tick
 
 TICKS = 400
@@ -137,7 +137,8 @@ def test_frames_that_the_kernel_dropped_are_reported_once(tmp_path, capfd):
         bus.stats.dropped += 7
         receive()
         receive()
-        assert capfd.readouterr().err.count("7 frames of crane0") == 1
+        said = capfd.readouterr().err
+        assert said.count("crane0") == 1 and 7 in numbers_in(said)
         inputs.items.put(None)
         write_all(Recorder(tmp_path, PROFILE, manifest()), inputs)
     assert manifests.read(tmp_path).dropped == 7, "a recording with gaps says so"
@@ -172,4 +173,4 @@ def test_records_that_do_not_fit_into_the_queue_are_counted(tmp_path, capfd):
     inputs.items.put(None)
     writer.join(10)
     assert recorder.dropped == 3 and manifests.read(tmp_path).dropped == 3
-    assert "3 records" in capfd.readouterr().err
+    assert 3 in numbers_in(capfd.readouterr().err)

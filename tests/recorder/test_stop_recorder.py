@@ -55,7 +55,7 @@ def test_a_stop_has_a_file_with_its_reason_and_numbers(whole: Path) -> None:
     assert stop.reason == pack(Reason.ENCODER_LOST, 1)
     age_ms, limit_ms, refused = stop.numbers
     assert age_ms is not None and age_ms > 15.0 == limit_ms and refused == 0
-    assert "joint lift" in stop.text and stop.text.endswith("[ENCODER_LOST]")
+    assert "lift" in stop.text and stop.text.endswith("[ENCODER_LOST]")
     assert manifest_of([path]).seed == 3
 
 

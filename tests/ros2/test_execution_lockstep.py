@@ -91,7 +91,8 @@ def test_a_goal_moves_the_crane_there_and_it_holds(machine: Machine) -> None:
     there = (start[0] - 0.4, start[1] + 0.1)
     machine.begin(goal((5.0, there), joints=("slew", "lift")))
     machine.run(20.0)
-    assert machine.bridge.outcome == Outcome(Status.SUCCEEDED, ErrorCode.SUCCESSFUL, "the crane has arrived")
+    outcome = machine.bridge.outcome
+    assert outcome is not None and (outcome.status, outcome.error_code) == (Status.SUCCEEDED, ErrorCode.SUCCESSFUL)
     sent = machine.bridge.sent
     assert machine.rest(1.0) < 0.02 and machine.bridge.sent == sent
     assert machine.report.mode == Mode.ARMED and machine.report.refused == 0
@@ -130,7 +131,7 @@ def test_a_stop_of_the_controller_ends_the_goal_with_its_reason(machine: Machine
     outcome = machine.bridge.outcome
     assert outcome is not None and outcome.status is Status.ABORTED
     assert outcome.error_code == machine.report.reason & 0xFF and outcome.error_code > 0
-    assert "[" in outcome.sentence
+    assert f"[{Reason(outcome.error_code).name}]" in outcome.sentence
     assert machine.rest(1.0) < 0.02
 
 
@@ -140,7 +141,7 @@ def test_leaving_the_path_ends_the_goal(machine: Machine) -> None:
     machine.run(10.0)
     outcome = machine.bridge.outcome
     assert outcome is not None and outcome.error_code == ErrorCode.PATH_TOLERANCE_VIOLATED
-    assert outcome.sentence.startswith("slew is ")
+    assert "slew" in outcome.sentence
 
 
 def test_a_goal_tolerance_that_is_not_reached_in_time_ends_the_goal(machine: Machine) -> None:

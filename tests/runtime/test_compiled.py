@@ -74,13 +74,13 @@ def test_of_several_builds_that_do_not_fit_the_newest_is_named(root: Path, tmp_p
     for age, key in enumerate(("b", "c", "a")):
         made = make_build(root, tmp_path / "builds", key, platform=f"platform {key}")
         os.utime(made / compiled.MANIFEST, ns=(0, 10**18 - age * 10**9))
-    assert "build b: it was made for platform b" in compiled.find_build(root, tmp_path / "builds")[1]
+    assert "platform b" in compiled.find_build(root, tmp_path / "builds")[1]
 
 
 def test_a_served_name_without_a_file_is_no_module(root: Path, tmp_path: Path) -> None:
-    sys.meta_path.insert(0, compiled._Finder({"runtime.served_module": tmp_path / "missing.py"}))
-    with pytest.raises(ModuleNotFoundError, match="compiled form only"):
-        importlib.import_module("runtime.served_module")
+    finder = compiled._Finder({"runtime.served_module": tmp_path / "missing.py"})
+    with pytest.raises(ModuleNotFoundError):
+        finder.find_spec("runtime.served_module", None)
 
 
 def test_a_removed_source_file_refuses_the_build(root: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ def test_a_folder_that_another_user_made_first_is_refused(tmp_path: Path, monkey
     trap = tmp_path / "timberhand-1000"
     trap.mkdir()
     os.chown(trap, 4321, 4321)
-    with pytest.raises(PermissionError, match="belongs to another user"):
+    with pytest.raises(PermissionError):
         SharedFile(trap / "controller.timing", 64)
     assert list(trap.iterdir()) == []
     os.chown(trap, 0, 0)

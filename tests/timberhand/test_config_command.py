@@ -30,29 +30,29 @@ def test_the_shipped_settings_have_no_problem() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words", "line"),
+    ("text", "named", "line"),
     [
-        (changed("SETPOINT_PORT", "24702"), "PLANNER_PORT and SETPOINT_PORT are both 24702", "PLANNER_PORT"),
-        (changed("SETPOINT_PORT", "9000"), "ports 24700 to 24799", "SETPOINT_PORT"),
-        (changed("CONSOLE_PORT", "24750"), "ports 8000 to 8999", "CONSOLE_PORT"),
-        (changed("CONSOLE_PORT", "page"), "ports 8000 to 8999", "CONSOLE_PORT"),
-        (changed("SCENE", "camera"), "write HOST:PORT", "SCENE"),
-        (changed("CRANE_BUS", "can0"), "write socketcan:INTERFACE", "CRANE_BUS="),
-        (changed("CRANE_BUS", ""), "every machine has a crane bus", "CRANE_BUS="),
-        (changed("CRANE_BITRATE", "2000000"), "classic CAN", "CRANE_BITRATE"),
-        (changed("MACHINE_BUS", "socketcan:mach0"), "has no machine bus", "MACHINE_BUS="),
-        (changed("PROFILE", "aoro_fc8"), "needs MACHINE_BUS", "MACHINE_BUS="),
+        (changed("SETPOINT_PORT", "24702"), "24702", "PLANNER_PORT"),
+        (changed("SETPOINT_PORT", "9000"), "24799", "SETPOINT_PORT"),
+        (changed("CONSOLE_PORT", "24750"), "8999", "CONSOLE_PORT"),
+        (changed("CONSOLE_PORT", "page"), "8999", "CONSOLE_PORT"),
+        (changed("SCENE", "camera"), "HOST:PORT", "SCENE"),
+        (changed("CRANE_BUS", "can0"), "socketcan:INTERFACE", "CRANE_BUS="),
+        (changed("CRANE_BUS", ""), "socketcan:crane0", "CRANE_BUS="),
+        (changed("CRANE_BITRATE", "2000000"), "2000000", "CRANE_BITRATE"),
+        (changed("MACHINE_BUS", "socketcan:mach0"), "MACHINE_BUS", "MACHINE_BUS="),
+        (changed("PROFILE", "aoro_fc8"), "MACHINE_BUS", "MACHINE_BUS="),
         (changed("PROFILE", "palms"), "PROFILE=palms", "PROFILE"),
-        (changed("PLC", "--modbus 192.168.7.2:502"), "has no [plc] table", "PLC="),
-        (TEXT + "CRANE_BUSS=x\n", "did you mean CRANE_BUS?", "CRANE_BUSS"),
-        (TEXT + "KEY_OPTIONS=\n", "KEY_OPTIONS is no longer a setting", "KEY_OPTIONS"),
-        (TEXT + "CRANE_BUS = x\n", "is no setting", "CRANE_BUS = x"),
-        (TEXT + "PLC=\n", "PLC stands in line", "PLC="),
-        (TEXT.replace("\nSCENE=", "\n# SCENE="), "SCENE is missing", ""),
+        (changed("PLC", "--modbus 192.168.7.2:502"), "[plc]", "PLC="),
+        (TEXT + "CRANE_BUSS=x\n", "CRANE_BUS", "CRANE_BUSS"),
+        (TEXT + "KEY_OPTIONS=\n", "KEY_OPTIONS", "KEY_OPTIONS"),
+        (TEXT + "CRANE_BUS = x\n", "CRANE_BUS", "CRANE_BUS = x"),
+        (TEXT + "PLC=\n", "PLC", "PLC="),
+        (TEXT.replace("\nSCENE=", "\n# SCENE="), "SCENE", ""),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line_and_what_to_do(text: str, words: str, line: str) -> None:
-    (found,) = (problem for problem in problems_of(text, TEXT) if words in problem.sentence)
+def test_what_is_wrong_is_said_with_its_line_and_what_to_do(text: str, named: str, line: str) -> None:
+    (found,) = (problem for problem in problems_of(text, TEXT) if named in problem.sentence)
     assert found.line == 0 if not line else text.splitlines()[found.line - 1].startswith(line)
 
 

@@ -82,7 +82,7 @@ def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None
         document = {"profile": "palms_471", "ports": {"sim": plant.getsockname()[1]}, "buses": {}, "pids": {}}
         (tmp_path / ADDRESSES).write_text(json.dumps(document))
         there = LiveTarget.of(tmp_path)
-        assert "begun" in inject(make("encoder-lift", "stuck", length_s=0.5), there)
+        assert "encoder-stuck" in inject(make("encoder-lift", "stuck", length_s=0.5), there)
         with pytest.raises(FaultError, check=coded("fault.plant-refuses")):
             inject(make("encoder-stuck"), there)
         thread.join()

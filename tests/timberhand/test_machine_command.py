@@ -81,7 +81,7 @@ def test_new_writes_every_file_and_says_what_comes_next(tmp_path: Path) -> None:
     arguments = ["machine", "new", str(tmp_path / "mine"), "--answers", str(tmp_path / "answers.toml")]
     drafted = RUNNER.invoke(app, arguments)
     assert drafted.exit_code == ExitCode.OK, drafted.output
-    assert "python -m controller.guard.seal" in drafted.stdout and "no problem" in drafted.stdout
+    assert "python -m controller.guard.seal" in drafted.stdout
     suffixes = (".toml", ".answers.toml", ".envelope.toml", ".truth.toml", ".urdf")
     assert {p.name for p in (tmp_path / "mine").iterdir()} == {NAME + suffix for suffix in suffixes}
     again = RUNNER.invoke(app, arguments)
@@ -114,7 +114,7 @@ def test_on_a_terminal_every_question_is_asked_until_its_answer_fits(monkeypatch
 def test_answers_that_no_profile_allows_write_nothing(tmp_path: Path) -> None:
     with pytest.raises(CommandFailed, match=r"joints.slew.lower", check=coded("profile.wrong-values")):
         make(answers(("joints.slew.lower", 3.0)), "answers", tmp_path / "mine")
-    with pytest.raises(CommandFailed, match="is not an encoder message", check=coded("profile.wrong-values")):
+    with pytest.raises(CommandFailed, match=r"joints.slew.encoder", check=coded("profile.wrong-values")):
         make(answers(("joints.slew.encoder.node", 33)), "answers", tmp_path / "mine")
     assert not (tmp_path / "mine").exists()
 

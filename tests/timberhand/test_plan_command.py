@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from host.exit_codes import CommandFailed, ExitCode
 from runtime.plot_style import MOSS, OIL, RUST, TIMBER
+from tests.codes import numbers_in
 from timberhand.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -38,7 +39,7 @@ def test_every_shipped_example_is_fine(name: str) -> None:
 
 def test_check_in_words_and_as_json() -> None:
     said = run("check", PAPER_B).output
-    assert "4 waypoints, 1 fence, 12 logs" in said and "250.0 m in 2 laps" in said and "24 logs" in said
+    assert {4, 1, 12, 250.0, 2, 24} <= set(numbers_in(said))
     facts = json.loads(run("check", PAPER_B, "--json").output)
     assert (facts["waypoints"], facts["laps"], facts["logs"], facts["logs_to_fetch"]) == (4, 2, 12, 24)
     assert facts["length_m"] == pytest.approx(250.0, abs=0.05) and len(facts["corners"]) == 4
@@ -67,7 +68,7 @@ def test_a_machine_that_does_not_drive_or_is_unknown() -> None:
 def test_convert_with_a_harvest(tmp_path: Path) -> None:
     out = tmp_path / "m.geojson"
     said = run("convert", EXAMPLES / "site.kml", out, "--logs", EXAMPLES / "harvest.hpr").output
-    assert "3 waypoints, 2 fences, 1 landing, 7 logs" in said
+    assert {3, 2, 1, 7} <= set(numbers_in(said))
     assert json.loads(run("check", out, "--json").output)["logs"] == 7
     assert failure("convert", PAPER_B, tmp_path / "m.dxf").exit_code == ExitCode.USAGE
     assert failure("convert", PAPER_B, tmp_path / "no" / "m.geojson").code == "mission.not-written"

@@ -19,9 +19,11 @@ from can_dbc.messages.crane import OperatorAction
 from can_dbc.messages.tick_record import TickRecord, decode
 from controller.process.tick_recording import record
 from host.exit_codes import CommandFailed, ExitCode
+from machine.status.faults import FAULTS, sentence_of
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from recorder.stop_files import files_in
+from tests.codes import numbers_in
 from tests.controller.bench import SETTINGS, Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 from timberhand.cli import app
@@ -65,9 +67,9 @@ def refused(*words: object) -> CommandFailed:
 def test_the_newest_stop_is_explained(run: Path) -> None:
     text = invoke(run)
     assert "GUARD_LOST" in text and "ENCODER_LOST" not in text
-    assert "The guard is no longer received." in text and "Start the guard, then reset." in text
-    assert "limit 50.0 ms" in text and "ACTIVE before" in text
-    assert "GuardStat silent from here for more than 50 ms" in text
+    assert sentence_of(Reason.GUARD_LOST) in text and FAULTS[Reason.GUARD_LOST].advice in text
+    assert "50.0 ms" in text and Mode.ACTIVE.name in text
+    assert any("GuardStat" in line and 50 in numbers_in(line) for line in text.splitlines())
     assert str(files_in(run / "stops")[-1]) in text
 
 
@@ -75,16 +77,16 @@ def test_all_stops_are_shown_with_what_happened_before_them(run: Path) -> None:
     text = invoke(run, "--all")
     first, second = text.index("ENCODER_LOST"), text.index("GUARD_LOST")
     assert first < second
-    for line in (
-        "request refused: A datagram of wrong length was refused",
-        "the tick began 12.0 ms late",
-        "EncLift silent from here for more than 15 ms",
-        "mode ACTIVE → STOP: ENCODER_LOST",
-        "mode STOP → FAULT",
-        "age of its last good sample",
-        "operator: RESET",
+    lines = text.splitlines()
+    for part in (
+        sentence_of(Reason.DATAGRAM_LENGTH),
+        "12.0 ms",
+        "ACTIVE → STOP: ENCODER_LOST",
+        "STOP → FAULT",
+        "RESET",
     ):
-        assert line in text, line
+        assert part in text, part
+    assert any("EncLift" in line and 15 in numbers_in(line) for line in lines)
 
 
 def test_json_has_values_in_si_units(run: Path) -> None:
@@ -120,7 +122,6 @@ def test_a_recording_without_stop_files_tells_the_same(run: Path, tmp_path: Path
 @pytest.mark.parametrize("name", ["palms", "aoro"])
 def test_an_old_recording_is_read(name: str, tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(lzma.decompress((KEPT / f"{name}.mcap.xz").read_bytes()))
-    assert "did not stop" in invoke(tmp_path)
     assert json.loads(invoke(tmp_path, "--json")) == {"stops": [], "plot": None, "failure": None}
 
 
@@ -174,7 +175,8 @@ def test_an_operator_and_a_pressed_stop_are_events(tmp_path: Path) -> None:
     texts = [event.text for event in events_of(found.ticks, found.stop.at_ns)]
     assert "EstopStat: ChannelA Released → Pressed, ChannelB Released → Pressed" in texts
     assert "GuardStat: Enable Enabled → Disabled, Verdict GOOD → ESTOP" in texts
-    assert "operator: RESET" in texts and "crane0: 12 error frames" in texts and "crane0: ACTIVE → PASSIVE" in texts
+    assert "operator: RESET" in texts and "crane0: ACTIVE → PASSIVE" in texts
+    assert any("crane0" in text and 12 in numbers_in(text) for text in texts)
     assert found.stop.code == "ESTOP_PRESSED"
 
 
@@ -182,7 +184,7 @@ def test_a_run_with_a_key_needs_it_for_a_recording_only(tmp_path: Path) -> None:
     error = refused(keyed_run(tmp_path))
     assert error.code == "recording.reports-unreadable"
     (tmp_path / "key").write_bytes(b"0123456789abcdef")
-    assert "did not stop" in invoke(tmp_path / "run", "--key-file", tmp_path / "key")
+    assert json.loads(invoke(tmp_path / "run", "--key-file", tmp_path / "key", "--json"))["stops"] == []
     assert refused(tmp_path / "run", "--key-file", tmp_path / "none").code == "why.key-unreadable"
 
 
@@ -197,20 +199,18 @@ def keyed_run(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize(
-    ("reason", "numbers", "line"),
-    [
-        (Reason.PERSON_IN_ZONE, (None, None, None), "no number belongs to this reason"),
-        (Reason.GUARD_LOST, (None, None, None), "unknown"),
-        (Reason.GUARD_LOST, (), "not recorded; the recording is of an earlier release"),
-    ],
-)
-def test_missing_numbers_are_explained(run: Path, reason: Reason, numbers: tuple[None, ...], line: str) -> None:
+def test_missing_numbers_are_explained(run: Path) -> None:
     (found,) = find_stops(run, newest=True)
-    stop = msgspec.structs.replace(found.stop, reason=int(reason), code=reason.name, numbers=numbers)
-    text = io.StringIO()
-    show(Console(file=text, width=120), replace(found, stop=stop), [])
-    assert f"  measured    {line}\n" in text.getvalue()
+    told = []
+    for reason, numbers in (
+        (Reason.PERSON_IN_ZONE, (None, None, None)), (Reason.GUARD_LOST, (None, None, None)), (Reason.GUARD_LOST, ()),
+    ):  # fmt: skip
+        stop = msgspec.structs.replace(found.stop, reason=int(reason), code=reason.name, numbers=numbers)
+        text = io.StringIO()
+        show(Console(file=text, width=120), replace(found, stop=stop), [])
+        (line,) = [line for line in text.getvalue().splitlines() if line.split()[:1] == ["measured"]]
+        told.append(line.split()[1:])
+    assert all(told) and len(set(map(tuple, told))) == 3, "none belongs to it, unknown, of an earlier release"
 
 
 def test_heartbeats_of_an_operator_are_an_event_only_when_they_stop(tmp_path: Path) -> None:
@@ -224,7 +224,7 @@ def test_heartbeats_of_an_operator_are_an_event_only_when_they_stop(tmp_path: Pa
     (found,) = find_stops(tmp_path)
     texts = [event.text for event in events_of(found.ticks, found.stop.at_ns)]
     assert found.stop.code == "OPERATOR_LINK_LOST"
-    assert "heartbeats of the operator silent from here for more than 500 ms" in texts
+    assert any(500 in numbers_in(text) for text in texts)
     assert not any("WATCH" in text for text in texts)
 
 
@@ -240,4 +240,4 @@ def test_a_watch_that_ends_on_purpose_is_no_silence() -> None:
         *[tick(bench) for _ in range(200)],
     ]
     texts = [event.text for event in events_of(ticks, bench.now_ns)]
-    assert "operator: WATCH_END" in texts and not any("heartbeats" in text for text in texts)
+    assert "operator: WATCH_END" in texts and not any(500 in numbers_in(text) for text in texts)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from autonomy.networks.weights import load
 from autonomy.perception.segmentation.mask_network import mask_network
 from machine.geometry.optics import Intrinsics
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 from timberhand.commands.train import app
 from training.common.dataset_error import DatasetError
 from training.pictures import piles
@@ -73,7 +73,7 @@ def test_the_command_writes_weights_card_and_checkpoint(folder):
     result = CliRunner().invoke(app, ["masks", str(folder), *few])
     assert result.exit_code == 0, result.output
     load(out, mask_network())
-    assert "1 steps" in out.with_suffix(".md").read_text() and out.with_suffix(".checkpoint").is_file()
+    assert 1 in numbers_in(out.with_suffix(".md").read_text()) and out.with_suffix(".checkpoint").is_file()
     assert out.with_suffix(".jsonl").is_file()
 
 

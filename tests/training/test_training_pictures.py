@@ -168,7 +168,7 @@ def test_weights_are_written_with_a_card(few, monkeypatch):
     assert BoxDetector(boxes).facts["command"].startswith("timberhand train detector --pictures 2 --large 2")
     on = detector_weights.Plan(2, 1, 1, 1e-6, out)
     text = detector_weights.produce("depth", on, few, few / "on.safetensors", Console(quiet=True)).read_text()
-    assert "begun with logs_depth.safetensors" in text
+    assert "logs_depth.safetensors" in text
     before, after = (
         load(few / f"{name}.safetensors", unet("depth"))[0]["maps.weight"] for name in ("logs_depth", "on")
     )
