@@ -12,7 +12,7 @@ CAMERA = "stick"
 def test_the_process_refuses_a_camera_that_the_machine_does_not_have() -> None:
     done = run("--camera", "moon", "--frames", "127.0.0.1:1")
     assert done.returncode == 3
-    assert "no camera 'moon'; it has: stick" in done.stderr
+    assert "moon" in done.stderr and CAMERA in done.stderr
 
 
 def test_the_process_refuses_damaged_weights(tmp_path: Path) -> None:

@@ -101,11 +101,13 @@ def words(browser: Browser) -> str:
 
 def test_control_is_taken_taken_over_and_lost(stage: Stage, browsers: list[Browser]) -> None:
     first, second = browsers
-    assert words(first) == "Nobody has control" and first.value("document.getElementById('arm').disabled")
+    assert first.value("document.body.dataset.control") == "nobody" and first.value(
+        "document.getElementById('arm').disabled"
+    )
     take_control(first)
     first.until("!document.getElementById('arm').disabled")
     second.until("document.body.dataset.control === 'other'")
-    assert "(page 1) has control" in words(second) and second.value("document.getElementById('arm').disabled")
+    assert "(page 1)" in words(second) and second.value("document.getElementById('arm').disabled")
 
     second.click("lease-button")
     second.wait(lambda: "Take control over?" in second.text("take-over"), "a question first")
@@ -152,7 +154,7 @@ def test_a_person_signs_in_and_out_and_stop_works_before(stage: Stage, tmp_path:
         browser.click("enter")
         browser.until("document.body?.dataset.control === 'nobody'")
         take_control(browser)
-        assert "Sign out anna" in browser.text("lease")
+        assert "anna" in browser.text("lease")
         assert browser.value("document.documentElement.scrollWidth <= innerWidth")
         browser.click("sign-out")
         browser.until("document.body?.className === 'sign-in'")

@@ -137,7 +137,7 @@ def test_a_newcomer_watches_it_live_and_breaks_it(folder: Path, tmp_path: Path) 
         browser.click_on(".fault-buttons button:not(:disabled)", "The emergency stop is pressed for 1 s")
         browser.wait(lambda: "reaction after" in browser.text("panel-faults"), "the card")
         card = browser.value("document.querySelector('.fault-card').innerText")
-        assert card.startswith("The emergency stop is pressed for 1 s") and "What to do: " in card
+        assert card.startswith("The emergency stop is pressed for 1 s")
         browser.click("stop")
         audit = folder / "runs" / "second" / "audit.jsonl"
         browser.wait(lambda: "POST /api/operator/stop" in audit.read_text(), "STOP in the audit log")

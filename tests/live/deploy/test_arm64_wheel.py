@@ -14,6 +14,7 @@ import pytest
 
 from host.exit_codes import CommandFailed, ExitCode
 from host.release import bundle as bundles
+from tests.codes import coded
 from tests.host.small_releases import keys
 
 pytestmark = pytest.mark.timeout(1800)
@@ -62,7 +63,7 @@ def test_a_signed_bundle_for_arm64_brings_all_that_runs_there(
     folder = tmp_path / "unpacked"
     bundles.unpack(bundles.make(wheel, private, tmp_path, None, bundles.Lock.MACHINE), folder)
     if platform.machine() != "aarch64":
-        with pytest.raises(CommandFailed, match="the bundle is for aarch64"):
+        with pytest.raises(CommandFailed, match="aarch64", check=coded("bundle.other-machine")):
             bundles.check(folder, public)
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     release = bundles.check(folder, public)

@@ -82,22 +82,22 @@ def test_an_address_outside_the_kernel_is_left_alone(can_up, address: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("bus", "link", "settings", "status", "sentence"),
+    ("bus", "link", "settings", "status", "named"),
     [
-        ("crane0", None, {}, 4, "there is no CAN interface can0; plug its adapter in, or set CRANE_BUS"),
-        ("crane0", REAL, {"REFUSES": "type"}, 4, "can0 does not take 1000000 bit/s; check CRANE_BITRATE"),
-        ("crane0", REAL, {"REFUSES": "up"}, 4, "can0 does not come up; see 'ip -details link show can0'"),
-        ("crane0", REAL, {"CRANE_BITRATE": "fast"}, 3, "CRANE_BITRATE=fast is no bit rate"),
-        ("crane0", {"ifname": "can0", "link_type": "ether"}, {}, 3, "can0 is no CAN interface"),
-        ("crane0", REAL, {"CRANE_BUS": "can0"}, 3, "CRANE_BUS=can0 is no address"),
-        ("mach0", None, {"MACHINE_BUS": "socketcan:can9"}, 4, "there is no CAN interface can9"),
-        ("crane9", None, {}, 2, "'crane9' is no bus"),
+        ("crane0", None, {}, 4, "can0"),
+        ("crane0", REAL, {"REFUSES": "type"}, 4, "CRANE_BITRATE"),
+        ("crane0", REAL, {"REFUSES": "up"}, 4, "ip -details link show can0"),
+        ("crane0", REAL, {"CRANE_BITRATE": "fast"}, 3, "CRANE_BITRATE=fast"),
+        ("crane0", {"ifname": "can0", "link_type": "ether"}, {}, 3, "can0"),
+        ("crane0", REAL, {"CRANE_BUS": "can0"}, 3, "CRANE_BUS=can0"),
+        ("mach0", None, {"MACHINE_BUS": "socketcan:can9"}, 4, "can9"),
+        ("crane9", None, {}, 2, "crane9"),
     ],
 )
-def test_every_refusal_is_one_sentence(can_up, bus, link, settings, status, sentence) -> None:
+def test_every_refusal_is_one_sentence(can_up, bus, link, settings, status, named) -> None:
     code, _, said = can_up(bus, link, **settings)
     assert code == status
-    assert sentence in said
+    assert named in said
     assert said.count("\n") == 1
 
 

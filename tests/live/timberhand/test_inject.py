@@ -19,6 +19,7 @@ from hil.faults.order import make
 from hil.faults.wire_faults import BABBLE_KEY
 from hil.wire.launch import wire_daemon
 from machine.loading.profile_file import load_profile
+from tests.codes import numbers_in
 
 PALMS = load_profile("palms_471")
 
@@ -31,7 +32,7 @@ def target(**changed: Any) -> LiveTarget:
 def test_a_process_is_stopped_for_a_while_and_killed() -> None:
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
         there = target(pids={"autonomy": process.pid})
-        assert "stopped for" in inject(make("process-stuck", part="planner", length_s=0.05), there)
+        assert 0.05 in numbers_in(inject(make("process-stuck", part="planner", length_s=0.05), there))
         assert process.poll() is None
         inject(make("process-off", part="planner"), there)
         assert process.wait(10) == -signal.SIGKILL
@@ -42,7 +43,7 @@ def test_forged_datagrams_reach_the_controllers_port() -> None:
         controller.bind(("127.0.0.1", 0))
         there = target(ports={"control": controller.getsockname()[1]})
         for fault in ("planner-garbage", "planner-arms", "planner-replay"):
-            assert "sent" in inject(make(fault, length_s=0.03), there)
+            assert fault in inject(make(fault, length_s=0.03), there)
             assert controller.recv(2048)
 
 
@@ -50,7 +51,7 @@ def test_the_wire_damages_frames_of_a_live_bus(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
     there = target(buses={"crane0": "wire:crane0"})
     with wire_daemon({"crane0": 1_000_000}), open_bus("wire:crane0") as listener:
-        assert "begun" in inject(make("bus-babble", length_s=0.02), there)
+        assert "bus-babble" in inject(make("bus-babble", length_s=0.02), there)
         frames: list[Frame] = []
         assert select.select([listener], [], [], 10.0)[0]
         listener.drain(frames)

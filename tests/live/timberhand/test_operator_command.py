@@ -80,8 +80,8 @@ def test_a_terminal_watches_until_it_is_interrupted(controller: socket.socket) -
         assert process.poll() is None, process.stderr and process.stderr.read()
     terminal.answer(1.0)
     process.send_signal(signal.SIGINT)
-    shown = terminal.answer(0.5)
-    assert process.wait(20) == 0 and b"ended" in shown
+    terminal.answer(0.5)
+    assert process.wait(20) == 0
     commands = [heard(controller)]
     while commands[-1].action is OperatorAction.WATCH:
         commands.append(heard(controller))
