@@ -66,6 +66,7 @@ def test_outline_and_depth_agree_with_the_renderer(degrees: float) -> None:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 90.0])
+@pytest.mark.long
 def test_with_exact_depth_the_fit_is_accurate_to_two_centimetres(degrees: float) -> None:
     log = lying(1, 4.6, 0.2, degrees)
     (fit,), view, _ = fits_of(log)

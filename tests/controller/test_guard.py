@@ -202,7 +202,7 @@ def test_commands_that_a_transmit_queue_holds_up_are_refused():
 @pytest.mark.parametrize(
     ("delays_ms", "skipped"),
     [
-        ([0.0005 * k for k in range(4000)], ()),
+        pytest.param([0.0005 * k for k in range(4000)], (), marks=pytest.mark.long),
         ([5.0 * (k % 7 == 3) for k in range(400)], ()),
         ([0.0] * 2000, range(100, 2000, 250)),
     ],

@@ -143,6 +143,7 @@ def test_record_of_a_whole_run_replays_to_the_same_bytes(settings_):
 
 
 @pytest.mark.parametrize("settings_", [SETTINGS, pytest.param(AORO, marks=pytest.mark.long)])
+@pytest.mark.long
 def test_tick_keeps_no_memory(settings_):
     bench = Bench(settings_).active()
     planned = []

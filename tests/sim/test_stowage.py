@@ -56,6 +56,7 @@ def test_a_still_load_is_stowed_and_logs_on_the_ground_are_not(world):
     assert world.log_bodies.stowed == tuple(range(LOGS))
 
 
+@pytest.mark.long
 def test_a_stowed_load_weighs_like_an_awake_one(world):
     other = laden(stowing=False)
     for seconds, drive in ((2.0, PARKED), (1.0, AHEAD), (3.0, AHEAD), (3.0, PARKED)):

@@ -77,6 +77,7 @@ def test_the_command_writes_weights_card_and_checkpoint(folder):
     assert out.with_suffix(".jsonl").is_file()
 
 
+@pytest.mark.long
 def test_an_interrupted_training_continues_to_the_same_weights(folder):
     from training.detection.masks import run as training
     from training.detection.masks.mixture import mixed
