@@ -59,6 +59,9 @@ class Verdict:
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if session.exitstatus not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):  # interrupted
+            shutil.rmtree(self._folder)
+            return
         whole = Coverage(data_file=str(self._folder / "share"), branch=True, include=_SOURCES)
         whole.exclude(r"if __name__ == .__main__.:")
         whole.combine([str(self._folder)])
