@@ -47,6 +47,8 @@ test)
     phase tests fast --durations=15 --durations-min=5 "$@"
     ;;
 live)
+    # On the interpreter a forwarder's tick takes a good part of a small computer, and its browser starves.
+    phase "compiling the tick" "$bin/timberhand" compile
     phase "live tests" "$bin/pytest" tests/live --durations=20 --durations-min=20 "$@"
     ;;
 long)
