@@ -8,6 +8,7 @@ give the same truth.
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -55,20 +56,19 @@ def load_truth(choice: str, seed: int, machine: str) -> Truth:
         PlantError: the file is missing, incomplete, has unknown keys or describes another machine.
     """
     kind, path = split(choice)
-    if path is None:
-        if machine not in FILES:
-            raise PlantError(
-                "truth.unknown-machine",
-                f"there is no shipped truth for machine {machine!r}, only for {', '.join(FILES)}; put "
-                f"{machine}.truth.toml beside its profile, or name a truth file",
-            )
-        path = Path(__file__).with_name(FILES[machine])
+    if path is None and machine not in FILES:
+        raise PlantError(
+            "truth.unknown-machine",
+            f"there is no shipped truth for machine {machine!r}, only for {', '.join(FILES)}; put "
+            f"{machine}.truth.toml beside its profile, or name a truth file",
+        )
     try:
-        truth = msgspec.convert(_with_shipped_sections(msgspec.toml.decode(path.read_bytes())), Truth)
+        content = _shipped(machine) if path is None else msgspec.toml.decode(path.read_bytes())
+        truth = msgspec.convert(_with_shipped_sections(content), Truth)
     except (OSError, msgspec.DecodeError) as error:
         raise PlantError(
             "truth.unreadable",
-            f"truth file {path}: {error}; use nominal, sampled, wide_valves or a complete TOML file",
+            f"truth file {path or FILES[machine]}: {error}; use nominal, sampled, wide_valves or a complete TOML file",
         ) from None
     if truth.machine != machine:
         raise PlantError(
@@ -86,8 +86,14 @@ def _with_shipped_sections(content: dict[str, Any]) -> dict[str, Any]:
     machine = content.get("machine")
     if not isinstance(machine, str) or machine not in FILES:
         return content
-    defaults = msgspec.toml.decode(Path(__file__).with_name(FILES[machine]).read_bytes())
-    return {name: defaults[name] for name in SHIPPED_SECTIONS} | content
+    return {name: _shipped(machine)[name] for name in SHIPPED_SECTIONS} | content
+
+
+@cache
+def _shipped(machine: str) -> dict[str, Any]:
+    """The content of a machine's shipped file; nobody writes to it."""
+    content: dict[str, Any] = msgspec.toml.decode(Path(__file__).with_name(FILES[machine]).read_bytes())
+    return content
 
 
 def _sampled(truth: Truth, seed: int) -> Truth:

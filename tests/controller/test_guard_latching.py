@@ -57,7 +57,7 @@ def test_it_never_enables_again_by_itself(name):
     if name not in ("other guard", "other guard on mach0", "corrupt", "joint moves without a command"):
         # These are over at once: the joint has moved, and stands.
         assert pressed_too_early is not Verdict.CALMING
-        assert traffic.tick(2000) is Verdict.LATCHED
+        assert traffic.tick(600) is Verdict.LATCHED
     traffic.tick(10)
     press_reset(traffic)
     assert count_until(traffic.tick, lambda: traffic.guard.enabled) * T <= CALM_NS + 2 * T

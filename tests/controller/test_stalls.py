@@ -76,6 +76,14 @@ def test_one_cut_cable_is_the_encoder_s_fault(late_ns: int) -> None:
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.ENCODER_LOST, 1)
 
 
+@pytest.mark.parametrize(("name", "reason"), [("EstopStat", Reason.ESTOP_LOST), ("GuardStat", Reason.GUARD_LOST)])
+def test_one_silent_safety_node_is_that_node_s_fault(name: str, reason: Reason) -> None:
+    bench = Bench().active()
+    bench.dropped.add(name)
+    bench.run(12)
+    assert (bench.mode, bench.reason) == (Mode.FAULT, reason)
+
+
 def test_long_after_a_stall_a_cut_trunk_is_no_computer_s_fault() -> None:
     bench = Bench().active()
     bench.tick(late_ns=9 * MS)

@@ -117,6 +117,7 @@ def test_a_load_below_open_jaws_stays_awake(above_m, stowed):
     world.close()
 
 
+@pytest.mark.long
 def test_equal_worlds_stow_and_wake_equally(world):
     other = laden()
     for w in (world, other):

@@ -110,6 +110,7 @@ def test_a_stop_file_alone_is_enough(run: Path, tmp_path: Path) -> None:
     assert "GUARD_LOST" in invoke(run / "stops")
 
 
+@pytest.mark.long
 def test_a_recording_without_stop_files_tells_the_same(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "run.mcap", tmp_path / "run.mcap")
     with_files, without = json.loads(invoke(run, "--all", "--json")), json.loads(invoke(tmp_path, "--all", "--json"))

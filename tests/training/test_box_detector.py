@@ -88,6 +88,7 @@ def test_the_generalised_overlap_of_two_boxes():
     assert lacks(left, right) == pytest.approx(1.0, abs=0.05), "beside each other they share next to nothing"
 
 
+@pytest.mark.long
 def test_training_starts_from_weights(tmp_path):
     sample = [picture(((90.0, 80.0), 0.3, 60, 14), size=304)]
     start = random_net(box_net(), 7).arrays()

@@ -84,6 +84,7 @@ def test_networks_are_small_and_accept_the_input():
         assert parameter_count(unet(variant)) < 500_000
 
 
+@pytest.mark.long
 def test_a_few_steps_reduce_the_loss_deterministically(small):
     torch.set_num_threads(1)  # sums of another order are other sums
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 90, 14), size=160) for i in range(4)]

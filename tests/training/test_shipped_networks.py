@@ -41,6 +41,7 @@ def test_the_card_matches_the_weights(weights):
     assert weights.stat().st_size < 5_000_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("variant", "least"), [("rgbd", 0.7), ("depth", 0.55)])
 def test_well_visible_logs_are_segmented(variant, least, seen):
     detector = LogSegmenter(variant)
@@ -56,6 +57,7 @@ def test_the_depth_variant_ignores_colour(seen):
     assert plain and [i.box_px for i in plain] == [i.box_px for i in dark]
 
 
+@pytest.mark.long
 def test_boxes_from_colour_overlap_logs(seen):
     detector = BoxDetector()
 

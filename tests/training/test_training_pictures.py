@@ -189,6 +189,7 @@ def test_the_depth_variant_can_start_from_weights_of_the_rgbd_variant(tmp_path):
         detector_weights.initial_arrays(alone, "rgbd")
 
 
+@pytest.mark.long
 def test_small_and_large_pictures_alternate(few):
     source = detector_weights.mixed_pictures(
         pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True)
