@@ -118,9 +118,12 @@ class JointWatch:
         if self._was_armed and not armed:
             self._stood = False
         self._was_armed = armed
-        shaken = carrier_moves or crane.grapple.spool_pct != 0.0
+        from_outside = carrier_moves or crane.grapple.spool_pct != 0.0
+        open_valves = 0
         for pct in crane.spools_pct:
-            shaken = shaken or pct != 0.0
+            if pct != 0.0:
+                open_valves += 1
+        shaken = from_outside or open_valves > 0
         self._yield.step(crane.load_kg, crane.grapple.spool_pct != 0.0, crane.roll_rad, crane.pitch_rad)
         moving, stands = NO_JOINT, True
         for j in range(N_JOINTS):
@@ -148,7 +151,9 @@ class JointWatch:
             elif reason is _REVERSED and j == _ROT and crane.grapple.at_work:
                 reason = _NONE
             if supervisor.mode in OPERATING:
-                self._judge_encoder(supervisor, j, neutral, tested, reason, now_ns)
+                others = open_valves if crane.spools_pct[j] == 0.0 else open_valves - 1
+                calm = not from_outside and others == 0 and not (j == _SLEW and self._yield.loads)
+                self._judge_encoder(supervisor, j, neutral, calm, tested, reason, now_ns)
             else:
                 stands = stands and standstill.quiet_s >= STOOD_S
                 if reason is _RUNAWAY:
@@ -156,14 +161,12 @@ class JointWatch:
         self._settle(supervisor, moving, stands, now_ns)
 
     def _judge_encoder(
-        self, supervisor: Supervisor, j: int, neutral: bool, tested: bool, reason: Reason, now_ns: int
+        self, supervisor: Supervisor, j: int, neutral: bool, calm: bool, tested: bool, reason: Reason, now_ns: int
     ) -> None:
         """React to the finding about an armed joint, or to what its encoder shows besides."""
         monitor = self._monitors[j]
         expected = 0.0 if tested else monitor.expected_velocity
-        drifts = j != _ROT and self._drift[j].step(
-            neutral, expected, self._estimators[j].position, self._yield.loads and j == _SLEW, self._yield.pressed
-        )
+        drifts = j != _ROT and self._drift[j].step(neutral, expected, self._estimators[j].position, calm)
         frozen = self._frozen(j, monitor, tested)
         if reason is _RUNAWAY:
             supervisor.react_to(reason, j, now_ns)

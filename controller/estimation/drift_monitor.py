@@ -7,9 +7,10 @@ other way whenever it is open.  Both ways are summed in leaky integrals.  A valv
 deserves the same.  While the reference moves, the valve is open and the monitor is blind; what was commanded then is
 no pulse and does not count, or the way to a pose would hide a drift along it for seconds.
 
-Jaws that press on ground and logs, and a log that they let go, move every joint by some millimetres on its oil, within
-some tenths of a second.  So while the jaws are at work, and a while after, only slow motion counts in full: faster
-than `DRIFT_SPEED_SHARE` of the speed limit no encoder drifts unseen by other monitors.
+It is judged only where nothing else explains a creep.  Jaws that press on ground and logs, a log that they let go,
+another joint's valve and a carrier that drives move every joint by some millimetres on its oil and steel, within some
+tenths of a second; a law answers them by the same pulses.  So what a joint does while one of them is at work, and
+`SETTLE_S` longer, is no evidence (``calm``).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ PULSE_S: Final = 1.0
 DRIFT_S_AT_LIMIT: Final = 0.012
 DRIFT_NOISES: Final = 3.0
 """A drift is further than the way of the first at the speed limit and this many times noise and resolution, ..."""
-DRIFT_SPEED_SHARE: Final = 0.05
-"""While jaws are at work a joint's motion counts up to this share of its speed limit."""
+SETTLE_S: Final = 1.0
+"""A joint that something else moved has come to rest on its oil after this time."""
 COMMANDED_SHARE: Final = 0.3
 """... and the command went at least this share of it the other way: the gain of small pulses is known badly."""
 
@@ -36,7 +37,9 @@ COMMANDED_SHARE: Final = 0.3
 class DriftMonitor:
     """Monitors one joint; `step` tells whether it drifts."""
 
-    __slots__ = ("_alone", "_before", "_commanded", "_decay", "_limit", "_most", "_open_s", "_period_s", "_shut_s")
+    __slots__ = (
+        "_alone", "_before", "_calm_s", "_commanded", "_decay", "_limit", "_open_s", "_period_s", "_shut_s",
+    )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float, least_speed: float = 0.0) -> None:
         """``least_speed``: see `controller.estimation.usual_speed`."""
@@ -44,25 +47,22 @@ class DriftMonitor:
         noise = 0.0 if encoder is None else encoder.noise + encoder.unit_per_count
         usual = max(spec.speed_limit, least_speed)
         self._limit = DRIFT_S_AT_LIMIT * usual + DRIFT_NOISES * noise
-        self._most = DRIFT_SPEED_SHARE * usual * period_s
         self._period_s, self._decay = period_s, math.exp(-period_s / MEMORY_S)
         self.reset()
 
     def reset(self) -> None:
         """Nothing has moved yet."""
-        self._alone = self._commanded = self._before = self._shut_s = self._open_s = 0.0
+        self._alone = self._commanded = self._before = self._shut_s = self._open_s = self._calm_s = 0.0
 
-    def step(
-        self, neutral: bool, expected_velocity: float, position: float, yields: bool = False, pressed: bool = False
-    ) -> bool:
-        """One period: is the valve ``neutral``, the velocity that the command lets expect, the position, whether the
-        joint ``yields`` to a load that changes (`controller.estimation.slope_yield`), and whether jaws are at work.
+    def step(self, neutral: bool, expected_velocity: float, position: float, calm: bool) -> bool:
+        """One period: is the valve ``neutral``, the velocity that the command lets expect, the position, and whether
+        nothing else moves the joint.
         """
         self._shut_s = self._shut_s + self._period_s if neutral else 0.0
+        self._calm_s = self._calm_s + self._period_s if calm else 0.0
         self._open_s = 0.0 if neutral else self._open_s + self._period_s
-        moved = position - self._before if self._shut_s > SHUT_S and not yields else 0.0
-        if pressed:
-            moved = min(max(moved, -self._most), self._most)
+        judged = self._shut_s > SHUT_S and self._calm_s > SETTLE_S
+        moved = position - self._before if judged else 0.0
         self._before = position
         self._alone = alone = self._decay * self._alone + moved
         if self._open_s > PULSE_S:

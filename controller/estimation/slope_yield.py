@@ -5,8 +5,7 @@ reach r that swings on this oil with w has the stiffness m r^2 w^2, and leans ag
 by g sin(lean) / (r w^2), 0.2 rad for each radian far out (7.5 m, a period of 2.5 s), and swings as far again.  So a
 slew yields when the lean changes, as a wheel climbs a stump, and on a slope when a log is lifted: 110 kg at 7.5 m on 10
 degrees are 1.4 kNm, which turned it by 7 mrad within a second (measured on the plant).  Jaws that close about a log
-pull it likewise.  On level ground there is nothing to yield to, and nothing changes.  Jaws at work press on every
-joint, on level ground, too (``pressed``).
+pull it likewise.  On level ground there is nothing to yield to, and nothing changes.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ LIMIT_RAD: Final = 0.06
 
 class SlopeYield:
     """`step` once per period; ``rad`` is how far the slew may yield now, ``loads`` whether a load comes or goes on a
-    slope, ``pressed`` whether the jaws move, or did a moment ago.
+    slope.
     """
 
-    __slots__ = ("_high", "_left_s", "_low", "_mean_kg", "_moved_s", "_period_s", "loads", "pressed", "rad")
+    __slots__ = ("_high", "_left_s", "_low", "_mean_kg", "_period_s", "loads", "rad")
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
-        self._mean_kg = self._left_s = self._moved_s = 0.0
+        self._mean_kg = self._left_s = 0.0
         self._low = [0.0, 0.0]
         self._high = [0.0, 0.0]
         self.rad = 0.0
-        self.loads = self.pressed = False
+        self.loads = False
 
     def step(self, load_kg: float, jaws_move: bool, roll_rad: float, pitch_rad: float) -> None:
         """The estimated load and the inclination of the crane's base (NaN: not known); whether the jaws move."""
@@ -53,8 +52,6 @@ class SlopeYield:
             self._left_s = YIELD_S
         else:
             self._left_s = max(0.0, self._left_s - self._period_s)
-        self._moved_s = YIELD_S if jaws_move else max(0.0, self._moved_s - self._period_s)
-        self.pressed = self._moved_s > 0.0
         lean = self._beyond_level(abs(roll_rad)) + self._beyond_level(abs(pitch_rad))
         turned = self._range(0, roll_rad) + self._range(1, pitch_rad)
         self.loads = self._left_s > 0.0 and lean > 0.0

@@ -117,12 +117,13 @@ def test_a_silent_machine_bus_is_named() -> None:
     assert bench.controller.evidence.numbers[0] > 15.0
 
 
-def test_the_carrier_alone_is_the_carrier_s_fault() -> None:
+@pytest.mark.parametrize(("name", "reason"), [("VehStat", Reason.CARRIER_LOST), ("ArmHeightA", Reason.SWING_ARMS_LOST)])
+def test_one_node_of_the_carrier_is_that_node_s_fault(name: str, reason: Reason) -> None:
     bench = Bench(AORO).active()
-    bench.dropped.add("VehStat")
+    bench.dropped.add(name)
     for _ in range(30):
         bench.tick()
-    assert bench.reason == Reason.CARRIER_LOST
+    assert bench.reason == reason
 
 
 def test_a_stall_that_the_machine_bus_feels_is_the_computer_s() -> None:
