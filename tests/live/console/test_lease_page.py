@@ -23,6 +23,7 @@ from machine.status.modes import Mode
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
 from tests.live.console.served_page import served
+from tests.operator_end import OperatorEnd
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 PROFILE = load_profile("aoro_fc8")
@@ -43,8 +44,7 @@ class Stage:
 
     def begin(self) -> None:
         self._open = ExitStack()
-        self._operator = self._open.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        self._operator.bind(str(self.folder / "operator"))
+        self._operator = self._open.enter_context(OperatorEnd(self.folder / "operator"))
         self._operator.settimeout(0.05)
         reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         reports.bind(("127.0.0.1", 0))

@@ -26,6 +26,7 @@ PALMS = load_profile("palms_471")
 
 def target(**changed: Any) -> LiveTarget:
     parts: dict[str, Any] = {"ports": {"sim": 1, "control": 1}, "buses": {"crane0": "socketcan:can0"}, "pids": {}}
+    parts["key_file"] = Path("/nowhere/key")
     return LiveTarget(PALMS, **(parts | changed))
 
 

@@ -18,6 +18,7 @@ import pytest
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode
 from machine.loading.profile_file import load_profile, profile_hash
+from tests.operator_end import OperatorEnd
 from timberhand.terminal_watch import QUESTION
 
 THERE = b"\x1b[0n"
@@ -31,8 +32,7 @@ THERE = b"\x1b[0n"
 
 @pytest.fixture
 def controller(tmp_path: Path) -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
-        made.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as made:
         made.settimeout(20)
         yield made
 
