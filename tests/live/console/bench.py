@@ -11,6 +11,7 @@ from can_dbc.messages.key_file import write_key
 from hil.harness.live import HARDWARE_PRIORITY
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.wire.bitrates import BITRATES
+from tests.live.console.entries import note
 
 START_S = 60.0
 
@@ -35,7 +36,7 @@ def bench(folder: Path, profile: str = "palms_471") -> Iterator[str]:
             "--controller", f"127.0.0.1:{setpoints}", "--commission", folder / "kept",
             "--audit", folder / "audit.jsonl", *keyed,
         )  # fmt: skip
-        url = str(group.await_message("console", "url", START_S)["url"])
+        url = note(str(group.await_message("console", "url", START_S)["url"]))
         group.start("guard", "controller.guard", *named, *bus)
         group.start(
             "controller", "controller", *named, *bus, "--setpoint-port", setpoints, "--operator", operator,
