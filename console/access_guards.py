@@ -107,9 +107,11 @@ class AccessGuards:
         await self._app(scope, receive, send)
 
     def _entered(self, scope: Scope, headers: Headers, token: str) -> Response:
-        session = self._access.enter(token)
+        """Whoever has a session already keeps it, and its pages theirs: the printed address may be opened again."""
+        kept = scope["session"] if scope["person"] is not VISITOR else ""
+        session = kept or self._access.enter(token)
         answer = RedirectResponse("/" + scope["path"].lstrip("/") if session else "/sign-in", 303)
-        if session:
+        if session and not kept:
             set_session(answer, headers, session, secure=scope["scheme"] == "https")
         return answer
 

@@ -275,6 +275,13 @@ def test_the_printed_address_opens_a_session_that_scripts_and_other_sites_cannot
     assert answer.headers.get("location", "/").startswith("//") is False
 
 
+def test_the_printed_address_may_be_opened_again(stage: Stage) -> None:
+    page = page_client(stage.console, leads=True)
+    again = page.get("/plan", params={"token": stage.console.access.token}, follow_redirects=False)
+    assert again.status_code == 303 and "set-cookie" not in again.headers
+    assert page.post("/api/operator/arm").status_code == 204, "the page keeps its control"
+
+
 def test_a_session_of_the_printed_address_ends_with_the_shift(stage: Stage) -> None:
     page = page_client(stage.console, leads=True)
     stage.clock.now_ns += SESSION_NS
