@@ -110,7 +110,7 @@ class TimingTestbed:
         directory.mkdir(parents=True, exist_ok=True)
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
-        self.page = self._private / "controller.timing"
+        self.page, self.key_file = self._private / "controller.timing", self._private / "key"
         self.family = ProcessGroup(directory, environment={"TIMBERHAND_WIRE_DIR": str(self._private)})
         self.helpers = ProcessGroup(directory, own_sessions=False)
 
@@ -141,7 +141,7 @@ class TimingTestbed:
         buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
         control, reports = free_udp_ports(2)
         ticks, operators = (self._private / f"controller.{kind}" for kind in ("ticks", "operator"))
-        keyed = ("--key-file", write_key(self._private / "key"))
+        keyed = ("--key-file", write_key(self.key_file))
         if not vcan:
             rates = dict(s.bitrates)
             self._start("wire", "hil.wire.daemon", *(x for n in names for x in ("--bus", f"{n}:{rates[n]}")))
