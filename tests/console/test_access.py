@@ -271,6 +271,8 @@ def test_the_printed_address_opens_a_session_that_scripts_and_other_sites_cannot
     token = person.post("/api/session").json()["token"]
     thief = visitor(stage.console)
     assert thief.post("/api/lease/take", json={"over": 0}, headers={TOKEN_HEADER: token}).status_code == 403
+    with pytest.raises(WebSocketDisconnect), thief.websocket_connect(f"{WS}?page={token}", headers=BROWSING):
+        pass
     answer = person.get("//evil.example/", params={"token": stage.console.access.token}, follow_redirects=False)
     assert answer.headers.get("location", "/").startswith("//") is False
 
