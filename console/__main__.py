@@ -1,6 +1,7 @@
 """``python -m console``: serves the operator's page until it is interrupted.
 
-Once the page can be opened, one JSON line with its ``url`` is written to stdout.
+Once the page can be opened, one JSON line with its ``url`` is written to stdout.  Where nobody has a password the
+address carries the token that opens a session (`console.access`): whoever has it may command.
 
 Exit codes: 0 interrupted, 2 usage, 3 configuration, 4 a port is in use.
 """
@@ -18,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from console.access_guards import ENTRY
 from console.audit import AuditLog
 from console.exposure import Exposure, check_local
 from console.start_error import StartError
@@ -106,7 +108,7 @@ def serve(
         tls=exposure.tls_cert is not None,
     )
     try:
-        _run(create_app(console, (*allow_hosts, bind)), page, bind, exposure, live)
+        _run(create_app(console, (*allow_hosts, bind)), page, bind, exposure, live, console.access.token)
     finally:
         if console.audit is not None:
             console.audit.close()
@@ -151,7 +153,12 @@ def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: 
 
 
 def _run(
-    app: Any, page: socket.socket, bind: str, exposure: Exposure = LOCAL, live: FoxgloveServer | None = None
+    app: Any,
+    page: socket.socket,
+    bind: str,
+    exposure: Exposure = LOCAL,
+    live: FoxgloveServer | None = None,
+    token: str = "",
 ) -> None:
     """Write the page's address to stdout, and that for Foxglove, and serve it."""
     import uvicorn
@@ -163,7 +170,8 @@ def _run(
     )  # fmt: skip
     scheme = "https" if exposure.tls_cert else "http"
     host = f"[{bind}]" if ":" in bind else bind
-    addresses = {"url": f"{scheme}://{host}:{page.getsockname()[1]}/"}
+    query = f"?{ENTRY}={token}" if token else ""
+    addresses = {"url": f"{scheme}://{host}:{page.getsockname()[1]}/{query}"}
     if live is not None:
         addresses["foxglove"] = f"ws://{host}:{live.port}"
     sys.stdout.write(json.dumps(addresses) + "\n")

@@ -1,9 +1,10 @@
 """Who is at which page: sign-in, the pages' tokens, roles, and what each may command.
 
-On this machine nobody signs in: whoever reaches the loopback address is a technician.  With accounts everybody signs
-in, and a cookie keeps the session.  Either way a page asks for a token of its own, which every command and the
-websocket must carry: a page of another site cannot read it, so it can command nothing even where the browser adds the
-cookie.  The control lease belongs to one page (`console.lease`).
+A session is opened by a person: with the accounts by name and password, on this machine alone by the console's token,
+which is drawn at the start and stands in the address that the console prints.  A cookie keeps the session.  A page of a
+session asks for a token of its own, which every command and the websocket must carry: a page of another site cannot
+read it, so it can command nothing even where the browser adds the cookie.  Without a session whoever is on this machine
+looks, and presses STOP.  The control lease belongs to one page (`console.lease`).
 
 Pure but for the tokens' randomness; `console.access_routes` and `console.access_guards` are the shell.
 """
@@ -11,6 +12,7 @@ Pure but for the tokens' randomness; `console.access_routes` and `console.access
 from __future__ import annotations
 
 import contextlib
+import hmac
 import secrets
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -18,7 +20,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from console.accounts import Accounts, Person, Role
-from console.guards import is_loopback
 from console.lease import ControlLease
 
 SESSION_NS: Final = 12 * 3600 * 1_000_000_000
@@ -32,6 +33,8 @@ go on."""
 LOCAL: Final = Person("this machine", Role.TECHNICIAN)
 VISITOR: Final = Person("", Role.VIEWER)
 TOKEN_BYTES: Final = 32
+ENTRY_BYTES: Final = 16
+"""Of the token in the printed address: 128 bits, and the address fits into a line of a terminal."""
 
 
 @dataclass(slots=True)
@@ -44,7 +47,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page in one tab of a browser; ``session`` is empty where nobody signs in."""
+    """A page in one tab of a browser."""
 
     number: int
     token: str
@@ -53,10 +56,11 @@ class Page:
 
 
 class Access:
-    """``accounts`` None: only this machine is served, and nobody signs in."""
+    """``accounts`` None: only this machine is served, and ``token`` opens a session; empty where persons sign in."""
 
     def __init__(self, accounts: Accounts | None, clock: Callable[[], int]) -> None:
         self.accounts = accounts
+        self.token = "" if accounts is not None else secrets.token_urlsafe(ENTRY_BYTES)
         self.lease = ControlLease()
         self._clock = clock
         self._pages: dict[str, Page] = {}
@@ -77,6 +81,14 @@ class Access:
         if person is None:
             self._failures.append(self._clock())
             return ""
+        return self._begin(person)
+
+    def enter(self, token: str) -> str:
+        """The new session of whoever has the console's token; empty for a wrong one, which cannot be guessed."""
+        right = self.token and hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
+        return self._begin(LOCAL) if right else ""
+
+    def _begin(self, person: Person) -> str:
         self._forget()
         while len(self._sessions) >= MAX_SESSIONS:
             self.sign_out(next(iter(self._sessions)))
@@ -91,31 +103,30 @@ class Access:
             self.lease.give_back(page.number, self._clock())
             del self._pages[page.token]
 
-    def person(self, session: str, peer: str | None) -> Person | None:
-        """Who sends a request; None: nobody who has signed in."""
-        if self.accounts is None:
-            return LOCAL if is_loopback(peer) else VISITOR
+    def person(self, session: str) -> Person | None:
+        """Who sends a request; None: nobody who has signed in, where that is needed to look."""
         self._forget()
         found = self._sessions.get(session)
-        return None if found is None else found.person
+        if found is None:
+            return VISITOR if self.accounts is None else None
+        return found.person
 
     # ---- pages
 
-    def page(self, token: str, session: str, peer: str | None) -> Page | None:
-        """The page that a token names, if the request is of the person for whom it was made."""
+    def page(self, token: str, session: str) -> Page | None:
+        """The page that a token names, if the request is of the session for which it was made."""
+        self._forget()
         page = self._pages.get(token)
-        if page is None or page.person != self.person(session, peer):
-            return None
-        return page if self.accounts is None or page.session == session else None
+        return page if page is not None and page.session == session else None
 
-    def open_page(self, token: str, session: str, peer: str | None) -> Page | None:
-        """The page with this token, or a new one; None: sign in first.
+    def open_page(self, token: str, session: str) -> Page | None:
+        """The page with this token, or a new one; None: there is no such session.
 
         A token that a page uses already is that of a duplicated tab, which becomes a page of its own.
         """
-        known = self.page(token, session, peer)
-        person = self.person(session, peer)
-        if person is None:
+        known = self.page(token, session)
+        found = self._sessions.get(session)
+        if found is None:
             return None
         if known is not None and known.number not in self._connected:
             return known
@@ -125,7 +136,7 @@ class Access:
             oldest = next(idle, None) or next(p for p in self._pages.values() if p.number != holder)
             del self._pages[oldest.token]
         self._number += 1
-        page = Page(self._number, secrets.token_urlsafe(TOKEN_BYTES), person, session if self.accounts else "")
+        page = Page(self._number, secrets.token_urlsafe(TOKEN_BYTES), found.person, session)
         self._pages[page.token] = page
         return page
 

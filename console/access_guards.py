@@ -3,7 +3,9 @@
 `AccessGuards` lets a request through when it may be read or commanded at all: with accounts every address of the API
 needs a session; every POST needs the token of a page, in the header `TOKEN_HEADER`, but for STOP, signing in and asking
 for a token.  It leaves the person and the page in the request's scope; what they may do, a handler decides.  STOP needs
-nothing: it is let through at once.
+nothing: it is let through at once.  A page that is asked for with the console's token in its address is answered with
+the cookie of a new session and the same address without the token.  A websocket that does not say its Origin, as every
+browser's does, only shows, whatever token it has.
 """
 
 from __future__ import annotations
@@ -13,16 +15,20 @@ from typing import Any, Final
 
 from starlette.datastructures import Headers, QueryParams
 from starlette.requests import HTTPConnection
-from starlette.responses import PlainTextResponse
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from console.access import VISITOR, Access, Page
 from console.accounts import Person
 from console.audit import AuditLog
+from console.guards import is_loopback
 
 TOKEN_HEADER: Final = "x-timberhand-page"
 COOKIE: Final = "timberhand-session"
+ENTRY: Final = "token"
+"""Of the query: the console's token."""
 STOP_PATH: Final = "/api/operator/stop"
+ENTER_WORDS: Final = "Open the address that the console printed at its start, or sign in with its token."
 FREE_POSTS: Final = frozenset({STOP_PATH, "/api/session", "/api/sign-in"})
 """They need no token: STOP, and what comes before there is one."""
 QUIET_PREFIXES: Final = ("/api/session", "/api/watch-end/", "/api/plan/check", "/api/plan/import", "/api/plan/export/")
@@ -30,10 +36,21 @@ QUIET_PREFIXES: Final = ("/api/session", "/api/watch-end/", "/api/plan/check", "
 MAX_SENTENCE_BYTES: Final = 300
 
 
+def cookie_of(headers: Headers) -> str:
+    """The name of the session's cookie: browsers share cookies between ports, consoles do not."""
+    port = headers.get("host", "").rpartition(":")[2]
+    return f"{COOKIE}-{port if port.isdecimal() else 0}"
+
+
+def set_session(answer: Response, headers: Headers, session: str, secure: bool) -> None:
+    """Let the browser keep a session, out of the reach of scripts and of other sites."""
+    answer.set_cookie(cookie_of(headers), session, httponly=True, samesite="strict", secure=secure, path="/")
+
+
 def session_of(headers: Headers) -> str:
     """The session's cookie; empty without one."""
     try:
-        found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        found = SimpleCookie(headers.get("cookie", "")).get(cookie_of(headers))
     except CookieError:
         return ""
     return "" if found is None else found.value
@@ -63,25 +80,40 @@ class AccessGuards:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        headers, peer = Headers(scope=scope), (scope.get("client") or (None,))[0]
+        headers, query = Headers(scope=scope), QueryParams(scope["query_string"])
         session = session_of(headers)
-        person = self._access.person(session, peer)
+        if self._access.accounts is None and not is_loopback((scope.get("client") or (None,))[0]):
+            session = ""  # the token is for this machine alone
+        scope["session"] = session
+        person = self._access.person(session)
         scope["person"] = person or VISITOR
         if scope["type"] == "websocket":
-            token = QueryParams(scope["query_string"]).get("page", "")
-            scope["page"] = self._access.page(token, session, peer)
+            token = query.get("page", "") if "origin" in headers else ""
+            scope["page"] = self._access.page(token, session)
             # Without a token it only shows, where whoever is on this machine may look.
             if scope["page"] is None and (token or person is None):
                 await receive()
                 await send({"type": "websocket.close", "code": 1008, "reason": "This page's token is not valid."})
                 return
         else:
-            scope["page"] = self._access.page(headers.get(TOKEN_HEADER, ""), session, peer)
+            if scope["method"] == "GET" and ENTRY in query and self._access.token:
+                await self._entered(scope, headers, query[ENTRY])(scope, receive, send)
+                return
+            scope["page"] = self._access.page(headers.get(TOKEN_HEADER, ""), session)
             refusal = self._refusal(scope)
             if refusal:
                 await PlainTextResponse(refusal, 401 if person is None else 403)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
+
+    def _entered(self, scope: Scope, headers: Headers, token: str) -> Response:
+        """Whoever has a session already keeps it, and its pages theirs: the printed address may be opened again."""
+        kept = scope["session"] if scope["person"] is not VISITOR else ""
+        session = kept or self._access.enter(token)
+        answer = RedirectResponse("/" + scope["path"].lstrip("/") if session else "/sign-in", 303)
+        if session and not kept:
+            set_session(answer, headers, session, secure=scope["scheme"] == "https")
+        return answer
 
     def _refusal(self, scope: Scope) -> str:
         path, writes = scope["path"], scope["method"] not in ("GET", "HEAD")
@@ -89,6 +121,8 @@ class AccessGuards:
             return ""
         if self._access.accounts is not None and scope["person"] is VISITOR:
             return "Sign in first."
+        if writes and scope["person"] is VISITOR:
+            return ENTER_WORDS
         if writes and scope["page"] is None:
             return "This does not come from a page of this console; load the page again."
         return ""

@@ -12,7 +12,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from console.access import Access
-from console.access_guards import COOKIE, TOKEN_HEADER, page_of, session_of
+from console.access_guards import TOKEN_HEADER, cookie_of, page_of, person_of, set_session
 
 STATIC: Final = Path(__file__).with_name("static")
 MAX_BODY_BYTES: Final = 2048
@@ -28,6 +28,12 @@ class SignIn(msgspec.Struct, forbid_unknown_fields=True):
     password: str
 
 
+class Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """What the sign-in form sends where nobody has a password."""
+
+    token: str
+
+
 class Take(msgspec.Struct, forbid_unknown_fields=True):
     """``over``: the page from which the lease is taken over, 0 for nobody."""
 
@@ -41,9 +47,25 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
     async def form(_: Request) -> Response:
         return FileResponse(STATIC / "sign-in.html", media_type="text/html")
 
+    async def how(_: Request) -> Response:
+        return JSONResponse({"by": "password" if access.accounts is not None else "token"})
+
+    async def enter(request: Request) -> Response:
+        told = await _body(request, Entry)
+        if told is None:
+            return PlainTextResponse("Send the token that the console printed at its start.", 422)
+        return begun(request, access.enter(told.token), "This is not the token that the console printed at its start.")
+
+    def begun(request: Request, session: str, otherwise: str) -> Response:
+        if not session:
+            return PlainTextResponse(otherwise, 403)
+        answer = Response(status_code=204)
+        set_session(answer, request.headers, session, secure)
+        return answer
+
     async def sign_in(request: Request) -> Response:
         if access.accounts is None:
-            return PlainTextResponse("Nobody signs in to this console.", 409)
+            return await enter(request)
         told = await _body(request, SignIn)
         if told is None:
             return PlainTextResponse("Send name and password.", 422)
@@ -53,29 +75,25 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
                 return PlainTextResponse("Too many wrong passwords; wait half a minute.", 429)
             person = await asyncio.to_thread(access.accounts.check, told.name, told.password)
             session = access.signed_in(person)
-        if not session:
-            return PlainTextResponse("Name or password is wrong.", 403)
-        answer = Response(status_code=204)
-        answer.set_cookie(COOKIE, session, httponly=True, samesite="strict", secure=secure, path="/")
-        return answer
+        return begun(request, session, "Name or password is wrong.")
 
     async def sign_out(request: Request) -> Response:
-        access.sign_out(session_of(request.headers))
+        access.sign_out(request.scope["session"])
         answer = Response(status_code=204)
-        answer.delete_cookie(COOKIE, path="/")
+        answer.delete_cookie(cookie_of(request.headers), path="/")
         return answer
 
     async def session(request: Request) -> Response:
-        peer, token = request.client.host if request.client else None, request.headers.get(TOKEN_HEADER, "")
+        token, person = request.headers.get(TOKEN_HEADER, ""), person_of(request)
         for _ in range(HANDOVER_STEPS):
             if not access.is_connected(token):
                 break
             await asyncio.sleep(HANDOVER_STEP_S)
-        page = access.open_page(token, session_of(request.headers), peer)
-        if page is None:
+        page = access.open_page(token, request.scope["session"])
+        if page is None and access.accounts is not None:
             return PlainTextResponse("Sign in first.", 401)
-        told: dict[str, Any] = {"token": page.token, "page": page.number, "person": page.person.name}
-        told |= {"role": page.person.role.name.lower(), "signs_in": access.accounts is not None}
+        told: dict[str, Any] = {"token": page.token if page else "", "page": page.number if page else 0}
+        told |= {"person": person.name, "role": person.role.name.lower(), "signs_in": access.accounts is not None}
         return JSONResponse(told)
 
     async def take(request: Request) -> Response:
@@ -94,6 +112,7 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
 
     return [
         Route("/sign-in", form),
+        Route("/api/sign-in", how),
         Route("/api/sign-in", sign_in, methods=["POST"]),
         Route("/api/sign-out", sign_out, methods=["POST"]),
         Route("/api/session", session, methods=["POST"]),

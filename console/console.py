@@ -72,7 +72,7 @@ class Console:
     recording: Path | None = None
     """Directory of the run's recording, which the page names when the run has ended."""
     accounts: Accounts | None = None
-    """Who may sign in; None: this machine only, and nobody signs in."""
+    """Who may sign in; None: this machine only, for whoever has the token of `Access`."""
     audit: AuditLog | None = None
     tls: bool = False
     """Whether the page is served over TLS."""
@@ -102,7 +102,7 @@ class Console:
         message = OperatorCommand(
             self._next(), self.profile_hash, self.clock() if stamp_ns is None else stamp_ns, action
         )
-        operator_link.send(encode(message, self.key), self.operator)
+        operator_link.send(encode(message), self.operator)
 
     def watch(self, answer: str, page: Page | None) -> None:
         """The answer of a page: it keeps its lease.  A page that may not command watches nothing."""

@@ -12,13 +12,14 @@ import hashlib
 import re
 from collections.abc import Collection, Sequence
 from typing import Final
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost", "::1")
+_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:[0-9]{1,5})?")
+"""``uri-host [":" port]`` of RFC 9110, section 7.2, as browsers send it: no user, no path."""
 _INLINE: Final = re.compile(r"<script type=\"importmap\">(.*?)</script>", re.DOTALL)
 
 
@@ -68,11 +69,12 @@ class RequestGuards:
 
     def _refusal(self, headers: Headers) -> str | None:
         host = headers.get("host", "")
-        if urlsplit(f"//{host}").hostname not in self._names:
+        found = _HOST.fullmatch(host)
+        if found is None or found[1].strip("[]").lower() not in self._names:
             return "This console does not serve that host name; start it with --allow-host to add it."
         origin = headers.get("origin")
         # A browser always sends Origin with a websocket and with a POST; a tool such as curl sends none.
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
             return "Pages of other sites may not use this console."
         return None
 

@@ -9,9 +9,9 @@ commands by POST.  Outputs: the page, ``/ws`` with the state 20 times a second (
 planner.  Pages that may command answer on ``/ws``, which makes the heartbeats of their watch (`console.page_watch`);
 a page that shows a panel says so there and gets its data (`console.panel`).
 
-STOP is accepted from every page that the console serves, at once and without more.  Everything else needs a page's
-token and a role, and what can move the machine the control lease as well (`console.access`).  All resources are served
-from the package; no other host is contacted.
+STOP is accepted from every page that the console serves, at once and without more.  Everything else needs a session
+that a person opened, a page's token and a role, and what can move the machine the control lease as well
+(`console.access`).  All resources are served from the package; no other host is contacted.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
                 await socket.close(1008, "The session has ended.")
         hearing.cancel()
 
-    return Starlette(
+    app = Starlette(
         routes=[
             Route("/", index),
             Route("/api/machine", api_machine),
@@ -291,3 +291,5 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         ],
         lifespan=lifespan,
     )
+    app.state.access = console.access
+    return app

@@ -1,4 +1,4 @@
-"""Settings of the controller: profile, rate and key.  Every error stops the start with one sentence."""
+"""Settings of the controller: profile and rate.  Every error stops the start with one sentence."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ class ConfigError(CodedError):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """A validated configuration.  ``key`` authenticates datagrams (None: checksum only)."""
+    """A validated configuration."""
 
     profile: Profile
     profile_hash: int
     rate_hz: int
-    key: bytes | None = None
 
     @property
     def period_ns(self) -> int:
@@ -38,7 +37,7 @@ class Settings:
         return self.period_ns * 3 // 5
 
 
-def load(name_or_path: str | Path, rate_hz: int = 0, key: bytes | None = None) -> Settings:
+def load(name_or_path: str | Path, rate_hz: int = 0) -> Settings:
     """Load a profile by shipped name or path; ``rate_hz`` 0 means the profile's rate.
 
     Raises:
@@ -51,4 +50,4 @@ def load(name_or_path: str | Path, rate_hz: int = 0, key: bytes | None = None) -
     rate_hz = rate_hz or profile.rate_hz
     if not 50 <= rate_hz <= 1000:
         raise ConfigError("config.rate", f"A control rate of {rate_hz} Hz is not possible; choose 50 to 1000 Hz.")
-    return Settings(profile, profile_hash(profile), rate_hz, key)
+    return Settings(profile, profile_hash(profile), rate_hz)

@@ -86,4 +86,4 @@ class StateReporter:
             operator_link=supervisor.operator_link.state(now_ns),
         )
         self.late_ns = self.tick_ns = 0
-        return encode(report, self._settings.key)
+        return encode(report)

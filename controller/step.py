@@ -101,7 +101,7 @@ class Controller:
         self.supervisor = Supervisor(
             profile, self.crane_inputs, self.crane_bus_monitor, self.carrier_bus, self.estimators, self.startup
         )
-        self.gate = RequestGate(profile, settings.profile_hash, settings.key)
+        self.gate = RequestGate(profile, settings.profile_hash)
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
         # A PLC passes on positions that its own cycle has smoothed: the same count again says nothing of the encoder.
         counted = sensed if profile.plc is None else [None] * len(sensed)
@@ -198,6 +198,9 @@ class Controller:
             else:
                 self._apply_operator_action(message, now_ns)
         except RequestRefused as refused:
+            if refused.reason is Reason.DATAGRAM_AUTHENTICATION:
+                self.gate.note_stranger()
+                return
             self.gate.count_refusal(refused.reason, refused.detail, now_ns)
             # Nobody can tell for whom an unreadable datagram was: it counts for a carrier that drives, too.
             if not operator and _UNREADABLE[0] <= refused.reason <= _UNREADABLE[1]:

@@ -383,7 +383,7 @@ uninstall_all() {
     run rm -rf "$root$opt"
     live journalctl --update-catalog || true
     run rm -f "$dropin" "$pinned" "$installed_signer"
-    # Recordings hold datagrams that only this key reads.
+    # Recordings of earlier releases hold datagrams that only this key reads.
     [ -d "$root/var/lib/timberhand" ] || run rm -f "$key"
     for folder in "${dropin%/*}" "${pinned%/*}"; do
         [ ! -d "$folder" ] || run rmdir --ignore-fail-on-non-empty "$folder"

@@ -120,7 +120,7 @@ class Recorder:
                 "recording.cannot-write",
                 f"cannot record in {directory} ({error.strerror}); free space on the disk or give another directory",
             ) from error
-        self._stops = StopRecorder(StopFiles(stops or directory / STOPS_NAME, self._durable), manifest, key, on_stop)
+        self._stops = StopRecorder(StopFiles(stops or directory / STOPS_NAME, self._durable), manifest, on_stop)
 
     @property
     def lost(self) -> int:

@@ -35,14 +35,13 @@ class StopRecorder:
         self,
         files: StopFiles,
         manifest: Manifest,
-        key: bytes | None = None,
         on_stop: Callable[[Stop, Path], None] | None = None,
     ) -> None:
         """``on_stop`` is called at once with every stop and the path that its file will have."""
         self.files = files
         self.dropped = 0
         """Stops whose file could not be written to its end."""
-        self._manifest, self._key, self._on_stop = manifest, key, on_stop
+        self._manifest, self._on_stop = manifest, on_stop
         self._offset_ns = manifest.utc_offset_ns if manifest.live else None
         self._detector = StopDetector()
         self._recent: deque[tuple[int, bytes]] = deque()
@@ -126,7 +125,7 @@ class StopRecorder:
         if not tick.report:
             return None
         try:
-            report = datagrams.decode(tick.report, self._key)
+            report = datagrams.decode(tick.report)
         except DatagramRefused:
             return None
         return report if isinstance(report, StateReport) else None

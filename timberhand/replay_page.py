@@ -20,7 +20,6 @@ def show_recording(
     run: Path,
     profile: str | None,
     port: int,
-    key: bytes | None = None,
     *,
     stop_ns: int | None = None,
     bind: str = "127.0.0.1",
@@ -32,7 +31,7 @@ def show_recording(
         CommandFailed: the recording cannot be shown, or the page cannot be served.
     """
     files = files_of(run)
-    recording = SeekableRecording(files, key)
+    recording = SeekableRecording(files)
     manifest = recording.manifest
     try:
         machine = load_profile(profile or profile_beside(files) or manifest.profile)
@@ -48,13 +47,3 @@ def show_recording(
                      allow_hosts=allow_hosts)  # fmt: skip
     except StartError as error:
         raise CommandFailed.from_error(error, ExitCode(error.exit_code)) from error
-
-
-def read_key(key_file: Path | None) -> bytes | None:
-    """The key in a file; raises CommandFailed."""
-    try:
-        return key_file.read_bytes().strip() if key_file else None
-    except OSError as error:
-        raise CommandFailed(
-            "replay.key-unreadable", f"{key_file} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
-        ) from error

@@ -8,9 +8,11 @@ codec.
 from __future__ import annotations
 
 import struct
+from typing import Final
 
 from can_dbc.messages.crane import (
     CraneSetpoint,
+    OperatorAction,
     OperatorCommand,
     SpoolTest,
     StateReport,
@@ -23,7 +25,15 @@ from can_dbc.messages.crane import (
     spool_body,
     spool_from,
 )
-from can_dbc.messages.envelope import DatagramFault, DatagramRefused, Kind, sealed, unsealed
+from can_dbc.messages.envelope import (
+    DatagramFault,
+    DatagramRefused,
+    Kind,
+    is_operator_command,
+    sealed,
+    unsealed,
+    without_mac,
+)
 from can_dbc.messages.vehicle import (
     DriveSetpoint,
     VehicleReport,
@@ -33,6 +43,10 @@ from can_dbc.messages.vehicle import (
     vehicle_from,
 )
 
+OPERATOR_BYTES: Final = len(
+    sealed(Kind.OPERATOR, (0, 0, 0), operator_body(OperatorCommand(0, 0, 0, OperatorAction.STOP)), None)
+)
+"""Of an operator's command without an authenticator."""
 Datagram = CraneSetpoint | SpoolTest | DriveSetpoint | OperatorCommand | StateReport | VehicleReport
 
 
@@ -70,6 +84,21 @@ def decode(data: bytes, key: bytes | None = None) -> Datagram:
     except ValueError:
         raise DatagramRefused(DatagramFault.VALUE) from None
     raise DatagramRefused(DatagramFault.KIND)
+
+
+def stop_in(data: bytes) -> bytes:
+    """The operator's STOP in a datagram that is whole by its checksum, without its authenticator, if it has one.
+
+    STOP is heard from anyone, whatever key he has.  Empty: the datagram is something else.
+    """
+    if not is_operator_command(data):
+        return b""
+    try:
+        plain = data if len(data) == OPERATOR_BYTES else without_mac(data)
+        message = decode(plain)
+    except DatagramRefused:
+        return b""
+    return plain if isinstance(message, OperatorCommand) and message.action is OperatorAction.STOP else b""
 
 
 def _body(message: Datagram) -> tuple[Kind, bytes]:

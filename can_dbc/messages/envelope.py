@@ -6,7 +6,8 @@ All kinds share one header and one trailer, little-endian::
     | body | [HMAC 16] | CRC-32
 
 The CRC-32 (``zlib``) covers everything before it; the optional HMAC-SHA-256, cut to 16 bytes, covers header
-and body and is present exactly when both sides are configured with a key.
+and body and is present exactly when both sides are configured with a key.  `signed` adds it to a datagram, `opened`
+checks it and takes it away: so a process checks what it receives before anything else sees it.
 """
 
 from __future__ import annotations
@@ -90,6 +91,38 @@ def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
     if key is not None and not hmac.compare_digest(_mac(signed, key), data[len(signed) : len(signed) + MAC_BYTES]):
         raise DatagramRefused(DatagramFault.AUTHENTICATION)
     return kind, (sequence, profile_hash, stamp_ns), signed[_HEADER.size :]
+
+
+def signed(data: bytes, key: bytes) -> bytes:
+    """A datagram without an authenticator, with one."""
+    covered = data[: -_CRC.size]
+    covered += _mac(covered, key)
+    return covered + _CRC.pack(zlib.crc32(covered))
+
+
+def opened(data: bytes, key: bytes | None) -> bytes:
+    """A datagram whose authenticator is right, without it; with no ``key`` as it is, unchecked.
+
+    Raises:
+        DatagramRefused: it is not whole, or was not made with this key.
+    """
+    if key is None:
+        return data
+    unsealed(data, key)
+    return _without_mac(data)
+
+
+def without_mac(data: bytes) -> bytes:
+    """A datagram that is whole by its checksum, without its authenticator, which is not checked; or DatagramRefused."""
+    unsealed(data, None)
+    if len(data) < _HEADER.size + MAC_BYTES + _CRC.size:
+        raise DatagramRefused(DatagramFault.LENGTH)
+    return _without_mac(data)
+
+
+def _without_mac(data: bytes) -> bytes:
+    covered = data[: -MAC_BYTES - _CRC.size]
+    return covered + _CRC.pack(zlib.crc32(covered))
 
 
 def kind_of(data: bytes) -> int:

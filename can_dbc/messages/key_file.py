@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +29,14 @@ def read_key(path: Path) -> bytes:
             "key.short", f"{path}: a key of {len(key)} bytes is too short; use at least {MIN_KEY_BYTES}."
         )
     return key
+
+
+def write_key(path: Path) -> Path:
+    """Draw a key for one run and write it to a new file that only this user reads; its path.  Raises OSError."""
+    path.unlink(missing_ok=True)
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as out:
+        out.write(secrets.token_hex(MIN_KEY_BYTES))
+    return path
 
 
 def service_key() -> bytes | None:

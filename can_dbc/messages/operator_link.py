@@ -1,15 +1,24 @@
 """The operator's way to the controller: a Unix datagram socket of its own, apart from the planner's port.
 
-ARM, DISARM and RESET are heard only there; STOP is heard there before anything else, whatever waits on the setpoint
-port.  The controller's side is `controller.requests.operator_socket`.
+ARM, DISARM, RESET and the heartbeats are heard only there, and only with an authenticator made with the credential of
+the controller's present start: random bytes in a file beside the socket, which its owner and its group may read (as
+X11's cookie).  So what was sent before a restart is worth nothing after it.  STOP needs none, and is heard there before
+anything else, whatever waits on the setpoint port.  The controller's side is `controller.requests.operator_socket`.
 """
 
 from __future__ import annotations
 
+import os
+import secrets
 import socket
 from pathlib import Path
+from typing import Final
 
+from can_dbc.messages.datagrams import stop_in
+from can_dbc.messages.envelope import signed
 from runtime.shared_file import shared_path
+
+CREDENTIAL_BYTES: Final = 32
 
 
 def default_path() -> Path:
@@ -17,8 +26,32 @@ def default_path() -> Path:
     return shared_path("controller.operator")
 
 
+def credential_path(path: Path) -> Path:
+    """Path of the credential that belongs to a socket."""
+    return path.with_name(f"{path.name}.key")
+
+
+def draw_credential(path: Path) -> bytes:
+    """Draw the credential of the socket at ``path`` and leave it beside it; raises OSError if that cannot be done."""
+    drawn, place = secrets.token_bytes(CREDENTIAL_BYTES), credential_path(path)
+    beside = place.with_name(f"{place.name}.new")
+    beside.unlink(missing_ok=True)
+    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with open(descriptor, "wb") as out:
+        out.write(drawn)
+        os.fchmod(descriptor, 0o640)  # independent of the umask
+    beside.replace(place)
+    return drawn
+
+
 def send(data: bytes, path: Path) -> None:
-    """Send one operator command; raises OSError if the controller does not listen or its queue is full."""
+    """Send one operator command, sealed without a key, as one of those who may read the credential.
+
+    Raises:
+        OSError: the credential cannot be read, the controller does not listen, or its queue is full.
+    """
+    if not stop_in(data):
+        data = signed(data, credential_path(path).read_bytes())
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
         link.setblocking(False)
         link.sendto(data, str(path))

@@ -1,4 +1,5 @@
 // The control lease in the header: who has control, take it, take it over on purpose, give it back; and who is signed in.
+// A page without a session only looks, and says how to get one.
 
 import { post } from "./access.js";
 
@@ -10,6 +11,7 @@ export function createLease(container, alarm, me) {
   container.append(words, button);
   container.hidden = false;
   if (me.signs_in) container.append(signOut());
+  if (!me.token) { container.append(signIn()); button.remove(); }
   let lease = null, had = false;
 
   button.addEventListener("click", () => {
@@ -31,7 +33,7 @@ export function createLease(container, alarm, me) {
     if (had && !lease.mine && lease.page) alarm(`${lease.holder} has taken control over.`, 10000);
     had = lease.mine;
     document.body.dataset.control = lease.mine ? "mine" : lease.page ? "other" : "nobody";
-    put(words, lease.mine ? "You have control" : lease.page ? `${lease.holder} has control` : "Nobody has control");
+    put(words, !me.token ? "Looking only" : lease.mine ? "You have control" : lease.page ? `${lease.holder} has control` : "Nobody has control");
     put(button, lease.mine ? "Give back" : lease.page ? "Take over …" : "Take control");
     button.hidden = !lease.may_take;
     if (dialog.element.open && (lease.mine || !lease.page)) dialog.element.close();
@@ -62,6 +64,14 @@ export function createLease(container, alarm, me) {
         no.focus();
       },
     };
+  }
+
+  function signIn() {
+    const enter = make("a", "button", "Sign in …");
+    enter.id = "sign-in";
+    enter.href = "sign-in";
+    enter.title = "To command, open the address that the console printed at its start";
+    return enter;
   }
 
   function signOut() {

@@ -1,4 +1,4 @@
-// Signing in; STOP works before it.
+// Signing in, by name and password or by the token that the console printed; STOP works before it.
 
 import { createStop } from "./stop.js";
 
@@ -6,20 +6,32 @@ const $ = (id) => document.getElementById(id);
 
 createStop($("stop"), (text) => { $("alarm").textContent = text; $("alarm").hidden = false; });
 
-$("form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  $("enter").disabled = true;
-  $("note").textContent = "";
-  try {
-    const body = JSON.stringify({ name: $("name").value, password: $("password").value });
-    const answer = await fetch("api/sign-in", { method: "POST", body });
-    if (!answer.ok) throw new Error(await answer.text());
-    location.replace("./");
-  } catch (error) {
-    $("note").textContent = error.message;
-    $("password").value = "";
-    $("password").focus();
-  }
-  $("enter").disabled = false;
-});
-$("name").focus();
+function connect(form, button, note, secret, body) {
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    button.disabled = true;
+    note.textContent = "";
+    try {
+      const answer = await fetch("api/sign-in", { method: "POST", body: JSON.stringify(body()) });
+      if (!answer.ok) throw new Error(await answer.text());
+      location.replace("./");
+    } catch (error) {
+      note.textContent = error.message;
+      secret.value = "";
+      secret.focus();
+    }
+    button.disabled = false;
+  });
+}
+
+connect($("form"), $("enter"), $("note"), $("password"), () => ({ name: $("name").value, password: $("password").value }));
+connect($("token-form"), $("enter-token"), $("token-note"), $("token"),
+  () => ({ token: $("token").value.trim().replace(/^.*[?&]token=/, "") }));
+
+async function start() {
+  const { by } = await (await fetch("api/sign-in")).json();
+  $(by === "token" ? "token-form" : "form").hidden = false;
+  $(by === "token" ? "token" : "name").focus();
+}
+
+start().catch((error) => { $("alarm").textContent = `The page could not start: ${error.message}`; $("alarm").hidden = false; });

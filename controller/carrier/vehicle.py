@@ -273,4 +273,4 @@ class Vehicle:
             or_nan(reckoning.heading_rad), _NAN if rate is None else -rate, vehicle.stamp_ns, reckoning.speed_m_s,
             self.estimator.position, roll, pitch, (h1, h2, h3, h4), self.stale_mask(),
         )  # fmt: skip
-        return encode(report, self._settings.key)
+        return encode(report)

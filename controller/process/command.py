@@ -20,6 +20,7 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.filters import FilterItem
 from can_dbc.dbc.codec import DbcError
 from can_dbc.dbc.codec import load as read_dbc
+from can_dbc.messages.key_file import KeyFileError, read_key
 from can_dbc.messages.operator_link import default_path as operator_path
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.record_ring import default_path as ring_path
@@ -48,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m controller",
         description="Closes the joint and grapple loops of the machine over CAN.",
         epilog="example: python -m controller --profile palms_471 --bus crane0=socketcan:can0 "
-        "--setpoint-port 5005 --report 127.0.0.1:5006",
+        "--setpoint-port 5005 --report 127.0.0.1:5006 --key-file key",
     )
     made.add_argument("--profile", required=True, help="shipped profile name or TOML file")
     made.add_argument("--bus", type=bus_address, action="append", default=[], metavar="NAME=ADDRESS",
@@ -61,7 +62,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--record", type=Path, metavar="FILE",
                       help="ring of tick records in shared memory; default: beside the timing page")  # fmt: skip
     made.add_argument("--rate", type=int, default=0, metavar="HZ", help="control rate; default: the profile's")
-    made.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
+    made.add_argument("--key-file", type=Path, required=True, metavar="FILE",
+                      help="file with the key of setpoints and reports, 16 bytes or more")  # fmt: skip
     made.add_argument("--cpu", type=int, help="processor to run on; use only an isolated one")
     made.add_argument("--spin-us", type=int, default=0, metavar="US",
                       help="poll the clock for the last US before a wake-up; on a processor of its own")  # fmt: skip
@@ -101,23 +103,6 @@ def listen(port: int) -> socket.socket:
         raise BusError("udp.port-in-use", sentence) from error
     made.setblocking(False)
     return made
-
-
-def settings_of(options: argparse.Namespace) -> Settings:
-    """The validated configuration of a command line; raises ConfigError."""
-    key = None
-    if options.key_file is not None:
-        try:
-            key = options.key_file.read_bytes().strip()
-        except OSError as error:
-            raise ConfigError(
-                "config.key-unreadable", f"{options.key_file}: the key cannot be read: {error.strerror}."
-            ) from error
-        if len(key) < 16:
-            raise ConfigError(
-                "config.key-short", f"{options.key_file}: a key of {len(key)} bytes is too short; use at least 16."
-            )
-    return load(options.profile, options.rate, key)
 
 
 def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
@@ -189,9 +174,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = made.parse_args(arguments)
     keep_memory()
     try:
-        settings = settings_of(options)
+        settings, key = load(options.profile, options.rate), read_key(options.key_file)
         database = read_dbc("crane")
-        warm_up(settings, Controller(settings, database))
+        warm_up(settings, Controller(settings, database), key)
         controller = Controller(settings, database)
         lead_ns = settings.sync_lead_ns if options.sync_lead_us is None else options.sync_lead_us * 1000
         if not 0 <= lead_ns < settings.period_ns:
@@ -205,9 +190,9 @@ def main(arguments: list[str] | None = None) -> int:
         timing = LoopTiming(controller, timing_writer(options.timing))
         loop = Loop(
             controller, buses, setpoints, operator, options.report, record_ring(options.record), timing,
-            settings.period_ns, lead_ns, sleep=make_sleep(options.spin_us * 1000),
+            settings.period_ns, lead_ns, sleep=make_sleep(options.spin_us * 1000), key=key,
         )  # fmt: skip
-    except (ConfigError, DbcError) as error:
+    except (ConfigError, DbcError, KeyFileError) as error:
         sys.stderr.write(f"controller: {error}\n")
         return 3
     except BusError as error:

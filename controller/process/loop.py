@@ -6,7 +6,8 @@ that follows from them::
 
     SYNC -- lead -- receive, decode, estimate, reference, accept, supervise, control, encode, send, record -- SYNC ...
 
-`step` gets the nominal time and the lateness, so that a record replays to the same bytes.  However the loop ends, it
+`step` gets the nominal time and the lateness, so that a record replays to the same bytes.  Authenticators are checked
+and taken away before it, and added after it: no record holds a key's work.  However the loop ends, it
 sends neutral commands and a last status.
 """
 
@@ -19,13 +20,14 @@ from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.batch import Batch
+from can_dbc.messages.envelope import signed
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.tick_record import RecordRefused, RecordWriter
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, sleep_until
 from controller.process.tick_recording import write
 from controller.process.timing import LoopTiming
-from controller.requests.operator_socket import OperatorSocket
+from controller.requests.operator_socket import OperatorSocket, admitted
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from machine.status.faults import describe
@@ -37,7 +39,10 @@ DATAGRAM_BYTES: Final = 2048
 
 
 class Loop:
-    """Runs a controller on its buses (crane0, and mach0 on a machine with a carrier) until `stop`."""
+    """Runs a controller on its buses (crane0, and mach0 on a machine with a carrier) until `stop`.
+
+    ``key`` authenticates setpoints and reports; None: both have only their checksum.
+    """
 
     def __init__(
         self,
@@ -53,6 +58,7 @@ class Loop:
         clock_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[int], None] = sleep_until,
         notify: str | None = None,
+        key: bytes | None = None,
     ) -> None:
         self.controller = controller
         self.buses = tuple(buses)
@@ -63,7 +69,7 @@ class Loop:
         self._crane, *more = (BusLink(bus) for bus in buses)
         self._machine = more[0] if more else None
         self._reports = [_connected(address) for address in reports]
-        self._record = record
+        self._record, self._key = record, key
         self._period_ns, self._sync_lead_ns = period_ns, sync_lead_ns
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
@@ -165,7 +171,7 @@ class Loop:
         inputs.operator.clear()
         datagrams.clear()
         if self.operator is not None:
-            self.operator.receive(inputs.operator)
+            self.operator.receive(inputs.operator, datagrams)
         batch = self._waiting
         try:
             count = batch.receive(self.setpoints.fileno())
@@ -173,14 +179,15 @@ class Loop:
             return
         for i in range(count):
             at = i * DATAGRAM_BYTES
-            datagrams.append(batch.data[at : at + batch.length(i)].tobytes())
+            datagrams.append(admitted(batch.data[at : at + batch.length(i)].tobytes(), self._key))
 
     def _report_and_record(self, inputs: Inputs, outputs: Outputs, now_ns: int) -> None:
         """Send reports and the tick's record, and publish the timing page once a second."""
         for report in (outputs.report, outputs.vehicle_report):
             if report is not None:
+                sent = report if self._key is None else signed(report, self._key)
                 for receiver in self._reports:
-                    self.unsent += not _send(receiver, report)
+                    self.unsent += not _send(receiver, sent)
         if self._record is not None:
             try:
                 self._record.append(write(self._writer, inputs, outputs, now_ns))

@@ -97,8 +97,8 @@ def _nearest(value: float, least: float | None, most: float | None) -> float:
     return most if most is not None and value > most else value
 
 
-def warm_up(settings: Settings, controller: Controller) -> None:
-    """Run every code path of ``controller``, which must not be used afterwards."""
+def warm_up(settings: Settings, controller: Controller, key: bytes | None = None) -> None:
+    """Run every code path of ``controller``, which must not be used afterwards; ``key`` as for `Loop`."""
     crane, machine = NullBus("crane"), NullBus("machine")
     buses = [crane, machine] if controller.carrier_bus else [crane]
     with (
@@ -115,15 +115,21 @@ def warm_up(settings: Settings, controller: Controller) -> None:
         loop = Loop(
             controller, buses, planner, OperatorSocket(operator), [address], RecordRing(Path(folder, "ticks")),
             LoopTiming(controller), settings.period_ns, settings.sync_lead_ns, clock.__next__,
-            lambda _deadline_ns: None, notify="",
+            lambda _deadline_ns: None, notify="", key=key,
         )  # fmt: skip
-        _run_ticks(loop, settings, crane, machine, planner.getsockname(), operator)
+        _run_ticks(loop, settings, crane, machine, planner.getsockname(), operator, key)
         loop.shut_down()
         loop.close()
 
 
 def _run_ticks(
-    loop: Loop, settings: Settings, crane: NullBus, machine: NullBus, planner: tuple[str, int], operator: Path
+    loop: Loop,
+    settings: Settings,
+    crane: NullBus,
+    machine: NullBus,
+    planner: tuple[str, int],
+    operator: Path,
+    key: bytes | None,
 ) -> None:
     controller, period_ns = loop.controller, settings.period_ns
     sources = [
@@ -150,9 +156,9 @@ def _run_ticks(
             else:
                 messages = []
                 pressed = OperatorCommand(*stamp, tuple(OperatorAction)[k % len(OperatorAction)])
-                operator_link.send(encode(pressed, settings.key), operator)
+                operator_link.send(encode(pressed), operator)
             for message in messages:
-                sender.sendto(encode(message, settings.key), planner)
+                sender.sendto(encode(message, key), planner)
             sender.sendto(b"invalid", planner)
             loop.tick(now_ns, 0)
             _run_laws(controller, crane_setpoint, drive, period_ns, now_ns)

@@ -4,6 +4,8 @@ Every datagram is a request, refused whole with a `Reason` or passed on; nothing
 length, version, finite numbers, by the codec), profile, age, order and lease.  The motion of a crane setpoint is
 checked by `controller.crane.trajectory_check`, that of a drive setpoint by `controller.carrier.vehicle`.  An operator's
 STOP is accepted whatever profile, age or order it carries, and from anyone; any other action only from an operator.
+Authenticators are checked, and taken away, where datagrams are received
+(`controller.requests.operator_socket`); a datagram without the right one arrives as an empty one.
 The heartbeats of those who watch are ordered by `controller.operator_link`, so that none of them can outrun an ARM.
 """
 
@@ -25,12 +27,11 @@ OPERATOR_AGE_NS: Final = 1_000_000_000
 class RequestGate(SetpointGate):
     """The gate of all datagrams; as a `SetpointGate` it keeps the order of crane setpoints and spool tests."""
 
-    __slots__ = ("_drives", "_key", "_operator_sequence", "_operator_stamp_ns", "watch_stamp_ns")
+    __slots__ = ("_drives", "_operator_sequence", "_operator_stamp_ns", "watch_stamp_ns")
 
-    def __init__(self, profile: Profile, profile_hash: int, key: bytes | None) -> None:
+    def __init__(self, profile: Profile, profile_hash: int) -> None:
         super().__init__(profile, profile_hash)
         self._drives = profile.carrier is not None
-        self._key = key
         self._operator_stamp_ns = self._operator_sequence = -1
         self.watch_stamp_ns = 0
         """Stamp of the last WATCH or WATCH_END."""
@@ -46,8 +47,10 @@ class RequestGate(SetpointGate):
         Raises:
             RequestRefused: the datagram does not pass.
         """
+        if not data:
+            raise RequestRefused(Reason.DATAGRAM_AUTHENTICATION)
         try:
-            message = decode(data, self._key)
+            message = decode(data)
         except DatagramRefused as error:
             raise RequestRefused(Reason(100 + error.fault)) from None
         if isinstance(message, OperatorCommand):

@@ -42,7 +42,8 @@ class SetpointGate:
     """
 
     __slots__ = (
-        "_lease_max_ns", "_profile_hash", "_refused_ns", "_sequence", "_stamp_ns", "detail", "refusal", "refused",
+        "_counted", "_lease_max_ns", "_profile_hash", "_refused_ns", "_sequence", "_stamp_ns", "detail", "refusal",
+        "refused",
     )  # fmt: skip
 
     def __init__(self, profile: Profile, profile_hash: int) -> None:
@@ -50,6 +51,7 @@ class SetpointGate:
         self._profile_hash = profile_hash
         self._sequence = self._stamp_ns = -1
         self._refused_ns = [-REFUSED_WINDOW_NS] * REFUSED_LIMIT_COUNT
+        self._counted = 0
         self.refused = 0
         self.refusal = Reason.NONE
         self.detail = 0
@@ -71,7 +73,13 @@ class SetpointGate:
     def count_refusal(self, reason: Reason, detail: int, now_ns: int) -> None:
         """Count and remember a refusal."""
         self.refusal, self.detail = reason, detail
-        self._refused_ns[self.refused % REFUSED_LIMIT_COUNT] = now_ns
+        self._refused_ns[self._counted % REFUSED_LIMIT_COUNT] = now_ns
+        self._counted += 1
+        self.refused += 1
+
+    def note_stranger(self) -> None:
+        """Count and remember a datagram without the right key: whoever sent it, it says nothing of the planner."""
+        self.refusal, self.detail = Reason.DATAGRAM_AUTHENTICATION, 0
         self.refused += 1
 
     def clear_refusals(self) -> None:
@@ -81,7 +89,7 @@ class SetpointGate:
 
     def refused_too_often(self, now_ns: int) -> bool:
         """Whether the last three refusals lie within one second."""
-        oldest_ns = self._refused_ns[self.refused % REFUSED_LIMIT_COUNT]
+        oldest_ns = self._refused_ns[self._counted % REFUSED_LIMIT_COUNT]
         return now_ns - oldest_ns < REFUSED_WINDOW_NS
 
     def check(self, setpoint: LeasedSetpoint, now_ns: int, late_ns: int) -> None:

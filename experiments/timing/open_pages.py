@@ -62,7 +62,7 @@ def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: 
         testbed.helpers.environment = testbed.family.environment  # the console listens on the same wire
         testbed.helpers.start(
             "console", "console", "--profile", PROFILE, "--port", port, "--report-port", reports, "--timing",
-            testbed.page, "--bus", "crane0=wire:crane0",
+            testbed.page, "--bus", "crane0=wire:crane0", "--key-file", testbed.key_file,
         )  # fmt: skip
         testbed.helpers.await_message("console", "url", START_S)
         for number in range(rounds):

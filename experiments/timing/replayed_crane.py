@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     files = files_of(options.recording)
     ticks = list(islice(recorded_ticks(files), options.ticks))
-    settings = settings_for(manifest_of(files), ticks[:64], profile_beside(files), None)
+    settings = settings_for(manifest_of(files), ticks[:64], profile_beside(files))
     controller, inputs, buses = Controller(settings), Inputs(), (BusPair(), BusPair())
     sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sink.bind(("127.0.0.1", 0))

@@ -1,6 +1,6 @@
 """The setpoint source of the timing testbed: arms the machine and moves every joint slowly, so that the laws work.
 
-``python -m experiments.timing.setpoint_source --profile aoro_fc8 --controller HOST:PORT --report-port N``
+``python -m experiments.timing.setpoint_source --profile aoro_fc8 --controller HOST:PORT --report-port N --key-file K``
 
 It sends a setpoint of 0.4 s every 50 ms, in which each joint swings through a tenth of its range.  It prints a JSON
 line for every change of mode, and once a second the newest report.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2
@@ -26,6 +26,7 @@ from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.key_file import KeyFileError, read_key
 from can_dbc.messages.udp_address import address_argument
 from hil.harness.operator import Operator
 from machine.joints import JOINTS
@@ -66,7 +67,8 @@ class Swing:
 class SetpointSource:
     """Reports in, datagrams out; pure."""
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, key: bytes | None = None) -> None:
+        self._key = key
         self._specs = [profile.joints[j.name.lower()] for j in JOINTS]
         self._hash = profile_hash(profile)
         self.operator = Operator(self._hash, lambda _action, _report: None)
@@ -95,7 +97,8 @@ class SetpointSource:
         return encode(
             CraneSetpoint(
                 self._sequence, self._hash, stamp_ns, LEASE_MS * 1_000_000, GrappleCommand.NEUTRAL, False, knots
-            )
+            ),
+            self._key,
         )
 
     def _from(self, reference: Sequence[float]) -> list[Swing]:
@@ -120,10 +123,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--controller", required=True, type=address_argument, metavar="HOST:PORT")
     parser.add_argument("--operator", required=True, type=Path, metavar="FILE")
     parser.add_argument("--report-port", required=True, type=int)
+    parser.add_argument("--key-file", required=True, type=Path)
     options = parser.parse_args(arguments)
     try:
-        source = SetpointSource(load_profile(options.profile))
-    except ProfileError as error:
+        key = read_key(options.key_file)
+        source = SetpointSource(load_profile(options.profile), key)
+    except (ProfileError, KeyFileError) as error:
         sys.stderr.write(f"setpoint source: {error}\n")
         return 3
     ended: list[int] = []
@@ -135,18 +140,23 @@ def main(arguments: list[str] | None = None) -> int:
         gc.collect()
         gc.freeze()
         print("ready", flush=True)
-        _serve(source, link, options.controller, options.operator, ended)
+        _serve(source, link, options.controller, options.operator, key, ended)
     return 0
 
 
 def _serve(
-    source: SetpointSource, link: socket.socket, controller: tuple[str, int], operator: Path, ended: list[int]
+    source: SetpointSource,
+    link: socket.socket,
+    controller: tuple[str, int],
+    operator: Path,
+    key: bytes,
+    ended: list[int],
 ) -> None:
     send_ns = next_print_ns = 0
     mode = -1
     while not ended:
         try:
-            message = decode(link.recv(2048))
+            message = decode(link.recv(2048), key)
         except (OSError, DatagramRefused):  # no controller yet, or another datagram
             message = None
         if isinstance(message, StateReport):

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
+from can_dbc.messages.key_file import write_key
 from can_dbc.timing.page import Facts, Timing, TimingRefused, read_timing
 from experiments.timing import host_activity
 from experiments.timing.losses import Loss, Stall, Stop, losses_between
@@ -109,7 +110,7 @@ class TimingTestbed:
         directory.mkdir(parents=True, exist_ok=True)
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
-        self.page = self._private / "controller.timing"
+        self.page, self.key_file = self._private / "controller.timing", self._private / "key"
         self.family = ProcessGroup(directory, environment={"TIMBERHAND_WIRE_DIR": str(self._private)})
         self.helpers = ProcessGroup(directory, own_sessions=False)
 
@@ -140,6 +141,7 @@ class TimingTestbed:
         buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
         control, reports = free_udp_ports(2)
         ticks, operators = (self._private / f"controller.{kind}" for kind in ("ticks", "operator"))
+        keyed = ("--key-file", write_key(self.key_file))
         if not vcan:
             rates = dict(s.bitrates)
             self._start("wire", "hil.wire.daemon", *(x for n in names for x in ("--bus", f"{n}:{rates[n]}")))
@@ -153,7 +155,7 @@ class TimingTestbed:
         )
         self._start(
             "setpoints", "experiments.timing.setpoint_source", "--profile", s.profile,
-            "--controller", f"{HOST}:{control}", "--operator", operators, "--report-port", reports,
+            "--controller", f"{HOST}:{control}", "--operator", operators, "--report-port", reports, *keyed,
         )  # fmt: skip
         self._start(
             "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
@@ -163,7 +165,7 @@ class TimingTestbed:
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,
             "--report", f"{HOST}:{reports}", "--record", ticks, "--operator", operators, "--rate", s.rate_hz,
-            "--timing", self.page,
+            "--timing", self.page, *keyed,
             *(("--cpu", self.cpu) if self.cpu not in self.others else ()), *s.arguments,
         )  # fmt: skip
         self._await_motion()

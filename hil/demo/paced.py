@@ -135,7 +135,7 @@ class PageLink:
     def commands(self, offset_ns: int, now_ns: int) -> list[bytes]:
         """The commands that wait, in virtual time."""
         self._waiting.clear()
-        self._commands.receive(self._waiting)
+        self._commands.receive(self._waiting, [])
         translated = (in_virtual_time(command, offset_ns, now_ns) for command in self._waiting)
         return [command for command in translated if command is not None]
 

@@ -22,6 +22,7 @@ from can_dbc.bus.factory import open_bus
 from can_dbc.bus.wire_client import control
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
+from can_dbc.messages.key_file import KeyFileError, read_key
 from hil.faults.order import Order
 from hil.faults.table import FAULTS, Edge, FaultError
 from hil.faults.wire_faults import wire_fault
@@ -43,6 +44,7 @@ class LiveTarget:
     ports: dict[str, int]
     buses: dict[str, str]
     pids: dict[str, int]
+    key_file: Path
 
     @classmethod
     def of(cls, directory: Path) -> LiveTarget:
@@ -54,7 +56,8 @@ class LiveTarget:
         path = directory / ADDRESSES
         try:
             found = json.loads(path.read_text())
-            return cls(load_profile(found["profile"]), found["ports"], found["buses"], found["pids"])
+            profile, key_file = load_profile(found["profile"]), Path(found["key_file"])
+            return cls(profile, found["ports"], found["buses"], found["pids"], key_file)
         except (OSError, ValueError, KeyError) as error:
             raise FaultError(
                 "fault.no-live-run", f"{path} cannot be read ({error}); give the directory of a live run with --run"
@@ -143,26 +146,30 @@ def _send_frames(order: Order, address: str, fault: Fault, consent: bool) -> str
 def _as_planner(order: Order, target: LiveTarget) -> str:
     if order.fault == "planner-off":
         return _signal("planner", order, target, off=False)
+    try:
+        key = read_key(target.key_file)
+    except KeyFileError as error:
+        raise FaultError("fault.no-live-run", f"{error} The run has ended.") from None
     random, sent = Random(order.seed), 0
     ends_s = time.monotonic() + (order.length_s if math.isfinite(order.length_s) else 1.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         while time.monotonic() < ends_s:
-            data = _datagram(order.fault, target, random)
+            data = _datagram(order.fault, target, random, key)
             client.sendto(data, (HOST, target.ports["control"]))
             sent += 1
             time.sleep(FLOOD_PERIOD_S)
     return f"{order.fault}: {sent} datagrams sent to the controller"
 
 
-def _datagram(fault: str, target: LiveTarget, random: Random) -> bytes:
+def _datagram(fault: str, target: LiveTarget, random: Random, key: bytes) -> bytes:
     code, now_ns = profile_hash(target.profile), time.monotonic_ns()
     match fault:
         case "planner-garbage":
             return random.randbytes(random.randrange(1, 900))
         case "planner-arms":
             action = random.choice((OperatorAction.ARM, OperatorAction.RESET))
-            return encode(OperatorCommand(random.randrange(1 << 31), code, now_ns, action))
-    return encode(OperatorCommand(1, code, 1, OperatorAction.ARM))  # the same old datagram again and again
+            return encode(OperatorCommand(random.randrange(1 << 31), code, now_ns, action), key)
+    return encode(OperatorCommand(1, code, 1, OperatorAction.ARM), key)  # the same old datagram again and again
 
 
 def _signal(process: str, order: Order, target: LiveTarget, off: bool) -> str:

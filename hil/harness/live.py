@@ -22,6 +22,7 @@ from can_dbc.bus.factory import VCAN_NAMES, kernel_has_can
 from can_dbc.messages import datagrams, operator_link
 from can_dbc.messages.crane import OperatorAction, StateReport
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.key_file import read_key, write_key
 from can_dbc.timing.page import default_path
 from hil.harness.display import Display
 from hil.harness.operator import Operator
@@ -32,6 +33,7 @@ from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 from machine.status.faults import describe
 from machine.status.modes import Mode
+from runtime.shared_file import make_own_folder
 
 Outcome = TypeVar("Outcome")
 HOST: Final = "127.0.0.1"
@@ -49,7 +51,7 @@ END_ORDER: Final = (
 )
 PORTS: Final = ("control", "planner", "orders", "page", "reports", "sim", "pictures", "detector")
 ADDRESSES: Final = "live.json"
-"""File in the directory of a live run with the ports, buses and process ids."""
+"""File in the directory of a live run with the ports, the file of its key, buses and process ids."""
 AUDIT: Final = "audit.jsonl"
 """File in the same directory: who commanded what on the page."""
 START_S: Final = 60.0
@@ -130,6 +132,9 @@ class LiveRun(ABC, Generic[Outcome]):
         self._timing, self._ticks = ("--timing", page), page.with_suffix(".ticks")
         self._operators = page.with_suffix(".operator")
         self._desk = page.with_suffix(".faults")
+        make_own_folder(page.parent)
+        self._key_file = write_key(page.with_suffix(".key"))
+        self._key, self._keyed = read_key(self._key_file), ("--key-file", self._key_file)
         self._report: StateReport | None = None
         self._first: StateReport | None = None
         self._failure = self._grasp = ""
@@ -159,6 +164,7 @@ class LiveRun(ABC, Generic[Outcome]):
                 signal.signal(number, signal.SIG_IGN)  # the end is short; a second Ctrl-C must not disturb it
             self._processes.stop_all(END_ORDER)
             self._socket.close()
+            self._key_file.unlink(missing_ok=True)
 
     def _start_all(self) -> dict[str, int]:
         ports = dict(zip(PORTS, free_udp_ports(len(PORTS)), strict=True))
@@ -172,7 +178,8 @@ class LiveRun(ABC, Generic[Outcome]):
     def _write_addresses(self, bus: list[str], ports: dict[str, int]) -> None:
         """Tell other processes where this run can be reached (`hil.faults.live`)."""
         document = {
-            "profile": self._options.profile_name, "ports": ports, "buses": dict(b.split("=", 1) for b in bus[1::2]),
+            "profile": self._options.profile_name, "ports": ports, "key_file": str(self._key_file),
+            "buses": dict(b.split("=", 1) for b in bus[1::2]),
             "pids": {name: child.process.pid for name, child in self._processes.children.items()},
         }  # fmt: skip
         (self._options.directory / ADDRESSES).write_text(json.dumps(document, indent=2))
@@ -197,7 +204,7 @@ class LiveRun(ABC, Generic[Outcome]):
         self._start(
             "recorder", "recorder", *self._profile, *bus, "--out", options.directory, "--seed", options.seed,
             "--no-sync",
-            "--ticks", self._ticks, "--report-port", ports["reports"], *self._timing,
+            "--ticks", self._ticks, "--report-port", ports["reports"], *self._timing, *self._keyed,
             *(("--pictures", f"{HOST}:{ports['detector']}") if options.camera else ()),
         )  # fmt: skip
         self._processes.await_message("recorder", "ready", START_S)
@@ -232,7 +239,7 @@ class LiveRun(ABC, Generic[Outcome]):
             self._start(
                 "console", "console", *self._profile, "--port", self._options.console_port,
                 "--report-port", ports["page"], "--operator", self._operators, "--planner", f"{HOST}:{ports['orders']}",
-                "--scene", scene, *self._timing, *bus, "--faults", self._desk, "--missions", "missions",
+                "--scene", scene, *self._timing, *self._keyed, *bus, "--faults", self._desk, "--missions", "missions",
                 "--truth", f"{HOST}:{ports['sim']}",
                 *(("--foxglove", options.foxglove_port) if options.foxglove_port else ()),
                 "--audit", options.directory / AUDIT, "--recording", options.directory,
@@ -247,7 +254,7 @@ class LiveRun(ABC, Generic[Outcome]):
         self._start(
             "autonomy", "autonomy", *self._profile,
             "--controller", control, "--report-port", ports["planner"], "--scene", scene,
-            "--order-port", ports["orders"], *(x for port in told for x in ("--tell", f"{HOST}:{port}")),
+            "--order-port", ports["orders"], *self._keyed, *(x for port in told for x in ("--tell", f"{HOST}:{port}")),
             *self.planner_arguments,
         )  # fmt: skip
         self._processes.await_message("autonomy", "event", START_S)
@@ -272,7 +279,7 @@ class LiveRun(ABC, Generic[Outcome]):
         listeners += [ports["page"]] if self._options.console_port else []
         self._start(
             "controller", "controller", *self._profile, *bus, "--setpoint-port", ports["control"],
-            "--operator", self._operators, "--record", self._ticks, *self._timing,
+            "--operator", self._operators, "--record", self._ticks, *self._timing, *self._keyed,
             *(x for port in listeners for x in ("--report", f"{HOST}:{port}")),
         )  # fmt: skip
 
@@ -319,7 +326,7 @@ class LiveRun(ABC, Generic[Outcome]):
 
     def _receive(self) -> None:
         try:
-            message = datagrams.decode(self._socket.recv(2048))
+            message = datagrams.decode(self._socket.recv(2048), self._key)
         except (TimeoutError, DatagramRefused):
             return
         if not isinstance(message, StateReport):

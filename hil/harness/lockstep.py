@@ -199,7 +199,7 @@ class Lockstep:
             self._observer.recorder.on_tick(record(inputs, outputs, self.now_ns))
         report = None
         if outputs.report is not None:
-            message = datagrams.decode(outputs.report, self._settings.key)
+            message = datagrams.decode(outputs.report)
             assert isinstance(message, StateReport)
             report = self.report = message
             if self._observer.recorder:
@@ -209,7 +209,7 @@ class Lockstep:
             if press := self.operator.step(report):
                 self._pressed.append(press)
         if outputs.vehicle_report is not None:
-            vehicle = datagrams.decode(outputs.vehicle_report, self._settings.key)
+            vehicle = datagrams.decode(outputs.vehicle_report)
             assert isinstance(vehicle, VehicleReport)
             self.vehicle_report = vehicle
             if self._observer.recorder:

@@ -13,7 +13,7 @@ Outputs = tuple[Sequence[RawFrame], Sequence[RawFrame], bytes, bytes]
 """Frames on crane0, frames on mach0, crane report, vehicle report."""
 
 
-def differing_lines(recorded: Outputs, replayed: Outputs, key: bytes | None) -> dict[str, list[str]]:
+def differing_lines(recorded: Outputs, replayed: Outputs) -> dict[str, list[str]]:
     """The outputs of either side in words, without the lines that both have."""
     databases = load("crane"), load("machine")
     lines = []
@@ -21,7 +21,7 @@ def differing_lines(recorded: Outputs, replayed: Outputs, key: bytes | None) -> 
         described = [_frame_text(databases[0], *frame) for frame in crane] + [
             _frame_text(databases[1], *frame) for frame in machine
         ]
-        lines.append(described + [line for report in reports for line in _report_text(report, key)])
+        lines.append(described + [line for report in reports for line in _report_text(report)])
     before, now = lines
     return {
         "recorded": [line for line in before if line not in now] or before,
@@ -38,10 +38,10 @@ def _frame_text(database: Database, key: int, data: bytes) -> str:
     return f"{raw} {codec.name} " + " ".join(f"{name}={value:g}" for name, value in values.items())
 
 
-def _report_text(report: bytes, key: bytes | None) -> list[str]:
+def _report_text(report: bytes) -> list[str]:
     if not report:
         return []
     try:
-        return [str(datagrams.decode(report, key))]
+        return [str(datagrams.decode(report))]
     except DatagramRefused:
         return [f"report {report.hex()}"]

@@ -56,14 +56,14 @@ class Result:
         return asdict(self) | {"agrees": self.agrees}
 
 
-def settings_for(manifest: Manifest, ticks: list[TickRecord], profile: str | None, key: bytes | None) -> Settings:
+def settings_for(manifest: Manifest, ticks: list[TickRecord], profile: str | None) -> Settings:
     """The controller's settings of the recorded run: its profile, checked by hash, and its rate.
 
     Raises:
         CommandFailed: profile or DBC differ from the recorded ones.
     """
     try:
-        settings = load_settings(profile or manifest.profile, _rate_hz(ticks), key)
+        settings = load_settings(profile or manifest.profile, _rate_hz(ticks))
     except ConfigError as error:
         hint = "" if profile else f"; name the recorded profile {manifest.profile} with --profile FILE"
         raise CommandFailed("replay.profile", f"{error}{hint}", ExitCode.CONFIGURATION) from error
@@ -96,7 +96,6 @@ def profile_beside(files: list[Path]) -> str | None:
 def replay(
     files: list[Path],
     profile: str | None = None,
-    key: bytes | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Result:
     """Replay every tick until the first difference or gap; ``progress`` gets ticks done and the total.
@@ -106,13 +105,13 @@ def replay(
     """
     manifest = manifest_of(files)
     first = list(islice(recorded_ticks(files), _RATE_TICKS))
-    settings = settings_for(manifest, first, profile or profile_beside(files), key)
+    settings = settings_for(manifest, first, profile or profile_beside(files))
     result = Result(
         total=sum(1 for _ in messages(files, TICK)),
         profile=settings.profile.name,
         profile_hash=manifest.profile_hash,
         rate_hz=settings.rate_hz,
-        missing=_missing_start(first, key),
+        missing=_missing_start(first),
     )
     if result.missing:
         return result
@@ -129,7 +128,7 @@ def replay(
         replayed = transmitted(step(controller, inputs, tick.now_ns))
         if replayed != (recorded := (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)):
             at = {"tick": result.ticks, "at": _seconds(first[0], tick), "now_ns": tick.now_ns}
-            result.difference = at | differing_lines(recorded, replayed, key)
+            result.difference = at | differing_lines(recorded, replayed)
             return result
         result.ticks += 1
         before = tick
@@ -157,16 +156,16 @@ def _rate_hz(ticks: list[TickRecord]) -> int:
     return round(1e9 / commonest) if commonest > 0 else 0
 
 
-def _missing_start(ticks: list[TickRecord], key: bytes | None) -> str:
+def _missing_start(ticks: list[TickRecord]) -> str:
     """What is missing at the start; empty when the first tick is there, which sends report number 1."""
     if not ticks:
         return "the recording holds no tick of the controller"
     try:
-        report = datagrams.decode(ticks[0].report, key) if ticks[0].report else None
+        report = datagrams.decode(ticks[0].report) if ticks[0].report else None
     except DatagramRefused as error:
         raise CommandFailed(
             "recording.reports-unreadable",
-            f"the recorded reports cannot be read ({error}); give the run's key with --key-file",
+            f"the recorded reports cannot be read ({error}); read it with the release that recorded it",
             ExitCode.CONFIGURATION,
         ) from error
     if report is None or report.sequence != 1:

@@ -61,9 +61,9 @@ class _Place(NamedTuple):
 
 
 class SeekableRecording:
-    """``files`` are those of one run, or one stop file; ``key`` is that of authenticated reports in tick records."""
+    """``files`` are those of one run, or one stop file."""
 
-    def __init__(self, files: list[Path], key: bytes | None = None) -> None:
+    def __init__(self, files: list[Path]) -> None:
         """Read the index.
 
         Raises:
@@ -71,7 +71,7 @@ class SeekableRecording:
         """
         self.manifest = manifest_of(files)
         self.buses = self.manifest.buses
-        self._key, self._lock = key, threading.Lock()
+        self._lock = threading.Lock()
         self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
         places = [place for path in files for place in self._places_of(path)]
         self._places = sorted(places, key=lambda place: place.begin_ns)
@@ -105,7 +105,7 @@ class SeekableRecording:
                 tick = tick_record.decode(message.data)
                 for data in filter(None, (tick.report, tick.vehicle_report)):
                     try:
-                        report = datagrams.decode(data, self._key)
+                        report = datagrams.decode(data)
                     except DatagramRefused:
                         continue
                     if isinstance(report, StateReport | VehicleReport):

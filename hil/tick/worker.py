@@ -66,7 +66,7 @@ def recorded(place: Path, limit: int) -> tuple[Settings, list[TickRecord]]:
     ticks = list(islice(replay.recorded_ticks(files), limit or None))
     # This worker runs with the packages of older releases too; before profiles lay beside recordings they had no such.
     beside = getattr(replay, "profile_beside", None)
-    return replay.settings_for(manifest_of(files), ticks[:64], beside and beside(files), None), ticks
+    return replay.settings_for(manifest_of(files), ticks[:64], beside and beside(files)), ticks
 
 
 def cost(place: Path, limit: int) -> dict[str, Any]:

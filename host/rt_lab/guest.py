@@ -93,6 +93,7 @@ def reference_loop() -> dict[str, Any]:
 
 def control_loop(checkout: Path) -> dict[str, Any]:
     """Controller, guard and emulated nodes on vcan; the controller is killed while the crane slews."""
+    from can_dbc.messages.key_file import read_key, write_key
     from can_dbc.timing.page import read_timing
     from host.service_lab import trial
     from host.service_lab.pilot import Pilot
@@ -105,6 +106,7 @@ def control_loop(checkout: Path) -> dict[str, Any]:
         raise TimeoutError("the emulated nodes do not start")
     os.sched_setscheduler(nodes.pid, os.SCHED_FIFO, os.sched_param(NODES_PRIORITY))
     page, operator = RUNTIME / "controller.timing", RUNTIME / "controller.operator"
+    key_file = write_key(RUNTIME / "key")
     guard, guard_ready = start(checkout, "controller.guard", *bus)
     controller, controller_ready = start(
         checkout,
@@ -118,10 +120,12 @@ def control_loop(checkout: Path) -> dict[str, Any]:
         page,
         "--operator",
         operator,
+        "--key-file",
+        key_file,
     )
     found: dict[str, Any] = {"guard_ready": await_ready(guard_ready), "controller_ready": await_ready(controller_ready)}
     step(f"guard and controller are ready: {found}")
-    pilot = Pilot(PROFILE, SETPOINTS, operator, REPORTS, f"socketcan:{LINKS[0]}")
+    pilot = Pilot(PROFILE, SETPOINTS, operator, REPORTS, f"socketcan:{LINKS[0]}", read_key(key_file))
     found["standby"] = pilot.until(lambda: pilot.report and Mode(pilot.report.mode) is Mode.STANDBY, WAIT_S)
     pilot.until(lambda: False, TICKS_S)
     for name, process in (("controller", controller), ("guard", guard)):

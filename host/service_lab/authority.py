@@ -13,17 +13,23 @@ from typing import Final
 
 from host.service_lab import trial
 from host.service_lab.updates import Expect
-from host.systemd import show
+from host.systemd import journal, show
 
 AUTHORITY_S: Final = 10.0
 TOKEN_HEADER: Final = "X-Timberhand-Page"
 """The page's token in a request; this test knows it as a foreign client would."""
+_ENTERED: Final = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+"""Keeps the cookie of the session, as a browser."""
 OPERATORS: Final = Path("/run/timberhand-operator/controller")
 
 
 def probe(expect: Expect, page: str) -> None:
-    """The page reaches the controller as an operator; the planner's user cannot even see the socket."""
+    """The page commands for who opened the printed address, nobody else; the planner's user cannot see the socket."""
     origin = page.rstrip("/")
+    _, session = post(origin, "session")
+    told = json.loads(session)
+    expect(told["token"] == "", f"who has not opened the printed address got the page {told['page']}")
+    _ENTERED.open(printed_address(), timeout=10.0).close()
     _, session = post(origin, "session")
     token = json.loads(session)["token"]
     unnamed, _ = post(origin, "operator/reset")
@@ -45,13 +51,18 @@ def probe(expect: Expect, page: str) -> None:
     expect("PermissionError" in done.stderr, f"the planner's user sent a command: {done.stderr[-300:]}")
 
 
+def printed_address() -> str:
+    """The page's address with its token, from the console's journal of its present start."""
+    return next(str(json.loads(line)["url"]) for line in reversed(journal("timberhand-console")) if '"url"' in line)
+
+
 def post(origin: str, path: str, token: str = "", body: object = None) -> tuple[int, str]:
     """Status and text of the page's answer to a command."""
     headers = {"Origin": origin, "Content-Type": "application/json"} | ({TOKEN_HEADER: token} if token else {})
     data = b"" if body is None else json.dumps(body).encode()
     request = urllib.request.Request(f"{origin}/api/{path}", data, headers, method="POST")
     try:
-        with urllib.request.urlopen(request, timeout=10.0) as answer:  # the page of this lab, http  # nosec B310
+        with _ENTERED.open(request, timeout=10.0) as answer:  # the page of this lab, http  # nosec B310
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode()

@@ -94,7 +94,7 @@ class Pilot:
         now_ns = time.monotonic_ns()
         with contextlib.suppress(OSError):  # no controller now
             command = OperatorCommand(next(self._numbers), self._hash, now_ns, action)
-            operator_link.send(encode(command, self._key), self._operator)
+            operator_link.send(encode(command), self._operator)
 
     def swing(self) -> None:
         """Start to slew the crane slowly from its present position towards the far side."""

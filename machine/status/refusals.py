@@ -20,7 +20,11 @@ REFUSALS: Final[dict[Reason, Fault]] = {
     ),
     Reason.DATAGRAM_CRC: Fault(Reaction.REFUSE, 10, _N, "A corrupt datagram was refused", PLANNER),
     Reason.DATAGRAM_AUTHENTICATION: Fault(
-        Reaction.REFUSE, 10, _N, "A datagram with a wrong key was refused", "Give both sides the same key."
+        Reaction.REFUSE,
+        10,
+        _N,
+        "A datagram without the right key was refused",
+        "Give both sides the same key.",
     ),
     Reason.DATAGRAM_NOT_FINITE: Fault(Reaction.REFUSE, 10, _N, "A datagram with NaN or infinity was refused", PLANNER),
     Reason.DATAGRAM_VALUE: Fault(Reaction.REFUSE, 10, _N, "A datagram with an illegal value was refused", PLANNER),

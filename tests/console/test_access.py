@@ -27,7 +27,8 @@ from console.lease import LEASE_NS, ControlLease
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.codes import coded
-from tests.console.page_client import HERE, WS, page_client, socket_of
+from tests.console.page_client import BROWSING, HERE, WS, page_client, socket_of, visitor
+from tests.operator_end import OperatorEnd
 
 PROFILE = load_profile("aoro_fc8")
 HASH = profile_hash(PROFILE)
@@ -71,10 +72,9 @@ class Stage:
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
     with (
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as operator,
+        OperatorEnd(tmp_path / "operator") as operator,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner,
     ):
-        operator.bind(str(tmp_path / "operator"))
         planner.bind(("127.0.0.1", 0))
         clock = Clock()
         log = AuditLog(tmp_path / "audit.jsonl", clock)
@@ -154,8 +154,7 @@ def test_what_moves_the_machine_needs_the_lease(stage: Stage, path: str) -> None
 
 def test_stop_needs_nothing_while_another_has_control(stage: Stage) -> None:
     page_client(stage.console, leads=True)
-    stranger = TestClient(create_app(stage.console), base_url=HERE, client=("192.0.2.7", 40000))
-    assert stranger.post("/api/operator/stop").status_code == 204
+    assert visitor(stage.console, "192.0.2.7").post("/api/operator/stop").status_code == 204
     assert decode(stage.operator.recv(100)).action is OperatorAction.STOP
 
 
@@ -176,7 +175,7 @@ def test_a_lease_cannot_be_stolen(stage: Stage) -> None:
     for token in ("", "1", "null", holder.headers[TOKEN_HEADER][:-1], "x" * 43):
         assert thief.post("/api/operator/arm", headers={TOKEN_HEADER: token}).status_code == 403
     thief.post("/api/lease/give-back")
-    with thief.websocket_connect(socket_of(thief)) as ws:
+    with thief.websocket_connect(socket_of(thief), headers=BROWSING) as ws:
         assert ws.receive_json()["lease"] == {"page": 1, "holder": "this machine (page 1)", "mine": False,
                                               "may_take": True}  # fmt: skip
     assert thief.post("/api/operator/arm").status_code == 403 and stage.nothing_sent()
@@ -194,7 +193,7 @@ def test_a_takeover_is_explicit_and_seen_by_both(stage: Stage) -> None:
 
 def test_the_lease_ends_when_the_page_is_gone_and_lives_while_it_answers(stage: Stage) -> None:
     page = page_client(stage.console, leads=True)
-    with page.websocket_connect(socket_of(page)) as ws:
+    with page.websocket_connect(socket_of(page), headers=BROWSING) as ws:
         for _ in range(4):
             stage.clock.now_ns += LEASE_NS // 2
             while (sent_ms := ws.receive_json()["sent_ms"]) * MS < stage.clock.now_ns:
@@ -212,8 +211,10 @@ def test_the_lease_ends_when_the_page_is_gone_and_lives_while_it_answers(stage: 
 def test_an_answer_that_waited_in_a_slow_network_keeps_no_lease(stage: Stage) -> None:
     page = page_client(stage.console, leads=True)
     stage.clock.now_ns += LEASE_NS - 1
-    stage.console.watch(f"abc {(stage.clock.now_ns - LEASE_NS) // MS}", stage.console.access.page(
-        page.headers[TOKEN_HEADER], "", "127.0.0.1"))  # fmt: skip
+    access = stage.console.access
+    known = access.page(page.headers[TOKEN_HEADER], next(iter(access._sessions)))
+    assert known is not None
+    stage.console.watch(f"abc {(stage.clock.now_ns - LEASE_NS) // MS}", known)
     stage.clock.now_ns += 1
     assert page.get("/api/state").json()["lease"]["page"] == 0
 
@@ -222,18 +223,89 @@ def test_a_duplicated_tab_is_a_page_of_its_own(stage: Stage) -> None:
     page = page_client(stage.console)
     token = page.headers[TOKEN_HEADER]
     assert page.post("/api/session").json()["token"] == token, "a page that is loaded again keeps its token"
-    with page.websocket_connect(socket_of(page)) as ws:
+    with page.websocket_connect(socket_of(page), headers=BROWSING) as ws:
         ws.receive_json()
         assert page.post("/api/session").json()["token"] != token
 
 
 def test_memory_is_bounded_and_the_holder_is_kept(stage: Stage) -> None:
     holder = page_client(stage.console, leads=True)
-    fresh = TestClient(create_app(stage.console), base_url=HERE, client=("127.0.0.1", 40000))
+    fresh = page_client(stage.console)
     for _ in range(MAX_PAGES + 10):
         fresh.post("/api/session")
     assert len(stage.console.access._pages) <= MAX_PAGES
     assert holder.post("/api/operator/arm").status_code == 204
+
+
+# -- attacks from this machine
+
+
+def test_without_a_session_nothing_moves_but_stop_works(stage: Stage) -> None:
+    """A process of this machine without the console's token: it asks for all that a page asks for."""
+    page_client(stage.console)
+    thief = visitor(stage.console)
+    for token in ("", "x", stage.console.access.token[:-1], stage.console.access.token + "=", "\u00e9"):
+        assert thief.get("/", params={"token": token}).url.path == "/sign-in"
+        assert thief.post("/api/sign-in", json={"token": token}).status_code == 403
+    for body in (b"", b"{}", b"[]", b'{"token": 1}', b'{"name": "a", "password": "b"}'):
+        assert thief.post("/api/sign-in", content=body).status_code == 422
+    assert not thief.cookies and thief.post("/api/session").json()["token"] == ""
+    for page in ("", "x" * 43):
+        for path in (*TRIES, "/api/operator/disarm", "/api/mission/pause", "/api/shift/begin", "/api/plan/check"):
+            assert thief.post(path, headers={TOKEN_HEADER: page, "origin": HERE}).status_code == 403, path
+        assert thief.post("/api/lease/take", json={"over": 0}, headers={TOKEN_HEADER: page}).status_code == 403
+    with thief.websocket_connect(WS, headers=BROWSING) as ws:
+        state = ws.receive_json()
+        assert state["role"] == "viewer" and not (state["may_command"] or state["may_order"])
+    assert stage.nothing_sent()
+    assert thief.post("/api/operator/stop").status_code == 204 and not stage.nothing_sent()
+
+
+def test_the_printed_address_opens_a_session_that_scripts_and_other_sites_cannot_use(stage: Stage) -> None:
+    person = visitor(stage.console)
+    answer = person.get("/plan", params={"token": stage.console.access.token}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/plan"), "the token leaves the address"
+    kept = answer.headers["set-cookie"].lower()
+    assert "httponly" in kept and "samesite=strict" in kept and stage.console.access.token.lower() not in kept
+    assert person.post("/api/operator/arm").status_code == 403, "a cookie alone is no page"
+    token = person.post("/api/session").json()["token"]
+    thief = visitor(stage.console)
+    assert thief.post("/api/lease/take", json={"over": 0}, headers={TOKEN_HEADER: token}).status_code == 403
+    with pytest.raises(WebSocketDisconnect), thief.websocket_connect(f"{WS}?page={token}", headers=BROWSING):
+        pass
+    answer = person.get("//evil.example/", params={"token": stage.console.access.token}, follow_redirects=False)
+    assert answer.headers.get("location", "/").startswith("//") is False
+
+
+def test_the_printed_address_may_be_opened_again(stage: Stage) -> None:
+    page = page_client(stage.console, leads=True)
+    again = page.get("/plan", params={"token": stage.console.access.token}, follow_redirects=False)
+    assert again.status_code == 303 and "set-cookie" not in again.headers
+    assert page.post("/api/operator/arm").status_code == 204, "the page keeps its control"
+
+
+def test_a_session_of_the_printed_address_ends_with_the_shift(stage: Stage) -> None:
+    page = page_client(stage.console, leads=True)
+    stage.clock.now_ns += SESSION_NS
+    assert page.post("/api/operator/arm").status_code == 403 and stage.nothing_sent()
+
+
+def test_consoles_share_no_cookie(stage: Stage) -> None:
+    page, other = page_client(stage.console), Console(PROFILE, HASH)
+    port = {"host": "127.0.0.1:8472"}
+    assert page.get(f"/?token={stage.console.access.token}", headers=port, follow_redirects=False).status_code == 303
+    assert len(page.cookies) == 2 and page_client(other).get("/api/state").json()["role"] == "technician"
+
+
+def test_a_websocket_without_origin_only_shows(stage: Stage) -> None:
+    page = page_client(stage.console, leads=True)
+    with page.websocket_connect(socket_of(page)) as ws:
+        state = ws.receive_json()
+        assert not (state["may_command"] or state["lease"]["mine"])
+        ws.send_text(f"abc {state['sent_ms']}")
+        for _ in range(3):
+            ws.receive_json()
+    assert stage.nothing_sent()
 
 
 # -- attacks from a browser
@@ -246,7 +318,7 @@ def test_a_websocket_is_not_hijacked(stage: Stage) -> None:
         with pytest.raises(WebSocketDisconnect), page.websocket_connect(socket_of(page), headers=headers):
             pass
     for token in ("", "wrong"):
-        with pytest.raises(WebSocketDisconnect), page.websocket_connect(f"{WS}?page={token or 'x'}"):
+        with pytest.raises(WebSocketDisconnect), page.websocket_connect(f"{WS}?page={token or 'x'}", headers=BROWSING):
             pass
     with page.websocket_connect(WS) as ws:  # without a token it shows, and its answers are nobody's
         state = ws.receive_json()
@@ -314,7 +386,7 @@ def test_a_token_is_worth_nothing_without_its_session(guarded: Stage) -> None:
     assert thief.post("/api/operator/arm", headers={TOKEN_HEADER: token}).status_code == 403
     again = signed_in(guarded.console, "operator")
     assert again.post("/api/operator/arm", headers={TOKEN_HEADER: token}).status_code == 403, "another session of his"
-    with pytest.raises(WebSocketDisconnect), thief.websocket_connect(f"{WS}?page={token}"):
+    with pytest.raises(WebSocketDisconnect), thief.websocket_connect(f"{WS}?page={token}", headers=BROWSING):
         pass
     assert guarded.nothing_sent()
 
@@ -322,7 +394,7 @@ def test_a_token_is_worth_nothing_without_its_session(guarded: Stage) -> None:
 def test_a_session_ends_by_signing_out_and_with_the_shift(guarded: Stage) -> None:
     operator = signed_in(guarded.console, "operator")
     operator.post("/api/lease/take", json={"over": 0})
-    with operator.websocket_connect(socket_of(operator)) as ws:
+    with operator.websocket_connect(socket_of(operator), headers=BROWSING) as ws:
         ws.receive_json()
         assert operator.post("/api/sign-out").status_code == 204
         with pytest.raises(WebSocketDisconnect):
@@ -478,7 +550,7 @@ def test_any_token_and_any_name_command_nothing(page: TestClient, token: str, na
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.text(max_size=40) | st.binary(max_size=40), max_size=5))
 def test_any_words_on_the_websocket_command_nothing(stage: Stage, page: TestClient, words: list[str | bytes]) -> None:
-    with page.websocket_connect(socket_of(page)) as ws:
+    with page.websocket_connect(socket_of(page), headers=BROWSING) as ws:
         for word in words:
             ws.send_text(word) if isinstance(word, str) else ws.send_bytes(word)
         assert ws.receive_json()["role"] == "technician"

@@ -16,6 +16,7 @@ from starlette.websockets import WebSocketDisconnect
 from autonomy.perception.log_list.datagrams import decode_logs, decode_request
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.operator_link import credential_path
 from can_dbc.timing.page import TimingWriter
 from console import server
 from console.console import Console
@@ -26,8 +27,9 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.status import faults
 from machine.status.modes import Mode
 from machine.status.stale_inputs import CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
-from tests.console.page_client import HERE, page_client, socket_of
+from tests.console.page_client import BROWSING, HERE, page_client, socket_of, visitor
 from tests.console.state_reports import REPORT
+from tests.operator_end import OperatorEnd
 
 PROFILE = load_profile("palms_471")
 
@@ -43,8 +45,7 @@ def controller_socket():
 @pytest.fixture
 def operator_socket(tmp_path):
     """The controller's end of the operator's commands."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s:
-        s.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as s:
         s.settimeout(5)
         yield s
 
@@ -99,7 +100,11 @@ def test_policy_names_the_hash_of_the_import_map(client):
     assert page.count("<script") == 2 and "<style" not in page and "onclick" not in page
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:8471", "127.0.0.1.evil.example", ""])
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "evil.example:8471", "127.0.0.1.evil.example", "", "evil@127.0.0.1", "evil@127.0.0.1:8471",
+     "127.0.0.1:8471:80", "127.0.0.1/x", "127.0.0.1 ", "127.0.0.1:x"],
+)  # fmt: skip
 def test_foreign_host_is_refused(client, host):
     assert client.get("/api/state", headers={"host": host}).status_code == 403
     with pytest.raises(WebSocketDisconnect), client.websocket_connect("/ws", headers={"host": host}):
@@ -145,14 +150,15 @@ def test_command_sequence_grows(client, operator_socket):
     assert sequences == sorted(set(sequences))
 
 
-def test_command_is_authenticated_with_a_key(console, operator_socket):
-    keyed = Console(PROFILE, 1, Path(operator_socket.getsockname()), key=b"secret")
-    client_of(keyed).post("/api/operator/stop")
-    assert decode(operator_socket.recv(100), b"secret").action is OperatorAction.STOP
+def test_a_command_needs_the_credential_and_stop_does_not(console, client, tmp_path, operator_socket):
+    credential_path(tmp_path / "operator").unlink()
+    assert client.post("/api/operator/arm").status_code == 502
+    assert client.post("/api/operator/stop").status_code == 204
+    assert decode(operator_socket.recv(100)).action is OperatorAction.STOP
 
 
 def test_stop_from_another_machine_is_sent_but_arm_is_refused(console, operator_socket):
-    client = client_of(console, peer="192.0.2.7")
+    client = visitor(console, "192.0.2.7")
     assert client.post("/api/operator/stop").status_code == 204
     assert decode(operator_socket.recv(100)).action is OperatorAction.STOP
     for action in ("arm", "disarm", "reset"):
@@ -179,7 +185,7 @@ def test_a_console_without_a_controller_is_read_only():
 
 def test_state_flows_over_the_websocket(console, client):
     console.crane_state.on_report(encode(REPORT), 10**10)
-    with client.websocket_connect(socket_of(client), headers={"origin": HERE}) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         state = ws.receive_json()
         assert state["mode"] == "ACTIVE" and state["alive"] and state["may_command"]
         console.crane_state.on_report(encode(replace(REPORT, mode=Mode.FAULT)), 10**10)

@@ -18,7 +18,8 @@ from console.console import Console
 from console.page_watch import CLOSED_PAGES, MIN_BEAT_NS, PageWatch
 from console.state import CraneState
 from machine.loading.profile_file import load_profile, profile_hash
-from tests.console.page_client import page_client, socket_of
+from tests.console.page_client import BROWSING, page_client, socket_of
+from tests.operator_end import OperatorEnd
 
 MS = 1_000_000
 LIMIT_NS = 1000 * MS
@@ -131,15 +132,14 @@ class Served:
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as operator:
-        operator.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as operator:
         clock = Clock()
         yield Served(Console(PROFILE, profile_hash(PROFILE), tmp_path / "operator", clock=clock), clock, operator)
 
 
 def test_an_answer_on_the_websocket_becomes_a_heartbeat(served: Served) -> None:
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         sent_ms = ws.receive_json()["sent_ms"]
         served.clock.now_ns += 60 * MS
         ws.send_text(answer("page", sent_ms))
@@ -151,7 +151,7 @@ def test_an_answer_on_the_websocket_becomes_a_heartbeat(served: Served) -> None:
 def test_the_server_alone_makes_no_heartbeat(served: Served) -> None:
     """A cut network keeps the websocket open for minutes: without answers of the browser nothing may be sent."""
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         for _ in range(8):
             ws.receive_json()
         assert served.heard(0.05) is None
@@ -159,7 +159,7 @@ def test_the_server_alone_makes_no_heartbeat(served: Served) -> None:
 
 def test_the_end_of_the_connection_is_no_end_of_the_watch(served: Served) -> None:
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
         assert served.heard() is not None
         ws.send_bytes(b"\xff")
@@ -168,7 +168,7 @@ def test_the_end_of_the_connection_is_no_end_of_the_watch(served: Served) -> Non
 
 def test_a_page_that_closes_ends_the_watch(served: Served) -> None:
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
         assert served.heard() is not None
     assert client.post("/api/watch-end/page").status_code == 204
@@ -178,7 +178,7 @@ def test_a_page_that_closes_ends_the_watch(served: Served) -> None:
 
 def test_a_page_that_closes_beside_an_open_one_ends_nothing(served: Served) -> None:
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         ws.send_text(answer("other", ws.receive_json()["sent_ms"]))
         assert served.heard() is not None
         assert client.post("/api/watch-end/page").status_code == 204
@@ -187,7 +187,7 @@ def test_a_page_that_closes_beside_an_open_one_ends_nothing(served: Served) -> N
 
 def test_a_page_of_another_machine_neither_watches_nor_ends_the_watch(served: Served) -> None:
     client = served.client("192.0.2.7")
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
         ws.receive_json()
     assert client.post("/api/watch-end/page").status_code == 403
@@ -204,7 +204,7 @@ def test_heartbeats_are_no_buttons(served: Served) -> None:
 def test_a_missing_controller_ends_no_connection(served: Served) -> None:
     served.operator.close()
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
         for _ in range(4):
             ws.receive_json()
@@ -216,7 +216,7 @@ def test_a_profile_without_a_limit_sends_no_heartbeat(served: Served) -> None:
         msgspec.structs.replace(PROFILE, timeouts=timeouts), 1, served.console.operator, clock=served.clock
     )
     client = served.client()
-    with client.websocket_connect(socket_of(client)) as ws:
+    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
         ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
         for _ in range(4):
             ws.receive_json()

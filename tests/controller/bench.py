@@ -214,11 +214,11 @@ class Bench:
             frames += [Frame(self.now_ns, key, data) for key, data in outputs.machine_frames]
             self.pending += split(self.guard.step(self.now_ns, frames))[0]
         if outputs.report is not None:
-            report = decode(outputs.report, self.settings.key)
+            report = decode(outputs.report)
             assert isinstance(report, StateReport)
             self.reports.append(report)
         if outputs.vehicle_report is not None:
-            vehicle = decode(outputs.vehicle_report, self.settings.key)
+            vehicle = decode(outputs.vehicle_report)
             assert isinstance(vehicle, VehicleReport)
             self.vehicle_reports.append(vehicle)
         self.count += 1

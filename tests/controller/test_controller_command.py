@@ -2,6 +2,7 @@
 
 import pytest
 
+from can_dbc.messages.key_file import write_key
 from can_dbc.messages.udp_address import address_argument
 from controller.config import ConfigError, load
 from controller.process.command import bus_address, listen, main, parser
@@ -10,27 +11,30 @@ from tests.controller.bench import MS
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
-    assert main(["--profile", "nowhere", "--setpoint-port", "0", "--bus", "crane0=wire:none"]) == 3
-    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=wire:none"]) == 4
-    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--rate", "7"]) == 3
+    good = ["--setpoint-port", "0", "--key-file", str(write_key(tmp_path / "good"))]
+    assert main(["--profile", "nowhere", *good, "--bus", "crane0=wire:none"]) == 3
+    assert main(["--profile", "palms_471", *good, "--bus", "crane0=wire:none"]) == 4
+    assert main(["--profile", "palms_471", *good, "--rate", "7"]) == 3
     key = tmp_path / "key"
     key.write_bytes(b"short")
     assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key)]) == 3
     assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key) + "x"]) == 3
-    for arguments in (["--bus", "x=wire:x"], ["--report", "nowhere"], ["--guard-not-needed"]):
+    for arguments in ([*good, "--bus", "x=wire:x"], [*good, "--report", "nowhere"], [*good, "--guard-not-needed"],
+                      good[:2]):  # fmt: skip
         with pytest.raises(SystemExit) as stopped:
-            main(["--profile", "palms_471", "--setpoint-port", "0", *arguments])
+            main(["--profile", "palms_471", *arguments])
         assert stopped.value.code == 2
-    palms = ["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=virtual:start"]
+    palms = ["--profile", "palms_471", *good, "--bus", "crane0=virtual:start"]
     assert main([*palms, "--bus", "mach0=virtual:x"]) == 3
     assert main([*palms, "--sync-lead-us", "5000"]) == 3
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("controller: ")]
     assert len(errors) == 7
 
 
-def test_busy_port_is_one_sentence_and_exit_4(capsys, udp):
+def test_busy_port_is_one_sentence_and_exit_4(capsys, udp, tmp_path):
     port = udp[0].getsockname()[1]
     arguments = ["--profile", "palms_471", "--setpoint-port", str(port), "--bus", "crane0=virtual:busy"]
+    arguments += ["--key-file", str(write_key(tmp_path / "key"))]
     assert main(arguments) == 4
     assert port in numbers_in(capsys.readouterr().err)
 
@@ -43,7 +47,7 @@ def test_setpoint_socket_is_on_loopback_only():
 def test_addresses_and_settings():
     assert address_argument("127.0.0.1:5006") == ("127.0.0.1", 5006)
     assert bus_address("mach0=wire:mach0") == ("mach0", "wire:mach0")
-    assert parser().parse_args(["--profile", "x", "--setpoint-port", "1"]).report == []
+    assert parser().parse_args(["--profile", "x", "--setpoint-port", "1", "--key-file", "key"]).report == []
     assert load("palms_471", 100).period_ns == 10 * MS
     with pytest.raises(ConfigError, check=coded("config.rate")):
         load("palms_471", 2000)

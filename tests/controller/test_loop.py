@@ -13,6 +13,7 @@ from can_dbc.frame import Frame
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.envelope import DatagramRefused, opened, signed
 from can_dbc.messages.vehicle import Driving
 from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
@@ -79,13 +80,13 @@ class Clock:
         self.now_ns = max(self.now_ns, deadline_ns) + late_ns
 
 
-def build(udp, clock, bus=None, page=None, reports=None, operator=None):
+def build(udp, clock, bus=None, page=None, reports=None, operator=None, key=None):
     setpoints, receiver, records = udp
     controller = Controller(SETTINGS, DATABASE)
     timing = LoopTiming(controller, TimingWriter(page) if page else None, clock.time, clock.time)
     return Loop(
         controller, [bus or MemoryBus()], setpoints, operator, [reports or receiver.getsockname()], records.ring,
-        timing, T, LEAD, clock.time, clock.sleep,
+        timing, T, LEAD, clock.time, clock.sleep, key=key,
     )  # fmt: skip
 
 
@@ -305,6 +306,22 @@ def test_an_operators_stop_waits_behind_no_setpoint(udp, tmp_path):
     (record,) = udp[2].read()
     assert record.operator == (stop,) and record.datagrams == (b"flood",) * MAX_DATAGRAMS
     loop.close()
+
+
+def test_with_a_key_only_its_holder_and_stop_are_heard_and_no_record_holds_its_work(udp):
+    key, hash_ = b"0123456789abcdef", SETTINGS.profile_hash
+    loop = build(udp, Clock(), key=key)
+    arm, stop = (encode(OperatorCommand(1, hash_, 10**9, a)) for a in (OperatorAction.ARM, OperatorAction.STOP))
+    sent = [arm, signed(arm, key), signed(arm, key[::-1]), b"", b"x", stop, signed(stop, key[::-1]), signed(stop, key)]
+    for data in sent:
+        udp[1].sendto(data, udp[0].getsockname())
+    loop.tick(10**9, 0)
+    (record,) = udp[2].read()
+    assert record.datagrams == (b"", arm, b"", b"", b"", stop, stop, stop)
+    told = udp[1].recv(2048)
+    assert opened(told, key) == record.report
+    with pytest.raises(DatagramRefused):
+        decode(told)
 
 
 def test_reports_that_nobody_receives_are_counted(udp):

@@ -1,12 +1,18 @@
-"""Authority: only who may write to the operator's socket arms; STOP is heard from anyone, the operator's first."""
+"""Authority: only who may write to the operator's socket and holds its credential arms; STOP is heard from anyone."""
 
+import os
+import socket
+import stat
 import tempfile
 from pathlib import Path
 
 import pytest
 
 from can_dbc.messages import operator_link
-from can_dbc.messages.crane import OperatorAction
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.envelope import signed
+from can_dbc.messages.operator_link import CREDENTIAL_BYTES
 from controller.requests.operator_socket import COMMAND_BYTES, OperatorSocket
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
@@ -21,27 +27,91 @@ def path():
         yield Path(name, "operator")
 
 
+ARM = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
+STOP = encode(OperatorCommand(1, 2, 3, OperatorAction.STOP))
+KEY = b"0123456789abcdef"
+
+
 def received(operator):
-    commands = []
-    operator.receive(commands)
-    return commands
+    """The commands that were heard, and what else there was."""
+    commands, others = [], []
+    operator.receive(commands, others)
+    return commands, others
 
 
-def test_commands_arrive_in_order_and_what_is_too_long_is_cut(path):
+def send_as_it_is(data, path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.sendto(data, str(path))
+
+
+def command(k):
+    return encode(OperatorCommand(k, 2, 3, OperatorAction.ARM))
+
+
+def test_commands_arrive_in_order_without_their_authenticator(path):
     operator = OperatorSocket(path)
-    operator_link.send(b"x" * (COMMAND_BYTES + 9), path)
-    operator_link.send(b"more", path)
-    assert received(operator) == [b"x" * COMMAND_BYTES, b"more"] and received(operator) == []
+    for k in range(3):
+        operator_link.send(command(k), path)
+    assert received(operator) == ([command(k) for k in range(3)], []) and received(operator) == ([], [])
     operator.close()
-    assert not path.exists()
+    assert not path.exists() and not operator_link.credential_path(path).exists()
+
+
+@pytest.mark.parametrize("action", [a for a in OperatorAction if a is not OperatorAction.STOP])
+def test_without_the_credential_nothing_but_stop_is_heard(path, action):
+    """Bare, with another key, with a key of the services, and what is too long."""
+    operator = OperatorSocket(path)
+    data = encode(OperatorCommand(1, 2, 3, action))
+    tried = [data, signed(data, KEY), signed(data, bytes(CREDENTIAL_BYTES)), data + data, b"x" * (COMMAND_BYTES + 9)]
+    for each in tried:
+        send_as_it_is(each, path)
+    assert received(operator) == ([], [b""] * len(tried))
+    operator_link.send(data, path)
+    assert received(operator) == ([data], [])
+    operator.close()
+
+
+def test_stop_is_heard_with_any_key_or_none(path):
+    operator = OperatorSocket(path)
+    for data in (STOP, signed(STOP, KEY), signed(STOP, operator_link.credential_path(path).read_bytes())):
+        send_as_it_is(data, path)
+    operator_link.credential_path(path).unlink()
+    operator_link.send(STOP, path)
+    assert received(operator) == ([STOP] * 4, [])
+    send_as_it_is(STOP[:-1] + b"?", path)
+    send_as_it_is(STOP + b"?", path)
+    assert received(operator) == ([], [b""] * 2)
+    operator.close()
+
+
+def test_what_was_sent_before_a_restart_is_worth_nothing_after_it(path):
+    first = OperatorSocket(path)
+    yesterday = signed(ARM, operator_link.credential_path(path).read_bytes())
+    send_as_it_is(yesterday, path)
+    assert received(first) == ([ARM], [])
+    second = OperatorSocket(path)
+    send_as_it_is(yesterday, path)
+    assert received(second) == ([], [b""])
+    first.close()
+    second.close()
+
+
+def test_only_owner_and_group_can_read_the_credential(path):
+    before = os.umask(0)
+    operator = OperatorSocket(path)
+    os.umask(before)
+    assert stat.S_IMODE(operator_link.credential_path(path).stat().st_mode) == 0o640
+    assert len(operator_link.credential_path(path).read_bytes()) == CREDENTIAL_BYTES
+    assert {each.name for each in path.parent.iterdir()} == {"operator", "operator.key"}
+    operator.close()
 
 
 def test_the_whole_queue_is_heard_in_one_tick(path):
     operator, sent = OperatorSocket(path), 0
     with pytest.raises(BlockingIOError):
         for sent in range(1000):
-            operator_link.send(b"%d" % sent, path)
-    assert len(received(operator)) == sent
+            operator_link.send(command(sent), path)
+    assert len(received(operator)[0]) == sent
     operator.close()
 
 
@@ -49,11 +119,11 @@ def test_a_restarted_controller_takes_the_path_over(path):
     first = OperatorSocket(path)
     second = OperatorSocket(path)
     first.close()
-    operator_link.send(b"hello", path)
-    assert received(second) == [b"hello"]
+    operator_link.send(ARM, path)
+    assert received(second) == ([ARM], [])
     second.close()
     with pytest.raises(OSError):
-        operator_link.send(b"hello", path)
+        operator_link.send(ARM, path)
 
 
 @pytest.mark.parametrize("action", [OperatorAction.ARM, OperatorAction.DISARM, OperatorAction.RESET])

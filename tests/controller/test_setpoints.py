@@ -12,7 +12,6 @@ from can_dbc.messages.crane import OperatorAction, StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import DatagramFault
 from can_dbc.messages.vehicle import DriveSetpoint, Steering
-from controller.config import load
 from controller.crane.trajectory import extremes, hermite, peak_speed
 from machine.joints import Joint
 from machine.status.modes import Mode
@@ -118,10 +117,22 @@ def test_setpoint_is_refused_while_not_armed():
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.NOT_ARMED
 
 
-def test_key_is_required_when_configured():
-    bench = Bench(settings=load("palms_471", key=b"0123456789abcdef"))
-    bench.tick([bench.hold()])
+def test_datagrams_of_strangers_are_counted_and_stop_nothing():
+    """Whoever has no key sends what he likes: the planner, who has one, goes on."""
+    bench = Bench().active()
+    before = bench.controller.gate.refused
+    for _ in range(5):
+        bench.tick_with(planner=[b"", b"", b""])
+    assert bench.mode is Mode.ACTIVE and bench.controller.gate.refused == before + 15
     assert bench.controller.gate.refusal is Reason.DATAGRAM_AUTHENTICATION
+
+
+def test_strangers_hide_no_refusals_of_the_planner():
+    bench = Bench().active()
+    bench.tick_with(planner=[b"", b"\x54", b"", b"", b"\x54", b""])
+    assert bench.mode is Mode.ACTIVE
+    bench.tick_with(planner=[b"", b"\x54"])
+    assert bench.mode is Mode.STOP
 
 
 def test_new_session_may_count_from_the_beginning_but_not_go_back_in_time():

@@ -25,7 +25,7 @@ def asked(bench: Bench, *points: tuple[float, float], joint: int = Joint.SLEW, l
     test = SpoolTest(
         bench.setpoint_sequence, bench.settings.profile_hash, bench.now_ns, lease_ms * MS, joint, knots
     )  # fmt: skip
-    return encode(test, bench.settings.key)
+    return encode(test)
 
 
 def spools(bench: Bench) -> list[float]:

@@ -110,7 +110,7 @@ def start_decode() -> Run:
 
 def start_gate() -> Run:
     """A gate keeps what it accepted, so its order and leases are tried as well."""
-    gate = RequestGate(SETTINGS.profile, HASH, None)
+    gate = RequestGate(SETTINGS.profile, HASH)
     missions_gate = CommandReceiver(HASH)
     now_ns = NOW_NS
 

@@ -19,6 +19,7 @@ from hil.harness.live import ADDRESSES
 
 def run_at(folder: Path, bus: str = "wire:crane0") -> Path:
     document = {"profile": "palms_471", "ports": {"sim": 1, "control": 2}, "buses": {"crane0": bus}, "pids": {}}
+    document["key_file"] = "key"
     (folder / ADDRESSES).write_text(json.dumps(document))
     return folder
 

@@ -25,6 +25,7 @@ PALMS = load_profile("palms_471")
 
 def target(**changed: Any) -> LiveTarget:
     parts: dict[str, Any] = {"ports": {"sim": 1, "control": 1}, "buses": {"crane0": "socketcan:can0"}, "pids": {}}
+    parts["key_file"] = Path("/nowhere/key")
     return LiveTarget(PALMS, **(parts | changed))
 
 
@@ -80,6 +81,7 @@ def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None
         thread = threading.Thread(target=answer)
         thread.start()
         document = {"profile": "palms_471", "ports": {"sim": plant.getsockname()[1]}, "buses": {}, "pids": {}}
+        document["key_file"] = "key"
         (tmp_path / ADDRESSES).write_text(json.dumps(document))
         there = LiveTarget.of(tmp_path)
         assert "encoder-stuck" in inject(make("encoder-lift", "stuck", length_s=0.5), there)

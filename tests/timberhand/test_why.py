@@ -16,6 +16,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from can_dbc.messages.crane import OperatorAction
+from can_dbc.messages.envelope import signed
 from can_dbc.messages.tick_record import TickRecord, decode
 from controller.process.tick_recording import record
 from host.exit_codes import CommandFailed, ExitCode
@@ -24,7 +25,7 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from recorder.stop_files import files_in
 from tests.codes import numbers_in
-from tests.controller.bench import SETTINGS, Bench
+from tests.controller.bench import Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 from timberhand.cli import app
 from timberhand.why.screen import show
@@ -181,23 +182,16 @@ def test_an_operator_and_a_pressed_stop_are_events(tmp_path: Path) -> None:
     assert found.stop.code == "ESTOP_PRESSED"
 
 
-def test_a_run_with_a_key_needs_it_for_a_recording_only(tmp_path: Path) -> None:
-    error = refused(keyed_run(tmp_path))
-    assert error.code == "recording.reports-unreadable"
-    (tmp_path / "key").write_bytes(b"0123456789abcdef")
-    assert json.loads(invoke(tmp_path / "run", "--key-file", tmp_path / "key", "--json"))["stops"] == []
-    assert refused(tmp_path / "run", "--key-file", tmp_path / "none").code == "why.key-unreadable"
-
-
-def keyed_run(tmp_path: Path) -> Path:
-    """A recording of a controller whose datagrams are authenticated."""
+def test_a_recording_of_a_release_that_kept_authenticators_is_refused(tmp_path: Path) -> None:
     recorder = recorder_in(tmp_path / "run")
-    bench = Bench(replace(SETTINGS, key=b"0123456789abcdef"))
+    bench = Bench()
     for _ in range(20):
         outputs = bench.tick()
+        if outputs.report is not None:
+            outputs.report = signed(outputs.report, b"0123456789abcdef")
         recorder.on_tick(record(bench.inputs, outputs, bench.now_ns))
     recorder.close()
-    return tmp_path / "run"
+    assert refused(tmp_path / "run").code == "recording.reports-unreadable"
 
 
 def test_missing_numbers_are_explained(run: Path) -> None:

@@ -86,9 +86,9 @@ def console(
     from host.exit_codes import CommandFailed, ExitCode
 
     if replay is not None:
-        from timberhand.replay_page import read_key, show_recording
+        from timberhand.replay_page import show_recording
 
-        show_recording(replay, None if profile == DEFAULT_PROFILE else profile, port, read_key(key_file), bind=bind,
+        show_recording(replay, None if profile == DEFAULT_PROFILE else profile, port, bind=bind,
                        allow_hosts=allow_host or ())  # fmt: skip
         return
     try:

@@ -32,14 +32,10 @@ class RoleName(StrEnum):
 SocketOption = Annotated[
     Path | None, typer.Option("--operator", metavar="FILE", help="The controller's socket for operators.")
 ]
-KeyOption = Annotated[
-    Path | None,
-    typer.Option(help="File with the key that authenticates datagrams (default: that of the installed services)."),
-]
 
 
 @app.command("watch")
-def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None, key_file: KeyOption = None) -> None:
+def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None) -> None:
     """Watch until Ctrl-C, which ends the watch on purpose.
 
     Every heartbeat is an answer of this terminal. When its link is cut, as by a lost network under ssh, the machine
@@ -54,7 +50,7 @@ def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None, k
     from host.exit_codes import CommandFailed, ExitCode
     from timberhand import terminal_watch
 
-    machine, send = _sender(profile, operator, key_file)
+    machine, send = _sender(profile, operator)
     limit_ms = machine.timeouts.operator_link_ms
     if not limit_ms:
         raise CommandFailed(
@@ -71,11 +67,11 @@ def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None, k
 
 
 @app.command("unwatch")
-def unwatch(profile: ProfileOption = "palms_471", operator: SocketOption = None, key_file: KeyOption = None) -> None:
+def unwatch(profile: ProfileOption = "palms_471", operator: SocketOption = None) -> None:
     """End the watch on purpose, also one whose link is lost: then the machine can be armed without a watcher."""
     from can_dbc.messages.crane import OperatorAction
 
-    _, send = _sender(profile, operator, key_file)
+    _, send = _sender(profile, operator)
     send(OperatorAction.WATCH_END, None)
 
 
@@ -131,9 +127,7 @@ def _replace(file: Path, text: str) -> None:
     beside.replace(file)
 
 
-def _sender(
-    profile: str, operator: Path | None, key_file: Path | None
-) -> tuple[Profile, Callable[[OperatorAction, int | None], None]]:
+def _sender(profile: str, operator: Path | None) -> tuple[Profile, Callable[[OperatorAction, int | None], None]]:
     """The machine, and a function that sends an action with its stamp (None: now) to its controller."""
     import os
     import time
@@ -141,20 +135,12 @@ def _sender(
     from can_dbc.messages import operator_link
     from can_dbc.messages.crane import OperatorCommand
     from can_dbc.messages.datagrams import encode
-    from can_dbc.messages.key_file import KeyFileError, read_key, service_key
     from host.exit_codes import CommandFailed, ExitCode
     from machine.loading.profile_file import load_profile, profile_hash
 
     machine = load_profile(profile)
     code = profile_hash(machine)
     path = operator or (SERVICE_SOCKET if os.path.exists(SERVICE_SOCKET) else operator_link.default_path())
-    if key_file is not None:
-        try:
-            key: bytes | None = read_key(key_file)
-        except KeyFileError as error:
-            raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
-    else:
-        key = service_key() if path == SERVICE_SOCKET else None
 
     def send(action: OperatorAction, stamp_ns: int | None) -> None:
         now_ns = time.monotonic_ns()
@@ -162,7 +148,7 @@ def _sender(
             now_ns // 1_000_000 & 0x7FFF_FFFF, code, now_ns if stamp_ns is None else stamp_ns, action
         )
         try:
-            operator_link.send(encode(command, key), path)
+            operator_link.send(encode(command), path)
         except OSError as error:
             raise CommandFailed(
                 "operator.no-controller",

@@ -18,7 +18,6 @@ def replay(
     profile: Annotated[
         str | None, typer.Option(help="Profile of that run (default: the shipped profile named in it).")
     ] = None,
-    key_file: Annotated[Path | None, typer.Option(help="Key file of a run with authenticated datagrams.")] = None,
     contents: Annotated[bool, typer.Option("--contents", help="Only list the topics of the recording.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -37,7 +36,7 @@ def replay(
 
     from hil.replay.recording import contents as list_contents
     from hil.replay.recording import files_of, manifest_of
-    from host.exit_codes import CommandFailed, ExitCode
+    from host.exit_codes import ExitCode
 
     files = files_of(recording)
     if contents:
@@ -50,13 +49,7 @@ def replay(
             typer.echo(f"{count:10d}  {topic}")
         return
 
-    try:
-        key = key_file.read_bytes().strip() if key_file else None
-    except OSError as error:
-        raise CommandFailed(
-            "replay.key-unreadable", f"{key_file} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
-        ) from error
-    result = _run(files, profile, key)
+    result = _run(files, profile)
     if as_json:
         typer.echo(json.dumps(result.as_dict()))
     elif result.agrees:
@@ -73,7 +66,7 @@ def replay(
         raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
-def _run(files: list[Path], profile: str | None, key: bytes | None) -> Result:
+def _run(files: list[Path], profile: str | None) -> Result:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -88,4 +81,4 @@ def _run(files: list[Path], profile: str | None, key: bytes | None) -> Result:
             if done % 100 == 0:
                 bar.update(task, completed=done, total=total)
 
-        return run(files, profile, key, progress)
+        return run(files, profile, progress)

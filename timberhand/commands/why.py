@@ -29,7 +29,6 @@ def why(
         bool, typer.Option("--page", help="Show the newest stop in the operator's page, from 10 s before it.")
     ] = False,
     port: Annotated[int, typer.Option(help="Port of the page.")] = 8471,
-    key_file: Annotated[Path | None, typer.Option(help="Key file of a run with authenticated datagrams.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Explain the last stop: code, sentence, numbers, what to do, and what happened before it.
@@ -58,18 +57,12 @@ def why(
     from timberhand.why.failures import newest_failure
     from timberhand.why.stops import SERVICE_STOPS
 
-    try:
-        key = key_file.read_bytes().strip() if key_file else None
-    except OSError as error:
-        raise CommandFailed(
-            "why.key-unreadable", f"{key_file} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
-        ) from error
     if page:
-        _open_page(run, key, port)
+        _open_page(run, port)
         return
     stops: list[dict[str, object]] | None = [] if as_json else None
     try:
-        count, newest_utc_ns = _explain(run, every, plot, key, stops)
+        count, newest_utc_ns = _explain(run, every, plot, stops)
     except (OSError, ValueError) as error:
         raise CommandFailed(
             "why.unusable", f"{run or 'the newest stop'} cannot be shown: {error}", ExitCode.CONFIGURATION
@@ -98,17 +91,17 @@ def why(
         typer.echo("plot: add --plot FILE.png")
 
 
-def _open_page(run: Path | None, key: bytes | None, port: int) -> None:
+def _open_page(run: Path | None, port: int) -> None:
     """Serve the page of the newest stop: of its whole run where that is recorded, else of the stop's file."""
     from recorder.recover import run_files
     from timberhand.replay_page import show_recording
     from timberhand.why.stops import find_stops
 
-    found = next(iter(find_stops(run, key, newest=True)), None)
+    found = next(iter(find_stops(run, newest=True)), None)
     if found is None:
         raise _no_stop(f"in {run or 'runs/'}")
     place = found.source if found.source.is_dir() else found.source.parent.parent
-    show_recording(place if run_files(place) else found.source, None, port, key, stop_ns=found.stop.at_ns)
+    show_recording(place if run_files(place) else found.source, None, port, stop_ns=found.stop.at_ns)
 
 
 def _no_stop(where: str) -> CommandFailed:
@@ -118,20 +111,20 @@ def _no_stop(where: str) -> CommandFailed:
 
 
 def _explain(
-    run: Path | None, every: bool, plot: Path | None, key: bytes | None, stops: list[dict[str, object]] | None
+    run: Path | None, every: bool, plot: Path | None, stops: list[dict[str, object]] | None
 ) -> tuple[int, int | None]:
     """Show the stops, or add them to ``stops``, one at a time; draw the last one; return their number, and its time."""
     from rich.console import Console
 
     from timberhand.why.screen import as_dict, show
-    from timberhand.why.stops import find_stops, key_for
+    from timberhand.why.stops import find_stops
     from timberhand.why.timeline import events_of
 
     console, count = Console(highlight=False), 0
     newest: FoundStop | None = None
-    for found in find_stops(run, key, newest=not every):
+    for found in find_stops(run, newest=not every):
         count, newest = count + 1, found
-        events = events_of(found.ticks, found.stop.at_ns, key_for(found.source, key))
+        events = events_of(found.ticks, found.stop.at_ns)
         if stops is not None:
             stops.append(as_dict(found, events))
         else:
@@ -140,5 +133,5 @@ def _explain(
     if plot is not None and newest is not None:
         from timberhand.why.plot import draw
 
-        draw(newest, plot, key_for(newest.source, key))
+        draw(newest, plot)
     return count, newest.stop.utc_ns if newest is not None else None

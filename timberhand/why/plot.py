@@ -21,10 +21,10 @@ _NAN: Final = math.nan
 Series = list[tuple[float, ...]]
 
 
-def draw(found: FoundStop, path: Path, key: bytes | None = None) -> None:
+def draw(found: FoundStop, path: Path) -> None:
     """Writes the plot as PNG; raises OSError."""
     at_ns = found.stop.at_ns
-    reports = [report for tick in found.ticks if (report := report_of(tick, key)) is not None]
+    reports = [report for tick in found.ticks if (report := report_of(tick)) is not None]
     times = [(report.stamp_ns - at_ns) / 1e9 for report in reports]
     with stack(path, (1.0, 1.6, 1.6, 1.6, 1.0), width=9.0, height=9.5) as axes:
         mode, commands, velocities, positions, lateness = axes

@@ -18,7 +18,6 @@ import msgspec
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.key_file import service_key
 from can_dbc.messages.tick_record import RecordRefused, TickRecord
 from hil.replay.recording import files_of, manifest_of, messages
 from hil.replay.replay import recorded_ticks
@@ -43,7 +42,7 @@ class FoundStop:
     source: Path
 
 
-def find_stops(run: Path | None, key: bytes | None = None, newest: bool = False) -> Iterator[FoundStop]:
+def find_stops(run: Path | None, newest: bool = False) -> Iterator[FoundStop]:
     """The stops of ``run``, oldest first; with ``newest`` the last of them only.  None found: an empty iterator.
 
     Raises:
@@ -54,7 +53,7 @@ def find_stops(run: Path | None, key: bytes | None = None, newest: bool = False)
         for path in paths[-1:] if newest else paths:
             yield from read_stop(path)
     elif run is not None:
-        found = stops_in_recording(_recording(run), key_for(run, key))
+        found = stops_in_recording(_recording(run))
         yield from deque(found, maxlen=1) if newest else found
 
 
@@ -66,12 +65,7 @@ def read_stop(path: Path) -> Iterator[FoundStop]:
         yield FoundStop(msgspec.json.decode(stop, type=Stop), manifest_of([path]), ticks, path)
 
 
-def key_for(place: Path, key: bytes | None) -> bytes | None:
-    """The given key, or without one that of the services for what they recorded."""
-    return service_key() if key is None and place.resolve().is_relative_to(SERVICE_RECORDINGS) else key
-
-
-def stops_in_recording(files: list[Path], key: bytes | None) -> Iterator[FoundStop]:
+def stops_in_recording(files: list[Path]) -> Iterator[FoundStop]:
     """The stops of a whole recording, found in the controller's reports."""
     manifest = manifest_of(files)
     offset_ns = manifest.utc_offset_ns if manifest.live else None
@@ -89,7 +83,7 @@ def stops_in_recording(files: list[Path], key: bytes | None) -> Iterator[FoundSt
             records.append(data)
         while recent[0][0] < tick.now_ns - BEFORE_NS:
             recent.popleft()
-        report = _report_of(tick, key)
+        report = _report_of(tick)
         before = detector.step(report) if report is not None else None
         if report is not None and before is not None:
             number += 1
@@ -111,15 +105,15 @@ def _decoded(data: bytes, file: Path) -> TickRecord:
         ) from error
 
 
-def _report_of(tick: TickRecord, key: bytes | None) -> StateReport | None:
+def _report_of(tick: TickRecord) -> StateReport | None:
     if not tick.report:
         return None
     try:
-        report = datagrams.decode(tick.report, key)
+        report = datagrams.decode(tick.report)
     except DatagramRefused as error:
         raise CommandFailed(
             "recording.reports-unreadable",
-            f"the recorded reports cannot be read ({error}); give the run's key with --key-file",
+            f"the recorded reports cannot be read ({error}); read it with the release that recorded it",
             ExitCode.CONFIGURATION,
         ) from error
     return report if isinstance(report, StateReport) else None

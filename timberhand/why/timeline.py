@@ -62,10 +62,10 @@ class Event(NamedTuple):
     text: str
 
 
-def events_of(ticks: tuple[TickRecord, ...], at_ns: int, key: bytes | None = None) -> list[Event]:
+def events_of(ticks: tuple[TickRecord, ...], at_ns: int) -> list[Event]:
     """The events from `BEFORE_S` before the stop at ``at_ns`` to the end of the ticks."""
     found: list[tuple[int, str]] = []
-    watchers = [_Modes(key), _Refusals(key), _Frames(), _Silences(), _Requests(key), _Buses(), _Lateness()]
+    watchers = [_Modes(), _Refusals(), _Frames(), _Silences(), _Requests(), _Buses(), _Lateness()]
     for watcher in watchers:
         for tick in ticks:
             found += watcher.step(tick)
@@ -93,12 +93,11 @@ class _Watcher:
 class _Modes(_Watcher):
     """Changes of the mode, and of what slows the machine down."""
 
-    def __init__(self, key: bytes | None) -> None:
-        self._key = key
+    def __init__(self) -> None:
         self._last: StateReport | None = None
 
     def step(self, tick: TickRecord) -> Iterator[tuple[int, str]]:
-        report = report_of(tick, self._key)
+        report = report_of(tick)
         if report is None:
             return
         last, self._last = self._last, report
@@ -117,12 +116,11 @@ class _Modes(_Watcher):
 class _Refusals(_Watcher):
     """Setpoints that the controller refused."""
 
-    def __init__(self, key: bytes | None) -> None:
-        self._key = key
+    def __init__(self) -> None:
         self._refused: int | None = None
 
     def step(self, tick: TickRecord) -> Iterator[tuple[int, str]]:
-        report = report_of(tick, self._key)
+        report = report_of(tick)
         if report is None:
             return
         count = 0 if self._refused is None else report.refused - self._refused & 0xFFFF
@@ -202,14 +200,13 @@ class _Silences(_Watcher):
 class _Requests(_Watcher):
     """What operators send, and pauses in the planner's setpoints."""
 
-    def __init__(self, key: bytes | None) -> None:
-        self._key = key
+    def __init__(self) -> None:
         self._setpoints, self._beats = _Silences(), _Silences()
 
     def step(self, tick: TickRecord) -> Iterator[tuple[int, str]]:
         for data in (*tick.operator, *tick.datagrams):
             try:
-                message = datagrams.decode(data, self._key)
+                message = datagrams.decode(data)
             except DatagramRefused:
                 continue
             if isinstance(message, OperatorCommand):
@@ -284,12 +281,12 @@ class _Lateness(_Watcher):
             yield tick.now_ns, f"the tick began {tick.late_ns / 1e6:.1f} ms late{more}"
 
 
-def report_of(tick: TickRecord, key: bytes | None) -> StateReport | None:
-    """The state report of a tick; None without one, or with one that the key does not open."""
+def report_of(tick: TickRecord) -> StateReport | None:
+    """The state report of a tick; None without one."""
     if not tick.report:
         return None
     try:
-        report = datagrams.decode(tick.report, key)
+        report = datagrams.decode(tick.report)
     except DatagramRefused:
         return None
     return report if isinstance(report, StateReport) else None

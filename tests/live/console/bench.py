@@ -7,9 +7,11 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+from can_dbc.messages.key_file import write_key
 from hil.harness.live import HARDWARE_PRIORITY
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.wire.bitrates import BITRATES
+from tests.live.console.entries import note
 
 START_S = 60.0
 
@@ -21,7 +23,7 @@ def bench(folder: Path, profile: str = "palms_471") -> Iterator[str]:
     group = ProcessGroup(folder, environment={"TIMBERHAND_WIRE_DIR": str(folder / "wire")})
     setpoints, reports, sim = free_udp_ports(3)
     named, bus = ("--profile", profile), ("--bus", "crane0=wire:crane0")
-    operator = folder / "operator"
+    operator, keyed = folder / "operator", ("--key-file", write_key(folder / "key"))
     try:
         group.start("wire", "hil.wire.daemon", "--bus", f"crane0:{BITRATES['crane0']}")
         group.await_message("wire", "ready", START_S)
@@ -32,13 +34,13 @@ def bench(folder: Path, profile: str = "palms_471") -> Iterator[str]:
         group.start(
             "console", "console", *named, "--port", 0, "--report-port", reports, "--operator", operator, *bus,
             "--controller", f"127.0.0.1:{setpoints}", "--commission", folder / "kept",
-            "--audit", folder / "audit.jsonl",
+            "--audit", folder / "audit.jsonl", *keyed,
         )  # fmt: skip
-        url = str(group.await_message("console", "url", START_S)["url"])
+        url = note(str(group.await_message("console", "url", START_S)["url"]))
         group.start("guard", "controller.guard", *named, *bus)
         group.start(
             "controller", "controller", *named, *bus, "--setpoint-port", setpoints, "--operator", operator,
-            "--timing", folder / "timing", "--report", f"127.0.0.1:{reports}",
+            "--timing", folder / "timing", "--report", f"127.0.0.1:{reports}", *keyed,
         )  # fmt: skip
         yield url
     finally:

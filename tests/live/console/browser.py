@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 from websockets.sync.client import connect
 
+from tests.live.console.entries import entered
+
 NAMES = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
 MISSING = "needs chromium: sudo apt-get install chromium"
 PATIENCE_S = 30.0
@@ -72,9 +74,9 @@ class Browser:
         self._process.wait(10)
         self._said.close()
 
-    def open(self, url: str) -> None:
-        """Load a page."""
-        self._ask("Page.navigate", url=url)
+    def open(self, url: str, enters: bool = True) -> None:
+        """Load a page, by the printed address if it ``enters``."""
+        self._ask("Page.navigate", url=entered(url) if enters else url)
         self.until("document.readyState === 'complete' && location.protocol === 'http:'")
 
     def draw_every(self, period_ms: int) -> None:

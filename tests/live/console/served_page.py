@@ -10,6 +10,8 @@ from collections.abc import Iterator
 import uvicorn
 from starlette.applications import Starlette
 
+from tests.live.console.entries import note
+
 
 @contextlib.contextmanager
 def served(app: Starlette) -> Iterator[str]:
@@ -21,8 +23,12 @@ def served(app: Starlette) -> Iterator[str]:
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [page]})
     thread.start()
+    url = f"http://127.0.0.1:{page.getsockname()[1]}/"
+    access = getattr(app.state, "access", None)
+    if access is not None and access.token:
+        note(f"{url}?token={access.token}")
     try:
-        yield f"http://127.0.0.1:{page.getsockname()[1]}/"
+        yield url
     finally:
         server.should_exit = True
         thread.join()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -18,6 +19,7 @@ from pathlib import Path
 from PIL import Image
 
 from tests.live.console.browser import Browser
+from tests.live.console.entries import note
 
 ROOT = Path(__file__).parents[3]
 TUTORIAL = ROOT / "docs" / "tutorial"
@@ -55,6 +57,8 @@ class Started:
         """Whether the page is served; raises AssertionError with what the command said when it has ended."""
         assert self.process.poll() is None, self.said.read_text()
         with contextlib.suppress(OSError), urllib.request.urlopen(f"{self.url}static/icon.svg", timeout=20) as answer:
+            if printed := re.search(rf"{self.url}\?\S+", self.said.read_text()):
+                note(printed[0])
             return bool(answer.status == 200)
         return False
 

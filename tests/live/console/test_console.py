@@ -11,6 +11,7 @@ import pytest
 
 from console.console import Console
 from machine.loading.profile_file import load_profile, profile_hash
+from tests.operator_end import OperatorEnd
 
 PROFILE = load_profile("palms_471")
 
@@ -18,8 +19,7 @@ PROFILE = load_profile("palms_471")
 @pytest.fixture
 def operator_socket(tmp_path):
     """The controller's end of the operator's commands."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s:
-        s.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as s:
         s.settimeout(5)
         yield s
 

@@ -22,7 +22,9 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
+from tests.live.console.entries import entered
 from tests.live.console.served_page import served
+from tests.operator_end import OperatorEnd
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 PROFILE = load_profile("aoro_fc8")
@@ -43,8 +45,7 @@ class Stage:
 
     def begin(self) -> None:
         self._open = ExitStack()
-        self._operator = self._open.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        self._operator.bind(str(self.folder / "operator"))
+        self._operator = self._open.enter_context(OperatorEnd(self.folder / "operator"))
         self._operator.settimeout(0.05)
         reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         reports.bind(("127.0.0.1", 0))
@@ -158,6 +159,34 @@ def test_a_person_signs_in_and_out_and_stop_works_before(stage: Stage, tmp_path:
         assert browser.value("document.documentElement.scrollWidth <= innerWidth")
         browser.click("sign-out")
         browser.until("document.body?.className === 'sign-in'")
+    finally:
+        browser.close()
+
+
+def test_who_opens_the_bare_address_looks_and_stops_and_enters_by_the_token(stage: Stage, tmp_path: Path) -> None:
+    browser = Browser(tmp_path, (1280, 800))
+    try:
+        browser.open(stage.url, enters=False)
+        browser.until(
+            "document.getElementById('sign-in')?.checkVisibility() && !document.getElementById('stop').disabled"
+        )
+        assert all(browser.value(f"document.getElementById('{b}').disabled") for b in ("arm", "reset", "disarm"))
+        assert browser.value("document.getElementById('lease-button') === null")
+        browser.click("stop")
+        browser.wait(lambda: stage.pressed == [OperatorAction.STOP], "STOP of who only looks")
+        browser.click("sign-in")
+        browser.until("document.activeElement?.id === 'token'")
+        browser.keys("Escape")
+        browser.wait(lambda: stage.pressed == [OperatorAction.STOP] * 2, "STOP before signing in")
+        browser.keys("wrong token")
+        browser.click("enter-token")
+        browser.until("document.getElementById('token-note').textContent !== ''")
+        browser.keys(entered(stage.url))
+        browser.click("enter-token")
+        browser.until("document.body?.dataset.control === 'nobody'")
+        take_control(browser)
+        browser.click("reset")
+        browser.wait(lambda: stage.pressed[2:] == [OperatorAction.RESET], "a command of who has entered")
     finally:
         browser.close()
 

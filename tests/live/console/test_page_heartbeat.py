@@ -21,6 +21,7 @@ from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.served_page import served
+from tests.operator_end import OperatorEnd
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 
@@ -62,8 +63,7 @@ class Stage:
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as operator:
-        operator.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as operator:
         operator.settimeout(0.1)
         made = Stage(operator)
         made.begin()

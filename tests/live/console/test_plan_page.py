@@ -33,6 +33,7 @@ from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
 from tests.live.console.plan_drawing import draw, shows, window
 from tests.live.console.served_page import served
+from tests.operator_end import OperatorEnd
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 SIZES = [(1280, 800), (800, 1280), (390, 844)]
@@ -89,8 +90,7 @@ class Stage:
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as operator:
-        operator.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as operator:
         operator.settimeout(0.5)
         made = Stage(tmp_path / "missions", operator)
         made.begin()

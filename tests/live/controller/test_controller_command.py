@@ -2,11 +2,12 @@
 
 import json
 
+from can_dbc.messages.key_file import write_key
 from controller.process.command import main
 from controller.process.warm_up import NullBus
 
 
-def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
+def test_main_runs_and_ends_by_signal(capsys, monkeypatch, tmp_path):
     """A short run on an in-memory bus, with SIGTERM after some ticks."""
     import signal
 
@@ -26,6 +27,7 @@ def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
     handlers = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)}
     monkeypatch.setattr(loop_module.Loop, "tick", tick)
     arguments = ["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=virtual:life", "--no-realtime"]
+    arguments += ["--key-file", str(write_key(tmp_path / "key"))]
     try:
         assert main(arguments) == 0
     finally:

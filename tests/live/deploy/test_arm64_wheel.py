@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from can_dbc.messages.key_file import write_key
 from host.exit_codes import CommandFailed, ExitCode
 from host.release import bundle as bundles
 from tests.codes import coded
@@ -75,7 +76,7 @@ def test_a_signed_bundle_for_arm64_brings_all_that_runs_there(
             archive.extractall(site)
     version = emulated(site, "-m", "timberhand", "--version")
     assert version.returncode == 0 and release.version in version.stdout, version.stderr
-    bus = ("--bus", "crane0=wire:nowhere", "--setpoint-port", "0")
+    bus = ("--bus", "crane0=wire:nowhere", "--setpoint-port", "0", "--key-file", str(write_key(tmp_path / "key")))
     lost = emulated(site, "-m", "controller", "--profile", "palms_471", *bus)
     assert lost.returncode == ExitCode.BUS and "nowhere" in lost.stderr, lost.stderr
 

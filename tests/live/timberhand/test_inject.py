@@ -14,6 +14,9 @@ import pytest
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
+from can_dbc.messages.crane import OperatorCommand
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.key_file import read_key, write_key
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import make
 from hil.faults.wire_faults import BABBLE_KEY
@@ -26,6 +29,7 @@ PALMS = load_profile("palms_471")
 
 def target(**changed: Any) -> LiveTarget:
     parts: dict[str, Any] = {"ports": {"sim": 1, "control": 1}, "buses": {"crane0": "socketcan:can0"}, "pids": {}}
+    parts["key_file"] = Path("/nowhere/key")
     return LiveTarget(PALMS, **(parts | changed))
 
 
@@ -38,13 +42,18 @@ def test_a_process_is_stopped_for_a_while_and_killed() -> None:
         assert process.wait(10) == -signal.SIGKILL
 
 
-def test_forged_datagrams_reach_the_controllers_port() -> None:
+def test_forged_datagrams_reach_the_controllers_port_with_the_runs_key(tmp_path: Path) -> None:
+    key_file = write_key(tmp_path / "key")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
         controller.bind(("127.0.0.1", 0))
-        there = target(ports={"control": controller.getsockname()[1]})
+        there = target(ports={"control": controller.getsockname()[1]}, key_file=key_file)
         for fault in ("planner-garbage", "planner-arms", "planner-replay"):
             assert fault in inject(make(fault, length_s=0.03), there)
-            assert controller.recv(2048)
+            data = controller.recv(2048)
+            if fault != "planner-garbage":
+                assert isinstance(decode(data, read_key(key_file)), OperatorCommand)
+            while select.select([controller], [], [], 0)[0]:
+                controller.recv(2048)
 
 
 def test_the_wire_damages_frames_of_a_live_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ import pytest
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode
 from machine.loading.profile_file import load_profile, profile_hash
+from tests.operator_end import OperatorEnd
 from timberhand.terminal_watch import QUESTION
 
 THERE = b"\x1b[0n"
@@ -31,8 +32,7 @@ THERE = b"\x1b[0n"
 
 @pytest.fixture
 def controller(tmp_path: Path) -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
-        made.bind(str(tmp_path / "operator"))
+    with OperatorEnd(tmp_path / "operator") as made:
         made.settimeout(20)
         yield made
 
@@ -112,14 +112,14 @@ def test_unwatch_ends_the_watch(controller: socket.socket) -> None:
     assert heard(controller).action is OperatorAction.WATCH_END
 
 
-@pytest.mark.parametrize(
-    ("more", "code"),
-    [((), b"operator.no-controller"), (("--key-file", "/nothing"), b"key.unreadable")],
-)
-def test_what_is_missing_is_said(tmp_path: Path, more: tuple[str, ...], code: bytes) -> None:
-    process = start("unwatch", str(tmp_path / "nobody"), None, *more)
+@pytest.mark.parametrize("left", ["operator", "operator.key"])
+def test_what_is_missing_is_said(tmp_path: Path, controller: socket.socket, left: str) -> None:
+    """Without the controller, or without its credential."""
+    for name in {"operator", "operator.key"} - {left}:
+        (tmp_path / name).unlink()
+    process = start("unwatch", controller.getsockname())
     _, said = process.communicate(timeout=30)
-    assert process.returncode in (3, 4) and code in said and said.count(b"\n") == 1
+    assert process.returncode == 4 and b"operator.no-controller" in said and said.count(b"\n") == 1
 
 
 def test_a_profile_that_watches_no_link_is_said(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.messages.crane import OperatorAction
+from can_dbc.messages.key_file import read_key, write_key
 from host.service_lab.pilot import PERIOD_NS, Pilot
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
@@ -56,11 +57,12 @@ class Run:
             time.sleep(0.01)
         bus = ("--profile", PROFILE, "--bus", f"crane0={BUS}")
         self.start("guard", sys.executable, "-m", "controller.guard", *bus)
-        self.pilot = Pilot(PROFILE, SETPOINTS, directory / "operator", REPORTS, BUS)
+        key_file = write_key(directory / "key")
+        self.pilot = Pilot(PROFILE, SETPOINTS, directory / "operator", REPORTS, BUS, read_key(key_file))
         self.start(
             "controller", sys.executable, "-m", "controller", *bus, "--setpoint-port", str(SETPOINTS),
             "--report", f"127.0.0.1:{REPORTS}", "--timing", str(directory / "timing"),
-            "--operator", str(directory / "operator"),
+            "--operator", str(directory / "operator"), "--key-file", str(key_file),
         )  # fmt: skip
 
     def start(self, name: str, *command: str, out: str = "") -> None:

@@ -1,0 +1,23 @@
+"""The controller's end of an operator's socket, with its credential, for what sends there."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from can_dbc.messages.envelope import MAC_BYTES
+from can_dbc.messages.operator_link import draw_credential
+from controller.requests.operator_socket import admitted
+
+
+class OperatorEnd(socket.socket):
+    """Bound at ``path``; receives as the controller's socket does: no authenticators, empty what has a wrong one."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._credential = draw_credential(path)
+        self.bind(str(path))
+
+    def recv(self, size: int, flags: int = 0, /) -> bytes:
+        """One command."""
+        return admitted(super().recv(size + MAC_BYTES, flags), self._credential)
