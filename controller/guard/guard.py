@@ -42,7 +42,10 @@ AGREE_NS: Final = 200_000_000
 """A controller that says that it has stopped ramps the spools to neutral in 150 ms."""
 HELD_PCT: Final = 30.0
 """Past the dead-band; an opening below this holds a joint in place while the carrier drives."""
-RANGE_MARGIN_UNITS: Final = 0.08
+APART_PERIODS: Final = 3
+"""ValveCmdA and B come together; when one of them stays away for longer than this, it is lost: the valve node itself
+waits for 50 ms, and its ramp takes 60 ms more."""
+RANGE_MARGIN_UNITS: Final = 0.008
 """How far outside its range [rad, m] a joint may still be driven outward."""
 BEYOND_STEPS: Final = 2
 """Steps in a row in which the crane must be where it must not: one sample that jumps is an encoder's fault."""
@@ -64,10 +67,10 @@ class Guard:
     """All state of the guard; `step` is its whole behaviour."""
 
     __slots__ = (
-        "_a", "_agreed_ns", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands", "_commands_of", "_estop",
-        "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_latched", "_motion", "_now_ns",
-        "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status", "_supply", "_watches", "axis",
-        "events", "verdict",
+        "_a", "_agreed_ns", "_apart_ns", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
+        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_latched",
+        "_motion", "_now_ns", "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status", "_supply",
+        "_watches", "axis", "events", "verdict",
     )  # fmt: skip
 
     def __init__(self, envelope: Envelope, layouts: dict[str, Layout]) -> None:
@@ -112,6 +115,7 @@ class Guard:
         self._now_ns = self._calm_ns = self._heartbeat_ns = 0
         self._heard_ns = -SILENCE_NS - 1
         self._clear_ns = self._agreed_ns = 0
+        self._apart_ns = APART_PERIODS * envelope.period_ns
         self._latched, self._reset_seen = False, True  # a button that is down already is no edge
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
@@ -182,7 +186,7 @@ class Guard:
     def _check_state(self, now_ns: int, elapsed_s: float) -> Finding:
         """Check the rules on the present state, in the order of the module's docstring."""
         estop_old, a_old, b_old = (watch.old(now_ns) for watch in (self._estop, self._a, self._b))
-        heard = not a_old and not b_old
+        heard = not a_old and not b_old and abs(self._a.stamp_ns - self._b.stamp_ns) <= self._apart_ns
         if heard:
             self._heard_ns = now_ns
         motion = self._check_motion(heard, now_ns, elapsed_s)
@@ -214,7 +218,7 @@ class Guard:
         return FINE if neutral else self._check_commanded(now_ns)
 
     def _check_motion(self, heard: bool, now_ns: int, elapsed_s: float) -> Finding:
-        """Motion that nobody commands; the valve node obeys only what is heard, and in its mode."""
+        """Motion that nobody commands, or too fast a one; the valve node obeys only what is heard, and in its mode."""
         words = {message: None if message.old(now_ns) else message.word for message in self._feedback}
         follows = heard and self._a.raw("Mode") == _SPOOL
         first = FINE
@@ -225,6 +229,9 @@ class Guard:
                 command = self._commands[watch.number].percent if follows else 0.0
             found = watch.check(command, words[feedback], now_ns, elapsed_s)
             first = found if first is FINE else first
+        for joint in self._joints.values():
+            if joint.too_fast() and first is FINE:
+                first = Verdict.OVERSPEED, joint.axis.number
         return first
 
     def _check_commanded(self, now_ns: int) -> Finding:

@@ -236,6 +236,6 @@ def test_the_numbers_of_the_verdicts_are_those_that_recordings_hold() -> None:
     """They are on both buses (GuardStat, GuardAlive): a new rule gets a new number, and none is used again."""
     names = (
         "GOOD NO_COMMAND CORRUPT OTHER_GUARD RANGE RATE NOT_ARMED ESTOP ENCODER OUTSIDE CALMING STALE ESTOP_LOST "
-        "LATCHED SPOOL MOVING PERSON REACH DISAGREE BOTH CARRIER_LOST"
+        "LATCHED SPOOL MOVING PERSON REACH DISAGREE BOTH CARRIER_LOST OVERSPEED"
     )
     assert {verdict.name: verdict.value for verdict in Verdict} == {n: i for i, n in enumerate(names.split())}
