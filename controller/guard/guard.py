@@ -64,16 +64,16 @@ MESSAGES: Final = (
 
 
 class Guard:
-    """All state of the guard; `step` is its whole behaviour."""
+    """All state of the guard; `step` is its whole behaviour.  ``latched``: a person has not pressed reset yet."""
 
     __slots__ = (
         "_a", "_agreed_ns", "_apart_ns", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
-        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_latched",
+        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints",
         "_motion", "_now_ns", "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status", "_supply",
-        "_watches", "axis", "events", "verdict",
+        "_watches", "axis", "events", "latched", "verdict",
     )  # fmt: skip
 
-    def __init__(self, envelope: Envelope, layouts: dict[str, Layout]) -> None:
+    def __init__(self, envelope: Envelope, layouts: dict[str, Layout], latched: bool = False) -> None:
         axes = envelope.axes
         self._a, self._b = (WatchedMessage(layouts[n], Verdict.STALE, Verdict.CORRUPT) for n in MESSAGES[:2])
         self._estop = WatchedMessage(layouts["EstopStat"], Verdict.ESTOP_LOST, Verdict.ESTOP_LOST)
@@ -116,7 +116,7 @@ class Guard:
         self._heard_ns = -SILENCE_NS - 1
         self._clear_ns = self._agreed_ns = 0
         self._apart_ns = APART_PERIODS * envelope.period_ns
-        self._latched, self._reset_seen = False, True  # a button that is down already is no edge
+        self.latched, self._reset_seen = latched, True  # a button that is down already is no edge
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
         """Check the frames since the last call (any period up to 10 ms); returns the frames to send."""
@@ -274,16 +274,16 @@ class Guard:
         """
         if verdict is not Verdict.GOOD:
             self._calm_ns = now_ns + CALM_NS
-            self._latched = self._latched or verdict in LATCHING
+            self.latched = self.latched or verdict in LATCHING
         elif self.verdict is not Verdict.GOOD:
             neutral = self._neutral() and not (self._carrier and (self._carrier.driven or self._carrier.raised))
             if not neutral:
                 self._calm_ns = now_ns + CALM_NS
-            if self._latched:
-                self._latched = not (pressed and neutral)
-            if self._latched or now_ns < self._calm_ns:
-                verdict = Verdict.LATCHED if self._latched else Verdict.CALMING
-        supply = not self._latched and now_ns - self._heard_ns <= SILENCE_NS
+            if self.latched:
+                self.latched = not (pressed and neutral)
+            if self.latched or now_ns < self._calm_ns:
+                verdict = Verdict.LATCHED if self.latched else Verdict.CALMING
+        supply = not self.latched and now_ns - self._heard_ns <= SILENCE_NS
         changed = verdict is not self.verdict or supply != self._supply
         if verdict is not self.verdict:
             self.events = (self.events + 1) & 0xFF
