@@ -26,7 +26,7 @@ from can_dbc.frame import EXTENDED, Frame, RawFrame
 from can_dbc.messages.tick_record import BusReading
 from controller.guard import carrier
 from controller.guard.can_socket import GuardSocket
-from controller.guard.envelope import SHIPPED, read_envelope
+from controller.guard.envelope import RATES_HZ, SHIPPED, read_envelope
 from controller.guard.guard import MESSAGES, Guard
 from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.layout import GuardConfigError, read_layouts
@@ -43,6 +43,8 @@ BUSES: Final = ("crane0", "mach0")
 def build(profile: Path, databases: Path = DATABASES, rate_hz: int = 0, latched: bool = False) -> Guard:
     """Build a guard for a profile file and commands at ``rate_hz`` (0: the profile's); raises GuardConfigError."""
     envelope = read_envelope(profile)
+    if rate_hz and not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+        raise GuardConfigError("guard.rate", f"A control rate of {rate_hz} Hz is not possible; choose 50 to 1000 Hz.")
     if rate_hz:
         envelope = envelope._replace(period_ns=1_000_000_000 // rate_hz)
     encoders = [axis.message for axis in envelope.axes if axis.message]
