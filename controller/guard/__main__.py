@@ -16,13 +16,16 @@ import signal
 import sys
 import time
 from collections.abc import Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame, RawFrame
+from can_dbc.messages.key_file import KeyFileError, read_key
+from can_dbc.messages.operator_link import default_path as operator_path
+from can_dbc.messages.operator_link import guard_path
 from can_dbc.messages.tick_record import BusReading
 from controller.guard import carrier
 from controller.guard.can_socket import GuardSocket
@@ -30,6 +33,7 @@ from controller.guard.envelope import RATES_HZ, SHIPPED, read_envelope
 from controller.guard.guard import MESSAGES, Guard
 from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.layout import GuardConfigError, read_layouts
+from controller.guard.operator import Ear
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, prepare, sleep_until, stop_garbage_collection
 from runtime.allocator import keep_memory
@@ -71,7 +75,7 @@ def split(frames: list[RawFrame]) -> tuple[list[RawFrame], list[RawFrame]]:
     return [f for f in frames if not f[0] & EXTENDED], [f for f in frames if f[0] & EXTENDED]
 
 
-def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, latch: LatchFile) -> None:
+def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, latch: LatchFile, ear: Ear) -> None:
     """Run until a signal number is in ``ended``; ``buses`` are crane0, and mach0 where the machine has one."""
     frames: list[Frame] = []
     received: list[Frame] = []
@@ -86,6 +90,8 @@ def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, la
         for link, reading in links:
             link.receive(received, reading)
             frames += received
+        for action in ear.actions(deadline_ns + late_ns % PERIOD_NS):
+            guard.hear(action, deadline_ns)
         for (link, _), out in zip(links, split(guard.step(deadline_ns, frames)), strict=False):
             link.send(out)
             link.watch(deadline_ns)
@@ -108,6 +114,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
     parser.add_argument("--bus", action="append", default=[], metavar="NAME=ADDRESS", help="address of crane0 or mach0")
     parser.add_argument("--rate", type=int, default=0, metavar="HZ", help="the controller's, if not the profile's")
+    parser.add_argument(
+        "--operator", type=Path, metavar="FILE", help="the controller's; the guard's own lies beside it"
+    )
+    parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     parser.add_argument("--state", type=Path, metavar="FILE", help="there while it is latched, also over a restart")
     parser.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     options = parser.parse_args(arguments)
@@ -123,17 +133,19 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         latch = LatchFile(options.state or default_path())
         guard = build(profile_path(options.profile), rate_hz=options.rate, latched=latch.latched)
+        key = read_key(options.key_file) if options.key_file else None
         with ExitStack() as opened:
+            ear = opened.enter_context(closing(Ear(guard_path(options.operator or operator_path()), key)))
             needed = [(name, keys) for name, keys in zip(BUSES, guard.keys_of_buses, strict=True) if keys]
             links = [open_link(addresses.get(name) or default_address(name), keys) for name, keys in needed]
             buses = [opened.enter_context(link) for link in links]
             if not options.no_realtime:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
-            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)), latch)
-    except (GuardConfigError, BusError) as error:
+            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)), latch, ear)
+    except (GuardConfigError, KeyFileError, BusError) as error:
         sys.stderr.write(f"guard: {error}\n")
-        return 3 if isinstance(error, GuardConfigError) else 4
+        return 4 if isinstance(error, BusError) else 3
     return 130 if signal.SIGINT in ended else 0
 
 

@@ -160,7 +160,7 @@ class TimingTestbed:
         )
         guard = self.family.start(
             "guard", "controller.guard", "--profile", s.profile, *buses, "--rate", s.rate_hz,
-            "--state", self.page.with_suffix(".latched"),
+            "--state", self.page.with_suffix(".latched"), "--operator", operators,
         )  # fmt: skip
         self._elsewhere(guard.process.pid)
         self.family.start(

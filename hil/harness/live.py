@@ -268,7 +268,7 @@ class LiveRun(ABC, Generic[Outcome]):
 
     def _start_control(self, bus: list[str], ports: dict[str, int]) -> None:
         latch = self._ticks.with_suffix(".latched")
-        self._start("guard", "controller.guard", *self._profile, *bus, "--state", latch)
+        self._start("guard", "controller.guard", *self._profile, *bus, "--state", latch, "--operator", self._operators)
         listeners = [self._socket.getsockname()[1], ports["planner"], ports["reports"]]
         listeners += [ports["page"]] if self._options.console_port else []
         self._start(

@@ -1,6 +1,7 @@
 """Traffic on the buses for tests of the guard alone, and a way to break each of its rules."""
 
 from can_dbc.frame import Frame
+from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.e2e import Sender
 from controller.guard.__main__ import build, profile_path
 from controller.guard.verdicts import Verdict
@@ -66,6 +67,11 @@ class Traffic:
     def good(self):
         self.tick(60)
         assert self.guard.verdict is Verdict.GOOD, self.guard.verdict
+        return self.press()
+
+    def press(self, action=OperatorAction.ARM):
+        """A person presses a button, and the guard hears it."""
+        self.guard.hear(action, self.now_ns)
         return self
 
 

@@ -9,7 +9,6 @@ from controller.guard.envelope import read_envelope
 from controller.guard.guard import MESSAGES, RANGE_MARGIN_UNITS, Guard
 from controller.guard.layout import read_layouts
 from controller.guard.verdicts import Verdict
-from tests.controller.bench import count_until
 from tests.controller.guard_traffic import (
     CENTRE,
     DRIVING,
@@ -42,7 +41,7 @@ def test_a_neutral_command_agrees_with_any_mode() -> None:
     traffic.controller["Mode"] = 4
     assert traffic.tick(200) is Verdict.GOOD
     traffic.a.update(MOVING)
-    assert count_until(traffic.tick, lambda: traffic.guard.verdict is not Verdict.GOOD) == 41
+    assert traffic.tick() is Verdict.NOT_ARMED, "a controller that has stopped needs a person's ARM"
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
@@ -77,6 +78,7 @@ def run_guard(monkeypatch, world: World, *arguments: str) -> int:
 def state(monkeypatch, tmp_path):
     """The folder of the service's state."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
     return tmp_path / "state" / "latched"
 
 
@@ -226,6 +228,10 @@ def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch
 
     class Judge:
         latched = True
+        pressed: ClassVar[list[int]] = []
+
+        def hear(self, action, _now_ns):
+            self.pressed.append(action)
 
         def step(self, _now_ns, frames):
             judged.append(list(frames))
@@ -245,8 +251,9 @@ def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: clock[0]))
     notifier = SimpleNamespace(tick_done=lambda _now, in_time: punctual.append(in_time), stopping=lambda: None)
     kept = []
-    process.run(Judge(), ["crane0", "mach0"], ended, notifier, SimpleNamespace(keep=kept.append))
-    assert kept == [True] * 3
+    ear = SimpleNamespace(actions=lambda now_ns: [now_ns // T])
+    process.run(Judge(), ["crane0", "mach0"], ended, notifier, SimpleNamespace(keep=kept.append), ear)
+    assert kept == [True] * 3 and Judge.pressed == [1, 3, 4], "at the time at which it woke"
     assert judged == [[(1, 0x181, b"a")], [(2, 0x182, b"b"), (3, 0x8CFF_0000, b"c")], []]
     assert [bus for bus, _ in watched] == ["crane0", "mach0"] * 3
     assert sent[:2] == [("crane0", [(0x77F, b"")]), ("mach0", [(0x18FF_0000 | EXTENDED, b"")])]
@@ -300,3 +307,12 @@ def test_without_a_service_the_latch_is_kept_in_shared_memory(monkeypatch, tmp_p
     monkeypatch.delenv("STATE_DIRECTORY")
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     assert default_path() == tmp_path / "guard.latched"
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_key_that_cannot_be_read_stops_the_start(monkeypatch, capsys, tmp_path):
+    assert run_guard(monkeypatch, World(3), "--key-file", str(tmp_path / "none")) == 3
+    assert "none" in capsys.readouterr().err
+    (tmp_path / "key").write_bytes(b"k" * 16)
+    assert run_guard(monkeypatch, World(3), "--key-file", str(tmp_path / "key")) == 0
+    assert not (tmp_path / "run-guard" / "controller.operator").exists(), "removed at the end"

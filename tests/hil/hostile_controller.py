@@ -7,6 +7,7 @@ SYNC, start-up and everything else that the nodes need stay as they are.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +19,7 @@ from controller.guard.verdicts import Verdict
 from controller.tick import Outputs
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
+from machine.status.modes import Mode
 from sim.plant import Plant
 
 CRANE = load("crane")
@@ -99,16 +101,27 @@ def lockstep(machine: str, hostile: Hostile, operator: Operator | None = None, s
     )
 
 
+def is_armed(system: Lockstep) -> bool:
+    """Whether its controller is armed."""
+    return system.report is not None and system.report.mode == Mode.ARMED
+
+
+def standing(machine: str, hostile: Hostile, operator: Operator | None, ready: Callable[[Lockstep], bool]) -> Lockstep:
+    """A machine whose controller lies from the moment on at which it is ``ready``."""
+    system = lockstep(machine, hostile, operator)
+    while not ready(system):
+        system.advance()
+        assert system.now_ns < 20_000_000_000
+    hostile.begin_ns = system.now_ns
+    return system
+
+
 def attack(machine: str, hostile: Hostile, joint: int, seconds: float) -> Attack:
     """Arm, attack for so long, and look at the joint and the tip as they truly are."""
-    system = lockstep(machine, hostile)
+    system = standing(machine, hostile, None, is_armed)
     plant, guard = system.plant, system._guard
     try:
-        while not (system.report and system.report.mode == 2):
-            system.advance()
-            assert system.now_ns < 20_000_000_000
-        limit = guard._commands[joint].axis
-        hostile.begin_ns = begun_ns = system.now_ns
+        limit, begun_ns = guard._commands[joint].axis, system.now_ns
         found, began, places = Attack(), plant.tip(), []
         while system.now_ns < begun_ns + int(seconds * 1e9):
             system.advance()
