@@ -6,8 +6,7 @@ import socket
 from pathlib import Path
 
 from can_dbc.messages.envelope import MAC_BYTES
-from can_dbc.messages.operator_link import draw_credential
-from controller.requests.operator_socket import admitted
+from can_dbc.messages.operator_link import admitted, draw_credential
 
 
 class OperatorEnd(socket.socket):

@@ -1,13 +1,15 @@
-"""The operator's way to the controller: a Unix datagram socket of its own, apart from the planner's port.
+"""The operator's way to controller and guard: Unix datagram sockets of their own, apart from the planner's port.
 
 ARM, DISARM, RESET and the heartbeats are heard only there, and only with an authenticator made with the credential of
-the controller's present start: random bytes in a file beside the socket, which its owner and its group may read (as
+the listener's present start: random bytes in a file beside the socket, which its owner and its group may read (as
 X11's cookie).  So what was sent before a restart is worth nothing after it.  STOP needs none, and is heard there before
-anything else, whatever waits on the setpoint port.  The controller's side is `controller.requests.operator_socket`.
+anything else, whatever waits on the setpoint port.  The controller's side is `controller.requests.operator_socket`, the
+guard's `controller.guard.operator`: it hears the person itself, and nothing moves without the ARM that it heard.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import socket
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from can_dbc.messages.datagrams import stop_in
-from can_dbc.messages.envelope import signed
+from can_dbc.messages.envelope import DatagramRefused, opened, signed
 from runtime.shared_file import shared_path
 
 CREDENTIAL_BYTES: Final = 32
@@ -24,6 +26,11 @@ CREDENTIAL_BYTES: Final = 32
 def default_path() -> Path:
     """Path of the controller's socket for operators."""
     return shared_path("controller.operator")
+
+
+def guard_path(path: Path) -> Path:
+    """The guard's socket beside the controller's: of another user, so in a folder of its own."""
+    return path.parent.with_name(f"{path.parent.name}-guard") / path.name
 
 
 def credential_path(path: Path) -> Path:
@@ -44,14 +51,33 @@ def draw_credential(path: Path) -> bytes:
     return drawn
 
 
+def admitted(data: bytes, key: bytes | None) -> bytes:
+    """A datagram as its listener sees it: without its authenticator; STOP whatever that is, anything else empty if
+    wrong.
+
+    An empty datagram stands for whatever was not made with the key.
+    """
+    try:
+        return opened(data, key)
+    except DatagramRefused:
+        return stop_in(data)
+
+
 def send(data: bytes, path: Path) -> None:
-    """Send one operator command, sealed without a key, as one of those who may read the credential.
+    """Send one operator command, sealed without a key, to controller and guard, as one of those who may read their
+    credentials.
+
+    A guard that does not listen moves nothing, and says so on the bus.
 
     Raises:
-        OSError: the credential cannot be read, the controller does not listen, or its queue is full.
+        OSError: the controller's credential cannot be read, it does not listen, or its queue is full.
     """
-    if not stop_in(data):
-        data = signed(data, credential_path(path).read_bytes())
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
         link.setblocking(False)
-        link.sendto(data, str(path))
+        with contextlib.suppress(OSError):
+            link.sendto(_signed(data, guard_path(path)), str(guard_path(path)))
+        link.sendto(_signed(data, path), str(path))
+
+
+def _signed(data: bytes, path: Path) -> bytes:
+    return data if stop_in(data) else signed(data, credential_path(path).read_bytes())

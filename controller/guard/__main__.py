@@ -16,19 +16,23 @@ import signal
 import sys
 import time
 from collections.abc import Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame, RawFrame
+from can_dbc.messages.operator_link import default_path as operator_path
+from can_dbc.messages.operator_link import guard_path
 from can_dbc.messages.tick_record import BusReading
 from controller.guard import carrier
 from controller.guard.can_socket import GuardSocket
-from controller.guard.envelope import SHIPPED, read_envelope
+from controller.guard.envelope import RATES_HZ, SHIPPED, read_envelope
 from controller.guard.guard import MESSAGES, Guard
+from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.layout import GuardConfigError, read_layouts
+from controller.guard.operator import Ear
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, prepare, sleep_until, stop_garbage_collection
 from runtime.allocator import keep_memory
@@ -39,16 +43,18 @@ DATABASES: Final = Path(__file__).parents[2] / "can_dbc"
 BUSES: Final = ("crane0", "mach0")
 
 
-def build(profile: Path, databases: Path = DATABASES, rate_hz: int = 0) -> Guard:
+def build(profile: Path, databases: Path = DATABASES, rate_hz: int = 0, latched: bool = False) -> Guard:
     """Build a guard for a profile file and commands at ``rate_hz`` (0: the profile's); raises GuardConfigError."""
     envelope = read_envelope(profile)
+    if rate_hz and not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+        raise GuardConfigError("guard.rate", f"A control rate of {rate_hz} Hz is not possible; choose 50 to 1000 Hz.")
     if rate_hz:
         envelope = envelope._replace(period_ns=1_000_000_000 // rate_hz)
     encoders = [axis.message for axis in envelope.axes if axis.message]
     layouts = read_layouts(databases / "crane.dbc", [*MESSAGES, *encoders])
     if envelope.carrier is not None:
         layouts |= read_layouts(databases / "machine.dbc", list(carrier.MESSAGES))
-    return Guard(envelope, layouts)
+    return Guard(envelope, layouts, latched)
 
 
 def profile_path(name: str) -> Path:
@@ -68,7 +74,7 @@ def split(frames: list[RawFrame]) -> tuple[list[RawFrame], list[RawFrame]]:
     return [f for f in frames if not f[0] & EXTENDED], [f for f in frames if f[0] & EXTENDED]
 
 
-def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier) -> None:
+def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, latch: LatchFile, ear: Ear) -> None:
     """Run until a signal number is in ``ended``; ``buses`` are crane0, and mach0 where the machine has one."""
     frames: list[Frame] = []
     received: list[Frame] = []
@@ -83,9 +89,12 @@ def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier) ->
         for link, reading in links:
             link.receive(received, reading)
             frames += received
+        for action in ear.actions(deadline_ns + late_ns % PERIOD_NS):
+            guard.hear(action, deadline_ns)
         for (link, _), out in zip(links, split(guard.step(deadline_ns, frames)), strict=False):
             link.send(out)
             link.watch(deadline_ns)
+        latch.keep(guard.latched)
         notifier.tick_done(deadline_ns, late_ns < PERIOD_NS)
         deadline_ns += PERIOD_NS
     notifier.stopping()
@@ -104,6 +113,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
     parser.add_argument("--bus", action="append", default=[], metavar="NAME=ADDRESS", help="address of crane0 or mach0")
     parser.add_argument("--rate", type=int, default=0, metavar="HZ", help="the controller's, if not the profile's")
+    parser.add_argument(
+        "--operator", type=Path, metavar="FILE", help="the controller's; the guard's own lies beside it"
+    )
+    parser.add_argument("--state", type=Path, metavar="FILE", help="there while it is latched, also over a restart")
     parser.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     options = parser.parse_args(arguments)
     addresses = {name: address for name, _, address in (text.partition("=") for text in options.bus)}
@@ -116,15 +129,17 @@ def main(arguments: list[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda which, _frame: ended.append(which))
     try:
-        guard = build(profile_path(options.profile), rate_hz=options.rate)
+        latch = LatchFile(options.state or default_path())
+        guard = build(profile_path(options.profile), rate_hz=options.rate, latched=latch.latched)
         with ExitStack() as opened:
+            ear = opened.enter_context(closing(Ear(guard_path(options.operator or operator_path()))))
             needed = [(name, keys) for name, keys in zip(BUSES, guard.keys_of_buses, strict=True) if keys]
             links = [open_link(addresses.get(name) or default_address(name), keys) for name, keys in needed]
             buses = [opened.enter_context(link) for link in links]
             if not options.no_realtime:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
-            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)))
+            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)), latch, ear)
     except (GuardConfigError, BusError) as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3 if isinstance(error, GuardConfigError) else 4

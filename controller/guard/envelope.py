@@ -23,6 +23,19 @@ DELAY_FACTOR, LAGS = 1.5, 3.0
 SEAL: Final = b"# sha256: "
 """The last line of an envelope file: this, and the digest of everything before it."""
 SHIPPED: Final = Path(__file__).parents[2] / "machine"
+RATES_HZ: Final = (50, 1000)
+_VALVE: Final = {
+    "deadband_plus_pct": (0.0, 49.99), "deadband_minus_pct": (0.0, 49.99), "full_speed_plus": (1e-3, 20.0),
+    "full_speed_minus": (1e-3, 20.0), "delay_s": (0.0, 0.5), "lag_s": (0.0, 0.3),
+}  # fmt: skip
+_ENCODER: Final = {"total_counts": (2, 1 << 32), "zero_counts": (-(1 << 31), 1 << 32), "unit_per_count": (1e-9, 0.1)}
+_LIMITS: Final = {
+    "lower": (-20.0, 20.0),
+    "upper": (-20.0, 20.0),
+    "speed_limit": (1e-3, 10.0),
+    "acceleration_limit": (0.01, 20.0),
+}
+"""What a number may be; the controller's bounds are as wide or narrower."""
 Corner = tuple[float, float, float]
 
 
@@ -91,17 +104,24 @@ def read_envelope(path: Path) -> Envelope:
     """Read a profile file and the envelope of its machine; raises GuardConfigError."""
     try:
         profile = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, no TOML, or a number of 5000 digits
         raise GuardConfigError("guard.profile-unreadable", f"{path}: unreadable profile: {error}.") from error
     try:
         limits = _sealed(_find(path, str(profile["name"])))
         _compare(path, profile, limits)
-        axes = tuple(_axis(i, profile["joints"][n], _numbers(limits["joints"][n])) for i, n in enumerate(JOINT_NAMES))
+        axes = tuple(_axis(i, profile["joints"][n], _limits(limits["joints"][n])) for i, n in enumerate(JOINT_NAMES))
         boxes = tuple((_corner(box["low_m"]), _corner(box["high_m"])) for box in limits.get("boxes", ()))
-        carrier = CarrierLimits(**_numbers(limits["carrier"])) if "machine_bus" in profile else None
+        if any(not all(a < b for a, b in zip(*box, strict=True)) for box in boxes):
+            raise ValueError("a box has its corners the wrong way round")
+        carrier = (
+            CarrierLimits(**_within(limits["carrier"], dict.fromkeys(CarrierLimits._fields, (1e-3, 10.0))))
+            if "machine_bus" in profile
+            else None
+        )
         geometry, ground_m = Kinematics(**_numbers(limits["kinematics"])), _number(limits["ground_m"])
-        return Envelope(axes, 1_000_000_000 // int(profile["rate_hz"]), geometry, ground_m, boxes, carrier)
-    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        rate_hz = int(_within(profile, {"rate_hz": RATES_HZ})["rate_hz"])
+        return Envelope(axes, 1_000_000_000 // rate_hz, geometry, ground_m, boxes, carrier)
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise GuardConfigError(
             "guard.profile-incomplete", f"{path} or its envelope: a joint or the rate is incomplete: {error!r}."
         ) from error
@@ -116,6 +136,22 @@ def _number(value: object) -> float:
 
 def _numbers(table: dict[str, Any]) -> dict[str, float]:
     return {key: _number(value) for key, value in table.items()}
+
+
+def _within(table: dict[str, Any], ranges: dict[str, tuple[float, float]]) -> dict[str, float]:
+    """The numbers of a table that ``ranges`` names; ValueError for one outside its range."""
+    found = {key: _number(table[key]) for key in ranges}
+    for key, (low, high) in ranges.items():
+        if not low <= found[key] <= high:
+            raise ValueError(f"{key} = {found[key]:g} is outside {low:g} to {high:g}")
+    return found
+
+
+def _limits(table: dict[str, Any]) -> dict[str, float]:
+    limits = _within(table, _LIMITS)
+    if limits["lower"] >= limits["upper"]:
+        raise ValueError(f"lower = {limits['lower']:g} is not below upper = {limits['upper']:g}")
+    return limits
 
 
 def _corner(values: list[Any]) -> Corner:
@@ -147,8 +183,12 @@ def _compare(path: Path, profile: dict[str, Any], limits: dict[str, Any]) -> Non
     pairs = [(f"joints.{name}", profile["joints"][name], limits["joints"][name]) for name in JOINT_NAMES]
     if "machine_bus" in profile:
         pairs.append(("carrier", profile["carrier"], limits["carrier"]))
+    for name in JOINT_NAMES:
+        _limits(limits["joints"][name])
+        _limits(profile["joints"][name])
     for place, mine, most in pairs:
         for key, limit in most.items():
+            _number(mine[key])
             if mine[key] < limit if key == "lower" else mine[key] > limit:
                 raise GuardConfigError(
                     "guard.profile-exceeds-envelope",
@@ -160,10 +200,15 @@ def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
     valve, encoder = joint["valve"], joint.get("encoder")
     linear = encoder is not None and encoder["kind"] == "linear"
     sides = ("minus", "plus") if int(valve["sign"]) > 0 else ("plus", "minus")
-    deadbands = [float(valve[f"deadband_{side}_pct"]) for side in sides]
-    fulls = [float(valve[f"full_speed_{side}"]) for side in sides]
-    if not all(0.0 <= d < 100.0 and 0.0 < f < math.inf for d, f in zip(deadbands, fulls, strict=True)):  # nor a NaN
-        raise ValueError(f"the valve {valve['signal']!r} has a dead-band or a speed that no valve has")
+    numbers, name = _within(valve, _VALVE), JOINT_NAMES[number].capitalize()
+    deadbands = [numbers[f"deadband_{side}_pct"] for side in sides]
+    fulls = [numbers[f"full_speed_{side}"] for side in sides]
+    if valve["sign"] not in (-1, 1) or valve["signal"] != name:
+        raise ValueError(f"the valve of {name} has the sign {valve['sign']!r} and the signal {valve['signal']!r}")
+    if encoder is not None:
+        _within(encoder, _ENCODER)
+        if encoder["direction"] not in (-1, 1) or encoder["message"] != f"Enc{name}" or linear != (name == "Ext"):
+            raise ValueError(f"the encoder of {name} is {encoder['message']!r}, {encoder['direction']!r}")
     return Axis(
         number=number,
         signal=str(valve["signal"]),
@@ -171,7 +216,7 @@ def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
         deadbands_pct=(deadbands[0], deadbands[1]),
         full_speeds=(fulls[0], fulls[1]),
         rate_pct_s=100.0 * RATE_FACTOR * limits["acceleration_limit"] / min(fulls),
-        closing_ns=int((DELAY_FACTOR * valve["delay_s"] + LAGS * valve["lag_s"]) * 1e9),
+        closing_ns=int((DELAY_FACTOR * numbers["delay_s"] + LAGS * numbers["lag_s"]) * 1e9),
         lower=limits["lower"],
         upper=limits["upper"],
         speed_limit=limits["speed_limit"],

@@ -40,9 +40,16 @@ PERSON_CARRIER_NS: Final = 2_200_000_000
 """A person in the zone: the controller stops the crane in 150 ms, and the carrier with a ramp of 1 m/s^2."""
 AGREE_NS: Final = 200_000_000
 """A controller that says that it has stopped ramps the spools to neutral in 150 ms."""
+STOP_NS, RAMP_NS = 85_000_000, 200_000_000
+"""After a person's STOP the spools ramp to neutral in 150 ms: so long they may be as open as at the STOP, and after it
+only by `STOP_SHARE` of that, or shut but for `STOP_PCT`; then they are neutral."""
+STOP_SHARE, STOP_PCT = 0.75, 5.0
 HELD_PCT: Final = 30.0
 """Past the dead-band; an opening below this holds a joint in place while the carrier drives."""
-RANGE_MARGIN_UNITS: Final = 0.08
+APART_PERIODS: Final = 3
+"""ValveCmdA and B come together; when one of them stays away for longer than this, it is lost: the valve node itself
+waits for 50 ms, and its ramp takes 60 ms more."""
+RANGE_MARGIN_UNITS: Final = 0.008
 """How far outside its range [rad, m] a joint may still be driven outward."""
 BEYOND_STEPS: Final = 2
 """Steps in a row in which the crane must be where it must not: one sample that jumps is an encoder's fault."""
@@ -53,6 +60,8 @@ _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
 _GRAPPLE_SIDE: Final = (0.0, 1.0, -1.0, -1.0)
 """Side of the grapple's spool by GrappleMode: neutral, opens, closes, holds."""
 _RELEASED, _PRESSED, _YES = 1, 1, 1
+_ARM, _ENDS = 1, (2, 3, 4)
+"""A person's ARM; DISARM, STOP and RESET."""
 _OPERATING: Final = (2, 3)
 """CtrlStatus.Mode: armed, run."""
 MESSAGES: Final = (
@@ -61,16 +70,16 @@ MESSAGES: Final = (
 
 
 class Guard:
-    """All state of the guard; `step` is its whole behaviour."""
+    """All state of the guard; `step` is its whole behaviour.  ``latched``: a person has not pressed reset yet."""
 
     __slots__ = (
-        "_a", "_agreed_ns", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands", "_commands_of", "_estop",
-        "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_latched", "_motion", "_now_ns",
-        "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status", "_supply", "_watches", "axis",
-        "events", "verdict",
+        "_a", "_agreed_ns", "_apart_ns", "_armed", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
+        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_motion",
+        "_now_ns", "_open_pct", "_operated_ns", "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent",
+        "_status", "_stopped_ns", "_supply", "_watches", "axis", "events", "latched", "verdict",
     )  # fmt: skip
 
-    def __init__(self, envelope: Envelope, layouts: dict[str, Layout]) -> None:
+    def __init__(self, envelope: Envelope, layouts: dict[str, Layout], latched: bool = False) -> None:
         axes = envelope.axes
         self._a, self._b = (WatchedMessage(layouts[n], Verdict.STALE, Verdict.CORRUPT) for n in MESSAGES[:2])
         self._estop = WatchedMessage(layouts["EstopStat"], Verdict.ESTOP_LOST, Verdict.ESTOP_LOST)
@@ -112,7 +121,9 @@ class Guard:
         self._now_ns = self._calm_ns = self._heartbeat_ns = 0
         self._heard_ns = -SILENCE_NS - 1
         self._clear_ns = self._agreed_ns = 0
-        self._latched, self._reset_seen = False, True  # a button that is down already is no edge
+        self._apart_ns = APART_PERIODS * envelope.period_ns
+        self._armed, self._operated_ns, self._open_pct, self._stopped_ns = False, 0, 0.0, -PERSON_CARRIER_NS
+        self.latched, self._reset_seen = latched, True  # a button that is down already is no edge
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
         """Check the frames since the last call (any period up to 10 ms); returns the frames to send."""
@@ -136,6 +147,13 @@ class Guard:
             out.append((HEARTBEAT_KEY, b"\x05" if self._heartbeat_ns else b"\x00"))
             self._heartbeat_ns = now_ns + HEARTBEAT_NS
         return out
+
+    def hear(self, action: int, now_ns: int) -> None:
+        """What a person asks for, heard from the person and not from the controller; nothing moves without an ARM."""
+        if action == _ARM:
+            self._armed, self._operated_ns = self.enabled, now_ns
+        elif action in _ENDS and self._armed:
+            self._armed, self._stopped_ns, self._open_pct = False, now_ns, self._opening_pct()
 
     @property
     def keys_of_buses(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -182,7 +200,7 @@ class Guard:
     def _check_state(self, now_ns: int, elapsed_s: float) -> Finding:
         """Check the rules on the present state, in the order of the module's docstring."""
         estop_old, a_old, b_old = (watch.old(now_ns) for watch in (self._estop, self._a, self._b))
-        heard = not a_old and not b_old
+        heard = not a_old and not b_old and abs(self._a.stamp_ns - self._b.stamp_ns) <= self._apart_ns
         if heard:
             self._heard_ns = now_ns
         motion = self._check_motion(heard, now_ns, elapsed_s)
@@ -209,12 +227,18 @@ class Guard:
             return carrier
         if self._carrier is not None and self._carrier.driven and now_ns - self._clear_ns > PERSON_CARRIER_NS:
             return Verdict.PERSON, DRIVE_AXIS
-        if neutral or (not self._status.old(now_ns) and self._status.raw("Mode") in _OPERATING):
+        if not self._status.old(now_ns) and self._status.raw("Mode") in _OPERATING:
+            self._operated_ns = now_ns
+        self._armed = self._armed and now_ns - self._operated_ns <= AGREE_NS
+        carried = self._carrier is not None and (self._carrier.driven or self._carrier.raised)
+        if carried and self.enabled and not self._armed and now_ns - self._stopped_ns > PERSON_CARRIER_NS:
+            return Verdict.NOT_ARMED, DRIVE_AXIS
+        if neutral or self._operated_ns == now_ns:
             self._agreed_ns = now_ns
         return FINE if neutral else self._check_commanded(now_ns)
 
     def _check_motion(self, heard: bool, now_ns: int, elapsed_s: float) -> Finding:
-        """Motion that nobody commands; the valve node obeys only what is heard, and in its mode."""
+        """Motion that nobody commands, or too fast a one; the valve node obeys only what is heard, and in its mode."""
         words = {message: None if message.old(now_ns) else message.word for message in self._feedback}
         follows = heard and self._a.raw("Mode") == _SPOOL
         first = FINE
@@ -225,6 +249,9 @@ class Guard:
                 command = self._commands[watch.number].percent if follows else 0.0
             found = watch.check(command, words[feedback], now_ns, elapsed_s)
             first = found if first is FINE else first
+        for joint in self._joints.values():
+            if joint.too_fast() and first is FINE:
+                first = Verdict.OVERSPEED, joint.axis.number
         return first
 
     def _check_commanded(self, now_ns: int) -> Finding:
@@ -235,6 +262,8 @@ class Guard:
             return Verdict.PERSON, NO_AXIS
         if now_ns - self._agreed_ns > AGREE_NS:
             return Verdict.DISAGREE, NO_AXIS
+        if self.enabled and not self._armed and not self._stopping(now_ns):
+            return Verdict.NOT_ARMED, NO_AXIS
         for joint in self._joints.values():
             if joint.silent(now_ns):
                 return Verdict.ENCODER, joint.axis.number
@@ -257,6 +286,15 @@ class Guard:
             return False
         return self._b.raw("Grapple") == 0 and all(command.percent == 0.0 for command in self._commands)
 
+    def _opening_pct(self) -> float:
+        """How far the spools are commanded to open past their dead-bands, all together."""
+        return sum(abs(command.opening) for command in self._commands)
+
+    def _stopping(self, now_ns: int) -> bool:
+        """Whether the spools go to neutral as after a person's STOP."""
+        since_ns, most_pct = now_ns - self._stopped_ns, max(STOP_SHARE * self._open_pct, STOP_PCT)
+        return since_ns <= STOP_NS or (since_ns <= RAMP_NS and self._opening_pct() <= most_pct)
+
     def _crane_moves(self) -> bool:
         return any(abs(command.opening) > HELD_PCT for command in self._commands)
 
@@ -267,16 +305,17 @@ class Guard:
         """
         if verdict is not Verdict.GOOD:
             self._calm_ns = now_ns + CALM_NS
-            self._latched = self._latched or verdict in LATCHING
+            self.latched = self.latched or verdict in LATCHING
+            self._armed = False
         elif self.verdict is not Verdict.GOOD:
             neutral = self._neutral() and not (self._carrier and (self._carrier.driven or self._carrier.raised))
             if not neutral:
                 self._calm_ns = now_ns + CALM_NS
-            if self._latched:
-                self._latched = not (pressed and neutral)
-            if self._latched or now_ns < self._calm_ns:
-                verdict = Verdict.LATCHED if self._latched else Verdict.CALMING
-        supply = not self._latched and now_ns - self._heard_ns <= SILENCE_NS
+            if self.latched:
+                self.latched = not (pressed and neutral)
+            if self.latched or now_ns < self._calm_ns:
+                verdict = Verdict.LATCHED if self.latched else Verdict.CALMING
+        supply = not self.latched and now_ns - self._heard_ns <= SILENCE_NS
         changed = verdict is not self.verdict or supply != self._supply
         if verdict is not self.verdict:
             self.events = (self.events + 1) & 0xFF

@@ -11,6 +11,12 @@ from controller.guard.verdicts import Verdict
 
 ENCODER_TIMEOUT_NS: Final = 90_000_000
 """The controller stops on a lost encoder within 100 ms; the guard enforces it."""
+SPEED_FACTOR: Final = 1.1
+"""A joint may swing and ring, and lasts nowhere above this share of its speed limit, ..."""
+SPEED_SLACK_S: Final = 0.02
+"""... by more than the way of this time at its limit: 5 times what ordinary work needs (docs/how-to/guard.md)."""
+FAST_FRAMES: Final = 3
+"""Frames in a row: one sample that jumps is an encoder's fault."""
 RATE_CREDIT_S: Final = 0.04
 RATE_SLACK_PCT: Final = 3.0
 
@@ -64,13 +70,14 @@ class CommandedAxis:
 
 
 class MeasuredJoint:
-    """The measured position of one joint."""
+    """The measured position of one joint, and a place that follows it no faster than the joint may move."""
 
-    __slots__ = ("_alive", "_at", "axis", "layout", "position", "stamp_ns")
+    __slots__ = ("_alive", "_at", "_fast", "_place", "_slack", "_speed", "axis", "layout", "position", "stamp_ns")
 
     def __init__(self, axis: Axis, layout: Layout) -> None:
         self.axis, self.layout = axis, layout
-        self.position = 0.0
+        self.position = self._place = 0.0
+        self._speed, self._slack, self._fast = SPEED_FACTOR * axis.speed_limit, SPEED_SLACK_S * axis.speed_limit, 0
         self.stamp_ns = -ENCODER_TIMEOUT_NS
         self._at = layout.fields.get("TimeStamp")
         self._alive = -1
@@ -89,7 +96,19 @@ class MeasuredJoint:
         if axis.total_counts:
             offset = (offset + axis.total_counts // 2) % axis.total_counts - axis.total_counts // 2
         self.position = offset * axis.unit
-        self.stamp_ns = min(frame.stamp_ns, now_ns)
+        before_ns, self.stamp_ns = self.stamp_ns, min(frame.stamp_ns, now_ns)
+        if self.stamp_ns - before_ns >= ENCODER_TIMEOUT_NS:
+            self._place = self.position
+        way = self._speed * (self.stamp_ns - before_ns) * 1e-9
+        self._place += min(max(self.position - self._place, -way), way)
+        self._fast = self._fast + 1 if abs(self.position - self._place) > self._slack else 0
+
+    def too_fast(self) -> bool:
+        """Whether it has moved faster than it may; told once, and its place is then where it is."""
+        if self._fast < FAST_FRAMES:
+            return False
+        self._place, self._fast = self.position, 0
+        return True
 
     def silent(self, now_ns: int) -> bool:
         """Whether its encoder has been silent for too long to move the joint."""

@@ -35,6 +35,7 @@ class Verdict(IntEnum):
     DISAGREE = 18  # a motion is commanded by a controller that does not say that it operates
     BOTH = 19  # crane and carrier move at once
     CARRIER_LOST = 20  # a motion of the carrier is commanded, and its state is not received
+    OVERSPEED = 21  # a joint moves faster than the envelope allows
 
 
 LATCHING: Final = frozenset(Verdict) - {

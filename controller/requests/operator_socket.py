@@ -13,25 +13,12 @@ from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.batch import Batch
-from can_dbc.messages.datagrams import stop_in
-from can_dbc.messages.envelope import DatagramRefused, opened
-from can_dbc.messages.operator_link import credential_path, draw_credential
+from can_dbc.messages.operator_link import admitted, credential_path, draw_credential
 from runtime.shared_file import make_own_folder
 
 MAX_COMMANDS: Final = 16
 """Commands received in one tick: more than the queue of a Unix socket holds."""
 COMMAND_BYTES: Final = 256
-
-
-def admitted(data: bytes, key: bytes | None) -> bytes:
-    """A datagram as the tick sees it: without its authenticator; STOP whatever that is, anything else empty if wrong.
-
-    An empty datagram stands for whatever was not made with the key.
-    """
-    try:
-        return opened(data, key)
-    except DatagramRefused:
-        return stop_in(data)
 
 
 class OperatorSocket:

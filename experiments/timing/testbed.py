@@ -160,7 +160,10 @@ class TimingTestbed:
         self._start(
             "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
         )
-        guard = self.family.start("guard", "controller.guard", "--profile", s.profile, *buses, "--rate", s.rate_hz)
+        guard = self.family.start(
+            "guard", "controller.guard", "--profile", s.profile, *buses, "--rate", s.rate_hz,
+            "--state", self.page.with_suffix(".latched"), "--operator", operators,
+        )  # fmt: skip
         self._elsewhere(guard.process.pid)
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,

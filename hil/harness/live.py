@@ -274,7 +274,8 @@ class LiveRun(ABC, Generic[Outcome]):
         return int(self._processes.await_message("detector", "ready", START_S)["ready"])
 
     def _start_control(self, bus: list[str], ports: dict[str, int]) -> None:
-        self._start("guard", "controller.guard", *self._profile, *bus)
+        latch = self._ticks.with_suffix(".latched")
+        self._start("guard", "controller.guard", *self._profile, *bus, "--state", latch, "--operator", self._operators)
         listeners = [self._socket.getsockname()[1], ports["planner"], ports["reports"]]
         listeners += [ports["page"]] if self._options.console_port else []
         self._start(

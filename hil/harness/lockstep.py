@@ -20,6 +20,7 @@ from can_dbc.messages.vehicle import VehicleReport
 from controller.config import Settings
 from controller.guard.__main__ import split
 from controller.guard.guard import Guard
+from controller.guard.operator import action_of
 from controller.process.bus_link import BusLink
 from controller.process.tick_recording import record
 from controller.process.tx_queue import MIN_QUEUE_FRAMES, crane_queue_frames
@@ -172,6 +173,9 @@ class Lockstep:
         disturbance = self.disturbance
         if disturbance is None or not disturbance.stalled("guard", self.now_ns):
             heard = [frame for bus in self._guard_buses for frame in _drained(bus)]
+            for command in self._pressed:
+                action, _ = action_of(command, None, 0, self.now_ns)
+                self._guard.hear(action, self.now_ns)
             for bus, frames in zip(self._guard_buses, split(self._guard.step(self.now_ns, heard)), strict=False):
                 bus.send_all(frames)
         if disturbance is not None:

@@ -61,11 +61,18 @@ def load_profile(name_or_path: str | Path) -> Profile:
         raise ProfileError("profile.not-utf8", sentence) from None
     except tomllib.TOMLDecodeError as error:
         raise ProfileError("profile.broken-toml", f"{path}: broken TOML: {error}") from None
+    except RecursionError:
+        raise ProfileError("profile.broken-toml", f"{path}: brackets nested too deeply; a profile has three") from None
+    except ValueError as error:  # Python converts no number of more than 4300 digits
+        raise ProfileError("profile.broken-toml", f"{path}: a number that cannot be read: {error}") from None
     problems: list[Problem] = []
     built = build(Profile, raw, "", problems)
     if problems:
         raise ProfileError("profile.wrong-structure", _lines(path, problems), problems)
-    problems = problems_of(built)
+    try:
+        problems = problems_of(built)
+    except OverflowError as error:  # an integer of hundreds of digits
+        raise ProfileError("profile.out-of-range", f"{path}: a number is out of every range: {error}") from None
     if problems:
         raise ProfileError("profile.wrong-values", _lines(path, problems), problems)
     profile: Profile = built

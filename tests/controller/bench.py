@@ -32,6 +32,7 @@ from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import frames as packet
 from controller.config import load as load_settings
 from controller.guard.__main__ import split
+from controller.guard.operator import action_of
 from controller.laws.valve_map import ValveMap
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
@@ -212,6 +213,8 @@ class Bench:
             frames += [Frame(self.now_ns, key, data) for key, data in outputs.frames]
             frames += self.inputs.machine_frames
             frames += [Frame(self.now_ns, key, data) for key, data in outputs.machine_frames]
+            for command in self.inputs.operator:
+                self.guard.hear(action_of(command, None, 0, self.now_ns)[0], self.now_ns)
             self.pending += split(self.guard.step(self.now_ns, frames))[0]
         if outputs.report is not None:
             report = decode(outputs.report)

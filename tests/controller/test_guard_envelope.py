@@ -96,6 +96,18 @@ def test_a_machine_without_an_envelope_does_not_start(files, capsys):
         ("full_speed_plus = ", "full_speed_plus = inf # "),
         ("total_counts = ", "total_counts = inf # "),
         ("rate_hz = ", "rate_hz = inf # "),
+        ("rate_hz = 200", "rate_hz = 2" + 399 * "0"),
+        ("rate_hz = 200", "rate_hz = 40"),
+        ("\nsign = ", "\nsign = 0 # "),
+        ("delay_s = ", "delay_s = 1e6 # "),
+        ("upper = 1.309", "upper = nan"),
+        ("lower = -0.383972", "lower = 1.4"),
+        ("direction = ", "direction = 0 # "),
+        ("unit_per_count = ", "unit_per_count = 0.0 # "),
+        ('message = "EncSlew"', 'message = "EncLift"'),
+        ('message = "EncExt"', 'message = "EncTilt"'),
+        ('signal = "Slew"', 'signal = "Lift"'),
+        ('kind = "linear"', 'kind = "rotary"'),
     ],
 )
 def test_numbers_that_would_switch_a_rule_off_or_end_the_guard_stop_the_start(files, old, new):
@@ -127,3 +139,36 @@ def test_a_sealed_limit_that_is_no_finite_number_stops_the_start(files, value):
     assert seal.main([str(envelope)]) == 0
     with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
         build(profile)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("lower = -1.74533\nupper = 1.74533", "lower = 1.74533\nupper = -1.74533"),
+        ("speed_limit = 0.35", "speed_limit = -0.35"),
+        ("acceleration_limit = 0.4", "acceleration_limit = 0.0"),
+        ("high_m = [0.4, 0.4, 1.2]", "high_m = [0.4, -0.5, 1.2]"),
+        ("ground_m = -1.39", "ground_m = " + 5000 * "[" + 5000 * "]"),
+    ],
+)
+def test_a_sealed_envelope_that_no_machine_has_stops_the_start(files, old, new):
+    profile, envelope = files
+    assert old in envelope.read_text()
+    envelope.write_text(envelope.read_text().replace(old, new))
+    assert seal.main([str(envelope)]) == 0
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
+        build(profile)
+
+
+@pytest.mark.parametrize("text", ["rate_hz = 2" + 5000 * "0", "x = " + 5000 * "[" + 5000 * "]"])
+def test_a_profile_that_no_reader_can_read_stops_the_start(files, text):
+    profile, _ = files
+    profile.write_text(text)
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-unreadable")):
+        build(profile)
+
+
+@pytest.mark.parametrize("rate_hz", [49, 1001])
+def test_a_rate_that_no_controller_runs_at_stops_the_start(rate_hz):
+    with pytest.raises(GuardConfigError, check=coded("guard.rate")):
+        build(PROFILE, rate_hz=rate_hz)

@@ -5,6 +5,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from can_dbc.frame import Frame
+from controller.guard.__main__ import build
 from controller.guard.guard import CALM_NS
 from controller.guard.verdicts import LATCHING, Verdict
 from tests.controller.bench import MS, T, count_until
@@ -15,6 +16,7 @@ from tests.controller.guard_traffic import (
     GOOD_A,
     GOOD_B,
     MOVING,
+    PROFILE,
     Traffic,
     press_reset,
     spoil,
@@ -171,8 +173,17 @@ def test_a_rotator_that_the_logs_turn_is_no_motion_without_a_command_and_one_tha
     traffic = Traffic().good()
     place = traffic.encoder["EncRot"]
     unit_rad = next(j.axis.unit for j in traffic.guard._joints.values() if j.axis.number == 4)
-    traffic.encoder["EncRot"] = place + round(0.15 / abs(unit_rad))
-    assert traffic.tick(20) is Verdict.GOOD
-    traffic.encoder["EncRot"] = place + round(0.3 / abs(unit_rad))
-    traffic.tick(20)
-    assert traffic.guard.verdict is Verdict.LATCHED
+    for k in range(75):
+        traffic.encoder["EncRot"] = place + round(0.002 * k / abs(unit_rad))
+        assert traffic.tick() is Verdict.GOOD
+    for k in range(75, 150):
+        traffic.encoder["EncRot"] = place + round(0.004 * k / abs(unit_rad))
+        traffic.tick()
+    assert traffic.guard.verdict in (Verdict.MOVING, Verdict.LATCHED)
+
+
+def test_a_guard_that_was_latched_before_it_was_restarted_waits_for_the_button():
+    traffic = Traffic()
+    traffic.guard = build(PROFILE, latched=True)
+    assert traffic.tick(100) is Verdict.LATCHED and traffic.pilot[-1]["Supply"] == 0
+    assert press_reset(traffic) is Verdict.GOOD and not traffic.guard.latched

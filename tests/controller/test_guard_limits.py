@@ -142,6 +142,37 @@ def test_a_linear_encoder_has_neither_turns_nor_a_time() -> None:
     assert joint.position == pytest.approx(6.0) and joint.stamp_ns == 2 * MS
 
 
+@pytest.mark.parametrize(("counts", "told_at"), [(4, None), (-4, None), (6, 5), (-6, 5), (30, 3)])
+def test_a_joint_that_lasts_above_its_speed_is_told_once(counts: int, told_at: int | None) -> None:
+    """One frame each 20 ms: its limit is 4 counts a frame, the place follows by 4.4, and 4 counts are its slack."""
+    joint, told = MeasuredJoint(AXIS, ENCODER), []
+    for k in range(60):
+        moved = min(k, 50) * counts
+        joint.receive(encoder_frame(8192 + moved, k + 1, (1000 + 20 * k) * MS), (1000 + 20 * k) * MS)
+        told.append(joint.too_fast())
+        if told[-1]:
+            assert not joint.too_fast(), "its place is where it is now"
+            break
+    assert (told.index(True) if told_at else any(told)) == (told_at or False)
+
+
+@pytest.mark.parametrize(("gap_ms", "told"), [(89, True), (90, False)])
+def test_where_a_joint_is_after_its_encoder_was_silent_is_its_place(gap_ms: int, told: bool) -> None:
+    joint = MeasuredJoint(AXIS, ENCODER)
+    joint.receive(encoder_frame(8192, 1, 1000 * MS), 1000 * MS)
+    for k in range(3):
+        at_ns = (1000 + gap_ms + k) * MS
+        joint.receive(encoder_frame(8192 + 500, 2 + k, at_ns), at_ns)
+    assert joint.too_fast() is told
+
+
+def test_two_samples_that_jump_are_an_encoder_s_fault() -> None:
+    joint = MeasuredJoint(AXIS, ENCODER)
+    for k, jump in enumerate((0, 900, 900, 0, 900, 0, 0)):
+        joint.receive(encoder_frame(8192 + jump, k + 1, (1000 + 5 * k) * MS), (1000 + 5 * k) * MS)
+        assert not joint.too_fast()
+
+
 # -- motion ------------------------------------------------------------------------------------------------------------
 
 
@@ -312,8 +343,9 @@ def test_a_valve_of_the_other_sign_swaps_its_sides(changed: dict) -> None:
     assert axis.rate_pct_s == pytest.approx(100.0 * 6.0 * 0.5 / 0.25)
     assert axis.closing_ns == (150 * MS if "lag_s" in changed else 30 * MS)
     assert (axis.total_counts, axis.zero_counts, axis.unit) == (16384, 5, -0.5)
-    linear = _axis(3, {"valve": valve, "encoder": encoder | {"kind": "linear"}}, limits)
-    assert (linear.total_counts, linear.message) == (0, "EncTilt")
+    telescope = {"valve": valve | {"signal": "Ext"}, "encoder": encoder | {"kind": "linear", "message": "EncExt"}}
+    linear = _axis(3, telescope, limits)
+    assert (linear.total_counts, linear.message) == (0, "EncExt")
 
 
 def test_layouts_are_those_of_the_database() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
@@ -11,6 +12,8 @@ from can_dbc.bus.base import BusError, BusState
 from can_dbc.frame import EXTENDED
 from controller.guard import __main__ as process
 from controller.guard.__main__ import build, main, profile_path
+from controller.guard.guard import Guard
+from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.verdicts import Verdict
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
@@ -69,6 +72,14 @@ def run_guard(monkeypatch, world: World, *arguments: str) -> int:
     for name in ("stop_garbage_collection", "keep_memory"):
         monkeypatch.setattr(process, name, lambda: None)
     return main(["--profile", "palms_471", "--bus", "crane0=here", *arguments])
+
+
+@pytest.fixture(autouse=True)
+def state(monkeypatch, tmp_path):
+    """The folder of the service's state."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    return tmp_path / "state" / "latched"
 
 
 @pytest.mark.usefixtures("handlers")
@@ -172,14 +183,14 @@ def test_without_a_profile_it_does_not_start(capsys):
 def test_the_rate_is_that_of_the_profile_or_the_option(monkeypatch, options, rate_hz):
     asked = []
     monkeypatch.setattr(
-        process, "build", lambda _path, rate_hz: asked.append(rate_hz) or build(profile_path("palms_471"))
+        process, "build", lambda _path, rate_hz, latched: asked.append(rate_hz) or build(profile_path("palms_471"))
     )
     assert run_guard(monkeypatch, World(2), *options) == 0
     assert asked == [rate_hz]
 
 
 def test_commands_at_another_rate_have_its_period(monkeypatch):
-    monkeypatch.setattr(process, "Guard", lambda envelope, _layouts: envelope)
+    monkeypatch.setattr(process, "Guard", lambda envelope, *_more: envelope)
     assert build(profile_path("palms_471")).period_ns == 5_000_000
     assert build(profile_path("palms_471"), rate_hz=1000).period_ns == 1_000_000
 
@@ -216,6 +227,12 @@ def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch
             watched.append((self.bus, now_ns))
 
     class Judge:
+        latched = True
+        pressed: ClassVar[list[int]] = []
+
+        def hear(self, action, _now_ns):
+            self.pressed.append(action)
+
         def step(self, _now_ns, frames):
             judged.append(list(frames))
             return [(0x77F, b""), (0x18FF_0000 | EXTENDED, b"")]
@@ -233,9 +250,66 @@ def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch
     monkeypatch.setattr(process, "sleep_until", sleep_until)
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: clock[0]))
     notifier = SimpleNamespace(tick_done=lambda _now, in_time: punctual.append(in_time), stopping=lambda: None)
-    process.run(Judge(), ["crane0", "mach0"], ended, notifier)
+    kept = []
+    ear = SimpleNamespace(actions=lambda now_ns: [now_ns // T])
+    process.run(Judge(), ["crane0", "mach0"], ended, notifier, SimpleNamespace(keep=kept.append), ear)
+    assert kept == [True] * 3 and Judge.pressed == [1, 3, 4], "at the time at which it woke"
     assert judged == [[(1, 0x181, b"a")], [(2, 0x182, b"b"), (3, 0x8CFF_0000, b"c")], []]
     assert [bus for bus, _ in watched] == ["crane0", "mach0"] * 3
     assert sent[:2] == [("crane0", [(0x77F, b"")]), ("mach0", [(0x18FF_0000 | EXTENDED, b"")])]
     assert deadlines == [T, 2 * T, 4 * T], "a whole period late: that period is left out"
     assert punctual == [True, False, True]
+
+
+@pytest.mark.usefixtures("handlers")
+def test_the_latch_survives_the_process_until_a_person_resets_it(monkeypatch, capsys, state):
+    world = World(20)
+    assert run_guard(monkeypatch, world) == 0 and not state.exists(), "nothing has happened"
+    world = World(20)
+    world.sleep_before = world.sleep_until
+
+    def meet_another_guard(deadline_ns: int) -> None:
+        world.sleep_before(deadline_ns)
+        if world.ticks == 10:
+            world.heard["here"].send(DATABASE.message("GuardStat").key, bytes(8))
+
+    world.sleep_until = meet_another_guard
+    assert run_guard(monkeypatch, world) == 0 and state.exists()
+    latched = []
+    monkeypatch.setattr(process, "Guard", lambda *given: latched.append(given[2]) or Guard(*given))
+    assert run_guard(monkeypatch, World(20)) == 0 and latched == [True]
+    assert state.exists(), "nobody has pressed reset"
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_latch_that_cannot_be_kept_stops_the_start(monkeypatch, capsys, tmp_path):
+    (tmp_path / "file").touch()
+    assert run_guard(monkeypatch, World(3), "--state", str(tmp_path / "file" / "latched")) == 3
+    assert "--state" in capsys.readouterr().err
+
+
+def test_a_latch_file_is_there_while_the_guard_is_latched(tmp_path, capsys):
+    latch = LatchFile(tmp_path / "new" / "latched")
+    assert not latch.latched
+    for latched in (False, True, True, False, True):
+        latch.keep(latched)
+        assert (tmp_path / "new" / "latched").exists() is latch.latched is latched
+        assert LatchFile(tmp_path / "new" / "latched").latched is latched
+    (tmp_path / "new" / "latched").unlink()
+    (tmp_path / "new").rmdir()
+    for _ in range(2):
+        latch.keep(False)
+        assert latch.latched, "it is tried again"
+    assert capsys.readouterr().err.count("guard: ") == 1
+
+
+def test_without_a_service_the_latch_is_kept_in_shared_memory(monkeypatch, tmp_path):
+    monkeypatch.delenv("STATE_DIRECTORY")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    assert default_path() == tmp_path / "guard.latched"
+
+
+@pytest.mark.usefixtures("handlers")
+def test_its_socket_for_the_operator_is_removed_at_the_end(monkeypatch, tmp_path):
+    assert run_guard(monkeypatch, World(3)) == 0
+    assert not any((tmp_path / "run-guard").iterdir())

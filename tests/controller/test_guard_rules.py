@@ -18,8 +18,8 @@ from tests.controller.guard_traffic import (
 
 CASES = BROKEN | DRIVE_BROKEN
 EXACT_STEPS = {
-    "command A gone": 11, "command B gone": 11, "estop gone": 7, "encoder gone": 19, "outside": 2,
-    "joint moves without a command": 3, "person in the zone": 61, "pin into the ground": 2,
+    "command A gone": 4, "command B gone": 4, "estop gone": 7, "encoder gone": 19, "outside": 2,
+    "joint moves without a command": 3, "too fast a motion": 3, "person in the zone": 61, "pin into the ground": 2,
     "controller says it has stopped": 41, "controller says nothing": 61, "drive command gone": 16,
     "arm command gone": 16, "state gone": 18, "rolls although it brakes": 301, "person while it drives": 441,
 }  # fmt: skip
@@ -203,7 +203,7 @@ def test_a_person_beside_a_machine_that_stands_breaks_no_rule() -> None:
 def test_a_bad_frame_makes_no_later_command_punctual() -> None:
     """Commands are 35 ms late, then one has a wrong checksum, then they are 45 ms late."""
     traffic = Traffic().good()
-    late_ticks = {"ValveCmdA"}
+    late_ticks = {"ValveCmdA", "ValveCmdB"}
     traffic.dropped = set(late_ticks)
     traffic.tick(7)
     traffic.dropped = set()

@@ -18,6 +18,7 @@ from can_dbc.timing.page import Facts, ProcessCounters
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.config import load as settings_of
 from controller.guard.__main__ import build, profile_path, split
+from controller.guard.operator import action_of
 from controller.process.tick_recording import record
 from controller.step import Controller, step
 from controller.tick import Inputs
@@ -71,6 +72,8 @@ class Virtual:
             self.for_guard = []
         inputs.frames += [Frame(self.now_ns, key, data) for key, data in guarded]
         inputs.operator[:], self.pressed = self.pressed, []
+        for command in inputs.operator:
+            self.guard.hear(action_of(command, None, 0, self.now_ns)[0], self.now_ns)
         inputs.datagrams[:], self.datagrams = self.datagrams, []
         outputs = step(self.controller, inputs, self.now_ns)
         self.observer.add(record(inputs, outputs, self.now_ns))

@@ -25,6 +25,7 @@ class FrameByFrame:
         self.keys_of_buses = guard.keys_of_buses
         self.refused: list[tuple[Verdict, int]] = []
         self._guard, self._ready = guard, False
+        self.hear = guard.hear
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
         sent: list[RawFrame] = []

@@ -186,3 +186,18 @@ def test_profiles_are_frozen():
     assert isinstance(profile, Profile)
     with pytest.raises(AttributeError):
         profile.rate_hz = 100  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code"),
+    [
+        ("schema = 1", "schema = 1\nx = " + 5000 * "[" + 5000 * "]", "profile.broken-toml"),
+        ("rate_hz = 200", "rate_hz = 2" + 5000 * "0", "profile.broken-toml"),
+        ("rate_hz = 200", "rate_hz = 2" + 399 * "0", "profile.out-of-range"),
+    ],
+)
+def test_brackets_and_digits_beyond_what_python_reads_are_refused_in_a_sentence(tmp_path, old, new, code):
+    path = tmp_path / "deep.toml"
+    path.write_text(SHIPPED.read_text().replace(old, new))
+    with pytest.raises(ProfileError, check=coded(code)):
+        load_profile(path)

@@ -1,0 +1,144 @@
+"""The guard hears the person itself: nothing moves without an ARM that it heard, and nothing for long after a STOP."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from can_dbc.messages import operator_link
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
+from can_dbc.messages.datagrams import encode
+from controller.guard.layout import GuardConfigError
+from controller.guard.operator import AGE_NS, Ear, action_of
+from controller.guard.verdicts import DRIVE_AXIS, NO_AXIS, Verdict
+from tests.codes import coded
+from tests.controller.bench import MS, T, count_until
+from tests.controller.guard_traffic import DRIVING, MOVING, Traffic
+
+ARM, DISARM, STOP, RESET = OperatorAction.ARM, OperatorAction.DISARM, OperatorAction.STOP, OperatorAction.RESET
+NOW, KEY = 10**10, b"k" * 16
+
+
+def opened(traffic: Traffic, percent: float = 60.0) -> Traffic:
+    """The slew is commanded to open so far."""
+    for k in range(200):
+        traffic.a = {"Mode": 2, "Slew": min(percent, 0.5 * k)}
+        assert traffic.tick() is Verdict.GOOD
+    return traffic
+
+
+def test_a_controller_that_arms_itself_moves_nothing() -> None:
+    traffic = Traffic()
+    assert traffic.tick(60) is Verdict.GOOD
+    traffic.a, traffic.b["ArmKey"], traffic.controller["Mode"] = dict(MOVING), 0xA, 3
+    traffic.tick()
+    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.NOT_ARMED, NO_AXIS)
+    drive = Traffic("aoro_fc8")
+    drive.tick(60)
+    drive.drive = dict(DRIVING)
+    assert count_until(drive.tick, lambda: not drive.guard.enabled) <= 5
+    assert (drive.guard.verdict, drive.guard.axis) == (Verdict.NOT_ARMED, DRIVE_AXIS)
+
+
+def test_an_arm_before_the_guard_enables_is_none() -> None:
+    traffic = Traffic().press()
+    traffic.tick(60)
+    traffic.a.update(MOVING)
+    assert traffic.tick() is Verdict.NOT_ARMED
+
+
+@pytest.mark.parametrize("action", [DISARM, STOP, RESET])
+@pytest.mark.parametrize(("kept", "ms"), [(1.0, 90), (0.76, 90), (0.7, 205)])
+def test_a_controller_that_goes_on_after_a_stop_is_cut(action: OperatorAction, kept: float, ms: int) -> None:
+    """As open as before, or as far as the ramp is watched: cut within 100 ms, or when the ramp must be over."""
+    traffic = opened(Traffic().good())
+    traffic.press(action)
+    shut = 12.0
+    traffic.a["Slew"] = shut + kept * (60.0 - shut)
+    assert count_until(traffic.tick, lambda: not traffic.guard.enabled) * T == ms * MS
+    assert traffic.guard.verdict is Verdict.NOT_ARMED
+
+
+def test_a_ramp_of_150_ms_after_a_stop_passes() -> None:
+    traffic = opened(Traffic().good())
+    traffic.press(STOP)
+    traffic.tick(2)
+    for k in range(30):
+        traffic.a["Slew"] = 60.0 - 1.6 * k
+        assert traffic.tick() is Verdict.GOOD
+    traffic.a = {"Mode": 0, "Slew": 0.0}
+    assert traffic.tick(100) is Verdict.GOOD
+    traffic.press()
+    traffic.a = dict(MOVING)
+    assert traffic.tick(60) is Verdict.GOOD, "armed again"
+
+
+def test_a_second_stop_gives_no_more_time() -> None:
+    traffic = opened(Traffic().good())
+    for k in range(19):
+        traffic.press(STOP)
+        assert (traffic.tick() is Verdict.GOOD) is (k < 17), k
+
+
+def test_a_carrier_has_the_time_of_its_brake_after_a_stop() -> None:
+    traffic = Traffic("aoro_fc8").good()
+    traffic.drive = dict(DRIVING)
+    traffic.tick(40)
+    assert traffic.press(STOP).tick(439) is Verdict.GOOD
+    count_until(traffic.tick, lambda: not traffic.guard.enabled, 3)
+    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.NOT_ARMED, DRIVE_AXIS)
+
+
+def test_after_the_guard_s_own_cut_a_person_arms_again() -> None:
+    traffic = opened(Traffic().good(), 13.0)
+    traffic.dropped |= {"ValveCmdA", "ValveCmdB"}
+    assert traffic.tick(20) is Verdict.NO_COMMAND
+    traffic.dropped.clear()
+    assert traffic.tick(10) is Verdict.CALMING, "what the controller has on its way breaks no further rule"
+    traffic.a = {"Mode": 0}
+    assert traffic.tick(60) is Verdict.GOOD
+    traffic.a = dict(MOVING)
+    assert traffic.tick() is Verdict.NOT_ARMED
+
+
+# -- datagrams ---------------------------------------------------------------------------------------------------------
+
+
+def command(action: OperatorAction, stamp_ns: int = NOW, key: bytes | None = None) -> bytes:
+    return encode(OperatorCommand(1, 0, stamp_ns, action), key)
+
+
+def test_a_command_counts_once_in_its_time_and_with_its_key() -> None:
+    assert action_of(command(ARM), None, 0, NOW) == (ARM, NOW)
+    assert action_of(command(ARM), None, NOW, NOW) == (0, NOW), "replayed"
+    assert action_of(command(ARM, NOW + 1000), None, 0, NOW) == (0, 0), "from the future"
+    assert action_of(command(ARM, NOW - AGE_NS), None, 0, NOW) == (0, 0), "too old"
+    assert action_of(command(ARM, NOW - AGE_NS + 1000), None, 0, NOW)[0] == ARM
+    assert action_of(command(ARM), KEY, 0, NOW) == (0, 0)
+    assert action_of(command(ARM, key=KEY), KEY, 0, NOW) == (ARM, NOW)
+    assert action_of(b"nothing", KEY, 7, NOW) == (0, 7)
+
+
+def test_stop_is_heard_from_anyone() -> None:
+    for data in (command(STOP), command(STOP, 1000), command(STOP, key=KEY)):
+        assert action_of(data, KEY, NOW, NOW) == (STOP, NOW)
+
+
+def test_both_sockets_hear_what_is_sent_to_one(tmp_path: Path) -> None:
+    path = tmp_path / "operators" / "controller"
+    ear = Ear(operator_link.guard_path(path))
+    assert ear.actions(NOW) == []
+    for _ in range(2):
+        with pytest.raises(FileNotFoundError):
+            operator_link.send(command(ARM), path)
+    assert ear.actions(NOW) == [ARM, 0]
+    assert operator_link.guard_path(path).stat().st_mode & 0o777 == 0o660
+    ear.close()
+    assert not operator_link.guard_path(path).exists()
+
+
+def test_a_socket_that_cannot_be_made_stops_the_start(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(GuardConfigError, check=coded("guard.operator")):
+        Ear(tmp_path / "file" / "socket")
