@@ -333,7 +333,7 @@ def test_a_valve_of_the_other_sign_swaps_its_sides(changed: dict) -> None:
     } | changed  # fmt: skip
     limits = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
     encoder = {
-        "kind": "rotary", "message": "EncTilt", "total_counts": 16384, "zero_counts": 5, "unit_per_count": 0.5,
+        "kind": "rotary", "message": "EncTilt", "total_counts": 16384, "zero_counts": 5, "unit_per_count": 0.05,
         "direction": -1,
     }  # fmt: skip
     axis = _axis(2, {"valve": valve, "encoder": encoder}, limits)
@@ -342,7 +342,7 @@ def test_a_valve_of_the_other_sign_swaps_its_sides(changed: dict) -> None:
     assert axis.full_speeds == ((0.5, 0.25) if plus_first else (0.25, 0.5))
     assert axis.rate_pct_s == pytest.approx(100.0 * 6.0 * 0.5 / 0.25)
     assert axis.closing_ns == (150 * MS if "lag_s" in changed else 30 * MS)
-    assert (axis.total_counts, axis.zero_counts, axis.unit) == (16384, 5, -0.5)
+    assert (axis.total_counts, axis.zero_counts, axis.unit) == (16384, 5, -0.05)
     telescope = {"valve": valve | {"signal": "Ext"}, "encoder": encoder | {"kind": "linear", "message": "EncExt"}}
     linear = _axis(3, telescope, limits)
     assert (linear.total_counts, linear.message) == (0, "EncExt")

@@ -8,6 +8,7 @@ import os
 import socket
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ from can_dbc.bus.base import BusState
 from controller.config import load
 from controller.guard.__main__ import build, profile_path
 from controller.guard.__main__ import run as run_guard
+from controller.guard.latch_file import LatchFile
+from controller.guard.operator import Ear
 from controller.process.loop import Loop
 from controller.process.realtime import Notifier
 from controller.process.timing import LoopTiming
@@ -219,12 +222,14 @@ def test_ten_seconds_of_ticks_leaves_no_garbage(systemd: Systemd, loop: Loop) ->
 
 
 @pytest.mark.parametrize("state", [BusState.ACTIVE, BusState.DOWN])
-def test_the_guard_lives_with_a_bus_and_without_one(systemd: Systemd, state: BusState) -> None:
+def test_the_guard_lives_with_a_bus_and_without_one(systemd: Systemd, state: BusState, tmp_path: Path) -> None:
     guard, bus = build(profile_path("palms_471")), SilentBus()
     bus.stats.state = state
     ended: list[int] = []
     bus.at_send = lambda: ended.append(15) if len(bus.sent) >= 10 else None
-    run_guard(guard, [bus], ended, Notifier(lambda: f"{guard.verdict.name} {bus.stats.state.name}"))
+    notifier = Notifier(lambda: f"{guard.verdict.name} {bus.stats.state.name}")
+    with closing(Ear(tmp_path / "guard" / "operator")) as ear:
+        run_guard(guard, [bus], ended, notifier, LatchFile(tmp_path / "latched"), ear)
     *others, last = systemd.heard()
     assert last == {"STOPPING": "1", "STATUS": "Ending."}
     assert others[0] == {"READY": "1", "WATCHDOG": "1", "STATUS": f"ESTOP_LOST {state.name}"}
