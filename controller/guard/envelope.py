@@ -110,6 +110,9 @@ def read_envelope(path: Path) -> Envelope:
         limits = _sealed(_find(path, str(profile["name"])))
         _compare(path, profile, limits)
         axes = tuple(_axis(i, profile["joints"][n], _limits(limits["joints"][n])) for i, n in enumerate(JOINT_NAMES))
+        messages = [axis.message for axis in axes if axis.message]
+        if len(set(messages)) < len(messages):
+            raise ValueError(f"two joints have one encoder: {', '.join(messages)}")
         boxes = tuple((_corner(box["low_m"]), _corner(box["high_m"])) for box in limits.get("boxes", ()))
         if any(not all(a < b for a, b in zip(*box, strict=True)) for box in boxes):
             raise ValueError("a box has its corners the wrong way round")
@@ -207,7 +210,7 @@ def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
         raise ValueError(f"the valve of {name} has the sign {valve['sign']!r} and the signal {valve['signal']!r}")
     if encoder is not None:
         _within(encoder, _ENCODER)
-        if encoder["direction"] not in (-1, 1) or encoder["message"] != f"Enc{name}" or linear != (name == "Ext"):
+        if encoder["direction"] not in (-1, 1) or linear != (encoder["message"] == "EncExt"):
             raise ValueError(f"the encoder of {name} is {encoder['message']!r}, {encoder['direction']!r}")
     return Axis(
         number=number,

@@ -60,8 +60,8 @@ _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
 _GRAPPLE_SIDE: Final = (0.0, 1.0, -1.0, -1.0)
 """Side of the grapple's spool by GrappleMode: neutral, opens, closes, holds."""
 _RELEASED, _PRESSED, _YES = 1, 1, 1
-_ARM, _ENDS = 1, (2, 3, 4)
-"""A person's ARM; DISARM, STOP and RESET."""
+_ARM, _ENDS = 1, (2, 3)
+"""A person's ARM; DISARM and STOP.  RESET ends nothing: a machine that works goes on."""
 _OPERATING: Final = (2, 3)
 """CtrlStatus.Mode: armed, run."""
 MESSAGES: Final = (

@@ -138,7 +138,7 @@ def test_three_refusals_within_a_second_stop_a_driving_machine():
 def test_three_unreadable_datagrams_within_a_second_stop_a_driving_machine():
     """Nobody can tell for whom they were: they count for whatever moves.  The lease would stop it 50 ms later."""
     bench = DriveBench().under_way(120)
-    for sent in (b"", b"rubbish"):
+    for sent in (b"?", b"rubbish"):
         bench.tick([sent])
         bench.run(9)
     assert bench.mode is Mode.ACTIVE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,12 @@ import pytest
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
+from controller.guard import operator
 from controller.guard.layout import GuardConfigError
 from controller.guard.operator import AGE_NS, Ear, action_of
 from controller.guard.verdicts import DRIVE_AXIS, NO_AXIS, Verdict
 from tests.codes import coded
-from tests.controller.bench import MS, T, count_until
+from tests.controller.bench import MS, Bench, T, count_until
 from tests.controller.guard_traffic import DRIVING, MOVING, Traffic
 
 ARM, DISARM, STOP, RESET = OperatorAction.ARM, OperatorAction.DISARM, OperatorAction.STOP, OperatorAction.RESET
@@ -48,7 +50,7 @@ def test_an_arm_before_the_guard_enables_is_none() -> None:
     assert traffic.tick() is Verdict.NOT_ARMED
 
 
-@pytest.mark.parametrize("action", [DISARM, STOP, RESET])
+@pytest.mark.parametrize("action", [DISARM, STOP])
 @pytest.mark.parametrize(("kept", "ms"), [(1.0, 90), (0.76, 90), (0.7, 205)])
 def test_a_controller_that_goes_on_after_a_stop_is_cut(action: OperatorAction, kept: float, ms: int) -> None:
     """As open as before, or as far as the ramp is watched: cut within 100 ms, or when the ramp must be over."""
@@ -102,6 +104,12 @@ def test_after_the_guard_s_own_cut_a_person_arms_again() -> None:
     assert traffic.tick() is Verdict.NOT_ARMED
 
 
+def test_reset_while_it_works_changes_nothing() -> None:
+    traffic = opened(Traffic().good())
+    traffic.press(RESET)
+    assert traffic.tick(100) is Verdict.GOOD
+
+
 # -- datagrams ---------------------------------------------------------------------------------------------------------
 
 
@@ -118,6 +126,21 @@ def test_a_command_counts_once_in_its_time_and_with_its_key() -> None:
     assert action_of(command(ARM), KEY, 0, NOW) == (0, 0)
     assert action_of(command(ARM, key=KEY), KEY, 0, NOW) == (ARM, NOW)
     assert action_of(b"nothing", KEY, 7, NOW) == (0, 7)
+
+
+def test_what_is_no_command_of_a_person_is_worth_nothing() -> None:
+    assert action_of(Bench().armed().hold(), None, 7, NOW) == (0, 7)
+
+
+def test_a_flood_waits_for_the_next_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(operator, "MOST", 2)
+    path = tmp_path / "operators" / "controller"
+    with closing(Ear(operator_link.guard_path(path))) as ear:
+        for _ in range(3):
+            with pytest.raises(FileNotFoundError):
+                operator_link.send(command(STOP), path)
+        assert ear.actions(NOW) == [STOP] * 2
+        assert ear.actions(NOW) == [STOP]
 
 
 def test_stop_is_heard_from_anyone() -> None:

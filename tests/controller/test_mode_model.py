@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from can_dbc.messages.crane import OperatorAction
 from controller.guard.guard import LATCHING, Verdict
 from controller.transitions import OPERATING, Event
 from machine.status.faults import FAULTS
@@ -190,6 +191,8 @@ def test_guard_and_valve_node_follow_the_model(seed: int) -> None:
             rig.command(replace(state, pilot_on=state.pilot_on or not state.pressed))
             rig.press()
         state = after(state, name)
+        if name in OperatorAction.__members__:
+            rig.traffic.press(OperatorAction[name])
         if state.mode in OPERATING and name == "time":
             state = after(state, "done")
             names.append("done")
