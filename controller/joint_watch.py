@@ -124,6 +124,7 @@ class JointWatch:
             if pct != 0.0:
                 open_valves += 1
         shaken = from_outside or open_valves > 0
+        pressed = crane.grapple.presses(now_ns)
         self._yield.step(crane.load_kg, crane.grapple.spool_pct != 0.0, crane.roll_rad, crane.pitch_rad)
         moving, stands = NO_JOINT, True
         for j in range(N_JOINTS):
@@ -146,7 +147,7 @@ class JointWatch:
             # Tongs that close about logs or release them turn the rotator against its valve, and its law turns it
             # back: only a fast motion of it is a runaway, and none is drift.
             slack = self._yield.rad if j == _SLEW else 0.0
-            if standstill.step(neutral, shaken, estimator.position, slack) and j != _ROT:
+            if standstill.step(neutral, shaken, estimator.position, slack, pressed) and j != _ROT:
                 reason = _RUNAWAY
             elif reason is _REVERSED and j == _ROT and crane.grapple.at_work:
                 reason = _NONE

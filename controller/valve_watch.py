@@ -83,6 +83,7 @@ class ValveWatch:
             return
         moved_by_law = supervisor.mode is _ACTIVE and crane.leased and not crane.spool_run.running
         limited = self._flow_limited.value() == 1
+        pressed = crane.grapple.presses(now_ns)
         for j in range(N_JOINTS):
             spool_pct, expected = self._measured[j].value(), crane.commands[j]
             if spool_pct is not None:
@@ -97,6 +98,6 @@ class ValveWatch:
             if turned or not moved_by_law or limited or not estimator.known or estimator.jumped:
                 self._speeds[j].reset()
                 continue
-            reason = self._speeds[j].step(expected, estimator.velocity)
+            reason = self._speeds[j].step(expected, estimator.velocity, pressed)
             if reason is not _NONE:
                 supervisor.react_to(reason, j, now_ns)

@@ -41,6 +41,8 @@ SLOWEST: Final = 0.75
 STOOD: Final = 0.25
 """Times the map's speed; a joint slower than the last stands."""
 FAST_S: Final = 0.05
+FAST_PRESSED_S: Final = 0.25
+"""A log that the jaws let go throws the boom up on its oil for a tenth of a second or two."""
 SLOW_S: Final = 0.07
 STICKING_S: Final = 0.3
 STICKING_SHARE: Final = 1.5
@@ -89,8 +91,10 @@ class SpeedMonitor:
         self._range.reset(0.0)
         self._stood_s = self._fast_s = self._slow_s = self._backwards_s = 0.0
 
-    def step(self, expected: float, velocity: float) -> Reason:
-        """One period with the speed that belongs to the valve and the measured one [rad/s or m/s]."""
+    def step(self, expected: float, velocity: float, pressed: bool = False) -> Reason:
+        """One period with the speed that belongs to the valve and the measured one [rad/s or m/s], and whether the
+        jaws press on the joint.
+        """
         seen, dt = self._range, self._period_s
         seen.add(expected)
         lowest, highest = seen.low, seen.high
@@ -121,7 +125,7 @@ class SpeedMonitor:
         self._backwards_s = self._backwards_s + dt if backwards else 0.0
         self._slow_s = self._slow_s + dt if slow and not stood else 0.0
         self._fast_s = self._fast_s + dt if fast else 0.0
-        if self._fast_s >= FAST_S:
+        if self._fast_s >= (FAST_PRESSED_S if pressed else FAST_S):
             return _RUNAWAY
         slow_s = SLOW_S if low > STICKING_SHARE * self._doubt else STICKING_S
         if self._backwards_s >= BACKWARDS_S or self._slow_s >= slow_s:

@@ -7,8 +7,9 @@ and measures how far, and for how long, the joint goes out of it in one directio
 grows to every turning point, and shrinks towards the joint in `FORGET_S`.
 
 Far away in a short time counts as much as near in a long one: a joint runs away when it is out by more than a distance
-and the product of distance and time is over the limit.  The distance is small while everything is calm and greater
-while another function moves or the carrier drives, because they shake the joint.
+and the product of distance and time is over the limit.  The distance is small while everything is calm, greater
+while another function moves or the carrier drives, because they shake the joint, and greatest while the jaws are at
+work: they press on ground and logs, and a log that they let go relieves the boom.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ CALM_S_AT_LIMIT: Final = 0.011
 (0.2 mrad), and less than 3 % of the speed limit cover in 0.5 s."""
 SHAKEN_S_AT_LIMIT: Final = 0.03
 """Distance while something else moves: a grapple that swings by 0.1 rad turns the slew by 5 mrad on its oil."""
+PRESSED_S_AT_LIMIT: Final = 0.1
+"""Distance while the jaws press: closing in a heap turned a slew by 17 mrad (0.038 s), and it would have gone on."""
 HOLD_S: Final = 0.15
 """Time at the distance that makes a runaway; at twice the distance half of it."""
 REST_S: Final = 0.5
@@ -44,7 +47,7 @@ class StandstillMonitor:
 
     __slots__ = (
         "_calm_far", "_calm_s", "_closing_s", "_forget", "_gone_to", "_high", "_low", "_neutral_s", "_noise", "_out_s",
-        "_peak", "_period_s", "_rest_s", "_shaken_far", "_started", "moves", "quiet_s",
+        "_peak", "_period_s", "_pressed_far", "_rest_s", "_shaken_far", "_started", "moves", "quiet_s",
     )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float, delay_s: float = 0.0, least_speed: float = 0.0) -> None:
@@ -59,6 +62,7 @@ class StandstillMonitor:
         self._forget = period_s / FORGET_S
         self._calm_far = CALM_S_AT_LIMIT * usual
         self._shaken_far = SHAKEN_S_AT_LIMIT * usual
+        self._pressed_far = PRESSED_S_AT_LIMIT * usual
         self.moves = False
         self.reset()
 
@@ -70,9 +74,9 @@ class StandstillMonitor:
         self.quiet_s = 0.0
         """How long the joint has not moved."""
 
-    def step(self, neutral: bool, shaken: bool, position: float, slack: float = 0.0) -> bool:
-        """One period: whether the valve is ``neutral``, whether something else shakes the joint, its position, and how
-        much farther it may yield to a slope (`controller.estimation.slope_yield`).
+    def step(self, neutral: bool, shaken: bool, position: float, slack: float = 0.0, pressed: bool = False) -> bool:
+        """One period: whether the valve is ``neutral``, whether something else shakes the joint, its position, how
+        much farther it may yield to a slope (`controller.estimation.slope_yield`), and whether jaws press on it.
         """
         if not self._started or not neutral:
             self._started = True
@@ -85,7 +89,7 @@ class StandstillMonitor:
         self._calm_s = 0.0 if shaken else self._calm_s + dt
         calm = self._calm_s > CALM_S
         begins = calm and self._calm_s <= CALM_S + dt  # the range that counts now is that of the shaken joint
-        far = (self._calm_far if calm else self._shaken_far) + slack
+        far = slack + (self._pressed_far if pressed else self._calm_far if calm else self._shaken_far)
         low, high = self._low, self._high
         if position > high:
             out = position - high

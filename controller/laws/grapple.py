@@ -30,6 +30,8 @@ _PERSISTS_NS: Final = 60_000_000
 _JAMMED_NS: Final = 1_000_000_000
 """An opening begins within this time, or the jaws are jammed."""
 _JAMMED_PCT: Final = 2.0
+_PRESSES_NS: Final = 1_200_000_000
+"""A joint comes to rest on its oil within half of its slowest period (2.5 s)."""
 _SHAKE_NS: Final = 300_000_000
 _MAX_SHAKES: Final = 3
 LOADED_KG: Final = 30.0
@@ -58,15 +60,29 @@ class GrappleLaw:
     """The grapple's sequence; `step` while active, `release` in every other mode."""
 
     __slots__ = (
-        "_close_ns", "_from_pct", "_high_ns", "_hold_bar", "_load_ns", "_loose_ns", "_open_ns", "_shakes",
-        "_shaking_until_ns", "_since_ns", "_squeezed", "loaded", "mode", "spool_pct", "state",
+        "_close_ns",
+        "_from_pct",
+        "_high_ns",
+        "_hold_bar",
+        "_load_ns",
+        "_loose_ns",
+        "_open_ns",
+        "_presses_until_ns",
+        "_shakes",
+        "_shaking_until_ns",
+        "_since_ns",
+        "_squeezed",
+        "loaded",
+        "mode",
+        "spool_pct",
+        "state",
     )  # fmt: skip
 
     def __init__(self, grapple: Grapple) -> None:
         self._close_ns = int(grapple.close_time_s * 1e9)
         self._open_ns = int(grapple.open_time_s * 1e9)
         self._hold_bar = grapple.hold_pressure_bar
-        self._since_ns = self._shaking_until_ns = 0
+        self._since_ns = self._shaking_until_ns = self._presses_until_ns = 0
         self._load_ns = -1
         """Since when a load is measured; -1: none is."""
         self.loaded = False
@@ -82,6 +98,10 @@ class GrappleLaw:
         self.state = GrappleState.UNKNOWN
         self.spool_pct = 0.0
         self.mode = GrappleCommand.NEUTRAL
+
+    def presses(self, now_ns: int) -> bool:
+        """Whether the jaws move, or did until `_PRESSES_NS` ago: what they press on or let go moves every joint."""
+        return now_ns < self._presses_until_ns
 
     @property
     def at_work(self) -> bool:
@@ -107,6 +127,8 @@ class GrappleLaw:
         elif self.state is GrappleState.CLOSING:
             self._close(clamp_bar, opening_pct, now_ns)
         self._output(now_ns)
+        if self.spool_pct != 0.0:
+            self._presses_until_ns = now_ns + _PRESSES_NS
 
     def observe_load(self, load_kg: float, now_ns: int) -> None:
         """Use a measurement of the load in the grapple [kg], NaN while unknown; several times per second."""

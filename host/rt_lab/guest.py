@@ -107,7 +107,7 @@ def control_loop(checkout: Path) -> dict[str, Any]:
     os.sched_setscheduler(nodes.pid, os.SCHED_FIFO, os.sched_param(NODES_PRIORITY))
     page, operator = RUNTIME / "controller.timing", RUNTIME / "controller.operator"
     key_file = write_key(RUNTIME / "key")
-    guard, guard_ready = start(checkout, "controller.guard", *bus)
+    guard, guard_ready = start(checkout, "controller.guard", *bus, "--operator", operator)
     controller, controller_ready = start(
         checkout,
         "controller",

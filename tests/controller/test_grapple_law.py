@@ -184,3 +184,11 @@ def test_loose_bundle_is_gripped_again_while_close_is_requested():
     assert (law.state, law.spool_pct) == (GrappleState.HOLDING, 0.0)
     run(law, GrappleCommand.CLOSE, 1.0, math.nan, 35.0, start_ns=now)
     assert law.state is GrappleState.HOLDING, "without a pressure sensor nothing counts as loose"
+
+
+def test_jaws_press_while_they_move_and_a_while_longer():
+    law = made()
+    assert not law.presses(0)
+    now = run(law, GrappleCommand.CLOSE, 0.3)
+    law.release()
+    assert law.presses(now + 1_100_000_000) and not law.presses(now + 1_300_000_000)

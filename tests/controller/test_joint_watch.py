@@ -9,6 +9,7 @@ import pytest
 from can_dbc.messages.crane import GrappleCommand, OperatorAction
 from controller.config import Settings
 from controller.crane.motion import Crane
+from controller.laws.grapple import GrappleLaw
 from machine.joints import Joint
 from machine.loading.profile_file import profile_hash
 from machine.profile import Plc
@@ -46,6 +47,18 @@ def test_slow_motion_without_a_command_cuts_while_armed(j, share):
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, j)
     assert k * T <= (SLOW_MS if share < 0.25 else 150) * MS
     assert bench.neutral and bench.commands_b["ArmKey"] == 0
+
+
+def test_jaws_that_press_move_a_joint_and_a_valve_that_stuck_open_moves_it_on(monkeypatch):
+    """Measured on a forwarder: closing in a heap turned the slew by the way of 0.04 s at its limit."""
+    monkeypatch.setattr(GrappleLaw, "presses", lambda law, now_ns: True)
+    bench = dithering(Bench()).armed()
+    bench.run(500)
+    drifts(bench, Joint.SLEW, 0.1)
+    bench.run(80)
+    assert bench.mode is Mode.ARMED
+    assert count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 250) * T >= 500 * MS
+    assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, Joint.SLEW)
 
 
 @pytest.mark.parametrize(("output_pct", "cut"), [(9.0, False), (0.0, True)])

@@ -8,6 +8,7 @@ import pytest
 from controller.estimation.speed_monitor import (
     BACKWARDS_S,
     DEADBAND_PCT,
+    FAST_PRESSED_S,
     FAST_S,
     LEARNED_S,
     SLOW_S,
@@ -103,6 +104,13 @@ def test_a_first_motion_is_judged_with_the_doubt_about_the_dead_band():
 def test_a_shut_valve_allows_small_motion_and_no_fast_one():
     assert first(monitor(), 0.0, 0.15 * LIMIT)[0] is Reason.NONE
     assert first(monitor(), 0.0, 0.6 * LIMIT)[0] is Reason.JOINT_RUNAWAY
+
+
+def test_a_joint_that_jaws_throw_is_no_runaway_and_one_that_goes_on_is():
+    watched = monitor()
+    ticks = round(FAST_PRESSED_S / T_S)
+    assert {watched.step(0.0, 0.6 * LIMIT, pressed=True) for _ in range(ticks - 1)} == {Reason.NONE}
+    assert Reason.JOINT_RUNAWAY in {watched.step(0.0, 0.6 * LIMIT, pressed=True) for _ in range(3)}
 
 
 def test_a_reset_forgets_the_motion_and_keeps_what_was_learned():

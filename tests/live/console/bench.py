@@ -37,7 +37,7 @@ def bench(folder: Path, profile: str = "palms_471") -> Iterator[str]:
             "--audit", folder / "audit.jsonl", *keyed,
         )  # fmt: skip
         url = note(str(group.await_message("console", "url", START_S)["url"]))
-        group.start("guard", "controller.guard", *named, *bus)
+        group.start("guard", "controller.guard", *named, *bus, "--operator", operator, "--state", folder / "latched")
         group.start(
             "controller", "controller", *named, *bus, "--setpoint-port", setpoints, "--operator", operator,
             "--timing", folder / "timing", "--report", f"127.0.0.1:{reports}", *keyed,

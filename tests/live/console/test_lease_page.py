@@ -170,7 +170,8 @@ def test_who_opens_the_bare_address_looks_and_stops_and_enters_by_the_token(stag
         browser.until(
             "document.getElementById('sign-in')?.checkVisibility() && !document.getElementById('stop').disabled"
         )
-        assert all(browser.value(f"document.getElementById('{b}').disabled") for b in ("arm", "reset", "disarm"))
+        for button in ("arm", "reset", "disarm"):
+            browser.until(f"document.getElementById('{button}').disabled")
         assert browser.value("document.getElementById('lease-button') === null")
         browser.click("stop")
         browser.wait(lambda: stage.pressed == [OperatorAction.STOP], "STOP of who only looks")

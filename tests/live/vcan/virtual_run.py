@@ -56,7 +56,8 @@ class Run:
         while "ready" not in (directory / "nodes.out").read_text():
             time.sleep(0.01)
         bus = ("--profile", PROFILE, "--bus", f"crane0={BUS}")
-        self.start("guard", sys.executable, "-m", "controller.guard", *bus)
+        heard = ("--operator", str(directory / "operator"), "--state", str(directory / "latched"))
+        self.start("guard", sys.executable, "-m", "controller.guard", *bus, *heard)
         key_file = write_key(directory / "key")
         self.pilot = Pilot(PROFILE, SETPOINTS, directory / "operator", REPORTS, BUS, read_key(key_file))
         self.start(
