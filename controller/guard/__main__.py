@@ -32,7 +32,7 @@ from controller.guard.envelope import RATES_HZ, SHIPPED, read_envelope
 from controller.guard.guard import MESSAGES, Guard
 from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.layout import GuardConfigError, read_layouts
-from controller.guard.operator import Ear
+from controller.guard.operator import OperatorActions
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, prepare, sleep_until, stop_garbage_collection
 from runtime.allocator import keep_memory
@@ -74,7 +74,9 @@ def split(frames: list[RawFrame]) -> tuple[list[RawFrame], list[RawFrame]]:
     return [f for f in frames if not f[0] & EXTENDED], [f for f in frames if f[0] & EXTENDED]
 
 
-def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, latch: LatchFile, ear: Ear) -> None:
+def run(
+    guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, latch: LatchFile, operator: OperatorActions
+) -> None:
     """Run until a signal number is in ``ended``; ``buses`` are crane0, and mach0 where the machine has one."""
     frames: list[Frame] = []
     received: list[Frame] = []
@@ -89,7 +91,7 @@ def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier, la
         for link, reading in links:
             link.receive(received, reading)
             frames += received
-        for action in ear.actions(deadline_ns + late_ns % PERIOD_NS):
+        for action in operator.receive(deadline_ns + late_ns % PERIOD_NS):
             guard.hear(action, deadline_ns)
         for (link, _), out in zip(links, split(guard.step(deadline_ns, frames)), strict=False):
             link.send(out)
@@ -132,14 +134,14 @@ def main(arguments: list[str] | None = None) -> int:
         latch = LatchFile(options.state or default_path())
         guard = build(profile_path(options.profile), rate_hz=options.rate, latched=latch.latched)
         with ExitStack() as opened:
-            ear = opened.enter_context(closing(Ear(guard_path(options.operator or operator_path()))))
+            operator = opened.enter_context(closing(OperatorActions(guard_path(options.operator or operator_path()))))
             needed = [(name, keys) for name, keys in zip(BUSES, guard.keys_of_buses, strict=True) if keys]
             links = [open_link(addresses.get(name) or default_address(name), keys) for name, keys in needed]
             buses = [opened.enter_context(link) for link in links]
             if not options.no_realtime:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
-            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)), latch, ear)
+            run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)), latch, operator)
     except (GuardConfigError, BusError) as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3 if isinstance(error, GuardConfigError) else 4

@@ -1,4 +1,4 @@
-"""The controller's socket for operators: a Unix datagram socket, so that the file system decides who may arm.
+"""The operator's socket, one of the controller and one of the guard: the file system decides who may arm.
 
 Only its owner, its group and root can send there (unix(7): a sender needs write permission), and only who can read the
 credential of this start is heard (`can_dbc.messages.operator_link`), but for STOP, which needs none; as a service both

@@ -89,8 +89,8 @@ CASES: Final[tuple[Case, ...]] = (
     Case(3, "encoder-drift", "Encoder drifts by 0.5 deg/s", "H, at the next hold", "3000 ms of holding",
          (_C, Work.HOLD), draws.encoder_drift, physics=True, blind_in=(_C,), blind_as=("late",),
          blind_most_m=0.15, blind="In motion: 0.5 deg/s is 2 to 6 % of a joint's speed, and the flow through a valve "
-         "is known no better. It is seen 0.7 to 3.3 s after the crane holds its pose; until then the tip strays with "
-         "the encoder."),
+         "is known no better. It is seen once the crane holds its pose and nothing else has moved for a second; until "
+         "then the tip strays with the encoder."),
     Case(4, "encoder-noise", "Encoder noise times ten", "D", "500 ms", _CRANE, draws.encoder_noise),
     Case(5, "encoder-scale", "Encoder sign or scale swapped", "R1", "200 ms, tip travel < 0.15 m", _CRANE,
          draws.encoder_scale, physics=True, blind_as=("undetected", "late", "far"), blind_most_m=0.25,

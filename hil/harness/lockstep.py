@@ -174,7 +174,7 @@ class Lockstep:
         if disturbance is None or not disturbance.stalled("guard", self.now_ns):
             heard = [frame for bus in self._guard_buses for frame in _drained(bus)]
             for command in self._pressed:
-                action, _ = action_of(command, None, 0, self.now_ns)
+                action, _ = action_of(command, 0, self.now_ns)
                 self._guard.hear(action, self.now_ns)
             for bus, frames in zip(self._guard_buses, split(self._guard.step(self.now_ns, heard)), strict=False):
                 bus.send_all(frames)

@@ -214,7 +214,7 @@ class Bench:
             frames += self.inputs.machine_frames
             frames += [Frame(self.now_ns, key, data) for key, data in outputs.machine_frames]
             for command in self.inputs.operator:
-                self.guard.hear(action_of(command, None, 0, self.now_ns)[0], self.now_ns)
+                self.guard.hear(action_of(command, 0, self.now_ns)[0], self.now_ns)
             self.pending += split(self.guard.step(self.now_ns, frames))[0]
         if outputs.report is not None:
             report = decode(outputs.report)

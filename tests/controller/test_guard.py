@@ -324,7 +324,7 @@ def test_configuration_errors_have_codes_and_exit_codes(tmp_path, capsys):
     assert capsys.readouterr().err.count("guard: ") == 2
 
 
-def test_what_judges_has_at_most_700_lines_of_code():
+def test_what_judges_has_at_most_650_lines_of_code():
     """Without blank lines, comments and docstrings, so that explaining a rule costs nothing.
 
     Apart from what runs once, at the start (reading the files, and the process around the loop), and what
@@ -340,7 +340,7 @@ def test_what_judges_has_at_most_700_lines_of_code():
         lines = enumerate(path.read_text().splitlines(), 1)
         part = "starts" if path.stem in start else "carries" if path.stem in carries else "judges"
         code[part] += sum(k not in explained and bool(t := line.strip()) and t[0] != "#" for k, line in lines)
-    assert code["judges"] <= 700 and code["starts"] <= 380 and code["carries"] <= 260, code
+    assert code["judges"] <= 650 and code["starts"] <= 360 and code["carries"] <= 230, code
     assert Guard.__slots__
 
 

@@ -251,8 +251,8 @@ def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: clock[0]))
     notifier = SimpleNamespace(tick_done=lambda _now, in_time: punctual.append(in_time), stopping=lambda: None)
     kept = []
-    ear = SimpleNamespace(actions=lambda now_ns: [now_ns // T])
-    process.run(Judge(), ["crane0", "mach0"], ended, notifier, SimpleNamespace(keep=kept.append), ear)
+    operator = SimpleNamespace(receive=lambda now_ns: [now_ns // T])
+    process.run(Judge(), ["crane0", "mach0"], ended, notifier, SimpleNamespace(keep=kept.append), operator)
     assert kept == [True] * 3 and Judge.pressed == [1, 3, 4], "at the time at which it woke"
     assert judged == [[(1, 0x181, b"a")], [(2, 0x182, b"b"), (3, 0x8CFF_0000, b"c")], []]
     assert [bus for bus, _ in watched] == ["crane0", "mach0"] * 3

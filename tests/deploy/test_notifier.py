@@ -18,7 +18,7 @@ from controller.config import load
 from controller.guard.__main__ import build, profile_path
 from controller.guard.__main__ import run as run_guard
 from controller.guard.latch_file import LatchFile
-from controller.guard.operator import Ear
+from controller.guard.operator import OperatorActions
 from controller.process.loop import Loop
 from controller.process.realtime import Notifier
 from controller.process.timing import LoopTiming
@@ -228,8 +228,8 @@ def test_the_guard_lives_with_a_bus_and_without_one(systemd: Systemd, state: Bus
     ended: list[int] = []
     bus.at_send = lambda: ended.append(15) if len(bus.sent) >= 10 else None
     notifier = Notifier(lambda: f"{guard.verdict.name} {bus.stats.state.name}")
-    with closing(Ear(tmp_path / "guard" / "operator")) as ear:
-        run_guard(guard, [bus], ended, notifier, LatchFile(tmp_path / "latched"), ear)
+    with closing(OperatorActions(tmp_path / "guard" / "operator")) as operator:
+        run_guard(guard, [bus], ended, notifier, LatchFile(tmp_path / "latched"), operator)
     *others, last = systemd.heard()
     assert last == {"STOPPING": "1", "STATUS": "Ending."}
     assert others[0] == {"READY": "1", "WATCHDOG": "1", "STATUS": f"ESTOP_LOST {state.name}"}

@@ -73,7 +73,7 @@ class Virtual:
         inputs.frames += [Frame(self.now_ns, key, data) for key, data in guarded]
         inputs.operator[:], self.pressed = self.pressed, []
         for command in inputs.operator:
-            self.guard.hear(action_of(command, None, 0, self.now_ns)[0], self.now_ns)
+            self.guard.hear(action_of(command, 0, self.now_ns)[0], self.now_ns)
         inputs.datagrams[:], self.datagrams = self.datagrams, []
         outputs = step(self.controller, inputs, self.now_ns)
         self.observer.add(record(inputs, outputs, self.now_ns))
