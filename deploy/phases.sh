@@ -44,7 +44,7 @@ test)
     phase "pages of the documentation" pages
     # With arguments only some of the tests run, and cannot take every branch.
     [ $# -gt 0 ] || set -- --branch-coverage
-    phase tests fast --durations=15 --durations-min=5 "$@"
+    phase tests fast --durations=40 --durations-min=2 "$@"
     ;;
 live)
     # On the interpreter a forwarder's tick takes a good part of a small computer, and its browser starves.

@@ -1,9 +1,10 @@
-"""Probe: how late does a process with deadlines wake up and work here?  ``python -ISB lateness.py SECONDS``.
+"""Probe: what does this computer leave to a process with deadlines?  ``python -ISB lateness.py SECONDS``.
 
-On every processor a child sleeps until absolute deadlines 1 ms apart and then works, as the processes of a live run do,
-with their real-time priority where the system grants it.  All of them work as much as a live run: a computer without
-that much to spare, or with a quota, shows it.  Prints one JSON object.  Standard
-library alone; a process of its own, because it ends with its children.
+First it counts for half a second how many processors the others leave free, and reads what share of its time a virtual
+machine lost to its host since it started.  Then, on every processor, a child sleeps until absolute deadlines 1 ms
+apart and works, as the processes of a live run do, with their real-time priority where the system grants it; a quota
+of the processor shows there.  Prints one JSON object.  Standard library alone; a process of its own, because it ends
+with its children.
 """
 
 import contextlib
@@ -19,6 +20,27 @@ MOST = 0.75
 """Share of a processor that the probe takes at most: something must remain for the computer."""
 PRIORITY = 50
 """SCHED_FIFO of the plant in a live run (`hil.harness.live`)."""
+COUNT_S = 0.5
+STAT = "/proc/stat"
+IDLE, IOWAIT, STEAL = 3, 4, 7
+"""Fields of the line ``cpu`` of /proc/stat, in ticks of all processors since the start: proc(5)."""
+
+
+def ticks() -> list[int]:
+    """User, nice, system, idle, iowait, irq, softirq, steal; guests are within user and nice."""
+    with open(STAT) as stat:
+        return [int(field) for field in stat.readline().split()[1:9]]
+
+
+def free(before: list[int], after: list[int], processors: int) -> float:
+    """How many processors idled between two readings of `ticks`."""
+    spent = [b - a for a, b in zip(before, after, strict=True)]
+    return processors * (spent[IDLE] + spent[IOWAIT]) / max(sum(spent), 1)
+
+
+def stolen(since_start: list[int]) -> float:
+    """Share of the time in which the processors had work that the host of a virtual machine took away."""
+    return since_start[STEAL] / max(sum(since_start) - since_start[IDLE] - since_start[IOWAIT], 1)
 
 
 def work_ns(processors: int) -> int:
@@ -59,8 +81,16 @@ def on(cpu: int, duration_ns: int, work_ns: int) -> int:
 def main() -> None:
     duration_ns = int(float(sys.argv[1]) * 1e9)
     cpus = sorted(os.sched_getaffinity(0))
+    before = ticks()
+    time.sleep(COUNT_S)
+    after = ticks()
     pipes = [on(cpu, duration_ns, work_ns(len(cpus))) for cpu in cpus]
-    print(json.dumps({"longest_ns": max(int(os.read(pipe, 32)) for pipe in pipes)}))
+    found = {
+        "longest_ns": max(int(os.read(pipe, 32)) for pipe in pipes),
+        "free": free(before, after, os.cpu_count() or 1),
+        "stolen": stolen(after),
+    }
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":

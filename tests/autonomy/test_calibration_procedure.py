@@ -194,6 +194,7 @@ def interrupted(crane: Crane, reason: Reason, for_s: float = 20.0) -> None:
     crane.mode = Mode.ARMED
 
 
+@pytest.mark.long
 def test_a_run_of_one_joint_repeats_the_tests_that_a_lost_message_and_a_person_interrupted() -> None:
     crane = Crane(surveyed=False, chosen=(Joint.TILT,), patience_s=60.0)
     crane.run(done=lambda c: isinstance(t := c.calibration.task, SpoolTask) and t.kind == "sweep")

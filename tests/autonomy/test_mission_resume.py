@@ -235,6 +235,7 @@ def test_a_route_without_waypoints_left_is_at_its_end(table) -> None:
     assert left is not None and left.ended, "another planner does not drive the route again"
 
 
+@pytest.mark.long
 def test_a_machine_interrupted_while_returning_keeps_its_extra_places() -> None:
     told = ForwardingMission("test", (place(10.0, 0.0), place(60.0, 0.0)))
     left = RouteRemainder(1, (place(-6.0, 0.0), place(0.0, 0.0)), (place(30.0, 6.0),))

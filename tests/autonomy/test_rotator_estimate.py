@@ -66,6 +66,7 @@ def askew_deg(count: int, learns: bool) -> list[float]:
     return found
 
 
+@pytest.mark.long
 def test_every_log_corrects_the_count() -> None:
     learned = askew_deg(7, learns=True)
     assert max(learned[2:]) < 8.0

@@ -16,7 +16,7 @@ SLEW = SPECS[0]
 TOTAL_S = 16.0
 
 
-@pytest.mark.parametrize("kind", [kind for kind in LAWS if kind != "pid"])
+@pytest.mark.parametrize("kind", ["pd", "sliding_mode", pytest.param("super_twisting", marks=pytest.mark.long)])
 def test_smooth_motion_of_all_joints_is_tracked(kind):
     """Profile of the 2026 test-bed (docs/reference/machines.md section 1.6), planner at 20 Hz, slow enough for the
     pump.

@@ -194,6 +194,7 @@ def test_neutral_first_and_then_stopping(systemd: Systemd, loop: Loop) -> None:
     assert systemd.heard() == [{"STOPPING": "1", "STATUS": "Ending."}]
 
 
+@pytest.mark.long
 def test_ten_seconds_of_ticks_leaves_no_garbage(systemd: Systemd, loop: Loop) -> None:
     """The collector is off in the process: a cycle per tick would eat the memory."""
     now_ns = START

@@ -64,6 +64,7 @@ def test_a_log_is_lifted_and_laid_into_the_bunk():
     assert t["load_kg"] == pytest.approx(t["true_load_kg"], rel=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["yaw90", "off1m"])
 def test_a_wrong_aim_lifts_nothing(kind):
     assert grasp(kind, 100_001)["raised"] == 0

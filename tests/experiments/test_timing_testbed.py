@@ -90,6 +90,7 @@ class Virtual:
             self.datagrams += [d for d in (self.source.setpoint(self.now_ns),) if d]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("profile", "rate_hz", "seconds"), [("aoro_fc8", 200, 5.0), ("palms_471", 1000, 4.0)])
 def test_the_emulated_machine_is_armed_moves_and_never_stops(profile, rate_hz, seconds):
     bench = Virtual(profile, rate_hz)

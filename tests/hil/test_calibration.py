@@ -73,6 +73,7 @@ def test_a_valve_with_reversed_polarity_ends_the_run(tmp_path: Path) -> None:
     assert outcome.seconds < 5.0
 
 
+@pytest.mark.long
 def test_an_abort_leaves_the_valves_neutral_and_the_run_replays(tmp_path: Path) -> None:
     profile = load_profile("palms_471")
     recorder = Recorder(tmp_path / "log", profile, describe(profile, (profile.crane_bus,), 3))

@@ -9,7 +9,8 @@ import pytest
 
 from can_dbc.dbc.codec import load
 from host import lateness, real_time
-from host.real_time import SHORTEST_TIMEOUT_NS, holds, look
+from host.lateness import NEED
+from host.real_time import BEARABLE_NS, SHORTEST_TIMEOUT_NS, STANDS_STILL, Finding, look, obstacle
 
 
 def test_a_live_run_bears_half_of_the_shortest_time_out_of_an_input() -> None:
@@ -17,7 +18,24 @@ def test_a_live_run_bears_half_of_the_shortest_time_out_of_an_input() -> None:
         m.timeout_ns for name in ("crane", "machine") for m in load(name).messages.values() if m.timeout_ns
     )
     assert shortest_ns == SHORTEST_TIMEOUT_NS
-    assert holds(shortest_ns // 2) and not holds(shortest_ns // 2 + 1)
+    assert BEARABLE_NS == shortest_ns // 2
+    assert not obstacle(Finding(BEARABLE_NS, NEED, 0.0)) and obstacle(Finding(BEARABLE_NS + 1, NEED, 0.0))
+
+
+def test_free_processors_are_counted_between_two_readings() -> None:
+    before = [100, 0, 50, 1000, 10, 0, 0, 5]
+    after = [150, 0, 50, 1048, 12, 0, 0, 5]  # 50 ticks of work, 50 of rest
+    assert lateness.free(before, after, 4) == pytest.approx(2.0)
+
+
+def test_what_a_host_took_is_a_share_of_the_time_with_work() -> None:
+    assert lateness.stolen([900, 0, 90, 10**6, 10**5, 0, 0, 10]) == pytest.approx(0.01)
+    assert lateness.stolen([0] * 8) == 0.0
+
+
+def test_a_virtual_machine_that_loses_its_processors_now_and_then_does_not_hold_the_period() -> None:
+    """A look of two seconds misses a standstill that comes every ten; the count since the start does not."""
+    assert obstacle(Finding(0, 2.0, 0.0047))
 
 
 def test_a_probe_that_does_not_come_to_its_end_is_a_computer_that_stands_still(
@@ -27,7 +45,7 @@ def test_a_probe_that_does_not_come_to_its_end_is_a_computer_that_stands_still(
         raise subprocess.TimeoutExpired("probe", 32.0)
 
     monkeypatch.setattr(real_time, "run_probe", silent)
-    assert not holds(look())
+    assert look() == STANDS_STILL and obstacle(STANDS_STILL)
 
 
 class Computer:

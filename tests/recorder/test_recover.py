@@ -44,6 +44,7 @@ def ticks_of(path):
         return [m.data for _, _, m in make_reader(file).iter_messages(topics=["/controller/tick"])]
 
 
+@pytest.mark.long
 def test_truncated_anywhere_is_readable_again_and_loses_one_chunk_at_most(whole, tmp_path):
     data = (whole / "run.mcap").read_bytes()
     size, dice = len(data), random.Random(1)

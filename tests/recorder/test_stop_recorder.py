@@ -143,6 +143,7 @@ def many_stops(directory: Path, stops: int) -> None:
         run_with_a_stop(directory / f"run-{k}", after=20, stops=directory / "stops")
 
 
+@pytest.mark.long
 def test_the_oldest_files_make_room_and_the_numbers_tell_how_many(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,6 +170,7 @@ def test_the_bytes_of_all_files_are_bounded_and_the_newest_stays(
 # ---- a writer that dies -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_truncated_anywhere_it_is_readable_again_and_earlier_stops_are_not_touched(whole: Path, tmp_path: Path) -> None:
     (complete,) = files_in(whole / "stops")
     data, dice = complete.read_bytes(), random.Random(1)

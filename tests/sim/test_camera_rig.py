@@ -93,6 +93,7 @@ def test_the_stick_camera_sees_the_grapple_and_pybullet_agrees(world: World) -> 
     assert np.median(np.abs(picture.depth_m - theirs.depth_m)[known & (picture.depth_m < 12.0)]) < 0.02
 
 
+@pytest.mark.long
 def test_a_carriers_front_camera_sees_the_ground_ahead() -> None:
     profile = load_profile("aoro_fc8")
     plant = open_world(profile, seed=1, scene=(LogSpec(7.0, 0.0, 1.2, 2.0, 0.25, 900.0),), terrain="rough")

@@ -56,6 +56,7 @@ def test_thin_and_thick_logs_are_grasped_held_and_released(seed, least_m, most_m
     w.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [{"turned_rad": math.pi / 2}, {"across_m": 1.0}])
 def test_a_wrong_aim_lifts_nothing(wrong):
     w, evaluator, _ = attempt(403, **wrong)

@@ -72,6 +72,7 @@ def test_a_stowed_load_weighs_like_an_awake_one(world):
     other.close()
 
 
+@pytest.mark.long
 def test_a_start_and_a_stop_wake_the_load_without_moving_it(world):
     go(world, 1.0)
     before = [in_base(world, log) for log in range(LOGS)]
@@ -86,6 +87,7 @@ def test_a_start_and_a_stop_wake_the_load_without_moving_it(world):
     assert woken >= 2
 
 
+@pytest.mark.long
 def test_a_falling_log_wakes_the_load_and_is_stowed_with_it(world):
     go(world, 1.0)
     p, falling = world.client, world.log_bodies.body_ids[LOGS]

@@ -9,18 +9,23 @@ from typer.testing import CliRunner
 
 from hil.demo.summary import Summary
 from host.exit_codes import CommandFailed, ExitCode
-from host.real_time import BEARABLE_NS
+from host.lateness import NEED
+from host.real_time import BEARABLE_NS, BEARABLE_STOLEN, Finding
 from timberhand.cli import app
 from timberhand.commands.demo import paced_or_live
 
-BUSY_NS = BEARABLE_NS + 1
+QUIET = Finding(BEARABLE_NS, NEED, BEARABLE_STOLEN)
+BUSY = Finding(BEARABLE_NS + 1, NEED, 0.0)
 
 
-def test_a_computer_that_stands_still_too_long_gets_a_paced_run_where_there_is_one() -> None:
-    assert paced_or_live(BEARABLE_NS, live_only=False) == (False, "")
-    paced, sentence = paced_or_live(BUSY_NS, live_only=False)
+@pytest.mark.parametrize(
+    "finding", [BUSY, Finding(0, NEED - 0.1, 0.0), Finding(0, NEED, BEARABLE_STOLEN + 1e-6)]
+)
+def test_a_computer_that_cannot_hold_the_period_gets_a_paced_run_where_there_is_one(finding: Finding) -> None:
+    assert paced_or_live(QUIET, live_only=False) == (False, "")
+    paced, sentence = paced_or_live(finding, live_only=False)
     assert paced and sentence
-    paced, sentence = paced_or_live(BUSY_NS, live_only=True)
+    paced, sentence = paced_or_live(finding, live_only=True)
     assert not paced and sentence
 
 
@@ -29,9 +34,9 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The looks and runs of the command, none of which takes place."""
     done: list[str] = []
 
-    def look() -> int:
+    def look() -> Finding:
         done.append("look")
-        return BUSY_NS
+        return BUSY
 
     def run(kind: str) -> object:
         def take_place(*_: object, **__: object) -> Summary:
@@ -74,7 +79,7 @@ def test_inside_the_lab_no_look_is_taken(ran: list[str], monkeypatch: pytest.Mon
 def test_a_computer_that_holds_the_period_runs_live(
     ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("host.real_time.look", lambda: BEARABLE_NS)
+    monkeypatch.setattr("host.real_time.look", lambda: QUIET)
     CliRunner().invoke(app, ["demo", "--bus", "wire", "--out", str(tmp_path)])
     assert ran == ["live"]
 

@@ -38,6 +38,7 @@ def same(a: TorchNet, b: TorchNet) -> bool:
     return all(torch.equal(x, b.state_dict()[k]) for k, x in a.state_dict().items())
 
 
+@pytest.mark.long
 def test_training_is_deterministic() -> None:
     (a, losses), (b, again) = run(None), run(None)
     assert losses == again and same(a, b)

@@ -27,6 +27,8 @@ from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOptio
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
+    from host.real_time import Finding
+
 
 class PlcRole(StrEnum):
     """What a PLC that drives the valves is given."""
@@ -216,22 +218,19 @@ def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> Comma
     return None
 
 
-def paced_or_live(longest_ns: int, live_only: bool) -> tuple[bool, str]:
-    """Whether the demo is paced on a computer that stood still for up to ``longest_ns`` [ns], and what to say.
+def paced_or_live(finding: Finding, live_only: bool) -> tuple[bool, str]:
+    """Whether the demo is paced on a computer of which a look found ``finding``, and what to say.
 
     ``live_only``: what was asked for exists in a live run alone.
     """
-    from host.real_time import BEARABLE_NS, LOOK_S, holds
+    from host.real_time import obstacle
 
-    if holds(longest_ns):
+    found = obstacle(finding)
+    if not found:
         return False, ""
-    found = (
-        f"This computer stood still for up to {longest_ns / 1e6:.1f} ms in a look of {LOOK_S:.0f} s, "
-        f"and a live run bears {BEARABLE_NS / 1e6:.1f} ms: "
-    )
     if live_only:
-        return False, f"{found}the machine may stop, and --plc-link udp exists live alone."
-    return True, f"{found}the demo runs in paced virtual time instead; --live insists."
+        return False, f"{found}: the machine may stop, and --plc-link udp exists live alone."
+    return True, f"{found}: the demo runs in paced virtual time instead; --live insists."
 
 
 def _paces(screen: RichConsole, live_only: bool) -> bool:
@@ -240,8 +239,8 @@ def _paces(screen: RichConsole, live_only: bool) -> bool:
     from host.real_time import look
 
     with screen.status("Does this computer hold the period of a live run?"):
-        longest_ns = look()
-    paced, sentence = paced_or_live(longest_ns, live_only)
+        finding = look()
+    paced, sentence = paced_or_live(finding, live_only)
     if sentence:
         say(screen, "", sentence, "yellow")
     return paced
