@@ -171,6 +171,7 @@ class Crane:
                 if refused.reason is not Reason.REFERENCE_JUMP:
                     raise
             else:
+                check.check_behind(governor.position, governor.behind_ns * 1e-9)
                 self._admit(setpoint)
                 return True
         check.load_and_check(setpoint, governor.candidate, governor.position, governor.velocity, now_ns)

@@ -61,6 +61,18 @@ class TrajectoryCheck:
             if far or kick:
                 raise RequestRefused(Reason.REFERENCE_JUMP, j)
 
+    def check_behind(self, position: Sequence[float], behind_s: float) -> None:
+        """Check that the trajectory loaded last is within what a plan can be ahead of the present reference, which
+        is ``behind_s`` late; a joint whose value is NaN is not compared.
+
+        Raises:
+            RequestRefused: setpoints have moved the plan away from the reference, jump by jump.
+        """
+        reach_s = JUMP_S + SPEED_TOLERANCE_SHARE * behind_s
+        for j in JOINTS:
+            if abs(self._new_position[j] - position[j]) > reach_s * self._speed[j]:
+                raise RequestRefused(Reason.REFERENCE_JUMP, j)
+
     def _check_path(self, setpoint: CraneSetpoint, j: int) -> None:
         knots, lower, upper = setpoint.knots, self._lower[j], self._upper[j]
         fastest = SPEED_TOLERANCE_SHARE * self._speed[j]

@@ -16,6 +16,7 @@ import math
 from array import array
 from typing import Final
 
+from controller.laws.command_bound import CommandBound
 from controller.laws.end_positioning import EndPositioning
 from controller.laws.feedback import LAWS
 from controller.laws.valve_map import ValveMap
@@ -88,9 +89,9 @@ class JointLaw:
     """The law of one joint; ``velocity_command`` is its last command [rad/s, m/s]."""
 
     __slots__ = (
-        "_damping", "_end_positioning", "_feedback", "_flight", "_frozen", "_lead", "_lower", "_max_rate", "_max_step",
-        "_plain", "_speed", "_stood", "_upper", "_valve", "_vibration", "has_encoder", "lead_ns",
-        "velocity_command", "velocity_desired",
+        "_bound", "_damping", "_end_positioning", "_feedback", "_flight", "_frozen", "_lead", "_lower", "_max_rate",
+        "_max_step", "_measured", "_plain", "_speed", "_stood", "_upper", "_valve", "_vibration", "has_encoder",
+        "lead_ns", "velocity_command", "velocity_desired",
     )  # fmt: skip
 
     def __init__(self, spec: JointSpec, valve_map: ValveMap, period_s: float) -> None:
@@ -110,6 +111,8 @@ class JointLaw:
         self.has_encoder = spec.encoder is not None
         self.lead_ns = int((reaction_s + valve.oil_s) * 1e9)
         """Lead of the feed-forward."""
+        self._bound = CommandBound(spec.speed_limit, reaction_s + valve.oil_s, period_s)
+        self._measured = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -121,6 +124,7 @@ class JointLaw:
         self._flight.reset()
         self._vibration.reset()
         self._end_positioning.reset()
+        self._bound.reset()
 
     @property
     def resting(self) -> bool:
@@ -147,6 +151,7 @@ class JointLaw:
         """
         self._lead = command = 0.0 if self._plain else v_lead
         if self.has_encoder:
+            self._measured = v
             swayed = damping != 0.0 or displaced != 0.0
             error = q_ref + displaced - q if swayed else q_ref - q
             predicted = error if self._plain else error - self._flight.travel
@@ -175,6 +180,8 @@ class JointLaw:
         """Share of the desired velocity within valve and speed limit; ``cap`` scales the speed limit."""
         desired = self.velocity_desired
         limit = min(self._speed * cap, self._valve.full_plus if desired >= 0.0 else self._valve.full_minus)
+        if self.has_encoder:
+            limit = min(limit, self._bound.limit(desired))
         return limit / abs(desired) if abs(desired) > limit else 1.0
 
     def command(self, share: float, elapsed_s: float) -> float:
@@ -185,4 +192,6 @@ class JointLaw:
         self._frozen = command != self.velocity_desired
         self._flight.add((command - self._lead) * elapsed_s)
         self.velocity_command = command
+        if self.has_encoder:
+            self._bound.add(command, self._measured, elapsed_s)
         return command

@@ -27,13 +27,14 @@ MAX_BEHIND_NS: Final = 800_000_000
 class TimeScaling:
     """``rate``: seconds of trajectory time per second; ``behind_ns``: how far it is behind the tick's time."""
 
-    __slots__ = ("_flow", "_flow_minus", "_flow_plus", "_speed", "behind_ns", "rate")
+    __slots__ = ("_fastest", "_flow", "_flow_minus", "_flow_plus", "_speed", "behind_ns", "rate")
 
     def __init__(self, profile: Profile) -> None:
         specs = [joint(profile, j) for j in JOINTS]
         self._flow = FLOW_SHARE * profile.hydraulics.pump_flow_m3_s
         self._flow_plus = tuple(s.valve.flow_plus for s in specs)
         self._flow_minus = tuple(s.valve.flow_minus for s in specs)
+        self._fastest = tuple(s.speed_limit for s in specs)
         self._speed = tuple(SPEED_SHARE * SPEED_HEADROOM_SHARE * s.speed_limit for s in specs)
         self.reset()
 
@@ -52,7 +53,7 @@ class TimeScaling:
             else:
                 speed = -velocity
                 flow += speed * self._flow_minus[j] * valves[j].arm
-            limit = cap * self._speed[j]
+            limit = min(cap * self._speed[j], self._fastest[j])
             if speed * wanted > limit:
                 wanted = limit / speed
         if flow * wanted > self._flow:

@@ -66,6 +66,7 @@ MODULES: Final = (
     "controller.estimation.usual_speed",
     "controller.evidence",
     "controller.joint_watch",
+    "controller.laws.command_bound",
     "controller.laws.crane",
     "controller.laws.drive",
     "controller.laws.end_positioning",
