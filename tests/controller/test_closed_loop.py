@@ -4,7 +4,6 @@ import msgspec
 import pytest
 
 from controller.config import Settings
-from controller.laws.feedback import LAWS
 from controller.laws.valve_map import ValveMap
 from machine.loading.profile_file import profile_hash
 from machine.motion_limits import SPEED_HEADROOM_SHARE

@@ -18,7 +18,7 @@ def test_a_live_run_bears_half_of_the_shortest_time_out_of_an_input() -> None:
         m.timeout_ns for name in ("crane", "machine") for m in load(name).messages.values() if m.timeout_ns
     )
     assert shortest_ns == SHORTEST_TIMEOUT_NS
-    assert BEARABLE_NS == shortest_ns // 2
+    assert shortest_ns // 2 == BEARABLE_NS
     assert not obstacle(Finding(BEARABLE_NS, NEED, 0.0)) and obstacle(Finding(BEARABLE_NS + 1, NEED, 0.0))
 
 

@@ -18,9 +18,7 @@ QUIET = Finding(BEARABLE_NS, NEED, BEARABLE_STOLEN)
 BUSY = Finding(BEARABLE_NS + 1, NEED, 0.0)
 
 
-@pytest.mark.parametrize(
-    "finding", [BUSY, Finding(0, NEED - 0.1, 0.0), Finding(0, NEED, BEARABLE_STOLEN + 1e-6)]
-)
+@pytest.mark.parametrize("finding", [BUSY, Finding(0, NEED - 0.1, 0.0), Finding(0, NEED, BEARABLE_STOLEN + 1e-6)])
 def test_a_computer_that_cannot_hold_the_period_gets_a_paced_run_where_there_is_one(finding: Finding) -> None:
     assert paced_or_live(QUIET, live_only=False) == (False, "")
     paced, sentence = paced_or_live(finding, live_only=False)
