@@ -14,11 +14,11 @@ from typing import Final
 
 from controller.estimation.recent_range import RecentRange
 
-UNKNOWN_SHARE: Final = 0.95
+UNKNOWN_SHARE: Final = 0.92
 """Share of the speed limit that may be commanded before the answer is known."""
-LEAST_SHARE: Final = 0.85
-MOST_SHARE: Final = 1.05
-"""Bounds of it afterwards: a load pushes or holds a joint for a while."""
+LEAST_SHARE: Final = 0.8
+MOST_SHARE: Final = 1.0
+"""Bounds of it afterwards: a load pushes or holds a joint for a while, and what held it may let it go."""
 MEMORY_S: Final = 1.0
 KNOWN_S: Final = 0.3
 """Time at the speed limit after which the answer is known."""

@@ -1,8 +1,9 @@
-"""Recordings made before the rooms and names changed replay to the same bytes: the controller decides as it did.
+"""Kept recordings replay to the same bytes: the controller decides as it did.
 
-`tests/recordings` holds the first seconds of two lockstep runs at commit 7d68e2e: a crane on a fixed base (palms_471:
-start-up, arming, the first motion) and a forwarder on both buses (aoro_fc8: start-up, driving, a search).  The profiles
-of their time lie beside them.
+`tests/recordings` holds the first seconds of two lockstep runs: a crane on a fixed base (palms_471: start-up, arming,
+the first motion) and a forwarder on both buses (aoro_fc8: start-up, driving, a search).  They were recorded when the
+commands of joints became bounded and `GuardStat` got its last signal, with the profiles of commit 7d68e2e, which lie
+beside them.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import pytest
 
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import encode
-from controller.config import load
+from controller.config import Settings, load
 from controller.guard.__main__ import build, profile_path
 from controller.tick import Outputs
 from hil.harness.lockstep import Lockstep, Observer
@@ -21,15 +21,13 @@ from tests.controller.setpoint_attacks import Attacker
 MS = 1_000_000
 SECONDS = 4.0
 WINDOW_TICKS = 100
-SETTINGS = load("palms_471")
-SPEED = [joint(SETTINGS.profile, j).speed_limit for j in JOINTS]
 
 
 class AttackingPlanner:
     """Sends a setpoint of the attack every ``every_ms``."""
 
-    def __init__(self, kind: str, joints: tuple[int, ...], every_ms: int) -> None:
-        self.attacker = Attacker(SETTINGS.profile, joints)
+    def __init__(self, settings: Settings, kind: str, joints: tuple[int, ...], every_ms: int) -> None:
+        self.settings, self.attacker = settings, Attacker(settings.profile, joints)
         self.kind, self.every_ns = kind, every_ms * MS
         self.system: Lockstep | None = None
         self.begun_ns = self.due_ns = self.sequence = 0
@@ -41,44 +39,54 @@ class AttackingPlanner:
             return None
         self.begun_ns = self.begun_ns or now_ns
         self.due_ns, self.sequence = now_ns + self.every_ns, self.sequence + 1
-        reference, velocity = list(controller.reference_position), list(controller.crane.governor.velocity)
+        # A joint without an encoder has no reference.
+        reference, velocity = (
+            [0.0 if value != value else value for value in values]
+            for values in (controller.reference_position, controller.crane.governor.velocity)
+        )
         knots = self.attacker.knots(self.kind, reference, velocity, (now_ns - self.begun_ns) * 1e-9)
         packed = tuple(Knot(round(ms * MS), tuple(p), tuple(v)) for ms, p, v in knots)
-        head = (self.sequence, SETTINGS.profile_hash, now_ns, 200 * MS, GrappleCommand.NEUTRAL, False)
+        head = (self.sequence, self.settings.profile_hash, now_ns, 200 * MS, GrappleCommand.NEUTRAL, False)
         return encode(CraneSetpoint(*head, packed))
 
 
 @pytest.mark.parametrize(
-    ("kind", "joints", "every_ms"),
+    ("machine", "kind", "joints", "every_ms"),
     [
-        ("field", (0,), 20),
-        pytest.param("lag, then go", (0,), 10, marks=pytest.mark.long),
-        pytest.param("field", (1,), 10, marks=pytest.mark.long),
-        pytest.param("lag, then go", (2,), 10, marks=pytest.mark.long),
-        pytest.param("lag, then go", (3,), 10, marks=pytest.mark.long),
-        pytest.param("rest ahead", (3,), 5, marks=pytest.mark.long),
-        pytest.param("field", (4,), 20, marks=pytest.mark.long),
-        pytest.param("field", (0, 1, 2, 3), 40, marks=pytest.mark.long),
+        ("palms_471", "field", (0,), 20),
+        pytest.param("aoro_fc8", "field", (0, 1), 10, marks=pytest.mark.long),
+        pytest.param("aoro_fc8", "lag, then go", (2,), 10, marks=pytest.mark.long),
+        pytest.param("palms_471", "lag, then go", (0,), 10, marks=pytest.mark.long),
+        pytest.param("palms_471", "field", (1,), 10, marks=pytest.mark.long),
+        pytest.param("palms_471", "lag, then go", (2,), 10, marks=pytest.mark.long),
+        pytest.param("palms_471", "lag, then go", (3,), 10, marks=pytest.mark.long),
+        pytest.param("palms_471", "rest ahead", (3,), 5, marks=pytest.mark.long),
+        pytest.param("palms_471", "field", (4,), 20, marks=pytest.mark.long),
+        pytest.param("palms_471", "field", (0, 1, 2, 3), 40, marks=pytest.mark.long),
     ],
 )
-def test_no_joint_is_driven_beyond_its_speed_limit(kind: str, joints: tuple[int, ...], every_ms: int) -> None:
-    plant = Plant(SETTINGS.profile, seed=1, truth="nominal", logs=0)
-    planner = AttackingPlanner(kind, joints, every_ms)
+def test_no_joint_is_driven_beyond_its_speed_limit(
+    machine: str, kind: str, joints: tuple[int, ...], every_ms: int
+) -> None:
+    settings = load(machine)
+    plant = Plant(settings.profile, seed=1, truth="nominal", logs=0)
+    planner = AttackingPlanner(settings, kind, joints, every_ms)
     positions: list[tuple[float, ...]] = []
 
     def look(outputs: Outputs, now_ns: int) -> None:
         if planner.begun_ns:
             positions.append(plant.joint_positions())
 
-    operator = Operator(SETTINGS.profile_hash, lambda action, report: None, 8)
-    guard = build(profile_path("palms_471"))
-    planner.system = system = Lockstep(SETTINGS, guard, plant, planner, operator, Observer(on_outputs=[look]))
+    operator = Operator(settings.profile_hash, lambda action, report: None, 8)
+    guard = build(profile_path(machine))
+    planner.system = system = Lockstep(settings, guard, plant, planner, operator, Observer(on_outputs=[look]))
     try:
         while not planner.begun_ns or system.now_ns < planner.begun_ns + SECONDS * 1e9:
             system.advance()
     finally:
         plant.close()
     q = np.array(positions)
-    share = np.abs(q[WINDOW_TICKS:] - q[:-WINDOW_TICKS]).max(axis=0) / (0.5 * np.array(SPEED))
+    speed = np.array([joint(settings.profile, j).speed_limit for j in JOINTS])
+    share = np.abs(q[WINDOW_TICKS:] - q[:-WINDOW_TICKS]).max(axis=0) / (0.5 * speed)
     assert share.max() <= 1.05, share
     assert share[list(joints)].max() >= 0.3, "the attack moves the crane"
