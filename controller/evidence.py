@@ -231,6 +231,8 @@ class Evidence:
         nodes = self._inputs.nodes
         if reason in _ESTOP:
             return _number(self._channel_a), _RELEASED, _number(self._channel_b)
+        if reason is Reason.PROFILE_DIFFERS:
+            return _number(self._supervisor.guard_check), float(self._supervisor.profile_check), _NAN
         if reason is Reason.GUARD_REFUSES:
             return _number(self._verdict), _NAN, _number(self._guard_axis)
         if reason is Reason.VALVE_ECHO_STUCK:

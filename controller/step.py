@@ -99,8 +99,9 @@ class Controller:
         ]
         self._sensed = [each for each in sensed if each is not None]
         self.supervisor = Supervisor(
-            profile, self.crane_inputs, self.crane_bus_monitor, self.carrier_bus, self.estimators, self.startup
-        )
+            profile, self.crane_inputs, self.crane_bus_monitor, self.carrier_bus, self.estimators, self.startup,
+            settings.file_check,
+        )  # fmt: skip
         self.gate = RequestGate(profile, settings.profile_hash)
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
         # A PLC passes on positions that its own cycle has smoothed: the same count again says nothing of the encoder.

@@ -102,12 +102,14 @@ class Supervisor:
         "coast_ns",
         "crane_inputs",
         "detail",
+        "guard_check",
         "half_speed",
         "latching",
         "late",
         "mode",
         "moving_joint",
         "operator_link",
+        "profile_check",
         "ramp_end_ns",
         "ramp_ns",
         "reason",
@@ -124,7 +126,9 @@ class Supervisor:
         carrier_bus: CarrierBus | None,
         estimators: list[JointEstimator],
         startup: Startup,
+        profile_check: int = 0,
     ) -> None:
+        """``profile_check``: CRC of the profile's file, which the guard must have too; 0: not compared."""
         self.crane_inputs = inputs
         self.carrier_inputs = carrier_bus.inputs if carrier_bus is not None else None
         self._enable, self._person, self._reset_button, self._channel_a, self._channel_b = (
@@ -132,6 +136,7 @@ class Supervisor:
             Signal(inputs.estop, "ChannelA"), Signal(inputs.estop, "ChannelB"),
         )  # fmt: skip
         self._lever = Signal(inputs.estop, "Lever")
+        self.guard_check, self.profile_check = Signal(inputs.guard, "ProfileCheck"), profile_check
         self._valve_state, self._echo_counter = Signal(inputs.valve_a, "State"), Signal(inputs.valve_b, "EchoCounter")
         self._plc_faults = Signal(inputs.plc, "FaultBits")
         carrier = self.carrier_inputs
@@ -419,8 +424,11 @@ class Supervisor:
     def _check_values(self, now_ns: int) -> None:
         """Values that are known and bad; a stale value is not checked here."""
         received = self.crane_inputs
-        if received.guard.values is not None and self._enable.value() != _ENABLED:
-            self._collect(Reason.GUARD_REFUSES)
+        if received.guard.values is not None:
+            if self._enable.value() != _ENABLED:
+                self._collect(Reason.GUARD_REFUSES)
+            if self.profile_check and self.guard_check.value() not in (self.profile_check, 0):
+                self._collect(Reason.PROFILE_DIFFERS)
         if self.lever_moved:
             self._collect(_LEVER)
         if self._person.value() == _YES:

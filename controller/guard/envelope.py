@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import tomllib
+import zlib
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -93,6 +94,8 @@ class Envelope(NamedTuple):
     ground_m: float
     boxes: tuple[tuple[Corner, Corner], ...]
     carrier: CarrierLimits | None
+    profile_check: int = 0
+    """CRC of the profile's file; the controller compares it with its own (`controller.config.Settings`)."""
 
 
 def digest(body: bytes) -> bytes:
@@ -103,7 +106,8 @@ def digest(body: bytes) -> bytes:
 def read_envelope(path: Path) -> Envelope:
     """Read a profile file and the envelope of its machine; raises GuardConfigError."""
     try:
-        profile = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = path.read_bytes()
+        profile = tomllib.loads(content.decode())
     except (OSError, ValueError, RecursionError) as error:  # not UTF-8, no TOML, or a number of 5000 digits
         raise GuardConfigError("guard.profile-unreadable", f"{path}: unreadable profile: {error}.") from error
     try:
@@ -123,7 +127,9 @@ def read_envelope(path: Path) -> Envelope:
         )
         geometry, ground_m = Kinematics(**_numbers(limits["kinematics"])), _number(limits["ground_m"])
         rate_hz = int(_within(profile, {"rate_hz": RATES_HZ})["rate_hz"])
-        return Envelope(axes, 1_000_000_000 // rate_hz, geometry, ground_m, boxes, carrier)
+        return Envelope(
+            axes, 1_000_000_000 // rate_hz, geometry, ground_m, boxes, carrier, zlib.crc32(content) & 0xFFFFFF
+        )
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise GuardConfigError(
             "guard.profile-incomplete", f"{path} or its envelope: a joint or the rate is incomplete: {error!r}."

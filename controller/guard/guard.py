@@ -75,8 +75,8 @@ class Guard:
     __slots__ = (
         "_a", "_agreed_ns", "_apart_ns", "_armed", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
         "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_motion",
-        "_now_ns", "_open_pct", "_operated_ns", "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent",
-        "_status", "_stopped_ns", "_supply", "_watches", "axis", "events", "latched", "verdict",
+        "_now_ns", "_open_pct", "_operated_ns", "_own_keys", "_profile_check", "_punctuality", "_reach", "_reset_seen",
+        "_sent", "_status", "_stopped_ns", "_supply", "_watches", "axis", "events", "latched", "verdict",
     )  # fmt: skip
 
     def __init__(self, envelope: Envelope, layouts: dict[str, Layout], latched: bool = False) -> None:
@@ -113,7 +113,7 @@ class Guard:
             feedback = next(m for m in self._feedback if f"Spool{signal}" in m.layout.fields)
             field = feedback.layout.fields[f"Spool{signal}"]
             self._motion.append((feedback, MotionWatch(number, field, deadband_pct, closing_ns, sensed.get(number))))
-        self._reach = Reach(envelope)
+        self._reach, self._profile_check = Reach(envelope), envelope.profile_check
         self._grapple_field = fields_b["Grapple"]
         self.verdict, self.axis = Verdict.NO_COMMAND, NO_AXIS
         self.events = 0
@@ -141,6 +141,7 @@ class Guard:
         values = {
             "Enable": ENABLE if self.enabled else 0, "Supply": SUPPLY if self._supply else 0, "Verdict": self.verdict,
             "FaultAxis": self.axis, "SeenCounter": max(self._a.counter, 0), "EventCount": self.events,
+            "ProfileCheck": self._profile_check,
         }  # fmt: skip
         out = [message.frame(values) for message in self._sent if message.due(now_ns, changed)]
         if now_ns >= self._heartbeat_ns:

@@ -96,6 +96,7 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
     Reason.SEND_REFUSED: Measurement("frames that the bus refused since the start", _COUNT, ""),
     Reason.LOOP_LATE: Measurement("lateness", _MS, "limit", "late ticks since the start"),
     Reason.LOOP_STALLED: Measurement("lateness", _MS, "limit", "late ticks since the start"),
+    Reason.PROFILE_DIFFERS: Measurement("the check of the guard's profile", _COUNT, "that of the controller's"),
     Reason.COMPUTER_STALLED: Measurement("stood still for", _MS, "", "inputs lost"),
     Reason.LEASE_LOST: Measurement("age of the last setpoint", _MS, "lease"),
     Reason.SETPOINTS_REFUSED: Measurement("setpoints refused since the start", _COUNT, "", "the last one for", _REASON),

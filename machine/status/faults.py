@@ -284,6 +284,13 @@ FAULTS: Final[dict[Reason, Fault]] = {
         "This computer stood still, so that inputs were lost",
         "Run `timberhand doctor --rt`, end what else runs here, then reset and arm.",
     ),
+    Reason.PROFILE_DIFFERS: Fault(
+        Reaction.CUT,
+        60,
+        _N,
+        "The guard runs on another profile file than the controller",
+        "Restart both, with one profile; then reset and arm.",
+    ),
     Reason.LEASE_LOST: Fault(Reaction.HOLD, 10, _N, "The planner's setpoints ended while moving", PLANNER),
     Reason.SETPOINTS_REFUSED: Fault(Reaction.HOLD, 10, _N, "Three setpoints were refused within a second", PLANNER),
     Reason.SPOOL_OPEN: Fault(

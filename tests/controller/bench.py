@@ -49,6 +49,8 @@ SETTINGS = load_settings("palms_471")
 PROFILE = SETTINGS.profile
 SPECS = [joint(PROFILE, j) for j in JOINTS]
 T = SETTINGS.period_ns
+OTHER_CHECK = SETTINGS.file_check ^ 1
+"""GuardStat.ProfileCheck of a guard with another profile."""
 MS = 1_000_000
 HOME = (0.0, 0.5, -1.2, 0.6, 0.0)
 PERIOD_MS = {"EstopStat": 10, "GuardStat": 10, "PressC": 20, "GrappleStat": 20, "PlcStatus": 20, "PlcOut": 10}

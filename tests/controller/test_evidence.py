@@ -15,7 +15,7 @@ from machine.status.evidence import EVIDENCE
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import DetailKind, Reason
-from tests.controller.bench import MS, Bench, T
+from tests.controller.bench import MS, OTHER_CHECK, SETTINGS, Bench, T
 from tests.controller.drive_bench import DriveBench
 
 REPORT_TICKS = 4
@@ -67,6 +67,12 @@ def test_of_several_messages_the_lost_one_is_measured() -> None:
     [
         ("EstopStat", {"ChannelA": 0}, Reason.ESTOP_PRESSED, (0.0, 1.0, 1.0)),
         ("GuardStat", {"Enable": 0, "Verdict": 5, "FaultAxis": 2}, Reason.GUARD_REFUSES, (5.0, math.nan, 2.0)),
+        (
+            "GuardStat",
+            {"Enable": 0xA, "ProfileCheck": OTHER_CHECK},
+            Reason.PROFILE_DIFFERS,
+            (float(OTHER_CHECK), float(SETTINGS.file_check), math.nan),
+        ),
         ("ValveFbA", {"State": 4}, Reason.VALVE_NODE_FAULT, (4.0, math.nan, 0.0)),
         ("PlcStatus", {"FaultBits": 0x21}, Reason.PLC_FAULT, (33.0, math.nan, math.nan)),
         ("EncRot", {"Alarms": 4}, Reason.ENCODER_ALARM, (4.0, math.nan, math.nan)),

@@ -9,7 +9,7 @@ from machine.status.faults import FAULTS, describe, part_of
 from machine.status.modes import Mode
 from machine.status.reasons import DetailKind, Reaction, Reason, pack
 from tests.codes import numbers_in
-from tests.controller.bench import MS, Bench, T, count_until
+from tests.controller.bench import MS, OTHER_CHECK, Bench, T, count_until
 
 PROMISE_NS = 100 * MS
 
@@ -99,6 +99,7 @@ VALUES = [
     ("EstopStat", {"ChannelB": 3}, Reason.ESTOP_CHANNELS),
     ("EstopStat", {"Person": 1}, Reason.PERSON_IN_ZONE),
     ("GuardStat", {"Enable": 0}, Reason.GUARD_REFUSES),
+    ("GuardStat", {"Enable": 0xA, "ProfileCheck": OTHER_CHECK}, Reason.PROFILE_DIFFERS),
     ("ValveFbA", {"State": 4}, Reason.VALVE_NODE_FAULT),
     ("ValveFbA", {"State": 3}, Reason.VALVE_NODE_FAULT),
     ("ValveFbB", {"EchoCounter": 7}, Reason.VALVE_ECHO_STUCK),

@@ -340,7 +340,7 @@ def test_what_judges_has_at_most_650_lines_of_code():
         lines = enumerate(path.read_text().splitlines(), 1)
         part = "starts" if path.stem in start else "carries" if path.stem in carries else "judges"
         code[part] += sum(k not in explained and bool(t := line.strip()) and t[0] != "#" for k, line in lines)
-    assert code["judges"] <= 650 and code["starts"] <= 360 and code["carries"] <= 230, code
+    assert code["judges"] <= 650 and code["starts"] <= 365 and code["carries"] <= 230, code
     assert Guard.__slots__
 
 

@@ -4,6 +4,8 @@ import re
 
 import pytest
 
+from can_dbc.dbc.codec import load as load_database
+from controller.config import load as load_settings
 from controller.guard import seal
 from controller.guard.__main__ import DATABASES, build
 from controller.guard.envelope import SHIPPED, read_envelope
@@ -172,3 +174,31 @@ def test_a_profile_that_no_reader_can_read_stops_the_start(files, text):
 def test_a_rate_that_no_controller_runs_at_stops_the_start(rate_hz):
     with pytest.raises(GuardConfigError, check=coded("guard.rate")):
         build(PROFILE, rate_hz=rate_hz)
+
+
+def test_guard_and_controller_have_one_check_of_one_file(files):
+    profile, _ = files
+    check = load_settings(profile).file_check
+    assert 0 < check == read_envelope(profile).profile_check == load_settings("palms_471").file_check
+    codec = load_database("crane").messages["GuardStat"]
+    told = [codec.decode(data) for key, data in build(profile).step(10**9, []) if key == codec.key]
+    assert told and all(values[codec.index["ProfileCheck"]] == check for values in told)
+    profile.write_text(profile.read_text() + "\n# changed after the controller's start\n")
+    assert read_envelope(profile).profile_check != check
+
+
+@pytest.mark.parametrize("name", shipped_profiles())
+def test_the_guard_stops_nothing_that_the_controller_lets_pass(name):
+    """A box around the crane's own column is out of its reach; every other one is a keep-out of the profile."""
+    profile = load_settings(name).profile
+    kept_out = [
+        [(c - h, c + h) for c, h in zip(box.center_m, box.half_m, strict=True)]
+        for box in profile.keep_out.values() if box.yaw_rad == 0.0
+    ]  # fmt: skip
+    for low, high in read_envelope(SHIPPED / f"{name}.toml").boxes:
+        if low[0] < 0.0 < high[0] and low[1] < 0.0 < high[1]:
+            continue
+        assert any(
+            all(a - 1e-9 <= x and y <= b + 1e-9 for x, y, (a, b) in zip(low[:2], high[:2], box[:2], strict=True))
+            and high[2] <= box[2][1] + 1e-9 for box in kept_out
+        ), (low, high)  # fmt: skip

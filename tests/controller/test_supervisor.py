@@ -7,7 +7,7 @@ from controller.transitions import TRANSITIONS, Event
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
-from tests.controller.bench import MS, VALUES, Bench
+from tests.controller.bench import MS, OTHER_CHECK, SETTINGS, VALUES, Bench
 
 B, S, A, X, P, F = Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE, Mode.STOP, Mode.FAULT
 #                 BOOT STANDBY ARMED ACTIVE STOP FAULT
@@ -279,3 +279,16 @@ def test_last_arm_command_replayed_does_not_arm_again():
     bench.tick([bench.operator(OperatorAction.STOP)])
     bench.tick([arm])
     assert bench.mode is Mode.STOP and bench.controller.gate.refusal is Reason.OUT_OF_ORDER
+
+
+def test_a_guard_with_another_profile_is_not_armed_with():
+    bench = Bench().boot()
+    bench.changed["GuardStat"] = {"Enable": 0xA, "ProfileCheck": OTHER_CHECK}
+    bench.run(10)
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.STANDBY
+    assert bench.controller.gate.refusal is Reason.PROFILE_DIFFERS
+    for check in (SETTINGS.file_check, 0):
+        bench = Bench().boot()
+        bench.changed["GuardStat"] = {"Enable": 0xA, "ProfileCheck": check}
+        assert bench.armed().mode is Mode.ARMED
