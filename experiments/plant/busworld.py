@@ -59,7 +59,7 @@ class BusWorld:
         grapple_mode = 1 if grapple > 0.0 else 2 if grapple < 0.0 else 0
         self._sync = self._sync % 240 + 1
         return [
-            self._guard.frame(ARM_KEY, 0, 0, 0, 0),
+            self._guard.frame(ARM_KEY, 0, 0, 0, 0, 0),
             self._pilot.frame(ARM_KEY, 0, 0),
             self._valve_a.frame(MODE_SPOOL, pct["slew"], pct["lift"], pct["tilt"], pct["ext"]),
             self._valve_b.frame(ARM_KEY, pct["rot"], abs(grapple), 0.0, grapple_mode, 0, 100.0),

@@ -56,7 +56,8 @@ CATALOGUE = [
     ),
     (
         "GuardStat", 0x1FD, 8, 10, 50,
-        {"Crc": 0, "Counter": 8, "Enable": 12, "Verdict": 16, "FaultAxis": 24, "SeenCounter": 28, "EventCount": 32},
+        {"Crc": 0, "Counter": 8, "Enable": 12, "Verdict": 16, "FaultAxis": 24, "SeenCounter": 28, "EventCount": 32,
+         "ProfileCheck": 40},
     ),
     ("GuardPilot", 0x2FD, 8, 10, 50, {"Crc": 0, "Counter": 8, "Supply": 12, "Verdict": 16, "EventCount": 32}),
     (

@@ -82,7 +82,7 @@ class Line:
 def valve() -> Line:
     node = ValveNode(CRANE, [], lambda: True, ValveInputs)
     commands = [("ValveCmdA", (2, 60.0, 0.0, 0.0, 0.0)), ("ValveCmdB", (ARMED, 0.0, 0.0, 0.0, 0, 1, 100.0))]
-    return Line(node, CRANE, 5 * MS, commands, [("GuardStat", (ARMED, 0, 15, 0, 0))])
+    return Line(node, CRANE, 5 * MS, commands, [("GuardStat", (ARMED, 0, 15, 0, 0, 0))])
 
 
 def vehicle() -> Line:

@@ -59,7 +59,7 @@ class Bench:
     ):
         out = []
         for _ in range(n):
-            frames = [self.message("GuardStat", guard, 0, 15, 0, 0)] if guard is not None else []
+            frames = [self.message("GuardStat", guard, 0, 15, 0, 0, 0)] if guard is not None else []
             frames += [self.message("GuardPilot", pilot, 0, 0)] if pilot is not None else []
             if commands:
                 frames.append(self.message("ValveCmdA", 2, *spools))

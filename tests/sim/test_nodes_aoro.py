@@ -73,7 +73,7 @@ class Bench:
             if arms is not None:
                 frames += [self.message("ArmCmdA", key, *arms), self.message("ArmCmdB", key, *floats)]
             for _ in range(4):
-                frames.append(self.message("GuardStat", 0xA, 0, 15, 0, 0))
+                frames.append(self.message("GuardStat", 0xA, 0, 15, 0, 0, 0))
                 frames.append(self.message("GuardPilot", 0xA, 0, 0))
                 frames.append(self.message("ValveCmdA", 2, *crane))
                 flow, mode = grapple or (0.0, 0)
