@@ -45,7 +45,6 @@ from timberhand.commands import (
     train,
     why,
 )
-from timberhand.deprecated import current_spelling
 
 if TYPE_CHECKING:
     from controller.guard.layout import GuardConfigError
@@ -120,11 +119,7 @@ def main() -> None:
     # When the reader of a pipe ends (`timberhand ... | head`), end quietly instead of with a traceback.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C: exit code 130
-    arguments, notes = current_spelling(sys.argv[1:])
-    for note in notes:
-        print(f"timberhand: {note}", file=sys.stderr)
-    sys.argv[1:] = arguments
-    if "--help" in arguments:
+    if "--help" in sys.argv:
         from timberhand import option_help
 
         option_help.install()

@@ -14,7 +14,6 @@ import pytest
 from typer.main import get_command
 
 from timberhand.cli import app
-from timberhand.deprecated import current_spelling
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -80,7 +79,6 @@ def the_command() -> Any:
 
 def _parsed(arguments: list[str]) -> str:
     """Parse the command as the command line does, and run nothing."""
-    arguments, _ = current_spelling(arguments)
     command = the_command()
     name = "timberhand"
     try:

@@ -16,10 +16,6 @@ from runtime.errors import CodedError
 
 INSTALLED: Final = Path("/etc/timberhand/timberhand.conf")
 SHIPPED: Final = Path(__file__).parents[2] / "deploy" / "timberhand.conf"
-RETIRED: Final = {
-    "KEY_OPTIONS": "the installation makes /etc/timberhand/key, and systemd hands it to the services",
-}
-"""Names of former releases, and what became of them."""
 _LINE: Final = re.compile(r"([A-Z][A-Z0-9_]*)=(.*)")
 
 
@@ -77,9 +73,7 @@ def parse(text: str, problems: list[Problem]) -> dict[str, Setting]:
 def unknown(settings: dict[str, Setting], known: dict[str, Setting]) -> Iterator[Problem]:
     """Names that this release does not have, and those that the file lacks."""
     for name, setting in settings.items():
-        if name in RETIRED:
-            yield Problem(setting.line, f"{name} is no longer a setting: {RETIRED[name]}; timberhand config migrate")
-        elif name not in known:
+        if name not in known:
             near = get_close_matches(name, known, 1)
             hint = f"; did you mean {near[0]}?" if near else "; remove it"
             yield Problem(setting.line, f"there is no setting {name}{hint}")
@@ -101,5 +95,5 @@ def migrated(text: str, shipped: str) -> tuple[str, list[str]]:
         else:
             notes.append(f"{name} is new: {setting.value or 'empty'}")
     for name in ours.keys() - known.keys():
-        notes.append(f"{name}={ours[name].value} is gone: {RETIRED.get(name, 'no release of this family has it')}")
+        notes.append(f"{name}={ours[name].value} is gone: this release has no such setting")
     return "\n".join(lines) + "\n", sorted(notes)

@@ -6,8 +6,7 @@ import html
 import re
 from typing import Any
 
-from timberhand.deprecated import RENAMED, Renamed
-from timberhand.reference.markdown import generated, table
+from timberhand.reference.markdown import generated
 
 
 def page() -> str:
@@ -32,24 +31,7 @@ def page() -> str:
         "the commands of `timberhand`",
         "Every command and option, as `--help` prints them.",
     )
-    return head + re.sub(r"\n{3,}", "\n\n", text).rstrip() + "\n\n" + _former_spellings()
-
-
-def _former_spellings() -> str:
-    rows = [row for rule in RENAMED for row in _rows(rule)]
-    return (
-        "## Former spellings\n\n"
-        "These spellings still work; the command prints a note with the present one on stderr.\n\n"
-        f"{table(('former', 'present'), rows)}\n"
-    )
-
-
-def _rows(rule: Renamed) -> list[tuple[str, str]]:
-    command = " ".join(("timberhand", *rule.old))
-    if rule.new:
-        return [(f"`{command}`", f"`{' '.join(('timberhand', *rule.new))}`")]
-    values = [(f" {old}", f" {new}") for old, new in rule.values.items()] or [("", "")]
-    return [(f"`{command} {rule.option}{old}`", f"`{command} {rule.new_option}{new}`") for old, new in values]
+    return head + re.sub(r"\n{3,}", "\n\n", text).rstrip() + "\n"
 
 
 def _show_whole_sentences(command: Any) -> None:
