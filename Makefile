@@ -68,7 +68,7 @@ test-all: test test-long test-live  ## the three
 lint: setup  ## style, types and the three floors
 	@sh deploy/phases.sh $(BIN) lint
 
-docs: setup  ## build the site into docs/_build; broken links and stale reference pages are errors
+docs: setup  ## build the site into docs/_build; generated reference pages; broken links are errors
 	@$(BIN)/python -m timberhand.reference --check
 	@$(BIN)/sphinx-build -W --keep-going -q docs docs/_build && echo "docs/_build/index.html"
 

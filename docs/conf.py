@@ -1,5 +1,9 @@
 """The documentation site: `make docs` builds it with broken links and references as errors."""
 
+from typing import Any
+
+from timberhand.reference.__main__ import write_built
+
 project = "timberhand"
 author = "the timberhand developers"
 copyright = "the timberhand developers, Apache-2.0"
@@ -16,3 +20,8 @@ html_theme = "furo"
 html_title = "timberhand"
 html_show_sphinx = False
 nitpicky = True
+
+
+def setup(_: Any) -> None:
+    """Write the reference pages that are generated and not committed, before Sphinx reads the pages."""
+    write_built()

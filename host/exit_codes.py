@@ -9,7 +9,7 @@ from runtime.errors import CodedError
 
 
 class ExitCode(IntEnum):
-    """The exit codes of every command and process (docs/reference/cli.md)."""
+    """The exit codes of every command and process (``timberhand --help``)."""
 
     OK = 0
     USAGE = 2

@@ -20,7 +20,7 @@ from host import lateness
 
 LOOK_S: Final = 2.0
 SHORTEST_TIMEOUT_NS: Final = 15_000_000
-"""An encoder sends every 5 ms and is missed after three (docs/reference/frames.md)."""
+"""An encoder sends every 5 ms and is missed after three (can_dbc/crane.dbc)."""
 BEARABLE_NS: Final = SHORTEST_TIMEOUT_NS // 2
 """The other half is the period and the way over the bus, which pass in any case."""
 BEARABLE_STOLEN: Final = 0.001

@@ -9,7 +9,7 @@ class CodedError(Exception):
     """An error with a sentence for people and a code for programs.
 
     ``code`` is stable; the sentence may be reworded.  A code is written ``area.what`` in lower case with hyphens, for
-    example ``profile.unknown-key``.  docs/reference/errors.md lists all of them.
+    example ``profile.unknown-key``.  The site of the documentation lists all of them.
     """
 
     def __init__(self, code: str, sentence: str) -> None:

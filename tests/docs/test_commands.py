@@ -6,18 +6,15 @@ import re
 import shlex
 from functools import cache
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import click
 import pytest
 from typer.main import get_command
 
+from tests.docs.pages import PAGES, ROOT, text_of
 from timberhand.cli import app
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PAGES = [page for page in PAGES if "_build" not in page.parts]
 FENCED = re.compile(r"(?ms)^```(?:sh|console|bash|shell)\n(.*?)^```")
 INDENTED = re.compile(r"(?m)^    (?=(?:sudo |[A-Z_]+=\S+ )*(?:timberhand|make|python -m) )(.*(?:\\\n.*)*)$")
 INLINE = re.compile(r"`((?:sudo )?(?:timberhand|make|python -m) [^`]+)`")
@@ -106,9 +103,9 @@ def _sentence(error: Exception, arguments: list[str]) -> str:
     return f"{kind}: {getattr(error, 'message', error)}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_every_command_on_a_page_exists(page: Path) -> None:
-    text = page.read_text()
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_on_a_page_exists(page: str) -> None:
+    text = text_of(page)
     # A usage line stands for every way to complete it.
     wrong = {" ".join(words): problem(words, mention="[OPTIONS]" in words) for words in commands(text)}
     wrong |= {" ".join(words): problem(words, mention=True) for words in mentions(text)}
