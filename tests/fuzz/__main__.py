@@ -14,9 +14,15 @@ import sys
 from collections.abc import Sequence
 
 from tests.fuzz.engine import Result, Target, fuzz, save, smallest
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.file_targets import FILES
+from tests.fuzz.frame_targets import FRAMES
+from tests.fuzz.message_targets import MESSAGES
+from tests.fuzz.plc_targets import PLC
 
+TARGETS = {target.name: target for target in (*FRAMES, *MESSAGES, *PLC, *FILES)}
 DEFAULT_S = 20.0
+Limits = tuple[int, int | None, int | None, float | None]
+"""Seed, inputs, units, seconds."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,9 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = options.seconds
     if seconds is None and options.runs is None and options.units is None:
         seconds = DEFAULT_S
-    names = options.target or list(TARGETS)
     limits = (options.seed, options.runs, options.units, seconds)
-    results = _side_by_side([TARGETS[n] for n in names], options.jobs, limits)
+    results = _side_by_side([TARGETS[n] for n in options.target or TARGETS], options.jobs, limits)
     broken = [r for r in results if r.failure]
     print(f"\n{len(results)} targets, {sum(r.runs for r in results)} inputs, {len(broken)} broken")
     for result in broken:
@@ -51,9 +56,7 @@ def _line(result: Result) -> str:
     )
 
 
-def _side_by_side(
-    targets: Sequence[Target], jobs: int, limits: tuple[int, int | None, int | None, float | None]
-) -> list[Result]:
+def _side_by_side(targets: Sequence[Target], jobs: int, limits: Limits) -> list[Result]:
     """One process per target, because memory is judged and a hang must not end the others."""
     waiting, running, results = list(targets), {}, []
     while waiting or running:
@@ -76,7 +79,7 @@ def _side_by_side(
     return results
 
 
-def _in_child(target: Target, limits: tuple[int, int | None, int | None, float | None], write: int) -> None:
+def _in_child(target: Target, limits: Limits, write: int) -> None:
     code = 1
     try:
         seed, runs, units, seconds = limits

@@ -1,6 +1,6 @@
 """Mutates inputs, runs targets on them, and keeps what breaks a contract.
 
-A `Target` reads bytes from outside: it uses them or refuses them, each time in the documented way.  The loop mutates
+A `Target` reads bytes from outside: it uses them or refuses them, each time in the documented way.  `fuzz` mutates
 known inputs: bits, bytes, numbers, words of the format, pieces of other inputs, lengths.  An input with a new outcome
 (a refusal code that was never seen, or a new kind of success) joins the known ones.  The same seed gives the same
 inputs.
@@ -11,29 +11,37 @@ processor time, and by memory that grows.
 
 from __future__ import annotations
 
+import atexit
+import hashlib
 import random
+import re
 import resource
+import shutil
 import signal
 import struct
+import tempfile
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 HANG_S = 10.0
-MAX_BYTES = 4096
 KNOWN_LIMIT = 512
+FOREVER = 1 << 62
 GROWTH_BYTES = 96 << 20
 """A run may keep this much: allocators keep pages, and known inputs are kept."""
 REGRESSIONS = Path(__file__).with_name("regressions")
+CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*(\.[a-z0-9]+(-[a-z0-9]+)*)+")
+MAX_SENTENCE_CHARS = 20_000
 _NUMBERS = (0, 1, 2, 7, 8, 0x0F, 0x10, 0x7F, 0x80, 0xFE, 0xFF)
 _WIDE = (0, 1, 0x7FFF, 0x8000, 0xFFFF, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 _FLOATS = (0.0, -0.0, 1.0, float("nan"), float("inf"), float("-inf"), 1e308, 5e-324, -1e9)
 
-Run = Callable[[bytes], "tuple[int, Hashable]"]
-"""Judges one input: how many units of the target it contained, and what became of it."""
+Run = Callable[[bytes], Hashable]
+"""Judges one input: what became of it."""
+_S = TypeVar("_S", list[bytes], bytes)
 
 
 class Broken(Exception):
@@ -49,22 +57,23 @@ class Target:
     """One surface.  ``start`` makes a judge with a fresh state, good for ``runs_per_state`` inputs.
 
     ``seeds`` makes valid inputs, ``words`` are pieces of the format, and ``mend`` repairs checksums, so that most
-    inputs get past them.  ``unit`` names what is counted; ``max_bytes`` bounds the length of an input.
+    inputs get past them.  ``unit`` names what ``count`` finds in an input; ``max_bytes`` bounds its length.
     """
 
     name: str
     unit: str
     start: Callable[[], Run]
     seeds: Callable[[], Sequence[bytes]]
-    words: tuple[bytes, ...] = ()
+    words: Sequence[bytes] = ()
     mend: Callable[[bytes], bytes] | None = None
-    runs_per_state: int = 1 << 62
-    max_bytes: int = MAX_BYTES
+    runs_per_state: int = FOREVER
+    max_bytes: int = 4096
+    count: Callable[[bytes], int] = lambda _: 1
 
 
 @dataclass(slots=True)
 class Result:
-    """What a run of a target did."""
+    """What a run of a target did; ``inputs`` are those since the last fresh state when a contract broke."""
 
     name: str
     unit: str
@@ -78,70 +87,121 @@ class Result:
     inputs: list[bytes] = field(default_factory=list)
 
 
-class Mutator:
-    """Makes inputs from known ones."""
+# -- what targets share ------------------------------------------------------------------------------------------------
 
-    def __init__(self, rng: random.Random, words: Sequence[bytes], max_bytes: int) -> None:
-        self._rng, self._words, self._max = rng, words, max_bytes
 
-    def changed(self, data: bytes, other: bytes) -> bytes:
-        """``data`` after one to six changes; ``other`` is a second known input."""
-        rng = self._rng
-        made = bytearray(data)
-        for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4, 6))):
-            self._change(made, other)
-        return bytes(made[: self._max])
+def coded(error: Exception) -> str:
+    """The code of a refusal, which has one that is stable, and one sentence that a person can read."""
+    code, text = getattr(error, "code", ""), str(error)
+    assert isinstance(code, str) and CODE.fullmatch(code), f"code {code!r}"
+    assert text.strip(), f"{code} has no sentence"
+    assert len(text) < MAX_SENTENCE_CHARS, f"{code}: {len(text)} characters"
+    assert "Traceback" not in text and "object at 0x" not in text, text
+    return code
 
-    def _change(self, made: bytearray, other: bytes) -> None:
-        rng, size = self._rng, len(made)
-        at = rng.randrange(size + 1)
-        match rng.randrange(12):
-            case 0 if size:
-                made[at % size] ^= 1 << rng.randrange(8)
-            case 1 if size:
-                made[at % size] = rng.choice(_NUMBERS)
-            case 2 if size:
-                made[at % size] = rng.randrange(256)
-            case 3:
-                made[at:at] = rng.randbytes(rng.randrange(1, 9))
-            case 4:
-                del made[at : at + rng.randrange(1, 17)]
-            case 5 if size:
-                piece = made[at : at + rng.randrange(1, 65)]
-                where = rng.randrange(size + 1)
-                made[where:where] = piece
-            case 6 if other:
-                begin = rng.randrange(len(other))
-                made[at : at + rng.choice((0, 8, 64))] = other[begin : begin + rng.randrange(1, 129)]
-            case 7:
-                width = rng.choice((2, 4, 8))
-                value = rng.choice(_WIDE) & ((1 << 8 * width) - 1)
-                made[at : at + width] = value.to_bytes(width, rng.choice(("little", "big")))
-            case 8:
-                made[at : at + 8] = struct.pack("<d", rng.choice(_FLOATS))
-            case 9 if self._words:
-                made[at : at + rng.choice((0, 0, 1, 8))] = rng.choice(self._words)
-            case 10 if size > 3 and rng.random() < 0.3:
-                del made[at:]
-            case _ if size:
-                made[at % size] = (made[at % size] + rng.choice((-1, 1))) & 0xFF
+
+def outcome(
+    refusal: type[Exception] | tuple[type[Exception], ...],
+    read: Callable[..., Any],
+    *arguments: Any,
+    then: Callable[[Any], Hashable] = lambda _: "good",
+) -> Hashable:
+    """The code of the documented refusal to read; else what ``then`` says of what was read."""
+    try:
+        found = read(*arguments)
+    except refusal as refused:
+        return coded(refused)
+    return then(found)
+
+
+def of_file(
+    name: str,
+    refusal: type[Exception] | tuple[type[Exception], ...],
+    read: Callable[[Path], Any],
+    then: Callable[[Any], Hashable] = lambda _: "good",
+) -> Callable[[], Run]:
+    """The start of a target that reads a file: of this name, with the input in it."""
+
+    def start() -> Run:
+        path = in_file(name)
+
+        def run(data: bytes) -> Hashable:
+            path.write_bytes(data)
+            return outcome(refusal, read, path, then=then)
+
+        return run
+
+    return start
+
+
+def in_file(name: str) -> Path:
+    """A file in a folder of this process, in memory where the system has one; it ends with the process."""
+    folder = Path(tempfile.mkdtemp(prefix="timberhand-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder / name
+
+
+# -- the loop ----------------------------------------------------------------------------------------------------------
+
+
+def changed(rng: random.Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
+    """``data`` after one to six changes; ``other`` is a second known input."""
+    made = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4, 6))):
+        _change(rng, made, other, words)
+    return bytes(made)
+
+
+def _change(rng: random.Random, made: bytearray, other: bytes, words: Sequence[bytes]) -> None:
+    size = len(made)
+    at = rng.randrange(size + 1)
+    match rng.randrange(12):
+        case 0 if size:
+            made[at % size] ^= 1 << rng.randrange(8)
+        case 1 if size:
+            made[at % size] = rng.choice(_NUMBERS)
+        case 2 if size:
+            made[at % size] = rng.randrange(256)
+        case 3:
+            made[at:at] = rng.randbytes(rng.randrange(1, 9))
+        case 4:
+            del made[at : at + rng.randrange(1, 17)]
+        case 5 if size:
+            piece = made[at : at + rng.randrange(1, 65)]
+            where = rng.randrange(size + 1)
+            made[where:where] = piece
+        case 6 if other:
+            begin = rng.randrange(len(other))
+            made[at : at + rng.choice((0, 8, 64))] = other[begin : begin + rng.randrange(1, 129)]
+        case 7:
+            width = rng.choice((2, 4, 8))
+            value = rng.choice(_WIDE) & ((1 << 8 * width) - 1)
+            made[at : at + width] = value.to_bytes(width, rng.choice(("little", "big")))
+        case 8:
+            made[at : at + 8] = struct.pack("<d", rng.choice(_FLOATS))
+        case 9 if words:
+            made[at : at + rng.choice((0, 0, 1, 8))] = rng.choice(words)
+        case 10 if size > 3 and rng.random() < 0.3:
+            del made[at:]
+        case _ if size:
+            made[at % size] = (made[at % size] + rng.choice((-1, 1))) & 0xFF
 
 
 def _resident_bytes() -> int:
-    fields = Path("/proc/self/statm").read_text().split()
-    return int(fields[1]) * resource.getpagesize()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def _alarm(_number: int, _frame: FrameType | None) -> None:
     raise Hang(f"an input took more than {HANG_S:g} s of processor time")
 
 
-def judged(run: Run, data: bytes) -> tuple[int, Hashable]:
+def judged(run: Run, data: bytes) -> Hashable:
     """The judgement of one input.
 
     Raises:
         Broken: the target raised, or hung.
     """
+    signal.signal(signal.SIGVTALRM, _alarm)
     signal.setitimer(signal.ITIMER_VIRTUAL, HANG_S)
     try:
         return run(data)
@@ -153,72 +213,53 @@ def judged(run: Run, data: bytes) -> tuple[int, Hashable]:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
 
 
-def inputs(target: Target, seed: int) -> Iterator[tuple[bytes, Callable[[Hashable], None]]]:
-    """Inputs without end, each with the function that takes its outcome."""
-    rng = random.Random(f"{target.name} {seed}")
-    known = list(target.seeds())
-    mutator = Mutator(rng, target.words, target.max_bytes)
-    seen: set[Hashable] = set()
-
-    def learn(data: bytes, outcome: Hashable) -> None:
-        if outcome in seen:
-            return
-        seen.add(outcome)
-        if len(known) < KNOWN_LIMIT:
-            known.append(data)
-
-    for data in known[:]:
-        yield data, lambda outcome, data=data: learn(data, outcome)
-    while True:
-        data = mutator.changed(rng.choice(known), rng.choice(known))
-        if target.mend is not None and rng.random() < 0.8:
-            data = target.mend(data)
-        yield data, lambda outcome, data=data: learn(data, outcome)
-
-
 def fuzz(
-    target: Target, seed: int = 1, *, runs: int | None = None, units: int | None = None, seconds: float | None = None,
-) -> Result:  # fmt: skip
-    """Run a target until a number of inputs or units or a time is reached, or a contract breaks.
-
-    ``Result.inputs`` are then the inputs since the last fresh state.
-    """
-    result = Result(target.name, target.unit)
-    signal.signal(signal.SIGVTALRM, _alarm)
+    target: Target,
+    seed: int = 1,
+    *,
+    runs: int | None = None,
+    units: int | None = None,
+    seconds: float | None = None,
+) -> Result:
+    """Run a target until a number of inputs or units or a time is reached, or a contract breaks."""
+    result, rng = Result(target.name, target.unit), random.Random(f"{target.name} {seed}")
+    known = list(target.seeds())
+    seeds, outcomes, base_bytes = iter(known[:]), set(), 0
     begun = time.monotonic()
     run, since = target.start(), []
-    outcomes: set[Hashable] = set()
-    base = 0
-    for data, learn in inputs(target, seed):
-        enough = (runs is not None and result.runs >= runs) or (units is not None and result.units >= units)
-        now = time.monotonic()
-        result.seconds = now - begun
-        if enough or (seconds is not None and result.seconds >= seconds):
-            break
+    while True:
+        result.seconds = time.monotonic() - begun
+        reached = ((result.runs, runs), (result.units, units), (result.seconds, seconds))
+        if any(limit is not None and value >= limit for value, limit in reached):
+            return result
+        data = next(seeds, None)
+        if data is None:
+            data = changed(rng, rng.choice(known), rng.choice(known), target.words)[: target.max_bytes]
+            if target.mend is not None and rng.random() < 0.8:
+                data = target.mend(data)
         if len(since) >= target.runs_per_state:
             run, since = target.start(), []
-        if target.runs_per_state < 1 << 62:
-            since.append(data)
-        else:
-            since = [data]
+        if target.runs_per_state == FOREVER:
+            since.clear()
+        since.append(data)
         result.runs += 1
         try:
-            count, outcome = judged(run, data)
+            fate = judged(run, data)
         except Broken as broken:
             result.failure, result.inputs = str(broken), since
-            break
-        result.units += count
-        outcomes.add(outcome)
+            return result
+        result.units += target.count(data)
+        if fate not in outcomes and len(known) < KNOWN_LIMIT:
+            known.append(data)
+        outcomes.add(fate)
         result.outcomes = len(outcomes)
-        learn(outcome)
         if result.runs == 2000:
-            base = _resident_bytes()
-        if base and result.runs % 5000 == 0:
-            result.grown_bytes = max(result.grown_bytes, _resident_bytes() - base)
+            base_bytes = _resident_bytes()
+        if base_bytes and result.runs % 5000 == 0:
+            result.grown_bytes = max(result.grown_bytes, _resident_bytes() - base_bytes)
             if result.grown_bytes > GROWTH_BYTES:
                 result.failure, result.inputs = f"memory grew by {result.grown_bytes >> 20} MiB", since
-                break
-    return result
+                return result
 
 
 # -- regressions -------------------------------------------------------------------------------------------------------
@@ -241,16 +282,15 @@ def unpacked(data: bytes) -> list[bytes]:
 
 def replay(target: Target, given: Sequence[bytes]) -> None:
     """Judge inputs from a fresh state; raises Broken."""
-    signal.signal(signal.SIGVTALRM, _alarm)
-    run: Any = target.start()
+    run = target.start()
     for data in given:
         judged(run, data)
 
 
 def smallest(target: Target, given: Sequence[bytes]) -> list[bytes]:
-    """Fewer and shorter inputs that break the contract as well."""
+    """Fewer inputs, the last of them shorter, that break the contract as well."""
 
-    def breaks(some: Sequence[bytes]) -> bool:
+    def breaks(some: list[bytes]) -> bool:
         try:
             replay(target, some)
         except Broken:
@@ -260,38 +300,29 @@ def smallest(target: Target, given: Sequence[bytes]) -> list[bytes]:
     kept = list(given)
     if not breaks(kept):
         return kept
-    if breaks(kept[-1:]):
-        kept = kept[-1:]
-    step = len(kept) // 2
+    kept = kept[-1:] if breaks(kept[-1:]) else _without_needless(kept, breaks)
+    return [*kept[:-1], _without_needless(kept[-1], lambda last: breaks([*kept[:-1], last]))]
+
+
+def _without_needless(whole: _S, breaks: Callable[[_S], bool]) -> _S:
+    """The whole without the pieces that it can do without and still breaks the contract."""
+    step = (len(whole) + 1) // 2
     while step:
         at = 0
-        while at < len(kept) - 1 and len(kept) > 1:
-            fewer = kept[:at] + kept[at + step :]
-            if fewer and breaks(fewer):
-                kept = fewer
+        while at < len(whole):
+            less = whole[:at] + whole[at + step :]
+            if breaks(less):
+                whole = less
             else:
                 at += step
         step //= 2
-    step = len(kept[-1]) // 2
-    while step:
-        at = 0
-        while at < len(kept[-1]):
-            shorter = kept[-1][:at] + kept[-1][at + step :]
-            if breaks([*kept[:-1], shorter]):
-                kept[-1] = shorter
-            else:
-                at += step
-        step //= 2
-    return kept
+    return whole
 
 
 def save(target: Target, given: Sequence[bytes]) -> Path:
     """Write inputs into the folder of regressions, which the tests replay."""
-    import hashlib
-
     data = packed(given)
-    folder = REGRESSIONS / target.name
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{hashlib.sha256(data).hexdigest()[:12]}.inputs"
+    path = REGRESSIONS / target.name / f"{hashlib.sha256(data).hexdigest()[:12]}.inputs"
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
     return path

@@ -6,9 +6,9 @@ import contextlib
 import random
 import re
 import shutil
-import tempfile
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,22 +16,22 @@ from autonomy.missions.mission_file import read as read_mission
 from autonomy.missions.mission_file import verify
 from autonomy.missions.model import MissionError
 from autonomy.networks import weights
-from autonomy.networks.graph import Network, parameter_shapes
+from autonomy.networks.graph import parameter_shapes
 from autonomy.networks.weights import WeightsError
-from can_dbc.dbc.codec import DbcError, EncodeRefused, FrameRefused
+from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
+from can_dbc.dbc.codec import Database, DbcError, EncodeRefused, FrameRefused
 from can_dbc.dbc.codec import load as load_dbc
 from can_dbc.trace.candump import MalformedRecord, read_trace
-from controller.config import ConfigError
+from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
 from controller.guard.__main__ import build
 from controller.guard.envelope import SEAL, digest
+from controller.guard.guard import Guard
 from controller.guard.layout import GuardConfigError, read_layouts
 from recorder.mcap_scan import NotMcap, is_complete, scan
 from recorder.recover import recover
 from tests.controller.guard_traffic import MOVING, Traffic
-from tests.fuzz.engine import Run, Target
-from tests.fuzz.message_targets import in_file
-from tests.fuzz.sentences import coded_sentence
+from tests.fuzz.engine import Run, Target, coded, in_file, of_file, outcome
 from tests.recorder import recordings
 
 ROOT = Path(__file__).parents[2]
@@ -65,55 +65,45 @@ def mission_seeds() -> list[bytes]:
     return [path.read_bytes() for path in sorted(EXAMPLES.iterdir()) if path.stat().st_size < 40_000]
 
 
-def start_mission() -> Run:
-    def run(data: bytes) -> tuple[int, Hashable]:
-        try:
-            draft = read_mission(data, "file")
-            verify(draft, site=(63.657853, 19.895562))
-        except MissionError as refused:
-            coded_sentence(refused)
-            assert all(p.place.startswith("file") and p.code and "\n" not in p.sentence for p in refused.problems)
-            return 1, tuple(p.code for p in refused.problems)[:3]
-        return 1, draft.format
-
-    return run
+def mission(data: bytes) -> Hashable:
+    try:
+        draft = read_mission(data, "file")
+        verify(draft, site=(63.657853, 19.895562))
+    except MissionError as refused:
+        coded(refused)
+        assert all(p.place.startswith("file") and p.code and "\n" not in p.sentence for p in refused.problems)
+        return tuple(p.code for p in refused.problems)[:3]
+    return draft.format
 
 
 def recording_seeds() -> list[bytes]:
-    folder = Path(tempfile.mkdtemp(prefix="timberhand-fuzz-"))
-    try:
-        recorder = recordings.record(folder, 24)
-        with contextlib.suppress(Exception):
-            recorder.close()
-        whole = (folder / "run.mcap").read_bytes()
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    folder = in_file("run.mcap").parent
+    recorder = recordings.record(folder, 24)
+    with contextlib.suppress(Exception):
+        recorder.close()
+    whole = (folder / "run.mcap").read_bytes()
     return [whole, whole[: len(whole) * 2 // 3]]
 
 
-def start_recording() -> Run:
-    """A damaged recording is read up to its damage, and repaired to something that can be read whole."""
-    folder = in_file("run")
-    folder.mkdir()
-    path = folder / "run.mcap"
+def read_recording(path: Path) -> tuple[Path, int]:
+    """The file and the number of its messages before a damage."""
+    try:
+        return path, sum(1 for _ in scan(path))
+    except NotMcap:
+        with contextlib.suppress(NotMcap):
+            recover(path.parent)
+        raise
 
-    def run(data: bytes) -> tuple[int, Hashable]:
-        path.write_bytes(data)
-        try:
-            before = sum(1 for _ in scan(path))
-        except NotMcap as refused:
-            coded_sentence(refused)
-            with contextlib.suppress(NotMcap):
-                recover(folder)
-            return 1, refused.code
-        complete = is_complete(path)
-        repaired = recover(folder)
-        assert bool(repaired) is not complete
-        if repaired:
-            assert is_complete(path) and sum(1 for _ in scan(path)) >= repaired[0].messages
-        return 1, (before > 0, complete, bool(repaired))
 
-    return run
+def repaired(read: tuple[Path, int]) -> Hashable:
+    """A damaged recording is repaired to something that can be read whole."""
+    path, before = read
+    complete = is_complete(path)
+    made = recover(path.parent)
+    assert bool(made) is not complete
+    if made:
+        assert is_complete(path) and sum(1 for _ in scan(path)) >= made[0].messages
+    return before > 0, complete, bool(made)
 
 
 TRACES = (
@@ -138,27 +128,17 @@ def blf_seed() -> bytes:
     return path.read_bytes()
 
 
-def trace(suffix: str) -> Callable[[], Run]:
-    """The reader of one kind of trace."""
-
-    def start() -> Run:
-        path = in_file(f"trace{suffix}")
-
-        def run(data: bytes) -> tuple[int, Hashable]:
-            path.write_bytes(data)
-            good = bad = 0
-            for record in read_trace(path):
-                if isinstance(record, MalformedRecord):
-                    bad += 1
-                    assert isinstance(record.text, str)
-                else:
-                    good += 1
-                    assert 0 <= len(record.data) <= 64
-            return 1, (min(good, 3), min(bad, 3))
-
-        return run
-
-    return start
+def counted(records: Iterable[Any]) -> Hashable:
+    """How many frames of a trace are good, how many malformed; three stand for more."""
+    good = bad = 0
+    for record in records:
+        if isinstance(record, MalformedRecord):
+            bad += 1
+            assert isinstance(record.text, str)
+        else:
+            good += 1
+            assert 0 <= len(record.data) <= 64
+    return min(good, 3), min(bad, 3)
 
 
 def dbc_seeds() -> list[bytes]:
@@ -174,97 +154,43 @@ def dbc_seeds() -> list[bytes]:
     return [(head + "\n".join(kept) + "\n" + "\n".join(rest) + "\n").encode("cp1252")]
 
 
-def start_dbc() -> Run:
-    """The codecs' reader; what it accepts can be used."""
-    path = in_file("fuzz.dbc")
-
-    def run(data: bytes) -> tuple[int, Hashable]:
-        path.write_bytes(data)
-        found: list[Hashable] = []
-        try:
-            database = load_dbc(path)
-        except DbcError as refused:
-            coded_sentence(refused)
-            found.append(refused.code)
-        else:
-            found.append("good")
-            for codec in list(database.messages.values())[:5]:
-                for payload in (bytes(codec.length), b"\xff" * codec.length, b""):
-                    with contextlib.suppress(FrameRefused):
-                        codec.receive(payload)
-                with contextlib.suppress(EncodeRefused):
-                    codec.encode(*(0 for _ in codec.signals))
-        return 1, tuple(found)
-
-    return run
+def used(database: Database) -> Hashable:
+    """What the codecs' reader accepts can be used."""
+    for codec in list(database.messages.values())[:5]:
+        for payload in (bytes(codec.length), b"\xff" * codec.length, b""):
+            with contextlib.suppress(FrameRefused):
+                codec.receive(payload)
+        with contextlib.suppress(EncodeRefused):
+            codec.encode(*(0 for _ in codec.signals))
+    return "good"
 
 
-def start_guard_dbc() -> Run:
+def guard_dbc(path: Path) -> Hashable:
     """The guard's own reader."""
-    path = in_file("guard.dbc")
 
-    def run(data: bytes) -> tuple[int, Hashable]:
-        path.write_bytes(data)
-        found: list[Hashable] = []
-        for name in ("ValveCmdA", "EstopStat", "EncSlew"):
-            try:
-                layout = read_layouts(path, [name])[name]
-                for field in layout.fields.values():
-                    field.inside(field.raw((1 << 64) - 1))
-                found.append("good")
-            except GuardConfigError as refused:
-                coded_sentence(refused)
-                found.append(refused.code)
-        return 1, tuple(found)
+    def use(name: str) -> None:
+        for field in read_layouts(path, [name])[name].fields.values():
+            field.inside(field.raw((1 << 64) - 1))
 
-    return run
+    return tuple(outcome(GuardConfigError, use, name) for name in ("ValveCmdA", "EstopStat", "EncSlew"))
 
 
 def profile_seeds() -> list[bytes]:
     return [path.read_bytes() for path in sorted((ROOT / "machine").glob("*.toml")) if "envelope" not in path.name]
 
 
-def start_profile() -> Run:
-    """The controller's profile."""
-    path = in_file("fuzz.toml")
-
-    def run(data: bytes) -> tuple[int, Hashable]:
-        path.write_bytes(data)
-        try:
-            settings = load_settings(path)
-        except ConfigError as refused:
-            coded_sentence(refused)
-            return 1, refused.code
-        return 1, settings.profile.carrier is not None
-
-    return run
+def has_carrier(settings: Settings) -> Hashable:
+    return settings.profile.carrier is not None
 
 
-def guard_limits(*suffixes: str) -> Callable[[], Run]:
-    """The files of limits that the guard reads; the input replaces the one with the last suffix."""
-
-    def start() -> Run:
-        folder = in_file("guard")
-        folder.mkdir()
-        for suffix in suffixes:
-            shutil.copy(ROOT / "machine" / f"palms_471{suffix}", folder / f"fuzz{suffix}")
-
-        def run(data: bytes) -> tuple[int, Hashable]:
-            (folder / f"fuzz{suffixes[-1]}").write_bytes(data)
-            try:
-                traffic = Traffic()
-                traffic.guard = build(folder / "fuzz.toml")
-            except GuardConfigError as refused:
-                coded_sentence(refused)
-                return 1, refused.code
-            traffic.tick(3)
-            traffic.a.update(MOVING)
-            traffic.tick(2)
-            return 1, "good"
-
-        return run
-
-    return start
+def guards(guard: Guard) -> Hashable:
+    """A guard that was made from files judges."""
+    traffic = Traffic()
+    traffic.guard = guard
+    traffic.tick(3)
+    traffic.a.update(MOVING)
+    traffic.tick(2)
+    return guard.verdict
 
 
 def sealed(data: bytes) -> bytes:
@@ -278,105 +204,43 @@ def envelope_seeds() -> list[bytes]:
 
 
 def start_envelope() -> Run:
-    """The guard's envelope beside a good profile: whatever passes makes a guard that judges."""
-    folder = in_file("guard")
-    folder.mkdir()
-    shutil.copy(ROOT / "machine" / "palms_471.toml", folder / "fuzz.toml")
+    """The guard's envelope beside a good profile."""
+    path = in_file("palms_471.envelope.toml")
+    shutil.copy(ROOT / "machine" / "palms_471.toml", path.with_name("fuzz.toml"))
 
-    def run(data: bytes) -> tuple[int, Hashable]:
-        (folder / "palms_471.envelope.toml").write_bytes(data)
-        try:
-            guard = build(folder / "fuzz.toml")
-        except GuardConfigError as refused:
-            coded_sentence(refused)
-            return 1, refused.code
-        traffic = Traffic()
-        traffic.guard = guard
-        traffic.tick(3)
-        traffic.a.update(MOVING)
-        traffic.tick(2)
-        return 1, traffic.guard.verdict
+    def run(data: bytes) -> Hashable:
+        path.write_bytes(data)
+        return outcome(GuardConfigError, build, path.with_name("fuzz.toml"), then=guards)
 
     return run
-
-
-def small_network() -> Network:
-    """The network that scores segments, the smallest one shipped."""
-    from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
-
-    return QUALITY_NETWORK
 
 
 def weight_seeds() -> list[bytes]:
-    network, path = small_network(), in_file("seed.safetensors")
-    arrays = {name: np.zeros(shape, np.float32) for name, shape in parameter_shapes(network).items()}
-    weights.save(path, network, arrays, {"data": "fuzz"})
+    path = in_file("seed.safetensors")
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in parameter_shapes(QUALITY_NETWORK).items()}
+    weights.save(path, QUALITY_NETWORK, arrays, {"data": "fuzz"})
     return [path.read_bytes(), path.read_bytes()[:200]]
 
 
-def start_weights() -> Run:
-    network, path = small_network(), in_file("fuzz.safetensors")
+def load_weights(path: Path) -> dict[str, Any]:
+    """Of the network that scores segments, the smallest one shipped."""
+    return weights.load(path, QUALITY_NETWORK)[0]
 
-    def run(data: bytes) -> tuple[int, Hashable]:
-        path.write_bytes(data)
-        try:
-            arrays, _ = weights.load(path, network)
-        except WeightsError as refused:
-            coded_sentence(refused)
-            return 1, refused.code
-        assert all(np.isfinite(a).all() for a in arrays.values())
-        return 1, "good"
 
-    return run
+def finite(arrays: dict[str, Any]) -> Hashable:
+    assert all(np.isfinite(a).all() for a in arrays.values())
+    return "good"
 
 
 _JSON = (b"null", b"[]", b"{}", b'"', b"NaN", b"1e309", b"-1", b"true", b'"role":"log",', b'"coordinates":', b"\\ud800")
 _XML = (b"<!DOCTYPE x>", b"&lol;", b"&#0;", b"<![CDATA[", b"</rte>", b"<trk>", b'lat="nan"', b'xmlns="urn:x"', b"Stem")
+_NUMBERS = b"nan -1 0 1e400 99999999999999999999"
 _TOML = (
-    b"{}",
-    b"[]",
-    b"[1, 2]",
-    b"1979-05-27",
-    b"5e-324",
-    b'"\\u0000"',
-    b"{a = 1}",
-    b"[",
-    b"]",
-    b"=",
-    b"[joints.slew]",
-    b"nan",
-    b"inf",
-    b"-1",
-    b"0",
-    b'""',
-    b"[[",
-    b"1e400",
-    b"true",
-    b"99999999999",
+    *_NUMBERS.split(),
+    *b'inf 5e-324 99999999999 true 1979-05-27 {} [] "" "\\u0000" [ ] [[ = [joints.slew]'.split(),
+    *(b"[1, 2]", b"{a = 1}"),
 )
-_DBC = (
-    b"-1",
-    b"0",
-    b"99999999999999999999",
-    b"1e400",
-    b"nan",
-    b"7x",
-    b"BO_ ",
-    b" SG_ ",
-    b"@1+",
-    b"@0-",
-    b"|",
-    b"m0",
-    b"M",
-    b"BA_ ",
-    b"VAL_ ",
-    b'"',
-    b";",
-    b"(0,0)",
-    b"[0|0]",
-    b"64",
-)
-
+_DBC = (*_NUMBERS.split(), *b'64 7x @1+ @0- | m0 M " ; (0,0) [0|0]'.split(), b"BO_ ", b" SG_ ", b"BA_ ", b"VAL_ ")
 _DBC_VALUE = rb"(-?[0-9.]+|[+-] )"
 _TOML_VALUE = rb"= *([^\n#]+)"
 
@@ -386,23 +250,25 @@ def _files(
     start: Callable[[], Run],
     seeds: Callable[[], Sequence[bytes]],
     words: tuple[bytes, ...] = (),
-    max_bytes: int = 1 << 16,
     value: bytes = b"",
+    max_bytes: int = 1 << 16,
 ) -> Target:
     mend = other_values(seeds, value, words) if value else None
     return Target(name, "files", start, seeds, words, mend, max_bytes=max_bytes)
 
 
+_PROFILE = of_file("fuzz.toml", ConfigError, load_settings, has_carrier)
+_GUARD_PROFILE = of_file("fuzz.toml", GuardConfigError, build, guards)
 FILES = (
-    _files("mission-file", start_mission, mission_seeds, _JSON + _XML, value=rb"[:,>\"] *([-0-9.]+|\"[^\"]*\")"),
-    _files("recording", start_recording, recording_seeds),
-    _files("trace-text", trace(".log"), lambda: list(TRACES)),
-    _files("trace-asc", trace(".asc"), lambda: [ASC], max_bytes=4096),
-    _files("trace-blf", trace(".blf"), lambda: [blf_seed()]),
-    _files("dbc", start_dbc, dbc_seeds, _DBC, 1 << 14, _DBC_VALUE),
-    _files("profile", start_profile, profile_seeds, _TOML, value=_TOML_VALUE),
-    _files("guard-dbc", start_guard_dbc, dbc_seeds, _DBC, 1 << 14, _DBC_VALUE),
-    _files("guard-profile", guard_limits(".toml"), profile_seeds, _TOML, value=_TOML_VALUE),
+    _files("mission-file", lambda: mission, mission_seeds, _JSON + _XML, rb"[:,>\"] *([-0-9.]+|\"[^\"]*\")"),
+    _files("recording", of_file("run.mcap", NotMcap, read_recording, repaired), recording_seeds),
+    _files("trace-text", of_file("trace.log", (), read_trace, counted), lambda: list(TRACES)),
+    _files("trace-asc", of_file("trace.asc", (), read_trace, counted), lambda: [ASC], max_bytes=4096),
+    _files("trace-blf", of_file("trace.blf", (), read_trace, counted), lambda: [blf_seed()]),
+    _files("dbc", of_file("fuzz.dbc", DbcError, load_dbc, used), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
+    _files("profile", _PROFILE, profile_seeds, _TOML, _TOML_VALUE),
+    _files("guard-dbc", of_file("guard.dbc", (), guard_dbc, tuple), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
+    _files("guard-profile", _GUARD_PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     Target("guard-envelope", "files", start_envelope, envelope_seeds, _TOML, sealed),
-    _files("weights", start_weights, weight_seeds, _JSON),
+    _files("weights", of_file("fuzz.safetensors", WeightsError, load_weights, finite), weight_seeds, _JSON),
 )

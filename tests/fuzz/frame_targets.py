@@ -9,7 +9,8 @@ every frame within the layout that the database gives it.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import Final
 
 from can_dbc.dbc.codec import Database
@@ -31,11 +32,9 @@ _LENGTHS: Final = 9
 Step = tuple[int, int, int, bytes]
 
 
-def records(data: bytes) -> Iterator[Step]:
+def records(data: bytes) -> list[Step]:
     """What to do, flags, key and payload, one after the other."""
-    for at in range(0, min(len(data), MAX_RECORDS * RECORD.size) - RECORD.size + 1, RECORD.size):
-        what, flags, key, payload = RECORD.unpack_from(data, at)
-        yield what, flags, key, payload
+    return list(RECORD.iter_unpack(data[: min(len(data) // RECORD.size, MAX_RECORDS) * RECORD.size]))
 
 
 class Protector:
@@ -101,54 +100,48 @@ def _judge(bench: Bench) -> None:
             assert 0 < len(data) <= 8
 
 
-def controller(settings: object) -> Callable[[], Run]:
+def controller(settings: object) -> Run:
     """The whole controller of one machine on its bench."""
+    bench = Bench(settings).active(ticks=10)
+    crane = Protector(DATABASE)
+    machine = Protector(MACHINE, GNSS)
 
-    def start() -> Run:
-        bench = Bench(settings).active(ticks=10)
-        crane = Protector(DATABASE)
-        machine = Protector(MACHINE, GNSS)
+    def tick(datagrams: Sequence[bytes] = (), **measured: int) -> None:
+        bench.tick(datagrams, **measured)
+        _judge(bench)
 
-        def tick(datagrams: Sequence[bytes] = (), **measured: int) -> None:
-            bench.tick(datagrams, **measured)
-            _judge(bench)
+    def perform(what: int, flags: int, key: int, payload: bytes) -> None:
+        match what % 7:
+            case 0:
+                frame = crane.frame(flags, key, payload, bench.now_ns)
+                bench.extra.append((frame.key, frame.data))
+            case 1:
+                frame = machine.frame(flags, key, payload, bench.now_ns)
+                bench.machine_extra.append((frame.key, frame.data))
+            case 2:
+                for _ in range(flags % 32 + 1 if flags & 0x80 else flags % 4 + 1):
+                    tick()
+            case 3:
+                tick([bench.operator(OperatorAction(flags % 4 + 1))])
+            case 4:
+                tick([bench.moving(key % 5, 0.05) if flags & 1 else bench.hold()])
+            case 5:
+                tick([payload])
+            case _:
+                tick(bus_state=flags % 5, late_ns=(payload[0] - 64) * 1_000_000)
 
-        def perform(what: int, flags: int, key: int, payload: bytes) -> int:
-            match what % 7:
-                case 0:
-                    frame = crane.frame(flags, key, payload, bench.now_ns)
-                    bench.extra.append((frame.key, frame.data))
-                    return 1
-                case 1:
-                    frame = machine.frame(flags, key, payload, bench.now_ns)
-                    bench.machine_extra.append((frame.key, frame.data))
-                    return 1
-                case 2:
-                    for _ in range(flags % 32 + 1 if flags & 0x80 else flags % 4 + 1):
-                        tick()
-                case 3:
-                    tick([bench.operator(OperatorAction(flags % 4 + 1))])
-                case 4:
-                    tick([bench.moving(key % 5, 0.05) if flags & 1 else bench.hold()])
-                case 5:
-                    tick([payload])
-                case _:
-                    tick(bus_state=flags % 5, late_ns=(payload[0] - 64) * 1_000_000)
-            return 0
+    def run(data: bytes) -> Hashable:
+        if bench.mode is not Mode.ACTIVE:  # an operator tries to start again
+            for action in (OperatorAction.RESET, OperatorAction.ARM):
+                bench.run(3)
+                tick([bench.operator(action)])
+            tick([bench.hold()])
+        for step in records(data):
+            perform(*step)
+        tick()
+        return bench.mode, bench.reason
 
-        def run(data: bytes) -> tuple[int, Hashable]:
-            if bench.mode is not Mode.ACTIVE:  # an operator tries to start again
-                for action in (OperatorAction.RESET, OperatorAction.ARM):
-                    bench.run(3)
-                    tick([bench.operator(action)])
-                tick([bench.hold()])
-            count = sum(perform(*step) for step in records(data))
-            tick()
-            return count, (bench.mode, bench.reason)
-
-        return run
-
-    return start
+    return run
 
 
 def guard() -> Run:
@@ -156,13 +149,11 @@ def guard() -> Run:
     traffic = Traffic().good()
     protector = Protector(DATABASE)
 
-    def run(data: bytes) -> tuple[int, Hashable]:
-        count = 0
+    def run(data: bytes) -> Hashable:
         for what, flags, key, payload in records(data):
             match what % 4:
                 case 0 | 1:
                     traffic.extra.append(protector.frame(flags, key, payload, traffic.now_ns))
-                    count += 1
                 case 2:
                     traffic.a.update(MOVING if flags & 1 else {"Mode": 0, "Slew": 0.0})
                     traffic.estop["ResetReq"] = flags >> 1 & 1
@@ -172,16 +163,21 @@ def guard() -> Run:
         traffic.tick()
         for _, sent in traffic.sent:
             assert 0 < len(sent) <= 8
-        return count, (traffic.guard.verdict, traffic.guard.enabled)
+        return traffic.guard.verdict, traffic.guard.enabled
 
     return run
 
 
+def _target(name: str, start: Callable[[], Run], runs_per_state: int, kinds: int) -> Target:
+    def frames(data: bytes) -> int:
+        return sum(what % kinds < 2 for what, *_ in records(data))
+
+    size = MAX_RECORDS * RECORD.size
+    return Target(name, "frames", start, scripts, runs_per_state=runs_per_state, max_bytes=size, count=frames)
+
+
 FRAMES = (
-    Target("controller-loader", "frames", controller(SETTINGS), scripts, runs_per_state=400,
-           max_bytes=MAX_RECORDS * RECORD.size),
-    Target("controller-forwarder", "frames", controller(AORO), scripts, runs_per_state=400,
-           max_bytes=MAX_RECORDS * RECORD.size),
-    Target("guard", "frames", guard, scripts, runs_per_state=1000,
-           max_bytes=MAX_RECORDS * RECORD.size),
-)  # fmt: skip
+    _target("controller-loader", partial(controller, SETTINGS), 400, 7),
+    _target("controller-forwarder", partial(controller, AORO), 400, 7),
+    _target("guard", guard, 1000, 4),
+)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import atexit
-import shutil
 import struct
-import tempfile
 import zlib
-from collections.abc import Callable, Hashable, Sequence
-from pathlib import Path
+from collections.abc import Hashable
 
 from autonomy.process.operator_commands import CommandReceiver, CommandRefused
 from can_dbc.messages import rgbd, tick_record
@@ -44,8 +40,7 @@ from controller.requests.gate import RequestGate
 from controller.requests.setpoint_gate import RequestRefused
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.conftest import a_timing
-from tests.fuzz.engine import Run, Target
-from tests.fuzz.sentences import coded_sentence
+from tests.fuzz.engine import Run, Target, in_file, outcome
 from tests.recorder import recordings
 
 MS = 1_000_000
@@ -90,22 +85,19 @@ def missions() -> list[bytes]:
     ]
 
 
-def start_decode() -> Run:
-    def run(data: bytes) -> tuple[int, Hashable]:
-        is_operator_command(data)
-        outcome: list[Hashable] = []
-        for what in (decode, decode_mission, decode_mission_command, decode_mission_upload, decode_grasp):
-            try:
-                message = what(data)
-                outcome.append(type(message).__name__)
-                if what is decode:
-                    assert encode(message)  # what is accepted can be said again
-            except DatagramRefused as refused:
-                assert str(refused)
-                outcome.append(refused.fault)
-        return 1, tuple(outcome)
-
-    return run
+def decoded(data: bytes) -> Hashable:
+    is_operator_command(data)
+    found: list[Hashable] = []
+    for what in (decode, decode_mission, decode_mission_command, decode_mission_upload, decode_grasp):
+        try:
+            message = what(data)
+            found.append(type(message).__name__)
+            if what is decode:
+                assert encode(message)  # what is accepted can be said again
+        except DatagramRefused as refused:
+            assert str(refused)
+            found.append(refused.fault)
+    return tuple(found)
 
 
 def start_gate() -> Run:
@@ -114,7 +106,7 @@ def start_gate() -> Run:
     missions_gate = CommandReceiver(HASH)
     now_ns = NOW_NS
 
-    def run(data: bytes) -> tuple[int, Hashable]:
+    def run(data: bytes) -> Hashable:
         nonlocal now_ns
         now_ns += 5 * MS
         found: list[Hashable] = []
@@ -127,73 +119,38 @@ def start_gate() -> Run:
             except RequestRefused as refused:
                 gate.count_refusal(refused.reason, refused.detail, now_ns)
                 found.append(refused.reason)
-        try:
-            found.append(missions_gate.accept(data, now_ns).action)
-        except CommandRefused as refused:
-            coded_sentence(refused)
-            found.append(refused.code)
-        return 1, tuple(found)
+        found.append(outcome(CommandRefused, missions_gate.accept, data, now_ns, then=lambda command: command.action))
+        return tuple(found)
 
     return run
 
 
-def keyed() -> Run:
+def keyed(data: bytes) -> Hashable:
     """With a key nothing passes that was not made with it."""
-    key = b"0123456789abcdef"
-
-    def run(data: bytes) -> tuple[int, Hashable]:
-        try:
-            decode(data, key)
-        except DatagramRefused as refused:
-            return 1, refused.fault
-        raise AssertionError("a datagram passed without the key")
-
-    return run
+    try:
+        decode(data, b"0123456789abcdef")
+    except DatagramRefused as refused:
+        return refused.fault
+    raise AssertionError("a datagram passed without the key")
 
 
-def start_record() -> Run:
-    def run(data: bytes) -> tuple[int, Hashable]:
-        try:
-            tick = tick_record.decode(data)
-        except RecordRefused as refused:
-            coded_sentence(refused)
-            return 1, refused.code
-        return 1, (len(tick.frames_in), len(tick.datagrams))
-
-    return run
+def recorded(data: bytes) -> Hashable:
+    return outcome(
+        RecordRefused, tick_record.decode, data, then=lambda tick: (len(tick.frames_in), len(tick.datagrams))
+    )
 
 
-def start_picture() -> Run:
+def pictured(data: bytes) -> Hashable:
     """Both sides read the fixed part first, with its exact length."""
-    parts = ((rgbd.decode, None), (rgbd.decode_header, rgbd.HEADER_BYTES),
-             (rgbd.request_name_bytes, rgbd.REQUEST_HEADER.size))  # fmt: skip
-
-    def run(data: bytes) -> tuple[int, Hashable]:
-        found: list[Hashable] = []
-        for what, size in parts:
-            if size is not None and len(data) < size:
-                continue
-            try:
-                what(data[:size])  # type: ignore[operator]
-                found.append("good")
-            except RgbdError as refused:
-                coded_sentence(refused)
-                found.append(refused.code)
-        return 1, tuple(found)
-
-    return run
+    found = [outcome(RgbdError, rgbd.decode, data)]
+    parts = ((rgbd.decode_header, rgbd.HEADER_BYTES), (rgbd.request_name_bytes, rgbd.REQUEST_HEADER.size))
+    found += [outcome(RgbdError, what, data[:size]) for what, size in parts if len(data) >= size]
+    return tuple(found)
 
 
 def pictures() -> list[bytes]:
     picture = rgbd.RgbdMessage("mast", NOW_NS, 6, 4, 5.0, 5.0, 3.0, 2.0, bytes(6 * 4 * 3), bytes(6 * 4 * 2))
     return [rgbd.encode_request("mast"), rgbd.encode_refusal("mast", "There is no such camera."), rgbd.encode(picture)]
-
-
-def in_file(name: str) -> Path:
-    """A file in a folder of this process, in memory where the system has one; it ends with the process."""
-    folder = Path(tempfile.mkdtemp(prefix="timberhand-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder / name
 
 
 RING_BYTES = 1 << 14
@@ -216,7 +173,7 @@ def start_ring() -> Run:
     """A reader of a file that another process writes: whatever it finds there, it ends and keeps nothing."""
     path = in_file("read.ring")
 
-    def run(data: bytes) -> tuple[int, Hashable]:
+    def run(data: bytes) -> Hashable:
         begun = bytearray(data[: 64 + RING_BYTES].ljust(64 + RING_BYTES, b"\0"))
         struct.pack_into("<QQ", begun, 0, RING_MAGIC, RING_BYTES)
         struct.pack_into("<Q", begun, 24, 0)
@@ -228,15 +185,12 @@ def start_ring() -> Run:
                 file.write(data[24:32].ljust(8, b"\0"))
             found = reader.read()
             for record in found:
-                try:
-                    tick_record.decode(record)
-                except RecordRefused as refused:
-                    coded_sentence(refused)
+                recorded(record)
         finally:
             reader.close()
         path.write_bytes(data)
         RingReader(path).close()
-        return 1, (min(len(found), 4), reader.lost > 0)
+        return min(len(found), 4), reader.lost > 0
 
     return run
 
@@ -259,34 +213,26 @@ def timing_page() -> bytes:
 def start_timing() -> Run:
     path, whole = in_file("read.timing"), timing_page()
 
-    def run(data: bytes) -> tuple[int, Hashable]:
+    def run(data: bytes) -> Hashable:
         data = data[:FACTS_BYTES] + whole[len(data[:FACTS_BYTES]) :]
         if data[8:16] == bytes(8) or data[8] & 1:
-            return 1, "not written"  # the reader waits for the writer, 0.1 s each time
+            return "not written"  # the reader waits for the writer, 0.1 s each time
         path.write_bytes(data)
-        try:
-            timing = read_timing(path)
-        except TimingRefused as refused:
-            coded_sentence(refused)
-            return 1, refused.code
-        return 1, timing.facts.mode
+        return outcome(TimingRefused, read_timing, path, then=lambda timing: timing.facts.mode)
 
     return run
 
 
-def _target(
-    name: str, start: Callable[[], Run], seeds: Callable[[], Sequence[bytes]], mend: bool = True,
-    unit: str = "datagrams", **more: object,
-) -> Target:  # fmt: skip
-    return Target(name, unit, start, seeds, mend=with_crc if mend else None, **more)  # type: ignore[arg-type]
+def all_datagrams() -> list[bytes]:
+    return [*datagrams(), *missions()]
 
 
 MESSAGES = (
-    _target("datagrams", start_decode, lambda: [*datagrams(), *missions()]),
-    _target("request-gate", start_gate, lambda: [*datagrams(), *missions()], runs_per_state=2000),
-    _target("datagrams-keyed", keyed, datagrams),
-    _target("tick-record", start_record, lambda: [recordings.tick(k) for k in range(3)], unit="records"),
-    _target("record-ring", start_ring, ring_seeds, mend=False, unit="rings", max_bytes=1 << 13),
-    _target("timing-page", start_timing, lambda: [timing_page()[:FACTS_BYTES].rstrip(b"\0")], mend=False, unit="pages"),
-    _target("camera-stream", start_picture, pictures, unit="messages", max_bytes=1 << 13),
+    Target("datagrams", "datagrams", lambda: decoded, all_datagrams, mend=with_crc),
+    Target("request-gate", "datagrams", start_gate, all_datagrams, mend=with_crc, runs_per_state=2000),
+    Target("datagrams-keyed", "datagrams", lambda: keyed, datagrams, mend=with_crc),
+    Target("tick-record", "records", lambda: recorded, lambda: [recordings.tick(k) for k in range(3)], mend=with_crc),
+    Target("record-ring", "rings", start_ring, ring_seeds, max_bytes=1 << 13),
+    Target("timing-page", "pages", start_timing, lambda: [timing_page()[:FACTS_BYTES].rstrip(b"\0")]),
+    Target("camera-stream", "messages", lambda: pictured, pictures, mend=with_crc, max_bytes=1 << 13),
 )

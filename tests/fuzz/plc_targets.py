@@ -16,9 +16,8 @@ from can_dbc.plc.map import COMMAND_COUNT, STATUS_COUNT, Bounds, Command, Feedba
 from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
 from controller.plc.handshake import Handshake
 from sim.plc.command_arbiter import CommandArbiter
-from tests.fuzz.engine import Run, Target
+from tests.fuzz.engine import Run, Target, coded, outcome
 from tests.fuzz.message_targets import with_crc
-from tests.fuzz.sentences import coded_sentence
 
 MS = 1_000_000
 ORDER = WordOrder.HIGH_FIRST
@@ -42,24 +41,18 @@ def start_datagrams() -> Run:
     shake, arbiter = Handshake(ORDER), CommandArbiter(Bounds.valves(), ORDER)
     now_ns = 10**9
 
-    def run(data: bytes) -> tuple[int, Hashable]:
+    def run(data: bytes) -> Hashable:
         nonlocal now_ns
         now_ns += 10 * MS
-        found: list[Hashable] = []
-        for what in (decode_reply, decode_command):
-            try:
-                what(data)
-                found.append("good")
-            except (DatagramRefused, MapError) as refused:
-                coded_sentence(refused)
-                found.append(refused.code)
+        refusals = (DatagramRefused, MapError)
+        found = [outcome(refusals, what, data) for what in (decode_reply, decode_command)]
         shake.datagram(COMMAND, now_ns)
         found.append(shake.accept_datagram(data, now_ns))
         arbiter.datagram("bridge", data, now_ns)
         found.append(arbiter.fault)
         if arbiter.accepted:
             Bounds.valves().check(arbiter.command)
-        return 1, tuple(found)
+        return tuple(found)
 
     return run
 
@@ -129,9 +122,8 @@ def start_answers() -> Run:
         try:
             registers = await client.exchange(shake.registers(COMMAND, now_ns))
         except LinkError as error:
-            coded_sentence(error)
             made.clear()
-            return error.code
+            return coded(error)
         except RegisterRefused as refused:
             assert 0 <= refused.code <= 255 and str(refused)
             shake.command_refused(refused.code)
@@ -142,10 +134,7 @@ def start_answers() -> Run:
             return shake.feedback.state
         return shake.problem.split(" ")[0]
 
-    def run(data: bytes) -> tuple[int, Hashable]:
-        return 1, loop.run_until_complete(exchange(data))
-
-    return run
+    return lambda data: loop.run_until_complete(exchange(data))
 
 
 class _Registers:
@@ -190,9 +179,9 @@ def start_requests() -> Run:
     registers = _Registers()
     connection = modbus._Connection(1, registers, None)  # type: ignore[arg-type]
 
-    def run(data: bytes) -> tuple[int, Hashable]:
+    def run(data: bytes) -> Hashable:
         if not 2 <= len(data) <= 254:
-            return 1, "length"  # `ModbusServer` ends such a connection before it reads the request
+            return "length"  # `ModbusServer` ends such a connection before it reads the request
         registers.now_ns += MS
         work = connection.answer(1, data[0], data[1:])
         try:
@@ -203,7 +192,7 @@ def start_requests() -> Run:
             raise AssertionError("the answer waits for something")
         assert 8 <= len(answer) <= 7 + 253, len(answer)
         Bounds.valves().check(registers.arbiter.command)
-        return 1, (answer[7], answer[8] if refused else len(answer))
+        return answer[7], answer[8] if refused else len(answer)
 
     return run
 
@@ -215,27 +204,22 @@ def status_blocks() -> list[bytes]:
     ]
 
 
-def start_blocks() -> Run:
-    def run(data: bytes) -> tuple[int, Hashable]:
-        registers = list(struct.unpack(f">{len(data) // 2}H", data[: len(data) // 2 * 2]))
-        found: list[Hashable] = []
-        for what in (plc.read_status, plc.read_command, plc.check_identity):
-            for order in WordOrder:
-                try:
-                    what(registers, order)
-                    found.append("good")
-                except MapError as refused:
-                    coded_sentence(refused)
-                    found.append(refused.code)
-        return 1, tuple(found)
+def blocks(data: bytes) -> Hashable:
+    registers = list(struct.unpack(f">{len(data) // 2}H", data[: len(data) // 2 * 2]))
+    return tuple(
+        outcome(MapError, what, registers, order)
+        for what in (plc.read_status, plc.read_command, plc.check_identity)
+        for order in WordOrder
+    )
 
-    return run
+
+def datagrams() -> list[bytes]:
+    return [*replies(), *commands()]
 
 
 PLC = (
-    Target("plc-datagrams", "datagrams", start_datagrams, lambda: [*replies(), *commands()], mend=with_crc,
-           runs_per_state=2000),
+    Target("plc-datagrams", "datagrams", start_datagrams, datagrams, mend=with_crc, runs_per_state=2000),
     Target("modbus-answers", "answers", start_answers, answers, runs_per_state=5000),
     Target("modbus-requests", "requests", start_requests, requests, runs_per_state=2000, max_bytes=254),
-    Target("plc-registers", "blocks", start_blocks, status_blocks, max_bytes=200),
-)  # fmt: skip
+    Target("plc-registers", "blocks", lambda: blocks, status_blocks, max_bytes=200),
+)
