@@ -10,7 +10,7 @@ joint on its path and ends it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Final
@@ -19,8 +19,7 @@ import numpy as np
 
 from autonomy.calibration.loop_gain import margins
 from autonomy.calibration.plan import free_range
-from autonomy.calibration.trace import BusTrace
-from autonomy.commissioning.pressure_trace import PressureTrace
+from autonomy.calibration.trace import BusTrace, SignalColumn
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import Axes, SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, joint_motion
@@ -43,6 +42,7 @@ BRAKE_S: Final = 0.8
 REPORT_TIMEOUT_NS: Final = 300_000_000
 BEGUN_SHARE: Final = 0.1
 """A motion is seen to have begun at this share of its way."""
+_PRESSURES: Final = ("PressA", "PressB")
 _MAX_TICK_S: Final = 0.1
 _NS: Final = 1e-9
 
@@ -72,6 +72,36 @@ class StepResult:
     delay_s: float
     """From the reference's to the joint's first tenth of the way out."""
     largest_command_pct: float
+
+
+class PressureTrace:
+    """The pressures of one joint's cylinder as its bus tells them.
+
+    ``sides``: the columns of the sides A and B of a joint, bar; empty where nothing measures them.
+    """
+
+    def __init__(self, database: Database, joint_name: str) -> None:
+        self.sides = (SignalColumn(), SignalColumn())
+        names = [f"{joint_name.capitalize()}{side}" for side in "AB"]
+        codecs = [database.message(name) for name in _PRESSURES]
+        self._codecs = [c for c in codecs if names[0] in c.index]
+        self._at = [[c.index[name] for name in names] for c in self._codecs]
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The keys of the frames that it uses."""
+        return tuple(c.key for c in self._codecs)
+
+    def accept(self, frames: Iterable[Frame]) -> None:
+        """Store frames as they arrive; others are ignored."""
+        for stamp_ns, key, data in frames:
+            for codec, at in zip(self._codecs, self._at, strict=True):
+                if key != codec.key or len(data) != codec.length:
+                    continue
+                values = codec.decode(data)
+                for index, column in zip(at, self.sides, strict=True):
+                    if values[index] is not None:
+                        column.add(stamp_ns, float(values[index]))
 
 
 class _ThereAndBack:

@@ -8,13 +8,14 @@ a client of this server needs ``RMW_IMPLEMENTATION=rmw_cyclonedds_cpp``.
 from __future__ import annotations
 
 import secrets
+import types
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from dataclasses import dataclass, fields
+from typing import Any, Final, Generic, TypeVar
 
 from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import int64, uint64
 
-from ros2.wire.call_header import fields_of, with_header
 from ros2.wire.node import Node, send
 from ros2.wire.qos import reliable
 
@@ -35,6 +36,23 @@ class Caller:
     client: int
     call: int
     writer: int
+
+
+def with_header(message: type[IdlStruct]) -> Any:
+    """The type that travels for ``message``: the number of the client, that of its call, and the message's fields.
+
+    It has the name of the message alone, because ``cdds_request_header_t`` is no part of the type.
+    """
+
+    def body(namespace: dict[str, Any]) -> None:
+        namespace["__annotations__"] |= {"client": uint64, "call": int64} | message.__annotations__
+
+    return dataclass(types.new_class("Call", (IdlStruct,), {"typename": message.__idl_typename__}, body))
+
+
+def fields_of(message: Any) -> dict[str, Any]:
+    """The fields of a message by name."""
+    return {field.name: getattr(message, field.name) for field in fields(message)}
 
 
 class ServiceServer(Generic[Request, Response]):

@@ -17,12 +17,10 @@ from typing import Final
 from host.exit_codes import ExitCode
 from timberhand.reference import (
     cli_page,
+    controller_pages,
     errors_page,
-    faults_page,
     frames_page,
-    journal_catalog,
     results_table,
-    transitions_page,
 )
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -39,9 +37,9 @@ BUILT: Final[dict[str, Callable[[], str]]] = {
 def committed(repository: Path = REPOSITORY) -> dict[Path, str]:
     """The text of every generated page that is committed, by its path."""
     made = {
-        "docs/reference/faults.md": faults_page.page(),
-        "docs/reference/transitions.md": transitions_page.page(),
-        "deploy/system/timberhand.catalog": journal_catalog.page(),
+        "docs/reference/faults.md": controller_pages.faults(),
+        "docs/reference/transitions.md": controller_pages.transitions(),
+        "deploy/system/timberhand.catalog": controller_pages.catalog(),
         "README.md": results_table.readme(repository),
     }
     return {repository / name: text for name, text in made.items()}
