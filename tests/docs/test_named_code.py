@@ -53,5 +53,5 @@ def test_every_file_and_name_on_a_page_exists(page: str) -> None:
 
 
 def test_a_wrong_name_is_noticed() -> None:
-    text = "`controller.step.up` `hil/none.py` `sim.nowhere.at_all`\n| x | `controller/step.py` | `Nobody.at_all` |\n"
+    text = "`controller.step.stepp` `hil/none.py` `sim.nowhere.at`\n| x | `controller/step.py` | `Nobody.at_all` |\n"
     assert len(missing(text)) == 5

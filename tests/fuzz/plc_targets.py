@@ -25,15 +25,12 @@ FEEDBACK = Feedback(7, State.EXECUTE, estop=7, position=(0.1,) * 7, velocity=(0.
 COMMAND = Command(Mode.VALVES, True, (0.5,) * 5 + (0.0, 0.0))
 
 
-def replies() -> list[bytes]:
-    """Replies of a PLC, numbered."""
-    return [encode_reply(Header(7, n, 1000 * n & 0xFFFF_FFFF, n), FEEDBACK) for n in (1, 2, 3, 0xFFFF_FFFF)]
-
-
-def commands() -> list[bytes]:
-    """Commands to a PLC, numbered."""
-    return [encode_command(Header(7, n, 1000 * n, n), COMMAND) for n in (1, 2, 3)] + [
-        encode_command(Header(7, 9, 1, 1), Command())
+def datagrams() -> list[bytes]:
+    """Replies of a PLC and commands to it, numbered."""
+    return [
+        *(encode_reply(Header(7, n, 1000 * n & 0xFFFF_FFFF, n), FEEDBACK) for n in (1, 2, 3, 0xFFFF_FFFF)),
+        *(encode_command(Header(7, n, 1000 * n, n), COMMAND) for n in (1, 2, 3)),
+        encode_command(Header(7, 9, 1, 1), Command()),
     ]
 
 
@@ -211,10 +208,6 @@ def blocks(data: bytes) -> Hashable:
         for what in (plc.read_status, plc.read_command, plc.check_identity)
         for order in WordOrder
     )
-
-
-def datagrams() -> list[bytes]:
-    return [*replies(), *commands()]
 
 
 PLC = (
