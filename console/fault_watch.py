@@ -12,10 +12,10 @@ from collections import deque
 from typing import Any, Final
 
 from can_dbc.messages.crane import StateReport
-from console.timeline import STOPPED, stop_words
+from console.timeline import stop_words
 from machine.geometry import kinematics
 from machine.profile import Profile
-from machine.status.modes import Mode
+from machine.status.modes import STOPPED, mode_name
 
 FOLLOWED_NS: Final = 10_000_000_000
 """A fault that has not stopped the machine by then is said not to have done so."""
@@ -47,7 +47,7 @@ class FaultWatch:
         self._at_ns, self._reacted_ns = at_ns, 0
         self._reason, self._from = (last.reason, self._tip(last)) if last else (0, None)
         self._fault = {
-            "title": title, "said": said, "begun_in": _name(last.mode) if last else "unknown",
+            "title": title, "said": said, "begun_in": mode_name(last.mode) if last else "unknown",
             "stood": last is not None and last.mode in STOPPED,
             "stop": None, "ms": None, "before_mm": None, "after_mm": None, "done": False,
         }  # fmt: skip
@@ -88,7 +88,7 @@ class FaultWatch:
     def _react(self, fault: dict[str, Any], report: StateReport) -> None:
         since_ns = report.since_ns if report.since_ns >= self._at_ns else report.stamp_ns
         code, text, advice = stop_words(report)
-        fault["stop"] = {"code": code, "text": text, "advice": advice, "mode": _name(report.mode)}
+        fault["stop"] = {"code": code, "text": text, "advice": advice, "mode": mode_name(report.mode)}
         if not self._reacted_ns:  # the reaction begins with its first reason, also when a STOP follows a slower motion
             fault["ms"] = round((since_ns - self._at_ns) / 1e6, 1)
             fault["before_mm"] = self._way_mm(report)
@@ -105,7 +105,3 @@ class FaultWatch:
         if not all(map(math.isfinite, q)):
             return None
         return tuple(kinematics.chain_points(self._profile.kinematics, (*q, 0.0))[PIN])
-
-
-def _name(mode: int) -> str:
-    return Mode(mode).name if mode in set(Mode) else f"MODE {mode}"

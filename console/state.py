@@ -29,7 +29,7 @@ from machine.geometry import grapple, kinematics
 from machine.geometry.map_projection import MapProjection
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
-from machine.status import faults
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import STALE_INPUT_NAMES
 
@@ -254,6 +254,6 @@ def _rate(window: list[StateReport]) -> float | None:
 
 def _sentence(reason: int, numbers: Sequence[float] = ()) -> str:
     try:
-        return faults.describe(reason, numbers=numbers)
+        return describe(reason, numbers=numbers)
     except ValueError:
         return f"The controller reports the unknown reason {reason & 0xFF}; run controller and console of one release."

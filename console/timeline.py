@@ -1,8 +1,7 @@
 """The timeline: modes, stops with sentence and remedy, and loads, from state reports and mission reports.  Pure.
 
-A stop begins when the mode enters STOP or FAULT from another mode, and when the reason changes while the machine is
-stopped, as in the recorder's files.  A load is what the grapple holds: from its lift, once it has been weighed, until
-the grapple opens.
+A stop begins as in the recorder's files.  A load is what the grapple holds: from its lift, once it has been weighed,
+until the grapple opens.
 """
 
 from __future__ import annotations
@@ -13,13 +12,12 @@ from typing import Any, Final
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.mission import MissionReport
-from machine.status.explanation import explain
-from machine.status.modes import Mode
-from machine.status.reasons import Reason
+from machine.status.explanation import StopDetector, explain
+from machine.status.modes import mode_name
+from machine.status.reasons import known
 
 ENTRIES: Final = 400
 """The newest entries are kept; of a long run the beginning is in its recording."""
-STOPPED: Final = (Mode.STOP, Mode.FAULT)
 HOLDING: Final = 5
 """``GrappleStat.State``: stopped by its load."""
 OPEN_STATES: Final = (1, 2)
@@ -43,7 +41,7 @@ class Timeline:
         """Stops and held loads so far."""
         self._mode: int | None = None
         self._reason = 0
-        self._before = "unknown"
+        self._detector = StopDetector()
         self._holds = False
         self._lifted_ns: int | None = None
         self._mission: MissionReport | None = None
@@ -69,21 +67,14 @@ class Timeline:
             self._add(now_ns, "mission", "Mission ended", report.failure or "As planned.")
 
     def _on_mode(self, report: StateReport) -> None:
-        before, mode = self._mode, report.mode
-        changed = report.reason != self._reason
-        self._mode, self._reason = mode, report.reason
-        at_ns = report.since_ns or report.stamp_ns
-        if mode not in STOPPED:
-            if mode != before:
-                self._add(report.stamp_ns, "mode", _name(mode), "", mode=_name(mode))
-                self._before = _name(mode)
-            return
-        if before is None or not (before not in STOPPED or changed):
-            if mode != before:  # the FAULT behind the ramp of its STOP, or stopped before the first report
-                self._add(report.stamp_ns, "mode", _name(mode), "", mode=_name(mode))
-            return
-        self.stops += 1
-        self._add(at_ns, "stop", *stop_words(report), mode=_name(mode), before=self._before)
+        changed, name = report.mode != self._mode, mode_name(report.mode)
+        self._mode, self._reason = report.mode, report.reason
+        before = self._detector.step(report.mode, report.reason)
+        if before is not None:
+            self.stops += 1
+            self._add(report.since_ns or report.stamp_ns, "stop", *stop_words(report), mode=name, before=before)
+        elif changed:  # also the FAULT behind the ramp of its STOP, or stopped before the first report
+            self._add(report.stamp_ns, "mode", name, "", mode=name)
 
     def _on_grapple(self, report: StateReport) -> None:
         if report.grapple_state in OPEN_STATES:
@@ -112,13 +103,9 @@ class Timeline:
 
 def stop_words(report: StateReport) -> tuple[str, str, str]:
     """Code, sentence with what was measured, and remedy of a stop."""
-    if report.reason & 0xFF not in set(Reason):
+    if known(report.reason) is None:
         code = f"REASON_{report.reason & 0xFF}"
         return code, "A reason of another release.", "Run controller and console of one release."
     found = explain(report.reason, report.numbers)
     measured = "; ".join(quantity.text for quantity in found.quantities)
     return found.code, found.sentence + (f" Measured: {measured}." if measured else ""), found.advice
-
-
-def _name(mode: int) -> str:
-    return Mode(mode).name if mode in set(Mode) else f"MODE {mode}"

@@ -13,10 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from machine.status.evidence import numbers_text
 from machine.status.explanation import ERROR, message_id, priority
-from machine.status.faults import FAULTS, part_of
-from machine.status.reasons import Reason
+from machine.status.reasons import known
 from recorder.stop import Stop
 
 SOCKET: Final = Path("/run/systemd/journal/socket")
@@ -57,13 +55,12 @@ def stop_fields(stop: Stop, file: Path) -> dict[str, str]:
         "TIMBERHAND_MODE_BEFORE": stop.mode_before,
         "TIMBERHAND_FILE": str(file),
     }
-    number, detail = stop.reason & 0xFF, stop.reason >> 8
-    if number not in set(Reason):
+    reason = known(stop.reason)
+    if reason is None:
         return fields
-    reason = Reason(number)
     return fields | {
         "MESSAGE_ID": message_id(reason),
         "PRIORITY": str(priority(reason)),
-        "TIMBERHAND_PART": part_of(FAULTS[reason].about, detail) or "the machine",
-        "TIMBERHAND_MEASURED": numbers_text(reason, detail, stop.numbers) or "nothing",
+        "TIMBERHAND_PART": stop.explanation.part or "the machine",
+        "TIMBERHAND_MEASURED": stop.explanation.measured or "nothing",
     }

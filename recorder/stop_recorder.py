@@ -7,17 +7,17 @@ recording: `timberhand why` reads them.
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from can_dbc.messages import datagrams
-from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import TickRecord
+from machine.status.explanation import StopDetector
 from recorder.manifest import Manifest
-from recorder.stop import Stop, StopDetector, stop_from
+from recorder.stop import Stop, report_of, stop_from
 from recorder.stop_files import StopFile, StopFiles
 
 BEFORE_NS: Final = 10_000_000_000
@@ -55,10 +55,9 @@ class StopRecorder:
         self._remember(now_ns, record)
         for file, _ in self._open:
             file.add_tick(now_ns, record)
-        report = self._report_of(tick)
-        mode_before = self._detector.step(report) if report is not None else None
-        if report is not None and mode_before is not None:
-            self._begin(stop_from(report, mode_before, self.files.next_number, self._offset_ns), now_ns)
+        with contextlib.suppress(DatagramRefused):
+            if (report := report_of(tick)) and (before := self._detector.step(report.mode, report.reason)):
+                self._begin(stop_from(report, before, self.files.next_number, self._offset_ns), now_ns)
         while self._open and now_ns >= self._open[0][1]:
             self._finish_oldest()
 
@@ -120,12 +119,3 @@ class StopRecorder:
         self._recent_bytes += len(record)
         while recent[0][0] < now_ns - BEFORE_NS or self._recent_bytes > MAX_MEMORY_BYTES:
             self._recent_bytes -= len(recent.popleft()[1])
-
-    def _report_of(self, tick: TickRecord) -> StateReport | None:
-        if not tick.report:
-            return None
-        try:
-            report = datagrams.decode(tick.report)
-        except DatagramRefused:
-            return None
-        return report if isinstance(report, StateReport) else None

@@ -41,7 +41,7 @@ from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.kinematics import Point
 from machine.joints import JOINTS, Joint
 from machine.profile import joint
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from runtime.errors import Problem
 

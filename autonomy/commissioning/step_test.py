@@ -28,7 +28,7 @@ from can_dbc.frame import Frame
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from runtime.errors import CodedError, Problem
 

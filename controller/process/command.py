@@ -34,7 +34,7 @@ from controller.process.tx_queue import MIN_QUEUE_FRAMES, crane_queue_frames
 from controller.process.warm_up import warm_up
 from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from runtime.allocator import keep_memory
 from runtime.compiled import running

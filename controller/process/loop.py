@@ -31,7 +31,7 @@ from controller.process.timing import LoopTiming
 from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
-from machine.status.faults import describe
+from machine.status.explanation import describe
 
 Address = tuple[str, int]
 MAX_DATAGRAMS: Final = 16

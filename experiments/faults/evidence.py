@@ -18,7 +18,8 @@ from controller.tick import Outputs
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
 from machine.profile import Profile
-from machine.status.faults import FAULTS, describe
+from machine.status.explanation import describe
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, pack
 from sim.plant_faults import database

@@ -24,7 +24,7 @@ from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.plc.bridged_plant import BridgedPlant, Transport
 from hil.plc.profile import write_plc_profile
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.reasons import pack
 from sim.plant import Plant

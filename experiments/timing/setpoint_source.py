@@ -32,7 +32,7 @@ from hil.harness.operator import Operator
 from machine.joints import JOINTS
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from machine.profile import Profile
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 
 SEND_PERIOD_NS: Final = 50_000_000

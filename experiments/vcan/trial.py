@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from experiments.common.pool import Job
 from experiments.vcan.stolen_time import StolenTime
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.reasons import Reason
 
 MISSION: Final = "docs/examples/paper_b.geojson"

@@ -31,7 +31,7 @@ from hil.wire.bitrates import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from runtime.shared_file import make_own_folder
 

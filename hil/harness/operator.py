@@ -13,7 +13,7 @@ from typing import Final
 
 from can_dbc.messages.crane import WATCH_PERIOD_NS, OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import encode
-from machine.status.modes import Mode
+from machine.status.modes import STOPPED, Mode
 
 REACTION_NS: Final = 1_000_000_000
 REPEAT_NS: Final = 2_000_000_000
@@ -24,8 +24,6 @@ MAX_PRESSES: Final = 90
 _BUTTONS: Final = {
     Mode.STANDBY: OperatorAction.ARM, Mode.STOP: OperatorAction.ARM, Mode.FAULT: OperatorAction.RESET
 }  # fmt: skip
-STOPPED: Final = (Mode.STOP, Mode.FAULT)
-"""A stop that turns into a latched fault counts as one stop."""
 
 
 class Operator:
@@ -79,6 +77,7 @@ class Operator:
 
     def _press(self, report: StateReport) -> bytes | None:
         if report.mode != self._mode:
+            # a stop that turns into a latched fault counts as one stop
             self.stops += report.mode in STOPPED and self._mode not in STOPPED
             self._mode, self._since_ns, self._presses = report.mode, report.stamp_ns, 0
         ready = report.stamp_ns - self._since_ns >= REACTION_NS and report.stamp_ns >= self._next_ns

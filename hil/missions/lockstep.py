@@ -37,7 +37,7 @@ from hil.missions.summary import MissionSummary
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from recorder.manifest import describe as describe_run
 from recorder.recorder import Recorder, RecordingRefused

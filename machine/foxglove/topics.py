@@ -44,7 +44,7 @@ from machine.foxglove.scene import machine_scene
 from machine.geometry.link_frames import link_frames
 from machine.joints import JOINTS
 from machine.profile import Profile
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 
 ENCODING: Final = "protobuf"

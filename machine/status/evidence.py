@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from machine.joints import Joint
-from machine.status.reasons import Reason
+from machine.status.reasons import Reason, known
 
 _MS: Final = "ms"
 _RAD, _RAD_S, _M, _M_S, _NM, _KG, _PCT, _BAR = "rad", "rad/s", "m", "m/s", "Nm", "kg", "%", "bar"
@@ -146,11 +146,6 @@ def quantities(reason: Reason, detail: int, numbers: Sequence[float | None]) -> 
     )
 
 
-def numbers_text(reason: Reason, detail: int, numbers: Sequence[float | None]) -> str:
-    """The numbers for a person, as in ``age of its last good sample 20.0 ms, limit 15.0 ms``; empty without any."""
-    return ", ".join(quantity.text for quantity in quantities(reason, detail, numbers))
-
-
 def _unit_of_joint(unit: str, joint: int) -> str:
     slides = joint == Joint.EXT
     return {_UNIT: _M if slides else _RAD, _UNIT_S: _M_S if slides else _RAD_S}.get(unit, unit)
@@ -160,8 +155,8 @@ def _shown(value: float, unit: str) -> str:
     if unit == _BITS:
         return f"{int(value):04X}h"
     if unit == _REASON:
-        number = int(value) & 0xFF
-        return Reason(number).name if number in set(Reason) else f"reason {number}"
+        refused = known(int(value))
+        return f"reason {int(value) & 0xFF}" if refused is None else refused.name
     if unit not in _SHOWN:
         return f"{value:g}"
     factor, decimals, mark = _SHOWN[unit]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Final
 
 
 class Mode(IntEnum):
@@ -17,3 +18,11 @@ class Mode(IntEnum):
     ACTIVE = 3
     STOP = 4
     FAULT = 5
+
+
+STOPPED: Final = (Mode.STOP, Mode.FAULT)
+
+
+def mode_name(mode: int) -> str:
+    """The name of a mode, also of one of another release."""
+    return Mode(mode).name if mode in set(Mode) else f"MODE {mode}"

@@ -188,10 +188,15 @@ class Fault(NamedTuple):
     bound_ms: int
     about: DetailKind
     sentence: str
-    advice: str
+    advice: str = ""
     always: bool = False
 
 
 def pack(reason: Reason, detail: int) -> int:
     """Reason and detail as one 16-bit number, as ``StateReport`` carries them."""
     return reason | detail << 8
+
+
+def known(reason: int) -> Reason | None:
+    """The reason without its detail; None for one of another release."""
+    return Reason(reason & 0xFF) if reason & 0xFF in set(Reason) else None

@@ -21,7 +21,7 @@ from controller.laws.grapple import GrappleState
 from controller.requests.setpoint_gate import REFUSED_LIMIT_COUNT
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from ros2.execution.goal_motion import GoalMotion, goal_motion, unit_of

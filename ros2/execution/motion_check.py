@@ -17,7 +17,7 @@ from controller.crane.workspace_check import MAX_KNOTS_CHECKED, WorkspaceCheck
 from controller.requests.setpoint_gate import RequestRefused
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint
-from machine.status.faults import sentence_of
+from machine.status.explanation import sentence_of
 from ros2.execution.goal_motion import GoalMotion, unit_of
 from ros2.execution.goal_refused import GoalRefused
 from ros2.interfaces.control import ErrorCode

@@ -6,7 +6,7 @@ from math import isfinite
 from typing import Final
 
 from can_dbc.messages.crane import StateReport
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import STALE_INPUT_NAMES
 from ros2.interfaces.builtin import Header, time_of

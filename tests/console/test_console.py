@@ -24,7 +24,7 @@ from console.server import STATIC
 from console.state import REPORT_TIMEOUT_NS, TIMING_TIMEOUT_NS, CraneState, describe_machine
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status import faults
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
 from tests.console.page_client import BROWSING, HERE, page_client, socket_of, visitor
@@ -236,7 +236,7 @@ def watched(report=REPORT, at_ns=0, seen_ns=0):
 
 def test_the_state_has_the_reason_and_the_stale_inputs():
     state = watched()
-    assert state["reason"] == faults.describe(REPORT.reason)
+    assert state["reason"] == describe(REPORT.reason)
     assert state["stale"] == [
         STALE_INPUT_NAMES[CRANE_INPUT_BITS["EstopStat"]],
         STALE_INPUT_NAMES[ENCODER_BIT + Joint.TILT],

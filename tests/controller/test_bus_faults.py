@@ -4,7 +4,8 @@ import pytest
 
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.canopen import heartbeat_frame
-from machine.status.faults import FAULTS, describe, part_of
+from machine.status.explanation import describe, part_of
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import DetailKind, Reaction, Reason
 from tests.controller.bench import AORO, MACHINE, MS, Bench, T

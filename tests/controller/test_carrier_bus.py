@@ -15,7 +15,7 @@ from controller.carrier.outputs import STANDING, CarrierCommand
 from controller.config import ConfigError
 from controller.step import Controller
 from machine.joints import ARTICULATION
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.codes import coded

@@ -5,7 +5,8 @@ import pytest
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.canopen import Emergency, emergency_frame, heartbeat_frame
 from machine.joints import Joint
-from machine.status.faults import FAULTS, describe, part_of
+from machine.status.explanation import describe, part_of
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import DetailKind, Reaction, Reason, pack
 from tests.codes import numbers_in

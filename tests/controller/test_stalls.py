@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from machine.status.faults import FAULTS, describe
+from machine.status.explanation import describe
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.codes import numbers_in

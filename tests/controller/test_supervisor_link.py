@@ -11,7 +11,8 @@ from can_dbc.messages.crane import LinkWatch, OperatorAction
 from controller.operator_link import OperatorLink
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
-from machine.status.faults import FAULTS, describe
+from machine.status.explanation import describe
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
 from tests.controller.bench import MS, SETTINGS, Bench, T

@@ -9,7 +9,8 @@ from controller.carrier.dead_reckoning import MAX_JUMP_M, MAX_REPEATED_JUMP_M
 from controller.carrier.monitors import ARM_STUCK_NS, DISAGREE_RAD, OVERSPEED_M_S, OVERSPEED_RATIO
 from controller.carrier.vehicle import RTK_FLOAT_SPEED_SHARE
 from machine.joints import ARTICULATION
-from machine.status.faults import FAULTS, describe, part_of
+from machine.status.explanation import describe, part_of
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import DetailKind, Reaction, Reason
 from tests.controller.drive_bench import CARRIER, MS, DriveBench, T

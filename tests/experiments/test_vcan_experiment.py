@@ -11,7 +11,7 @@ from experiments.common.result_page import markdown
 from experiments.vcan.experiment import environment_of, noisy, page_of
 from experiments.vcan.metrics import METRICS, gather
 from experiments.vcan.trial import command, read_output, read_summary
-from machine.status.faults import describe
+from machine.status.explanation import describe
 from machine.status.reasons import Reason
 
 TOLD = f"""   1.6 s  controller ACTIVE

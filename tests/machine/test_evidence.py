@@ -7,11 +7,15 @@ import math
 import pytest
 
 from machine.joints import Joint
-from machine.status.evidence import EVIDENCE, numbers_text, quantities
-from machine.status.explanation import explain, message_id, priority
-from machine.status.faults import FAULTS, describe, sentence_of
+from machine.status.evidence import EVIDENCE, quantities
+from machine.status.explanation import describe, explain, message_id, priority, sentence_of
+from machine.status.faults import FAULTS
 from machine.status.reasons import DetailKind, Reaction, Reason, pack
 from tests.codes import numbers_in
+
+
+def numbers_text(reason: Reason, detail: int, numbers: tuple[float | None, ...]) -> str:
+    return explain(pack(reason, detail), numbers).measured
 
 
 def test_numbers_have_their_names_and_units() -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from can_dbc.messages.crane import StateReport
 from can_dbc.messages.tick_record import decode
 from hil.replay.recording import manifest_of, messages
+from machine.status.explanation import StopDetector
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
 from recorder import manifest as manifests
@@ -22,11 +22,9 @@ from recorder import stop_files
 from recorder import stop_recorder as stop_recorder_module
 from recorder.mcap_scan import is_complete
 from recorder.recorder import TICK
-from recorder.stop import TOPIC, Stop, StopDetector
+from recorder.stop import TOPIC, Stop
 from recorder.stop_files import StopFiles, files_in, parts_in, repair
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
-
-NAN5 = (float("nan"),) * 5
 
 
 def stop_of(path: Path) -> Stop:
@@ -113,10 +111,6 @@ def test_in_lockstep_the_same_run_leaves_the_same_bytes(whole: Path, tmp_path: P
     assert first.name == second.name and first.read_bytes() == second.read_bytes()
 
 
-def report(mode: Mode, reason: int = 0) -> StateReport:
-    return StateReport(1, 2, 3, mode, 0, reason, 0, 0, 0, 0, NAN5, NAN5, NAN5, 0.0, 0.0, 0.0, 0, 0, 0, 0)
-
-
 @pytest.mark.parametrize(
     ("modes", "stops"),
     [
@@ -130,7 +124,7 @@ def report(mode: Mode, reason: int = 0) -> StateReport:
 )
 def test_what_counts_as_a_stop(modes: list[tuple[Mode, int]], stops: list[str]) -> None:
     detector = StopDetector()
-    found = [detector.step(report(mode, reason)) for mode, reason in modes]
+    found = [detector.step(mode, reason) for mode, reason in modes]
     assert [before for before in found if before is not None] == stops
 
 

@@ -20,7 +20,8 @@ from can_dbc.messages.envelope import signed
 from can_dbc.messages.tick_record import TickRecord, decode
 from controller.process.tick_recording import record
 from host.exit_codes import CommandFailed, ExitCode
-from machine.status.faults import FAULTS, sentence_of
+from machine.status.explanation import sentence_of
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from recorder.stop_files import files_in

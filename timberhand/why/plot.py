@@ -12,7 +12,7 @@ from machine.joints import JOINTS, Joint
 from machine.status.modes import Mode
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, stack
 from timberhand.why.stops import FoundStop
-from timberhand.why.timeline import report_of
+from timberhand.why.timeline import reports_of
 
 COLORS: Final = (OIL, TIMBER, MOSS, RUST, STEEL)
 COMMANDS: Final = {"ValveCmdA": ("Slew", "Lift", "Tilt", "Ext"), "ValveCmdB": ("Rot",)}
@@ -24,7 +24,7 @@ Series = list[tuple[float, ...]]
 def draw(found: FoundStop, path: Path) -> None:
     """Writes the plot as PNG; raises OSError."""
     at_ns = found.stop.at_ns
-    reports = [report for tick in found.ticks if (report := report_of(tick)) is not None]
+    reports = list(reports_of(found.ticks))
     times = [(report.stamp_ns - at_ns) / 1e9 for report in reports]
     with stack(path, (1.0, 1.6, 1.6, 1.6, 1.0), width=9.0, height=9.5) as axes:
         mode, commands, velocities, positions, lateness = axes
@@ -48,8 +48,8 @@ def draw(found: FoundStop, path: Path) -> None:
         lateness.set_xlim(min(times, default=-1.0), max(times, default=1.0))
         for axis in axes:
             axis.axvline(0.0, color="black", lw=1.2)
-        measured = ", ".join(quantity.text for quantity in found.stop.explanation.quantities)
-        mode.set_title(f"{found.stop.code}: {found.stop.explanation.sentence}" + (f"\n{measured}" if measured else ""))
+        explained = found.stop.explanation
+        mode.set_title("\n".join(filter(None, (f"{found.stop.code}: {explained.sentence}", explained.measured))))
 
 
 def _draw_modes(axis: Any, times: list[float], modes: list[int]) -> None:

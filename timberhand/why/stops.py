@@ -15,16 +15,17 @@ from typing import Final
 
 import msgspec
 
-from can_dbc.messages import datagrams, tick_record
+from can_dbc.messages import tick_record
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import RecordRefused, TickRecord
 from hil.replay.recording import files_of, manifest_of, messages
 from hil.replay.replay import recorded_ticks
 from host.exit_codes import CommandFailed, ExitCode
+from machine.status.explanation import StopDetector
 from recorder.manifest import Manifest
 from recorder.recorder import STOPS_NAME, TICK
-from recorder.stop import TOPIC, Stop, StopDetector, stop_from
+from recorder.stop import TOPIC, Stop, report_of, stop_from
 from recorder.stop_files import files_in, parts_in
 from recorder.stop_recorder import AFTER_NS, BEFORE_NS
 
@@ -84,8 +85,7 @@ def stops_in_recording(files: list[Path]) -> Iterator[FoundStop]:
         while recent[0][0] < tick.now_ns - BEFORE_NS:
             recent.popleft()
         report = _report_of(tick)
-        before = detector.step(report) if report is not None else None
-        if report is not None and before is not None:
+        if report and (before := detector.step(report.mode, report.reason)):
             number += 1
             open_.append((stop_from(report, before, number, offset_ns), [record for _, record in recent]))
         while open_ and tick.now_ns >= open_[0][0].at_ns + AFTER_NS:
@@ -106,17 +106,14 @@ def _decoded(data: bytes, file: Path) -> TickRecord:
 
 
 def _report_of(tick: TickRecord) -> StateReport | None:
-    if not tick.report:
-        return None
     try:
-        report = datagrams.decode(tick.report)
+        return report_of(tick)
     except DatagramRefused as error:
         raise CommandFailed(
             "recording.reports-unreadable",
             f"the recorded reports cannot be read ({error}); read it with the release that recorded it",
             ExitCode.CONFIGURATION,
         ) from error
-    return report if isinstance(report, StateReport) else None
 
 
 def _newest_directory() -> list[Path]:
