@@ -16,8 +16,7 @@ from experiments.timing.fitness import Figures
 from experiments.timing.losses import losses_between
 from experiments.timing.measurement import MeasurementWindow, measure, pooled
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
-from host.doctor import computer
-from host.doctor.facts import UNLIMITED, Facts
+from host.doctor.facts import UNLIMITED, Facts, interrupt_counts
 from host.doctor.timing import PRIORITY
 from host.systemd import process_facts
 from host.vcan_lab import links
@@ -134,6 +133,6 @@ def figures_of(
 
 def _interrupts(cpu: int) -> dict[str, int]:
     try:
-        return computer.interrupt_counts(Path("/proc/interrupts").read_text(), cpu)
+        return interrupt_counts(Path("/proc/interrupts").read_text(), cpu)
     except OSError:
         return {}

@@ -15,8 +15,7 @@ from typing import Any, Final
 
 from experiments.timing.fitness import Judgement, Verdict, disturbances, judge, overall
 from experiments.timing.fitness_measurement import Measured
-from host.doctor.computer import Computer
-from host.doctor.facts import UNLIMITED, Facts
+from host.doctor.facts import UNLIMITED, Computer, Facts
 from host.doctor.finding import Finding, Severity
 
 REMOVED: Final = "(removed)"

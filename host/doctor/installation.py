@@ -40,6 +40,7 @@ DATA: Final = Path("/var/lib/timberhand")
 KEY_OWNER: Final = 0
 MIN_FREE_MB: Final = 1000
 """Disk space for some hours of recording."""
+ADVICE, CHANGE, FAULT = Severity.ADVICE, Severity.CHANGE, Severity.FAULT
 
 
 def examine() -> tuple[Finding, ...]:
@@ -52,37 +53,31 @@ def python() -> Finding:
     """The interpreter; pip refuses versions that are too old, and pybullet has no wheels for the newest."""
     version = sys.version.split()[0]
     if sys.version_info >= (3, 12):
-        return Finding(
-            "python", Severity.ADVICE, f"Python {version} has no pybullet", "the simulated plant",
-            ("make setup PYTHON=python3.11",),
-        )  # fmt: skip
+        command = "make setup PYTHON=python3.11"
+        return Finding("python", ADVICE, f"Python {version} has no pybullet", "the simulated plant", (command,))
     return fine("python", f"Python {version} in {sys.prefix}")
 
 
 def packages() -> Iterator[Finding]:
     """Whether every required package is installed in a suitable version."""
+    gain, mend = "a working program", ("make setup",)
     try:
         wanted = [Requirement(text) for text in metadata.requires("timberhand") or ()]
     except metadata.PackageNotFoundError:
-        yield Finding(
-            "packages", Severity.FAULT, "timberhand itself is not installed", "a working program", ("make setup",)
-        )
+        yield Finding("packages", FAULT, "timberhand itself is not installed", gain, mend)
         return
     base = [need for need in wanted if need.marker is None or need.marker.evaluate({"extra": ""})]
     lacking = [fault for need in base if (fault := _missing(need))]
     if lacking:
-        yield Finding(
-            "packages", Severity.FAULT, f"missing: {', '.join(lacking)}", "a working program", ("make setup",)
-        )
+        yield Finding("packages", FAULT, f"missing: {', '.join(lacking)}", gain, mend)
     else:
-        yield fine(
-            "packages", f"timberhand {metadata.version('timberhand')}; all {len(base)} required packages are installed"
-        )
+        version = metadata.version("timberhand")
+        yield fine("packages", f"timberhand {version}; all {len(base)} required packages are installed")
     for extra, purpose in EXTRAS.items():
         needs = [n for n in wanted if n.marker and n.marker.evaluate({"extra": extra}) and n not in base]
         if faults := [fault for need in needs if (fault := _missing(need))]:
             command = f"{sys.executable} -m pip install 'timberhand[{extra}]'"
-            yield Finding(f"packages, {extra}", Severity.ADVICE, f"missing: {', '.join(faults)}", purpose, (command,))
+            yield Finding(f"packages, {extra}", ADVICE, f"missing: {', '.join(faults)}", purpose, (command,))
 
 
 def _missing(need: Requirement) -> str:
@@ -100,10 +95,8 @@ def tick() -> Finding:
     running, _, reason = answer.partition("|")
     if running.startswith("compiled"):
         return fine("tick", running)
-    return Finding(
-        "tick", Severity.ADVICE, f"runs on the interpreter: {reason or 'unknown'}",
-        "less than half the time for every tick", ("timberhand compile",),
-    )  # fmt: skip
+    gain = "less than half the time for every tick"
+    return Finding("tick", ADVICE, f"runs on the interpreter: {reason or 'unknown'}", gain, ("timberhand compile",))
 
 
 def profiles() -> Iterator[Finding]:
@@ -116,31 +109,28 @@ def profiles() -> Iterator[Finding]:
             load_profile(name)
         except ProfileError as error:
             command = "git status machine" if name in shipped_profiles() else f"sudo nano {CONF}  # PROFILE"
-            yield Finding("profile", Severity.FAULT, str(error), "the controller starts", (command,))
+            yield Finding("profile", FAULT, str(error), "the controller starts", (command,))
         else:
             yield fine("profile", f"{name} loads" + (", chosen in the settings" if name == chosen else ""))
 
 
 def buses() -> Iterator[Finding]:
     """The buses that a controller can use."""
+    interfaces, settings = [name for _, name in socket.if_nameindex()], _settings()
     if not kernel_has_can():
-        yield Finding(
-            "buses", Severity.ADVICE, "this kernel has no SocketCAN; the wire (a CAN bus in user space) works",
-            "a real machine", ("sudo modprobe can_raw  # if that fails: a kernel with CONFIG_CAN_RAW",),
-        )  # fmt: skip
+        wrong = "this kernel has no SocketCAN; the wire (a CAN bus in user space) works"
+        command = "sudo modprobe can_raw  # if that fails: a kernel with CONFIG_CAN_RAW"
+        yield Finding("buses", ADVICE, wrong, "a real machine", (command,))
     else:
-        names = [n for _, n in socket.if_nameindex() if _type_of(n) == "280"]  # ARPHRD_CAN, linux/if_arp.h
-        there = ", ".join(names) if names else "no interface yet"
-        yield fine("buses", f"SocketCAN: {there}; the wire")
-    settings = _settings()
+        there = [name for name in interfaces if _type_of(name) == "280"]  # ARPHRD_CAN, linux/if_arp.h
+        yield fine("buses", f"SocketCAN: {', '.join(there) or 'no interface yet'}; the wire")
     for setting in ("CRANE_BUS", "MACHINE_BUS"):
         address = settings.get(setting, "")
         name = address.removeprefix("socketcan:")
-        if name != address and name not in {n for _, n in socket.if_nameindex()}:
-            yield Finding(
-                "buses", Severity.CHANGE, f"{setting}={address} in {CONF}, but there is no interface {name}",
-                "the controller service finds its bus", (f"sudo nano {CONF}", "ip -brief link show type can"),
-            )  # fmt: skip
+        if name != address and name not in interfaces:
+            wrong = f"{setting}={address} in {CONF}, but there is no interface {name}"
+            commands = (f"sudo nano {CONF}", "ip -brief link show type can")
+            yield Finding("buses", CHANGE, wrong, "the controller service finds its bus", commands)
 
 
 def vcan_lab() -> Finding:
@@ -149,8 +139,8 @@ def vcan_lab() -> Finding:
     try:
         method = choose(survey(request))
     except LabError as reason:
-        packages = "sh deploy/debian_packages.sh"
-        return Finding("vcan lab", Severity.ADVICE, str(reason), "SocketCAN for tests and demos", (packages,))
+        command = "sh deploy/debian_packages.sh"
+        return Finding("vcan lab", ADVICE, str(reason), "SocketCAN for tests and demos", (command,))
     return fine("vcan lab", f"works ({method.kind})")
 
 
@@ -159,7 +149,7 @@ def kernel_of_lab() -> Finding:
     if built := lab_kernel.find(shim.user_cache()):
         return fine("lab kernel", built)
     gain = "tests in simulated time: hil vcan --time-travel"
-    return Finding("lab kernel", Severity.ADVICE, "not built", gain, ("make lab-kernel",))
+    return Finding("lab kernel", ADVICE, "not built", gain, ("make lab-kernel",))
 
 
 def places() -> Iterator[Finding]:
@@ -170,15 +160,14 @@ def places() -> Iterator[Finding]:
         near = next(p for p in (place.absolute(), *place.absolute().parents) if p.exists())
         free_mb = shutil.disk_usage(near).free >> 20
         if place is not DATA and not os.access(near, os.W_OK):
-            yield Finding("disk", Severity.CHANGE, f"{near} cannot be written", purpose, (f"ls -ld {near}",))
+            yield Finding("disk", CHANGE, f"{near} cannot be written", purpose, (f"ls -ld {near}",))
         elif free_mb < MIN_FREE_MB:
-            yield Finding("disk", Severity.CHANGE, f"{near} has {free_mb} MB free", purpose, (f"du -h -d 1 {near}",))
+            yield Finding("disk", CHANGE, f"{near} has {free_mb} MB free", purpose, (f"du -h -d 1 {near}",))
         else:
             yield fine("disk", f"{near}: {free_mb >> 10} GB free for {purpose}")
     if not os.access(shm := "/dev/shm", os.W_OK):  # asked only  # nosec B108
-        yield Finding(
-            "disk", Severity.CHANGE, f"{shm} cannot be written", "the controller's timing page", ("mount | grep shm",)
-        )  # fmt: skip
+        gain = "the controller's timing page"
+        yield Finding("disk", CHANGE, f"{shm} cannot be written", gain, ("mount | grep shm",))
 
 
 def ports() -> Finding:
@@ -188,10 +177,9 @@ def ports() -> Finding:
     taken = {name: port for name, port in wanted.items() if not _free(port, name == "CONSOLE_PORT")}
     if taken:
         which = ", ".join(f"{name} {port}" for name, port in taken.items())
-        return Finding(
-            "ports", Severity.ADVICE, f"in use: {which}; expected while the services run",
-            "the processes find their ports", (f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'",),
-        )  # fmt: skip
+        command = f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'"
+        wrong = f"in use: {which}; expected while the services run"
+        return Finding("ports", ADVICE, wrong, "the processes find their ports", (command,))
     return fine("ports", f"free: {', '.join(map(str, wanted.values()))}")
 
 
@@ -203,14 +191,14 @@ def key() -> Iterator[Finding]:
     try:
         status = SERVICE_KEY.stat()
     except OSError:
-        yield Finding("key", Severity.FAULT, f"{SERVICE_KEY} is missing", "the services start", mend)
+        yield Finding("key", FAULT, f"{SERVICE_KEY} is missing", "the services start", mend)
         return
     if status.st_mode & 0o037 or status.st_uid != KEY_OWNER:
         command = (f"sudo chown root:timberhand-operator {SERVICE_KEY}", f"sudo chmod 0440 {SERVICE_KEY}")
         gain = "nobody but root and the operators can make a command"
-        yield Finding("key", Severity.FAULT, f"others may read or change {SERVICE_KEY}", gain, command)
+        yield Finding("key", FAULT, f"others may read or change {SERVICE_KEY}", gain, command)
     elif status.st_size < MIN_KEY_BYTES:
-        yield Finding("key", Severity.FAULT, f"{SERVICE_KEY} has {status.st_size} bytes", "the services start", mend)
+        yield Finding("key", FAULT, f"{SERVICE_KEY} has {status.st_size} bytes", "the services start", mend)
     else:
         yield fine("key", f"{SERVICE_KEY}, for root and the operators")
 
@@ -223,13 +211,13 @@ def signed() -> Iterator[Finding]:
     gain = "only what its maker signed runs here"
     if not SIGNER.is_file():
         command = f"sudo install -m 0644 signer.pem {SIGNER}"
-        yield Finding("signature", Severity.ADVICE, f"no key of a signer in {SIGNER}", gain, (command,))
+        yield Finding("signature", ADVICE, f"no key of a signer in {SIGNER}", gain, (command,))
         return
     chosen = _settings().get("PROFILE")
     found = list(installed.problems(SIGNER, profile_path(chosen) if chosen else installed.PROGRAM))
     for problem in found:
         command = "sudo timberhand service update BUNDLE"
-        yield Finding("signature", Severity.CHANGE, problem.sentence, gain, (command,))
+        yield Finding("signature", CHANGE, problem.sentence, gain, (command,))
     if not found:
         yield fine("signature", f"the release {tree.name} and the machine's files are what was signed")
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from experiments.timing.fitness import Figures, Verdict, judge, overall
 from experiments.timing.fitness_measurement import Measured
 from experiments.timing.fitness_report import REMOVED, data_of, private_words, read_data, text_of, without_private
-from host.doctor import computer, facts
-from host.doctor.computer import interrupt_counts
+from host.doctor import facts
+from host.doctor.facts import interrupt_counts
 from timberhand.cli import app
 
 GOOD = Figures(
@@ -78,7 +78,7 @@ def test_names_and_private_paths_leave_every_text() -> None:
 
 
 def test_the_report_holds_its_data_and_the_failure_of_a_measurement() -> None:
-    found, machine = facts.read(Path("/")), computer.read(Path("/"), "#1 SMP", 0)
+    found, machine = facts.read(Path("/")), facts.read_computer(Path("/"), "#1 SMP", 0)
     measured = Measured(GOOD, "wire", "aoro_fc8", 0, "interpreter", (), {"LOC": 7})
     data = data_of(found, machine, (), measured, private_words())
     assert read_data(text_of(data)) == data
@@ -97,8 +97,8 @@ def test_facts_of_the_computer_from_a_test_tree(tmp_path: Path) -> None:
     }.items():  # fmt: skip
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).write_text(text)
-    found = computer.read(tmp_path, "#1 SMP PREEMPT_RT", 1)
-    assert found == computer.Computer(
+    found = facts.read_computer(tmp_path, "#1 SMP PREEMPT_RT", 1)
+    assert found == facts.Computer(
         "Atom", 2, 2, "#1 SMP PREEMPT_RT", ("isolcpus=1", "nohz_full=1"), (4,), 2, "3"
     )  # fmt: skip
     counts = (

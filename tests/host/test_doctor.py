@@ -13,8 +13,7 @@ from rich.console import Console
 
 from host.doctor import installation
 from host.doctor.facts import UNLIMITED, CanLink, Facts, cpu_set, read
-from host.doctor.finding import Finding, Severity, fine
-from host.doctor.show import conclusion, show
+from host.doctor.finding import Finding, Severity, conclusion, fine, show
 from host.doctor.timing import evaluate
 from machine.loading.profile_file import ProfileError
 

@@ -57,8 +57,7 @@ def doctor(
     from rich.console import Console
 
     from host.doctor import facts, installation, timing
-    from host.doctor.finding import Severity
-    from host.doctor.show import conclusion, show
+    from host.doctor.finding import Severity, conclusion, show
     from host.exit_codes import ExitCode
 
     if report:
@@ -98,10 +97,10 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
     from rich.console import Console
 
     from experiments.timing.fitness import Verdict
-    from experiments.timing.fitness_measurement import loopback_bus, measure_computer
+    from experiments.timing.fitness_measurement import Measured, loopback_bus, measure_computer
     from experiments.timing.fitness_report import data_of, text_of
     from experiments.timing.testbed import cores
-    from host.doctor import computer, facts, timing
+    from host.doctor import facts, timing
     from host.exit_codes import CommandFailed, ExitCode
 
     try:
@@ -114,18 +113,17 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
         ) from None
     cpu = cores()[0]
     found = facts.read(Path("/"), _links(), cpu)
-    machine = computer.read(Path("/"), platform.version(), cpu)
+    machine = facts.read_computer(Path("/"), platform.version(), cpu)
     chosen = loopback_bus(profile) if bus is LoopbackBus.AUTO else bus.value
     console = Console(highlight=False)
     with tempfile.TemporaryDirectory(prefix="timberhand-report-") as place, console.status("") as status:
         try:
-            measured = measure_computer(
+            measured: Measured | str = measure_computer(
                 found, profile, chosen, seconds, Path(place), lambda step: status.update(f"real-time report: {step}")
             )
         except CommandFailed as failure:
-            data = data_of(found, machine, timing.evaluate(found), f"the measurement failed: {failure}", _private())
-        else:
-            data = data_of(found, machine, timing.evaluate(found), measured, _private())
+            measured = f"the measurement failed: {failure}"
+    data = data_of(found, machine, timing.evaluate(found), measured, _private())
     out.write_text(text_of(data))
     for judged in data["judgements"]:
         console.print(f"{judged['verdict']:>12}  {judged['topic']}: {judged['sentence']}", soft_wrap=True)
