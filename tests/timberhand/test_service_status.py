@@ -13,10 +13,9 @@ from typer.testing import CliRunner
 from can_dbc.timing.page import InputAge, Timing, TimingWriter
 from host.exit_codes import CommandFailed
 from tests.codes import numbers_in
+from timberhand import service_status as status
 from timberhand.cli import app
-from timberhand.service_status import status
-from timberhand.service_status.screen import duration, number, screen
-from timberhand.service_status.status import Status, Unit, oldest_first, read_status, read_unit
+from timberhand.service_status import Status, Unit, duration, number, oldest_first, read_status, read_unit, screen
 
 S = 1_000_000_000
 Timings = Callable[..., Timing]

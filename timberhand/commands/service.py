@@ -135,23 +135,34 @@ def status(
     """
     import json
 
+    from rich.console import Console
+    from rich.live import Live
+
     from host.exit_codes import CommandFailed, ExitCode
-    from timberhand.service_status.status import read_status
+    from timberhand.service_status import read_status, screen
 
-    if watch:
-        _watch(timing, as_json)
-        return
-    found = read_status(timing)
-    if as_json:
-        print(json.dumps(found.named()))
-    elif found.units or found.timing:
-        from rich.console import Console
-
-        from timberhand.service_status.screen import screen
-
-        Console(highlight=False).print(screen(found))
-    else:
+    console = Console(highlight=False)
+    found, before = read_status(timing), None
+    if not (watch or as_json or found.units or found.timing):
         raise CommandFailed("service.nothing-found", " ".join(found.notes), ExitCode.CONFIGURATION)
+    try:
+        while as_json:
+            print(json.dumps(found.named()), flush=True)
+            if not watch:
+                return
+            time.sleep(PERIOD_S)
+            found = read_status(timing)
+        if not watch:
+            console.print(screen(found))
+            return
+        with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
+            while True:
+                live.update(screen(found, before), refresh=True)
+                before = found.timing or before
+                time.sleep(PERIOD_S)
+                found = read_status(timing)
+    except KeyboardInterrupt:
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def _updater() -> Updater:
@@ -162,7 +173,7 @@ def _updater() -> Updater:
     from host.release.services import SystemdServices
     from host.release.trees import Trees
     from host.release.updater import PLACE, SIGNER, ReleaseProgram, Updater
-    from timberhand.service_status.status import SYSTEMD
+    from timberhand.service_status import SYSTEMD
 
     if os.geteuid() != 0:
         raise CommandFailed("update.not-root", "this needs root; start it with sudo", ExitCode.CONFIGURATION)
@@ -173,34 +184,6 @@ def _updater() -> Updater:
         Trees(PLACE), SIGNER, SystemdServices(units), ReleaseProgram(),
         lambda line: print(f"update: {line}", file=sys.stderr, flush=True),
     )  # fmt: skip
-
-
-def _watch(page: Path | None, as_json: bool) -> None:
-    import json
-
-    from host.exit_codes import ExitCode
-    from timberhand.service_status.status import read_status
-
-    before = None
-    try:
-        if as_json:
-            while True:
-                print(json.dumps(read_status(page).named()), flush=True)
-                time.sleep(PERIOD_S)
-        from rich.console import Console
-        from rich.live import Live
-
-        from timberhand.service_status.screen import screen
-
-        console = Console(highlight=False)
-        with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
-            while True:
-                found = read_status(page)
-                live.update(screen(found, before), refresh=True)
-                before = found.timing or before
-                time.sleep(PERIOD_S)
-    except KeyboardInterrupt:
-        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def _script(options: list[str], dry_run: bool) -> Any:

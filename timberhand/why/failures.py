@@ -13,7 +13,7 @@ from typing import Final
 
 import msgspec
 
-from timberhand.service_status.status import ending
+from timberhand.service_status import ending
 
 SERVICE_FAILURES: Final = Path("/var/lib/timberhand-failures/failures.jsonl")
 

@@ -21,7 +21,7 @@ from host.release.services import RESUME
 from host.release.trees import TRIAL
 from host.release.updater import PLACE
 from timberhand.cli import app
-from timberhand.service_status.status import NAMES, SERVICE_PAGE
+from timberhand.service_status import NAMES, SERVICE_PAGE
 from timberhand.why.stops import SERVICE_STOPS
 
 DEPLOY = Path(__file__).parents[3] / "deploy"

@@ -1,18 +1,42 @@
-"""The status of services and controller timing as one screen, for terminals of 60 columns or more."""
+"""The status of the installed services: systemd's state of each unit, and the controller's timing page.
+
+Read-only, for any user.  `read_status` returns everything; its ``named`` is the JSON of ``service status``, and
+`screen` shows it on a terminal of 60 columns or more.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from can_dbc.timing.durations import Durations
-from can_dbc.timing.page import Facts, Timing
-from timberhand.service_status.status import Status, Unit, oldest_first
+from can_dbc.timing.page import Facts, InputAge, Timing, TimingRefused, default_path, read_timing
+from host.exit_codes import ExitCode
+from host.systemd import last_journal_line, show_all
 
+NAMES: Final = ("controller", "guard", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0", "update")
+PROPERTIES: Final = (
+    "Id", "Type", "LoadState", "ActiveState", "SubState", "Result", "ExecMainStatus", "NRestarts", "StatusText",
+    "StateChangeTimestampMonotonic", "ExecMainExitTimestampMonotonic",
+)  # fmt: skip
+SYSTEMD: Final = Path("/run/systemd/system")
+SERVICE_PAGE: Final = Path("/run/timberhand/controller.timing")
+ENDINGS: Final = {
+    "success": "",
+    "signal": "killed by signal {}",
+    "watchdog": "hung, ended by the watchdog",
+    "timeout": "timeout of starting or stopping",
+}
+"""In words, by systemd's result; another result is its own word."""
+STALE_NS: Final = 3_000_000_000
+"""The page is written once per second; at this age the controller hangs or has ended."""
 STATE_STYLES: Final = {"running": "green", "done": "green", "failed": "bold red", "restarting": "bold red"}
 MODE_STYLES: Final = {"FAULT": "bold red", "STOP": "bold red", "ACTIVE": "bold green", "ARMED": "bold green"}
 TABLE_ROWS: Final = {
@@ -22,6 +46,101 @@ TABLE_ROWS: Final = {
 """Durations with a row of their own; the stages of the tick share a line."""
 INPUT_COUNT: Final = 4
 """Number of inputs shown, the oldest first; the JSON has all of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """One service.
+
+    ``state`` is one of running, starting, ending, done (a one-shot that succeeded), stopped, failed, restarting, not
+    configured, not installed.  ``why`` tells how it ended if it failed; ``since_s`` is the time in this state.
+    """
+
+    name: str
+    state: str
+    why: str
+    since_s: float | None
+    restarts: int
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Units and timing; ``notes`` are sentences about what is unavailable."""
+
+    units: tuple[Unit, ...]
+    timing: Timing | None
+    notes: tuple[str, ...]
+
+    @property
+    def silent(self) -> bool:
+        """Whether the controller writes no timing page, or has stopped writing it."""
+        return self.timing is None or self.timing.age_ns > STALE_NS
+
+    def named(self) -> dict[str, Any]:
+        """As plain values for JSON."""
+        timing = None
+        if self.timing is not None:
+            timing = self.timing.named() | {"age_ns": self.timing.age_ns, "silent": self.silent}
+        return {"units": [asdict(unit) for unit in self.units], "timing": timing, "notes": list(self.notes)}
+
+
+def read_status(page: Path | None = None) -> Status:
+    """The status now; ``page`` is the controller's timing page (default: that of the service, else of this user)."""
+    notes = []
+    units: tuple[Unit, ...] = ()
+    if SYSTEMD.is_dir():
+        names = [f"timberhand-{name}.service" for name in NAMES]
+        units = tuple(read_unit(found, time.monotonic()) for found in show_all(names, *PROPERTIES))
+    else:
+        notes.append("systemd does not run here, so no service is shown.")
+    timing = None
+    try:
+        timing = read_timing(page or (SERVICE_PAGE if SERVICE_PAGE.exists() else default_path()))
+    except TimingRefused as refused:
+        notes.append(str(refused))
+    return Status(units, timing, tuple(notes))
+
+
+def read_unit(found: dict[str, str], now_s: float) -> Unit:
+    """A unit from its systemd properties; ``now_s`` is the monotonic clock."""
+    name = found["Id"].removeprefix("timberhand-").removesuffix(".service")
+    state = _state(found)
+    changed_s = int(found.get("StateChangeTimestampMonotonic") or 0) * 1e-6
+    ended = state in ("failed", "restarting", "stopped")
+    why = ending(found.get("Result", ""), found.get("ExecMainStatus") or "0") if ended else ""
+    words = found.get("StatusText", "")
+    if state in ("failed", "restarting") and not words:
+        words = last_journal_line(found["Id"])
+    since_s = now_s - changed_s if changed_s else None
+    return Unit(name, state, why, since_s, int(found.get("NRestarts") or 0), words)
+
+
+def _state(found: dict[str, str]) -> str:
+    active = found.get("ActiveState", "")
+    if found.get("LoadState") == "not-found":
+        return "not installed"
+    if found.get("SubState") == "auto-restart":
+        return "restarting"
+    if active == "inactive" and found.get("Result") == "exec-condition":
+        return "not configured"
+    if active == "inactive" and found.get("Result") == "success" and found.get("ExecMainExitTimestampMonotonic") != "0":
+        return "done" if found.get("Type") == "oneshot" else "stopped"
+    words = {"active": "running", "activating": "starting", "deactivating": "ending", "inactive": "stopped"}
+    return words.get(active, active)
+
+
+def ending(result: str, status: str) -> str:
+    """How a service ended, from systemd's result and the exit status or signal of its main process."""
+    if result == "exit-code":
+        known = status.isdecimal() and int(status) in set(ExitCode)
+        return f"exit status {status}" + (f", {ExitCode(int(status)).words}" if known else "")
+    return ENDINGS.get(result, result).format(status)
+
+
+def oldest_first(inputs: Sequence[tuple[str, InputAge]]) -> list[tuple[str, InputAge]]:
+    """Inputs sorted by the longest age at which they were used."""
+    return sorted(inputs, key=lambda item: -item[1].longest_ns)
 
 
 def screen(now: Status, before: Timing | None = None) -> RenderableType:
@@ -63,7 +182,6 @@ def _units(units: tuple[Unit, ...]) -> Table:
 
 def _timing(timing: Timing, before: Timing | None, silent: bool) -> list[RenderableType]:
     facts = timing.facts
-    old_s = timing.age_ns * 1e-9
     head = Text.assemble(
         "controller ", (facts.mode, MODE_STYLES.get(facts.mode, "bold")),
         f", {1e9 / facts.period_ns:.0f} Hz for {duration((facts.written_ns - facts.started_ns) * 1e-9)}",
@@ -71,17 +189,12 @@ def _timing(timing: Timing, before: Timing | None, silent: bool) -> list[Rendera
     )  # fmt: skip
     parts: list[RenderableType] = [head, Text(facts.words)]
     if silent:
-        parts.append(Text(f"no update for {duration(old_s)}: the controller hangs or has ended", style="bold red"))
-    parts += [Text(), _counters(facts, before.facts if before else None), Text()]
-    parts += [
-        _durations(timing, before),
-        Text(),
-        _inputs(facts),
-        Text(),
-        _buses(facts),
-        Text(),
-        _process(facts, before),
-    ]
+        parts.append(
+            Text(f"no update for {duration(timing.age_ns * 1e-9)}: the controller hangs or has ended", style="bold red")
+        )
+    counters = _counters(facts, before.facts if before else None)
+    for part in (counters, _durations(timing, before), _inputs(facts), _buses(facts), _process(facts, before)):
+        parts += [Text(), part]
     return [*parts, Text()] if silent else parts
 
 

@@ -1,1 +1,0 @@
-"""The status of the systemd services and of the controller's timing."""
