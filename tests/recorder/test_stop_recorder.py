@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from can_dbc.messages.crane import StateReport
 from can_dbc.messages.tick_record import decode
 from hil.replay.recording import manifest_of, messages
 from machine.status.explanation import StopDetector
@@ -22,8 +23,9 @@ from recorder import stop_files
 from recorder import stop_recorder as stop_recorder_module
 from recorder.mcap_scan import is_complete
 from recorder.recorder import TICK
-from recorder.stop import TOPIC, Stop
+from recorder.stop import TOPIC, Stop, stop_from
 from recorder.stop_files import StopFiles, files_in, parts_in, repair
+from tests.codes import numbers_in
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 
 
@@ -126,6 +128,13 @@ def test_what_counts_as_a_stop(modes: list[tuple[Mode, int]], stops: list[str]) 
     detector = StopDetector()
     found = [detector.step(mode, reason) for mode, reason in modes]
     assert [before for before in found if before is not None] == stops
+
+
+def test_a_reason_of_another_release_keeps_its_number() -> None:
+    nan5 = (float("nan"),) * 5
+    report = StateReport(1, 2, 3, Mode.STOP, 0, 250, 0, 0, 0, 0, nan5, nan5, nan5, 0.0, 0.0, 0.0, 0, 0, 0, 0)
+    stop = stop_from(report, "ACTIVE", 7, None)
+    assert (stop.reason, stop.code, numbers_in(stop.text)) == (250, "REASON_250", [250])
 
 
 # ---- the ring of files --------------------------------------------------------------------------------------------

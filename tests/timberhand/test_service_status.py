@@ -11,10 +11,11 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from can_dbc.timing.page import InputAge, Timing, TimingWriter
-from host.exit_codes import CommandFailed
+from host.exit_codes import CommandFailed, ExitCode
 from tests.codes import numbers_in
 from timberhand import service_status as status
 from timberhand.cli import app
+from timberhand.commands import service
 from timberhand.service_status import Status, Unit, duration, number, oldest_first, read_status, read_unit, screen
 
 S = 1_000_000_000
@@ -148,6 +149,31 @@ def test_without_systemd_there_is_the_page_alone(
     assert document["timing"]["silent"] is False and document["units"] == []
     assert "longest_ns" not in document["timing"]
     writer.close()
+
+
+@pytest.mark.parametrize("words", [["--json"], []])
+def test_watching_goes_on_until_it_is_interrupted(
+    words: list[str], timing: Timings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+
+    def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(status, "SYSTEMD", tmp_path / "nothing")
+    monkeypatch.setattr(service.time, "sleep", pause)
+    written = timing(10)
+    writer = TimingWriter(tmp_path / "page")
+    writer.publish(written.facts, written.durations)
+    done = CliRunner().invoke(app, ["service", "status", "--watch", *words, "--timing", str(tmp_path / "page")])
+    writer.close()
+    assert (done.exit_code, len(pauses)) == (ExitCode.INTERRUPTED, 3)
+    if words:
+        assert [json.loads(line)["timing"]["pid"] for line in done.stdout.splitlines()] == [4711] * 3
+    else:
+        assert "process 4711" in done.stdout
 
 
 def test_without_services_and_timing_the_command_fails_with_one_sentence(
