@@ -12,7 +12,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -109,12 +109,20 @@ def _written(value: float) -> float | str | None:
 
 
 def evaluate(
-    definitions: Iterable[Metric], metrics: Mapping[str, float], noisy: bool
+    definitions: Iterable[Metric], metrics: Mapping[str, float], noisy: bool, undecided: Collection[str] = ()
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the metrics that miss their limit, and of those that a noisy host leaves inconclusive."""
-    failed = [m for m in definitions if m.name in metrics and not m.holds(metrics[m.name])]
-    inconclusive = tuple(m.name for m in failed if m.clocked and noisy)
-    return tuple(m.name for m in failed if m.name not in inconclusive), inconclusive
+    """Names of the metrics that miss their limit, and of the inconclusive ones.
+
+    Inconclusive are clocked metrics that miss theirs on a noisy host, and the ``undecided``, whatever their value.
+    """
+    failed, inconclusive = [], []
+    for m in definitions:
+        fails = m.name in metrics and not m.holds(metrics[m.name])
+        if m.name in undecided or (fails and m.clocked and noisy):
+            inconclusive.append(m.name)
+        elif fails:
+            failed.append(m.name)
+    return tuple(failed), tuple(inconclusive)
 
 
 def make_result(
@@ -128,9 +136,14 @@ def make_result(
     more: Mapping[str, str],
     paper: Mapping[str, float] | None = None,
     noisy: bool = False,
+    undecided: Mapping[str, str] | None = None,
 ) -> Result:
-    """The result of an experiment, evaluated against its limits; ``more`` is added to the host's environment."""
-    missed, inconclusive = evaluate(definitions, metrics, noisy)
+    """The result of an experiment, evaluated against its limits; ``more`` is added to the host's environment.
+
+    ``undecided``: metrics that this run cannot decide, with the reason, which is added as ``open: NAME``.
+    """
+    reasons = dict(undecided or {})
+    missed, inconclusive = evaluate(definitions, metrics, noisy, reasons)
     return Result(
         experiment=experiment,
         commit=commit(),
@@ -139,7 +152,7 @@ def make_result(
         trials=trials,
         metrics=metrics,
         paper=dict(paper or {}),
-        environment={**environment(), **more},
+        environment={**environment(), **more, **{f"open: {n}": reasons[n] for n in inconclusive if n in reasons}},
         limits=limits_of(definitions),
         missed=missed,
         inconclusive=inconclusive,

@@ -1,31 +1,64 @@
 """Checks the controller's tick records for missing data: ``python -m experiments.timing.bus_observer``.
 
 Input: the ring of tick records (`can_dbc.messages.record_ring`), polled.  It checks the frames that the controller
-received and sent (`experiments.timing.continuity`), and that no record is missing apart from missed periods.  It prints
-its totals once a second as a JSON line.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2 usage, 3 profile.
+received and sent, and that no record is missing apart from missed periods.  It prints its totals once a second as a
+JSON line until SIGTERM or SIGINT.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
 import json
-import signal
 import sys
 import time
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from can_dbc.dbc.codec import Database, load
 from can_dbc.messages.record_ring import RingReader
 from can_dbc.messages.tick_record import RecordRefused, TickRecord, decode
 from can_dbc.protocols.canopen import SYNC_ID
-from experiments.timing.continuity import Continuity, databases
-from machine.loading.profile_file import ProfileError, load_profile
+from can_dbc.protocols.e2e import Checker, Status
+from hil.harness.processes import announce_ready
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 
 PRINT_PERIOD_NS: Final = 1_000_000_000
 POLL_PERIOD_S: Final = 0.05
 """A fortieth of what the ring holds at 1 kHz."""
+
+
+class Continuity:
+    """Frames that one participant saw on a bus.
+
+    ``frames`` counts them by key; ``gaps`` and ``damaged`` count protected frames with a counter that is not
+    consecutive, or with a wrong CRC.
+    """
+
+    def __init__(self, databases: Iterable[Database]) -> None:
+        every = [m for database in databases for m in database.messages.values()]
+        self._checkers = {m.key: Checker(m.data_ids) for m in every if m.data_ids}
+        self.frames: Counter[int] = Counter()
+        self.gaps = self.damaged = 0
+
+    def add(self, key: int, data: bytes) -> None:
+        """Add one frame, in the order of the bus."""
+        self.frames[key] += 1
+        checker = self._checkers.get(key)
+        if checker is None:
+            return
+        last = checker.counter
+        if checker.check(data) is Status.ERROR:
+            self.damaged += 1
+        elif 0 <= last != (checker.counter - 1) & 0x0F:
+            self.gaps += 1
+
+
+def databases(profile: Profile) -> list[Database]:
+    """The databases that define the protected frames of a machine."""
+    return [load("crane"), *([load("machine")] if profile.machine_bus else [])]
 
 
 class BusObserver:
@@ -93,18 +126,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rate", required=True, type=int, metavar="HZ")
     parser.add_argument("--ticks", required=True, type=Path, help="ring of the tick records")
     options = parser.parse_args(arguments)
-    try:
-        observer = BusObserver(load_profile(options.profile), 1_000_000_000 // options.rate)
-    except ProfileError as error:
-        sys.stderr.write(f"bus observer: {error}\n")
-        return 3
-    ended: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda which, _frame: ended.append(which))
+    observer = BusObserver(load_profile(options.profile), 1_000_000_000 // options.rate)
     ring = RingReader(options.ticks)
-    gc.collect()
-    gc.freeze()
-    print("ready", flush=True)
+    ended = announce_ready()
     next_print_ns = 0
     while not ended:
         time.sleep(POLL_PERIOD_S)

@@ -6,7 +6,7 @@ Every CAN node of the machine on its buses, around joints that follow their valv
 whole machine for a fraction of a core.  ``--cycle-us`` is the period of the PLC and the fast pressures.  It prints
 ``ready``, then once a second a JSON line with its timing.
 
-Exit codes: 0 stopped by SIGTERM or SIGINT; 2 usage; 3 profile; 4 bus.
+Exit codes: 0 stopped by SIGTERM or SIGINT; 2 usage; 4 bus.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from collections.abc import Mapping
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
-from experiments.timing.continuity import Continuity, databases
-from machine.loading.profile_file import ProfileError, load_profile
+from experiments.timing.bus_observer import Continuity, databases
+from machine.loading.profile_file import load_profile
 from sim.kinematic.machine import KinematicMachine
 from sim.process.live import TX_QUEUE_FRAMES, LiveMachine
 
@@ -76,9 +76,6 @@ def main(arguments: list[str] | None = None) -> int:
             gc.freeze()
             print("ready", flush=True)
             live.run()
-    except (ProfileError, ValueError) as error:
-        sys.stderr.write(f"emulated machine: {error}\n")
-        return 3
     except (BusError, OSError) as error:
         sys.stderr.write(f"emulated machine: {error}\n")
         return 4

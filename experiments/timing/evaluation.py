@@ -9,14 +9,14 @@ inconclusive, whatever its value.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
 from can_dbc.timing.durations import BINS, Durations, edge_ns
-from experiments.common.result import Metric
+from can_dbc.timing.page import Facts
+from experiments.timing.events import explained
 from experiments.timing.measurement import MeasurementWindow, pooled
 from experiments.timing.metrics import METRICS
 
@@ -70,6 +70,14 @@ def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWi
     return ordered[: max(1, math.ceil(COST_WINDOW_SHARE * len(ordered)))]
 
 
+def cost_metrics(name: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
+    """Processor time of a tick in the quietest windows and in all, and whether the host was still in the former."""
+    judged = quietest_windows(windows)
+    found = spread_us(name, pooled([w.durations["cpu"] for w in judged]))
+    found |= spread_us(f"{name}_all", pooled([w.durations["cpu"] for w in windows]))
+    return found | {f"{name}_host_still": float(all(map(still, judged)))}
+
+
 def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     """Processor time of the sleep loop's cycle [us], and the tick's median in such cycles: the median window's."""
     in_cycles = [w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.sleep_loop.cpu_us for w in windows]
@@ -119,43 +127,47 @@ def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], sha
         return up / down if down else math.nan
 
     n = len(ours)
-    if n == 0:
-        return {name: math.nan}
-    every = np.arange(n)
     rng = np.random.default_rng(1)
-    drawn = [of(rng.integers(0, n, n)) for _ in range(RESAMPLE_COUNT)] if n > 1 else [of(every)]
+    drawn = [of(rng.integers(0, n, n)) for _ in range(RESAMPLE_COUNT)]
     low, high = np.quantile(drawn, (0.025, 0.975))
-    return {name: of(every), f"{name}_low": float(low), f"{name}_high": float(high), f"{name}_n": float(n)}
+    return {name: of(np.arange(n)), f"{name}_low": float(low), f"{name}_high": float(high), f"{name}_n": float(n)}
 
 
 def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     """Counters of the process over all windows: totals, or per tick where the name says so."""
-    ticks = max(1, sum(w.ticks for w in windows))
-    first, last = windows[0].begin.process, windows[-1].end.process
-    span = max(1, windows[-1].end.ticks - windows[0].begin.ticks)
-    frames = sum(b.received + b.sent for b in windows[-1].end.buses)
-    frames -= sum(b.received + b.sent for b in windows[0].begin.buses)
+    begin, end = windows[0].begin, windows[-1].end
+    first, last = begin.process, end.process
+    span = max(1, end.ticks - begin.ticks)
     return {
-        "ticks": float(ticks),
+        "ticks": float(max(1, sum(w.ticks for w in windows))),
         "page_faults": float(last.minor_faults + last.major_faults - first.minor_faults - first.major_faults),
         "gc_runs": float(last.gc_runs - first.gc_runs),
-        "allocated_blocks_growth": float(block_growth(windows)),
+        "allocated_blocks_growth": block_growth([*(w.begin for w in windows), end]),
         "resident_growth_kb": float(last.resident_kb - first.resident_kb),
         "voluntary_switches_per_tick": (last.voluntary_switches - first.voluntary_switches) / span,
         "involuntary_switches_per_tick": (last.involuntary_switches - first.involuntary_switches) / span,
-        "cpu_share": (last.cpu_ns - first.cpu_ns) / (windows[-1].end.written_ns - windows[0].begin.written_ns),
-        "frames_per_s": frames / ((windows[-1].end.written_ns - windows[0].begin.written_ns) * 1e-9),
+        **load_metrics(begin, end),
     }
 
 
-def block_growth(windows: Sequence[MeasurementWindow]) -> int:
+def load_metrics(begin: Facts, end: Facts) -> dict[str, float]:
+    """Share of a processor that the controller used between two pages, and its frames per second, both directions."""
+    seconds = (end.written_ns - begin.written_ns) * 1e-9
+    frames = [sum(b.received + b.sent for b in facts.buses) for facts in (begin, end)]
+    return {
+        "cpu_share": (end.process.cpu_ns - begin.process.cpu_ns) * 1e-9 / seconds,
+        "frames_per_s": (frames[1] - frames[0]) / seconds,
+    }
+
+
+def block_growth(readings: Sequence[Facts]) -> float:
     """Growth of the interpreter's memory blocks: minimum of the second half of the readings less that of the first.
 
     The minima remove blocks that come and go between readings.
     """
-    readings = [w.begin.process.allocated_blocks for w in windows] + [windows[-1].end.process.allocated_blocks]
-    half = max(1, len(readings) // 2)
-    return min(readings[half:]) - min(readings[:half])
+    blocks = [facts.process.allocated_blocks for facts in readings]
+    half = max(1, len(blocks) // 2)
+    return float(min(blocks[half:]) - min(blocks[:half]))
 
 
 def host_metrics(windows: Sequence[MeasurementWindow], enough: bool) -> dict[str, float]:
@@ -171,34 +183,6 @@ def host_metrics(windows: Sequence[MeasurementWindow], enough: bool) -> dict[str
         "pressure": sum(pressures) / len(pressures) if pressures else math.nan,
         "load_average": max(w.host.load for w in windows),
     }
-
-
-@dataclass(frozen=True, slots=True)
-class Evaluation:
-    """Names of the missed metrics, and the inconclusive ones with their reason."""
-
-    missed: tuple[str, ...]
-    inconclusive: dict[str, str]
-
-
-def evaluate(definitions: Iterable[Metric], metrics: Mapping[str, float], undecidable: Mapping[str, str]) -> Evaluation:
-    """Compare every metric that has a limit with it.
-
-    ``undecidable``: metrics that this run cannot decide, with the reason.  They are inconclusive even if their value
-    meets the limit.  A metric without a value is inconclusive, too.
-    """
-    missed, inconclusive = [], {}
-    for metric in definitions:
-        if metric.least is None and metric.most is None:
-            continue
-        value = metrics.get(metric.name, math.nan)
-        if metric.name in undecidable:
-            inconclusive[metric.name] = undecidable[metric.name]
-        elif math.isnan(value):
-            inconclusive[metric.name] = "it could not be measured here"
-        elif not metric.holds(value):
-            missed.append(metric.name)
-    return Evaluation(tuple(missed), inconclusive)
 
 
 def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
@@ -225,37 +209,38 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
             found[name] = f"{count:.0f} ticks are too few; at least {MIN_CPU_TICKS} are needed"
         elif metrics[name] > most and not metrics[f"{name.partition('_p')[0]}_host_still"]:
             found[name] = "even the quietest windows were noisy, and noise adds to the processor time"
-    for name in ("frames_lost", "stops"):
-        if metrics.get(name) and not metrics[f"{name}_unexplained"]:
-            found[name] = (
-                f"the host withheld a processor for up to {metrics['stall_max_ms']:.0f} ms; a witness saw a stall "
-                "before each of them"
-            )
+    found |= explained(metrics)
     if not metrics["host_verdict"] and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
         found["sample_to_command_p99_us"] = noisy
-    for end in ("", "_1k"):
-        if reason := _loaded_undecidable(metrics, end):
-            found[f"missed_loaded{end}_share"] = reason
-    return found
+    ours, plain = metrics["missed_loaded"], metrics["missed_loaded_plain"]
+    if ours and metrics["missed_loaded_cyclictest"] >= ours:
+        found["missed_loaded_share"] = "cyclictest missed as many deadlines: the host withheld the processor"
+    elif plain < 100.0 and ours * 100.0 <= plain:
+        why = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
+        found["missed_loaded_share"] = why
+    unmeasured = {m.name for m in METRICS if m.limit_text() and math.isnan(metrics.get(m.name, math.nan))}
+    return dict.fromkeys(unmeasured, "it could not be measured here") | found
 
 
-def _loaded_undecidable(metrics: Mapping[str, float], end: str) -> str:
-    """Why the comparison under load is inconclusive; empty if it is not."""
-    ours, plain = metrics.get(f"missed_loaded{end}", 0.0), metrics.get(f"missed_loaded_plain{end}", 0.0)
-    if ours and metrics.get(f"missed_loaded_cyclictest{end}", 0.0) >= ours:
-        return "cyclictest missed as many deadlines: the host withheld the processor"
-    if plain < 100.0 and ours * 100.0 <= plain:
-        return f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
-    return ""
-
-
-def wakeups(kind: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Lateness of the wake-ups of controller, cyclictest and sleep loop, as metrics whose names begin with ``kind``."""
-    found: dict[str, float] = {}
+def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
+    """Lateness of the wake-ups of controller, cyclictest and sleep loop; ``mark`` follows their names."""
     ours, theirs, plain = loops(windows)
-    for name, histogram in (("wakeup", ours), ("cyclictest", theirs), ("plain", plain)):
-        found |= spread_us(f"{kind}{name}", histogram)
-    return found
+    found = spread_us(f"wakeup{mark}", ours) | spread_us(f"cyclictest{mark}", theirs)
+    return found | spread_us(f"plain{mark}", plain)
+
+
+def loaded(end: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
+    """Missed deadlines of the three loops under load; ``end`` is the suffix of the metric names."""
+    ours = sum(w.missed for w in windows)
+    plain = sum(w.sleep_loop.missed for w in windows)
+    theirs = sum(w.cyclictest.periods(w.end.period_ns) for w in windows)
+    return {
+        f"missed_loaded{end}": float(ours),
+        f"missed_loaded_plain{end}": float(plain),
+        f"missed_loaded_cyclictest{end}": float(theirs),
+        f"missed_loaded{end}_share": ours / plain if plain else math.nan,
+        f"cycles_loaded{end}": float(sum(w.ticks + w.missed for w in windows)),
+    }
 
 
 def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, Durations]:

@@ -1,4 +1,6 @@
-"""Judges whether a computer is fit to run the control loop: figures of a short measurement in, verdicts out; pure.
+"""Judges whether a computer is fit to run the control loop: a minute on the timing testbed, then verdicts.
+
+Beside the controller run cyclictest, if there is one, and a sleep loop.
 
 A bad figure that depends on the clock is *inconclusive* when the computer was disturbed meanwhile; a good one stays
 good.  The limits are shares of the control period.
@@ -7,11 +9,27 @@ good.  The limits are shares of the control period.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import os
+import shutil
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Final
 
+from can_dbc.bus.factory import VCAN_NAMES
+from experiments.timing import evaluation
+from experiments.timing.events import losses_between
+from experiments.timing.measurement import measure, pooled
+from experiments.timing.testbed import TestbedConfig, TimingTestbed
+from host.doctor.facts import UNLIMITED, Facts, interrupt_counts
+from host.doctor.timing import PRIORITY
+from host.systemd import process_facts
+from host.vcan_lab import links
+from machine.loading.profile_file import load_profile
+
+WINDOW_S: Final = 15.0
+SETTLE_S: Final = 2.0
 GOOD_LATE_SHARE: Final = 0.1
 MARGINAL_LATE_SHARE: Final = 0.5
 """Longest lateness of a wake-up, as a share of the period."""
@@ -80,6 +98,94 @@ class Figures:
     emulated: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The figures, and what else a reader of the report asks for."""
+
+    figures: Figures
+    bus: str
+    profile: str
+    cpu: int
+    tick: str
+    stop_reasons: tuple[str, ...]
+    interrupts: dict[str, int]
+    """Interrupts of the controller's processor during the measurement, by source; those that occurred."""
+
+
+def loopback_bus(profile_name: str) -> str:
+    """``vcan`` where its interfaces exist and are up, else ``wire``."""
+    profile = load_profile(profile_name)
+    names = [VCAN_NAMES[b] for b in (profile.crane_bus, profile.machine_bus) if b]
+    return "wire" if any(links.state(name) for name in names) else "vcan"
+
+
+def may_run_cyclictest(facts: Facts) -> bool:
+    """Whether cyclictest is installed and this user may give it the controller's priority."""
+    limit = facts.rtprio_limit or 0
+    allowed = facts.may_prioritise or limit == UNLIMITED or limit >= PRIORITY
+    return allowed and shutil.which("cyclictest") is not None
+
+
+def measure_computer(
+    facts: Facts, profile: str, bus: str, seconds: float, directory: Path, show: Callable[[str], None]
+) -> Measured:
+    """Measure for ``seconds`` in windows of a quarter of a minute; raises CommandFailed when a process does not run."""
+    load_before = os.getloadavg()[0] / max(1, len(facts.online))
+    count = max(1, round(seconds / WINDOW_S))
+    with_cyclictest = may_run_cyclictest(facts)
+    setting = TestbedConfig(profile, load_profile(profile).rate_hz, bus)
+    show("starting controller, guard and emulated machine")
+    with TimingTestbed(setting, directory) as testbed:
+        testbed.wait(SETTLE_S)
+        controller = testbed.family.children["controller"]
+        granted = process_facts(controller.process.pid)
+        told = [line for line in controller.errors.read_text().splitlines() if "timing page" not in line]
+        before, windows = _interrupts(testbed.cpu), []
+        for i in range(count):
+            show(f"window {i + 1} of {count}, {seconds / count:.0f} s")
+            windows.append(measure(testbed, seconds / count, directory, with_cyclictest))
+        after = _interrupts(testbed.cpu)
+    ours, theirs, plain = evaluation.loops(windows)
+    late = evaluation.spread_us("late", ours)
+    beside = evaluation.spread_us("reference", theirs if with_cyclictest else plain)
+    cost = evaluation.spread_us("tick", pooled([w.durations["cpu"] for w in windows]))
+    process = evaluation.process_metrics(windows)
+    figures = Figures(
+        seconds=sum(w.host.seconds for w in windows),
+        period_us=setting.period_ns / 1e3,
+        ticks=sum(w.ticks for w in windows),
+        missed=sum(w.missed for w in windows),
+        late_p50_us=late["late_p50_us"],
+        late_p99_us=late["late_p99_us"],
+        late_max_us=late["late_max_us"],
+        reference="cyclictest" if with_cyclictest else "sleep loop",
+        reference_p99_us=beside["reference_p99_us"],
+        reference_max_us=beside["reference_max_us"],
+        tick_p50_us=cost["tick_p50_us"],
+        tick_p99_us=cost["tick_p99_us"],
+        frames_lost=sum(loss.frames for loss in losses_between(windows[0].begin, windows[-1].end)),
+        page_faults=round(process["page_faults"]),
+        gc_runs=round(process["gc_runs"]),
+        stops=len(testbed.events.stops),
+        fifo=granted["policy"] == "fifo",
+        locked_kb=int(str(granted["locked_kb"])),
+        refused=tuple(line.partition("not granted: ")[2] for line in told if "not granted" in line),
+        steal_ms=sum(w.host.steal_ms for w in windows),
+        load_before=load_before,
+        emulated=facts.machine == "user-mode Linux",
+    )
+    reasons = tuple(sorted(reason.name for reason in testbed.stop_reasons))
+    interrupts = {name: n - before.get(name, 0) for name, n in after.items() if n > before.get(name, 0)}
+    return Measured(figures, bus, profile, testbed.cpu, windows[-1].end.tick, reasons, interrupts)
+
+
+def _interrupts(cpu: int) -> dict[str, int]:
+    try:
+        return interrupt_counts(Path("/proc/interrupts").read_text(), cpu)
+    except OSError:
+        return {}
+
+
 def disturbances(f: Figures) -> list[str]:
     """Why clocked figures cannot be held against this computer; empty when it was left alone."""
     found = []
@@ -103,6 +209,20 @@ def overall(found: Iterable[Judgement]) -> Verdict:
     return max((j.verdict for j in found), key=order.index, default=Verdict.INCONCLUSIVE)
 
 
+def _clocked(f: Figures, topic: str, verdict: Verdict, said: str, advice: str) -> Judgement:
+    """A verdict that depends on the clock: what is not good is inconclusive where the computer was disturbed."""
+    if verdict is Verdict.GOOD:
+        return Judgement(topic, verdict, said)
+    if why := disturbances(f):
+        advice = "end other programs, or use a computer without a hypervisor, and measure again"
+        return Judgement(topic, Verdict.INCONCLUSIVE, f"{said}; {' and '.join(why)}", advice)
+    return Judgement(topic, verdict, said, advice)
+
+
+def _graded(share: float, good: float, marginal: float) -> Verdict:
+    return Verdict.GOOD if share <= good else Verdict.MARGINAL if share <= marginal else Verdict.UNFIT
+
+
 def rights(f: Figures) -> Judgement:
     """FIFO scheduling and locked memory."""
     if f.fifo and f.locked_kb and not f.refused:
@@ -123,51 +243,33 @@ def wakeups(f: Figures) -> Judgement:
     )
     if math.isnan(f.late_max_us):
         return Judgement("wake-ups", Verdict.INCONCLUSIVE, "no tick was measured", "measure again")
-    if f.missed or f.late_max_us > MARGINAL_LATE_SHARE * f.period_us:
-        verdict = Verdict.UNFIT
-    else:
-        verdict = Verdict.GOOD if f.late_max_us <= GOOD_LATE_SHARE * f.period_us else Verdict.MARGINAL
-    if verdict is Verdict.GOOD:
-        if f.ticks < MIN_TICKS:
-            advice = f"measure longer: a good verdict needs {MIN_TICKS} ticks"
-            return Judgement("wake-ups", Verdict.INCONCLUSIVE, said, advice)
-        return Judgement("wake-ups", Verdict.GOOD, said)
-    if why := disturbances(f):
-        advice = "end other programs, or use a computer without a hypervisor, and measure again"
-        return Judgement("wake-ups", Verdict.INCONCLUSIVE, f"{said}; {' and '.join(why)}", advice)
+    verdict = _graded(f.late_max_us / f.period_us, GOOD_LATE_SHARE, MARGINAL_LATE_SHARE)
+    if verdict is Verdict.GOOD and not f.missed and f.ticks < MIN_TICKS:
+        advice = f"measure longer: a good verdict needs {MIN_TICKS} ticks"
+        return Judgement("wake-ups", Verdict.INCONCLUSIVE, said, advice)
     if f.reference_max_us >= SAME_SHARE * f.late_max_us:
         advice = f"{f.reference} was late, too: kernel, firmware or drivers; the settings below, the first one first"
     elif not f.fifo:
         advice = "the controller had no real-time priority; see the topic rights"
     else:
         advice = f"{f.reference} was not late: this is the controller's own; send this report"
-    return Judgement("wake-ups", verdict, said, advice)
+    return _clocked(f, "wake-ups", Verdict.UNFIT if f.missed else verdict, said, advice)
 
 
 def tick_cost(f: Figures) -> Judgement:
     """CPU time of a tick; other programs raise it, because they use the caches."""
-    said = f"a tick takes {f.tick_p50_us:.0f} us of CPU time in the median, {f.tick_p99_us:.0f} at p99"
-    share = f.tick_p99_us / f.period_us
-    if math.isnan(share):
+    if math.isnan(f.tick_p99_us):
         return Judgement("tick", Verdict.INCONCLUSIVE, "no tick was measured", "measure again")
-    if share <= GOOD_TICK_SHARE:
-        return Judgement("tick", Verdict.GOOD, said)
-    if why := disturbances(f):
-        return Judgement("tick", Verdict.INCONCLUSIVE, f"{said}; {' and '.join(why)}", "measure again, undisturbed")
+    said = f"a tick takes {f.tick_p50_us:.0f} us of CPU time in the median, {f.tick_p99_us:.0f} at p99"
     advice = "compile the tick (timberhand compile), set the governor to performance, or use a faster processor"
-    verdict = Verdict.MARGINAL if share <= MARGINAL_TICK_SHARE else Verdict.UNFIT
-    return Judgement("tick", verdict, said, advice)
+    return _clocked(f, "tick", _graded(f.tick_p99_us / f.period_us, GOOD_TICK_SHARE, MARGINAL_TICK_SHARE), said, advice)
 
 
 def losses(f: Figures) -> Judgement:
     """Frames refused by a bus or lost before they were read."""
-    said = f"{f.frames_lost} frames were lost"
-    if not f.frames_lost:
-        return Judgement("frames", Verdict.GOOD, said)
-    if why := disturbances(f):
-        return Judgement("frames", Verdict.INCONCLUSIVE, f"{said}; {' and '.join(why)}", "measure again, undisturbed")
     advice = "the controller read too late: first correct wake-ups and rights; else send this report"
-    return Judgement("frames", Verdict.UNFIT, said, advice)
+    verdict = Verdict.UNFIT if f.frames_lost else Verdict.GOOD
+    return _clocked(f, "frames", verdict, f"{f.frames_lost} frames were lost", advice)
 
 
 def memory(f: Figures) -> Judgement:
@@ -183,8 +285,5 @@ def memory(f: Figures) -> Judgement:
 def stops(f: Figures) -> Judgement:
     """Stops of the machine by its supervisor."""
     said = f"the supervisor stopped the machine {f.stops} times"
-    if not f.stops:
-        return Judgement("stops", Verdict.GOOD, said)
-    if why := disturbances(f):
-        return Judgement("stops", Verdict.INCONCLUSIVE, f"{said}; {' and '.join(why)}", "measure again, undisturbed")
-    return Judgement("stops", Verdict.UNFIT, said, "the reasons are under 'stop_reasons'; correct wake-ups first")
+    advice = "the reasons are under 'stop_reasons'; correct wake-ups first"
+    return _clocked(f, "stops", Verdict.UNFIT if f.stops else Verdict.GOOD, said, advice)

@@ -13,8 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from experiments.timing.fitness import Judgement, Verdict, disturbances, judge, overall
-from experiments.timing.fitness_measurement import Measured
+from experiments.timing.fitness import Judgement, Measured, Verdict, disturbances, judge, overall
 from host.doctor.facts import UNLIMITED, Computer, Facts
 from host.doctor.finding import Finding, Severity
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import Facts, Timing
-from experiments.timing import host_activity, reference_loops
+from experiments.common import host_activity
+from experiments.timing import reference_loops
 from experiments.timing.reference_loops import SleepLoopReport
 from experiments.timing.testbed import TimingTestbed
 from host.exit_codes import CommandFailed, ExitCode
@@ -111,12 +112,12 @@ def system_calls(testbed: TimingTestbed, seconds: float, directory: Path) -> tup
     table.unlink(missing_ok=True)
     pid = testbed.family.children["controller"].process.pid
     child = testbed.helpers.launch("strace", "strace", "-c", "-f", "-p", pid, "-o", table)
-    limit = time.monotonic() + GRACE_S
-    while "attached" not in child.errors.read_text():
-        if child.process.poll() is not None or time.monotonic() > limit:
-            testbed.helpers.stop("strace")
-            return None
-        time.sleep(0.005)
+    testbed.until(
+        lambda: "attached" in child.errors.read_text() or child.process.poll() is not None, GRACE_S, period_s=0.005
+    )
+    if "attached" not in child.errors.read_text():
+        testbed.helpers.stop("strace")
+        return None
     begin, begin_s = testbed.timing().facts, time.monotonic()
     testbed.wait(seconds)
     passed_s = time.monotonic() - begin_s

@@ -23,6 +23,30 @@ INTRODUCTION: Final = (
     "follow their valves, so that the processors are free for what is measured."
 )
 
+LOOPS: Final = {"wakeup": "Controller", "cyclictest": "cyclictest", "plain": "Sleep loop"}
+QUANTILES: Final = {"p50": "median", "p99": "p99", "p999": "p99.9", "max": "longest"}
+
+
+def _lateness(mark: str, where: str, *keys: str) -> tuple[Metric, ...]:
+    """Quantiles of the lateness of the three loops; ``mark`` follows the names of the loops."""
+    how = "From the deadline to the first reading of the clock, in the loop's own histogram."
+    return tuple(
+        Metric(f"{loop}{mark}_{key}_us", f"{title}{where}: lateness, {QUANTILES[key]}", "us", how)
+        for key in keys or QUANTILES
+        for loop, title in LOOPS.items()
+    )
+
+
+def _missed(end: str, where: str) -> tuple[Metric, ...]:
+    """Deadlines that each loop missed under load."""
+    loops = {"": "controller", "_cyclictest": "cyclictest", "_plain": "sleep loop"}
+    how = "Periods skipped, or by which a wake-up of cyclictest was late."
+    return tuple(
+        Metric(f"missed_loaded{loop}{end}", f"Deadlines missed{where}: {title}", "", how)
+        for loop, title in loops.items()
+    )
+
+
 OWN: Final = Section(
     "Cost of the controller",
     "Page faults, garbage collection and system calls do not depend on the host's noise, so their limits hold on any "
@@ -101,20 +125,10 @@ WAKEUPS: Final = Section(
         Metric("host_verdict", "Host quiet enough (1 yes, 0 no)", "", "The rule above."),
         Metric("quiet_windows", "Quiet windows", "", "The rule above."),
         Metric("windows", "All windows", "", "Quiet and noisy ones."),
-        Metric("wakeup_p50_us", "Controller: lateness, median", "us",
-               "From the deadline to the first reading of the clock."),
-        Metric("cyclictest_p50_us", "cyclictest: lateness, median", "us", "Its own histogram."),
-        Metric("wakeup_p50_ratio", "Ratio of the medians", "x",
+        *_lateness("", ""),
+        Metric("wakeup_p50_ratio", "Ratio of the medians, controller over cyclictest", "x",
                "Interpolated inside the bins of 1 us; interval by bootstrap over the windows.", most=1.5),
-        Metric("wakeup_p99_us", "Controller: lateness, p99", "us", "As for the median."),
-        Metric("cyclictest_p99_us", "cyclictest: lateness, p99", "us", "As for the median."),
         Metric("wakeup_p99_ratio", "Ratio of the p99", "x", "As for the medians.", most=2.0),
-        Metric("wakeup_p999_us", "Controller: lateness, p99.9", "us", "As for the median."),
-        Metric("cyclictest_p999_us", "cyclictest: lateness, p99.9", "us", "As for the median."),
-        Metric("wakeup_max_us", "Controller: lateness, longest", "us", "As for the median."),
-        Metric("cyclictest_max_us", "cyclictest: lateness, longest", "us", "As for the median."),
-        Metric("plain_p50_us", "Sleep loop: lateness, median", "us", "Its own histogram."),
-        Metric("plain_p99_us", "Sleep loop: lateness, p99", "us", "Its own histogram."),
         Metric("judged_cycles", "Cycles compared", "", "Ticks of the controller in the windows that are compared."),
         Metric("missed", "Deadlines missed in these cycles", "",
                "Whole periods skipped; the limit is zero in 100,000 cycles.", most=0.0),
@@ -129,22 +143,13 @@ LOADED: Final = Section(
     "stress-ng keeps every core and the memory busy. The sleep loop runs during the same seconds on the same core and "
     "in the same session, like a script started from the terminal of the load.",
     (
-        Metric("wakeup_loaded_p50_us", "Controller: lateness, median", "us", "200 Hz."),
-        Metric("wakeup_loaded_p99_us", "Controller: lateness, p99", "us", "200 Hz."),
-        Metric("cyclictest_loaded_p99_us", "cyclictest: lateness, p99", "us", "200 Hz."),
-        Metric("plain_loaded_p99_us", "Sleep loop: lateness, p99", "us", "200 Hz."),
-        Metric("missed_loaded", "Deadlines missed by the controller", "", "200 Hz."),
-        Metric("missed_loaded_cyclictest", "Deadlines missed by cyclictest", "",
-               "Periods by which its wake-ups were late."),
-        Metric("missed_loaded_plain", "Deadlines missed by the sleep loop", "", "Periods skipped."),
+        *_lateness("_loaded", "", "p50", "p99"),
+        *_missed("", ""),
         Metric("missed_loaded_share", "Deadlines missed, controller over sleep loop", "%", "200 Hz.",
                most=MAX_MISSED_SHARE, scale=100.0),
-        Metric("wakeup1k_p99_us", "Controller at 1 kHz, quiet: lateness, p99", "us", "Fixed crane."),
-        Metric("cyclictest1k_p99_us", "cyclictest at 1 kHz, quiet: lateness, p99", "us", "Fixed crane."),
+        *_lateness("1k", " at 1 kHz, quiet", "p99"),
         Metric("missed_1k", "Deadlines missed by the controller at 1 kHz, quiet", "", "Fixed crane."),
-        Metric("missed_loaded_1k", "Deadlines missed by the controller at 1 kHz, loaded", "", "Fixed crane."),
-        Metric("missed_loaded_cyclictest_1k", "Deadlines missed by cyclictest at 1 kHz, loaded", "", "Fixed crane."),
-        Metric("missed_loaded_plain_1k", "Deadlines missed by the sleep loop at 1 kHz, loaded", "", "Fixed crane."),
+        *_missed("_1k", " at 1 kHz"),
         Metric("stops", "Stops of the machine in the whole measurement", "",
                "200 Hz and 1 kHz, quiet and loaded; the supervisor stops a machine whose inputs or loop are late.",
                most=0.0),

@@ -11,13 +11,16 @@ from __future__ import annotations
 import platform
 import statistics
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Thread
 from typing import Any, Final
 
+from websockets.sync.client import ClientConnection, connect
+
 from can_dbc.timing.page import Facts
-from experiments.timing import host_activity
+from experiments.common import host_activity
 from experiments.timing.measurement import system_calls
 from experiments.timing.testbed import HOST, START_S, TestbedConfig, TimingTestbed
 from hil.harness.processes import free_udp_ports
@@ -32,6 +35,7 @@ SAME: Final = 0.02
 """Counts of a tick that differ by less are the same: a window begins and ends within some tick, and the setpoint source
 sends by its own clock."""
 SETTLE_S: Final = 1.0
+PANELS: Final = ("can", "ticks", "error", "timeline")
 Progress = Callable[[str], None]
 
 
@@ -46,7 +50,7 @@ class Window:
     frames: float
     instructions: float | None
     calls: float | None
-    states: int
+    states: int = 0
 
 
 def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: Progress) -> dict[str, list[Window]]:
@@ -70,34 +74,33 @@ def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: 
             for side in order:
                 progress(f"round {number + 1} of {rounds}: {pages if side == 'open' else 'no'} pages")
                 with _opened(testbed, port, pages if side == "open" else 0) as states:
-                    found[side].append(_window(testbed, seconds, directory, states))
+                    window = _window(testbed, seconds, directory)
+                found[side].append(replace(window, states=sum(states)))
     return found
 
 
 @contextmanager
-def _opened(testbed: TimingTestbed, port: int, pages: int) -> Iterator[Callable[[], int]]:
-    """So many open pages; call it once to close them and get the number of states that they got."""
-    if not pages:
+def _opened(testbed: TimingTestbed, port: int, pages: int) -> Iterator[list[int]]:
+    """So many open pages, without their drawing: each reads every state and shows a panel.  The states of each so far.
+
+    One of the panels is the CAN table, for which the console listens on the bus.
+    """
+    states = [0] * pages
+
+    def read(number: int, page: ClientConnection) -> None:
+        for _ in page:
+            states[number] += 1
+
+    with ExitStack() as stack:
+        for number in range(pages):
+            page = stack.enter_context(connect(f"ws://{HOST}:{port}/ws", max_size=None))
+            page.send(f"panel {PANELS[number % len(PANELS)]}")
+            Thread(target=read, args=(number, page), daemon=True).start()
         testbed.wait(SETTLE_S)
-        yield lambda: 0
-        return
-    testbed.helpers.start(
-        "viewers", "experiments.timing.page_viewers", f"ws://{HOST}:{port}/ws", "--pages", pages
-    )  # fmt: skip
-    testbed.helpers.await_message("viewers", "ready", START_S)
-    testbed.wait(SETTLE_S)
-
-    def close() -> int:
-        testbed.helpers.children["viewers"].process.terminate()
-        return int(testbed.await_end("viewers", START_S)["states"])
-
-    try:
-        yield close
-    finally:
-        testbed.helpers.stop("viewers")
+        yield states
 
 
-def _window(testbed: TimingTestbed, seconds: float, directory: Path, close: Callable[[], int]) -> Window:
+def _window(testbed: TimingTestbed, seconds: float, directory: Path) -> Window:
     counter = open_counter(testbed.family.children["controller"].process.pid, INSTRUCTIONS)
     begin = testbed.fresh_timing().facts
     counted = None if counter is None else count(counter)
@@ -105,11 +108,11 @@ def _window(testbed: TimingTestbed, seconds: float, directory: Path, close: Call
     end = testbed.fresh_timing().facts
     executed = None if counter is None or counted is None else count(counter) - counted
     traced = system_calls(testbed, seconds, directory)
-    states, ticks = close(), end.ticks - begin.ticks
+    ticks = end.ticks - begin.ticks
     return Window(
         ticks=ticks, missed=end.missed - begin.missed, cpu_us=(end.process.cpu_ns - begin.process.cpu_ns) / ticks / 1e3,
         frames=(_sent(end) - _sent(begin)) / ticks, instructions=None if executed is None else executed / ticks,
-        calls=None if traced is None else sum(traced[0].values()) / traced[1], states=states,
+        calls=None if traced is None else sum(traced[0].values()) / traced[1],
     )  # fmt: skip
 
 

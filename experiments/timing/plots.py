@@ -16,7 +16,8 @@ from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 OUTSIDE: Final = ("wake", "sync", "tick", "cpu", "sample_to_command")
 """Durations of the timing page that are not a stage of the tick."""
 WITHIN: Final = tuple(name for name in STAGES if name not in OUTSIDE)
-NAMES: Final = (("controller", OIL), ("cyclictest", MOSS), ("time.sleep loop", RUST))
+COLOURS: Final = {"controller": OIL, "cyclictest": MOSS, "time.sleep loop": RUST}
+PERIOD_NS: Final = 5_000_000
 POINTS: Final = 60
 Loops = tuple[Durations, Durations, Durations]
 
@@ -44,18 +45,22 @@ def exceeded(histogram: Durations) -> tuple[np.ndarray, np.ndarray]:
     return np.minimum(tops, histogram.longest_ns / 1e3), np.maximum(later, 0.5 / total)
 
 
+def draw_exceeded(axis: Any, histograms: Mapping[str, Durations], period_ns: int) -> None:
+    """Share of wake-ups later than x for each loop, and the period as a dashed line."""
+    for name, histogram in histograms.items():
+        axis.step(*exceeded(histogram), where="post", color=COLOURS[name], label=name)
+    axis.axvline(period_ns / 1e3, color=STEEL, ls="--", lw=0.8)
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_xlabel("lateness [us]")
+    axis.set_ylabel("share of later wake-ups")
+
+
 def wakeups(quiet: Loops, loaded: Loops, path: Path) -> None:
     """Share of wake-ups later than x, for the three loops."""
     with sheet(path, 2, height=3.4) as axes:
         for axis, loops, title in zip(axes, (quiet, loaded), ("Quiet", "Every core loaded"), strict=True):
-            for histogram, (name, colour) in zip(loops, NAMES, strict=True):
-                x, y = exceeded(histogram)
-                axis.step(x, y, where="post", color=colour, label=name)
-            axis.axvline(5000.0, color=STEEL, ls="--", lw=0.8)
-            axis.set_xscale("log")
-            axis.set_yscale("log")
-            axis.set_xlabel("lateness [us]")
-            axis.set_ylabel("share of later wake-ups")
+            draw_exceeded(axis, dict(zip(COLOURS, loops, strict=True)), PERIOD_NS)
             axis.set_title(title)
         axes[0].legend()
 
@@ -95,7 +100,7 @@ def sample_to_command(histogram: Durations, path: Path) -> None:
             middles = (EDGES_NS[:-1] + EDGES_NS[1:])[: BINS - 1] / 2e3
             counts, _ = np.histogram(middles, edges, weights=bins[: BINS - 1])
             axis.stairs(counts / bins.sum(), edges, fill=True, color=OIL)
-            axis.axvline(5000.0, color=STEEL, ls="--", lw=0.8)
+            axis.axvline(PERIOD_NS / 1e3, color=STEEL, ls="--", lw=0.8)
             axis.set_yscale("log")
         axis.set_xlabel("from the encoders' sample to the valve command [us]")
         axis.set_ylabel("share of ticks")

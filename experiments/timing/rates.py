@@ -18,33 +18,40 @@ from typing import Any, Final
 import numpy as np
 from rich.console import Console
 
+from experiments.common import host_activity
 from experiments.common.registry import Options
-from experiments.common.result import Metric, Result, commit, environment, limits_of
+from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing import evaluation, host_activity
-from experiments.timing.losses import Loss, Stall, Stop, sentences, stall_before_stop, stall_of_loss
+from experiments.timing.evaluation import load_metrics, spread_us
+from experiments.timing.events import STALL_NS, Events, event_metrics, explained
 from experiments.timing.measurement import between
 from experiments.timing.testbed import TestbedConfig, TimingTestbed, cores
 from hil.harness.processes import ProcessGroup
+from hil.replay.recording import files_of, manifest_of
 from hil.tick.compare import kept_recordings
 from host.exit_codes import CommandFailed, ExitCode
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, sheet
 
-MACHINES: Final = ("palms_471", "aoro_fc8")
+MACHINES: Final = {"palms_471": "Fixed crane", "aoro_fc8": "Forwarder"}
 FORWARDER: Final = "aoro_fc8"
 RATES_HZ: Final = (100, 200, 500, 1000)
 BITRATES: Final = (("crane0", 4_000_000), ("mach0", 250_000))
 """A CAN bus of 1 Mbit/s carries the traffic of crane0 up to 400 Hz; at 1 kHz the wire stands in for a faster one."""
 CARRIER_FUNCTIONS: Final = 8
 """Articulation, drive and six swing arms."""
+FIGURES: Final = ("frames_per_s", "cpu_p50_us", "cpu_p99_us", "cpu_share", "ticks", "missed")
+"""Of a `RatePoint`; those of the forwarder at the highest rate are metrics."""
 CRANE_COUNTS: Final = (1, 2, 3, 4, 6, 8, 10, 12, 16)
 TRIES: Final = 3
 """A number of controllers fails only if it fails this often: a stall of the host looks the same as too many."""
 MISSED_SHARE: Final = 0.001
 """Share of the periods that may be missed before a processor carries too many controllers."""
 REPLAY_TICKS: Final = 1000
+PERIOD_NS: Final = 5_000_000
+MAX_RESIDUAL: Final = 0.1
+"""Of a straight line, as a share of its largest value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +66,7 @@ class RatePoint:
     cpu_p99_us: float
     ticks: int
     missed: int
-    stops: Sequence[Stop]
-    losses: Sequence[Loss]
-    stalls: Sequence[Stall]
+    events: Events
     tick: str
 
 
@@ -75,7 +80,6 @@ class CranePoint:
     missed: int
     differing: int
     cpu_us: float
-    period_us: float
 
     @property
     def carried(self) -> bool:
@@ -106,26 +110,19 @@ def run(options: Options, console: Console) -> Result:
         status.update("rates: controllers on one processor")
         cranes = measure_cranes(ticks, options.out / "cranes", CRANE_COUNTS[:2] if options.quick else CRANE_COUNTS)
     metrics = gather(points, cranes)
-    found = evaluation.evaluate(METRICS, metrics, undecided(metrics, points))
-    rows = [f"{p.machine} {p.rate_hz} Hz: {text}" for p in points for text in sentences(p.stops, p.losses, p.stalls)]
-    result = Result(
-        experiment="rates",
-        commit=commit(),
+    result = make_result(
+        "rates",
+        METRICS,
+        metrics,
         profile=FORWARDER,
         seed=options.seed,
         trials=len(points),
-        metrics=metrics,
-        paper={},
-        environment={
-            **environment(),
+        more={
             **host_activity.describe(),
             "tick": points[-1].tick,
-            "events": "; ".join(rows),
-            **{f"open: {name}": why for name, why in found.inconclusive.items()},
+            "events": "; ".join(f"{p.machine} {p.rate_hz} Hz: {text}" for p in points for text in p.events.sentences()),
         },
-        limits=limits_of(METRICS),
-        missed=found.missed,
-        inconclusive=tuple(found.inconclusive),
+        undecided=undecided(metrics, points),
     )
     draw(points, cranes, options.out / "rates.png")
     publish(result, page_of(result, {}), options, console)
@@ -140,14 +137,11 @@ def measure_rate(machine: str, rate_hz: int, seconds: float, directory: Path) ->
         testbed.wait(seconds)
         end = testbed.fresh_timing()
         testbed.wait(0.5)
-        events = list(testbed.stop_events), list(testbed.losses), list(testbed.stalls)
-    cpu = evaluation.spread_us("cpu", between(begin, end)["cpu"])
-    passed_s = (end.facts.written_ns - begin.facts.written_ns) * 1e-9
-    frames = sum(b.received + b.sent for b in end.facts.buses) - sum(b.received + b.sent for b in begin.facts.buses)
-    used_ns = end.facts.process.cpu_ns - begin.facts.process.cpu_ns
+    cpu = spread_us("cpu", between(begin, end)["cpu"])
+    load = load_metrics(begin.facts, end.facts)
     return RatePoint(
-        machine, rate_hz, used_ns * 1e-9 / passed_s, frames / passed_s, cpu["cpu_p50_us"], cpu["cpu_p99_us"],
-        end.facts.ticks - begin.facts.ticks, end.facts.missed - begin.facts.missed, *events, end.facts.tick,
+        machine, rate_hz, load["cpu_share"], load["frames_per_s"], cpu["cpu_p50_us"], cpu["cpu_p99_us"],
+        end.facts.ticks - begin.facts.ticks, end.facts.missed - begin.facts.missed, testbed.events, end.facts.tick,
     )  # fmt: skip
 
 
@@ -158,12 +152,10 @@ def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[C
     with tempfile.TemporaryDirectory() as folder:
         for recording in kept_recordings(Path(folder)):
             for cranes in counts:
-                points.append(run_cranes(recording, cranes, ticks, directory))
-                for _ in range(TRIES - 1):
-                    if not points[-1].carried:
-                        points[-1] = min(
-                            points[-1], run_cranes(recording, cranes, ticks, directory), key=lambda point: point.missed
-                        )
+                tries = [run_cranes(recording, cranes, ticks, directory)]
+                while not tries[-1].carried and len(tries) < TRIES:
+                    tries.append(run_cranes(recording, cranes, ticks, directory))
+                points.append(min(tries, key=lambda point: point.missed))
                 if not points[-1].carried:
                     break
     return points
@@ -174,15 +166,14 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
     cpu, _ = cores()
     family = ProcessGroup(directory)
     outputs: dict[str, dict[str, Any]] = {}
-    period_ns = 5_000_000
     start_ns = time.monotonic_ns() + round((3.0 + 2.0 * cranes) * 1e9)
     try:
         for k in range(cranes):
             family.start(
                 f"crane-{k}", "experiments.timing.replayed_crane", recording, "--ticks", ticks, "--cpu", cpu,
-                "--start-at", start_ns + k * period_ns // cranes,
+                "--start-at", start_ns + k * PERIOD_NS // cranes,
             )  # fmt: skip
-        limit = time.monotonic() + 60.0 + 3.0 * cranes + 3.0 * ticks * period_ns * 1e-9
+        limit = time.monotonic() + 60.0 + 3.0 * cranes + 3.0 * ticks * PERIOD_NS * 1e-9
         while len(outputs) < cranes:
             for name, message in family.messages():
                 if "cpu_us" in message:
@@ -196,16 +187,10 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
         family.stop_all(())
     found = list(outputs.values())
     return CranePoint(
-        machine_of(recording), cranes, sum(x["ticks"] for x in found), sum(x["missed"] for x in found),
-        sum(x["differing"] for x in found), sum(x["cpu_us"] for x in found), found[0]["period_us"],
-    )  # fmt: skip
-
-
-def machine_of(recording: Path) -> str:
-    """The machine of a kept recording."""
-    from hil.replay.recording import files_of, manifest_of
-
-    return Path(manifest_of(files_of(recording)).profile).stem
+        Path(manifest_of(files_of(recording)).profile).stem,
+        cranes,
+        *(sum(x[name] for x in found) for name in ("ticks", "missed", "differing", "cpu_us")),
+    )
 
 
 def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
@@ -221,18 +206,8 @@ def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[st
     """All metrics."""
     fast = next(p for p in points if p.machine == FORWARDER and p.rate_hz == max(q.rate_hz for q in points))
     metrics = {
-        "forwarder1k_frames_per_s": fast.frames_per_s,
-        "forwarder1k_cpu_p50_us": fast.cpu_p50_us,
-        "forwarder1k_cpu_p99_us": fast.cpu_p99_us,
-        "forwarder1k_cpu_share": fast.cpu_share,
-        "forwarder1k_ticks": float(fast.ticks),
-        "forwarder1k_missed": float(fast.missed),
-        "frames_lost": float(sum(x.frames for p in points for x in p.losses)),
-        "frames_lost_unexplained": float(
-            sum(x.frames for p in points for x in p.losses if stall_of_loss(x, p.stalls) is None)
-        ),
-        "stops": float(sum(len(p.stops) for p in points)),
-        "stops_unexplained": float(sum(stall_before_stop(s, p.stalls) is None for p in points for s in p.stops)),
+        **{f"forwarder1k_{name}": float(getattr(fast, name)) for name in FIGURES},
+        **event_metrics([p.events for p in points]),
         "differing_ticks": float(sum(c.differing for c in cranes)),
     }
     for machine in MACHINES:
@@ -252,18 +227,14 @@ def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[st
 
 def undecided(metrics: Mapping[str, float], points: Sequence[RatePoint]) -> dict[str, str]:
     """The metrics that this run cannot decide, with the reason."""
-    found = {}
-    stalled = any(s.length_ns >= 10_000_000 for p in points for s in p.stalls)
-    for name in ("frames_lost", "stops"):
-        if metrics[name] and not metrics[f"{name}_unexplained"]:
-            found[name] = "the host withheld a processor before each of them"
-    for name in ("palms_471_frame_residual", "aoro_fc8_frame_residual", "function_residual"):
+    found = explained(metrics)
+    stalled = any(s.length_ns >= STALL_NS for p in points for s in p.events.stalls)
+    for name in (*(f"{machine}_frame_residual" for machine in MACHINES), "function_residual"):
         if metrics[name] > MAX_RESIDUAL and stalled:
             found[name] = "the host stalled during the measurement"
     return found
 
 
-MAX_RESIDUAL: Final = 0.1
 FAST: Final = Section(
     "The forwarder at 1 kHz",
     "Crane and carrier on both buses with the limits and gains of the profile, which are per second and not per tick. "
@@ -290,12 +261,15 @@ COST: Final = Section(
     "frames is measured live at 100 to 1000 Hz, so that its slope contains the ticks that carry the frames. The cost "
     "against functions is that of several controllers at 200 Hz on one processor.",
     (
-        Metric("palms_471_frame_us", "Fixed crane: CPU time per frame", "us", "Slope of the line."),
-        Metric("palms_471_frame_residual", "Fixed crane: largest residual", "%", "Of the largest load.",
-               most=MAX_RESIDUAL, scale=100.0),
-        Metric("aoro_fc8_frame_us", "Forwarder: CPU time per frame", "us", "Slope of the line."),
-        Metric("aoro_fc8_frame_residual", "Forwarder: largest residual", "%", "Of the largest load.",
-               most=MAX_RESIDUAL, scale=100.0),
+        *(
+            metric
+            for machine, title in MACHINES.items()
+            for metric in (
+                Metric(f"{machine}_frame_us", f"{title}: CPU time per frame", "us", "Slope of the line."),
+                Metric(f"{machine}_frame_residual", f"{title}: largest residual", "%", "Of the largest load.",
+                       most=MAX_RESIDUAL, scale=100.0),
+            )
+        ),
         Metric("function_us", "CPU time per function and period", "us", "Slope of the line, both machines."),
         Metric("function_residual", "Functions: largest residual", "%", "Of the largest cost.", most=MAX_RESIDUAL,
                scale=100.0),
@@ -346,7 +320,7 @@ def draw(points: Sequence[RatePoint], cranes: Sequence[CranePoint], path: Path) 
             ours = [c for c in cranes if c.machine == machine]
             axes[1].plot([c.functions for c in ours], [c.cpu_us for c in ours], "o", color=colour, label=machine)
         _line(axes[1], [float(c.functions) for c in cranes], [c.cpu_us for c in cranes], STEEL, "", marker="")
-        axes[1].axhline(5000.0, color=RUST, ls="--", lw=0.8)
+        axes[1].axhline(PERIOD_NS / 1e3, color=RUST, ls="--", lw=0.8)
         axes[0].set_xlabel("frames per second")
         axes[0].set_ylabel("CPU load [%]")
         axes[1].set_xlabel("functions on one processor at 200 Hz")

@@ -188,52 +188,58 @@ def _discard(lane: Lane) -> int:
 
 def _lanes(stack: contextlib.ExitStack) -> list[Lane]:
     """Every path of this machine: ours, python-can's, the wire's."""
-    interface = _interface()
-    if interface is None:
-        fast, slow = _ours_on_a_pair(stack), _python_can_on_a_pair(stack)
-    else:
-        fast, slow = _ours_on(interface, stack), _python_can_on(interface, stack)
-    return [fast, slow, _wire(stack)]
+    present = {name for _, name in socket.if_nameindex()} if kernel_has_can() else set()
+    interface = next((name for name in ("vcan0", "vcan1") if name in present), None)
+    return [*(_on_pairs(stack) if interface is None else _on_interface(interface, stack)), _wire(stack)]
 
 
-def _interface() -> str | None:
-    """A virtual kernel CAN interface; None if there is none."""
-    present = {name for _, name in socket.if_nameindex()}
-    return next((name for name in ("vcan0", "vcan1") if name in present), None) if kernel_has_can() else None
-
-
-def _ours_on(interface: str, stack: contextlib.ExitStack) -> Lane:
-    sender, receiver = (stack.enter_context(open_bus(f"socketcan:{interface}")) for _ in range(2))
-    return Lane("ours", f"ours on {interface}", _all_of(sender.send_all), receiver.drain)
-
-
-def _python_can_on(interface: str, stack: contextlib.ExitStack) -> Lane:
+def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
+    """Ours and python-can's on a virtual kernel CAN interface."""
     sender = stack.enter_context(open_bus(f"socketcan:{interface}", filters=[]))
-    receiver = stack.enter_context(can.Bus(interface="socketcan", channel=interface))
-    return Lane("pythoncan", f"python-can on {interface}", _all_of(sender.send_all), _recv_all(receiver), True)
+    ours = stack.enter_context(open_bus(f"socketcan:{interface}"))
+    theirs = stack.enter_context(can.Bus(interface="socketcan", channel=interface))
 
+    def send(frames: list[RawFrame]) -> None:
+        if sender.send_all(frames) != len(frames):
+            raise CommandFailed(
+                "receive-cost.interface-blocked", "The interface takes no frames; see `ip link`.", ExitCode.BUS
+            )
 
-def _ours_on_a_pair(stack: contextlib.ExitStack) -> Lane:
-    near, far = _pair(stack)
-    link, stats = FrameSocket(near), BusStats()
-    return Lane(
-        "ours", "ours on an AF_UNIX pair", _through(far),
-        lambda frames: link.receive(frames, DRAIN_LIMIT, stats.note_error),
-    )  # fmt: skip
-
-
-def _python_can_on_a_pair(stack: contextlib.ExitStack) -> Lane:
-    near, far = _pair(stack)
-    near.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-    return Lane("pythoncan", "python-can on an AF_UNIX pair", _through(far), _recv_all(_OnPair(near)), True)
+    return (
+        Lane("ours", f"ours on {interface}", send, ours.drain),
+        Lane("pythoncan", f"python-can on {interface}", send, _recv_all(theirs), True),
+    )
 
 
 class _OnPair(SocketcanBus):
     """python-can's own receive path on a given socket."""
 
     def __init__(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self.socket, self.channel = sock, "pair"
         self._is_filtered = self._is_shutdown = True
+
+
+def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
+    """Ours and python-can's, each on an AF_UNIX datagram pair."""
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
+    (ours, to_ours), (theirs, to_theirs) = [tuple(map(stack.enter_context, pair)) for pair in pairs]
+    link, stats = FrameSocket(ours), BusStats()
+
+    def through(sock: socket.socket) -> Callable[[list[RawFrame]], None]:
+        def send(frames: list[RawFrame]) -> None:
+            for key, data in frames:
+                sock.send(CAN_FRAME.pack(key, len(data), data))
+
+        return send
+
+    def drain(frames: list[Any]) -> None:
+        link.receive(frames, DRAIN_LIMIT, stats.note_error)
+
+    return (
+        Lane("ours", "ours on an AF_UNIX pair", through(to_ours), drain),
+        Lane("pythoncan", "python-can on an AF_UNIX pair", through(to_theirs), _recv_all(_OnPair(theirs)), True),
+    )
 
 
 def _wire(stack: contextlib.ExitStack) -> Lane:
@@ -269,29 +275,6 @@ def _greet(server: Server) -> None:
     (member,) = server.members.values()
     while not server.core.nodes:
         member.read()
-
-
-def _pair(stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
-    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    return stack.enter_context(near), stack.enter_context(far)
-
-
-def _through(sock: socket.socket) -> Callable[[list[RawFrame]], None]:
-    def send(frames: list[RawFrame]) -> None:
-        for key, data in frames:
-            sock.send(CAN_FRAME.pack(key, len(data), data))
-
-    return send
-
-
-def _all_of(send_all: Callable[[list[RawFrame]], int]) -> Callable[[list[RawFrame]], None]:
-    def send(frames: list[RawFrame]) -> None:
-        if send_all(frames) != len(frames):
-            raise CommandFailed(
-                "receive-cost.interface-blocked", "The interface takes no frames; see `ip link`.", ExitCode.BUS
-            )
-
-    return send
 
 
 def _recv_all(bus: can.BusABC) -> Callable[[list[Any]], object]:

@@ -3,18 +3,15 @@
 ``python -m experiments.timing.setpoint_source --profile aoro_fc8 --controller HOST:PORT --report-port N --key-file K``
 
 It sends a setpoint of 0.4 s every 50 ms, in which each joint swings through a tenth of its range.  It prints a JSON
-line for every change of mode, and once a second the newest report.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2
-usage, 3 profile.
+line for every change of mode, and once a second the newest report, until SIGTERM or SIGINT.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import gc
 import json
 import math
-import signal
 import socket
 import sys
 import time
@@ -26,11 +23,12 @@ from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.key_file import KeyFileError, read_key
+from can_dbc.messages.key_file import read_key
 from can_dbc.messages.udp_address import address_argument
 from hil.harness.operator import Operator
+from hil.harness.processes import announce_ready
 from machine.joints import JOINTS
-from machine.loading.profile_file import ProfileError, load_profile, profile_hash
+from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from machine.status.explanation import describe
 from machine.status.modes import Mode
@@ -125,62 +123,41 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--report-port", required=True, type=int)
     parser.add_argument("--key-file", required=True, type=Path)
     options = parser.parse_args(arguments)
-    try:
-        key = read_key(options.key_file)
-        source = SetpointSource(load_profile(options.profile), key)
-    except (ProfileError, KeyFileError) as error:
-        sys.stderr.write(f"setpoint source: {error}\n")
-        return 3
-    ended: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda which, _frame: ended.append(which))
+    key = read_key(options.key_file)
+    source = SetpointSource(load_profile(options.profile), key)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", options.report_port))
         link.settimeout(0.02)
-        gc.collect()
-        gc.freeze()
-        print("ready", flush=True)
-        _serve(source, link, options.controller, options.operator, key, ended)
+        ended = announce_ready()
+        send_ns = next_print_ns = 0
+        mode = -1
+        while not ended:
+            try:
+                message = decode(link.recv(2048), key)
+            except (OSError, DatagramRefused):  # no controller yet, or another datagram
+                message = None
+            if isinstance(message, StateReport):
+                if press := source.receive(message):
+                    with contextlib.suppress(OSError):  # it has ended
+                        operator_link.send(press, options.operator)
+                if message.mode != mode:
+                    mode = message.mode
+                    _print(source, event="mode", why=describe(message.reason), reason=message.reason & REASON_MASK)
+            now_ns = time.monotonic_ns()
+            if now_ns >= send_ns and (datagram := source.setpoint(now_ns)):
+                send_ns = max(send_ns + SEND_PERIOD_NS, now_ns)
+                link.sendto(datagram, options.controller)
+            if now_ns >= next_print_ns and source.report is not None:
+                next_print_ns = now_ns + PRINT_PERIOD_NS
+                _print(source, event="report")
     return 0
-
-
-def _serve(
-    source: SetpointSource,
-    link: socket.socket,
-    controller: tuple[str, int],
-    operator: Path,
-    key: bytes,
-    ended: list[int],
-) -> None:
-    send_ns = next_print_ns = 0
-    mode = -1
-    while not ended:
-        try:
-            message = decode(link.recv(2048), key)
-        except (OSError, DatagramRefused):  # no controller yet, or another datagram
-            message = None
-        if isinstance(message, StateReport):
-            if press := source.receive(message):
-                with contextlib.suppress(OSError):  # it has ended
-                    operator_link.send(press, operator)
-            if message.mode != mode:
-                mode = message.mode
-                _print(source, event="mode", why=describe(message.reason), reason=message.reason & REASON_MASK)
-        now_ns = time.monotonic_ns()
-        if now_ns >= send_ns and (datagram := source.setpoint(now_ns)):
-            send_ns = max(send_ns + SEND_PERIOD_NS, now_ns)
-            link.sendto(datagram, controller)
-        if now_ns >= next_print_ns and source.report is not None:
-            next_print_ns = now_ns + PRINT_PERIOD_NS
-            _print(source, event="report")
 
 
 def _print(source: SetpointSource, **more: str | int) -> None:
     report = source.report
     assert report is not None
-    state = {"mode": Mode(report.mode).name, "stops": source.operator.stops, "refused": report.refused}
-    facts = {"stamp_ns": report.stamp_ns, "refusal": describe(report.refusal)}
-    print(json.dumps(more | state | facts), flush=True)
+    state = {"mode": Mode(report.mode).name, "refused": report.refused, "refusal": describe(report.refusal)}
+    print(json.dumps(more | state | {"stamp_ns": report.stamp_ns}), flush=True)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +13,17 @@ from typing import Any, Final
 from rich.console import Console
 
 from can_dbc.timing.page import Facts
+from experiments.common import host_activity
 from experiments.common.registry import Options
-from experiments.common.result import Metric, Result, commit, environment, limits_of
+from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing import evaluation, host_activity
-from experiments.timing.evaluation import MIN_STEADY_TICKS
+from experiments.timing.evaluation import MIN_STEADY_TICKS, block_growth, spread_us
 from experiments.timing.measurement import between
-from experiments.timing.plots import exceeded
+from experiments.timing.plots import draw_exceeded
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
 from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason
-from runtime.plot_style import OIL, STEEL, TIMBER, sheet
+from runtime.plot_style import OIL, TIMBER, sheet
 
 MINUTES: Final = 30.0
 QUICK_MINUTES: Final = 1.0 / 3.0
@@ -133,8 +134,7 @@ def run(options: Options, console: Console) -> Result:
     first = host_activity.sample()
     with console.status("soak: starting") as status, TimingTestbed(setting, options.out / "testbed") as testbed:
         testbed.wait(WARM_S)
-        begin = testbed.fresh_timing()
-        before = copied(testbed.status)
+        begin, before = testbed.fresh_timing(), testbed.counters()
         began, readings = time.monotonic(), list[Reading]()
         while (passed := time.monotonic() - began) < 60.0 * minutes:
             readings.append(read(testbed, passed))
@@ -142,56 +142,42 @@ def run(options: Options, console: Console) -> Result:
             testbed.wait(min(READING_PERIOD_S, 60.0 * minutes / MIN_READINGS, 60.0 * minutes - passed))
         end = testbed.fresh_timing()
         readings.append(read(testbed, time.monotonic() - began))
-        after, stops, modes, stop_reasons = (
-            copied(testbed.status),
-            testbed.stops,
-            list(testbed.modes),
-            set(testbed.stop_reasons),
-        )
+        counted = testbed.counters()
+        counted.subtract(before)
     durations = between(begin, end)
     metrics = {
         "minutes": minutes,
         "ticks": float(end.facts.ticks - begin.facts.ticks),
         "missed": float(end.facts.missed - begin.facts.missed),
-        "stops": float(stops),
+        "stops": float(len(testbed.events.stops)),
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
         "steal_ms": host_activity.between(first, host_activity.sample()).steal_ms,
         **memory(readings),
-        **frames(before, after, begin.facts, end.facts),
-        **evaluation.spread_us("wakeup", durations["wake"]),
-        **evaluation.spread_us("tick_cpu", durations["cpu"]),
+        **frames(counted, begin.facts, end.facts),
+        **spread_us("wakeup", durations["wake"]),
+        **spread_us("tick_cpu", durations["cpu"]),
     }
-    found = evaluation.evaluate(METRICS, metrics, undecided(metrics, stop_reasons))
-    result = Result(
-        experiment="soak",
-        commit=commit(),
+    result = make_result(
+        "soak",
+        METRICS,
+        metrics,
         profile=profile.name,
         seed=options.seed,
         trials=1,
-        metrics=metrics,
-        paper={},
-        environment={
-            **environment(),
+        more={
             **host_activity.describe(),
             "bus": options.bus,
             "rate_hz": str(profile.rate_hz),
-            "lab": lab(),
-            "modes": "; ".join(modes),
+            "lab": " in user-mode Linux" if os.environ.get("TIMBERHAND_LAB") == "uml" else "",
+            "modes": "; ".join(testbed.modes),
             "tick": readings[-1].facts.tick,
         },
-        limits=limits_of(METRICS),
-        missed=found.missed,
-        inconclusive=tuple(found.inconclusive),
+        undecided=undecided(metrics, testbed.stop_reasons),
     )
     options.out.mkdir(parents=True, exist_ok=True)
     draw_memory(readings, options.out / "memory.png")
     with sheet(options.out / "lateness.png") as axis:
-        axis.step(*exceeded(durations["wake"]), where="post", color=OIL)
-        axis.axvline(setting.period_ns / 1e3, color=STEEL, ls="--", lw=0.8)
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.set_xlabel("lateness [us]")
-        axis.set_ylabel("share of later wake-ups")
+        draw_exceeded(axis, {"controller": durations["wake"]}, setting.period_ns)
     publish(result, page_of(result, {}), options, console)
     return result
 
@@ -222,17 +208,11 @@ def undecided(metrics: dict[str, float], stop_reasons: set[Reason]) -> dict[str,
     return found
 
 
-def lab() -> str:
-    """Where the test ran, if in user-mode Linux."""
-    return " in user-mode Linux" if os.environ.get("TIMBERHAND_LAB") == "uml" else ""
-
-
 def read(testbed: TimingTestbed, at_s: float) -> Reading:
     """Read a running testbed."""
     pids = {name: child.process.pid for name, child in testbed.family.children.items()}
-    return Reading(
-        at_s, testbed.timing().facts, resident_kb(pids["controller"]), resident_kb(pids["guard"]), testbed.mode
-    )  # fmt: skip
+    memory_kb = (resident_kb(pids[name]) for name in ("controller", "guard"))
+    return Reading(at_s, testbed.timing().facts, *memory_kb, testbed.mode)
 
 
 def resident_kb(pid: int) -> int:
@@ -248,44 +228,24 @@ def memory(readings: Sequence[Reading]) -> dict[str, float]:
     half = max(1, len(readings) // 2)
     early, late = readings[:half], readings[half:]
     first, last = readings[0].facts.process, readings[-1].facts.process
-    blocks = [r.facts.process.allocated_blocks for r in readings]
     return {
         "controller_growth_kb": float(max(r.controller_kb for r in late) - max(r.controller_kb for r in early)),
         "guard_growth_kb": float(max(r.guard_kb for r in late) - max(r.guard_kb for r in early)),
-        "allocated_blocks_growth": float(min(blocks[half:]) - min(blocks[:half])),
+        "allocated_blocks_growth": block_growth([r.facts for r in readings]),
         "gc_runs": float(last.gc_runs - first.gc_runs),
         "minor_faults": float(last.minor_faults - first.minor_faults),
         "major_faults": float(last.major_faults - first.major_faults),
     }
 
 
-def copied(status: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """A copy of the newest messages of all processes."""
-    return {name: dict(words) for name, words in status.items()}
-
-
-def frames(
-    before: dict[str, dict[str, Any]], after: dict[str, dict[str, Any]], begin: Facts, end: Facts
-) -> dict[str, float]:
-    """Counts of frames between two readings, by bus observer, emulated machine and controller.
-
-    Only differences count: a machine that is alone on its bus at the start has frames refused.
-    """
-
-    def grown(who: str, *names: str) -> float:
-        return float(sum(after[who][name] - before[who][name] for name in names))
-
+def frames(counted: Counter[str], begin: Facts, end: Facts) -> dict[str, float]:
+    """Counts of frames in a run, by bus observer, emulated machine and controller."""
     lost = sum(b.dropped + b.refused for b in end.buses) - sum(b.dropped + b.refused for b in begin.buses)
+    names = ("received", "sent", "gaps", "gaps_rig", "damaged", "unanswered", "records_lost")
     return {
-        "received": grown("observer", "received"),
-        "sent": grown("observer", "sent"),
-        "gaps": grown("observer", "gaps"),
-        "gaps_rig": grown("machine", "gaps"),
-        "damaged": grown("observer", "damaged") + grown("machine", "damaged"),
-        "unanswered": grown("observer", "unanswered"),
-        "records_lost": grown("observer", "records_lost", "records_unreadable"),
-        "frames_lost": lost + grown("machine", "dropped_frames", "refused_frames"),
-        "rig_stalls": grown("machine", "stalls"),
+        **{name: float(counted[name]) for name in names},
+        "frames_lost": float(lost + counted["machine_frames_lost"]),
+        "rig_stalls": float(counted["machine_stalls"]),
     }
 
 

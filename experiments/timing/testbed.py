@@ -12,6 +12,7 @@ import os
 import shutil
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,9 +21,9 @@ from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
 from can_dbc.messages.key_file import write_key
-from can_dbc.timing.page import Facts, Timing, TimingRefused, read_timing
-from experiments.timing import host_activity
-from experiments.timing.losses import Loss, Stall, Stop, losses_between
+from can_dbc.timing.page import Timing, TimingRefused, read_timing
+from experiments.common import host_activity
+from experiments.timing.events import Events, Stall, Stop, losses_between
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.wire.bitrates import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
@@ -42,6 +43,7 @@ controller the witness wakes below it and less often, so that it does not distur
 END_ORDER: Final = ("setpoints", "controller", "guard", "observer", "machine", "wire")
 START_S: Final = 60.0
 ACTIVE_S: Final = 60.0
+PAGE_S: Final = 5.0
 HELPER_ENDS_S: Final = 60.0
 MEMORY: Final = Path("/dev/shm")  # only mkdtemp makes names in it  # nosec B108
 """The timing page lies in memory: a write to a page of a disk file can fault and wait for the disk."""
@@ -91,8 +93,8 @@ class TimingTestbed:
     """A running testbed.
 
     ``helpers`` are processes that run beside it for a while (`experiments.timing.reference_loops`).  ``status`` holds
-    the newest message of each process, ``modes`` every change of mode, ``stop_reasons`` why the machine stopped;
-    ``stop_events``, ``losses`` and ``stalls`` what happened when.
+    the newest message of each process, ``modes`` every change of mode, ``stop_reasons`` why the machine stopped, and
+    ``events`` what was lost, stopped or stalled.
     """
 
     def __init__(self, setting: TestbedConfig, directory: Path) -> None:
@@ -101,10 +103,8 @@ class TimingTestbed:
         self.status: dict[str, dict[str, Any]] = {}
         self.modes: list[str] = []
         self.stop_reasons: set[Reason] = set()
-        self.stop_events: list[Stop] = []
-        self.losses: list[Loss] = []
-        self.stalls: list[Stall] = []
-        self._facts: Facts | None = None
+        self.events = Events()
+        self._last: Timing | None = None
         self._was = ""
         self._load = OwnLoad()
         directory.mkdir(parents=True, exist_ok=True)
@@ -148,7 +148,7 @@ class TimingTestbed:
         cycle_us = min(5000, s.period_ns // 1000)
         for name, cpu in (("witness", min(self.others)), ("witness-controller", self.cpu)):
             if name == "witness" or self.cpu not in self.others:
-                self._start(name, "experiments.timing.stall_witness", "--period-us", min(WITNESS_US[name], cycle_us))
+                self._start(name, "experiments.common.stall_witness", "--period-us", min(WITNESS_US[name], cycle_us))
                 os.sched_setaffinity(self.family.children[name].process.pid, {cpu})
         self._start(
             "machine", "experiments.timing.emulated_machine", "--profile", s.profile, *buses, "--cycle-us", cycle_us
@@ -164,14 +164,19 @@ class TimingTestbed:
             "guard", "controller.guard", "--profile", s.profile, *buses, "--rate", s.rate_hz,
             "--state", self.page.with_suffix(".latched"), "--operator", operators,
         )  # fmt: skip
-        self._elsewhere(guard.process.pid)
+        os.sched_setaffinity(guard.process.pid, self.others)
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,
             "--report", f"{HOST}:{reports}", "--record", ticks, "--operator", operators, "--rate", s.rate_hz,
             "--timing", self.page, *keyed,
             *(("--cpu", self.cpu) if self.cpu not in self.others else ()), *s.arguments,
         )  # fmt: skip
-        self._await_motion()
+        if not self.until(lambda: self.mode == "ACTIVE" and self.page.exists(), ACTIVE_S):
+            raise CommandFailed(
+                "timing-testbed.not-moving",
+                f"the machine does not move on the timing testbed: {self.status.get('setpoints', 'no report')}",
+                ExitCode.SAFETY_STOP,
+            )
 
     def _start(self, name: str, module: str, *arguments: object) -> None:
         child = self.family.start(name, module, *arguments)
@@ -180,23 +185,7 @@ class TimingTestbed:
             self.family.set_fifo_priority(name, PRIORITY[name])
         else:  # it only reads what the ring holds for seconds
             self.family.set_niceness(name, OBSERVER_NICENESS)
-        self._elsewhere(child.process.pid)
-
-    def _elsewhere(self, pid: int) -> None:
-        os.sched_setaffinity(pid, self.others)
-
-    def _await_motion(self) -> None:
-        limit = time.monotonic() + ACTIVE_S
-        while self.mode != "ACTIVE" or not self.page.exists():
-            self.poll()
-            if time.monotonic() > limit:
-                why = self.status.get("setpoints", {})
-                raise CommandFailed(
-                    "timing-testbed.not-moving",
-                    f"the machine does not move on the timing testbed: {why or 'no report'}",
-                    ExitCode.SAFETY_STOP,
-                )
-            time.sleep(0.05)
+        os.sched_setaffinity(child.process.pid, self.others)
 
     def poll(self) -> None:
         """Read the messages of all processes.
@@ -211,12 +200,12 @@ class TimingTestbed:
             if "stall_ns" in message:
                 cpu = min(self.others) if name == "witness" else self.cpu
                 own = self._load.share if name == "witness" else 0.0
-                self.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"], own))
+                self.events.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"], own))
             if name == "setpoints" and message.get("event") == "mode":
                 self.modes.append(f"{message['mode']}: {message['why']}")
                 if message["mode"] in ("STOP", "FAULT"):
                     if self._was not in ("STOP", "FAULT"):
-                        self.stop_events.append(Stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
+                        self.events.stops.append(Stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
                     self.stop_reasons.add(Reason(message["reason"]))
                 self._was = message["mode"]
         if gone is not None:
@@ -232,14 +221,26 @@ class TimingTestbed:
         return str(self.status.get("setpoints", {}).get("mode", ""))
 
     @property
-    def stops(self) -> int:
-        """Number of stops since the start."""
-        return int(self.status.get("setpoints", {}).get("stops", 0))
-
-    @property
     def stamp_ns(self) -> int:
         """Nominal time of one of the controller's ticks [ns]."""
         return int(self.status["setpoints"]["stamp_ns"])
+
+    def counters(self) -> Counter[str]:
+        """What observer and emulated machine have counted so far; a machine alone on its bus has frames refused."""
+        seen, rig = (Counter(self.status.get(name, {})) for name in ("observer", "machine"))
+        found = Counter({name: seen[name] for name in ("received", "sent", "gaps", "unanswered")})
+        return found + Counter({
+            "damaged": seen["damaged"] + rig["damaged"],
+            "gaps_rig": rig["gaps"],
+            "records_lost": seen["records_lost"] + seen["records_unreadable"],
+            "machine_frames_lost": rig["refused_frames"] + rig["dropped_frames"],
+            "machine_stalls": rig["stalls"],
+        })  # fmt: skip
+
+    def take_events(self) -> Events:
+        """What was lost, stopped or stalled since the start or the last call."""
+        taken, self.events = self.events, Events()
+        return taken
 
     def timing(self) -> Timing:
         """The controller's timing page now, its losses noted; raises CommandFailed when there is none."""
@@ -247,33 +248,44 @@ class TimingTestbed:
             now = read_timing(self.page)
         except TimingRefused as error:
             raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
-        if self._facts is not None:
-            self.losses += losses_between(self._facts, now.facts)
-        self._facts = now.facts
+        if self._last is not None:
+            self.events.losses.extend(losses_between(self._last.facts, now.facts))
+        self._last = now
         return now
 
     def fresh_timing(self) -> Timing:
         """The next timing page that the controller writes; it writes one per second."""
-        before = self.timing().facts.written_ns
-        limit = time.monotonic() + 5.0
-        while (now := self.timing()).facts.written_ns == before:
-            self.poll()
-            if time.monotonic() > limit:
-                raise CommandFailed(
-                    "timing-testbed.page-stale",
-                    "the controller has stopped writing its timing page",
-                    ExitCode.SAFETY_STOP,
-                )
-            time.sleep(0.02)
+        now = before = self.timing()
+
+        def written() -> bool:
+            nonlocal now
+            now = self.timing()
+            return now.facts.written_ns != before.facts.written_ns
+
+        if not self.until(written, PAGE_S):
+            raise CommandFailed(
+                "timing-testbed.page-stale",
+                "the controller has stopped writing its timing page",
+                ExitCode.SAFETY_STOP,
+            )
         return now
 
-    def wait(self, seconds: float, progress: Callable[[float], None] = lambda _share: None) -> None:
-        """Let the testbed run for a time and check its processes; ``progress`` receives the share that has passed."""
-        begin = time.monotonic()
-        while (passed := time.monotonic() - begin) < seconds:
+    def until(self, reached: Callable[[], bool], seconds: float, period_s: float = 0.02) -> bool:
+        """Check the processes until something is reached; False if it is not within this time."""
+        limit = time.monotonic() + seconds
+        while not reached():
             self.poll()
-            progress(passed / seconds)
-            time.sleep(min(0.1, seconds - passed))
+            if time.monotonic() > limit:
+                return False
+            time.sleep(period_s)
+        return True
+
+    def wait(self, seconds: float) -> None:
+        """Let the testbed run for a time and check its processes."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self.poll()
+            time.sleep(min(0.1, left))
 
     def await_end(self, name: str, seconds: float) -> dict[str, Any]:
         """Wait until a helper ends by itself; returns its output.
@@ -282,20 +294,18 @@ class TimingTestbed:
             CommandFailed: it fails or does not end, or the testbed fails meanwhile.
         """
         child = self.helpers.children[name]
-        limit = time.monotonic() + seconds
         output: dict[str, Any] = {}
-        while True:
-            ended = child.process.poll() is not None
+
+        def ended() -> bool:
+            gone = child.process.poll() is not None
             for who, message in self.helpers.messages():
-                output |= message if who == name else {}
-            if ended:
-                break
-            if time.monotonic() > limit:
-                raise CommandFailed(
-                    "timing-testbed.helper-hangs", f"{name} does not end; see {child.errors}", ExitCode.CONFIGURATION
-                )
-            self.poll()
-            time.sleep(0.05)
+                output.update(message if who == name else {})
+            return gone
+
+        if not self.until(ended, seconds, 0.05):
+            raise CommandFailed(
+                "timing-testbed.helper-hangs", f"{name} does not end; see {child.errors}", ExitCode.CONFIGURATION
+            )
         self.end_helper(name)
         return output
 

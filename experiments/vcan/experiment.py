@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
@@ -11,20 +11,70 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, make_result
-from experiments.common.result_page import Page, publish
+from experiments.common.result import Metric, Result, make_result, mean, rate
+from experiments.common.result_page import Page, Section, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
 from experiments.common.workers import Workers
 from experiments.common.worlds import profile_named
-from experiments.vcan.metrics import CONCLUSION, INTRODUCTION, KINDS, METRICS, SECTIONS, gather, seed_table
 from experiments.vcan.trial import perform
 
 TRIALS: Final = 10
 QUICK_TRIALS: Final = 1
 MAX_LOST_SHARE: Final = 0.01
-"""Of the time of the runs, by the probe: a host that takes more is not quiet."""
+"""Of the time of the runs, by the witness: a host that takes more is not quiet."""
 MAX_LONGEST_MS: Final = 25.0
 """Half of a motion input's time-out."""
+KINDS: Final = {"demo": "one log into the bunk", "mission": "mission with three logs"}
+CLOCKS: Final = ("real", "simulated", "native")
+SEED_FIGURES: Final = (
+    "done", "stops", "leases_lost", "refused", "missed_ticks", "seconds", "wall_s", "steal_ms", "lost_ms", "longest_ms",
+)  # fmt: skip
+COLUMNS: Final = {
+    "leases lost": ("leases_lost", "{:.0f}"), "refused": ("refused", "{:.0f}"), "machine time": ("seconds", "{:.1f} s"),
+    "wall time": ("wall_s", "{:.1f} s"), "steal": ("steal_ms", "{:.0f} ms"), "lost": ("lost_ms", "{:.0f} ms"),
+}  # fmt: skip
+"""Of the table of seeds, after run, seed, clock, done and stops."""
+CONCLUSION: Final = tuple(
+    f"{title}: {{{kind}_runs}} runs, {{{kind}_done}} done, {{{kind}_stops}} stops; {{{kind}_real}} in real time, "
+    f"{{{kind}_simulated}} in simulated time."
+    for kind, title in (("demo", "One log into the bunk"), ("mission", "Missions"))
+)
+INTRODUCTION: Final = (
+    "Every run is the command that a user types, with a seed of its own: all processes of the machine on SocketCAN. "
+    "Where the kernel has no vcan, they share user-mode Linux on one processor. Before such a run the command measures "
+    "the processor time that the host takes, and chooses simulated time when too little is left; it says which. "
+    "**Runs in simulated time show that the processes do their job and never that they do it in real time**, so they "
+    "are counted apart, and the limit on real time is then inconclusive and never met."
+)
+
+
+def _metrics(kind: str, title: str) -> Iterator[Metric]:
+    yield Metric(f"{kind}_runs", f"Runs: {title}", "", "One seed each, one after the other.")
+    yield Metric(f"{kind}_done", f"Done: {title}", "%", "By the plant's physics.", least=1.0, scale=100.0)
+    yield Metric(f"{kind}_stops", f"Stops: {title}", "", "All runs, whatever their clock.", most=0.0, clocked=True)
+    yield Metric(f"{kind}_leases_lost", f"Ended leases among them: {title}", "", "Setpoints that came too late.")
+    yield Metric(f"{kind}_refused", f"Refused setpoints: {title}", "", "By the controller, at the end of each run.")
+    for clock, words in (("real", "real time"), ("simulated", "simulated time")):
+        yield Metric(f"{kind}_{clock}", f"Runs in {words}: {title}", "", "As announced.")
+        yield Metric(f"{kind}_{clock}_stops", f"Stops in {words}: {title}", "", "Of these runs alone.")
+    yield Metric(
+        f"{kind}_real_share", f"Share of runs in real time: {title}", "%",
+        "In user-mode Linux or natively; simulated only where the host's lost time leaves no other choice.",
+        least=1.0, scale=100.0, clocked=True,
+    )  # fmt: skip
+    yield Metric(f"{kind}_wall_s", f"Duration on the host: {title}", "s", "Mean, with the start of every process.")
+
+
+HOST: Final = (
+    Metric("steal_ms", "Steal during the runs", "ms", "/proc/stat, all processors."),
+    Metric("lost_ms", "Time lost by the witness", "ms", "It sleeps beside the run on the lab's processor at FIFO 99."),
+    Metric("longest_ms", "Longest delay of the witness", "ms", "In all runs."),
+)
+SECTIONS: Final = (
+    *(Section(title.capitalize(), "", tuple(_metrics(kind, title))) for kind, title in KINDS.items()),
+    Section("The host", "", HOST),
+)
+METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 
 def run(options: Options, console: Console) -> Result:
@@ -43,8 +93,32 @@ def run(options: Options, console: Console) -> Result:
     return result
 
 
+def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """All metrics, and the figures of every seed as KIND_SEED_FIGURE."""
+    metrics: dict[str, float] = {}
+    for kind in KINDS:
+        runs = [o for o in outcomes.values() if o["kind"] == kind]
+        if not runs:
+            continue
+        metrics |= {f"{kind}_runs": float(len(runs)), f"{kind}_wall_s": mean([o["wall_s"] for o in runs])}
+        metrics |= rate(f"{kind}_done", sum(o["done"] and o["exit"] == 0 for o in runs), len(runs))
+        for name in ("stops", "leases_lost", "refused"):
+            metrics[f"{kind}_{name}"] = float(sum(o[name] for o in runs))
+        for clock, these in (("real", ("real", "native")), ("simulated", ("simulated",))):
+            chosen = [o for o in runs if o["clock"] in these]
+            metrics[f"{kind}_{clock}"] = float(len(chosen))
+            metrics[f"{kind}_{clock}_stops"] = float(sum(o["stops"] for o in chosen))
+        metrics[f"{kind}_real_share"] = metrics[f"{kind}_real"] / len(runs)
+        for o in runs:
+            metrics |= {f"{kind}_{o['seed']}_{name}": float(o[name]) for name in SEED_FIGURES}
+            metrics[f"{kind}_{o['seed']}_clock"] = float(CLOCKS.index(o["clock"]))
+    runs = list(outcomes.values())
+    metrics |= {name: sum(o[name] for o in runs) for name in ("steal_ms", "lost_ms")}
+    return metrics | {"longest_ms": max((o["longest_ms"] for o in runs), default=0.0)}
+
+
 def noisy(outcomes: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether the host took too much: by the probe beside the runs, or by the measurement that chose the clock."""
+    """Whether the host took too much: by the witness beside the runs, or by the measurement that chose the clock."""
     wall_ms = sum(o["wall_s"] for o in outcomes.values()) * 1e3
     lost = sum(o["lost_ms"] for o in outcomes.values()) > MAX_LOST_SHARE * wall_ms
     long = any(o["longest_ms"] > MAX_LONGEST_MS for o in outcomes.values())
@@ -53,14 +127,11 @@ def noisy(outcomes: Mapping[str, Mapping[str, Any]]) -> bool:
 
 def environment_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Reasons of the chosen clocks and of the stops, by run."""
-    clocks = {name: f"{o['clock']}: {o['clock_reason']}" for name, o in outcomes.items()}
-    stops = {name: "; ".join(o["stop_reasons"]) for name, o in outcomes.items() if o["stop_reasons"]}
+    clocks = {f"clock {name}": f"{o['clock']}: {o['clock_reason']}" for name, o in outcomes.items()}
+    stops = {f"stops {name}": "; ".join(o["stop_reasons"]) for name, o in outcomes.items() if o["stop_reasons"]}
     probe = all(o["probe_real_time"] for o in outcomes.values())
-    return {
-        **{f"clock {name}": words for name, words in clocks.items()},
-        **{f"stops {name}": words for name, words in stops.items()},
-        "probe": "FIFO 99: the hypervisor alone delays it" if probe else "ordinary priority: other processes delay it",
-    }
+    words = "FIFO 99: the hypervisor alone delays it" if probe else "ordinary priority: other processes delay it"
+    return {**clocks, **stops, "probe": words}
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
@@ -70,6 +141,18 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     e = result.environment
     setting = (
         f"Commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}; "
-        f"probe at {e['probe']}."
+        f"witness at {e['probe']}."
     )
     return Page("Live runs on SocketCAN", CONCLUSION, INTRODUCTION, sections, setting)
+
+
+def seed_table(result: Result) -> str:
+    """One line per run, as Markdown."""
+    lines = [f"| run | seed | clock | done | stops | {' | '.join(COLUMNS)} |", f"|{'---|' * (5 + len(COLUMNS))}"]
+    runs = [words for name in result.metrics if len(words := name.split("_")) == 3 and words[2] == "clock"]
+    for kind, seed, _ in sorted(runs, key=lambda words: (words[0], int(words[1]))):
+        value = {name: result.metrics[f"{kind}_{seed}_{name}"] for name in (*SEED_FIGURES, "clock")}
+        rest = " | ".join(form.format(value[name]) for name, form in COLUMNS.values())
+        done, clock = "yes" if value["done"] else "no", CLOCKS[int(value["clock"])]
+        lines.append(f"| {kind} | {seed} | {clock} | {done} | {value['stops']:.0f} | {rest} |")
+    return "\n".join(lines)

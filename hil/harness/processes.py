@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import json
 import os
 import selectors
@@ -171,6 +172,17 @@ class ProcessGroup:
         for name in (*order, *reversed(tuple(self.children))):
             self.stop(name)
         self.selector.close()
+
+
+def announce_ready() -> list[int]:
+    """In a child: tell the harness that it is ready; the signals SIGTERM and SIGINT go into the returned list."""
+    ended: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda which, _frame: ended.append(which))
+    gc.collect()
+    gc.freeze()
+    print("ready", flush=True)
+    return ended
 
 
 def free_udp_ports(count: int) -> list[int]:

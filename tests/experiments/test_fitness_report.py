@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from experiments.timing.fitness import Figures, Verdict, judge, overall
-from experiments.timing.fitness_measurement import Measured
+from experiments.timing.fitness import Figures, Measured, Verdict, judge, overall
 from experiments.timing.fitness_report import REMOVED, data_of, private_words, read_data, text_of, without_private
 from host.doctor import facts
 from host.doctor.facts import interrupt_counts

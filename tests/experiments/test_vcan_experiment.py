@@ -8,8 +8,7 @@ from typing import Any
 
 from experiments.common.result import evaluate, make_result
 from experiments.common.result_page import markdown
-from experiments.vcan.experiment import environment_of, noisy, page_of
-from experiments.vcan.metrics import METRICS, gather
+from experiments.vcan.experiment import METRICS, environment_of, gather, noisy, page_of
 from experiments.vcan.trial import command, read_output, read_summary
 from machine.status.explanation import describe
 from machine.status.reasons import Reason

@@ -1,6 +1,6 @@
 """Live tests: what a test starts ends with it, and a failure beside a stall of the host is inconclusive.
 
-A witness on every processor tells when it stood still (`experiments.timing.stall_witness`).  A test that fails while
+A witness on every processor tells when it stood still (`experiments.common.stall_witness`).  A test that fails while
 the host stood still for longer than the test bears (15 ms, or its mark ``bears``) has found nothing; it is reported as
 inconclusive, with the stall.  Any other failure is a failure.
 """
@@ -8,19 +8,16 @@ inconclusive, with the stall.  Any other failure is a failure.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from experiments.common.stall_witness import Witness
 
 TAG = "TIMBERHAND_TEST_RUN"
 """In the environment of everything that this run starts."""
@@ -34,57 +31,14 @@ _FAILED = pytest.StashKey[bool]()
 _BEGIN = pytest.StashKey[int]()
 
 
-@dataclass(frozen=True, slots=True)
-class Stall:
-    """One processor did not run its witness for ``stall_ns``, until ``end_ns`` on CLOCK_MONOTONIC."""
-
-    stall_ns: int
-    end_ns: int
-
-
-class Witnesses:
-    """One on every processor, above everything else there where it may be; their words go to files."""
-
-    def __init__(self, folder: Path) -> None:
-        self._files: list[Path] = []
-        self._processes: list[subprocess.Popen[bytes]] = []
-        for cpu in sorted(os.sched_getaffinity(0)):
-            path = folder / f"stalls-{cpu}"
-            command = [sys.executable, "-m", "experiments.timing.stall_witness", "--period-us", "2000"]
-            environment = {name: value for name, value in os.environ.items() if name != TAG}
-            with path.open("wb") as out:
-                process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, env=environment)
-            with contextlib.suppress(OSError):
-                os.sched_setaffinity(process.pid, {cpu})
-                os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(98))
-            self._files.append(path)
-            self._processes.append(process)
-
-    def longest_ms(self, begin_ns: int, end_ns: int) -> float:
-        """The longest stall that touched this time."""
-        found = 0
-        for path in self._files:
-            for line in path.read_text().splitlines():
-                if line.startswith("{") and line.endswith("}"):
-                    stall = Stall(**json.loads(line))
-                    if stall.end_ns > begin_ns and stall.end_ns - stall.stall_ns < end_ns:
-                        found = max(found, stall.stall_ns)
-        return found / 1e6
-
-    def end(self) -> None:
-        for process in self._processes:
-            process.terminate()
-            process.wait()
-
-
 class LiveRun:
     """The plugin of one run of live tests."""
 
     def __init__(self) -> None:
+        os.environ.pop(TAG, None)  # the witnesses are no part of the run that they watch
+        self.witnesses = [Witness(cpu, priority=98) for cpu in sorted(os.sched_getaffinity(0))]
         os.environ[TAG] = str(os.getpid())
         self._memory = shared_memory()
-        self._folder = tempfile.TemporaryDirectory(prefix="stalls-")
-        self.witnesses = Witnesses(Path(self._folder.name))
         self.left: list[str] = []
         self.inconclusive: list[str] = []
 
@@ -100,7 +54,15 @@ class LiveRun:
             # call.start is of the wall clock
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             begin_ns = now_ns - (wall_ns - item.stash.get(_BEGIN, wall_ns))
-            stall_ms = self.witnesses.longest_ms(begin_ns, now_ns)
+            stall_ms = max(
+                (
+                    stall.stall_ns / 1e6
+                    for witness in self.witnesses
+                    for stall in witness.stalls()
+                    if stall.end_ns > begin_ns and stall.end_ns - stall.stall_ns < now_ns
+                ),
+                default=0.0,
+            )
             if stall_ms > bears_ms:
                 words = f"inconclusive: the host stood still for {stall_ms:.0f} ms, and the test bears {bears_ms:g} ms"
                 self.inconclusive.append(f"{item.nodeid}: {words}\n{report.longreprtext}")
@@ -110,8 +72,8 @@ class LiveRun:
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        self.witnesses.end()
-        self._folder.cleanup()
+        for witness in self.witnesses:
+            witness.end()
         left = remaining(set(), PATIENCE_S)
         self.left += [f"process {pid}: {command}" for pid, command in left.items()]
         kill(left)

@@ -96,8 +96,7 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
 
     from rich.console import Console
 
-    from experiments.timing.fitness import Verdict
-    from experiments.timing.fitness_measurement import Measured, loopback_bus, measure_computer
+    from experiments.timing.fitness import Measured, Verdict, loopback_bus, measure_computer
     from experiments.timing.fitness_report import data_of, text_of
     from experiments.timing.testbed import cores
     from host.doctor import facts, timing

@@ -1,20 +1,21 @@
 """Activity of the host during a measurement (steal, pressure, load), and its description.
 
 Sources: proc(5) for stat and loadavg, the kernel's accounting/psi.rst for pressure.  What a host does not report is
-None or "unknown", never 0.
+None or "unknown"; only steal is then 0.
 """
 
 from __future__ import annotations
 
 import os
-import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-_STEAL: Final = 7
-"""Index of steal in a line of /proc/stat: user nice system idle iowait irq softirq steal."""
+from host.doctor import facts
+
+_STEAL: Final = 8
+"""Index of steal in a line of /proc/stat: name user nice system idle iowait irq softirq steal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +30,14 @@ class Sample:
 
 def sample() -> Sample:
     """The totals now."""
-    words = _read("/proc/stat").split("\n", 1)[0].split()[1:]
-    tick_ms = 1e3 / os.sysconf("SC_CLK_TCK")
-    steal = float(words[_STEAL]) * tick_ms if len(words) > _STEAL else 0.0
-    load = os.getloadavg()[0]
-    return Sample(time.monotonic_ns(), steal, pressure_us(_read("/proc/pressure/cpu")), load)
+    pressure = pressure_us(_read("/proc/pressure/cpu"))
+    return Sample(time.monotonic_ns(), steal_ms(_read("/proc/stat")), pressure, os.getloadavg()[0])
+
+
+def steal_ms(stat: str) -> float:
+    """Steal of all processors since boot, from the text of /proc/stat; 0 where it is not reported."""
+    words = stat.partition("\n")[0].split()
+    return float(words[_STEAL]) * 1e3 / os.sysconf("SC_CLK_TCK") if len(words) > _STEAL else 0.0
 
 
 def pressure_us(text: str) -> int | None:
@@ -72,25 +76,17 @@ def cpu_s(pid: int) -> float:
 
 
 def describe() -> dict[str, str]:
-    """Kernel, preemption model, frequency governor, isolated processors and hypervisor."""
+    """Kernel, preemption model, frequency governors, isolated processors, clock, hypervisor, real-time throttling."""
+    found = facts.read(Path("/"))
     return {
-        "kernel": platform.release(),
-        "preemption": preemption(platform.version(), _read("/sys/kernel/debug/sched/preempt")),
-        "governor": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip() or "none reported",
-        "isolated": _read("/sys/devices/system/cpu/isolated").strip() or "none",
-        "clock": _read("/sys/devices/system/clocksource/clocksource0/current_clocksource").strip() or "unknown",
-        "hypervisor": "yes" if " hypervisor" in _read("/proc/cpuinfo") else "no",
-        "rt_runtime_us": _read("/proc/sys/kernel/sched_rt_runtime_us").strip() or "unknown",
+        "kernel": found.release,
+        "preemption": found.preemption or "unknown",
+        "governor": ", ".join(sorted(set(found.governors.values()))) or "none reported",
+        "isolated": ", ".join(map(str, sorted(found.isolated))) or "none",
+        "clock": found.clock_source or "unknown",
+        "hypervisor": "no" if found.machine in ("", "a container") else "yes",
+        "rt_runtime_us": "unknown" if found.rt_runtime_us is None else str(found.rt_runtime_us),
     }
-
-
-def preemption(version: str, dynamic: str) -> str:
-    """The preemption model by ``uname -v`` and, for a dynamic one, the mode in brackets of sched/preempt."""
-    for word in ("PREEMPT_RT", "PREEMPT_DYNAMIC", "PREEMPT"):
-        if word in version:
-            mode = dynamic.partition("(")[2].partition(")")[0]
-            return f"{word} ({mode})" if word == "PREEMPT_DYNAMIC" and mode else word
-    return "none"
 
 
 def _read(path: str) -> str:
