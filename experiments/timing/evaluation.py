@@ -9,13 +9,14 @@ inconclusive, whatever its value.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
 from can_dbc.timing.durations import BINS, Durations, edge_ns
 from can_dbc.timing.page import Facts
+from experiments.common.result import Metric
 from experiments.timing.events import explained
 from experiments.timing.measurement import MeasurementWindow, pooled
 from experiments.timing.metrics import METRICS
@@ -218,8 +219,13 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
     elif plain < 100.0 and ours * 100.0 <= plain:
         why = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
         found["missed_loaded_share"] = why
-    unmeasured = {m.name for m in METRICS if m.limit_text() and math.isnan(metrics.get(m.name, math.nan))}
-    return dict.fromkeys(unmeasured, "it could not be measured here") | found
+    return unmeasured(METRICS, metrics) | found
+
+
+def unmeasured(definitions: Iterable[Metric], metrics: Mapping[str, float]) -> dict[str, str]:
+    """The metrics with a limit that have no value: inconclusive, with the reason."""
+    missing = [m.name for m in definitions if m.limit_text() and math.isnan(metrics.get(m.name, math.nan))]
+    return dict.fromkeys(missing, "it could not be measured here")
 
 
 def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:

@@ -58,11 +58,9 @@ def data_of(
     else:
         judged = judge(measured.figures)
         more = {"measured": asdict(measured), "disturbed": disturbances(measured.figures)}
-    settings = asdict(facts)
-    settings["links"] = [asdict(link) for link in facts.links]
     data = {
         "report": VERSION, "verdict": overall(judged).value, "judgements": [asdict(j) for j in judged], **more,
-        "computer": asdict(computer), "settings": settings, "findings": [f.document() for f in findings],
+        "computer": asdict(computer), "settings": asdict(facts), "findings": [f.document() for f in findings],
     }  # fmt: skip
     found: dict[str, Any] = without_private(data, words)
     return found

@@ -22,7 +22,7 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing.evaluation import load_metrics, spread_us
+from experiments.timing.evaluation import load_metrics, spread_us, unmeasured
 from experiments.timing.events import STALL_NS, Events, event_metrics, explained
 from experiments.timing.measurement import between
 from experiments.timing.testbed import TestbedConfig, TimingTestbed, cores
@@ -227,7 +227,7 @@ def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[st
 
 def undecided(metrics: Mapping[str, float], points: Sequence[RatePoint]) -> dict[str, str]:
     """The metrics that this run cannot decide, with the reason."""
-    found = explained(metrics)
+    found = unmeasured(METRICS, metrics) | explained(metrics)
     stalled = any(s.length_ns >= STALL_NS for p in points for s in p.events.stalls)
     for name in (*(f"{machine}_frame_residual" for machine in MACHINES), "function_residual"):
         if metrics[name] > MAX_RESIDUAL and stalled:

@@ -222,8 +222,9 @@ class _OnPair(SocketcanBus):
 
 def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
     """Ours and python-can's, each on an AF_UNIX datagram pair."""
-    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
-    (ours, to_ours), (theirs, to_theirs) = [tuple(map(stack.enter_context, pair)) for pair in pairs]
+    (ours, to_ours), (theirs, to_theirs) = (socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2))
+    for end in (ours, to_ours, theirs, to_theirs):
+        stack.enter_context(end)
     link, stats = FrameSocket(ours), BusStats()
 
     def through(sock: socket.socket) -> Callable[[list[RawFrame]], None]:

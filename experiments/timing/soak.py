@@ -211,8 +211,8 @@ def undecided(metrics: dict[str, float], stop_reasons: set[Reason]) -> dict[str,
 def read(testbed: TimingTestbed, at_s: float) -> Reading:
     """Read a running testbed."""
     pids = {name: child.process.pid for name, child in testbed.family.children.items()}
-    memory_kb = (resident_kb(pids[name]) for name in ("controller", "guard"))
-    return Reading(at_s, testbed.timing().facts, *memory_kb, testbed.mode)
+    controller_kb, guard_kb = (resident_kb(pids[name]) for name in ("controller", "guard"))
+    return Reading(at_s, testbed.timing().facts, controller_kb, guard_kb, testbed.mode)
 
 
 def resident_kb(pid: int) -> int:
