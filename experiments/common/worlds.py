@@ -89,16 +89,6 @@ def hang(world: World, mass_kg: float) -> None:
     world.client.changeDynamics(world.crane.body, link, mass=own + mass_kg)
 
 
-def mass_points(world: World, links: Sequence[str]) -> list[tuple[float, Point]]:
-    """Mass [kg] and centre of mass [m] in the world frame of each link."""
-    p, body = world.client, world.crane.body
-    out = []
-    for name in links:
-        index = world.crane.link[name]
-        out.append((p.getDynamicsInfo(body, index)[0], p.getLinkState(body, index, computeForwardKinematics=1)[0]))
-    return out
-
-
 def step_neutral(world: World, steps: int) -> None:
     """Advance the physics with every spool closed."""
     neutral = [0.0] * len(world.functions)

@@ -15,6 +15,7 @@ from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, rotato
 from machine.geometry.kinematics import Point, Unreachable, inverse, reachable_extensions, solve
 from machine.joints import Joint
 from machine.profile import joint_limits
+from sim.nodes.vehicle import spool_for
 from sim.world import STEP_S, World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")
@@ -39,23 +40,20 @@ class Driver:
         self.world = world
         self.reference = {name: world.q[name] for name in DRIVEN}
         self.grapple = 0.0
-        self.extra: dict[str, float] = {}
+        self.steps = 0
         self._each_step = each_step
         self._kin, self._limits = world.profile.kinematics, joint_limits(world.profile)
 
     def tick(self, rates: Mapping[str, float]) -> None:
         """One physics step towards the reference, with feed-forward ``rates`` [unit/s]."""
-        spools = {"grapple": self.grapple, **self.extra}
+        spools = {"grapple": self.grapple}
         for name, target in self.reference.items():
-            spec = self.world.profile.joints[name]
-            valve = spec.valve
+            valve = self.world.profile.joints[name].valve
             speed = rates.get(name, 0.0) + GAIN_1_S * (target - self.world.q[name])
-            plus = speed > 0.0
-            full = valve.full_speed_plus if plus else valve.full_speed_minus
-            band = (valve.deadband_plus_pct if plus else valve.deadband_minus_pct) / 100.0
-            share = min(1.0, abs(speed) / full)
-            spools[name] = 0.0 if share < REST_SHARE else math.copysign(band + (1.0 - band) * share, speed)
+            full = valve.full_speed_plus if speed > 0.0 else valve.full_speed_minus
+            spools[name] = spool_for(valve, speed, REST_SHARE * full)
         self.world.step([spools.get(name, 0.0) for name in self.world.functions])
+        self.steps += 1
         if self._each_step:
             self._each_step()
 
@@ -63,15 +61,6 @@ class Driver:
         """Hold the reference for a time."""
         for _ in range(round(seconds / STEP_S)):
             self.tick({})
-
-    def rest(self, seconds: float) -> None:
-        """Keep every spool neutral for a time: the cylinders are closed."""
-        neutral = [0.0] * len(self.world.functions)
-        for _ in range(round(seconds / STEP_S)):
-            self.world.step(neutral)
-            if self._each_step:
-                self._each_step()
-        self.reference = {name: self.world.q[name] for name in DRIVEN}
 
     def move(self, goal: Mapping[str, float]) -> None:
         """Move all joints to ``goal`` on one minimum-jerk profile whose peak speeds are the profile's limits."""
@@ -163,31 +152,36 @@ class Driver:
         self.line((x, y, z), (x, y, carry_m), ext)
 
     def _open_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
-        jaws = self.world.profile.grapple.jaws
         self.grapple = OPENING
-        for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
-            angle = self.world.jaw_angle_rad
-            wanted = floor + max(tip_below_pin_m(jaws, angle - ahead) for ahead in LOOK_AHEAD_RAD)
-            z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
-            self._follow((x, y, z), ext)
-            if angle < RELEASED_RAD:
-                break
+        z = self._sweep(x, y, z, floor, ext, -1.0, lambda: self.world.jaw_angle_rad < RELEASED_RAD)
         self.grapple = 0.0
         return z
 
     def _close_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
-        """Close until the jaws stop on a load; the tips sweep lower, so the pin rises meanwhile."""
-        world, jaws = self.world, self.world.profile.grapple.jaws
-        self.grapple = -0.7
+        """Close until the jaws stop on a load."""
         still_s = 0.0
+
+        def gripped() -> bool:
+            nonlocal still_s
+            qd = self.world.qd
+            moving = abs(qd["tong_left"]) + abs(qd["tong_right"]) > STILL_RAD_S or self.world.jaw_angle_rad < 0.2
+            still_s = 0.0 if moving else still_s + STEP_S
+            return still_s > GRIPPED_S
+
+        self.grapple = -0.7
+        return self._sweep(x, y, z, floor, ext, 1.0, gripped)
+
+    def _sweep(
+        self, x: float, y: float, z: float, floor: float, ext: float, sign: float, done: Callable[[], bool]
+    ) -> float:
+        """Let the jaws move until ``done``; where their tips sweep lower the pin rises.  Returns its height [m]."""
+        jaws = self.world.profile.grapple.jaws
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
-            angle = world.jaw_angle_rad
-            wanted = floor + max(tip_below_pin_m(jaws, angle + ahead) for ahead in LOOK_AHEAD_RAD)
+            angle = self.world.jaw_angle_rad
+            wanted = floor + max(tip_below_pin_m(jaws, angle + sign * ahead) for ahead in LOOK_AHEAD_RAD)
             z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
             self._follow((x, y, z), ext)
-            moving = abs(world.qd["tong_left"]) + abs(world.qd["tong_right"]) > STILL_RAD_S
-            still_s = 0.0 if moving or angle < 0.2 else still_s + STEP_S
-            if still_s > GRIPPED_S:
+            if done():
                 break
         return z
 

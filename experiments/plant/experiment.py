@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
 from typing import Any, Final
 
 from rich.console import Console
@@ -18,7 +15,7 @@ from experiments.common.result import Result, make_result, mean, rate
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import check_truth, checkpoint
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.plant import bench, endurance, energy, physics, rolling, trial
+from experiments.plant import bench, runs, trial
 from experiments.plant.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS
 from experiments.plant.plots import draw
 
@@ -34,26 +31,18 @@ GRASPS: Final = {
     "yaw90": {"scene": "single", "logs": 1, "across_m": 0.0, "turned_rad": math.pi / 2, "unload": False},
     "off1m": {"scene": "single", "logs": 1, "across_m": 1.0, "turned_rad": 0.0, "unload": False},
 }
-RESTS: Final = {"rest_pile": {"scene": "pile", "logs": 6}, "rest_bunk": {"scene": "bunk", "logs": 8}}
 CRANE: Final = {
-    "sag": physics.sag,
-    "boom_stop": physics.boom_stop,
-    "pendulum": physics.pendulum,
-    "slew_stop": physics.slew_stop,
-    "sharing": physics.sharing,
-    "cylinder": physics.cylinder_spring,
-    "left_alone": energy.left_alone,
-    "falling": energy.falling,
-    "lifting": energy.lifting,
+    "sag": runs.sag,
+    "boom_stop": runs.boom_stop,
+    "pendulum": runs.pendulum,
+    "slew_stop": runs.slew_stop,
+    "sharing": runs.sharing,
+    "cylinder": runs.cylinder,
+    "left_alone": runs.left_alone,
+    "falling": runs.falling,
 }
-CARRIER: Final = {"turning": rolling.turning, "braking": rolling.braking}
-FUNCTIONS: Final = {
-    "shift": endurance.shift,
-    **dict.fromkeys(GRASPS, trial.grasp),
-    **dict.fromkeys(RESTS, energy.resting),
-    **CRANE,
-    **CARRIER,
-}
+CARRIER: Final = {"turning": runs.turning, "braking": runs.braking}
+FUNCTIONS: Final = {"shift": runs.shift, **dict.fromkeys(GRASPS, trial.grasp), **CRANE, **CARRIER}
 
 
 def perform(job: Job) -> Any:
@@ -67,7 +56,6 @@ def plan(options: Options, trials: int) -> list[Job]:
     common = {"profile": options.profile, "truth": options.truth, "quick": options.quick}
     shift_s = QUICK_SHIFT_S if options.quick else SHIFT_S
     jobs = [Job("shift", "shift", seed, {**common, "seconds": shift_s})]
-    jobs += [Job(kind, kind, seed, {**common, **scene}) for kind, scene in RESTS.items()]
     jobs += [Job(kind, kind, seed, common) for kind in CRANE]
     # A truth file belongs to one machine; with a fixed crane's file the carrier uses the shipped truth.
     other = carrier_profile(options.profile)
@@ -92,7 +80,6 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, (), [options.profile], options.truth) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "plant trials", console)
         metrics, traces = gather(outcomes)
-        metrics["repeat_equal"] = float(_repeats(options))
         speed, noisy, costs = bench.measure(options.profile, options.truth, options.quick, console)
         metrics |= speed
         traces |= costs
@@ -110,15 +97,6 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     return Page("Plant experiment", CONCLUSION, INTRODUCTION, SECTIONS)
 
 
-def _repeats(options: Options) -> bool:
-    """Whether two new processes produce the same bytes for a grasp."""
-    o = {"profile": options.profile, "truth": options.truth, "scene": "pile", "logs": 3}
-    job = Job("repeat", "repeat", options.seed * SEEDS_PER_RUN, o)
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as processes:
-        first, second = processes.map(partial(endurance.fingerprint), [job, job])
-    return first == second
-
-
 def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
     """Metrics and traces of all jobs."""
     by_kind: dict[str, list[Any]] = {}
@@ -129,10 +107,6 @@ def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
     for kind in ("shift", *CRANE, *CARRIER):
         metrics |= by_kind[kind][0]["metrics"]
         traces |= by_kind[kind][0].get("traces", {})
-    rests = [by_kind[kind][0]["metrics"] for kind in RESTS]
-    metrics["rest_speed_max_m_s"] = max(r["fastest_m_s"] for r in rests)
-    metrics["rest_awake_speed_m_s"] = max(r["awake_fastest_m_s"] for r in rests)
-    metrics["rest_awake_moved_m"] = max(r["awake_moved_m"] for r in rests)
     single, pile, yaw90, off1m = (by_kind[kind] for kind in GRASPS)
     lifted = [t for t in single if t["held"] == 1]
     metrics |= rate("single_success", len(lifted), len(single))
@@ -147,7 +121,6 @@ def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
         "penetration_max_m": max((t["penetration_m"] for t in good), default=math.nan),
         "penetration_wrong_max_m": max(t["penetration_m"] for t in wrong),
         "log_speed_max_m_s": max((t["log_speed_m_s"] for t in good), default=math.nan),
-        "log_speed_bound_max_m_s": max((t["log_speed_bound_m_s"] for t in good), default=math.nan),
         "peak_bar_max": max(t["peak_bar"] for t in (*single, *pile)),
         "load_cell_error": mean([abs(t["load_kg"] / t["true_load_kg"] - 1.0) for t in good]),
         "grasp_energy_j": mean([t["energy_j"] for t in lifted]),

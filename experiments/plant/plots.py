@@ -9,7 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from experiments.plant.runs import SAMPLE_S, WARM_CYCLES
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
+from sim.world import STEP_S
 
 Metrics = dict[str, float]
 RATES: Final = (
@@ -26,20 +28,28 @@ def draw(metrics: Metrics, traces: dict[str, Any], out: Path) -> None:
     _grasps(metrics, out / "grasps.png")
     _grasp_quality(traces["good"], out / "grasp-quality.png")
     _sag(traces["sag"], out / "sag.png")
-    _boom_stop(metrics, traces, out / "boom-stop.png")
+    _boom_stop(metrics, traces["boom_stop"], out / "boom-stop.png")
     _sharing(traces["sharing"], out / "sharing.png")
-    _slew_stop(traces, out / "slew-stop.png")
-    _pendulum(traces, out / "pendulum.png")
-    _cylinder(traces, out / "cylinder.png")
+    _slew_stop(metrics, traces["slew_stop"], out / "slew-stop.png")
+    _pendulum(metrics, traces["pendulum"], out / "pendulum.png")
+    _cylinder(metrics, traces["cylinder"], out / "cylinder.png")
     _turning(traces["turning"], out / "turning.png")
     _braking(traces["braking"], out / "braking.png")
-    _energy(traces, out / "energy.png")
+    _energy(traces["kinetic_j"], traces["falling_j"], out / "energy.png")
     _endurance(traces["endurance"], out / "endurance.png")
     _cost(traces["step_ms"], out / "cost.png")
 
 
-def _time(values: Sequence[float] | np.ndarray, step_s: float) -> np.ndarray:
+def _time(values: Sequence[float] | np.ndarray, step_s: float = SAMPLE_S) -> np.ndarray:
     return np.arange(len(values)) * step_s
+
+
+def _labels(axis: Any, title: str, x: str, y: str = "", *, legend: bool = False) -> None:
+    axis.set_title(title)
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    if legend:
+        axis.legend()
 
 
 def _grasps(m: Metrics, path: Path) -> None:
@@ -67,19 +77,14 @@ def _grasp_quality(good: list[list[float]], path: Path) -> None:
         rows = np.array(good) if good else np.zeros((0, 4))
         left.hist(1e3 * rows[:, 0], bins=np.linspace(0, 6, 25), color=OIL)
         left.axvline(5.0, color=RUST, ls="--", lw=0.8)
-        left.set_xlabel("deepest penetration of a jaw [mm]")
-        left.set_ylabel("good grasps")
+        _labels(left, "Penetration", "deepest penetration of a jaw [mm]", "good grasps")
         middle.hist(rows[:, 1], bins=np.linspace(0, 4, 25), color=TIMBER)
         middle.axvline(3.0, color=RUST, ls="--", lw=0.8)
-        middle.set_xlabel("highest speed of a log [m/s]")
+        _labels(middle, "Log speed", "highest speed of a log [m/s]")
         right.plot(rows[:, 2], rows[:, 3], "o", ms=3, color=MOSS)
         top = max(10.0, *rows[:, 2:].max(axis=0)) if len(rows) else 10.0
         right.plot([0, top], [0, top], color=STEEL, lw=0.8)
-        right.set_xlabel("true load [kg]")
-        right.set_ylabel("load cell [kg]")
-        left.set_title("Penetration")
-        middle.set_title("Log speed")
-        right.set_title("Load cell")
+        _labels(right, "Load cell", "true load [kg]", "load cell [kg]")
 
 
 def _sag(rows: list[dict[str, float]], path: Path) -> None:
@@ -88,35 +93,20 @@ def _sag(rows: list[dict[str, float]], path: Path) -> None:
         left.plot(load, [1e3 * r["sag_m"] for r in rows], "o-", label="sag of the true tip")
         left.plot(load, [1e3 * r["encoder_drop_m"] for r in rows], "s-", label="drop shown by encoders")
         left.plot([250, 250], [80, 120], color=RUST, lw=5, alpha=0.3, solid_capstyle="butt", label="80 to 120 mm")
-        left.set_xlabel("load on the hook at 6 m [kg]")
-        left.set_ylabel("[mm]")
-        left.set_title("Structure")
-        left.legend()
-        right.plot(load, [1e-3 * r["force_n"] for r in rows], "o", label="pA AA - pB AB")
-        right.plot(load, [1e-3 * r["static_n"] for r in rows], "-", label="statics")
-        right.set_xlabel("load [kg]")
-        right.set_ylabel("lift cylinder [kN]")
-        pressure = right.twinx()
-        pressure.plot(load, [1e-6 * r["pressure_pa"] for r in rows], color=MOSS, ls=":", label="pA")
-        pressure.set_ylabel("pA [MPa]", color=MOSS)
-        pressure.grid(visible=False)
-        right.set_title("Oil")
-        right.legend()
+        _labels(left, "Structure", "load on the hook at 6 m [kg]", "[mm]", legend=True)
+        right.plot(load, [1e-6 * r["pressure_pa"] for r in rows], "o-", color=MOSS)
+        _labels(right, "Oil", "load [kg]", "lift cylinder, chamber A [MPa]")
 
 
-def _boom_stop(m: Metrics, traces: dict[str, Any], path: Path) -> None:
+def _boom_stop(m: Metrics, stops: dict[str, list[float]], path: Path) -> None:
     with sheet(path) as axis:
         for name, colour in (("empty", OIL), ("250kg", TIMBER)):
-            heights = np.array(traces["boom_stop"][name])
+            heights = np.array(stops[name])
             label = f"{name}: {m[f'ring_hz_{name}']:.2f} Hz, zeta {m[f'ring_zeta_{name}']:.3f}"
-            t = _time(heights, traces["boom_stop_step_s"])
-            axis.plot(t, 1e3 * (heights - heights[-len(heights) // 4 :].mean()), color=colour, label=label)
+            axis.plot(_time(heights), 1e3 * (heights - heights[-len(heights) // 4 :].mean()), color=colour, label=label)
         axis.axvline(1.5, color=STEEL, lw=0.8, ls="--")
         axis.set_ylim(-350, 250)
-        axis.set_xlabel("time [s]")
-        axis.set_ylabel("true tip height from rest [mm]")
-        axis.set_title("A boom stop rings")
-        axis.legend()
+        _labels(axis, "A boom stop rings", "time [s]", "true tip height from rest [mm]", legend=True)
 
 
 def _sharing(sharing: dict[str, dict[str, float]], path: Path) -> None:
@@ -129,108 +119,70 @@ def _sharing(sharing: dict[str, dict[str, float]], path: Path) -> None:
             axis.bar(i + 0.18, together, 0.34, color=OIL, label="all four together" if i == 0 else None)
             axis.text(i + 0.18, together, f"{100 * together / alone:.0f} %", ha="center", va="bottom")
         axis.set_xticks(range(len(names)), [f"{n} [{units.get(n, 'rad/s')}]" for n in names])
-        axis.set_ylabel("speed at full spool")
-        axis.set_title("One pump for all functions")
-        axis.legend()
+        _labels(axis, "One pump for all functions", "", "speed at full spool", legend=True)
 
 
-def _slew_stop(traces: dict[str, Any], path: Path) -> None:
-    angles = np.degrees(traces["slew_stop"])
-    t = _time(angles, traces["slew_stop_step_s"])
+def _slew_stop(m: Metrics, angles_rad: list[float], path: Path) -> None:
     with sheet(path) as axis:
-        axis.plot(t, angles, label="fork hinge")
+        axis.plot(_time(angles_rad), np.degrees(angles_rad), label=f"fork hinge: {m['slew_pendulum_hz']:.3f} Hz")
         axis.axvspan(0, 1.5, color=TIMBER, alpha=0.12, lw=0, label="slewing")
-        period = 1.0 / traces["slew_stop_hz"]
-        after = np.flatnonzero(t > 2.2)
-        peak = t[after[np.argmax(np.abs(angles[after]))]]
-        for k in range(int((t[-1] - peak) / period) + 1):
-            axis.axvline(peak + k * period, color=RUST, lw=0.7, ls=":", label=None if k else "theory, every period")
-        axis.set_xlabel("time [s]")
-        axis.set_ylabel("[deg]")
-        axis.set_title("A grasped log swings after a slew stop")
-        axis.legend(loc="upper right")
+        _labels(axis, "A grasped log swings after a slew stop", "time [s]", "[deg]", legend=True)
 
 
-def _pendulum(traces: dict[str, Any], path: Path) -> None:
+def _pendulum(m: Metrics, swings: dict[str, list[float]], path: Path) -> None:
     with sheet(path, 2) as axes:
-        for axis, (name, p) in zip(axes, traces["pendulum"].items(), strict=True):
-            angles = np.degrees(p["angle_rad"])
-            t = _time(angles, traces["pendulum_step_s"])
-            envelope = angles[0] * np.exp(-p["zeta"] * 2.0 * math.pi * p["hz"] * t)
-            axis.plot(t, angles)
-            axis.plot(t, envelope, color=RUST, ls="--", lw=0.9)
-            axis.plot(t, -envelope, color=RUST, ls="--", lw=0.9)
-            axis.set_xlabel("time [s]")
-            axis.set_ylabel("[deg]")
-            axis.set_title(f"{name} hinge, theory {p['hz']:.3f} Hz, zeta {p['zeta']:.3f}")
+        for axis, (name, angles_rad) in zip(axes, swings.items(), strict=True):
+            axis.plot(_time(angles_rad), np.degrees(angles_rad))
+            _labels(
+                axis, f"{name} hinge, {m[f'{name}_period_s']:.3f} s, zeta {m[f'{name}_zeta']:.3f}", "time [s]", "[deg]"
+            )
 
 
-def _cylinder(traces: dict[str, Any], path: Path) -> None:
+def _cylinder(m: Metrics, angles_rad: list[float], path: Path) -> None:
     with sheet(path) as axis:
-        y = 1e3 * np.array(traces["cylinder"])
-        axis.plot(_time(y, 0.0025), y)
-        axis.set_xlabel("time [s]")
-        axis.set_ylabel("joint [mrad]")
-        axis.set_title(f"Oil spring of the lift cylinder, theory {traces['cylinder_hz']:.2f} Hz")
+        axis.plot(_time(angles_rad, STEP_S), 1e3 * np.array(angles_rad))
+        _labels(axis, f"Oil spring of the lift cylinder, {m['cylinder_hz']:.2f} Hz", "time [s]", "joint [mrad]")
 
 
 def _turning(turns: list[dict[str, Any]], path: Path) -> None:
     with sheet(path, 1, 5.0, 4.6) as axis:
         for turn, colour in zip(turns, (OIL, TIMBER), strict=True):
-            xy, (x, y), r = np.array(turn["path"]), turn["centre"], turn["radius"]
-            a = np.linspace(0, 2 * math.pi, 200)
-            axis.plot(x + r * np.cos(a), y + r * np.sin(a), color=colour, lw=0.8, ls="--")
-            label = f"{math.degrees(turn['articulation_rad']):.1f} deg: theory R = {r:.2f} m"
-            axis.plot(*xy.T, color=colour, lw=2.2, label=label)
+            label = f"{math.degrees(turn['articulation_rad']):.1f} deg: R = {turn['radius_m']:.2f} m"
+            axis.plot(*np.array(turn["path"]).T, color=colour, lw=2.2, label=label)
         axis.set_aspect("equal")
-        axis.set_xlabel("east [m]")
-        axis.set_ylabel("north [m]")
-        axis.set_title("Path of the front axle")
+        _labels(axis, "Path of the front axle", "east [m]", "north [m]")
         axis.get_figure().legend(loc="outside lower center")
 
 
 def _braking(b: dict[str, Any], path: Path) -> None:
     with sheet(path) as axis:
-        t = _time(b["hang_rad"], b["step_s"])
+        t = _time(b["hang_rad"])
         axis.plot(t, np.degrees(b["hang_rad"]), label="grapple from the vertical [deg]")
         axis.plot(t, b["speed_m_s"], label="speed [m/s]")
         axis.axvline(6.0, color=STEEL, lw=0.8, ls="--")
-        axis.set_xlabel("time [s]")
-        axis.set_title("Driving off, cruising, braking")
-        axis.legend()
+        _labels(axis, "Driving off, cruising, braking", "time [s]", legend=True)
 
 
-def _energy(traces: dict[str, Any], path: Path) -> None:
+def _energy(kinetic_j: list[float], falling_j: list[float], path: Path) -> None:
     with sheet(path, 2) as (left, right):
-        kinetic = np.maximum(traces["kinetic_j"], 1e-6)
-        left.semilogy(_time(kinetic, traces["kinetic_step_s"]), kinetic)
-        left.set_xlabel("time after all spools are closed [s]")
-        left.set_ylabel("kinetic energy [J]")
-        left.set_title("Undisturbed machine")
-        falling = np.array(traces["falling_j"])
-        right.plot(_time(falling, traces["falling_step_s"]), falling, color=TIMBER)
-        right.set_xlabel("time [s]")
-        right.set_ylabel("kinetic + potential [J]")
-        right.set_title("Falling pile")
+        left.semilogy(_time(kinetic_j), np.maximum(kinetic_j, 1e-6))
+        _labels(left, "Undisturbed machine", "time after all spools are closed [s]", "kinetic energy [J]")
+        right.plot(_time(falling_j), falling_j, color=TIMBER)
+        _labels(right, "Falling pile", "time [s]", "kinetic + potential [J]")
 
 
 def _endurance(rows: list[dict[str, float]], path: Path) -> None:
     minutes = [r["time_s"] / 60.0 for r in rows]
     with sheet(path, 2) as (left, right):
         left.plot(minutes, [r["resident_mb"] for r in rows], "o-", ms=2)
-        left.set_xlabel("work [min]")
-        left.set_ylabel("resident memory [MB]")
         left.set_ylim(bottom=0)
-        left.set_title("Memory")
-        first = rows[min(3, len(rows) - 1)]
+        _labels(left, "Memory", "work [min]", "resident memory [MB]")
+        first = rows[min(WARM_CYCLES, len(rows) - 1)]
         for key, label in (("tip_z_m", "true tip"), ("encoder_z_m", "encoders")):
             right.plot(minutes, [1e3 * (r[key] - first[key]) for r in rows], "o-", ms=2, label=label)
         right.set_ylim(-15, 15)
         limit_band(right, -10.0, 10.0)
-        right.set_xlabel("work [min]")
-        right.set_ylabel("tip height at home [mm]")
-        right.set_title("Drift")
-        right.legend()
+        _labels(right, "Drift", "work [min]", "tip height at home [mm]", legend=True)
 
 
 def _cost(step_ms: dict[str, float], path: Path) -> None:
@@ -243,7 +195,4 @@ def _cost(step_ms: dict[str, float], path: Path) -> None:
         axis.set_xticks(counts, [str(n) for n in counts])
         axis.set_yticks([0.1, 0.2, 0.5, 1.0, 2.0, 5.0], ["0.1", "0.2", "0.5", "1", "2", "5"])
         axis.minorticks_off()
-        axis.set_xlabel("logs on the ground")
-        axis.set_ylabel("physics step [ms]")
-        axis.set_title("Cost of a 2.5 ms step")
-        axis.legend()
+        _labels(axis, "Cost of a 2.5 ms step", "logs on the ground", "physics step [ms]", legend=True)

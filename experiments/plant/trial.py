@@ -74,7 +74,6 @@ def grasp(job: Job) -> dict[str, Any]:
         outcome |= {
             "penetration_m": last.max_penetration_m,
             "log_speed_m_s": fastest.m_s,
-            "log_speed_bound_m_s": last.max_log_speed_m_s,
             "peak_bar": last.peak_pressure_bar,
             "energy_j": last.energy_j,
             "time_s": last.time_s,

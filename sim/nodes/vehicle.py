@@ -13,7 +13,7 @@ from enum import IntEnum
 
 from can_dbc.dbc.codec import Database
 from can_dbc.protocols.punctuality import Punctuality
-from machine.profile import Carrier, CarrierValve
+from machine.profile import Carrier, CarrierValve, Valve
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
 from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, ProtectedMessage
@@ -44,7 +44,7 @@ class Gear(IntEnum):
     PARK = 3
 
 
-def spool_for(valve: CarrierValve, speed: float, least: float = 0.0) -> float:
+def spool_for(valve: CarrierValve | Valve, speed: float, least: float = 0.0) -> float:
     """Spool command -1..1 that gives ``speed`` by the profile; speeds up to ``least`` leave the spool neutral."""
     if abs(speed) <= least:
         return 0.0

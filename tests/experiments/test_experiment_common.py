@@ -21,7 +21,7 @@ from experiments.common.result import ROOT, Metric, Result, evaluate, limits_of,
 from experiments.common.result_page import Page, Section, markdown
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint
 from experiments.common.workers import Workers
-from experiments.plant.signals import ringing
+from experiments.plant.runs import ringing
 from host.exit_codes import CommandFailed
 from tests.codes import numbers_in
 

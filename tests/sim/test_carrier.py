@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from experiments.common.worlds import step_neutral, trial_world
 from machine.geometry import carrier as geometry
 from sim.ground.terrain import SIDE_SLOPE, Terrain
 from sim.mechanics.carrier import PARKED, Drive, carrier_links
@@ -105,10 +106,10 @@ def test_the_brake_stops_within_friction(rig):
     assert r.carrier.speed_m_s == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("side", [1, -1])
-def test_turning_radius_at_full_articulation(rig, side):
-    r = rig()
-    r.steer_rad = side * C.articulation_limit_rad
+@pytest.mark.parametrize("share", [1.0, -1.0, 0.5])
+def test_turning_radius(rig, share):
+    r, angle = rig(), share * C.articulation_limit_rad
+    r.steer_rad = angle
     r.run(4.0, Drive(0.3))
     path, heading = [r.carrier.front_axle()], r.carrier.heading_rad
     for _ in range(20):
@@ -116,11 +117,26 @@ def test_turning_radius_at_full_articulation(rig, side):
         path.append(r.carrier.front_axle())
     length = sum(math.dist(a[:2], b[:2]) for a, b in pairwise(path))
     turned = r.carrier.heading_rad - heading
-    assert length / turned == pytest.approx(side * geometry.turning_radius_m(C, C.articulation_limit_rad), rel=0.02)
-    assert math.degrees(abs(turned)) / length == pytest.approx(9.0, rel=0.05)
+    around = geometry.turning_radius_m(C, abs(angle))
+    assert length / turned == pytest.approx(math.copysign(around, share), rel=0.02)
     slow, fast = sorted((r.carrier.wheel_speeds_rad_s[0], r.carrier.wheel_speeds_rad_s[1]))
-    around = geometry.turning_radius_m(C, C.articulation_limit_rad)
     assert fast / slow == pytest.approx((around + C.track_width_m / 2) / (around - C.track_width_m / 2), rel=0.03)
+    if abs(share) == 1.0:
+        assert math.degrees(abs(turned)) / length == pytest.approx(9.0, rel=0.05)
+
+
+def test_the_whole_forwarder_stands_on_its_wheels_and_cruises():
+    with trial_world("aoro_fc8", "nominal", 1) as w:
+        p, body, neutral = w.client, w.crane.body, [0.0] * len(w.functions)
+        step_neutral(w, round(4.0 / STEP_S))
+        mass = sum(p.getDynamicsInfo(body, i)[0] for i in range(-1, p.getNumJoints(body)))
+        assert sum(w.wheel_loads_n()) == pytest.approx(mass * GRAVITY, rel=0.01)
+        start = w.carrier.front_axle()
+        step_neutral(w, round(2.0 / STEP_S))
+        assert math.dist(start, w.carrier.front_axle()) < 5e-3
+        for _ in range(round(6.0 / STEP_S)):
+            w.step(neutral, CRUISE)
+        assert w.carrier.speed_m_s == pytest.approx(C.cruise_speed_m_s, rel=0.05)
 
 
 def test_coasting_only_loses_speed_to_rolling_resistance(rig):

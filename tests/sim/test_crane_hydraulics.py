@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
+from experiments.common.worlds import hang, home_at, step_neutral
 from machine.loading.profile_file import load_profile
+from sim.bullet.client import GRAVITY_M_S2
 from sim.truth.load import load_truth
 from sim.world import STEP_S, World, home_pose
 
@@ -71,6 +74,30 @@ def test_a_boom_stop_rings_and_decays(crane):
 def test_an_extended_crane_needs_more_holding_pressure(crane):
     near, far = crane(lift=0.3, tilt=-1.5), crane(lift=0.3, tilt=-0.3, ext=1.5)
     assert far.hydraulics.pressures_pa["lift"][0] > near.hydraulics.pressures_pa["lift"][0] + 1e6
+
+
+@pytest.mark.parametrize("kg", [0.0, 250.0])
+def test_the_lift_cylinder_carries_what_statics_demand(crane, kg):
+    """pA AA - pB AB = moment of all that hangs beyond the boom's pin / lever arm; no chamber is empty."""
+    w = crane(**home_at("palms_471", 6.0, 1.2))
+    p, body, link = w.client, w.crane.body, w.crane.link
+    for part in range(1, 251):
+        hang(w, kg * part / 250)
+        step_neutral(w, 10)
+    run(w, 3.0)
+    lift = w.truth.functions["lift"].cylinder
+    pin = w.link_poses()["boom"][0]
+    ahead = np.subtract(w.link_poses()["hanger"][0], w.base_pose()[0])[:2]
+    ahead /= np.hypot(*ahead)
+    moment = 0.0
+    for name in ("boom", "stick", "telescope", "hanger", "fork", "rotator", "tong_left", "tong_right"):
+        com = p.getLinkState(body, link[name], computeForwardKinematics=1)[0]
+        moment += p.getDynamicsInfo(body, link[name])[0] * GRAVITY_M_S2 * float(np.subtract(com, pin)[:2] @ ahead)
+    a, b = w.hydraulics.pressures_pa["lift"]
+    assert a * lift.area_a - b * lift.area_b == pytest.approx(
+        moment / np.interp(w.q["lift"], lift.arm_at, lift.arm), rel=0.05
+    )
+    assert min(min(pair) for pair in w.hydraulics.pressures_pa.values()) > 0.0
 
 
 def test_the_empty_grapple_closes_with_pressure_stays_closed_and_opens(crane):

@@ -6,15 +6,19 @@ import itertools
 import math
 
 import msgspec
+import numpy as np
 import pytest
 
+from experiments.common.worlds import home_at, step_neutral, trial_world
+from experiments.plant.driver import Driver
+from experiments.plant.runs import SAMPLE_S, released, ringing, stopped
+from experiments.plant.trial import pick_logs
 from machine.geometry.kinematics import solve
 from machine.loading.profile_file import load_profile
 from sim.bullet.client import GRAVITY_M_S2
-from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
+from sim.wood.log_shape import LogSpec
 from sim.world import STEP_S, World
-from tests.sim.crane_driver import Driver
 
 PROFILE = load_profile("palms_471")
 NOMINAL = load_truth("nominal", 0, "palms_471")
@@ -83,64 +87,47 @@ def test_after_a_boom_stop_the_tip_rings_at_1_to_2_hz_and_comes_to_rest():
     w.close()
 
 
-def pendulum(w: World, log: int | None = None) -> tuple[float, float]:
-    """Period [s] and damping ratio by theory: all that hangs on the hanger pin as one rigid body about its axis."""
-    p, pin = w.client, w.tip()
-    hanging = [("hanger", 1), ("fork", 1), ("rotator", 1), ("tong_left", 1), ("tong_right", 1)]
-    about, moment = 0.0, 0.0
-    for name, _ in hanging:
-        link = NOMINAL.links["tong" if name.startswith("tong") else name]
-        com = p.getLinkState(w.crane.body, w.crane.link[name], computeForwardKinematics=1)[0]
-        r = math.dist(com[1:], pin[1:])
-        about += link.inertia_kg_m2[0] + link.mass_kg * r * r
-        moment += link.mass_kg * GRAVITY_M_S2 * (pin[2] - com[2])
-    if log is not None:
-        state = w.log_bodies.states()[log]
-        along = state.axis[1] ** 2 + state.axis[2] ** 2  # how much of the log turns about x
-        r = math.dist(state.position_m[1:], pin[1:])
-        about += state.mass_kg * (r * r + along * state.length_m**2 / 12)
-        moment += state.mass_kg * GRAVITY_M_S2 * (pin[2] - state.position_m[2])
-    omega = math.sqrt(moment / about)
-    return 2 * math.pi / omega, NOMINAL.structure.hanger_damping_nm_s_rad / (2 * about * omega)
+def compound(w: World, hinge: str, logs: tuple[int, ...] = ()) -> tuple[float, float]:
+    """Natural frequency [Hz] and inertia [kg m^2] about a hinge of the parts below it, as one rigid body."""
+    p, body = w.client, w.crane.body
+    hanging = ("hanger", "fork", "rotator", "tong_left", "tong_right")
+    pivot, turn = p.getLinkState(body, w.crane.link[hinge], computeForwardKinematics=1)[4:6]
+    axis = np.array(p.getMatrixFromQuaternion(turn)).reshape(3, 3) @ p.getJointInfo(body, w.crane.index[hinge])[13]
+    links = [w.crane.link[name] for name in hanging[hanging.index(hinge) :]]
+    parts = [(p.getDynamicsInfo(body, i), *p.getLinkState(body, i, computeForwardKinematics=1)[:2]) for i in links] + [
+        (p.getDynamicsInfo(log, -1), *p.getBasePositionAndOrientation(log)) for log in logs
+    ]
+    inertia = moment = 0.0
+    for (mass, _, principal, *_), com, orientation in parts:
+        r = np.array(com) - pivot
+        local = np.array(p.getMatrixFromQuaternion(orientation)).reshape(3, 3).T @ axis
+        inertia += float(np.dot(local * local, principal) + mass * (r @ r - (r @ axis) ** 2))
+        moment -= mass * GRAVITY_M_S2 * r[2]
+    return math.sqrt(moment / inertia) / (2.0 * math.pi), inertia
 
 
-def swing(w: World, step) -> tuple[float, float]:
-    """Period [s] and damping ratio of the hanger after a push, from its turning points."""
-    link = w.crane.link["rotator"]
-    for _ in range(round(0.4 / STEP_S)):
-        at = w.link_poses()["rotator"][0]
-        w.client.applyExternalForce(w.crane.body, link, [0.0, 200.0, 0.0], at, w.client.WORLD_FRAME)
-        step()
-    angles = []
-    for _ in range(round(8.0 / STEP_S)):
-        step()
-        angles.append(w.q["hanger"] + w.q["lift"] + w.q["tilt"] + w.q["flex_pitch"])
-    turns = [(i, b) for i, (a, b, c) in enumerate(zip(angles, angles[1:], angles[2:], strict=False)) if a < b >= c]
-    turns = [t for t in turns if t[1] > 0.004]
-    (i, first), (j, last), n = turns[0], turns[-1], len(turns) - 1
-    decrement = math.log(first / last) / n
-    return (j - i) * STEP_S / n, decrement / math.hypot(2 * math.pi, decrement)
-
-
-def test_the_empty_grapple_swings_with_the_period_and_damping_of_its_mass():
-    w = make()
-    period, zeta = pendulum(w)
-    seen = swing(w, lambda: w.step([0.0] * len(w.functions)))
-    assert seen[0] == pytest.approx(period, rel=0.10) and 1.3 < period < 1.9
-    assert seen[1] == pytest.approx(zeta, rel=0.25)
-    w.close()
+@pytest.mark.parametrize("hinge", ["hanger", "fork"])
+def test_the_empty_grapple_swings_with_the_period_and_damping_of_its_mass(hinge):
+    """Period 2 pi sqrt(I / (m g d)), damping ratio c / (2 I w)."""
+    with trial_world("palms_471", "nominal", 1, home=home_at("palms_471", 4.0, 1.2)) as w:
+        step_neutral(w, round(1.0 / STEP_S))
+        hz, inertia = compound(w, hinge)
+        zeta = getattr(w.truth.structure, f"{hinge}_damping_nm_s_rad") / (2.0 * inertia * 2.0 * math.pi * hz)
+        seen = ringing(released(w, hinge), SAMPLE_S, floor=2e-3)
+    assert seen.hz == pytest.approx(hz * math.sqrt(1.0 - zeta * zeta), rel=0.05) and 1.3 < 1.0 / seen.hz < 2.2
+    assert seen.zeta == pytest.approx(zeta, rel=0.15)
 
 
 @pytest.mark.long
-def test_a_held_log_lengthens_the_pendulum():
-    scene = random_scene(PROFILE, NOMINAL.wood, 403, 1)
-    w = World(PROFILE, NOMINAL, 403, scene)
-    driver = Driver(w)
-    log = w.log_bodies.states()[0]
-    driver.pick(*log.position_m[:2], math.atan2(log.axis[1], log.axis[0]))
-    driver.move({"slew": 0.0})
-    driver.wait(4.0)
-    period, _ = pendulum(w, 0)
-    seen, _ = swing(w, lambda: driver.tick({}))
-    assert seen == pytest.approx(period, rel=0.10) and period > 1.5
-    w.close()
+def test_a_held_log_swings_after_a_slew_stop_with_the_period_of_all_that_hangs():
+    x, y = PROFILE.workspace.pick_center_m
+    with trial_world("palms_471", "nominal", 1, (LogSpec(x, y, 0.4, 2.5, 0.30, 600.0),)) as w:
+        driver = Driver(w)
+        pick_logs(w, driver)
+        driver.wait(3.0)
+        assert w.touched() == [True]
+        empty_hz, _ = compound(w, "fork")
+        hz, _ = compound(w, "fork", w.log_bodies.body_ids)
+        _, seen = stopped(w)
+    assert seen.hz == pytest.approx(hz, rel=0.10) and seen.hz < 0.95 * empty_hz
+    assert seen.peak_to_peak / 2.0 > 0.01

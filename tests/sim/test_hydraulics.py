@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from experiments.common.pool import Job
+from experiments.plant import runs
 from sim.errors import PlantError
 from sim.hydraulics import layout
 from sim.hydraulics.circuit import REST_PA, Hydraulics
@@ -50,6 +52,20 @@ def test_the_oil_spring_rings_at_the_frequency_of_bulk_modulus_and_volumes(truth
     assert len(periods) > 4
     assert np.mean(periods[:4]) == pytest.approx(2 * math.pi / math.sqrt(spring / inertia), rel=0.05)
     assert abs(rig.qd[name]) < 1.05 * speed  # no energy from nowhere
+
+
+def test_the_oil_spring_of_the_lift_cylinder_follows_its_lever_arm():
+    """w^2 = beta r^2 (AA^2 / VA + AB^2 / VB) / I at 0.4 rad, I = 4000 kg m^2."""
+    seen = runs.cylinder(Job("cylinder", "cylinder", 1, {"profile": "palms_471", "truth": "nominal"}))["metrics"]
+    c = PALMS.functions["lift"].cylinder
+    grid = np.linspace(c.arm_at[0], c.arm_at[-1], 2001)
+    arms = np.interp(grid, c.arm_at, c.arm)
+    steps = (arms[1:] + arms[:-1]) / 2.0 * np.diff(grid)
+    travel = float(steps[grid[1:] <= 0.4].sum())
+    volume_a, volume_b = c.dead_volume_m3 + np.array([c.area_a * travel, c.area_b * (float(steps.sum()) - travel)])
+    stiffness = PALMS.supply.bulk_modulus_pa * (c.area_a**2 / volume_a + c.area_b**2 / volume_b)
+    hz = math.sqrt(stiffness / 4000.0) * float(np.interp(0.4, c.arm_at, c.arm)) / (2.0 * math.pi)
+    assert seen["cylinder_hz"] == pytest.approx(hz, rel=0.02)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -100,11 +100,17 @@ def test_a_pile_is_stable_without_sleep(stands):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("kind", "logs"), [("separate", 3), ("pile", 6), ("bunk", 20)])
-def test_logs_rest_for_a_minute(stands, kind, logs):
+@pytest.mark.parametrize(("kind", "logs"), [("separate", 3), ("pile", 6), ("bunk", 8), ("bunk", 20)])
+def test_woken_logs_rest_for_a_minute_and_kept_awake_for_another(stands, kind, logs):
     stand = Stand(of(kind, 1, logs))
     stands.append(stand)
+    stand.log_bodies.wake()
     assert stand.fastest(60.0) < 5e-3
+    stand.awake()
+    before = [log.position_m for log in stand.log_bodies.states()]
+    assert stand.fastest(60.0) < 5e-3
+    after = [log.position_m for log in stand.log_bodies.states()]
+    assert max(math.dist(a, b) for a, b in zip(before, after, strict=True)) < 5e-3
 
 
 def test_the_same_scene_comes_to_rest_in_the_same_place_to_the_bit(stands):
