@@ -71,7 +71,7 @@ _LIVE: Final = ("machine", "can_dbc", "controller", "runtime", "recorder", "hil"
 
 EXPERIMENTS: Final = {
     "plant": Entry(
-        "Does the simulated machine behave like steel, oil and wood? Grasps, closed-form physics, endurance, speed.",
+        "Does the simulated machine behave like steel, oil and wood? Grasps, structure, hydraulics, endurance, speed.",
         "experiments.plant.experiment",
         (*_PLANT, "experiments/plant"),
         scale=40.0,
