@@ -167,7 +167,7 @@ def _energy(kinetic_j: list[float], falling_j: list[float], path: Path) -> None:
     with sheet(path, 2) as (left, right):
         left.semilogy(_time(kinetic_j), np.maximum(kinetic_j, 1e-6))
         _labels(left, "Undisturbed machine", "time after all spools are closed [s]", "kinetic energy [J]")
-        right.plot(_time(falling_j), falling_j, color=TIMBER)
+        right.plot(_time(falling_j, STEP_S), falling_j, color=TIMBER)
         _labels(right, "Falling pile", "time [s]", "kinetic + potential [J]")
 
 

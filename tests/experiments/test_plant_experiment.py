@@ -8,18 +8,11 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from experiments.common.pool import Job
 from experiments.common.registry import EXPERIMENTS, Options, load
 from experiments.common.workers import Workers
-from experiments.plant import experiment, trial
+from experiments.plant import experiment
 from experiments.plant.metrics import METRICS, SECTIONS
 from timberhand.cli import app
-
-COMMON = {"profile": "palms_471", "truth": "nominal", "quick": True}
-
-
-def grasp(kind: str, seed: int) -> dict:
-    return trial.grasp(Job(kind, kind, seed, {**COMMON, **experiment.GRASPS[kind]}))
 
 
 def options(tmp_path, **changes) -> Options:
@@ -49,14 +42,6 @@ def test_names_of_metrics_and_files_of_plots_are_unique():
     assert len(set(files)) == len(files)
 
 
-@pytest.mark.long
-def test_a_log_is_lifted_and_laid_into_the_bunk():
-    t = grasp("single", 100_001)
-    assert t["held"] == t["raised"] == t["in_bunk"] == 1
-    assert t["penetration_m"] < 5e-3 and t["log_speed_m_s"] < 3.0
-    assert t["load_kg"] == pytest.approx(t["true_load_kg"], rel=0.2)
-
-
 def test_an_unusable_truth_file_is_named(tmp_path):
     done = CliRunner().invoke(
         app, ["experiment", "plant", "--truth", str(tmp_path / "no.toml"), "--out", str(tmp_path)]
@@ -76,6 +61,7 @@ def test_the_quick_run_meets_its_limits_and_writes_everything(tmp_path):
     assert document["experiment"] == "plant" and document["trials"] == experiment.QUICK_TRIALS
     assert all(isinstance(v, float) for v in document["metrics"].values())
     assert {f.name for f in METRICS} <= document["metrics"].keys()
+    assert document["metrics"]["load_cell_error"] < 0.2
     page = (tmp_path / "docs" / "plant.md").read_text()
     for section in SECTIONS:
         assert section.title in page
