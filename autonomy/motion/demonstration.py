@@ -65,21 +65,29 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
         encoders.append(encoder)
     codecs = {database.messages[e.message].key: (i, e, database.messages[e.message]) for i, e in enumerate(encoders)}
     samples: list[tuple[list[int], list[float]]] = [([], []) for _ in AXES]
+    received = [0 for _ in AXES]
     for stamp_ns, key, data in frames:
         found = codecs.get(key)
         if found is None or len(data) != found[2].length:
             continue
         i, encoder, codec = found
+        received[i] += 1
         if samples[i][0] and stamp_ns <= samples[i][0][-1]:
             continue
         samples[i][0].append(stamp_ns)
         counts = int(codec.named(codec.decode(data))["Position"])
         samples[i][1].append(position_from_counts(encoder, counts))
-    for j, e, (stamps, _) in zip(AXES, encoders, samples, strict=True):
-        if len(stamps) < 2:
+    for j, e, n, (stamps, _) in zip(AXES, encoders, received, samples, strict=True):
+        if n > 1 and len(stamps) < 2:
+            raise RecordingRefused(
+                "demonstration.no-stamps",
+                f"the recording has no time stamps that advance at its {n} frames {e.message}; "
+                "record it with them (candump -L)",
+            )
+        if n < 2:
             raise RecordingRefused(
                 "demonstration.encoder-missing",
-                f"the recording holds no frames {e.message} of the {j.name.lower()} encoder",
+                f"the recording holds {n or 'no'} frame{'' if n else 's'} {e.message} of the {j.name.lower()} encoder",
             )
     begin, end = max(h[0][0] for h in samples), min(h[0][-1] for h in samples)
     if end - begin < MIN_DURATION_S * 1e9:

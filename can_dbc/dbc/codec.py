@@ -28,6 +28,7 @@ from typing import Any, Final
 from can_dbc.dbc.codegen import Decoder, Encoder, Values, compile_message
 from can_dbc.dbc.signals import EncodeRefused, FrameRefused, Policy, Refusal, SignalInfo
 from can_dbc.frame import EXTENDED, describe
+from can_dbc.text import decoded
 from runtime.errors import CodedError
 
 __all__ = [
@@ -154,7 +155,7 @@ def parse(path: Path, *, strict: bool = True) -> Any:
     if kind not in ("dbc", "kcd"):
         raise DbcError("dbc.wrong-suffix", f"{path}: not a .dbc or .kcd file")
     try:
-        text = path.read_text(encoding="cp1252" if kind == "dbc" else "utf-8")
+        text = "\n".join(re.split("\r\n?|\n", decoded(path.read_bytes(), "cp1252" if kind == "dbc" else "utf-8")))
         return cantools.database.load_string(text, database_format=kind, strict=strict)
     except (OSError, UnicodeError) as error:
         raise DbcError("dbc.unreadable", f"{path}: cannot be read: {error}") from error

@@ -1,27 +1,32 @@
-"""Reads CAN traces of other tools: candump (both forms), PCAN-View and Yacht Devices text, ASC and BLF.
+"""Reads CAN traces of other tools: candump (all forms), PCAN (TRC 1.0 to 2.1), Yacht Devices text, ASC and BLF.
 
 ``read_trace`` yields a ``Frame`` per valid record and a ``MalformedRecord`` per line that cannot be parsed; it never
-raises for the contents of a file.  Stamps are ns on the trace's own scale, 0 if it has none.  Blank lines, comments and
-header lines of the known formats are not records and are skipped.
+raises for the contents of a file.  Its ``notes`` say what else is not read.  Stamps are ns on the trace's own scale, 0
+if it has none.  Blank lines, comments and header lines of the known formats are not records and are skipped.
 """
 
 from __future__ import annotations
 
+import calendar
 import io
+import logging
 import re
-import struct
-import zlib
+from collections import Counter
 from collections.abc import Iterator
+from datetime import date
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
+from can_dbc.text import decoded
+from can_dbc.trace.records import MalformedRecord, Trace
 
 CANDUMP: Final = re.compile(r"\((\d+(?:\.\d+)?)\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(\S*)")
 CANDUMP_SCREEN: Final = re.compile(
-    r"(?:<0x[0-9a-f]+>)?\s*(?:\((\d+(?:\.\d+)?)\)\s+)?[A-Za-z]\S*\s+"
+    r"(?:<0x[0-9a-f]+>)?\s*(?:\((\d+(?:\.\d+)?|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d+)\)\s+)?[A-Za-z]\S*\s+"
     r"(?:[TR]X\s(?:[-BE]\s)*\s*)?([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+"
-    r"\[(\d+)\]\s*((?:[0-9A-Fa-f]{2}\s*)*|remote request.*?)(?:'.*')?$"
+    r"\[(\d+)\]\s*((?:[0-9A-Fa-f]{2}\s*)*|remote request[^']*)(?:ERRORFRAME\s*)?(?:'.*')?$"
 )
 PCAN_VIEW: Final = re.compile(
     r"\d+\)\s+(\d+(?:\.\d+)?)\s+(?:Rx|Tx)\s+([0-9A-Fa-f]{4}|[0-9A-Fa-f]{8})\s+(\d+)\s+((?:[0-9A-Fa-f]{2}\s*)*)$"
@@ -29,32 +34,56 @@ PCAN_VIEW: Final = re.compile(
 YACHT_DEVICES: Final = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) [RT] ([0-9A-Fa-f]{8})((?: [0-9A-Fa-f]{2}){0,8})\s*$")
 PAYLOAD: Final = re.compile(r"(?:#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)(?:_[0-9A-Fa-f])?$")
 MAX_DATA: Final = 64
+MAX_LINE: Final = 2048
+"""Characters; a CAN FD frame of 64 bytes with everything that the formats add has less than 500."""
+PCAN_COLUMNS: Final = {
+    "1.0": "NOIlD", "1.1": "NOTIlD", "1.2": "NOBTIlD", "1.3": "NOBTIRlD", "2.0": "NOTIdlD", "2.1": "NOTBIdRLD",
+}  # fmt: skip
+"""Columns of the TRC versions by the letters of the format: number, offset [ms], type, bus, identifier, data."""
+PCAN_DATA: Final = frozenset(("Rx", "Tx", "DT", "FD", "FB", "FE", "BI", "RR"))
+PCAN_ERRORS: Final = frozenset(("Warng", "Error", "ST", "ER"))
+PCAN_OTHERS: Final = frozenset(("EC", "EV"))
+FD_BYTES: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+ASC_BASE: Final = re.compile(r"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE)
+ASC_TIMED: Final = re.compile(r"(-?\d{1,19}\.\d+)\s+(.+)")
+ASC_OTHER: Final = re.compile(r"(?!CANFD\b)[^\W\d]|\d+\s+(?:Statistic|SV:|J1939TP)|.*(?:\bStatus:|Trigger|log )")
 
 
-class MalformedRecord(NamedTuple):
-    """A record that cannot be parsed: line number (0 in a binary file) and its text."""
-
-    line: int
-    text: str
-
-
-def read_trace(path: Path) -> Iterator[Frame | MalformedRecord]:
+def read_trace(path: Path) -> Trace:
     """The records of a trace in file order; raises OSError if the file cannot be opened."""
     content = path.read_bytes()
-    if path.suffix.lower() == ".blf":
-        return _binary(content)
-    lines = content.decode("utf-8", "replace").splitlines()
-    return _asc(lines) if path.suffix.lower() == ".asc" else _text(lines)
+    if path.suffix.lower() == ".blf" or content.startswith(b"LOGG"):
+        from can_dbc.trace.blf import read_blf
+
+        return Trace(partial(read_blf, content))
+    lines = decoded(content, "utf-8").splitlines()
+    return Trace(partial(_asc if path.suffix.lower() == ".asc" else _text, lines))
 
 
 # -- text ----------------------------------------------------------------------------------------------------
 
 
-def _text(lines: list[str]) -> Iterator[Frame | MalformedRecord]:
-    for number, line in enumerate(lines, 1):
-        line = line.strip()
-        if line and line[0] not in "#;":
-            yield parse_line(line) or MalformedRecord(number, line)
+def _text(lines: list[str], notes: list[str]) -> Iterator[Frame | MalformedRecord]:
+    pcan = Pcan()
+    error_frame = False
+    for number, raw in enumerate(lines, 1):
+        line = raw.strip()
+        if not line or line[0] == "#":
+            continue
+        if line[0] == ";":
+            pcan.header(line)
+        elif error_frame and raw[0] == "\t":
+            continue  # the words of `candump -e` about the error frame above
+        elif len(line) > MAX_LINE:
+            yield MalformedRecord(number, line[:MAX_LINE])
+        elif (frame := parse_line(line) or pcan.frame(line)) is not None:
+            error_frame = bool(frame.key & ERROR)
+            yield frame
+        elif not pcan.other(line):
+            yield MalformedRecord(number, line)
+    if pcan.others:
+        kinds = ", ".join(sorted(pcan.others))
+        notes.append(f"{pcan.others.total()} rows of PCAN hold no frames ({kinds})")
 
 
 def parse_line(line: str) -> Frame | None:
@@ -100,7 +129,14 @@ def _frame(stamp: str, identifier: str, data: str, length: int | None = None, re
 
 
 def _nanoseconds(text: str) -> int:
-    """Decimal seconds as ns, exactly."""
+    """Decimal seconds as ns, exactly; the date and time of ``candump -tA``, which names no time zone, as UTC."""
+    if text[4:5] == "-":
+        day, _, clock = text.partition(" ")
+        hour, minute, second = clock.split(":")
+        days = calendar.timegm(date.fromisoformat(day).timetuple())
+        return (days + int(hour) * 3600 + int(minute) * 60) * 1_000_000_000 + _nanoseconds(second)
+    if text[:1] == "-":
+        return -_nanoseconds(text[1:])
     whole, _, fraction = text.partition(".")
     return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
 
@@ -110,41 +146,104 @@ def _milliseconds(text: str) -> str:
     return f"{nanoseconds // 1_000_000_000}.{nanoseconds % 1_000_000_000:09d}"
 
 
-# -- Vector formats, through python-can ----------------------------------------------------------------------
+class Pcan:
+    """The rows of a TRC file; the header says which columns it has, without one they are those of 1.0."""
+
+    def __init__(self) -> None:
+        self.columns = PCAN_COLUMNS["1.0"]
+        self.others: Counter[str] = Counter()
+
+    def header(self, line: str) -> None:
+        """Takes the version and the columns out of a comment line."""
+        key, _, value = line[1:].replace(" ", "").partition("=")
+        if key == "$FILEVERSION":
+            self.columns = PCAN_COLUMNS.get(value, self.columns)
+        elif key == "$COLUMNS":
+            self.columns = value.replace(",", "")
+
+    def frame(self, line: str) -> Frame | None:
+        """The frame of a row: data, remote, or an error frame for a bus error or warning; None for another row."""
+        try:
+            return self._parsed(self._cells(line))
+        except (KeyError, ValueError):
+            return None
+
+    def other(self, line: str) -> bool:
+        """Whether a row is of a kind that holds no frame; counts it."""
+        kind = self._cells(line).get("T", "")
+        self.others.update([kind] if kind in PCAN_OTHERS else [])
+        return kind in PCAN_OTHERS
+
+    def _cells(self, line: str) -> dict[str, str]:
+        kind = line.split(maxsplit=3)[2:3]
+        columns = self.columns
+        if columns == PCAN_COLUMNS["1.0"] and kind and kind[0] in PCAN_DATA | PCAN_ERRORS:
+            columns = PCAN_COLUMNS["1.1"]  # PCAN-View's rows, pasted without their header
+        return dict(zip(columns, line.split(maxsplit=len(columns) - 1), strict=False))
+
+    def _parsed(self, cells: dict[str, str]) -> Frame | None:
+        kind, identifier, data = cells.get("T", "Rx"), cells["I"], cells.get("D", "")
+        if not re.fullmatch(r"\d+\)?", cells["N"]) or not re.fullmatch(r"\d+(\.\d+)?", cells["O"]):
+            return None
+        stamp_ns = _nanoseconds(_milliseconds(cells["O"]))
+        if kind in PCAN_ERRORS or identifier == "FFFFFFFF":
+            shown = re.match(r"(?:[0-9A-Fa-f]{2}\b\s*){0,8}", data)
+            return Frame(stamp_ns, ERROR, bytes.fromhex(shown[0]) if shown else b"")
+        if kind not in PCAN_DATA or not re.fullmatch(r"[0-9A-Fa-f]{4}|[0-9A-Fa-f]{8}", identifier):
+            return None
+        remote = kind == "RR" or data.strip() == "RTR"
+        length = int(cells["l"] if "l" in cells else cells["L"])
+        if "l" not in cells and kind not in ("DT", "RR", "Rx", "Tx"):
+            length = FD_BYTES[length] if length < len(FD_BYTES) else -1
+        return _frame(_milliseconds(cells["O"]), identifier, "" if remote else data, None if remote else length, remote)
 
 
-def _converted(message: Any) -> Frame:
-    key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-    key |= (REMOTE if message.is_remote_frame else 0) | (ERROR if message.is_error_frame else 0)
-    return Frame(round(message.timestamp * 1e9), key, bytes(message.data))
+# -- ASC, each line through python-can -----------------------------------------------------------------------
 
 
-def _asc(lines: list[str]) -> Iterator[Frame | MalformedRecord]:
-    """Reads ASC line by line, each with the header in front, so that a damaged record affects only itself."""
+def _asc(lines: list[str], notes: list[str]) -> Iterator[Frame | MalformedRecord]:
+    """Reads ASC line by line, so that a damaged line affects only itself.
+
+    The stamp is read here: python-can takes neither a negative nor a relative one.
+    """
+    base, relative, stamp_ns, others = "hex", False, 0, 0
+    for number, raw in enumerate(lines, 1):
+        line = raw.strip()
+        if found := ASC_BASE.match(line):
+            base, relative = found[1].lower(), (found[2] or "").lower() == "relative"
+        timed = ASC_TIMED.match(line)
+        if timed is None:
+            if line[:1].isdigit() or re.match(r"-\d", line):
+                yield MalformedRecord(number, line[:MAX_LINE])
+            continue
+        if len(line) > MAX_LINE:
+            yield MalformedRecord(number, line[:MAX_LINE])
+            continue
+        stamp_ns = _nanoseconds(timed[1]) + (stamp_ns if relative else 0)
+        frame = _asc_frame(timed[2], base, stamp_ns)
+        if frame is not None:
+            yield frame
+        elif ASC_OTHER.match(timed[2]):
+            others += "Start" not in timed[2]
+        else:
+            yield MalformedRecord(number, line)
+    if others:
+        notes.append(f"{others} lines are events of other kinds and hold no CAN frames")
+
+
+def _asc_frame(event: str, base: str, stamp_ns: int) -> Frame | None:
     from can.io.asc import ASCReader
 
-    start = next((i for i, line in enumerate(lines) if re.match(r"\s*\d+\.\d+\s", line)), len(lines))
-    header = "\n".join(lines[:start])
-    for number, line in enumerate(lines[start:], start + 1):
-        if not re.match(r"\s*\d", line):
-            continue
-        try:
-            messages = [_converted(m) for m in ASCReader(io.StringIO(f"{header}\n{line}\n"))]
-        except (ValueError, IndexError, KeyError, OverflowError):
-            messages = []
-        if messages:
-            yield from messages
-        elif not re.search(r"Start of measurement|Statistic|SV:|J1939TP|\bStatus:|Trigger|log ", line):
-            yield MalformedRecord(number, line.strip())
+    from can_dbc.trace.blf import converted
 
-
-def _binary(content: bytes) -> Iterator[Frame | MalformedRecord]:
-    """Reads BLF up to the first damage; records behind a damaged container cannot be found."""
-    from can.io.blf import BLFParseError, BLFReader
-
+    logging.getLogger("can.io.asc").setLevel(logging.ERROR)  # a line a frame about lengths, which are checked below
+    text = f"base {base} timestamps absolute\ninternal events logged\n0.0 {event}\n"
     try:
-        with BLFReader(io.BytesIO(content)) as reader:
-            for message in reader:
-                yield _converted(message)
-    except (BLFParseError, struct.error, zlib.error, ValueError, IndexError, OverflowError) as error:
-        yield MalformedRecord(0, f"damaged from here on: {error}")
+        messages = list(ASCReader(io.StringIO(text)))
+    except (ValueError, IndexError, KeyError, OverflowError):
+        return None
+    if len(messages) != 1:
+        return None
+    message = messages[0]
+    whole = message.is_remote_frame or message.is_error_frame or len(message.data) == min(message.dlc, MAX_DATA)
+    return converted(message, stamp_ns) if whole or (not message.is_fd and len(message.data) == 8) else None

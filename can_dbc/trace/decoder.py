@@ -13,12 +13,15 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from can_dbc.dbc.codec import Database, FrameRefused, MessageCodec, load
-from can_dbc.frame import ERROR, REMOTE, Frame, describe
+from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, describe
 from can_dbc.protocols.e2e import frame_crc
-from can_dbc.protocols.nmea2000 import Reassembler
-from can_dbc.trace.candump import MalformedRecord
+from can_dbc.protocols.nmea2000 import Reassembler, split_id
+from can_dbc.trace.records import MalformedRecord
 
 MAX_EXAMPLES: Final = 5
+FIRST_FAST_PACKET_PGN: Final = 0x1ED00
+"""Long messages of NMEA 2000 travel as fast packets; those of J1939, whose PGNs are lower, by J1939 transport."""
+TRANSPORT_PGNS: Final = (0xEB00, 0xEC00)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,18 +77,19 @@ class Decoder:
             if isinstance(record, MalformedRecord):
                 self.counts["broken"] += 1
                 if len(self.broken_examples) < MAX_EXAMPLES:
-                    self.broken_examples.append(f"line {record.line}: {record.text[:80]}")
+                    where = f"line {record.line}: " if record.line else ""
+                    self.broken_examples.append(where + record.text[: 80 if record.line else None])
                 continue
             self.counts["frames"] += 1
             entry = self._frame(record)
             if entry is not None:
-                self.counts["decoded"] += 1
+                self.counts["decoded"] += not entry.fault
                 self.messages[entry.name] += 1
                 yield entry
 
     def summary(self) -> dict[str, Any]:
         """Counts of the records, by kind and by message."""
-        names = ("frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken")
+        names = ("frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken", "j1939_transport")
         return {name: self.counts[name] for name in names} | {
             "lost_fast_packets": self.reassembler.lost,
             "messages": dict(sorted(self.messages.items())),
@@ -99,6 +103,7 @@ class Decoder:
         codec = next((c for d in self.databases if (c := d.find(frame.key)) is not None), None)
         if codec is None:
             self.counts["unknown"] += 1
+            self.counts["j1939_transport"] += bool(frame.key & EXTENDED) and split_id(frame.key).pgn in TRANSPORT_PGNS
             return None
         try:
             data = self._payload(frame, codec)
@@ -120,7 +125,7 @@ class Decoder:
 
     def _payload(self, frame: Frame, codec: MessageCodec) -> bytes | None:
         """The bytes to decode; None while a fast packet is incomplete."""
-        if not codec.by_pgn or codec.length <= 8:
+        if not codec.by_pgn or codec.length <= 8 or split_id(frame.key).pgn < FIRST_FAST_PACKET_PGN:
             return frame.data
         data = self.reassembler.add(frame.key, frame.data, frame.stamp_ns)
         return None if data is None else data[: codec.length]

@@ -12,7 +12,7 @@ import msgspec
 
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
-from recorder.mcap_scan import Channel, NotMcap, Stored, scan
+from recorder.mcap_scan import Channel, NotMcap, Stored, is_complete, scan
 from recorder.recover import recover, run_files
 
 PROFILE_FILE: Final = "profile.toml"
@@ -82,6 +82,12 @@ def manifest_of(files: list[Path]) -> Manifest:
         CommandFailed: there is none, or it is damaged.
     """
     first = next(messages(files[:1], "/manifest"), None)
+    if first is None and not is_complete(files[0]):
+        raise CommandFailed(
+            "recording.cut-off",
+            f"{files[0]} is cut off at byte {files[0].stat().st_size}, before its manifest; give another recording",
+            ExitCode.CONFIGURATION,
+        )
     if first is None:
         raise CommandFailed(
             "recording.no-manifest",

@@ -10,8 +10,9 @@ import pytest
 
 from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame
-from can_dbc.trace.candump import MalformedRecord, parse_line, read_trace
+from can_dbc.trace.candump import parse_line, read_trace
 from can_dbc.trace.decoder import Decoder
+from can_dbc.trace.records import MalformedRecord
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
 N2K = 0x09F8027F | EXTENDED
@@ -31,6 +32,13 @@ LINES = [
     ("<0x09f8027f> can0  09F8027F   [8]  00 FC FF FF 00 00 FF FF", (0, N2K, EIGHT)),
     ("1)         2.7  Rx     09F8027F  8  00 FC FF FF 00 00 FF FF", (2700000, N2K, EIGHT)),
     ("5)      1027.75  Tx     0210  2  00 FC", (1027750000, 0x210, b"\x00\xfc")),
+    (
+        "(1.25)  can0  20000004   [8]  00 08 00 00 00 00 60 00   ERRORFRAME",
+        (1250000000, 4 | ERROR, bytes.fromhex("0008000000006000")),
+    ),
+    ("(2023-11-14 22:13:20.000100)  can0  210   [2]  00 FC", (1700000000000100000, 0x210, b"\x00\xfc")),
+    ("(2023-11-31 22:13:20.000100)  can0  210   [2]  00 FC", None),
+    ("can0  210   [4]  remote request" + "'" * 1500 + "x", None),
     ("21:55:35.425 R 09F8027F 00 FC FF FF 00 00 FF FF", (78935425000000, N2K, EIGHT)),
     ("(1502984866.421964) slcan0 09F8027F#00FCFFFF0", None),
     ("(1502984866.421964) slcan0 09F8027F#00FCFFFF00", (1502984866421964000, N2K, EIGHT[:5])),
@@ -146,6 +154,6 @@ def test_decoder_counts_everything() -> None:
     assert "LiftB=2 bar" in entries[0].text() and "Status=Ok" in entries[0].text()
     summary = decoder.summary()
     assert {k: v for k, v in summary.items() if isinstance(v, int)} == {
-        "frames": 7, "decoded": 4, "unknown": 2, "refused": 2, "bad_crc": 1, "error_frames": 1, "broken": 1,
-        "lost_fast_packets": 0,
+        "frames": 7, "decoded": 1, "unknown": 2, "refused": 2, "bad_crc": 1, "error_frames": 1, "broken": 1,
+        "j1939_transport": 0, "lost_fast_packets": 0,
     }  # fmt: skip

@@ -21,7 +21,8 @@ from autonomy.networks.weights import WeightsError
 from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
 from can_dbc.dbc.codec import Database, DbcError, EncodeRefused, FrameRefused
 from can_dbc.dbc.codec import load as load_dbc
-from can_dbc.trace.candump import MalformedRecord, read_trace
+from can_dbc.trace.candump import read_trace
+from can_dbc.trace.records import MalformedRecord
 from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
 from controller.guard.__main__ import build

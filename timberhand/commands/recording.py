@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from timberhand.commands.options import JsonOption
+
+if TYPE_CHECKING:
+    from can_dbc.trace.decoder import Decoder
+    from can_dbc.trace.records import Trace
 
 app = typer.Typer(no_args_is_help=True, help="Read CAN recordings.")
 
@@ -22,7 +26,7 @@ def group() -> None:
     "timberhand recording decode crane.blf --dbc crane --json"
 )
 def decode(
-    recording: Annotated[Path, typer.Argument(metavar="FILE", help="candump, PCAN-View or YDWG text, .asc, .blf.")],
+    recording: Annotated[Path, typer.Argument(metavar="FILE", help="candump, PCAN (.trc) or YDWG text, .asc, .blf.")],
     dbc: Annotated[
         list[str] | None,
         typer.Option(
@@ -34,8 +38,9 @@ def decode(
 ) -> None:
     """Decode a CAN recording with one or more databases (default: all shipped ones), fast packets included.
 
-    Malformed lines are counted and never fatal; a frame out of range or with a
-    bad CRC is shown and counted.
+    Malformed lines are counted and not fatal; a frame out of range or with a
+    bad CRC is shown and counted. A file in which no frame can be read ends
+    with exit code 3.
     """
     import json
 
@@ -59,13 +64,28 @@ def decode(
             if not quiet:
                 typer.echo(separator + json.dumps(entry.as_dict(), allow_nan=False))
                 separator = ","
+        _refuse_nothing(recording, decoder)
         head = separator if separator != "," else ""
-        typer.echo(f'{head}], "summary": {json.dumps(decoder.summary())}}}')
+        typer.echo(f'{head}], "summary": {json.dumps(decoder.summary() | {"notes": records.notes})}}}')
         return
-    _print(decoder, records, quiet)
+    _print(recording, decoder, records, quiet)
 
 
-def _print(decoder, records, quiet: bool) -> None:  # type: ignore[no-untyped-def]
+def _refuse_nothing(recording: Path, decoder: Decoder) -> None:
+    """Raises CommandFailed for a file in which no frame could be read."""
+    from host.exit_codes import CommandFailed, ExitCode
+
+    if decoder.counts["frames"]:
+        return
+    why = "; ".join(decoder.broken_examples[:1])
+    raise CommandFailed(
+        "recording.no-frames",
+        f"{recording}: holds no CAN frame that can be read{f' ({why})' if why else ''}; give a log of a CAN bus",
+        ExitCode.CONFIGURATION,
+    )
+
+
+def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -77,6 +97,7 @@ def _print(decoder, records, quiet: bool) -> None:  # type: ignore[no-untyped-de
             name = escape(f"{entry.name:<20}")
             stamp = f"{entry.stamp_ns / 1e9:17.6f}"
             console.print(f"[dim]{stamp} {entry.identifier:>8}[/dim] [cyan]{name}[/cyan] {escape(entry.text())}{mark}")
+    _refuse_nothing(recording, decoder)
     summary = decoder.summary()
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("message")
@@ -88,7 +109,11 @@ def _print(decoder, records, quiet: bool) -> None:  # type: ignore[no-untyped-de
         f"{summary['frames']} frames, {summary['decoded']} messages decoded, {summary['unknown']} frames unknown, "
         f"{summary['refused']} refused, {summary['bad_crc']} with a bad CRC, "
         f"{summary['error_frames']} error frames, "
-        f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} malformed lines"
+        f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} malformed records"
     )
+    if summary["j1939_transport"]:
+        console.print(f"{summary['j1939_transport']} frames of J1939 transport (TP.CM, TP.DT), which is not decoded")
+    for note in records.notes:
+        console.print(escape(note))
     for text in summary["broken_examples"]:
         console.print(f"[yellow]malformed[/yellow] {escape(text)}")

@@ -1,0 +1,24 @@
+"""The text of a file that another tool wrote."""
+
+from __future__ import annotations
+
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
+from typing import Final
+
+HEAD_BYTES: Final = 256
+
+
+def decoded(content: bytes, fallback: str) -> str:
+    """UTF-8 or UTF-16, with or without a byte order mark, else ``fallback``; what that cannot read is replaced."""
+    if content.startswith(BOM_UTF8):
+        return content[len(BOM_UTF8) :].decode("utf-8", "replace")
+    if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        return content.decode("utf-16", "replace")
+    head = content[:HEAD_BYTES]
+    for encoding, zeros, letters in (("utf-16-le", head[1::2], head[::2]), ("utf-16-be", head[::2], head[1::2])):
+        if zeros.count(0) > len(zeros) // 2 and not letters.count(0):
+            return content.decode(encoding, "replace")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        return content.decode(fallback, "replace")
