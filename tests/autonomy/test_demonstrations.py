@@ -88,6 +88,12 @@ def test_an_encoder_without_frames_is_named() -> None:
         joint_track(PROFILE, CRANE, frames(shown(), without=Joint.TILT))
 
 
+def test_a_log_without_time_stamps_is_named_so() -> None:
+    bare = [Frame(0, frame.key, frame.data) for frame in frames(shown())]
+    with pytest.raises(RecordingRefused, check=coded("demonstration.no-stamps")):
+        joint_track(PROFILE, CRANE, bare)
+
+
 def test_motions_are_segmented_from_rest_to_rest_without_small_corrections() -> None:
     out, back = segment_motions(PROFILE, shown())
     assert out.time_s[0] == back.time_s[0] == 0.0

@@ -248,3 +248,11 @@ def test_contents_are_listed(tmp_path):
 
 def test_one_file_will_do(tmp_path):
     assert replay(files_of(keep(tmp_path, RECORDS) / "run.mcap")).agrees
+
+
+@pytest.mark.parametrize("size", [0, 8, 40])
+def test_a_recording_that_is_cut_before_its_manifest_is_named_so(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes((b"\x89MCAP0\r\n" + bytes((1,)) + (1000).to_bytes(8, "little") + bytes(100))[:size])
+    with pytest.raises(CommandFailed, check=coded("recording.cut-off")):
+        manifest_of([path])

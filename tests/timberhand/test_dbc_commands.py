@@ -108,3 +108,16 @@ def test_bench_codec_measures_every_message() -> None:
     reached = all(result["ratios"][name] >= needed for name, needed in result["needed"].items())
     assert result["reached"] is reached
     assert json.loads(json.dumps(result)) == result
+
+
+@pytest.mark.parametrize("options", [[], ["--json"], ["--quiet"]])
+@pytest.mark.parametrize(
+    ("name", "content"), [("x.log", b"hello\n"), ("x.blf", b"LOGG"), ("x.asc", b""), ("y.log", b"# \n")]
+)
+def test_a_file_without_a_readable_frame_is_refused(
+    tmp_path: Path, name: str, content: bytes, options: list[str]
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    code, sentence = run(recording.app, "decode", tmp_path / name, "--dbc", "crane", *options)
+    assert code == ExitCode.CONFIGURATION
+    assert name in sentence and "\n" not in sentence.strip()
