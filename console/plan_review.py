@@ -76,7 +76,8 @@ def imported(data: bytes, name: str) -> dict[str, Any]:
         MissionError: it cannot be read as a mission.
     """
     draft = read(data, name)
-    return {"mission": msgspec.to_builtins(draft.mission), "format": draft.format, "notes": draft.notes}
+    notes = [*(problem.sentence for problem in draft.warnings), *draft.notes]
+    return {"mission": msgspec.to_builtins(draft.mission), "format": draft.format, "notes": notes}
 
 
 def _told(findings: list[Finding]) -> list[dict[str, Any]]:

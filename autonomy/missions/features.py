@@ -15,7 +15,16 @@ import numpy as np
 
 from autonomy.missions.area import signed_area_m2
 from autonomy.missions.local_frame import LocalFrame
-from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, MissionError, Options, Point
+from autonomy.missions.model import (
+    Fence,
+    ForwardingMission,
+    KnownLog,
+    Landing,
+    MissionError,
+    Options,
+    Point,
+    Problem,
+)
 from autonomy.missions.source import Place, Source
 
 ROLES: Final = ("route", "waypoint", "fence", "keep-out", "log", "landing")
@@ -47,13 +56,21 @@ class Shape:
 
 @dataclass(slots=True)
 class Draft:
-    """A mission as read, the places of its parts in the file, and notes on what was ignored."""
+    """A mission as read, and the places of its parts in the file.
+
+    ``notes`` say what was ignored, ``warnings`` where the mission will be driven otherwise than the file means.
+    """
 
     mission: ForwardingMission
     source: Source
     format: str
     places: dict[Key, Place] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    warnings: list[Problem] = field(default_factory=list)
+
+    def warn(self, code: str, place: Place, sentence: str) -> None:
+        """Add a warning."""
+        self.warnings.append(Problem(code, " ".join(sentence.split()), self.source.at(place)))
 
 
 def assemble(
@@ -98,6 +115,9 @@ def assemble(
             logs.append(reader.log(shape, len(logs)))
     if problems:
         raise source.errors(problems)
+    inside = sum(not fence.keep_out for fence in fences)
+    if inside > 1:
+        draft.notes.append(f"{inside} keep-in fences: the machine stays inside one of them, any of them")
     draft.mission = ForwardingMission(
         name, waypoints, tuple(fences), tuple(landings), tuple(logs), options or Options()
     )
@@ -110,7 +130,7 @@ def merged(route: Draft, harvest: Draft) -> Draft:
     fields = {name: getattr(route.mission, name) for name in ("name", "waypoints", "fences", "landings", "options")}
     return Draft(
         ForwardingMission(**fields, logs=both), route.source, route.format, dict(route.places),
-        [*route.notes, *harvest.notes],
+        [*route.notes, *harvest.notes], [*route.warnings, *harvest.warnings],
     )  # fmt: skip
 
 

@@ -2,17 +2,22 @@
 
 Both are WGS84.  Their heights are above sea level, not above the ellipsoid, so they are ignored.  GPX names latitude
 and longitude; KML has longitude, latitude, height.  In KML the extended data of a placemark are its properties,
-including ``role``; in GPX a waypoint's ``type`` is its role if it is one.
+including ``role``; in GPX a waypoint's ``type`` is its role if it is one.  A track in several segments is one route,
+and a gap between them a warning.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
+import numpy as np
+
 from autonomy.missions.features import ROLES, Draft, Position, Shape, assemble
-from autonomy.missions.model import MAX_LOGS, MAX_WAYPOINTS
+from autonomy.missions.local_frame import LocalFrame
+from autonomy.missions.model import MAX_LOGS, MAX_WAYPOINTS, Point
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree
 from runtime.errors import CodedError
@@ -28,10 +33,16 @@ _GPX_LIMITS: Final = {
     "wpt": (MAX_LOGS, "waypoints"),
     ANY: (MAX_ELEMENTS, "elements"),
 }
+_KML_UNUSED: Final = {
+    "GroundOverlay": "image on the ground", "PhotoOverlay": "photo", "ScreenOverlay": "image on the screen",
+    "Model": "model", "Tour": "tour",
+}  # fmt: skip
+MAX_GAP_M: Final = 5.0
+"""Segments of a track that begin no farther than this from the end of the one before are one drive [est]."""
 _KML: Final = frozenset({
     "Document", "Folder", "Placemark", "name", "ExtendedData", "Data", "value", "SchemaData", "SimpleData",
     "MultiGeometry", "Point", "LineString", "LinearRing", "Polygon", "outerBoundaryIs", "innerBoundaryIs",
-    "coordinates",
+    "coordinates", "Track", "MultiTrack", "coord", "NetworkLink", *_KML_UNUSED,
 })  # fmt: skip
 _KML_LIMITS: Final = {"Placemark": (MAX_LOGS, "placemarks"), ANY: (MAX_ELEMENTS, "elements")}
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
@@ -60,30 +71,66 @@ def read_gpx(data: bytes, name: str) -> Draft:
     """The mission in a GPX file: its route, else its track, else its waypoints."""
     root = tree(data, name, _GPX, _GPX_LIMITS)
     source = Source(name)
-    routes = [("route", list(route.all("rtept")), route) for route in root.all("rte")]
-    tracks = [
-        ("track", [p for seg in track.all("trkseg") for p in seg.all("trkpt")], track) for track in root.all("trk")
-    ]
-    notes = []
+    routes = [([list(route.all("rtept"))], route) for route in root.all("rte")]
+    tracks = [([list(seg.all("trkpt")) for seg in track.all("trkseg")], track) for track in root.all("trk")]
+    empty = sum(not any(segments) for segments, _ in (*routes, *tracks))
+    notes = [f"{empty} × an empty route or track ignored"] if empty else []
+    routes, tracks = ([line for line in lines if any(line[0])] for lines in (routes, tracks))
     lines = routes or tracks
     if routes and tracks:
         notes.append("a track beside the route ignored")
-    shapes = []
-    for _, points, owner in lines:
-        at = tuple(_gpx_position(point, source) for point in points)
-        if at:
-            shapes.append(Shape("line" if len(at) > 1 else "point", (at,), {}, owner.line))
-        else:
-            notes.append("an empty route ignored")
+    shapes, gaps = [], Gaps()
+    for segments, owner in lines:
+        read = [tuple(_gpx_position(point, source) for point in points) for points in segments]
+        at = gaps.joined(read)
+        shapes.append(Shape("line" if len(at) > 1 else "point", (at,), {}, owner.line))
     for point in root.all("wpt"):
         kind = point.value("type").lower()
         properties: dict[str, Any] = {"role": kind} if kind in ROLES else {}
         properties |= {"key" if kind == "log" else "name": point.value("name")}
         shapes.append(Shape("point", ((_gpx_position(point, source),),), properties, point.line))
-    title = root.value("metadata", "name") or (lines[0][2].value("name") if lines else "")
+    title = root.value("metadata", "name") or (lines[0][1].value("name") if lines else "")
     draft = assemble(shapes, source, "GPX", title)
     draft.notes += notes
+    gaps.tell(draft)
     return draft
+
+
+class Gaps:
+    """The gaps between segments that are joined to one line."""
+
+    def __init__(self) -> None:
+        self.found: list[tuple[float, Place]] = []
+
+    def joined(self, segments: Iterable[tuple[Position, ...]]) -> tuple[Position, ...]:
+        """One line of all segments."""
+        line: list[Position] = []
+        for segment in segments:
+            if line and segment:
+                gap_m = _distance_m(line[-1], segment[0])
+                if gap_m > MAX_GAP_M:
+                    self.found.append((gap_m, segment[0].place))
+            line += segment
+        return tuple(line)
+
+    def tell(self, draft: Draft) -> None:
+        """Warn of the gaps, at the widest one."""
+        if not self.found:
+            return
+        widest_m, place = max(self.found, key=lambda gap: gap[0])
+        draft.warn(
+            "mission.track-gap", place,
+            f"the track has {len(self.found) + 1} pieces with up to {widest_m:.0f} m between them, which the machine "
+            "drives straight; draw the way across, or delete what does not belong to the route",
+        )  # fmt: skip
+
+
+def _distance_m(a: Position, b: Position) -> float:
+    """The distance of two positions; 0 where one is no place, which validation refuses."""
+    if not all(abs(p.latitude_deg) <= 90.0 and abs(p.longitude_deg) <= 180.0 for p in (a, b)):
+        return 0.0
+    frame = LocalFrame(a.latitude_deg, a.longitude_deg)
+    return float(np.hypot(*frame.points_enu([Point(b.latitude_deg, b.longitude_deg)])[0, :2]))
 
 
 def _gpx_position(point: Element, source: Source) -> Position:
@@ -105,9 +152,24 @@ def read_kml(data: bytes, name: str) -> Draft:
     for placemark in _placemarks(root):
         reader.placemark(placemark)
     title = root.value("Document", "name") or root.value("name")
+    for element in _inside(root):
+        if element.name in _KML_UNUSED:
+            reader.left_out[_KML_UNUSED[element.name]] += 1
     draft = assemble(reader.shapes, reader.source, "KML", title)
-    draft.notes += reader.notes
+    draft.notes += [*reader.notes, *(f"{count} × {what} ignored" for what, count in reader.left_out.items())]
+    reader.gaps.tell(draft)
+    for link in (element for element in _inside(root) if element.name == "NetworkLink"):
+        sentence = "a link to another file is not followed; save what it shows as a file of its own"
+        draft.warn("kml.network-link", link.line, sentence)
+        break
     return draft
+
+
+def _inside(element: Element) -> Iterator[Element]:
+    """Every kept element below one."""
+    for child in element.children:
+        yield child
+        yield from _inside(child)
 
 
 def _placemarks(element: Element) -> Iterator[Element]:
@@ -125,6 +187,8 @@ class _Kml:
         self.source = source
         self.shapes: list[Shape] = []
         self.notes: list[str] = []
+        self.left_out: Counter[str] = Counter()
+        self.gaps = Gaps()
         self.count = 0
 
     def placemark(self, placemark: Element) -> None:
@@ -145,6 +209,11 @@ class _Kml:
                 self.add("point", [self.positions(child)], properties, child.line)
             elif child.name in ("LineString", "LinearRing"):
                 self.add("line", [self.positions(child)], properties, child.line)
+            elif child.name == "Track":
+                self.add("line", [self.track(child)], properties, child.line)
+            elif child.name == "MultiTrack":
+                line = self.gaps.joined(self.track(track) for track in child.all("Track"))
+                self.add("line", [line], properties, child.line)
             elif child.name == "Polygon":
                 rings = [
                     self.positions(ring)
@@ -160,25 +229,45 @@ class _Kml:
         else:
             self.notes.append(f"an empty {kind} ignored")
 
+    def track(self, owner: Element) -> tuple[Position, ...]:
+        """The places of a gx:Track; its times are not used."""
+        found = []
+        for element in owner.all("coord"):
+            self.counted(element.line)
+            parts = element.text.split()
+            if not parts:
+                continue  # the receiver had no fix
+            if not 2 <= len(parts) <= 3:
+                sentence = f'"{element.text.strip()[:40]}" is not a position; write longitude latitude [height]'
+                raise self.source.error("kml.position", element.line, sentence)
+            found.append(self.position(parts, element.line))
+        return tuple(found)
+
+    def counted(self, line: int) -> None:
+        self.count += 1
+        if self.count > MAX_KML_POSITIONS:
+            sentence = f"has more than {MAX_KML_POSITIONS} positions; thin it out"
+            raise self.source.error("mission.too-many-positions", line, sentence)
+
+    def position(self, parts: list[str], line: int) -> Position:
+        try:
+            longitude, latitude = decimal(parts[0], "longitude"), decimal(parts[1], "latitude")
+        except NumberError as error:
+            raise self.source.error(error.code, line, str(error)) from None
+        return Position(latitude, longitude, None, line)
+
     def positions(self, owner: Element) -> tuple[Position, ...]:
         element = owner.first("coordinates")
         if element is None:
             return ()
         text, line, at, found = element.text, element.line, 0, []
         for word in _WORD.finditer(text):
-            self.count += 1
-            if self.count > MAX_KML_POSITIONS:
-                sentence = f"has more than {MAX_KML_POSITIONS} positions; thin it out"
-                raise self.source.error("mission.too-many-positions", line, sentence)
+            self.counted(line)
             line += text.count("\n", at, word.start())
             at = word.start()
             parts = word[0].split(",")
             if not 2 <= len(parts) <= 3 or not parts[0]:
                 sentence = f'"{word[0][:40]}" is not a position; write longitude,latitude[,height] without spaces'
                 raise self.source.error("kml.position", line, sentence)
-            try:
-                longitude, latitude = decimal(parts[0], "longitude"), decimal(parts[1], "latitude")
-            except NumberError as error:
-                raise self.source.error(error.code, line, str(error)) from None
-            found.append(Position(latitude, longitude, None, line))
+            found.append(self.position(parts, line))
         return tuple(found)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +30,8 @@ Place = int | tuple[str | int, ...] | None
 _SPACE: Final = re.compile(r"[ \t\r\n]*")
 _BYTE: Final = re.compile(r"(.*) \(byte (\d+)\)$")
 _DECODER: Final = json.JSONDecoder()
+_LONG_NUMBER: Final = re.compile(r"(?<![0-9])[0-9]{309}")
+"""An integer that no float holds; the look-behind has every digit looked at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,19 +106,37 @@ def json_document(data: bytes, name: str) -> tuple[Any, Source]:
         ) from None
     source = Source(name, text)
     try:
-        return msgspec.json.decode(text), source
+        value = msgspec.json.decode(text)
     except RecursionError:
         raise source.error("mission.nesting", None, "is nested deeper than any mission") from None
     except msgspec.DecodeError as error:
         raise _no_json(source, str(error)) from None
+    if _LONG_NUMBER.search(text):
+        _refuse_long_numbers(value, source)
+    return value, source
+
+
+def _refuse_long_numbers(value: Any, source: Source) -> None:
+    """Refuse integers that no float holds, so that every number of a document can be computed with."""
+    left: list[tuple[Any, tuple[str | int, ...]]] = [(value, ())] if isinstance(value, dict | list) else []
+    while left:
+        at, path = left.pop()
+        for key, inner in at.items() if isinstance(at, dict) else enumerate(at):
+            if isinstance(inner, dict | list):
+                left.append((inner, (*path, key)))
+            elif isinstance(inner, int) and abs(inner) > sys.float_info.max:
+                sentence = "this number has more than 308 digits; write the value that it stands for"
+                raise source.error("mission.json-number", (*path, key), sentence)
 
 
 def _no_json(source: Source, complaint: str) -> MissionError:
     """The error for text that the JSON reader refused, with its line."""
     found = _BYTE.match(complaint)
     if found is None:
-        last = source.text.count("\n") + 1 if "truncated" in complaint else None
-        return source.error("mission.not-json", last, f"this is not JSON: {complaint[0].lower()}{complaint[1:]}")
+        cut = "truncated" in complaint
+        last = source.text.count("\n") + 1 if cut else None
+        reason = "it ends too early; was the file cut off?" if cut else f"{complaint[0].lower()}{complaint[1:]}"
+        return source.error("mission.not-json", last, f"this is not JSON: {reason}")
     before = source.text.encode()[: int(found[2])]
     line = before.count(b"\n") + 1
     rest = source.text.encode()[len(before) : len(before) + 12].decode(errors="ignore")
@@ -125,7 +146,7 @@ def _no_json(source: Source, complaint: str) -> MissionError:
     if number:
         sentence = f"{number[0]} is not a number in JSON; write the value, or leave the member out"
         return source.error("mission.json-number", line, sentence)
-    sentence = f"this is not JSON: {found[1].removeprefix('JSON is malformed: ')}; was the file cut off?"
+    sentence = f"this is not JSON: {found[1].removeprefix('JSON is malformed: ')}"
     return source.error("mission.not-json", line, sentence)
 
 

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 from xml.etree.ElementTree import ParseError
+from xml.parsers.expat import errors as xml_errors
 
 from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
@@ -22,6 +23,15 @@ MAX_DEPTH: Final = 100
 ANY: Final = "*"
 """Key of the limit on all kept elements."""
 _CHUNK: Final = 1 << 16
+_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
+_CUT: Final = frozenset(
+    xml_errors.codes[text]
+    for text in (
+        xml_errors.XML_ERROR_NO_ELEMENTS, xml_errors.XML_ERROR_UNCLOSED_TOKEN, xml_errors.XML_ERROR_PARTIAL_CHAR,
+        xml_errors.XML_ERROR_UNCLOSED_CDATA_SECTION,
+    )
+)  # fmt: skip
+"""What the parser says of a document that ends too early."""
 
 
 @dataclass(slots=True)
@@ -64,8 +74,10 @@ class TooMany(Exception):
 class _Builder:
     """Parser target: keeps wanted elements, counts all."""
 
-    def __init__(self, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]]) -> None:
-        self.wanted, self.limits = wanted, dict(limits)
+    def __init__(self, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]], inside: str = "") -> None:
+        self.wanted, self.limits, self.inside = wanted, dict(limits), inside
+        self.outside = 0
+        self.more = 0
         self.counts: dict[str, int] = {}
         self.elements = 0
         self.skipping = 0
@@ -82,6 +94,12 @@ class _Builder:
             self.skipping += 1
             return
         namespace, _, name = tag.rpartition("}")
+        if self.inside and not self.open and (name != self.inside or self.root is not None):
+            self.outside += 1
+            self.more += name == self.inside
+            if self.outside > MAX_DEPTH:
+                raise TooMany("mission.nesting", self.line(), "is nested deeper than any mission")
+            return
         if self.open and name not in self.wanted:
             self.skipping = 1
             return
@@ -105,6 +123,8 @@ class _Builder:
         """End of an element."""
         if self.skipping:
             self.skipping -= 1
+        elif not self.open:
+            self.outside -= 1
         else:
             self.open.pop()
 
@@ -127,15 +147,19 @@ def root_name(data: bytes) -> str:
     return builder.root.name if builder.root is not None else ""
 
 
-def tree(data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]]) -> Element:
+def tree(
+    data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]], inside: str = ""
+) -> Element:
     """The root of an XML document with the elements named ``wanted`` below it.
 
     ``limits`` has the greatest number of elements by name (``ANY``: of all kept ones), and their name in the error.
+    ``inside`` is the name of the element to return instead of the root, where a document is an envelope round it.
 
     Raises:
-        MissionError: not well-formed XML, a document type or an entity, or more than the limits allow.
+        MissionError: not well-formed XML, a document type or an entity, more than the limits allow, or no element
+            ``inside`` or several.
     """
-    builder = _Builder(wanted, limits)
+    builder = _Builder(wanted, limits, inside)
     parser = DefusedXMLParser(target=builder, forbid_dtd=True)
     builder.line = lambda: parser.parser.CurrentLineNumber
     try:
@@ -153,15 +177,43 @@ def tree(data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tu
         code, line, sentence = error.args
         raise MissionError(code, f"{sentence}; thin it out, or split the mission", f"{name}:{line}") from None
     except ParseError as error:
-        line = error.position[0]
-        reason = str(error).partition(":")[0]
-        raise MissionError(
-            "mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?", f"{name}:{line}"
-        ) from None
+        code, sentence = _complaint(data, error, parser.parser.ErrorByteIndex)
+        raise MissionError(code, sentence, f"{name}:{error.position[0]}") from None
     except (ValueError, LookupError) as error:
         sentence = f"its encoding cannot be read ({error}); save the file with UTF-8"
         raise MissionError("mission.encoding", sentence, name) from None
     if root is None:
-        raise MissionError("mission.empty-file", "is empty", name)
+        what = f"has no <{inside}>" if inside else "is empty"
+        raise MissionError("mission.empty-file", what, name)
+    if builder.more:
+        sentence = f"is an envelope of {builder.more + 1} <{inside}>; save each one as a file of its own"
+        raise MissionError("mission.envelope", sentence, name)
     found: Element = root
     return found
+
+
+def _complaint(data: bytes, error: ParseError, at_byte: int) -> tuple[str, str]:
+    """Code and sentence of what the parser refused."""
+    reason = str(error).partition(":")[0]
+    if error.code in _CUT:
+        return "mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?"
+    if error.code == xml_errors.codes[xml_errors.XML_ERROR_MISPLACED_XML_PI]:
+        return "mission.xml-start", "something stands before <?xml; delete what comes before it, blanks and lines too"
+    if error.code == xml_errors.codes[xml_errors.XML_ERROR_UNBOUND_PREFIX]:
+        sentence = "this element or attribute has a prefix that no xmlns: declares; declare it, or delete the element"
+        return "mission.xml-prefix", sentence
+    if error.code == xml_errors.codes[xml_errors.XML_ERROR_UNDEFINED_ENTITY]:
+        sentence = "this contains an entity that XML does not know, such as &ntilde;; write the character itself"
+        return "mission.xml-entity", sentence
+    if error.code == xml_errors.codes[xml_errors.XML_ERROR_INCORRECT_ENCODING]:
+        return "mission.encoding", "the encoding in <?xml ...?> is not that of the file; save the file with UTF-8"
+    if error.code == xml_errors.codes[xml_errors.XML_ERROR_INVALID_TOKEN]:
+        try:
+            data[: at_byte + 8].decode("utf-8")
+        except UnicodeDecodeError as found:
+            if found.start <= at_byte and not data.startswith(_UTF_16):
+                return (
+                    "mission.encoding",
+                    f"byte {found.start} is not UTF-8 text; save the file with the encoding UTF-8",
+                )
+    return "mission.not-xml", f"this is not well-formed XML: {reason}"

@@ -54,6 +54,24 @@ def test_nan_and_infinity_in_xml() -> None:
 def test_huge_numbers() -> None:
     assert codes(b'{"type": "Point", "coordinates": [1e999, 2]}') == ["not-json"]
     assert codes(b'{"type": "Point", "coordinates": [%d, 2]}' % 10**30) == ["projected-coordinates"]
+    assert codes(gpx(f'<rte><rtept lat="{10**400}" lon="2"/></rte>')) == ["non-finite-coordinate"]
+    assert codes(b'{"type": "Point", "coordinates": ["%d", 2]}' % 10**400) == ["geojson-position"]  # a text
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b'{"type": "Point",\n"coordinates": [%d, 2]}',
+        b'{"type": "Point",\n"coordinates": [1, 2, -%d]}',
+        b'{"type":"Feature","geometry":null,\n"properties":{"length_m":%d}}',
+        b'{"fileType":"Plan","mission":{\n"items":[{"command":16,"params":[0,0,0,0,%d,2,0]}]}}',
+        b'{"fileType":"Plan","mission":{\n"items":[{"command":178,"params":[1,%d]}]}}',
+        b'{"fileType":"Plan","mission":{"items":[]},\n"geoFence":{"circles":[{"circle":{"center":[1,2],"radius":%d}}]}}',
+    ],
+    ids=["longitude", "height", "length", "waypoint", "speed", "radius"],
+)
+def test_numbers_of_400_digits(data: bytes) -> None:
+    assert codes(data % 10**400) == ["json-number"] and place(data % 10**400) == "m:2"
 
 
 @pytest.mark.parametrize("form", ["geojson", "gpx", "kml", "plan"])
@@ -120,7 +138,8 @@ def test_not_utf_8() -> None:
     named = latin.replace("UTF-8", "ISO-8859-1").encode("latin-1")
     assert good(named).mission.name == "Hörnefors"
     assert good(latin.replace('encoding="UTF-8"', "").encode("utf-16")).mission.name == "Hörnefors"
-    assert codes(latin.encode("latin-1")) == ["not-xml"]
+    assert codes(latin.encode("latin-1")) == ["encoding"]
+    assert codes(latin.encode("utf-16")) == ["encoding"]  # says UTF-8 and is not
     assert codes(latin.replace("UTF-8", "no-such").encode()) == ["encoding"]
 
 
@@ -137,6 +156,20 @@ def test_entity_expansion(declared: str) -> None:
     data = f'<?xml version="1.0"?>\n{declared}\n<gpx><metadata><name>&b;</name></metadata></gpx>'.encode()
     assert codes(data) == ["xml-doctype"] and place(data) == "m:2"
     assert "root:" not in str(refused(data))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code", "line"),
+    [
+        ("<?xml", "\n <?xml", "xml-start", 2),
+        ("<rte>", "<rte><a:x/>", "xml-prefix", 3),
+        ("<rte>", "<rte><name>Ca&ntilde;on</name>", "xml-entity", 3),
+        ("<rte>", "<rte><name>a & b</name>", "not-xml", 3),
+    ],
+)
+def test_why_a_file_is_not_xml(old: str, new: str, code: str, line: int) -> None:
+    data = gpx(f"<rte>{gpx_points('rtept')}</rte>").decode().replace(old, new, 1).encode()
+    assert codes(data) == [code] and place(data) == f"m:{line}"
 
 
 def test_files_cut_off_and_files_of_other_kinds(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from host.exit_codes import CommandFailed, ExitCode
 from runtime.plot_style import MOSS, OIL, RUST, TIMBER
+from tests.autonomy.mission_texts import at, gpx, gpx_points
 from tests.codes import numbers_in
 from timberhand.cli import app
 
@@ -58,6 +59,17 @@ def test_a_bad_mission_ends_with_its_line_and_exit_code_3(tmp_path: Path) -> Non
 def test_strict_makes_warnings_fail() -> None:
     assert run("check", EXAMPLES / "route.gpx").exit_code == 0
     assert run("check", EXAMPLES / "route.gpx", "--strict").exit_code == ExitCode.CONFIGURATION
+
+
+def test_strict_refuses_what_a_file_loses(tmp_path: Path) -> None:
+    parts = ([at(0, 0), at(20, 0)], [at(40, 0), at(60, 0)])
+    rows = "".join(f"<trkseg>{gpx_points('trkpt', part)}</trkseg>" for part in parts)
+    (tmp_path / "t.gpx").write_bytes(gpx(f"<trk>{rows}</trk>"))
+    said = json.loads(run("check", tmp_path / "t.gpx", "--json").output)
+    assert said["warning_codes"] == ["mission.track-gap", "mission.no-fence"]
+    assert len(said["warnings"]) == 2
+    assert run("check", tmp_path / "t.gpx").exit_code == 0
+    assert run("check", tmp_path / "t.gpx", "--strict").exit_code == ExitCode.CONFIGURATION
 
 
 def test_a_machine_that_does_not_drive_or_is_unknown() -> None:

@@ -111,12 +111,15 @@ def run(
         machine = load_profile(profile)
         carrier = machine.carrier
         site = None if carrier is None else (carrier.site_lat_deg, carrier.site_lon_deg)
-        mission = load_mission(file, route_wanted=True, site=site).mission
+        draft = load_mission(file, route_wanted=True, site=site)
     except (MissionError, ProfileError) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     truth = truth_of(profile, truth)
     directory = out or new_directory(f"mission-{file.stem}-{manager.value}-seed{seed}")
     screen = Console(stderr=as_json)
+    mission = draft.mission
+    for problem in draft.warnings:
+        screen.print(f"warning: {problem}", style="yellow", markup=False, soft_wrap=True)
     if lockstep:
         from hil.missions.lockstep import run_mission
 

@@ -63,7 +63,7 @@ def check(
         typer.echo(json.dumps(_facts(file, draft, review), indent=2))
     else:
         _show(file, draft, review)
-    if strict and review is not None and review.warnings:
+    if strict and (draft.warnings or (review is not None and review.warnings)):
         raise typer.Exit(ExitCode.CONFIGURATION)
 
 
@@ -114,6 +114,8 @@ def convert(
     console.print(f"[green]✔[/green] {escape(str(out))}: {escape(_contents(draft))}")
     for note in draft.notes:
         console.print(f"[yellow]note[/yellow] {escape(note)}")
+    for problem in draft.warnings:
+        console.print(f"[yellow]warning[/yellow] {escape(str(problem))}")
 
 
 @app.command()
@@ -195,6 +197,8 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
         "file": str(file), "format": draft.format, "name": mission.name, "waypoints": len(mission.waypoints),
         "laps": mission.options.laps, "fences": len(mission.fences), "landings": len(mission.landings),
         "logs": len(mission.logs), "notes": draft.notes,
+        "warnings": [str(problem) for problem in draft.warnings],
+        "warning_codes": [problem.code for problem in draft.warnings],
     }  # fmt: skip
     if review is not None:
         corners = [
@@ -208,7 +212,8 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
         facts |= {
             "length_m": round(review.length_m, 2), "drive_s": round(review.drive_s, 1), "logs_to_fetch": review.logs,
             "crane_s": round(review.crane_s, 1), "total_s": round(review.total_s, 1), "corners": corners,
-            "warnings": [warning.sentence for warning in review.warnings],
+            "warnings": facts["warnings"] + [warning.sentence for warning in review.warnings],
+            "warning_codes": facts["warning_codes"] + [warning.code for warning in review.warnings],
         }  # fmt: skip
     return facts
 
@@ -244,7 +249,9 @@ def _show(file: Path, draft: Draft, review: Review | None) -> None:
     console.print(table)
     for note in draft.notes:
         console.print(f"[yellow]note[/yellow] {escape(note)}")
+    for problem in draft.warnings:
+        console.print(f"[yellow]warning[/yellow] {escape(str(problem))}")
     for warning in review.warnings if review is not None else ():
         console.print(f"[yellow]warning[/yellow] {escape(warning.sentence)}")
-    if review is not None and not review.warnings:
+    if review is not None and not review.warnings and not draft.warnings:
         console.print("[green]✔[/green] no warnings for this machine")
