@@ -29,8 +29,8 @@ MACHINE_SIGMA_M: Final = 7.0
 _WANTED: Final = frozenset({
     "Machine", "SpeciesGroupDefinition", "SpeciesGroupKey", "SpeciesGroupName", "ProductDefinition", "ProductKey",
     "ClassifiedProductDefinition", "UnclassifiedProductDefinition", "ProductName", "Stem", "StemKey", "StemNumber",
-    "StemCoordinates", "Latitude", "Longitude", "SingleTreeProcessedStem", "MultiTreeProcessedStem", "Log",
-    "LogKey", "LogVolume", "LogMeasurement", "LogDiameter", "LogLength", "ObjectDefinition", "ObjectName",
+    "StemCoordinates", "Coordinates", "Latitude", "Longitude", "SingleTreeProcessedStem", "MultiTreeProcessedStem",
+    "Log", "LogKey", "LogVolume", "LogMeasurement", "LogDiameter", "LogLength", "ObjectDefinition", "ObjectName",
 })  # fmt: skip
 _LIMITS: Final = {"Log": (MAX_LOGS, "logs"), "Stem": (MAX_LOGS, "stems"), ANY: (1_000_000, "elements")}
 _MIDDLE: Final = ("Mid ob", "Mid ub")
@@ -43,7 +43,7 @@ def read_hpr(data: bytes, name: str) -> Draft:
     Raises:
         MissionError: not an hpr, a coordinate system other than WGS84, or an invalid value.
     """
-    root = tree(data, name, _WANTED, _LIMITS)
+    root = tree(data, name, _WANTED, _LIMITS, "HarvestedProduction")
     source = Source(name)
     if root.namespace != NAMESPACE:
         sentence = f'the namespace "{root.namespace[:60]}" is not {NAMESPACE}, StanForD 2010'
@@ -53,7 +53,7 @@ def read_hpr(data: bytes, name: str) -> Draft:
         raise source.error("hpr.message-type", root.line, sentence)
     logs: list[KnownLog] = []
     places: dict[Key, Place] = {}
-    lost = 0
+    lost = several = 0
     title = ""
     for machine in root.all("Machine"):
         title = title or machine.value("ObjectDefinition", "ObjectName")
@@ -62,17 +62,24 @@ def read_hpr(data: bytes, name: str) -> Draft:
         }
         products = {p.value("ProductKey"): _product_name(p) for p in machine.all("ProductDefinition")}
         for stem in machine.all("Stem"):
-            found = [log for processed in stem.children for log in processed.all("Log")]
-            at = _position(stem, source)
-            if at is None:
-                lost += len(found)
-                continue
-            for log in found:
-                places[("log", len(logs))] = log.line
-                logs.append(_log(log, stem, *at, species, products, source))
+            for processed in stem.children:
+                found = list(processed.all("Log"))
+                at = _position((stem, processed), source) if found else None
+                if at is None:
+                    lost += len(found)
+                    continue
+                for log in found:
+                    several += len(list(log.all("LogMeasurement"))) > 1
+                    places[("log", len(logs))] = log.line
+                    logs.append(_log(log, stem, *at, species, products, source))
     draft = Draft(ForwardingMission(title, logs=tuple(logs)), source, HPR, places)
     if lost:
-        draft.notes.append(f"{lost} logs of stems without coordinates ignored")
+        sentence = f"{lost} logs of stems without coordinates are left out; the machine is not told of them"
+        draft.warn("hpr.no-coordinates", None, sentence)
+    if several:
+        draft.notes.append(
+            f"{several} logs were measured more than once; one measurement is read, the harvester's if it is marked"
+        )
     return draft
 
 
@@ -82,10 +89,10 @@ def _product_name(product: Element) -> str:
     )
 
 
-def _position(stem: Element, source: Source) -> tuple[Point, float] | None:
-    """Where a stem was felled and the position's sigma [m], or None."""
+def _position(owners: tuple[Element, ...], source: Source) -> tuple[Point, float] | None:
+    """Where a stem was felled and the position's sigma [m], or None; some makers write it at the processing."""
     best: tuple[Point, float] | None = None
-    for given in stem.all("StemCoordinates"):
+    for given in (given for owner in owners for given in owner.all("StemCoordinates", "Coordinates")):
         system = given.attributes.get("coordinateReferenceSystem", "WGS84")
         if system.replace(" ", "").upper() != "WGS84":
             sentence = f'coordinates are in "{system[:40]}"; a mission is in WGS84'
@@ -116,14 +123,15 @@ def _log(
     source: Source,
 ) -> KnownLog:
     key = log.first("ProductKey")
-    length = log.first("LogMeasurement", "LogLength")
+    measurement = _measurement(log)
+    length = None if measurement is None else measurement.first("LogLength")
     product = None if key is None or not key.text.strip() else int(_number(key, source))
     return KnownLog(
         at,
         f"{stem.value('StemKey') or stem.value('StemNumber')}/{log.value('LogKey')}",
         None,
         None if length is None else _number(length, source) / 100.0,
-        _diameter_m(log, length, source),
+        _diameter_m(log, measurement, length, source),
         species.get(stem.value("SpeciesGroupKey"), "") or species.get(_species_key(stem), ""),
         "" if key is None else products.get(key.text.strip(), ""),
         product,
@@ -136,12 +144,18 @@ def _species_key(stem: Element) -> str:
     return next((child.value("SpeciesGroupKey") for child in stem.children if child.first("SpeciesGroupKey")), "")
 
 
-def _diameter_m(log: Element, length: Element | None, source: Source) -> float | None:
+def _measurement(log: Element) -> Element | None:
+    """The harvester's own measurement of a log, else the first: values of two measurements are never mixed."""
+    measured = list(log.all("LogMeasurement"))
+    own = (m for m in measured if m.attributes.get("logMeasurementCategory") == "Machine")
+    return next(own, measured[0] if measured else None)
+
+
+def _diameter_m(log: Element, measurement: Element | None, length: Element | None, source: Source) -> float | None:
     """The diameter at the middle over bark, else the mean of both ends, else that from the volume."""
     given = {
         d.attributes.get("logDiameterCategory", ""): d
-        for measurement in log.all("LogMeasurement")
-        for d in measurement.all("LogDiameter")
+        for d in (() if measurement is None else measurement.all("LogDiameter"))
     }
     for name in _MIDDLE:
         if name in given:

@@ -56,7 +56,8 @@ def read(data: bytes, name: str) -> Draft:
     if not start:
         raise MissionError("mission.empty-file", "is empty", name)
     if start.startswith(b"PK"):
-        raise MissionError("mission.zip-file", "is a zip file; unpack it and read the .kml inside", name)
+        sentence = "is a zip file, such as an .hprz or a .kmz; unpack it and give the file inside"
+        raise MissionError("mission.zip-file", sentence, name)
     if start.startswith(_XML_BEGINS):
         return _read_xml(data, name)
     if start.startswith(b"{") and not start.startswith(b"{\0"):
@@ -83,6 +84,8 @@ def _read_xml(data: bytes, name: str) -> Draft:
     if root == "kml":
         return read_kml(data, name)
     if root == "HarvestedProduction":
+        return read_hpr(data, name)
+    if b"HarvestedProduction" in data:
         return read_hpr(data, name)
     raise MissionError(
         "mission.unknown-xml",

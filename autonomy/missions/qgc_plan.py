@@ -1,7 +1,8 @@
 """QGroundControl ``.plan``: JSON; positions are latitude, longitude, height.
 
 Read: waypoints, the ground speed, fences (polygons and circles).  Heights are flight altitudes and are ignored, as are
-all commands that a forwarder cannot execute; notes list what was ignored.
+all commands that a forwarder cannot execute; notes list what was ignored.  A mission has one speed: of several that
+hold on its legs the slowest is taken, which is a warning.
 """
 
 from __future__ import annotations
@@ -18,6 +19,11 @@ from autonomy.missions.source import Source
 NAV_WAYPOINT: Final = 16
 NAV_SPLINE_WAYPOINT: Final = 82
 DO_CHANGE_SPEED: Final = 178
+GROUND_SPEED: Final = 1
+NO_CHANGE, DEFAULT_SPEED = -1, -2
+GLOBAL_FRAMES: Final = frozenset({0, 3, 5, 6, 10, 11})
+"""MAV_FRAME: latitude and longitude in degrees; the others are metres, or no place at all."""
+ARDUPILOT: Final = 3
 CIRCLE_CORNERS: Final = 48
 Path = tuple[str | int, ...]
 
@@ -38,7 +44,14 @@ def read(document: dict[str, Any], source: Source) -> Draft:
     if not isinstance(fence, dict):
         raise source.error("plan.geofence", ("geoFence",), "geoFence is not an object")
     reader.fences(fence)
-    draft = assemble(reader.shapes, source, "QGroundControl plan", "", Options(speed_m_s=reader.speed_m_s))
+    draft = assemble(reader.shapes, source, "QGroundControl plan", "", Options(speed_m_s=reader.speed_m_s()))
+    reader.tell(draft)
+    if mission.get("firmwareType") == ARDUPILOT and sum(not fence.keep_out for fence in draft.mission.fences) > 1:
+        sentence = (
+            "ArduPilot stays inside all keep-in fences at once unless it is set otherwise; here the machine stays "
+            "inside one of them, any of them, so draw the area as one fence"
+        )
+        draft.warn("plan.several-fences", ("geoFence",), sentence)
     draft.notes += [f"{count} × {what} ignored" for what, count in reader.left_out.items()]
     rally = document.get("rallyPoints")
     if isinstance(rally, dict) and rally.get("points"):
@@ -53,7 +66,24 @@ class _Reader:
         self.source = source
         self.shapes: list[Shape] = []
         self.left_out: Counter[str] = Counter()
-        self.speed_m_s: float | None = None
+        self.speeds_m_s: list[float | None] = []
+        self.other_speed: Path | None = None
+
+    def speed_m_s(self) -> float | None:
+        """The slowest speed that holds on a leg; None if none is given."""
+        return min((speed for speed in self.speeds_m_s if speed is not None), default=None)
+
+    def tell(self, draft: Draft) -> None:
+        """Warn of speeds that the mission does not have."""
+        slowest = self.speed_m_s()
+        if slowest is not None and len(set(self.speeds_m_s)) > 1:
+            sentence = (
+                f"the plan changes its speed on the way; a mission has one, so all legs are driven at {slowest:g} m/s"
+            )
+            draft.warn("plan.several-speeds", ("mission", "items"), sentence)
+        if self.other_speed is not None:
+            sentence = "this speed is no ground speed (type 1) and is not used; set the ground speed"
+            draft.warn("plan.speed-type", self.other_speed, sentence)
 
     def items(self, items: list[Any]) -> None:
         """The route: every waypoint item in its order."""
@@ -61,6 +91,7 @@ class _Reader:
             sentence = f"has {len(items)} items; a route has at most {MAX_WAYPOINTS} waypoints"
             raise self.source.error("mission.too-many-waypoints", ("mission", "items"), sentence)
         route = []
+        speed: float | None = None
         for i, item in enumerate(items):
             path: Path = ("mission", "items", i)
             if not isinstance(item, dict):
@@ -72,11 +103,23 @@ class _Reader:
                 if not isinstance(given, list) or len(given) < 6:
                     sentence = "a waypoint has seven params; the 5th and 6th are its position"
                     raise self.source.error("plan.params", path, sentence)
+                frame = item.get("frame", 0)
+                if not _number(frame) or frame not in GLOBAL_FRAMES:
+                    sentence = "the frame of this waypoint is not latitude and longitude; use a global frame"
+                    raise self.source.error("plan.frame", path, sentence)
                 route.append(self.position(given[4:6], (*path, "params")))
+                self.speeds_m_s.append(speed)
             elif command == DO_CHANGE_SPEED and isinstance(given, list) and len(given) > 1 and _number(given[1]):
-                self.speed_m_s = float(given[1]) if self.speed_m_s is None else self.speed_m_s
+                if given[1] == NO_CHANGE:
+                    continue
+                if given[0] == GROUND_SPEED:
+                    speed = None if given[1] == DEFAULT_SPEED else float(given[1])
+                else:
+                    self.other_speed = path
             else:
                 self.left_out[f"command {command}"[:40]] += 1
+        if len(route) > 1:
+            del self.speeds_m_s[0]  # a speed holds on the legs after it
         if route:
             kind: Any = "line" if len(route) > 1 else "point"
             self.shapes.append(Shape(kind, (tuple(route),), {}, ("mission", "items")))

@@ -177,8 +177,7 @@ def tree(
         code, line, sentence = error.args
         raise MissionError(code, f"{sentence}; thin it out, or split the mission", f"{name}:{line}") from None
     except ParseError as error:
-        code, sentence = _complaint(data, error, parser.parser.ErrorByteIndex)
-        raise MissionError(code, sentence, f"{name}:{error.position[0]}") from None
+        raise _refusal(data, error, parser.parser.ErrorByteIndex, name) from None
     except (ValueError, LookupError) as error:
         sentence = f"its encoding cannot be read ({error}); save the file with UTF-8"
         raise MissionError("mission.encoding", sentence, name) from None
@@ -192,28 +191,33 @@ def tree(
     return found
 
 
-def _complaint(data: bytes, error: ParseError, at_byte: int) -> tuple[str, str]:
-    """Code and sentence of what the parser refused."""
+def _refusal(data: bytes, error: ParseError, at_byte: int, name: str) -> MissionError:
+    """Why the parser refused a document."""
+    place = f"{name}:{error.position[0]}"
     reason = str(error).partition(":")[0]
     if error.code in _CUT:
-        return "mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?"
+        return MissionError("mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?", place)
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_MISPLACED_XML_PI]:
-        return "mission.xml-start", "something stands before <?xml; delete what comes before it, blanks and lines too"
+        return MissionError(
+            "mission.xml-start",
+            "something stands before <?xml; delete what comes before it, blanks and lines too",
+            place,
+        )
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_UNBOUND_PREFIX]:
         sentence = "this element or attribute has a prefix that no xmlns: declares; declare it, or delete the element"
-        return "mission.xml-prefix", sentence
+        return MissionError("mission.xml-prefix", sentence, place)
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_UNDEFINED_ENTITY]:
         sentence = "this contains an entity that XML does not know, such as &ntilde;; write the character itself"
-        return "mission.xml-entity", sentence
+        return MissionError("mission.xml-entity", sentence, place)
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_INCORRECT_ENCODING]:
-        return "mission.encoding", "the encoding in <?xml ...?> is not that of the file; save the file with UTF-8"
+        return MissionError(
+            "mission.encoding", "the encoding in <?xml ...?> is not that of the file; save the file with UTF-8", place
+        )
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_INVALID_TOKEN]:
         try:
             data[: at_byte + 8].decode("utf-8")
         except UnicodeDecodeError as found:
             if found.start <= at_byte and not data.startswith(_UTF_16):
-                return (
-                    "mission.encoding",
-                    f"byte {found.start} is not UTF-8 text; save the file with the encoding UTF-8",
-                )
-    return "mission.not-xml", f"this is not well-formed XML: {reason}"
+                sentence = f"byte {found.start} is not UTF-8 text; save the file with the encoding UTF-8"
+                return MissionError("mission.encoding", sentence, place)
+    return MissionError("mission.not-xml", f"this is not well-formed XML: {reason}", place)

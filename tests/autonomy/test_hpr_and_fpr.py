@@ -69,7 +69,36 @@ def test_stems_without_coordinates_are_counted() -> None:
     start = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
     end = TEXT.index("</StemCoordinates>", start) + len("</StemCoordinates>")
     draft = read((TEXT[:start] + TEXT[end:]).encode(), "h")
-    assert len(draft.mission.logs) == 5 and numbers_in(draft.notes[0])[0] == 2
+    assert len(draft.mission.logs) == 5 and draft.notes == []
+    assert [(p.code, numbers_in(p.sentence)) for p in draft.warnings] == [("hpr.no-coordinates", [2])]
+
+
+def test_a_position_in_the_processing_of_a_stem() -> None:
+    start = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
+    end = TEXT.index("</StemCoordinates>", start) + len("</StemCoordinates>")
+    given = TEXT[start:end].replace("StemCoordinates", "Coordinates")
+    inner = "<SingleTreeProcessedStem>"
+    moved = TEXT[:start] + TEXT[end:].replace(inner, inner + given, 1)
+    draft = read(moved.encode(), "h")
+    assert draft.mission.logs == read(TEXT.encode(), "h").mission.logs and draft.warnings == []
+
+
+def test_two_measurements_of_a_log_are_not_mixed() -> None:
+    other = (
+        '<LogMeasurement logMeasurementCategory="Other"><LogDiameter logDiameterCategory="Mid ob">999</LogDiameter>'
+        "<LogLength>999</LogLength></LogMeasurement>"
+    )
+    draft = read(TEXT.replace("<LogMeasurement", other + "<LogMeasurement", 1).encode(), "h")
+    again = read(TEXT.replace("</LogMeasurement>", "</LogMeasurement>" + other, 1).encode(), "h")
+    assert draft.mission.logs == again.mission.logs == read(TEXT.encode(), "h").mission.logs
+    assert [numbers_in(note) for note in draft.notes] == [[1]]
+
+
+def test_an_hpr_in_an_envelope() -> None:
+    body = TEXT[TEXT.index("<HarvestedProduction ") :]
+    draft = read(f"<Envelope><Head/>{body}</Envelope>".encode(), "h")
+    assert draft.mission.logs == read(TEXT.encode(), "h").mission.logs
+    assert problem(f"<Envelope>{body}{body}</Envelope>").code == "mission.envelope"
 
 
 @pytest.mark.parametrize(
