@@ -55,28 +55,26 @@ def join_id(priority: int, pgn: int, source: int, destination: int = BROADCAST) 
 
 
 class _Assembly:
-    __slots__ = ("length", "parts", "started_ns")
+    """The frames of one message so far; ``lost``: it cannot be completed, and its remaining frames are not used."""
 
-    def __init__(self, started_ns: int) -> None:
-        self.started_ns = started_ns
-        self.length: int | None = None
-        self.parts: dict[int, bytes] = {}
+    __slots__ = ("lost", "missing", "newest_ns", "next_index", "parts", "started_ns")
 
-    def payload(self) -> bytes | None:
-        """The payload, once every frame has arrived."""
-        if self.length is None:
-            return None
-        needed = 1 + max(0, -(-(self.length - FIRST_FRAME_BYTES) // NEXT_FRAME_BYTES))
-        if any(index not in self.parts for index in range(needed)):
-            return None
-        return b"".join(self.parts[i] for i in range(needed))[: self.length]
+    def __init__(self, missing: int, next_index: int, lost: bool, now_ns: int) -> None:
+        self.missing, self.next_index, self.lost = missing, next_index, lost
+        self.started_ns = self.newest_ns = now_ns
+        self.parts: list[bytes] = []
+
+    def continues(self, index: int, now_ns: int) -> bool:
+        """Whether a frame may be of this message: a later one, not stamped before its newest nor after 750 ms."""
+        return index >= self.next_index and self.newest_ns <= now_ns <= self.started_ns + MAX_FAST_PACKET_AGE_NS
 
 
 class Reassembler:
-    """Reassembles fast packets per source, PGN and sequence number, with frames in any order.
+    """Reassembles the fast packets of one bus per source, destination, PGN and sequence number.
 
-    A frame with a repeated index starts a new packet.  A packet not complete after 750 ms is dropped, and at most 64
-    are open; ``lost`` counts the dropped ones.
+    A message is complete only of its first frame and all further ones in the order of their counter, none stamped
+    before the one in front of it, within 750 ms.  Anything else loses it: frames without a first one, behind a gap or
+    from a clock that was set are not used.  At most 64 are open.  ``lost`` counts the messages lost so far.
     """
 
     def __init__(self) -> None:
@@ -89,31 +87,50 @@ class Reassembler:
             raise FrameRefused(Refusal.LENGTH, f"fast packet frame of PGN {split_id(key).pgn}")
         index, slot = data[0] & 0x1F, (key & 0x03FF_FFFF, data[0] >> 5)
         assembly = self._open.get(slot)
-        if assembly is not None and (index in assembly.parts or now_ns - assembly.started_ns > MAX_FAST_PACKET_AGE_NS):
-            del self._open[slot]
-            self.lost += 1
-            assembly = None
-        if assembly is None:
-            if len(self._open) >= MAX_OPEN_PACKETS:
-                self._drop_oldest()
-            assembly = self._open[slot] = _Assembly(now_ns)
         if index == 0:
-            if data[1] > MAX_FAST_PACKET_BYTES:
-                del self._open[slot]
-                raise FrameRefused(Refusal.LENGTH, f"fast packet of PGN {split_id(key).pgn}")
-            assembly.length = data[1]
-        assembly.parts[index] = data[2:8] if index == 0 else data[1:8]
-        payload = assembly.payload()
-        if payload is None:
+            self._lose(assembly)
+            assembly = self._begin(slot, data[1], 1, data[1] > MAX_FAST_PACKET_BYTES, now_ns)
+            part, room = data[2:8], FIRST_FRAME_BYTES
+        else:
+            if assembly is None or not assembly.continues(index, now_ns):
+                self._lose(assembly)
+                self.lost += 1  # the message of this frame, whose first one did not come
+                self._begin(slot, 0, index + 1, True, now_ns)
+                return None
+            if index > assembly.next_index:
+                self._lose(assembly)
+            assembly.newest_ns, assembly.next_index = now_ns, index + 1
+            if assembly.lost:
+                return None
+            part, room = data[1:8], NEXT_FRAME_BYTES
+        if assembly.lost or len(part) < min(assembly.missing, room):
+            assembly.lost = True  # refused, and counted as that
+            raise FrameRefused(Refusal.LENGTH, f"fast packet of PGN {split_id(key).pgn}")
+        if assembly.missing > room:
+            assembly.missing -= room
+            assembly.parts.append(part)
             return None
         del self._open[slot]
-        if len(payload) != assembly.length:
-            raise FrameRefused(Refusal.LENGTH, f"fast packet of PGN {split_id(key).pgn}")
-        return payload
+        return b"".join(assembly.parts) + part[: assembly.missing]
 
-    def _drop_oldest(self) -> None:
-        del self._open[min(self._open, key=lambda slot: self._open[slot].started_ns)]
-        self.lost += 1
+    def end(self) -> None:
+        """No more frames will come: what is still open is lost."""
+        for assembly in self._open.values():
+            self._lose(assembly)
+        self._open.clear()
+
+    def _begin(self, slot: tuple[int, int], missing: int, next_index: int, lost: bool, now_ns: int) -> _Assembly:
+        if slot not in self._open and len(self._open) >= MAX_OPEN_PACKETS:
+            oldest = min(self._open, key=lambda slot: self._open[slot].started_ns)
+            self._lose(self._open.pop(oldest))
+        assembly = self._open[slot] = _Assembly(missing, next_index, lost, now_ns)
+        return assembly
+
+    def _lose(self, assembly: _Assembly | None) -> None:
+        """Counts a message as lost, once."""
+        if assembly is not None and not assembly.lost:
+            assembly.lost = True
+            self.lost += 1
 
 
 def fast_packet(payload: bytes, sequence: int) -> Iterator[bytes]:
