@@ -16,8 +16,8 @@ from typing import Any, Final
 
 from can.io import blf
 
-from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame
-from can_dbc.trace.records import MalformedRecord
+from can_dbc.frame import ERROR, EXTENDED, REMOTE
+from can_dbc.trace.records import MalformedRecord, TraceFrame
 
 MAX_EXPANSION: Final = 64
 """Unpacked bytes per byte of the file; equal frames at equal steps, the most regular real traffic, reach 10."""
@@ -44,7 +44,7 @@ class _Damaged(Exception):
     """The objects cannot be followed any further."""
 
 
-def read_blf(content: bytes, notes: list[str]) -> Iterator[Frame | MalformedRecord]:
+def read_blf(content: bytes, notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
     """The frames of a file up to the first damage; a record says where that is, ``notes`` what else is not read."""
     return _Reader(content, notes).records()
 
@@ -62,7 +62,7 @@ class _Reader:
         self.other_types: Counter[int] = Counter()
         self.other_versions: Counter[int] = Counter()
 
-    def records(self) -> Iterator[Frame | MalformedRecord]:
+    def records(self) -> Iterator[TraceFrame | MalformedRecord]:
         content = self.content
         if content[:4] != b"LOGG" or len(content) < blf.FILE_HEADER_STRUCT.size:
             yield MalformedRecord(0, "not a BLF file: it does not start with a whole header LOGG")
@@ -93,7 +93,7 @@ class _Reader:
             types = ", ".join(str(t) for t in sorted(self.other_types)[:8])
             self.notes.append(f"{self.other_types.total()} objects are no CAN frames (object types {types})")
 
-    def _file(self, at: int) -> Iterator[Frame | MalformedRecord]:
+    def _file(self, at: int) -> Iterator[TraceFrame | MalformedRecord]:
         """Containers, and objects beside them."""
         content = self.content
         while True:
@@ -123,7 +123,7 @@ class _Reader:
                 raise _Damaged(f"the file ends inside the container at byte {at}")
             at = end
 
-    def _container(self, at: int, body: int, end: int) -> Iterator[Frame | MalformedRecord]:
+    def _container(self, at: int, body: int, end: int) -> Iterator[TraceFrame | MalformedRecord]:
         method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(self.content, body)
         first = body + blf.LOG_CONTAINER_STRUCT.size
         if method == blf.NO_COMPRESSION:
@@ -153,7 +153,7 @@ class _Reader:
                 packed = unpacker.unconsumed_tail
                 yield data
 
-    def _objects(self, data: bytes, place: str, origin: int | None = None) -> Iterator[Frame | MalformedRecord]:
+    def _objects(self, data: bytes, place: str, origin: int | None = None) -> Iterator[TraceFrame | MalformedRecord]:
         """The frames of the whole objects; what is left waits for the next container."""
         waiting = self.waiting
         offset = None if origin is None else origin - len(waiting)
@@ -218,7 +218,7 @@ class _Reader:
         return self.start_ns + int(stamp) * (10_000 if flags == blf.TIME_TEN_MICS else 1)
 
 
-def _frames(batch: list[tuple[int, bytes]]) -> Iterator[Frame | MalformedRecord]:
+def _frames(batch: list[tuple[int, bytes]]) -> Iterator[TraceFrame | MalformedRecord]:
     """The frames of whole objects: all at once, one by one if an object among them is damaged."""
     can_objects = [data for _, data in batch if not _is_plain_error(data)]
     messages = _messages(can_objects) if can_objects else []
@@ -227,7 +227,7 @@ def _frames(batch: list[tuple[int, bytes]]) -> Iterator[Frame | MalformedRecord]
     rest = iter(messages)
     for stamp_ns, data in batch:
         if _is_plain_error(data):
-            yield Frame(stamp_ns, ERROR, b"")
+            yield _plain_error(stamp_ns, data)
         elif (message := next(rest)) is not None:
             yield converted(message, stamp_ns)
         else:
@@ -236,6 +236,12 @@ def _frames(batch: list[tuple[int, bytes]]) -> Iterator[Frame | MalformedRecord]
 
 def _is_plain_error(data: bytes) -> bool:
     return bool(blf.OBJ_HEADER_BASE_STRUCT.unpack_from(data)[4] == CAN_ERROR)
+
+
+def _plain_error(stamp_ns: int, data: bytes) -> TraceFrame:
+    body = blf.OBJ_HEADER_BASE_STRUCT.size + STAMPS[blf.OBJ_HEADER_BASE_STRUCT.unpack_from(data)[2]].size
+    channel = data[body : body + 2]
+    return TraceFrame(stamp_ns, ERROR, b"", str(int.from_bytes(channel, "little")) if channel else "")
 
 
 def _messages(objects: list[bytes]) -> list[Any] | None:
@@ -253,8 +259,9 @@ def _messages(objects: list[bytes]) -> list[Any] | None:
     return found if len(found) == len(objects) else None
 
 
-def converted(message: Any, stamp_ns: int) -> Frame:
-    """A python-can message as a frame."""
+def converted(message: Any, stamp_ns: int) -> TraceFrame:
+    """A python-can message as a frame; its channel is that of the file less one."""
     key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
     key |= (REMOTE if message.is_remote_frame else 0) | (ERROR if message.is_error_frame else 0)
-    return Frame(stamp_ns, key, b"" if message.is_remote_frame else bytes(message.data))
+    data = b"" if message.is_remote_frame else bytes(message.data)
+    return TraceFrame(stamp_ns, key, data, "" if message.channel is None else str(message.channel + 1))

@@ -1,8 +1,8 @@
 """Reads CAN traces of other tools: candump (all forms), PCAN (TRC 1.0 to 2.1), Yacht Devices text, ASC and BLF.
 
-``read_trace`` yields a ``Frame`` per valid record and a ``MalformedRecord`` per line that cannot be parsed; it never
-raises for the contents of a file.  Its ``notes`` say what else is not read.  Stamps are ns on the trace's own scale, 0
-if it has none.  Blank lines, comments and header lines of the known formats are not records and are skipped.
+``read_trace`` yields a ``TraceFrame`` per valid record and a ``MalformedRecord`` per line that cannot be parsed; it
+never raises for the contents of a file.  Its ``notes`` say what else is not read.  Stamps are ns on the trace's own
+scale, 0 if it has none.  Blank lines, comments and header lines of the known formats are not records and are skipped.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
+from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK
 from can_dbc.text import decoded
-from can_dbc.trace.records import MalformedRecord, Trace
+from can_dbc.trace.records import MalformedRecord, Trace, TraceFrame
 
 CANDUMP: Final = re.compile(r"\((\d+(?:\.\d+)?)\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(\S*)")
 CANDUMP_SCREEN: Final = re.compile(
-    r"(?:<0x[0-9a-f]+>)?\s*(?:\((\d+(?:\.\d+)?|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d+)\)\s+)?[A-Za-z]\S*\s+"
+    r"(?:<0x[0-9a-f]+>)?\s*(?:\((\d+(?:\.\d+)?|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d+)\)\s+)?([A-Za-z]\S*)\s+"
     r"(?:[TR]X\s(?:[-BE]\s)*\s*)?([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+"
     r"\[(\d+)\]\s*((?:[0-9A-Fa-f]{2}\s*)*|remote request[^']*)(?:ERRORFRAME\s*)?(?:'.*')?$"
 )
@@ -63,7 +63,7 @@ def read_trace(path: Path) -> Trace:
 # -- text ----------------------------------------------------------------------------------------------------
 
 
-def _text(lines: list[str], notes: list[str]) -> Iterator[Frame | MalformedRecord]:
+def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
     pcan = Pcan()
     error_frame = False
     for number, raw in enumerate(lines, 1):
@@ -86,7 +86,7 @@ def _text(lines: list[str], notes: list[str]) -> Iterator[Frame | MalformedRecor
         notes.append(f"{pcan.others.total()} rows of PCAN hold no frames ({kinds})")
 
 
-def parse_line(line: str) -> Frame | None:
+def parse_line(line: str) -> TraceFrame | None:
     """The frame in one line of any of the text formats; None if the line is of another format or damaged."""
     try:
         return _parsed(line)
@@ -94,12 +94,13 @@ def parse_line(line: str) -> Frame | None:
         return None
 
 
-def _parsed(line: str) -> Frame | None:
+def _parsed(line: str) -> TraceFrame | None:
     if found := CANDUMP.match(line):
-        return _candump(found[1], found[3], found[4])
+        return _candump(found[1], found[2], found[3], found[4])
     if found := CANDUMP_SCREEN.match(line):
-        remote = found[4].startswith("remote")
-        return _frame(found[1] or "0", found[2], "" if remote else found[4], None if remote else int(found[3]), remote)
+        remote = found[5].startswith("remote")
+        data, length = ("", None) if remote else (found[5], int(found[4]))
+        return _frame(found[1] or "0", found[3], data, length, remote, found[2])
     if found := PCAN_VIEW.match(line):
         return _frame(_milliseconds(found[1]), found[2], found[4], int(found[3]))
     if found := YACHT_DEVICES.match(line):
@@ -108,14 +109,16 @@ def _parsed(line: str) -> Frame | None:
     return None
 
 
-def _candump(stamp: str, identifier: str, rest: str) -> Frame | None:
+def _candump(stamp: str, interface: str, identifier: str, rest: str) -> TraceFrame | None:
     if rest[:1] == "R":
-        return _frame(stamp, identifier, "", None, remote=True)
+        return _frame(stamp, identifier, "", None, remote=True, interface=interface)
     payload = PAYLOAD.match(rest)
-    return _frame(stamp, identifier, payload[1].replace(".", "")) if payload else None
+    return _frame(stamp, identifier, payload[1].replace(".", ""), interface=interface) if payload else None
 
 
-def _frame(stamp: str, identifier: str, data: str, length: int | None = None, remote: bool = False) -> Frame | None:
+def _frame(
+    stamp: str, identifier: str, data: str, length: int | None = None, remote: bool = False, interface: str = ""
+) -> TraceFrame | None:
     payload = bytes.fromhex(data)
     value = int(identifier, 16)
     if len(payload) > MAX_DATA or length not in (None, len(payload)):
@@ -125,7 +128,7 @@ def _frame(stamp: str, identifier: str, data: str, length: int | None = None, re
         key = value & (ERROR | EXTENDED_MASK) if value & ERROR else value & EXTENDED_MASK | EXTENDED
     else:
         key = value & STANDARD_MASK
-    return Frame(_nanoseconds(stamp), key | (REMOTE if remote else 0), payload)
+    return TraceFrame(_nanoseconds(stamp), key | (REMOTE if remote else 0), payload, interface)
 
 
 def _nanoseconds(text: str) -> int:
@@ -161,7 +164,7 @@ class Pcan:
         elif key == "$COLUMNS":
             self.columns = value.replace(",", "")
 
-    def frame(self, line: str) -> Frame | None:
+    def frame(self, line: str) -> TraceFrame | None:
         """The frame of a row: data, remote, or an error frame for a bus error or warning; None for another row."""
         try:
             return self._parsed(self._cells(line))
@@ -181,27 +184,27 @@ class Pcan:
             columns = PCAN_COLUMNS["1.1"]  # PCAN-View's rows, pasted without their header
         return dict(zip(columns, line.split(maxsplit=len(columns) - 1), strict=False))
 
-    def _parsed(self, cells: dict[str, str]) -> Frame | None:
+    def _parsed(self, cells: dict[str, str]) -> TraceFrame | None:
         kind, identifier, data = cells.get("T", "Rx"), cells["I"], cells.get("D", "")
         if not re.fullmatch(r"\d+\)?", cells["N"]) or not re.fullmatch(r"\d+(\.\d+)?", cells["O"]):
             return None
-        stamp_ns = _nanoseconds(_milliseconds(cells["O"]))
+        stamp, bus = _milliseconds(cells["O"]), cells.get("B", "")
         if kind in PCAN_ERRORS or identifier == "FFFFFFFF":
             shown = re.match(r"(?:[0-9A-Fa-f]{2}\b\s*){0,8}", data)
-            return Frame(stamp_ns, ERROR, bytes.fromhex(shown[0]) if shown else b"")
+            return TraceFrame(_nanoseconds(stamp), ERROR, bytes.fromhex(shown[0]) if shown else b"", bus)
         if kind not in PCAN_DATA or not re.fullmatch(r"[0-9A-Fa-f]{4}|[0-9A-Fa-f]{8}", identifier):
             return None
         remote = kind == "RR" or data.strip() == "RTR"
         length = int(cells["l"] if "l" in cells else cells["L"])
         if "l" not in cells and kind not in ("DT", "RR", "Rx", "Tx"):
             length = FD_BYTES[length] if length < len(FD_BYTES) else -1
-        return _frame(_milliseconds(cells["O"]), identifier, "" if remote else data, None if remote else length, remote)
+        return _frame(stamp, identifier, "" if remote else data, None if remote else length, remote, bus)
 
 
 # -- ASC, each line through python-can -----------------------------------------------------------------------
 
 
-def _asc(lines: list[str], notes: list[str]) -> Iterator[Frame | MalformedRecord]:
+def _asc(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
     """Reads ASC line by line, so that a damaged line affects only itself.
 
     The stamp is read here: python-can takes neither a negative nor a relative one.
@@ -231,7 +234,7 @@ def _asc(lines: list[str], notes: list[str]) -> Iterator[Frame | MalformedRecord
         notes.append(f"{others} lines are events of other kinds and hold no CAN frames")
 
 
-def _asc_frame(event: str, base: str, stamp_ns: int) -> Frame | None:
+def _asc_frame(event: str, base: str, stamp_ns: int) -> TraceFrame | None:
     from can.io.asc import ASCReader
 
     from can_dbc.trace.blf import converted

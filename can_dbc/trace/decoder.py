@@ -2,6 +2,7 @@
 
 Input is every record of `can_dbc.trace.candump`; output is a ``DecodedMessage`` for each message of a database.
 Nothing raises for the contents of a trace: a frame of wrong length, out of range or with a bad CRC has ``fault`` set.
+The fast packets of NMEA 2000 and the transport protocol of J1939 are reassembled for each interface of the trace apart.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from typing import Any, Final
 from can_dbc.dbc.codec import Database, FrameRefused, MessageCodec, load
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, describe
 from can_dbc.protocols.e2e import frame_crc
+from can_dbc.protocols.j1939_transport import CONNECTION_PGN, DATA_PGN, Transport
 from can_dbc.protocols.nmea2000 import Reassembler, split_id
-from can_dbc.trace.records import MalformedRecord
+from can_dbc.trace.records import MalformedRecord, TraceFrame
 
 MAX_EXAMPLES: Final = 5
 FIRST_FAST_PACKET_PGN: Final = 0x1ED00
-"""Long messages of NMEA 2000 travel as fast packets; those of J1939, whose PGNs are lower, by J1939 transport."""
-TRANSPORT_PGNS: Final = (0xEB00, 0xEC00)
+"""NMEA 2000 has fast packets from here on (126208 is the first in use); the PGNs of J1939 lie below."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class DecodedMessage:
     labels: dict[str, str]
     units: dict[str, str]
     fault: str
+    interface: str = ""
 
     def text(self) -> str:
         """The values in one line: ``Name=value unit``, labels where the database has them."""
@@ -53,6 +55,7 @@ class DecodedMessage:
         }
         entry = {
             "time_ns": self.stamp_ns,
+            "interface": self.interface,
             "id": self.identifier,
             "name": self.name,
             "values": finite,
@@ -61,12 +64,22 @@ class DecodedMessage:
         return entry | {"fault": self.fault} if self.fault else entry
 
 
+class _Bus:
+    """What is under way on one interface of a trace."""
+
+    __slots__ = ("frames", "interface", "reassembler", "transport")
+
+    def __init__(self, interface: str) -> None:
+        self.interface, self.frames = interface, 0
+        self.reassembler, self.transport = Reassembler(), Transport()
+
+
 class Decoder:
     """Decodes frames with the first database that has their message; raises DbcError for an unusable file."""
 
     def __init__(self, files: Sequence[str]) -> None:
         self.databases: list[Database] = [load(file) for file in files]
-        self.reassembler = Reassembler()
+        self._buses: dict[str, _Bus] = {}
         self.counts: Counter[str] = Counter()
         self.messages: Counter[str] = Counter()
         self.broken_examples: list[str] = []
@@ -81,39 +94,82 @@ class Decoder:
                     self.broken_examples.append(where + record.text[: 80 if record.line else None])
                 continue
             self.counts["frames"] += 1
-            entry = self._frame(record)
-            if entry is not None:
+            bus = self._bus(record)
+            bus.frames += 1
+            for entry in self._entries(record, bus):
                 self.counts["decoded"] += not entry.fault
                 self.messages[entry.name] += 1
                 yield entry
+        for bus in self._buses.values():
+            bus.reassembler.end()
+            bus.transport.end()
 
     def summary(self) -> dict[str, Any]:
         """Counts of the records, by kind and by message."""
-        names = ("frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken", "j1939_transport")
+        names = (
+            "frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken", "transported",
+            "unknown_transported",
+        )  # fmt: skip
+        buses = self._buses.values()
         return {name: self.counts[name] for name in names} | {
-            "lost_fast_packets": self.reassembler.lost,
+            "lost_fast_packets": sum(bus.reassembler.lost for bus in buses),
+            "lost_transported": sum(bus.transport.lost for bus in buses),
+            "extended_transported": sum(bus.transport.extended for bus in buses),
+            "interfaces": {name: bus.frames for name, bus in sorted(self._buses.items()) if name},
             "messages": dict(sorted(self.messages.items())),
             "broken_examples": self.broken_examples,
         }
 
-    def _frame(self, frame: Frame) -> DecodedMessage | None:
+    def _bus(self, frame: Frame) -> _Bus:
+        interface = frame.interface if isinstance(frame, TraceFrame) else ""
+        bus = self._buses.get(interface)
+        if bus is None:
+            bus = self._buses[interface] = _Bus(interface)
+        return bus
+
+    def _find(self, key: int) -> MessageCodec | None:
+        return next((c for d in self.databases if (c := d.find(key)) is not None), None)
+
+    def _entries(self, frame: Frame, bus: _Bus) -> Iterator[DecodedMessage]:
+        entry = self._frame(frame, bus)
+        if entry is not None:
+            yield entry
+        message = bus.transport.receive(frame.key, frame.data, frame.stamp_ns)
+        if message is None:
+            return
+        self.counts["transported"] += 1
+        codec = self._find(message.key)
+        if codec is None:
+            self.counts["unknown_transported"] += 1
+            return
+        yield self._checked(Frame(frame.stamp_ns, *message), codec, message.data[: codec.length], bus)
+
+    def _frame(self, frame: Frame, bus: _Bus) -> DecodedMessage | None:
         if frame.key & (ERROR | REMOTE):
             self.counts["error_frames" if frame.key & ERROR else "unknown"] += 1
             return None
-        codec = next((c for d in self.databases if (c := d.find(frame.key)) is not None), None)
+        codec = self._find(frame.key)
         if codec is None:
-            self.counts["unknown"] += 1
-            self.counts["j1939_transport"] += bool(frame.key & EXTENDED) and split_id(frame.key).pgn in TRANSPORT_PGNS
+            if not (frame.key & EXTENDED and split_id(frame.key).pgn in (CONNECTION_PGN, DATA_PGN)):
+                self.counts["unknown"] += 1
             return None
-        try:
-            data = self._payload(frame, codec)
-        except FrameRefused as refusal:
-            self.counts["refused"] += 1
-            return _decoded(frame, codec, {}, str(refusal))
-        if data is None:
-            return None
+        data: bytes | None = frame.data
+        if _is_fast_packet(codec):
+            try:
+                data = bus.reassembler.add(frame.key, frame.data, frame.stamp_ns)
+            except FrameRefused as refusal:
+                self.counts["refused"] += 1
+                return _decoded(frame, codec, {}, str(refusal), bus)
+        return None if data is None else self._checked(frame, codec, data, bus)
+
+    def _checked(self, frame: Frame, codec: MessageCodec, data: bytes, bus: _Bus) -> DecodedMessage:
+        """A message with all its bytes; those of a PGN may be more than the database describes, or fewer in J1939."""
+        if codec.by_pgn and codec.length > 8:
+            data = data[: codec.length]
         fault = ""
         try:
+            if codec.by_pgn and len(data) < codec.length and not _is_fast_packet(codec) and codec.length > 8:
+                return _decoded(frame, codec, _present(codec, data), "", bus)
             values = codec.named(codec.receive(data))
         except FrameRefused as refusal:
             self.counts["refused"] += 1
@@ -121,14 +177,7 @@ class Decoder:
         if not fault and codec.data_ids and frame_crc(data, codec.data_ids) != data[0]:
             self.counts["bad_crc"] += 1
             fault = "bad CRC"
-        return _decoded(frame, codec, values, fault)
-
-    def _payload(self, frame: Frame, codec: MessageCodec) -> bytes | None:
-        """The bytes to decode; None while a fast packet is incomplete."""
-        if not codec.by_pgn or codec.length <= 8 or split_id(frame.key).pgn < FIRST_FAST_PACKET_PGN:
-            return frame.data
-        data = self.reassembler.add(frame.key, frame.data, frame.stamp_ns)
-        return None if data is None else data[: codec.length]
+        return _decoded(frame, codec, values, fault, bus)
 
     @staticmethod
     def _unchecked(codec: MessageCodec, data: bytes) -> dict[str, Any]:
@@ -139,7 +188,31 @@ class Decoder:
             return {}
 
 
-def _decoded(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str) -> DecodedMessage:
+def _is_fast_packet(codec: MessageCodec) -> bool:
+    """Whether a message travels as a fast packet; a long message of J1939 uses the transport protocol instead."""
+    return codec.by_pgn and codec.length > 8 and split_id(codec.key).pgn >= FIRST_FAST_PACKET_PGN
+
+
+def _present(codec: MessageCodec, data: bytes) -> dict[str, Any]:
+    """The values whose bits a message of J1939 holds that is shorter than the database describes; raises
+    FrameRefused.
+    """
+    padded = data.ljust(codec.length, b"\xff")
+    little, big = int.from_bytes(padded, "little"), int.from_bytes(padded, "big")
+    found: dict[str, Any] = {}
+    raws: dict[int, int | float] = {}
+    for place, s in enumerate(codec.signals):
+        last_byte = codec.length - 1 - s.shift // 8 if s.big_endian else (s.shift + s.bits - 1) // 8
+        if last_byte >= len(data) or (s.parent is not None and raws.get(s.parent) not in s.parent_ids):
+            continue
+        raws[place] = raw = s.extract(little, big)
+        value = s.valid(raw)
+        if value is not None:
+            found[s.name] = value
+    return found
+
+
+def _decoded(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str, bus: _Bus) -> DecodedMessage:
     labels, units = {}, {}
     values = {name: value for name, value in values.items() if not name.startswith("Reserved")}
     for s in codec.signals:
@@ -150,4 +223,5 @@ def _decoded(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: s
                 labels[s.name] = label
         if s.unit not in ("", "1"):
             units[s.name] = s.unit
-    return DecodedMessage(frame.stamp_ns, describe(frame.key), codec.name, values, labels, units, fault)
+    key = describe(frame.key)
+    return DecodedMessage(frame.stamp_ns, key, codec.name, values, labels, units, fault, bus.interface)

@@ -1,11 +1,23 @@
-"""What a reader of traces yields besides frames, and what it says at the end."""
+"""What a reader of traces yields, and what it says at the end."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from can_dbc.frame import Frame
+
+
+class TraceFrame(Frame):
+    """A frame of a trace with the interface (or channel) that the trace names, "" if it names none."""
+
+    interface: str
+
+    def __new__(cls, stamp_ns: int, key: int, data: bytes, interface: str = "") -> Self:
+        """As a ``Frame``, which it equals."""
+        frame = super().__new__(cls, stamp_ns, key, data)
+        frame.interface = interface
+        return frame
 
 
 class MalformedRecord(NamedTuple):
@@ -15,12 +27,12 @@ class MalformedRecord(NamedTuple):
     text: str
 
 
-class Trace(Iterator[Frame | MalformedRecord]):
+class Trace(Iterator[TraceFrame | MalformedRecord]):
     """The records of a trace in file order; ``notes`` is complete behind the last one and says what is not read."""
 
-    def __init__(self, reader: Callable[[list[str]], Iterator[Frame | MalformedRecord]]) -> None:
+    def __init__(self, reader: Callable[[list[str]], Iterator[TraceFrame | MalformedRecord]]) -> None:
         self.notes: list[str] = []
         self._records = reader(self.notes)
 
-    def __next__(self) -> Frame | MalformedRecord:
+    def __next__(self) -> TraceFrame | MalformedRecord:
         return next(self._records)

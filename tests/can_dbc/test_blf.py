@@ -14,7 +14,7 @@ from can.io import blf
 from can_dbc.frame import ERROR, Frame
 from can_dbc.trace import blf as reader
 from can_dbc.trace.candump import read_trace
-from can_dbc.trace.records import MalformedRecord
+from can_dbc.trace.records import MalformedRecord, TraceFrame
 
 START = (2023, 11, 2, 14, 22, 13, 20, 0)
 START_NS = 1_700_000_000_000_000_000
@@ -114,7 +114,9 @@ def test_other_objects_are_a_note_and_error_frames_are_frames() -> None:
     body = can_object(MS, 1) + can_object(MS, 2, kind=65) + can_object(MS, 3, kind=reader.CAN_ERROR)
     notes: list[str] = []
     found = list(reader.read_blf(file(container(body), 3), notes))
-    assert [(f.key, len(f.data)) for f in found if isinstance(f, Frame)] == [(0x185, 8), (ERROR, 0)]
+    assert [(f.key, len(f.data), f.interface) for f in found if isinstance(f, TraceFrame)] == [
+        (0x185, 8, "1"), (ERROR, 0, "1"),
+    ]  # fmt: skip
     assert len(notes) == 1 and "65" in notes[0]
 
 

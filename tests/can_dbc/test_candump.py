@@ -10,9 +10,10 @@ import pytest
 
 from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame
+from can_dbc.protocols import nmea2000 as n2k
 from can_dbc.trace.candump import parse_line, read_trace
 from can_dbc.trace.decoder import Decoder
-from can_dbc.trace.records import MalformedRecord
+from can_dbc.trace.records import MalformedRecord, TraceFrame
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
 N2K = 0x09F8027F | EXTENDED
@@ -155,5 +156,58 @@ def test_decoder_counts_everything() -> None:
     summary = decoder.summary()
     assert {k: v for k, v in summary.items() if isinstance(v, int)} == {
         "frames": 7, "decoded": 1, "unknown": 2, "refused": 2, "bad_crc": 1, "error_frames": 1, "broken": 1,
-        "j1939_transport": 0, "lost_fast_packets": 0,
+        "lost_fast_packets": 0, "transported": 0, "unknown_transported": 0, "lost_transported": 0,
+        "extended_transported": 0,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("line", "interface"),
+    [
+        ("(1502984866.421964) slcan0 09F8027F#00FCFFFF0000FFFF", "slcan0"),
+        ("(1.5) can1 210#R", "can1"),
+        ("(1.25)  vcan0  RX - -  210   [2]  00 FC", "vcan0"),
+        ("can3  210   [4]  remote request", "can3"),
+        ("5)      1027.75  Tx     0210  2  00 FC", ""),
+    ],
+)
+def test_a_line_names_its_interface(line: str, interface: str) -> None:
+    frame = parse_line(line)
+    assert isinstance(frame, TraceFrame) and frame.interface == interface
+
+
+def test_channels_of_a_file_are_its_interfaces(tmp_path: Path) -> None:
+    for name in ("x.asc", "x.blf"):
+        with can.Logger(tmp_path / name) as logger:
+            for channel in (0, 1):
+                logger.on_message_received(can.Message(timestamp=1.0, arbitration_id=1, data=b"\0", channel=channel))
+        frames = list(read_trace(tmp_path / name))
+        assert [f.interface for f in frames if isinstance(f, TraceFrame)] == ["1", "2"]
+
+
+def fix(interface: str, latitude_deg: float, sequence: int) -> list[TraceFrame]:
+    """The frames of a position, 1 ms apart."""
+    from can_dbc.dbc import codec
+
+    message = codec.load("gnss").messages["GnssPositionData"]
+    payload = n2k.encode(message, Latitude=latitude_deg, Longitude=1.0)
+    frames = n2k.frames(message, payload, source=0x1C, sequence=sequence)
+    return [TraceFrame(i * 1_000_000, key, data, interface) for i, (key, data) in enumerate(frames)]
+
+
+def test_two_interfaces_are_two_buses() -> None:
+    north, south = fix("can0", 63.0, 3), fix("can1", 47.0, 3)
+    mixed = [frame for pair in zip(north, south, strict=True) for frame in pair]
+    decoder = Decoder(["gnss"])
+    found = [(e.interface, e.values["Latitude"]) for e in decoder.run(mixed)]
+    assert found == [("can0", pytest.approx(63.0)), ("can1", pytest.approx(47.0))]
+    assert decoder.summary()["interfaces"] == {"can0": 7, "can1": 7}
+    torn = Decoder(["gnss"])
+    assert list(torn.run(south[:4] + north[4:])) == []
+    assert torn.summary()["lost_fast_packets"] == 2
+
+
+def test_a_message_cut_by_the_end_of_a_trace_is_lost() -> None:
+    decoder = Decoder(["gnss"])
+    assert list(decoder.run(fix("can0", 63.0, 0)[:-1])) == []
+    assert decoder.summary()["lost_fast_packets"] == 1

@@ -14,7 +14,7 @@ from can_dbc.text import decoded
 from can_dbc.trace import candump
 from can_dbc.trace.candump import read_trace
 from can_dbc.trace.decoder import Decoder
-from can_dbc.trace.records import MalformedRecord, Trace
+from can_dbc.trace.records import MalformedRecord, Trace, TraceFrame
 
 MS = 1_000_000
 TRC = {
@@ -50,6 +50,8 @@ def test_pcan_rows(tmp_path: Path, version: str) -> None:
     ]  # fmt: skip
     assert all(isinstance(r, Frame) and r.key == ERROR for r in found[3:]) and len(found) > 3
     assert len(trace.notes) == (version in ("2.0", "2.1"))
+    buses = {"1.2": ["1", "1", "2", "1"], "1.3": ["1", "1", "2", "1"], "2.1": ["1"] * 4}.get(version, [""] * 4)
+    assert [r.interface for r in found[:4] if isinstance(r, TraceFrame)] == buses
 
 
 @pytest.mark.parametrize("version", ["1.0", "1.1", "1.3", "2.0", "2.1"])
@@ -116,7 +118,7 @@ def test_the_words_about_an_error_frame_belong_to_it(tmp_path: Path) -> None:
         " (1.0)  can0  20000004   [8]  00 08 00 00 00 00 60 00   ERRORFRAME\n\tcontroller-problem{tx-error-warning}\n"
     )
     assert [type(r) for r in write(tmp_path / "x.log", text + "\tstill the same\n (2.0)  can0  210   [0]\n")] == [
-        Frame, Frame,
+        TraceFrame, TraceFrame,
     ]  # fmt: skip
 
 
@@ -169,8 +171,8 @@ def test_a_message_of_j1939_is_no_fast_packet(tmp_path: Path) -> None:
     decoder = Decoder([str(path)])
     frames = [Frame(i * MS, 0x18FECA00 | EXTENDED, bytes(8)) for i in range(3)]
     frames += [Frame(9 * MS, pgn | EXTENDED, bytes(8)) for pgn in (0x1CECFF00, 0x1CEBFF00)]
-    assert [bool(e.fault) for e in decoder.run(frames)] == [True] * 3
+    assert [(e.values, e.fault) for e in decoder.run(frames)] == [({"Spn1": 0}, "")] * 3
     summary = decoder.summary()
-    assert (summary["lost_fast_packets"], summary["j1939_transport"], summary["refused"], summary["decoded"]) == (
-        0, 2, 3, 0,
+    assert (summary["lost_fast_packets"], summary["transported"], summary["refused"], summary["decoded"]) == (
+        0, 0, 0, 3,
     )  # fmt: skip

@@ -36,7 +36,8 @@ def decode(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print the counts only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Decode a CAN recording with one or more databases (default: all shipped ones), fast packets included.
+    """Decode a CAN recording with one or more databases (default: all shipped ones), with the fast packets of
+    NMEA 2000 and the transport protocol of J1939.  Each interface of the recording is a bus of its own.
 
     Malformed lines are counted and not fatal; a frame out of range or with a
     bad CRC is shown and counted. A file in which no frame can be read ends
@@ -96,7 +97,10 @@ def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> No
             mark = f"  [red]{escape(entry.fault)}[/red]" if entry.fault else ""
             name = escape(f"{entry.name:<20}")
             stamp = f"{entry.stamp_ns / 1e9:17.6f}"
-            console.print(f"[dim]{stamp} {entry.identifier:>8}[/dim] [cyan]{name}[/cyan] {escape(entry.text())}{mark}")
+            interface = escape(f" {entry.interface}" if entry.interface else "")
+            console.print(
+                f"[dim]{stamp}{interface} {entry.identifier:>8}[/dim] [cyan]{name}[/cyan] {escape(entry.text())}{mark}"
+            )
     _refuse_nothing(recording, decoder)
     summary = decoder.summary()
     table = Table(box=None, header_style="bold", pad_edge=False)
@@ -111,8 +115,15 @@ def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> No
         f"{summary['error_frames']} error frames, "
         f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} malformed records"
     )
-    if summary["j1939_transport"]:
-        console.print(f"{summary['j1939_transport']} frames of J1939 transport (TP.CM, TP.DT), which is not decoded")
+    if summary["transported"] or summary["lost_transported"] or summary["extended_transported"]:
+        console.print(
+            f"J1939 transport protocol: {summary['transported']} messages, {summary['unknown_transported']} of them "
+            f"unknown, {summary['lost_transported']} lost, {summary['extended_transported']} of the extended protocol "
+            "not decoded"
+        )
+    if len(summary["interfaces"]) > 1:
+        counts = ", ".join(f"{name} {count} frames" for name, count in summary["interfaces"].items())
+        console.print(escape(f"interfaces, decoded apart: {counts}"))
     for note in records.notes:
         console.print(escape(note))
     for text in summary["broken_examples"]:
