@@ -77,6 +77,18 @@ def test_a_file_without_motions_is_refused(tmp_path: Path, name: str, text: str 
         motions_in(SHOWN, "palms_471")
 
 
+def test_encoder_frames_of_two_interfaces_are_refused(tmp_path: Path) -> None:
+    log = tmp_path / "both.log"
+    encoder = load_database("crane").message("EncSlew").key
+    lines = [f"({i / 100:.6f}) can{i % 2} {encoder:03X}#0011223344556677\n" for i in range(4)]
+    log.write_text("".join(lines))
+    with pytest.raises(CommandFailed, check=coded("demonstration.several-buses")):
+        motions_in(log)
+    log.write_text("".join(lines[::2]) + "(9.0) can1 18FECA00#04FF6E000401FFFF\n")
+    with pytest.raises(CommandFailed, check=coded("demonstration.encoder-missing")):
+        motions_in(log)
+
+
 @pytest.mark.long
 def test_a_recording_of_hands_on_the_levers_is_learned_from(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run", PROFILE, describe(PROFILE, ("crane0", "mach0"), 2))

@@ -17,10 +17,11 @@ from autonomy.motion.demonstration import (
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.trace.candump import read_trace
+from can_dbc.trace.records import TraceFrame
 from hil.replay.recording import files_of, manifest_of
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import ProfileError, load_profile
-from machine.profile import Profile
+from machine.profile import Profile, encoders
 from recorder.mcap_scan import NotMcap, Stored, scan
 
 _RAW: Final = struct.Struct("<IB3x8s")
@@ -62,7 +63,7 @@ def _frames(log: Path, profile: str | None) -> tuple[Profile, Iterator[Frame]]:
     if log.is_file() and log.suffix.lower() != ".mcap":
         machine = load_profile(profile or DEFAULT_PROFILE)
         try:
-            return machine, (entry for entry in read_trace(log) if isinstance(entry, Frame))
+            return machine, _of_one_interface(log, machine)
         except OSError as error:
             raise CommandFailed(
                 "demonstration.unreadable", f"{log} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
@@ -70,6 +71,22 @@ def _frames(log: Path, profile: str | None) -> tuple[Profile, Iterator[Frame]]:
     files = files_of(log)
     machine = load_profile(profile or manifest_of(files).profile)
     return machine, _raw(files, f"/{machine.crane_bus}/raw")
+
+
+def _of_one_interface(log: Path, machine: Profile) -> Iterator[Frame]:
+    """The encoder frames of a log; refused when they come on several interfaces, which may be two machines."""
+    database = load_database("crane")
+    keys = {database.message(e.message).key for e in encoders(machine).values() if e.message in database.messages}
+    frames = [entry for entry in read_trace(log) if isinstance(entry, TraceFrame) and entry.key in keys]
+    interfaces = sorted({frame.interface for frame in frames})
+    if len(interfaces) > 1:
+        raise CommandFailed(
+            "demonstration.several-buses",
+            f"{log} holds encoder frames of {len(interfaces)} interfaces ({', '.join(interfaces)}); keep the lines of "
+            "one of them",
+            ExitCode.CONFIGURATION,
+        )
+    return iter(frames)
 
 
 def _raw(files: Sequence[Path], topic: str) -> Iterator[Frame]:
