@@ -16,6 +16,7 @@ from typing import Any, Final
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.bus_io.message_state import MessageState, Signal
 from controller.carrier.bus import CarrierBus
+from controller.carrier.dead_reckoning import TRUE_REFERENCE
 from controller.carrier.inputs import CarrierInputs
 from controller.crane.inputs import CraneInputs
 from controller.crane.startup import Startup
@@ -64,7 +65,8 @@ _PRESSED: Final = 0
 _YES: Final = 1
 _ENABLED: Final = 0xA
 _VALVE_PILOT_OFF: Final = 3
-_VALVE_FAULT: Final = 4
+_VALVE_NOT_GOOD: Final = (4, None)
+"""ValveFbA.State: a fault, or the node does not say whether there is one."""
 _ALARM_SIGNALS: Final = {"rotary": "Alarms", "linear": "SystemReg"}
 
 
@@ -91,6 +93,7 @@ class Supervisor:
         "_lever",
         "_person",
         "_plc_faults",
+        "_reference",
         "_reset_button",
         "_reset_pressed",
         "_slow_end_ns",
@@ -142,6 +145,7 @@ class Supervisor:
         carrier = self.carrier_inputs
         self._latitude = Signal(carrier.position, "Latitude") if carrier is not None else None
         self._heading = Signal(carrier.heading, "Heading") if carrier is not None else None
+        self._reference = Signal(carrier.heading, "Reference") if carrier is not None else None
         self._bus_monitors = (crane_monitor,) if carrier_bus is None else (crane_monitor, carrier_bus.monitor)
         self._startup = startup
         self.operator_link = OperatorLink(profile)
@@ -264,7 +268,7 @@ class Supervisor:
             return Reason.INPUT_MISSING, 0
         if self._enable.value() != _ENABLED:
             return Reason.GUARD_NOT_READY, 0
-        if self._valve_state.value() == _VALVE_FAULT:
+        if self._valve_state.value() in _VALVE_NOT_GOOD:
             return Reason.VALVE_NODE_NOT_READY, 0
         absent = received.nodes.not_ready(now_ns)
         if absent:
@@ -435,8 +439,8 @@ class Supervisor:
             self._collect(Reason.PERSON_IN_ZONE)
         if now_ns >= self.operator_link.lost_from_ns:
             self._collect(Reason.OPERATOR_LINK_LOST)
-        state = self._valve_state.value()
-        if state == _VALVE_FAULT or (state == _VALVE_PILOT_OFF and self.mode is _ACTIVE):
+        state, heard = self._valve_state.value(), self.crane_inputs.valve_a.values is not None
+        if (heard and state in _VALVE_NOT_GOOD) or (state == _VALVE_PILOT_OFF and self.mode is _ACTIVE):
             self._collect(Reason.VALVE_NODE_FAULT)
         if self._plc_faults.value():
             self._collect(Reason.PLC_FAULT)
@@ -467,10 +471,10 @@ class Supervisor:
 
     def _advisory(self) -> Reason:
         """A loss to report although the machine may work."""
-        carrier, latitude, heading = self.carrier_inputs, self._latitude, self._heading
-        if carrier is None or latitude is None or heading is None:
+        carrier, latitude, heading, reference = self.carrier_inputs, self._latitude, self._heading, self._reference
+        if carrier is None or latitude is None or heading is None or reference is None:
             return _NONE
-        if latitude.value() is None or heading.value() is None:
+        if latitude.value() is None or heading.value() is None or reference.value() != TRUE_REFERENCE:
             return Reason.GNSS_LOST
         return Reason.ENGINE_LOST if carrier.engine.values is None else _NONE
 

@@ -41,8 +41,8 @@ MAX_COURSE_ERROR_RAD: Final = 1.2
 """Greatest angle between course and heading; beyond it the heading is wrong."""
 MAX_BEND_RAD: Final = 1.2
 """No articulation bends further; an encoder value beyond it is not an angle."""
-MAGNETIC_REFERENCE: Final = 1
-"""VesselHeading.Reference."""
+TRUE_REFERENCE: Final = 0
+"""VesselHeading.Reference and CogSogRapidUpdate.CogReference: the only one of the four whose angle can be used."""
 _NONE: Final = Reason.NONE
 RTK_METHODS: Final = (4, 5)
 """Methods of PGN 129029 that are good enough to drive to a waypoint: RTK fixed and float."""
@@ -99,9 +99,9 @@ class DeadReckoning:
 
     @property
     def heading_rad(self) -> float | None:
-        """As received, clockwise from true north; None while unknown or when it refers to magnetic north."""
+        """As received, clockwise from true north; None while unknown or when it is not said to refer to true north."""
         heading: float | None = self._heading.value()
-        return None if self._reference.value() == MAGNETIC_REFERENCE else heading
+        return heading if self._reference.value() == TRUE_REFERENCE else None
 
     def offset_m(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """(east, north) [m] from the front axle to a geodetic position; NaN while its own position is unknown."""
@@ -185,7 +185,7 @@ class DeadReckoning:
     def _update_course(self, inputs: CarrierInputs) -> None:
         state = inputs.course
         course, ground = state.get("Cog"), state.get("Sog")
-        if not state.fresh or course is None or ground is None:
+        if not state.fresh or course is None or ground is None or state.get("CogReference") != TRUE_REFERENCE:
             return
         goes = self.speed_m_s > MIN_COURSE_SPEED_M_S
         goes = goes and ground > max(MIN_COURSE_SPEED_M_S, MIN_COURSE_SHARE * self.speed_m_s)

@@ -42,7 +42,9 @@ ARM_MOVED_M: Final = 0.01
 """An arm that is commanded to move moves by this much in that time."""
 COMMAND_DELAY_S: Final = 0.04
 """At most this much is added to the steering valve's dead time by VehCmd's period and the vehicle node."""
-_ARMS_FAULT: Final = 3
+_NO_FAULT: Final = 0
+_ARMS_GOOD: Final = (0, 1)
+"""ArmHeightA.State: hold and active; neither a fault nor "not available" is good."""
 _NONE: Final = Reason.NONE
 _STEERING_REASONS: Final = {
     Reason.NONE: Reason.NONE,
@@ -57,7 +59,7 @@ class VehicleMonitor:
 
     __slots__ = (
         "_arm_from_m", "_arm_since_ns", "_arms_state", "_articulation", "_carrier", "_disagree_ns", "_fault",
-        "_overspeed_ns", "_recent_command_m_s", "_reckoning", "_steering", "_stuck_ns", "_tilt_ns",
+        "_inputs", "_overspeed_ns", "_recent_command_m_s", "_reckoning", "_steering", "_stuck_ns", "_tilt_ns",
     )  # fmt: skip
 
     def __init__(
@@ -66,6 +68,7 @@ class VehicleMonitor:
         self._carrier, self._reckoning = carrier, reckoning
         self._fault, self._articulation = Signal(inputs.vehicle, "Fault"), Signal(inputs.vehicle, "Articulation")
         self._arms_state = Signal(inputs.arms_a, "State")
+        self._inputs = inputs
         self._steering = MotionMonitor(steering, period_s, COMMAND_DELAY_S, max(LATE_LAG_S, carrier.articulation_lag_s))
         self._arm_from_m, self._arm_since_ns = [0.0] * N_ARMS, [0] * N_ARMS
         self.reset(0)
@@ -81,9 +84,10 @@ class VehicleMonitor:
     def ready(self, waypoint: bool) -> Reason:
         """The reason that prevents driving now, to a waypoint or by articulation angles, or NONE."""
         reckoning = self._reckoning
-        if self._fault.value():
-            return Reason.CARRIER_FAULT
-        if self._arms_state.value() == _ARMS_FAULT:
+        reason = self._reported()
+        if reason:
+            return reason
+        if self._tilt_unknown():
             return Reason.ARMS_FAULT
         if self._tilted():
             return Reason.TILTED
@@ -118,19 +122,19 @@ class VehicleMonitor:
             return Reason.ENCODER_JUMP, ARTICULATION
         if abs(reckoning.steering.position) > self._carrier.articulation_limit_rad + BEND_MARGIN_RAD:
             return Reason.POSITION_OUTSIDE, ARTICULATION
-        if self._fault.value():
-            return Reason.CARRIER_FAULT, 0
-        if self._arms_state.value() == _ARMS_FAULT:
-            return Reason.ARMS_FAULT, 0
+        reported = self._reported()
+        if reported:
+            return reported, 0
         if self._disagrees(now_ns):
             return Reason.STEERING_DISAGREES, 0
         steering = _STEERING_REASONS[self._steering.step(rate_command_rad_s, reckoning.steering.velocity)]
         if steering:
             return steering, 0
-        if not self._tilted():
+        unknown = self._tilt_unknown()
+        if not (unknown or self._tilted()):
             self._tilt_ns = now_ns
         elif now_ns - self._tilt_ns >= TILT_NS:
-            return Reason.TILTED, 0
+            return Reason.ARMS_FAULT if unknown else Reason.TILTED, 0
         if waypoint:
             reason = self._lost(reckoning) or reckoning.finding
             if reason:
@@ -138,6 +142,20 @@ class VehicleMonitor:
         if self._stuck(speed_command_m_s, now_ns):
             return Reason.CARRIER_STUCK, 0
         return self._check_arms(arms, now_ns)
+
+    def _reported(self) -> Reason:
+        """A fault that carrier or arms report, or that they cannot say whether there is one."""
+        inputs = self._inputs
+        if inputs.vehicle.values is not None and self._fault.value() != _NO_FAULT:
+            return Reason.CARRIER_FAULT
+        if inputs.arms_a.values is not None and self._arms_state.value() not in _ARMS_GOOD:
+            return Reason.ARMS_FAULT
+        return Reason.NONE
+
+    def _tilt_unknown(self) -> bool:
+        """Whether the arms' node is heard and says that it does not know roll or pitch."""
+        roll, pitch = self._reckoning.tilt_rad
+        return self._inputs.arms_b.values is not None and (roll != roll or pitch != pitch)
 
     def _tilted(self) -> bool:
         roll, pitch = self._reckoning.tilt_rad

@@ -102,6 +102,7 @@ VALUES = [
     ("GuardStat", {"Enable": 0}, Reason.GUARD_REFUSES),
     ("GuardStat", {"Enable": 0xA, "ProfileCheck": OTHER_CHECK}, Reason.PROFILE_DIFFERS),
     ("ValveFbA", {"State": 4}, Reason.VALVE_NODE_FAULT),
+    ("ValveFbA", {"State": None}, Reason.VALVE_NODE_FAULT),
     ("ValveFbA", {"State": 3}, Reason.VALVE_NODE_FAULT),
     ("ValveFbB", {"EchoCounter": 7}, Reason.VALVE_ECHO_STUCK),
     ("PlcStatus", {"FaultBits": 1}, Reason.PLC_FAULT),

@@ -63,6 +63,29 @@ def no_heading(b):
     b.lies["VesselHeading"] = {"Heading": None}
 
 
+def heading_of(reference):
+    def inject(b):
+        b.lies["VesselHeading"] = {"Reference": reference}
+
+    return inject
+
+
+def unknown_to_the_carrier(b):
+    b.lies["VehStat"] = {"Fault": None}
+
+
+def unknown_to_the_arms(b):
+    b.lies["ArmHeightA"] = {"State": None}
+
+
+def unknown_roll(b):
+    b.lies["ArmHeightB"] = {"Roll": None}
+
+
+def unknown_pitch(b):
+    b.lies["ArmHeightB"] = {"Pitch": None}
+
+
 def lose_fix(b):
     b.lies["GnssPositionData"] = {"Method": 1}
 
@@ -136,12 +159,18 @@ CASES = {
     "position not available": (Reason.POSITION_LOST, straight, no_position),
     "heading lost": (Reason.HEADING_LOST, straight, lose_heading),
     "heading not available": (Reason.HEADING_LOST, straight, no_heading),
+    "heading magnetic": (Reason.HEADING_LOST, straight, heading_of(1)),
+    "heading of unknown reference": (Reason.HEADING_LOST, straight, heading_of(None)),
     "fix lost": (Reason.FIX_LOST, straight, lose_fix),
     "position jump": (Reason.POSITION_JUMP, straight, jump_position),
     "heading flipped": (Reason.HEADING_JUMP, straight, swap_antennas),
     "heading frozen": (Reason.HEADING_FROZEN, turning, freeze_heading),
     "carrier fault": (Reason.CARRIER_FAULT, straight, carrier_fault),
     "arms fault": (Reason.ARMS_FAULT, straight, arms_fault),
+    "carrier fault not available": (Reason.CARRIER_FAULT, straight, unknown_to_the_carrier),
+    "arms state not available": (Reason.ARMS_FAULT, straight, unknown_to_the_arms),
+    "roll not available": (Reason.ARMS_FAULT, straight, unknown_roll),
+    "pitch not available": (Reason.ARMS_FAULT, straight, unknown_pitch),
     "runaway": (Reason.CARRIER_RUNAWAY, straight, run_away),
     "rolls back": (Reason.CARRIER_RUNAWAY, straight, roll_back),
     "stuck": (Reason.CARRIER_STUCK, straight, block),
