@@ -250,9 +250,9 @@ def test_frames_after_the_time_out_are_not_joined() -> None:
     assert reassembler.lost == 2
 
 
-@pytest.mark.parametrize("short", range(7))
+@pytest.mark.parametrize("short", range(6))
 def test_a_frame_that_lacks_bytes_of_the_message_is_refused(short: int) -> None:
-    frames = packet(bytes(range(48)))
+    frames = packet(bytes(range(43)))  # the padding of the last frame would make up for what is missing
     frames[short] = frames[short][:6]
     reassembler, refused = n2k.Reassembler(), 0
     for frame in frames:
