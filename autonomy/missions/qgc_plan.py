@@ -120,7 +120,9 @@ class _Reader:
                 self.left_out[f"command {command}"[:40]] += 1
         if len(route) > 1:
             del self.speeds_m_s[0]  # a speed holds on the legs after it
-        if route:
+        if not route:
+            self.speeds_m_s = [speed]  # a plan of fences may still name it
+        else:
             kind: Any = "line" if len(route) > 1 else "point"
             self.shapes.append(Shape(kind, (tuple(route),), {}, ("mission", "items")))
 

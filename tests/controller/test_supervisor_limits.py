@@ -140,7 +140,7 @@ def _only_time(supervisor, now_ns: int) -> None:
     """One call in which nothing is found: no input is checked."""
     inputs, supervisor.crane_inputs = supervisor.crane_inputs, SimpleNamespace(
         foreign=False, stale_mask=0, estop=SimpleNamespace(values=None), guard=SimpleNamespace(values=None),
-        nodes=SimpleNamespace(worst_finding=lambda at_ns: (Reason.NONE, 0)),
+        valve_a=SimpleNamespace(values=None), nodes=SimpleNamespace(worst_finding=lambda at_ns: (Reason.NONE, 0)),
     )  # fmt: skip
     unknown = SimpleNamespace(value=lambda: None)
     names = ("_person", "_valve_state", "_plc_faults", "_enable")
