@@ -39,10 +39,10 @@ if [ ! -e "$venv/.ready" ]; then # none yet, or one that was interrupted: half a
 fi
 step "2 of 3: installing uv, which installs the rest ten times as fast as pip" \
     "$venv/bin/python" -m pip install --disable-pip-version-check -c "$constraints" uv
-# What this computer has set for pip holds for uv, which reads variables of its own.
+# What this computer has set for pip holds for uv, which reads variables of its own; its certificates, too.
 UV_FIND_LINKS=${UV_FIND_LINKS-${PIP_FIND_LINKS-$(pip_setting find-links)}}
 UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX-${PIP_INDEX_URL-$(pip_setting index-url)}}
 export UV_FIND_LINKS
 [ -z "$UV_DEFAULT_INDEX" ] || export UV_DEFAULT_INDEX
 step "3 of 3: installing $(grep -c == "$constraints") pinned packages (about 1 GB, once)" \
-    "$venv/bin/uv" pip install --python "$venv/bin/python" -c "$constraints" -e "$here/..[dev]"
+    "$venv/bin/uv" pip install --system-certs --python "$venv/bin/python" -c "$constraints" -e "$here/..[dev]"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from host.release.bundle import Lock
@@ -79,3 +80,19 @@ def test_the_plant_s_list_adds_the_plant_alone() -> None:
     machine, plant = locked(Lock.MACHINE), locked(Lock.PLANT)
     assert machine.items() <= plant.items()
     assert "pybullet" in set(plant) - set(machine)
+
+
+def test_every_pinned_package_installs_on_the_python_of_debian_12() -> None:
+    """``requires-python`` of each installed distribution admits 3.11.2, also where a later 3.11 runs this test."""
+    pinned = {canonicalize_name(Requirement(line).name) for line in constraints()}
+    wants = {canonicalize_name(d.name): d.metadata["Requires-Python"] for d in metadata.distributions()}
+    refused = {name: wants[name] for name in pinned & wants.keys() if wants[name] and not admits(wants[name])}
+    assert refused == {}
+
+
+def constraints() -> list[str]:
+    return [line for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line.split("#")[0]]
+
+
+def admits(requires_python: str) -> bool:
+    return SpecifierSet(requires_python).contains("3.11.2")
