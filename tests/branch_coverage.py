@@ -1,11 +1,12 @@
 """Branch coverage of supervisor and guard by their own tests, in the run that tests them: ``pytest --branch-coverage``.
 
-Only the tests of `tests.safety_scope` count: a line that a run of the whole machine happens to pass is not tested by
-that.  A branch that none of them takes fails the run.  Every worker measures its share; the run adds them up.
+Only tests that `tests.safety_scope` names count: a line that a run of the whole machine happens to pass is not tested
+by that.  A branch that none of them takes fails the run.  Every worker measures its share; the run adds them up.
 """
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -14,26 +15,26 @@ from pathlib import Path
 import pytest
 from coverage import Coverage
 
-from tests.safety_scope import SCOPES, UNMEASURED
+from tests.safety_scope import SCOPES, is_measured
 
 OPTION = "--branch-coverage"
-_TESTS = {path for scope in SCOPES for path in scope.tests()}
 _SOURCES = [str(path) for scope in SCOPES for path in scope.sources().values()]
 
 
 class Measurement:
-    """Measures while a test of the scope runs, and while modules are imported: they run statements of their own."""
+    """Measures while the modules are imported, which runs statements, and while a test of the scope runs."""
 
     def __init__(self, data: Path) -> None:
         self._coverage = Coverage(data_file=str(data), data_suffix=True, branch=True, include=_SOURCES)
         self._coverage.start()
-
-    def pytest_collection_finish(self) -> None:
+        for scope in SCOPES:
+            for module in scope.sources():
+                importlib.import_module(module)
         self._coverage.stop()
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        if item.path not in _TESTS or getattr(item, "originalname", item.name) in UNMEASURED:
+        if not is_measured(item.path, getattr(item, "originalname", item.name)):
             return (yield)
         self._coverage.start()
         try:

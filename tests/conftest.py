@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing.process  # noqa: TID251
 import signal
 import sys
@@ -73,6 +74,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     branch_coverage.configure(config)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session: pytest.Session) -> Iterator[None]:
+    """What is imported and collected stays for the whole run: the collector of garbage need not visit it again."""
+    gc.disable()
+    yield
+    gc.freeze()
+    gc.enable()
 
 
 def a_timing(count: int = 100, **facts: Any) -> Timing:
