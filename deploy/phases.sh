@@ -22,7 +22,21 @@ lint() {
     "$bin/ruff" check . && "$bin/ruff" format --check . && "$bin/lint-imports" --no-cache
 }
 pages() {
-    "$bin/python" -m timberhand.reference --check && "$bin/sphinx-build" -W --keep-going -q -j 2 docs docs/_build
+    "$bin/python" -m timberhand.reference --check && "$bin/sphinx-build" -W --keep-going -q docs docs/_build
+}
+types_and_pages() { # side by side: the builder of the site uses one processor, mypy would leave it idle at times
+    log=$(mktemp)
+    pages >"$log" 2>&1 &
+    site=$!
+    trap 'kill $site; rm -f "$log"; exit 130' INT TERM
+    "$bin/mypy"
+    types=$?
+    wait $site
+    site=$?
+    trap - INT TERM
+    [ $site -eq 0 ] || cat "$log" >&2
+    rm -f "$log"
+    [ $types -eq 0 ] && [ $site -eq 0 ]
 }
 fast() {
     "$bin/pytest" -q -m "not long" --ignore=tests/live -n 2 --dist worksteal "$@"
@@ -40,8 +54,7 @@ check)
     ;;
 test)
     phase "style and architecture" lint
-    phase types "$bin/mypy"
-    phase "pages of the documentation" pages
+    phase "types, and pages of the documentation" types_and_pages
     # With arguments only some of the tests run, and cannot take every branch.
     [ $# -gt 0 ] || set -- --branch-coverage
     phase tests fast --durations=40 --durations-min=2 "$@"
