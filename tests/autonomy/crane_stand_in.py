@@ -59,13 +59,16 @@ class StandIn:
     setpoint: CraneSetpoint | None = None
     trace: list[Moment] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        self.profile_hash = profile_hash(self.profile)
+
     def report(self) -> StateReport:
         """What the controller says now."""
         opening = opening_pct_from_jaw_angle(self.profile.grapple.jaws, self.tong_rad)
         state = 5 if self.gripped else 0
         sequence = self.setpoint.sequence if self.setpoint else 0
         return StateReport(
-            0, profile_hash(self.profile), self.now_ns, self.mode, state, 0, sequence, 0, 0, 0, self.q,
+            0, self.profile_hash, self.now_ns, self.mode, state, 0, sequence, 0, 0, 0, self.q,
             (0.0,) * 5, self.q, opening if self.feedback else nan, nan, self.load_kg, 0, 0, 0, 0,
         )  # fmt: skip
 
@@ -126,7 +129,7 @@ class StandIn:
         return next((k for k in self.setpoint.knots if k.after_ns >= after), self.setpoint.knots[-1])
 
     def _judge(self, new: CraneSetpoint) -> None:
-        assert new.stamp_ns == self.now_ns and new.profile_hash == profile_hash(self.profile)
+        assert new.stamp_ns == self.now_ns and new.profile_hash == self.profile_hash
         assert new.lease_ns <= self.profile.timeouts.lease_max_ms * 1_000_000
         assert self.mode in (Mode.ARMED, Mode.ACTIVE), f"a setpoint in {self.mode.name}"
         if self.setpoint is not None:

@@ -20,7 +20,6 @@ from can_dbc.messages.crane import CraneSetpoint
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from machine.geometry.carrier import heading_rate_rad_s
-from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
 from tests.autonomy.carrier_model import heading_from_yaw
@@ -83,7 +82,7 @@ class Forwarder:
         lon = self.plane.longitude_deg + east * self._degrees[1]
         obeys = self.drive is not None
         return VehicleReport(
-            0, profile_hash(self.profile), now_ns, self.drive.sequence if self.drive else 0,
+            0, self.crane.profile_hash, now_ns, self.drive.sequence if self.drive else 0,
             Driving.DRIVING if obeys else Driving.STANDING, 0, 0, now_ns, lat, lon, 102.5, 4, 18, 0.01, now_ns,
             heading_from_yaw(yaw), self._turn_rad_s, now_ns, self.speed_m_s, self.articulation_rad, 0.0, 0.0,
             tuple(self.heights_m), 0,
@@ -108,7 +107,7 @@ class Forwarder:
                 crane.setpoint, crane.mode = setpoint, Mode.ACTIVE
             else:
                 assert isinstance(setpoint, DriveSetpoint)
-                assert setpoint.profile_hash == profile_hash(self.profile)
+                assert setpoint.profile_hash == self.crane.profile_hash
                 assert not (setpoint.float_front and setpoint.float_rear)
                 self.drive = setpoint
         crane.now_ns += TICK_NS
