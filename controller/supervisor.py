@@ -435,7 +435,7 @@ class Supervisor:
                 self._collect(Reason.PROFILE_DIFFERS)
         if self.lever_moved:
             self._collect(_LEVER)
-        if self._person.value() == _YES:
+        if self._person.value():
             self._collect(Reason.PERSON_IN_ZONE)
         if now_ns >= self.operator_link.lost_from_ns:
             self._collect(Reason.OPERATOR_LINK_LOST)

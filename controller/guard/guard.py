@@ -59,7 +59,8 @@ _NEUTRAL, _SPOOL = 0, 2
 _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
 _GRAPPLE_SIDE: Final = (0.0, 1.0, -1.0, -1.0)
 """Side of the grapple's spool by GrappleMode: neutral, opens, closes, holds."""
-_RELEASED, _PRESSED, _YES = 1, 1, 1
+_RELEASED, _PRESSED = 1, 1
+_PERSON = (1, 2)  # yes, and faulty: a detector that has failed sees nobody
 _ARM, _ENDS = 1, (2, 3)
 """A person's ARM; DISARM and STOP.  RESET ends nothing: a machine that works goes on."""
 _OPERATING: Final = (2, 3)
@@ -222,7 +223,7 @@ class Guard:
             return Verdict.RANGE, AUX_AXIS
         if not self._grapple_field.inside(self._b.raw("Grapple")):
             return Verdict.RANGE, GRAPPLE_AXIS
-        if self._estop.raw("Person") != _YES:
+        if self._estop.raw("Person") not in _PERSON:
             self._clear_ns = now_ns
         if carrier is not FINE:
             return carrier

@@ -60,7 +60,9 @@ _FAULTS: Final = {
     Reason.NODE_RESTARTED: Fault(RAMP, 105, NODE, "{} restarted or left the operational state"),
     Reason.EMERGENCY_MESSAGE: Fault(RAMP, 5, NODE, "{} sends an emergency message"),
     Reason.EMERGENCY_WARNING: Fault(DEGRADE, 5, NODE, "{} sends a warning; half speed"),
-    Reason.PERSON_IN_ZONE: Fault(HOLD, 20, NOTHING, "A person is in the machine's zone"),
+    Reason.PERSON_IN_ZONE: Fault(
+        HOLD, 20, NOTHING, "A person is in the machine's zone, or the detector of persons has failed"
+    ),
     Reason.LEVER_MOVED: Fault(
         HOLD, 20, NOTHING, "A hand lever was moved or its switch is faulty: automatic work has ended"
     ),
@@ -222,7 +224,7 @@ ADVICE: Final = {
     Reason.NODE_RESTARTED: "Find the cause, then reset and arm.",
     Reason.EMERGENCY_MESSAGE: "Read its error register, then reset and arm.",
     Reason.EMERGENCY_WARNING: "Read its error register (1001h, 1003h).",
-    Reason.PERSON_IN_ZONE: "Clear the zone, then arm.",
+    Reason.PERSON_IN_ZONE: "Clear the zone and check the detector, then arm.",
     Reason.LEVER_MOVED: "Leave the levers in neutral, then arm; if nobody moved one, check its switch.",
     Reason.CARRIER_LOST: "Check the vehicle controller and the machine bus, then reset and arm.",
     Reason.SWING_ARMS_LOST: "Check the swing-arm controller and the machine bus, then reset and arm.",

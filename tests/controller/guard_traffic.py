@@ -166,6 +166,7 @@ BROKEN = {
     "grapple opens without a command": (Verdict.SPOOL, 5, 10, change(valve_b={"SpoolGrapple": 30.0})),
     "joint moves without a command": (Verdict.MOVING, 2, 20, displaced),
     "person in the zone": (Verdict.PERSON, 15, 310, change(a=MOVING, estop={"Person": 1})),
+    "failed detector of persons": (Verdict.PERSON, 15, 310, change(a=MOVING, estop={"Person": 2})),
     "pin into the ground": (Verdict.REACH, 15, 10, under_ground),
     "controller says it has stopped": (Verdict.DISAGREE, 15, 210, change(a=MOVING, controller={"Mode": 4})),
     "controller says nothing": (

@@ -20,8 +20,9 @@ CASES = BROKEN | DRIVE_BROKEN
 EXACT_STEPS = {
     "command A gone": 4, "command B gone": 4, "estop gone": 7, "encoder gone": 19, "outside": 2,
     "joint moves without a command": 3, "too fast a motion": 3, "person in the zone": 61, "pin into the ground": 2,
-    "controller says it has stopped": 41, "controller says nothing": 61, "drive command gone": 16,
-    "arm command gone": 16, "state gone": 18, "rolls although it brakes": 301, "person while it drives": 441,
+    "failed detector of persons": 61, "controller says it has stopped": 41, "controller says nothing": 61,
+    "drive command gone": 16, "arm command gone": 16, "state gone": 18, "rolls although it brakes": 301,
+    "person while it drives": 441,
 }  # fmt: skip
 """Steps of 5 ms until a limit of `controller.guard` is exceeded; all others count at once."""
 

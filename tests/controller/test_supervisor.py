@@ -159,6 +159,7 @@ ARMING = [
     ("valve fault", {"changed": {"ValveFbA": {"State": 4}}}, Reason.VALVE_NODE_NOT_READY),
     ("PLC fault", {"changed": {"PlcStatus": {"FaultBits": 2}}}, Reason.PLC_FAULT),
     ("person", {"changed": {"EstopStat": {"Person": 1}}}, Reason.PERSON_IN_ZONE),
+    ("failed detector of persons", {"changed": {"EstopStat": {"Person": 2}}}, Reason.PERSON_IN_ZONE),
     ("hand lever", {"changed": {"EstopStat": {"Lever": 1}}}, Reason.LEVER_MOVED),
     ("hand lever's switch", {"changed": {"EstopStat": {"Lever": 2}}}, Reason.LEVER_MOVED),
     ("valve node silent", {"silent_nodes": {0x10}}, Reason.NODE_NOT_OPERATIONAL),
