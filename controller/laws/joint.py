@@ -13,10 +13,10 @@ with all joints and within the acceleration limit.
 from __future__ import annotations
 
 import math
-from array import array
 from typing import Final
 
 from controller.laws.command_bound import CommandBound
+from controller.laws.delay_compensation import DelayCompensation
 from controller.laws.end_positioning import EndPositioning
 from controller.laws.feedback import LAWS
 from controller.laws.valve_map import ValveMap
@@ -33,30 +33,6 @@ PRESSURE_MEAN_S: Final = 2.0
 """Slower changes of the load pressure are load, not vibration."""
 PRESSURE_SMOOTH_S: Final = 0.05
 """The delayed valve would answer a faster vibration too late."""
-
-
-class DelayCompensation:
-    """Travel in flight: the commands of the last delay, which the joint cannot show yet; fixed size."""
-
-    __slots__ = ("_at", "_line", "travel")
-
-    def __init__(self, delay_s: float, period_s: float) -> None:
-        self._line = array("d", [0.0] * max(1, round(delay_s / period_s)))
-        self.reset()
-
-    def reset(self) -> None:
-        """Nothing is in flight."""
-        self._at = 0
-        self.travel = 0.0
-        for i in range(len(self._line)):
-            self._line[i] = 0.0
-
-    def add(self, travel: float) -> None:
-        """Add one tick's commanded travel; the oldest leaves."""
-        line, at = self._line, self._at
-        self.travel += travel - line[at]
-        line[at] = travel
-        self._at = at + 1 if at + 1 < len(line) else 0
 
 
 class VibrationFilter:
@@ -151,7 +127,7 @@ class JointLaw:
         """
         self._lead = command = 0.0 if self._plain else v_lead
         if self.has_encoder:
-            self._measured = v
+            self._measured = q
             swayed = damping != 0.0 or displaced != 0.0
             error = q_ref + displaced - q if swayed else q_ref - q
             predicted = error if self._plain else error - self._flight.travel

@@ -68,6 +68,7 @@ MODULES: Final = (
     "controller.joint_watch",
     "controller.laws.command_bound",
     "controller.laws.crane",
+    "controller.laws.delay_compensation",
     "controller.laws.drive",
     "controller.laws.end_positioning",
     "controller.laws.feedback",
