@@ -1,9 +1,11 @@
 """Kept recordings replay to the same bytes: the controller decides as it did.
 
 `tests/recordings` holds the first seconds of two lockstep runs: a crane on a fixed base (palms_471: start-up, arming,
-the first motion) and a forwarder on both buses (aoro_fc8: start-up, driving, a search).  They were recorded when the
-commands of joints became bounded and `GuardStat` got its last signal, with the profiles of commit 7d68e2e, which lie
-beside them.
+the first motion) and a forwarder on both buses (aoro_fc8: start-up, driving, a search), with the profiles of commit
+7d68e2e, which lie beside them.  A change of a database or of the law wants new ones::
+
+    timberhand demo --lockstep --profile tests/recordings/palms.toml --limit-s 8
+    timberhand mission run docs/examples/paper_b.geojson --lockstep --profile tests/recordings/aoro.toml --limit-s 8
 """
 
 from __future__ import annotations
