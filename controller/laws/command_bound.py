@@ -2,9 +2,9 @@
 
 A bounded reference does not bound the joint: a planner can let it fall behind, by announcing again and again a rest
 that never comes, and then have it catch up while the reference itself runs at the limit.  So a place follows the joint
-by its speed limit at most, and a command that takes the joint further ahead of that place than a slack is cut.  The
-joint is taken where it will be when the commands of its reaction time have reached it.  Over any time its way is that
-of its limit and the slack, whatever its valve gives; a joint behind its reference may still hurry for a moment.
+by its speed limit at most, and the further the joint is ahead of that place, the less may be commanded.  The joint is
+taken where it will be when the commands of its reaction time have reached it.  So its way in any time is that of its
+limit, and a little more while a valve that gives more than its map has not shown it; slower work is not touched.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from typing import Final
 
 from controller.laws.delay_compensation import DelayCompensation
 
-MOST_SHARE: Final = 1.15
+MOST_SHARE: Final = 1.1
 """Share of the speed limit that is commanded at most: to a joint that stood, or whose valve gives too little."""
 LEAST_SHARE: Final = 0.7
 """Share that may always be commanded: a joint that a load pushes ahead is not brought to a stop by this."""
-SLACK_S: Final = 0.01
-"""How far ahead of its place the joint may come, as time at the speed limit."""
-APPROACH_S: Final = 0.05
-"""Time constant with which the slack is used up."""
+RETURN_S: Final = 0.03
+"""Time constant with which a joint ahead of its place is brought back to it."""
 
 
 class CommandBound:
@@ -42,10 +40,9 @@ class CommandBound:
 
     def limit(self, desired: float) -> float:
         """The greatest speed to command in the direction of ``desired`` [rad/s, m/s]."""
-        speed = self._speed
+        most = MOST_SHARE * self._speed
         ahead = self._ahead if desired >= 0.0 else -self._ahead
-        allowed = speed + (SLACK_S * speed - ahead) / APPROACH_S
-        return min(max(allowed, LEAST_SHARE * speed), MOST_SHARE * speed)
+        return min(max(most - ahead / RETURN_S, LEAST_SHARE * self._speed), most)
 
     def add(self, command: float, position: float, elapsed_s: float) -> None:
         """One tick with the commanded velocity [rad/s, m/s] and the measured position [rad, m]."""
