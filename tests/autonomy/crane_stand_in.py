@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import atan2, cos, hypot, inf, nan, pi, remainder, sin
 
 import numpy as np
@@ -59,8 +60,10 @@ class StandIn:
     setpoint: CraneSetpoint | None = None
     trace: list[Moment] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self.profile_hash = profile_hash(self.profile)
+    @cached_property
+    def profile_hash(self) -> int:
+        """Of the profile."""
+        return profile_hash(self.profile)
 
     def report(self) -> StateReport:
         """What the controller says now."""
