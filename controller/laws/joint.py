@@ -66,7 +66,7 @@ class JointLaw:
 
     __slots__ = (
         "_bound", "_damping", "_end_positioning", "_feedback", "_flight", "_frozen", "_lead", "_lower", "_max_rate",
-        "_max_step", "_measured", "_plain", "_speed", "_stood", "_upper", "_valve", "_vibration", "has_encoder",
+        "_max_step", "_plain", "_position", "_speed", "_stood", "_upper", "_valve", "_vibration", "has_encoder",
         "lead_ns", "velocity_command", "velocity_desired",
     )  # fmt: skip
 
@@ -88,7 +88,7 @@ class JointLaw:
         self.lead_ns = int((reaction_s + valve.oil_s) * 1e9)
         """Lead of the feed-forward."""
         self._bound = CommandBound(spec.speed_limit, reaction_s + valve.oil_s, period_s)
-        self._measured = 0.0
+        self._position = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -127,7 +127,7 @@ class JointLaw:
         """
         self._lead = command = 0.0 if self._plain else v_lead
         if self.has_encoder:
-            self._measured = q
+            self._position = q
             swayed = damping != 0.0 or displaced != 0.0
             error = q_ref + displaced - q if swayed else q_ref - q
             predicted = error if self._plain else error - self._flight.travel
@@ -169,5 +169,5 @@ class JointLaw:
         self._flight.add((command - self._lead) * elapsed_s)
         self.velocity_command = command
         if self.has_encoder:
-            self._bound.add(command, self._measured, elapsed_s)
+            self._bound.add(command, self._position, elapsed_s)
         return command
