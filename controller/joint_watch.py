@@ -124,8 +124,8 @@ class JointWatch:
             if pct != 0.0:
                 open_valves += 1
         shaken = from_outside or open_valves > 0
-        pressed = crane.grapple.presses(now_ns)
-        self._yield.step(crane.load_kg, crane.grapple.spool_pct != 0.0, crane.roll_rad, crane.pitch_rad)
+        pressed = crane.pressed(now_ns)
+        self._yield.step(pressed, crane.roll_rad, crane.pitch_rad)
         moving, stands = NO_JOINT, True
         for j in range(N_JOINTS):
             estimator, monitor, standstill = estimators[j], self._monitors[j], self._standstill[j]
@@ -153,7 +153,7 @@ class JointWatch:
                 reason = _NONE
             if supervisor.mode in OPERATING:
                 others = open_valves if crane.spools_pct[j] == 0.0 else open_valves - 1
-                calm = not from_outside and others == 0 and not (j == _SLEW and self._yield.loads)
+                calm = not (from_outside or pressed) and others == 0
                 self._judge_encoder(supervisor, j, neutral, calm, tested, reason, now_ns)
             else:
                 stands = stands and standstill.quiet_s >= STOOD_S
@@ -186,6 +186,23 @@ class JointWatch:
             return False
         self._travel[j] += abs(monitor.expected_velocity) * self._period_s
         return sensed.unchanged >= self._frozen_ticks[tested] and self._travel[j] > self._frozen_travel[j]
+
+    def shares(self, j: int) -> dict[str, float]:
+        """What was measured of a joint over what is a fault, 1 and more, by the fault."""
+        reversed_, stuck, runaway = self._monitors[j].shares()
+        shares = {"joint stuck": stuck, "joint too fast for its command": runaway}
+        if not (j == _ROT and self._crane.grapple.at_work):
+            shares["joint against its command"] = reversed_
+        if j != _ROT:
+            shares |= {
+                "joint moves with its valve shut": self._standstill[j].share(),
+                "encoder drifts": self._drift[j].share(),
+            }
+        sensed = self._sensed[j]
+        if sensed is not None:
+            unchanged = sensed.unchanged / self._frozen_ticks[0]
+            shares["encoder frozen"] = min(unchanged, self._travel[j] / self._frozen_travel[j])
+        return shares
 
     def _settle(self, supervisor: Supervisor, moving: int, stands: bool, now_ns: int) -> None:
         """Judge a motion while nothing is armed."""

@@ -72,6 +72,15 @@ class ValveWatch:
             for s, least in zip(specs, USUAL_SPEED, strict=True)
         ]
 
+    def shares(self, j: int) -> dict[str, float]:
+        """What was measured of a valve and its joint over what is a fault, 1 and more, by the fault."""
+        opened, shut, wrong = self._monitors[j].shares()
+        fast, slow, stood = self._speeds[j].shares()
+        return {
+            "spool open": opened, "spool shut": shut, "spool wrong": wrong, "joint too fast for its valve": fast,
+            "joint too slow for its valve": slow, "joint stands while its valve is open": stood,
+        }  # fmt: skip
+
     def step(self, supervisor: Supervisor, now_ns: int) -> None:
         """Watch every valve once and react; after the supervisor has decided on everything else."""
         follows = supervisor.mode in OPERATING and self._state.value() == _FOLLOWS
@@ -83,7 +92,7 @@ class ValveWatch:
             return
         moved_by_law = supervisor.mode is _ACTIVE and crane.leased and not crane.spool_run.running
         limited = self._flow_limited.value() == 1
-        pressed = crane.grapple.presses(now_ns)
+        pressed = crane.pressed(now_ns)
         for j in range(N_JOINTS):
             spool_pct, expected = self._measured[j].value(), crane.commands[j]
             if spool_pct is not None:

@@ -55,7 +55,8 @@ class DeadReckoning:
         "_against", "_arms", "_axle_m", "_carrier", "_frozen", "_heading", "_heading_off", "_heading_rad",
         "_inputs", "_latitude", "_longitude", "_method", "_middle_m", "_pitch", "_position_off", "_reference", "_roll",
         "_speed",
-        "east_m", "finding", "heights_m", "latitude_deg", "longitude_deg", "north_m", "speed_m_s", "steering",
+        "east_m", "finding", "heading_off_rad", "heights_m", "latitude_deg", "longitude_deg", "north_m",
+        "position_off_m", "speed_m_s", "steering",
         "tilt_rad", "yaw_rad", "yaw_rate_rad_s",
     )  # fmt: skip
 
@@ -79,6 +80,8 @@ class DeadReckoning:
         self.tilt_rad = (math.nan, math.nan)
         """Roll, + right side down, and pitch, + nose up, of the rear half."""
         self.finding = Reason.NONE
+        self.heading_off_rad = self.position_off_m = 0.0
+        """How far the last samples were from the odometry."""
         self.latitude_deg = self.longitude_deg = math.nan
         self.east_m = self.north_m = self.yaw_rad = math.nan
         self._forget_position()
@@ -146,6 +149,7 @@ class DeadReckoning:
             off = abs(math.remainder(yaw - self.yaw_rad, math.tau)) if self.yaw_rad == self.yaw_rad else 0.0
             self._heading_off = self._heading_off + 1 if off > MAX_REPEATED_JUMP_RAD else 0
             self._heading_rad, self.yaw_rad = heading, yaw
+            self.heading_off_rad = off
             if off > MAX_JUMP_RAD or self._heading_off >= 2:
                 self.finding = Reason.HEADING_JUMP
             elif self._frozen >= FROZEN_SAMPLES_COUNT:
@@ -162,6 +166,7 @@ class DeadReckoning:
                 moved = east_north_m(self.latitude_deg, self.longitude_deg, latitude, longitude)
                 off = math.hypot(moved[0] + east - self.east_m, moved[1] + north - self.north_m)
                 self._position_off = self._position_off + 1 if off > MAX_REPEATED_JUMP_M else 0
+                self.position_off_m = off
                 if not self.finding and (off > MAX_JUMP_M or self._position_off >= 2):
                     self.finding = Reason.POSITION_JUMP
             self.latitude_deg, self.longitude_deg = latitude, longitude

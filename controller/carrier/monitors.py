@@ -10,7 +10,12 @@ from __future__ import annotations
 from typing import Final
 
 from controller.bus_io.message_state import Signal
-from controller.carrier.dead_reckoning import RTK_METHODS, DeadReckoning
+from controller.carrier.dead_reckoning import (
+    MAX_REPEATED_JUMP_M,
+    MAX_REPEATED_JUMP_RAD,
+    RTK_METHODS,
+    DeadReckoning,
+)
 from controller.carrier.inputs import CarrierInputs
 from controller.estimation.joint_estimator import TrackedJoint
 from controller.estimation.motion_monitor import LATE_LAG_S, MotionMonitor
@@ -142,6 +147,21 @@ class VehicleMonitor:
         if self._stuck(speed_command_m_s, now_ns):
             return Reason.CARRIER_STUCK, 0
         return self._check_arms(arms, now_ns)
+
+    def shares(self, now_ns: int) -> dict[str, float]:
+        """What was measured of the carrier over what is a fault, 1 and more, by the fault."""
+        reckoning = self._reckoning
+        reversed_, stuck, runaway = self._steering.shares()
+        return {
+            "carrier too fast": (now_ns - self._overspeed_ns) / RUNAWAY_NS,
+            "carrier stuck": (now_ns - self._stuck_ns) / STUCK_NS,
+            "steering stuck": stuck, "steering runs away": max(reversed_, runaway),
+            "steering disagrees": (now_ns - self._disagree_ns) / DISAGREE_NS,
+            "carrier tilted": (now_ns - self._tilt_ns) / TILT_NS,
+            "arm stuck": (now_ns - min(self._arm_since_ns)) / ARM_STUCK_NS,
+            "position jumps": reckoning.position_off_m / MAX_REPEATED_JUMP_M,
+            "heading jumps": reckoning.heading_off_rad / MAX_REPEATED_JUMP_RAD,
+        }  # fmt: skip
 
     def _reported(self) -> Reason:
         """A fault that carrier or arms report, or that they cannot say whether there is one."""

@@ -22,6 +22,7 @@ from controller.crane.spool_test_run import SpoolTestRun
 from controller.crane.trajectory_check import TrajectoryCheck
 from controller.crane.workspace_check import WorkspaceCheck
 from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.load_change import LoadChange
 from controller.estimation.load_estimator import LoadEstimator
 from controller.estimation.pressure_monitor import PressureMonitor
 from controller.laws.crane import LOADS, CraneLaw
@@ -44,7 +45,8 @@ class Crane:
 
     __slots__ = (
         "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_lift_a", "_lift_b", "_load",
-        "_load_due", "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "_workspace",
+        "_load_change", "_load_due", "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed",
+        "_workspace",
         "commands", "governor", "grapple", "law", "lease_end_ns", "leased", "load_kg", "load_moment",
         "pitch_rad", "pressure_monitor", "roll_rad", "spool_run", "spools_pct", "sway",
     )  # fmt: skip
@@ -70,6 +72,7 @@ class Crane:
         self.pressure_monitor = PressureMonitor(self._pressure_pairs)
         self._pressures_bar = [math.nan] * N_JOINTS
         self._load, self._load_due, self._load_updated = LoadEstimator(profile), PeriodicTimer(LOAD_PERIOD_NS), False
+        self._load_change = LoadChange(LOAD_PERIOD_NS * 1e-9)
         self.load_kg = math.nan
         """Load in the grapple; NaN while unknown."""
         self.roll_rad = self.pitch_rad = 0.0
@@ -108,8 +111,13 @@ class Crane:
             self.load_kg = self._load.step(
                 position, lift.velocity, self._lift_a.value(), self._lift_b.value(), LOAD_PERIOD_NS * 1e-9
             )
+        self._load_change.step(self.load_kg, now_ns)
         if moment is not None:
             moment.update(position, self.load_kg, roll_rad, pitch_rad)
+
+    def pressed(self, now_ns: int) -> bool:
+        """Whether jaws that work, or a load that comes or goes, move every joint now or did a moment ago."""
+        return self.grapple.presses(now_ns) or self._load_change.recent(now_ns)
 
     # -- reference
 

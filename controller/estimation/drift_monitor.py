@@ -71,3 +71,9 @@ class DriftMonitor:
             self._commanded = self._decay * self._commanded + self._period_s * expected_velocity
         against = -self._commanded if alone > 0.0 else self._commanded
         return abs(alone) > self._limit and against > COMMANDED_SHARE * abs(alone)
+
+    def share(self) -> float:
+        """What was measured over what is a drift; 1 and more is one."""
+        alone = abs(self._alone)
+        against = -self._commanded if self._alone > 0.0 else self._commanded
+        return max(0.0, min(alone / self._limit, against / (COMMANDED_SHARE * alone))) if alone > 0.0 else 0.0

@@ -104,6 +104,10 @@ class JointEstimator:
         """Whether the samples scatter much more about the estimate than before, or than the profile explains."""
         return self._noise is not None and self._noise.noisy
 
+    def noise_share(self) -> float:
+        """How noisy the encoder is, over what is a fault."""
+        return 0.0 if self._noise is None else self._noise.share()
+
     def predict(self, now_ns: int) -> None:
         """Extrapolate the estimate to ``now_ns``; once per tick, before `update`."""
         if self.known:

@@ -133,3 +133,13 @@ class MotionMonitor:
         if self._overspeed > _RUNAWAY_S * usual:
             return Reason.JOINT_RUNAWAY
         return _NONE
+
+    def shares(self) -> tuple[float, float, float]:
+        """What was measured over what is a fault: joint reversed, stuck, running away.  1 and more is the fault."""
+        expected = self._expected
+        behind = self._behind / (_STUCK_SHARE * expected) if expected > 0.0 else 0.0
+        return (
+            self._against / self._against_most,
+            max(0.0, min(expected / self._min_travel, behind)),
+            self._overspeed / (_RUNAWAY_S * self._usual),
+        )

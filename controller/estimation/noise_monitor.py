@@ -47,8 +47,8 @@ class NoiseMonitor:
     """Monitors one encoder; ``noisy`` is the finding after `update`."""
 
     __slots__ = (
-        "_allowed", "_before", "_before_that", "_gain", "_least", "_least_share", "_max_innovation", "_mean", "_most",
-        "_punctual", "_scatter", "_share", "_toss", "_usual", "noisy",
+        "_allowed", "_before", "_before_that", "_gain", "_least", "_least_share", "_limit", "_max_innovation", "_mean",
+        "_most", "_punctual", "_scatter", "_share", "_toss", "_usual", "noisy",
     )  # fmt: skip
 
     def __init__(
@@ -70,6 +70,7 @@ class NoiseMonitor:
     def restart(self) -> None:
         """The estimator starts again; what is usual stays known."""
         self._mean = self._scatter = self._before = self._before_that = 0.0
+        self._limit = self._max_innovation
         self.noisy = False
 
     def update(self, innovation: float) -> None:
@@ -78,7 +79,7 @@ class NoiseMonitor:
         self._before_that, self._before = self._before, innovation
         square = difference * difference
         usual = min(max(self._usual - self._toss, self._least), self._most)
-        limit = USUAL_RATIO * usual + self._allowed
+        self._limit = limit = USUAL_RATIO * usual + self._allowed
         self._mean += self._gain * (innovation * innovation - self._mean)
         self._scatter += self._gain * (min(square, _CLIP_RATIO * limit) - self._scatter)
         learning = self._share > _LEARNING_SHARE
@@ -89,3 +90,8 @@ class NoiseMonitor:
             self._share = max(self._least_share, self._share / (1.0 + self._share))
         unusual = self._punctual and not learning and self._scatter > limit
         self.noisy = unusual or self._mean > self._max_innovation
+
+    def share(self) -> float:
+        """What was measured over what is noise; 1 and more is noisy."""
+        scatter = self._scatter / self._limit if self._punctual and self._share <= _LEARNING_SHARE else 0.0
+        return max(scatter, self._mean / self._max_innovation)

@@ -12,11 +12,6 @@ from __future__ import annotations
 
 from typing import Final
 
-CHANGE_KG: Final = 40.0
-"""Least difference from the load's mean that is a change: twice what friction of the lift falsifies."""
-MEAN_S: Final = 1.0
-YIELD_S: Final = 1.2
-"""A joint comes to rest on its oil within half of its slowest period (2.5 s)."""
 FORGET_S: Final = 2.0
 """The range of the last inclinations shrinks with this time constant."""
 LEVEL_RAD: Final = 0.02
@@ -27,35 +22,22 @@ LIMIT_RAD: Final = 0.06
 
 
 class SlopeYield:
-    """`step` once per period; ``rad`` is how far the slew may yield now, ``loads`` whether a load comes or goes on a
-    slope.
-    """
+    """`step` once per period; ``rad`` is how far the slew may yield now."""
 
-    __slots__ = ("_high", "_left_s", "_low", "_mean_kg", "_period_s", "loads", "rad")
+    __slots__ = ("_forget", "_high", "_low", "rad")
 
     def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._mean_kg = self._left_s = 0.0
+        self._forget = period_s / FORGET_S
         self._low = [0.0, 0.0]
         self._high = [0.0, 0.0]
         self.rad = 0.0
-        self.loads = False
 
-    def step(self, load_kg: float, jaws_move: bool, roll_rad: float, pitch_rad: float) -> None:
-        """The estimated load and the inclination of the crane's base (NaN: not known); whether the jaws move."""
-        changes = False
-        if load_kg == load_kg:
-            off_kg = load_kg - self._mean_kg
-            changes = abs(off_kg) > CHANGE_KG
-            self._mean_kg += self._period_s / MEAN_S * off_kg
-        if changes or jaws_move:
-            self._left_s = YIELD_S
-        else:
-            self._left_s = max(0.0, self._left_s - self._period_s)
-        lean = self._beyond_level(abs(roll_rad)) + self._beyond_level(abs(pitch_rad))
+    def step(self, pressed: bool, roll_rad: float, pitch_rad: float) -> None:
+        """Whether jaws or a load press on the boom, or did lately; the inclination of its base (NaN: not known)."""
         turned = self._range(0, roll_rad) + self._range(1, pitch_rad)
-        self.loads = self._left_s > 0.0 and lean > 0.0
-        self.rad = min(YIELD_SHARE * (turned + (lean if self.loads else 0.0)), LIMIT_RAD)
+        if pressed:
+            turned += self._beyond_level(abs(roll_rad)) + self._beyond_level(abs(pitch_rad))
+        self.rad = min(YIELD_SHARE * turned, LIMIT_RAD)
 
     def _beyond_level(self, angle_rad: float) -> float:
         return angle_rad - LEVEL_RAD if angle_rad > LEVEL_RAD else 0.0
@@ -64,8 +46,7 @@ class SlopeYield:
         """How far the machine has leaned to and fro about an axis lately."""
         if angle_rad != angle_rad:
             return 0.0
-        low, high = self._low, self._high
-        forget = self._period_s / FORGET_S
+        low, high, forget = self._low, self._high, self._forget
         low[axis] = min(angle_rad, low[axis] + forget * (angle_rad - low[axis]))
         high[axis] = max(angle_rad, high[axis] + forget * (angle_rad - high[axis]))
         return self._beyond_level(high[axis] - low[axis])

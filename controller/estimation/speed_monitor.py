@@ -42,7 +42,7 @@ STOOD: Final = 0.25
 """Times the map's speed; a joint slower than the last stands."""
 FAST_S: Final = 0.05
 FAST_PRESSED_S: Final = 0.25
-"""A log that the jaws let go throws the boom up on its oil for a tenth of a second or two."""
+"""A log that the jaws let go throws the boom up on its oil for a tenth of a second or two, one that comes free does."""
 SLOW_S: Final = 0.07
 STICKING_S: Final = 0.3
 STICKING_SHARE: Final = 1.5
@@ -70,8 +70,8 @@ class SpeedMonitor:
     """
 
     __slots__ = (
-        "_backwards_s", "_doubt", "_fast_s", "_learned_s", "_least", "_limit", "_period_s", "_range",
-        "_shift", "_slack", "_slow_s", "_stood_s",
+        "_backwards_s", "_doubt", "_fast_most_s", "_fast_s", "_learned_s", "_least", "_limit", "_period_s", "_range",
+        "_shift", "_slack", "_slow_most_s", "_slow_s", "_stood_s",
     )  # fmt: skip
 
     def __init__(
@@ -85,6 +85,7 @@ class SpeedMonitor:
         self._shift, self._learned_s = [0.0, 0.0], [0.0, 0.0]
         """By which the map is too fast in the negative and the positive direction, and how long it was learned."""
         self._stood_s = self._fast_s = self._slow_s = self._backwards_s = 0.0
+        self._fast_most_s, self._slow_most_s = FAST_S, STICKING_S
 
     def reset(self) -> None:
         """The valve has been shut; what was learned of it stays."""
@@ -125,12 +126,18 @@ class SpeedMonitor:
         self._backwards_s = self._backwards_s + dt if backwards else 0.0
         self._slow_s = self._slow_s + dt if slow and not stood else 0.0
         self._fast_s = self._fast_s + dt if fast else 0.0
-        if self._fast_s >= (FAST_PRESSED_S if pressed else FAST_S):
+        self._fast_most_s = FAST_PRESSED_S if pressed else FAST_S
+        if self._fast_s >= self._fast_most_s:
             return _RUNAWAY
-        slow_s = SLOW_S if low > STICKING_SHARE * self._doubt else STICKING_S
-        if self._backwards_s >= BACKWARDS_S or self._slow_s >= slow_s:
+        self._slow_most_s = SLOW_S if low > STICKING_SHARE * self._doubt else STICKING_S
+        if self._backwards_s >= BACKWARDS_S or self._slow_s >= self._slow_most_s:
             return _WRONG
         return _STUCK if self._stood_s >= STOOD_S else _NONE
+
+    def shares(self) -> tuple[float, float, float]:
+        """How long the joint has been too fast, backwards or too slow, and standing, over what is a fault."""
+        wrong = max(self._backwards_s / BACKWARDS_S, self._slow_s / self._slow_most_s)
+        return self._fast_s / self._fast_most_s, wrong, self._stood_s / STOOD_S
 
     def _learn(self, side: int, shift: float) -> None:
         """Take a steady speed into account; a shift beyond what a dead-band explains is none."""

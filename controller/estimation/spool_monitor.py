@@ -98,3 +98,7 @@ class SpoolMonitor:
         if self._shut_s >= SHUT_S:
             return _SHUT
         return _WRONG if self._wrong_s >= WRONG_S else _NONE
+
+    def shares(self) -> tuple[float, float, float]:
+        """How long the spool has been too far open, shut, and otherwise wrong, over what is a fault."""
+        return self._open_s / OPEN_S, self._shut_s / SHUT_S, self._wrong_s / WRONG_S

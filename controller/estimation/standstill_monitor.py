@@ -46,8 +46,9 @@ class StandstillMonitor:
     """Monitors one joint; ``moves`` tells whether it moves without a command."""
 
     __slots__ = (
-        "_calm_far", "_calm_s", "_closing_s", "_forget", "_gone_to", "_high", "_low", "_neutral_s", "_noise", "_out_s",
-        "_peak", "_period_s", "_pressed_far", "_rest_s", "_shaken_far", "_started", "moves", "quiet_s",
+        "_calm_far", "_calm_s", "_closing_s", "_far", "_forget", "_gone_to", "_high", "_low", "_neutral_s", "_noise",
+        "_out", "_out_s", "_peak", "_period_s", "_pressed_far", "_rest_s", "_shaken_far", "_started", "moves",
+        "quiet_s",
     )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float, delay_s: float = 0.0, least_speed: float = 0.0) -> None:
@@ -70,7 +71,8 @@ class StandstillMonitor:
         """Nothing is known of the joint."""
         self._started = self.moves = False
         self._low = self._high = self._peak = self._gone_to = 0.0
-        self._out_s = self._neutral_s = self._calm_s = self._rest_s = 0.0
+        self._out = self._out_s = self._neutral_s = self._calm_s = self._rest_s = 0.0
+        self._far = self._calm_far
         self.quiet_s = 0.0
         """How long the joint has not moved."""
 
@@ -81,7 +83,7 @@ class StandstillMonitor:
         if not self._started or not neutral:
             self._started = True
             self._low = self._high = self._peak = self._gone_to = position
-            self._rest_s = self._out_s = self._neutral_s = self._calm_s = self.quiet_s = 0.0
+            self._rest_s = self._out = self._out_s = self._neutral_s = self._calm_s = self.quiet_s = 0.0
             self.moves = False
             return False
         dt = self._period_s
@@ -112,9 +114,15 @@ class StandstillMonitor:
             self._out_s += dt
         self._low += self._forget * (position - self._low)
         self._high += self._forget * (position - self._high)
+        self._out, self._far = out, far
         self.moves = out > far and out * self._out_s > far * HOLD_S
         self.quiet_s = 0.0 if out > far else self.quiet_s + dt
         return self.moves
+
+    def share(self) -> float:
+        """What was measured over what is a motion; 1 and more is one."""
+        out = self._out / self._far
+        return min(out, out * self._out_s / HOLD_S)
 
     def _absorb(self, position: float) -> None:
         """The joint is inside its range, has turned back, or its valve is still closing: extend the range to it."""

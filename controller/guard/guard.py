@@ -239,6 +239,13 @@ class Guard:
             self._agreed_ns = now_ns
         return FINE if neutral else self._check_commanded(now_ns)
 
+    def shares(self) -> dict[str, float]:
+        """What was measured of the joints over what is a fault, 1 and more, by the fault."""
+        return {
+            "guard: joint moves with its valve shut": max(watch.share() for _, watch in self._motion),
+            "guard: joint too fast": max((joint.share() for joint in self._joints.values()), default=0.0),
+        }
+
     def _check_motion(self, heard: bool, now_ns: int, elapsed_s: float) -> Finding:
         """Motion that nobody commands, or too fast a one; the valve node obeys only what is heard, and in its mode."""
         words = {message: None if message.old(now_ns) else message.word for message in self._feedback}

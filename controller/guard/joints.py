@@ -103,6 +103,10 @@ class MeasuredJoint:
         self._place += min(max(self.position - self._place, -way), way)
         self._fast = self._fast + 1 if abs(self.position - self._place) > self._slack else 0
 
+    def share(self) -> float:
+        """How far it was too fast, over what is too far."""
+        return abs(self.position - self._place) / self._slack
+
     def too_fast(self) -> bool:
         """Whether it has moved faster than it may; told once, and its place is then where it is."""
         if self._fast < FAST_FRAMES:

@@ -42,6 +42,11 @@ class MotionWatch:
         self._place: float | None = None  # not known yet
         self._away = 0
 
+    def share(self) -> float:
+        """How far the joint has moved without a command, over what is too far."""
+        joint, place = self._joint, self._place
+        return 0.0 if joint is None or place is None else abs(joint.position - place) / self._moved
+
     def check(self, command: float, feedback_word: int | None, now_ns: int, elapsed_s: float) -> Finding:
         """One step; ``command`` is what the valve node may follow now, ``feedback_word`` None when it is not known."""
         opened_ns = self._opened_ns

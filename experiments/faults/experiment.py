@@ -121,7 +121,7 @@ def nominal_plan(seed: int, seconds: float) -> list[Job]:
     jobs = []
     for scene, share in shares.items():
         left_s, number = seconds * share / sum(shares.values()), 0
-        stretch_s = nominal.LOG_S if scene.startswith("log") else nominal.STRETCH_S
+        stretch_s = nominal.STRETCHES_S.get(scene.split()[0], nominal.STRETCH_S)
         while left_s > 0.0:
             options = {"scene": scene, "seconds": min(left_s, stretch_s)}
             jobs.append(Job(f"nominal/{scene}/{number}", "nominal", 5000 + 1000 * seed + number, options))

@@ -1,7 +1,9 @@
 """Nominal work without faults: every stop is a false trip.
 
 One job is a stretch of work on one individual machine.  The scenes of the campaign run with sampled truths and on rough
-ground; the log job is that of `timberhand demo`, with another log for every stretch, over CAN and through a PLC.
+ground; the log job is that of `timberhand demo`, with another log for every stretch, over CAN and through a PLC; a
+mission is paper B's with its own camera and another field every time, on individuals with the shipped profile and with
+one of their own calibration, and on drawn ground.
 """
 
 from __future__ import annotations
@@ -14,14 +16,21 @@ from typing import Any, Final
 from autonomy.crane_job.activity import Activity
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
+from autonomy.missions.mission_file import load_mission
 from controller.config import load as load_settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from controller.tick import Outputs
+from experiments.common.individuals import calibrated
+from experiments.common.mission_trial import PAPER_B, run_mission, shuffled
 from experiments.common.pool import Job
+from experiments.common.recording import RECORD
+from experiments.common.worlds import profile_named
 from experiments.faults.running import build
+from experiments.faults.separation import Separation
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
+from hil.missions.site import site_of
 from hil.plc.bridged_plant import BridgedPlant, Transport
 from hil.plc.profile import write_plc_profile
 from machine.status.explanation import describe
@@ -30,9 +39,10 @@ from machine.status.reasons import pack
 from sim.plant import Plant
 
 STRETCH_S: Final = 300.0
-LOG_S: Final = 30.0
-"""A log job takes longer than this."""
+STRETCHES_S: Final = {"log": 30.0, "mission": 1000.0}
+"""What is done whole takes longer than this."""
 LOG_LIMIT_S: Final = 150.0
+MISSION_LIMIT_S: Final = 2700.0
 SETTINGS: Final = {
     "crane palms_471": ("nominal", "flat", 2.0),
     "crane palms_471 physics": ("sampled", "flat", 1.0),
@@ -44,17 +54,33 @@ SETTINGS: Final = {
     "log aoro_fc8": ("sampled", "flat", 0.15),
     "log palms_471 plc references": ("sampled", "flat", 0.1),
     "log palms_471 plc valves": ("sampled", "flat", 0.1),
+    "mission aoro_fc8": ("nominal", "flat", 2.0),
+    "mission aoro_fc8 individual": ("sampled", "flat", 2.0),
+    "mission aoro_fc8 calibrated": ("sampled", "flat", 2.0),
+    "mission aoro_fc8 ground": ("nominal", "drawn", 2.0),
 }
 """Scene to truth, ground, and its part of the hours relative to the others."""
 
 
 class _Trips:
-    """Counts transitions from work into a stop."""
+    """Counts transitions from work into a stop, and sees how near the monitors come to one."""
 
-    def __init__(self) -> None:
+    def __init__(self, system: Lockstep) -> None:
         self.found: list[tuple[float, str]] = []
         self.working_ticks = 0
+        self.separation = Separation(system.controller, system.guard, START_NS)
+        self._system = system
         self._mode: Mode = Mode.BOOT
+        system.observer.on_outputs += [self.outputs, self.separation.outputs]
+
+    def outcome(self, scene: str, seed: int) -> dict[str, Any]:
+        """What has been counted."""
+        system = self._system
+        return {
+            "scene": scene, "seed": seed, "seconds": (system.now_ns - START_NS) * 1e-9,
+            "working_s": self.working_ticks * system.period_ns * 1e-9, "trips": self.found,
+            "shares": self.separation.shares,
+        }  # fmt: skip
 
     def outputs(self, outputs: Outputs, now_ns: int) -> None:
         """The outputs of a tick."""
@@ -71,11 +97,12 @@ def perform(job: Job) -> dict[str, Any]:
     truth, terrain, _ = SETTINGS[scene]
     if scene.startswith("log"):
         return _log_job(scene, job.seed, truth)
+    if scene.startswith("mission"):
+        return _mission(job, scene, truth, terrain)
     machine = build(scene, job.seed, truth, terrain)
-    trips = _Trips()
+    trips = _Trips(machine.system)
     gc.collect()
     gc.freeze()
-    machine.system._observer.on_outputs.append(trips.outputs)
     try:
         while machine.system.now_ns < START_NS + round(seconds * 1e9):
             machine.system.advance()
@@ -83,7 +110,7 @@ def perform(job: Job) -> dict[str, Any]:
         close = getattr(machine.plant, "close", None)
         if close is not None:
             close()
-    return _outcome(scene, job.seed, machine.system, trips)
+    return trips.outcome(scene, job.seed)
 
 
 def _log_job(scene: str, seed: int, truth: str) -> dict[str, Any]:
@@ -99,20 +126,32 @@ def _log_job(scene: str, seed: int, truth: str) -> dict[str, Any]:
         if role
         else Plant(settings.profile, seed, truth)
     )
-    trips = _Trips()
     try:
         activity = Activity(settings.profile, settings.profile_hash, grasp_selector=PlannerSelection(SamplingPlanner()))
         operator = Operator(settings.profile_hash, lambda *_: None, watches=True)
-        system = Lockstep(settings, guard, plant, activity, operator, Observer(on_outputs=[trips.outputs]))
+        system = Lockstep(settings, guard, plant, activity, operator, Observer())
+        trips = _Trips(system)
         while not (activity.done or activity.failure) and system.now_ns < START_NS + round(LOG_LIMIT_S * 1e9):
             system.advance()
     finally:
         plant.close()
-    return _outcome(scene, seed, system, trips)
+    return trips.outcome(scene, seed)
 
 
-def _outcome(scene: str, seed: int, system: Lockstep, trips: _Trips) -> dict[str, Any]:
-    return {
-        "scene": scene, "seed": seed, "seconds": (system.now_ns - START_NS) * 1e-9,
-        "working_s": trips.working_ticks * system.period_ns * 1e-9, "trips": trips.found,
-    }  # fmt: skip
+def _mission(job: Job, scene: str, truth: str, terrain: str) -> dict[str, Any]:
+    """A whole mission; what it loaded and believes is in the outcome, too."""
+    name = scene.split()[1]
+    what = {"profile": name, "truth": truth, "way": "ours", "eyes": "ours", "limit_s": MISSION_LIMIT_S}
+    what |= {key: job.options[key] for key in (RECORD,) if key in job.options}
+    if scene.endswith("calibrated"):
+        machine = calibrated(Job(job.name, "calibration", job.seed, what))
+        if machine["profile"] is None:
+            return {"scene": scene, "seed": job.seed, "seconds": 0.0, "failure": machine["failure"]}
+        what["text"] = machine["profile"]
+    mission = shuffled(load_mission(PAPER_B, route_wanted=True).mission, job.seed)
+    site = site_of(mission, profile_named(name), job.seed, truth, terrain=terrain)
+    trips: list[_Trips] = []
+    told = run_mission(Job(job.name, "mission", job.seed, what), mission, site, lambda run: trips.append(_Trips(run)))
+    aboard = sum(log["in_bunk"] for log in told["logs"])
+    more = {key: told[key] for key in ("finished", "failure", "loaded", "stops", "given_up")}
+    return trips[0].outcome(scene, job.seed) | more | {"in_bunk": aboard}

@@ -8,16 +8,17 @@ from typing import Any, Final
 from rich.console import Console
 
 from experiments.common import pool
+from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import ROOT, Result, make_result
+from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures, sampled_unless_given
 from experiments.common.workers import Trial
 from experiments.common.worlds import carrier_profile
 from experiments.forwarding_mission.metrics import CM, CONCLUSION, INTRODUCTION, METRICS, PAPER, gather, sections
 from experiments.forwarding_mission.plots import draw
-from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform
+from experiments.forwarding_mission.trial import perform
 
 TRIALS: Final = 20
 """Missions on sampled machines; each takes a quarter of an hour of simulated time."""
@@ -29,7 +30,6 @@ DETECTORS: Final = {"ours": "ours", "paper-b": "faithful"}
 """Detector of each method."""
 NOMINAL: Final = "machine/nominal"
 LIMIT_S: Final = 5400.0
-FILE: Final = ROOT / "docs" / "examples" / "paper_b.geojson"
 SOURCES: Final = (*LOCKSTEP_SOURCES, "docs/examples/paper_b.geojson")
 PUBLISHED_TRIALS: Final = "results/forwarding-mission/trials.jsonl.xz"
 """Outcomes of all missions, in the docs."""
@@ -77,7 +77,7 @@ def failed(trial: Trial) -> bool:
 def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[Job]:
     """One mission of the nominal machine on the original field by each method."""
     what: dict[str, Any] = {
-        "profile": profile, "truth": "nominal", "file": str(FILE), "shuffled": False, "short": options.quick,
+        "profile": profile, "truth": "nominal", "file": str(PAPER_B), "shuffled": False, "short": options.quick,
         "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None, "limit_s": LIMIT_S,
     }  # fmt: skip
     ways = ("ours",) if options.quick else ("ours", "paper-b")
@@ -104,7 +104,7 @@ def missions(options: Options, profile: str, truth: str, trials: int, machines: 
         if text is None:
             continue
         what: dict[str, Any] = {
-            "profile": profile, "truth": truth, "file": str(FILE), "shuffled": True, "text": text, "way": "ours",
+            "profile": profile, "truth": truth, "file": str(PAPER_B), "shuffled": True, "text": text, "way": "ours",
             "eyes": DETECTORS["ours"], "field": first + MACHINES + i, "limit_s": LIMIT_S,
         }  # fmt: skip
         jobs.append(Job(f"mission/{i}", "mission", first + i % MACHINES, what))

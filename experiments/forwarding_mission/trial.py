@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,19 +10,13 @@ import msgspec
 
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
-from autonomy.missions.model import ForwardingMission, KnownLog, Point
+from autonomy.missions.model import ForwardingMission, Point
 from experiments.common.individuals import calibrated
-from experiments.common.mission_trial import run_mission
+from experiments.common.mission_trial import run_mission, shuffled
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.missions.site import site_of
 
-ALONG_M: Final = 0.5
-"""Maximum shift of a log along the route on a shuffled field."""
-ACROSS_M: Final = 0.25
-"""Maximum shift of a log across the route on a shuffled field."""
-TURN_DEG: Final = 15.0
-"""Maximum turn of a log on a shuffled field."""
 SHORT_M: Final = 17.0
 
 
@@ -50,14 +43,6 @@ def drive(job: Job) -> dict[str, Any]:
     return run_mission(job, mission, site)
 
 
-def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:
-    """The same mission with every log shifted and turned; one seed gives one field."""
-    rng = random.Random(f"field {seed}")
-    first = mission.waypoints[0]
-    plane = LocalPlane(first.latitude_deg, first.longitude_deg)
-    return msgspec.structs.replace(mission, logs=tuple(_elsewhere(log, plane, rng) for log in mission.logs))
-
-
 def short(mission: ForwardingMission) -> ForwardingMission:
     """A short version: ``SHORT_M`` of the first leg, the first log, one lap."""
     first, second = mission.waypoints[:2]
@@ -69,12 +54,3 @@ def short(mission: ForwardingMission) -> ForwardingMission:
     return msgspec.structs.replace(
         mission, waypoints=(first, Point(lat, lon)), logs=mission.logs[:1], fences=(), options=options
     )
-
-
-def _elsewhere(log: KnownLog, plane: LocalPlane, rng: random.Random) -> KnownLog:
-    x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
-    x, y = x + rng.uniform(-ALONG_M, ALONG_M), y + rng.uniform(-ACROSS_M, ACROSS_M)
-    turn = rng.uniform(-TURN_DEG, TURN_DEG)
-    bearing = None if log.bearing_deg is None else math.fmod(log.bearing_deg + turn + 360.0, 360.0)
-    lat, lon, _ = plane.geodetic(x, y)
-    return msgspec.structs.replace(log, position=Point(lat, lon), bearing_deg=bearing)

@@ -138,6 +138,21 @@ class Lockstep:
         self._sync: RawFrame | None = None
 
     @property
+    def controller(self) -> Controller:
+        """The controller."""
+        return self._controller
+
+    @property
+    def guard(self) -> Guard:
+        """The guard."""
+        return self._guard
+
+    @property
+    def observer(self) -> Observer:
+        """Recorder and hooks, to add to."""
+        return self._observer
+
+    @property
     def next_tick_ns(self) -> int:
         """Time of the next tick."""
         return self._next_tick_ns

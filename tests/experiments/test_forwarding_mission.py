@@ -13,14 +13,15 @@ import pytest
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
-from experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
+from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG, shuffled
+from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, trial
 from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw
-from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
+from experiments.forwarding_mission.trial import perform, short
 from tests.codes import numbers_in
 
 OPTIONS = SimpleNamespace(seed=3, quick=False)
-MISSION = load_mission(FILE, route_wanted=True).mission
+MISSION = load_mission(PAPER_B, route_wanted=True).mission
 
 
 def grasp(log: int | None, off_m: tuple[float, float, float], logs: int = 1, state: str = "COLLECT") -> dict[str, Any]:
