@@ -11,6 +11,7 @@ from typing import Any, Final
 from experiments.common.result import Result
 from experiments.common.result_page import Section
 from experiments.faults.metrics import CAMPAIGN, HOUR_S, NOMINAL, case_prefix, injections_of
+from experiments.faults.separation import EDGES, merged
 from hil.faults.catalogue import CASES, Case
 
 CONCLUSION: Final = (
@@ -87,11 +88,14 @@ def write_evidence(outcomes: Mapping[str, Mapping[str, Any]], metrics: Mapping[s
 
 
 def work_page(outcomes: Iterable[Mapping[str, Any]]) -> str:
-    """The page of the work without faults: hours by scene, and every stop with what it takes to see it again."""
+    """The page of the work without faults: hours by scene, every stop with what it takes to see it again, the
+    missions' logs, and how near each monitor came to a stop.
+    """
+    work = [o for o in outcomes if "working_s" in o or o.get("scene", "").startswith("mission")]
+    done = [o for o in work if "trips" in o]
     by_scene: dict[str, list[Mapping[str, Any]]] = {}
-    for outcome in outcomes:
-        if "trips" in outcome:
-            by_scene.setdefault(outcome["scene"], []).append(outcome)
+    for outcome in done:
+        by_scene.setdefault(outcome["scene"], []).append(outcome)
     out = ["---", "orphan: true", "---", "", "# Work without faults", ""]
     out += ["| scene | stretches | hours | false trips |", "|---|---|---|---|"]
     trips = []
@@ -100,7 +104,45 @@ def work_page(outcomes: Iterable[Mapping[str, Any]]) -> str:
         out.append(f"| {scene} | {len(found)} | {sum(o['seconds'] for o in found) / HOUR_S:.2f} | {len(stopped)} |")
         trips += [f"- {scene}, seed {seed}, after {at_s:.2f} s: {why}" for seed, at_s, why in stopped]
     out += ["", *(trips or ["No stretch of work was stopped."]), ""]
-    return "\n".join(out)
+    missions = [o for o in work if o["scene"].startswith("mission")]
+    if missions:
+        out += [
+            "## Missions",
+            "",
+            "| scene | seed | minutes | loaded | in the bunk | end |",
+            "|---|---|---|---|---|---|",
+        ]
+        for o in missions:
+            end = "finished" if o.get("finished") else o["failure"]
+            out.append(
+                f"| {o['scene']} | {o['seed']} | {o['seconds'] / 60.0:.1f} | {o.get('loaded', 0)} "
+                f"| {o.get('in_bunk', 0)} | {end} |"
+            )
+        out.append("")
+    return "\n".join(out + separations(done))
+
+
+def separations(work: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How near each monitor came to a stop in work without faults, as lines of Markdown."""
+    measured = [o for o in work if "shares" in o]
+    if not measured:
+        return []
+    lines = [
+        "## How near work comes to a stop", "",
+        "A monitor's share is its statistic over its threshold: at 1 it stops or slows the machine. Armed seconds by "
+        "their greatest share, of any joint:", "",
+        "| monitor | hours | above 0.5 [s] | above 0.8 [s] | 1 and above [s] | greatest | where |",
+        "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    half, most = EDGES.index(0.5) + 1, EDGES.index(0.8) + 1
+    for name, one in sorted(merged(measured).items()):
+        bins = one["bins"]
+        where = f"{one['where']}, {one['run']}" if one["most"] > 0.0 else _EMPTY
+        lines.append(
+            f"| {name} | {sum(bins) / HOUR_S:.2f} | {sum(bins[half:])} | {sum(bins[most:])} | {bins[-1]} "
+            f"| {one['most']:.2f} | {where} |"
+        )
+    return [*lines, ""]
 
 
 def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, float]) -> str:

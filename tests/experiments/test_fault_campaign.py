@@ -9,16 +9,19 @@ from typing import Any
 import pytest
 
 from controller.config import load as load_settings
+from controller.transitions import OPERATING
 from experiments.faults.evidence import Evidence
 from experiments.faults.experiment import nominal_plan, plan, scenes_of
 from experiments.faults.judgement import judge
 from experiments.faults.metrics import METRICS, gather, is_blind
-from experiments.faults.pages import _example, blind_spots, evidence, table
+from experiments.faults.pages import _example, blind_spots, evidence, separations, table
 from experiments.faults.running import HeldSwing, Swing, build, warm
+from experiments.faults.separation import Separation, merged
 from experiments.faults.trial import in_child, inject
 from hil.faults.catalogue import BY_NAME, CASES
 from hil.faults.order import parse
 from hil.faults.table import FaultError
+from hil.harness.lockstep import START_NS
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
@@ -99,6 +102,39 @@ def test_a_miss_is_a_named_blind_spot_only_in_the_works_that_the_catalogue_names
         said = blind_spots(metrics)
         assert {1, blind, 8.0} <= set(numbers_in(said))
     assert all(case.blind for case in CASES if case.blind_in)
+
+
+def test_work_without_faults_tells_how_near_each_monitor_came_and_where() -> None:
+    def work(seed: int, most: float, bins: list[int]) -> dict[str, Any]:
+        share = {"bins": bins, "most": most, "where": "lift", "at_s": 12.0}
+        return {
+            "scene": "crane",
+            "seed": seed,
+            "seconds": 3600.0,
+            "working_s": 1.0,
+            "trips": [],
+            "shares": {"a": share},
+        }
+
+    runs = [work(1, 0.4, [3000, 500, 0, 0, 0, 0, 0]), work(2, 0.95, [1000, 2000, 30, 4, 3, 2, 1])]
+    total = merged(runs)["a"]
+    assert total["bins"] == [4000, 2500, 30, 4, 3, 2, 1]
+    assert (total["most"], total["run"]) == (0.95, "crane, seed 2, after 12 s")
+    assert numbers_in(separations(runs)[-2])[1:4] == [40.0, 6.0, 1.0]
+
+
+def test_an_armed_machine_tells_the_shares_of_its_monitors_and_a_disarmed_one_none() -> None:
+    machine = build("drive aoro_fc8")
+    controller = machine.system.controller
+    separation = Separation(controller, machine.system.guard, START_NS)
+    machine.system.observer.on_outputs.append(separation.outputs)
+    while controller.supervisor.mode not in OPERATING:
+        assert not separation.shares
+        machine.system.advance()
+    for _ in range(2400):
+        machine.system.advance()
+    assert {"carrier too fast", "guard: joint too fast", "joint stuck", "spool open"} <= separation.shares.keys()
+    assert all(sum(one["bins"]) >= 3 and one["most"] < 1.0 for one in separation.shares.values())
 
 
 def test_a_held_swing_ends_at_rest_without_a_step() -> None:
