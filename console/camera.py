@@ -2,22 +2,126 @@
 
 ``/api/camera`` says what belongs to the newest picture, ``/api/camera/NUMBER`` is its JPEG.  However many pages ask,
 the detector is asked at most twice a second, and answers beside its own work: controller and planner take no part.
+
+The camera's newest picture for the page: what belongs to it, and where the chosen grasp is in it.  Pure.
+
+The picture comes from the log detector (`can_dbc.messages.picture`).  The grasp is in the crane's base frame, so it is
+drawn only while the machine stands where the picture was taken.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import AsyncIterator, Callable
-from typing import Final
+from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from can_dbc.messages.picture import PictureFacts
-from console.camera_state import NO_DETECTOR, CameraState
+from can_dbc.messages.picture import PictureFacts, PictureRefused, decode_picture, encode_picture_request
 from console.state import CraneState
+
+SILENT_NS: Final = 5_000_000_000
+"""A detector that has not answered for this long is said not to answer; a detection takes a second or two."""
+MOVED_M: Final = 0.05
+TURNED_RAD: Final = 0.02
+MIN_DEPTH_M: Final = 0.1
+NO_DETECTOR: Final = "No camera: this console is not connected to a log detector (--scene)."
+NO_CAMERA: Final = "No camera: the log detector of this run works without pictures."
+WAITING: Final = "The log detector has not answered yet."
+SILENT: Final = "The log detector does not answer: check that its process runs."
+NO_PICTURE: Final = "No picture has been measured yet: the detector looks when the planner asks and the crane rests."
+
+Place = dict[str, float]
+"""Of the vehicle: ``x_m``, ``y_m``, ``front_rad``, ``rear_rad``."""
+
+
+class CameraState:
+    """The newest picture of one detector; ``jpegs`` has its JPEG and the one before, by ``measured_ns``."""
+
+    def __init__(self) -> None:
+        self.jpegs: dict[int, bytes] = {}
+        self.facts: PictureFacts | None = None
+        self._problem = ""
+        self._begun_ns = self._answered_ns = 0
+        self._without_camera = False
+        self._place: Place | None = None
+
+    def request(self, now_ns: int) -> bytes:
+        """The next request to the detector: for a picture that is newer than this one."""
+        self._begun_ns = self._begun_ns or now_ns
+        return encode_picture_request(self.facts.measured_ns if self.facts else 0)
+
+    def on_reply(self, data: bytes, now_ns: int, place: Place | None) -> None:
+        """Take a datagram of the detector; ``place`` is where the vehicle is now, None for a stationary machine."""
+        self._answered_ns = now_ns
+        try:
+            facts, jpeg = decode_picture(data)
+        except PictureRefused as error:
+            self._without_camera, self._problem = error.code == "picture.no-camera", str(error)
+            return
+        self._without_camera, self._problem = False, facts.problem
+        if jpeg:
+            before = self.facts.measured_ns if self.facts else 0
+            # A page may still fetch the picture of which it was told before.
+            self.jpegs = {n: data for n, data in self.jpegs.items() if n == before} | {facts.measured_ns: jpeg}
+            self.facts, self._place = facts, place
+
+    def page(self, now_ns: int, grasp: dict[str, Any] | None, place: Place | None) -> dict[str, Any]:
+        """What the page shows: ``words`` say why there is no picture or no newer one, empty when all is well."""
+        facts = self.facts
+        if facts is None:
+            return {"picture": 0, "words": self._why_none(now_ns)}
+        silent = now_ns - self._answered_ns > SILENT_NS
+        moved = self._moved(place)
+        return {
+            "picture": facts.measured_ns,
+            "words": SILENT if silent else self._problem,
+            "age_s": round(max(0, now_ns - facts.measured_ns) * 1e-9, 1),
+            "camera": facts.camera,
+            "width_px": facts.width_px,
+            "height_px": facts.height_px,
+            "logs": [
+                {"id": log.id, "ends_px": log.ends_px, "length_m": log.length_m, "diameter_m": log.diameter_m,
+                 "seen": log.seen}
+                for log in facts.logs
+            ],
+            "moved": moved,
+            "grasp": None if grasp is None else {
+                "tips_px": None if moved else _projected(facts, grasp["tips"]),
+                "logs": grasp["logs"], "reason": grasp["reason"],
+            },
+        }  # fmt: skip
+
+    def _why_none(self, now_ns: int) -> str:
+        if self._without_camera:
+            return NO_CAMERA
+        if not self._answered_ns:
+            return SILENT if self._begun_ns and now_ns - self._begun_ns > SILENT_NS else WAITING
+        return f"No picture: {self._problem}." if self._problem else NO_PICTURE
+
+    def _moved(self, place: Place | None) -> bool:
+        before = self._place
+        if before is None or place is None:
+            return False
+        turned = max(abs(math.remainder(place[k] - before[k], math.tau)) for k in ("front_rad", "rear_rad"))
+        return math.hypot(place["x_m"] - before["x_m"], place["y_m"] - before["y_m"]) > MOVED_M or turned > TURNED_RAD
+
+
+def _projected(facts: PictureFacts, points_m: list[list[float]]) -> list[list[float]] | None:
+    """Pixels of base-frame points [m]; None when one is not in front of the camera."""
+    found = []
+    for point in points_m:
+        d = [p - o for p, o in zip(point, facts.position_m, strict=True)]
+        x, y, z = (sum(d[row] * facts.rotation[3 * row + axis] for row in range(3)) for axis in range(3))
+        if z < MIN_DEPTH_M:
+            return None
+        found.append([round(facts.fx_px * x / z + facts.cx_px, 1), round(facts.fy_px * y / z + facts.cy_px, 1)])
+    return found
+
 
 ASK_PERIOD_NS: Final = 450_000_000
 ANSWER_S: Final = 0.3

@@ -6,12 +6,17 @@ commands by POST.  Outputs: the page, ``/ws`` with the state 20 times a second (
 ``/api/state``, ``/api/trail`` (the vehicle's track), ``/api/timeline``, ``/api/camera`` (`console.camera`),
 ``/api/machine``, ``/healthz``; one
 ``OperatorCommand`` datagram per command to the controller, one ``MissionCommand`` datagram per mission command to the
-planner.  Pages that may command answer on ``/ws``, which makes the heartbeats of their watch (`console.page_watch`);
+planner.  Pages that may command answer on ``/ws``, which makes the heartbeats of their watch (`console.console`);
 a page that shows a panel says so there and gets its data (`console.panel`).
 
 STOP is accepted from every page that the console serves, at once and without more.  Everything else needs a session
 that a person opened, a page's token and a role, and what can move the machine the control lease as well
 (`console.access`).  All resources are served from the package; no other host is contacted.
+
+The page's buttons to try to break a live run: asks the desk of faults, and follows what becomes of each.
+
+The harness of a live run gives the desk's socket (`--faults`); the console of a machine has none, and then these
+addresses do not exist.  A fault needs the control lease.
 """
 
 from __future__ import annotations
@@ -21,7 +26,7 @@ import contextlib
 import json
 from collections.abc import AsyncIterator, Callable, Collection
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -36,19 +41,64 @@ from autonomy.perception.log_list.datagrams import LogListError, decode_logs, en
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction
 from can_dbc.messages.mission import MissionAction
 from can_dbc.timing.page import TimingRefused, read_timing
-from console.access import Page
+from console.access import Access, Page
 from console.access_guards import AccessGuards, AuditTrail, page_of, person_of
 from console.access_routes import access_routes
 from console.accounts import Role
 from console.camera import Camera
 from console.console import Address, Console
-from console.fault_desk import fault_routes
+from console.fault_watch import FaultWatch
 from console.foxglove_server import feed_pictures
 from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy
 from console.panel import Panel, panel_data, panels_of
 from console.plan_api import PlanApi
 from console.state import CraneState, describe_machine
 from console.true_logs import TrueLogs
+
+ANSWER_S: Final = 6.0
+MAX_ANSWER_BYTES: Final = 65_536
+
+
+def fault_routes(desk: Path, watch: FaultWatch, access: Access) -> list[Route]:
+    """``/api/faults`` lists what can be tried; a POST to ``/api/faults/NAME`` tries it."""
+    trying = asyncio.Lock()
+
+    async def listed(_: Request) -> Response:
+        told = await _ask(desk, {"op": "list"})
+        return JSONResponse(told["faults"]) if "faults" in told else PlainTextResponse(_error(told), 502)
+
+    async def inject(request: Request) -> Response:
+        if why := access.refusal(page_of(request), Role.OPERATOR, leased=True):
+            return PlainTextResponse(why, 403)
+        if trying.locked():
+            return PlainTextResponse("Another fault is being injected.", 409)
+        async with trying:
+            told = await _ask(desk, {"op": "inject", "name": request.path_params["name"]})
+        if "at_ns" not in told:
+            return PlainTextResponse(_error(told), 409)
+        watch.begin(str(told["title"]), str(told["said"]), int(told["at_ns"]))
+        return Response(status_code=204)
+
+    return [Route("/api/faults", listed), Route("/api/faults/{name}", inject, methods=["POST"])]
+
+
+async def _ask(desk: Path, request: dict[str, str]) -> dict[str, Any]:
+    try:
+        async with asyncio.timeout(ANSWER_S):
+            reader, writer = await asyncio.open_unix_connection(str(desk), limit=MAX_ANSWER_BYTES)
+            try:
+                writer.write(json.dumps(request).encode() + b"\n")
+                told = json.loads(await reader.readline())
+            finally:
+                writer.close()
+    except (OSError, ValueError, TimeoutError) as error:
+        return {"error": f"The run's desk of faults does not answer ({error})."}
+    return told if isinstance(told, dict) else {}
+
+
+def _error(told: dict[str, Any]) -> str:
+    return str(told.get("error") or "The run's desk of faults gave no answer.")
+
 
 PERIOD_S: Final = 0.05
 LOG_REQUEST_PERIOD_S: Final = 0.1  # a log in the grapple moves with it

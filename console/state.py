@@ -2,6 +2,15 @@
 
 Pure: datagrams and integer times in, JSON-ready dictionaries out.  An unknown number (NaN) becomes None.  Peaks (tick
 time, delay) are maxima of the last second, because the page is updated less often than the controller reports.
+
+The chosen grasp for the page, in the crane's base frame; pure, like `console.state`.
+
+The histograms of the timing page, coarse enough for a plot: counts between 1, 2 and 5 of each decade.  Pure.
+
+The numbers of a shift: logs, volume, stops, metres driven and working time, from the reports as they arrive.  Pure.
+
+A shift begins with the console's first report of the controller or when a person begins a new one, and counts whether a
+page is open or not.  Of a mission that had begun before, only what follows is counted.
 """
 
 from __future__ import annotations
@@ -9,21 +18,21 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from math import cos, sin
 from typing import Any, Final
 
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import LinkWatch, StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.grasp import ChosenGrasp, decode_grasp
 from can_dbc.messages.mission import MissionReport
 from can_dbc.messages.vehicle import VehicleReport
+from can_dbc.timing.durations import BINS, edge_ns
 from can_dbc.timing.page import Timing
 from console.fault_watch import FaultWatch
-from console.grasp_state import GraspState
 from console.mission_state import MissionState, describe_carrier
-from console.shift import Shift
-from console.tick_histogram import histograms
 from console.timeline import Timeline
 from machine.geometry import grapple, kinematics
 from machine.geometry.map_projection import MapProjection
@@ -32,6 +41,152 @@ from machine.profile import Profile, joint
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import STALE_INPUT_NAMES
+
+MIN_RATE_NS: Final = 300_000_000_000
+"""Volume per hour is told from this time on: before, a single log decides it."""
+MAX_GAP_NS: Final = 1_000_000_000
+"""Between reports that are farther apart it is unknown whether the machine worked."""
+
+
+@dataclass(slots=True)
+class _Counts:
+    """What a shift has counted."""
+
+    logs: int = 0
+    volume_m3: float = 0.0
+    driven_m: float = 0.0
+    lifts: int = 0
+    stops: int = 0
+    working_ns: int = 0
+
+
+class Shift:
+    """Takes reports in their order."""
+
+    def __init__(self) -> None:
+        self._begun_ns: int | None = None
+        self._counts = _Counts()
+        self._mission: MissionReport | None = None
+        self._report_ns = 0
+        self._events_known = (0, 0)
+
+    def begin(self, now_ns: int) -> None:
+        """Begin a new shift now; the present mission is counted from here."""
+        self._begun_ns, self._counts = now_ns, _Counts()
+
+    def on_report(self, report: StateReport, now_ns: int, stops: int, lifts: int) -> None:
+        """Take a state report; ``stops`` and ``lifts`` are those of the timeline since the console began."""
+        if self._begun_ns is None:
+            self.begin(now_ns)
+        counts, (stops_known, lifts_known) = self._counts, self._events_known
+        counts.stops += stops - stops_known
+        counts.lifts += lifts - lifts_known
+        self._events_known = (stops, lifts)
+        if report.mode == Mode.ACTIVE and 0 < now_ns - self._report_ns < MAX_GAP_NS:
+            counts.working_ns += now_ns - self._report_ns
+        self._report_ns = now_ns
+
+    def on_mission(self, report: MissionReport) -> None:
+        """Take a mission report."""
+        last, self._mission = self._mission, report
+        if last is None or last.name != report.name or report.loaded < last.loaded:
+            return
+        counts = self._counts
+        counts.logs += report.loaded - last.loaded
+        counts.driven_m += max(0.0, report.driven_m - last.driven_m)
+        gained_m3 = report.on_board_m3 - last.on_board_m3
+        if report.loaded > last.loaded and math.isfinite(gained_m3):
+            counts.volume_m3 += max(0.0, gained_m3)
+
+    def numbers(self, now_ns: int) -> dict[str, Any] | None:
+        """The numbers for the page; None before the first report."""
+        if self._begun_ns is None:
+            return None
+        c, long_ns = self._counts, now_ns - self._begun_ns
+        return {
+            "seconds": round(long_ns * 1e-9),
+            "working_s": round(c.working_ns * 1e-9),
+            "logs": c.logs,
+            "lifts": c.lifts,
+            "stops": c.stops,
+            "driven_m": round(c.driven_m, 1),
+            "m3": round(c.volume_m3, 3),
+            "m3_h": round(c.volume_m3 * 3.6e12 / long_ns, 2) if long_ns >= MIN_RATE_NS else None,
+        }
+
+
+EDGES_US: Final = tuple(step * 10**power for power in range(6) for step in (1, 2, 5))[:16]
+"""Upper edges 1 us to 100 ms; what is longer is in one more bar."""
+SHOWN: Final = {
+    "wake": "wake-up latency",
+    "tick": "tick, by the clock",
+    "cpu": "tick, processor time",
+    "sample_to_command": "sample to command",
+}
+
+
+def _bar_of(i: int) -> int:
+    edge_us = edge_ns(i) / 1e3
+    return next((bar for bar, edge in enumerate(EDGES_US) if edge_us <= edge), len(EDGES_US))
+
+
+_BARS: Final = tuple(_bar_of(i) if i < BINS - 1 else len(EDGES_US) for i in range(BINS))
+
+
+def histograms(timing: Timing) -> dict[str, Any]:
+    """Edges [us] and for each measured time its counts, median, 99.9 % and longest [us]."""
+    found = []
+    for name, words in SHOWN.items():
+        durations = timing.durations[name]
+        counts = [0] * (len(EDGES_US) + 1)
+        for i, n in enumerate(durations.bins):
+            if n:
+                counts[_BARS[i]] += n
+        summary = durations.summary()
+        found.append({"name": name, "words": words, "counts": counts, **summary})
+    return {"edges_us": list(EDGES_US), "period_us": timing.facts.period_ns / 1e3, "of": found}
+
+
+TIMEOUT_NS: Final = 1_500_000_000
+"""A grasp that has not been repeated for this long is over; the planner repeats it twice a second."""
+
+
+class GraspState:
+    """Accepts the planner's grasps; those of another machine are refused."""
+
+    def __init__(self, profile: Profile, profile_hash: int, key: bytes | None) -> None:
+        self._hash, self._key = profile_hash, key
+        jaws = profile.grapple.jaws
+        self._half_gap_m, self._below_m = grapple.half_gap_m(jaws, 0.0), grapple.tip_below_pin_m(jaws, 0.0)
+        self._grasp: ChosenGrasp | None = None
+        self._received_ns = 0
+
+    def on_grasp(self, datagram: bytes, now_ns: int) -> bool:
+        """Accept a datagram; False when it is no grasp of this machine."""
+        try:
+            profile_hash, _, grasp = decode_grasp(datagram, self._key)
+        except DatagramRefused:
+            return False
+        if self._hash and profile_hash != self._hash:
+            return False
+        self._grasp, self._received_ns = grasp, now_ns
+        return True
+
+    def shown(self, now_ns: int) -> dict[str, Any] | None:
+        """Hanger pin and both tips of the open jaws [m], logs and reason; None when no grasp is chosen."""
+        g = self._grasp
+        if g is None or now_ns - self._received_ns > TIMEOUT_NS:
+            return None
+        x, y, z = g.pin_m
+        across = (self._half_gap_m * cos(g.yaw_rad), self._half_gap_m * sin(g.yaw_rad))
+        return {
+            "pin": list(g.pin_m),
+            "tips": [[round(x + s * across[0], 4), round(y + s * across[1], 4), round(z - self._below_m, 4)]
+                     for s in (-1.0, 1.0)],
+            "logs": list(g.logs),
+            "reason": g.reason,
+        }  # fmt: skip
+
 
 REPORT_TIMEOUT_NS: Final = 300_000_000
 """Without a report for this long the controller is shown as disconnected."""

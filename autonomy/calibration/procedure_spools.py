@@ -1,12 +1,29 @@
 """The part of a calibration run that moves joints by their spools: programs, travels, and what a wiggle teaches.
 
 See `autonomy.calibration.procedure.Calibration`, of which this is one half.
+
+What the first, gentle opening of a valve tells of it: dead-band, full speed and dead time, roughly.
+
+The search (`autonomy.calibration.spool_program.wiggle`) knows nothing: the spool opens slowly from neutral until the
+encoder has moved a little, to either side.  On such a ramp a valve moves its joint along a parabola, whose foot is the
+dead-band and whose curvature is the gain; so both come from one short motion, well enough to plan the tests that
+measure them (dead-band within 2 % of the stroke, full speed within a third).  The dead time is that of the spool where
+the valve node reports it, else it is fitted with the rest.
+
+The profile is not asked.  Whether it may stay in force for ordinary motions is judged by `suits`: a controller whose
+map is farther off would neither follow nor believe what it sees, and the crane travels by its spools instead
+(`autonomy.calibration.spool_travel`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import isfinite
+from typing import Final
+
+import msgspec
+import numpy as np
 
 from autonomy.calibration.plan import MIN_REACH_M
 from autonomy.calibration.procedure_state import CalibrationState
@@ -14,9 +31,108 @@ from autonomy.calibration.spool_program import SpoolProgram
 from autonomy.calibration.spool_run import LEAD_S, TAIL_S, SpoolRun, program_for
 from autonomy.calibration.spool_travel import Leg, SpoolTravel, best_order
 from autonomy.calibration.tasks import MoveTask, SpoolTask
-from autonomy.calibration.valve_search import rough_spec, suits
+from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, joint
+from machine.sensing.weighing import lever_share
+
+OIL_S: Final = 0.08
+"""Delay of oil, pump and steel between a spool and its joint, roughly."""
+SPOOL_LAG_S: Final = 0.04
+"""What a spool stays behind its dead time, roughly."""
+HALF_PLAY: Final = 0.01
+"""Half of a spool's usual hysteresis, share of the stroke."""
+DEADBANDS: Final = np.arange(0.005, 0.48, 0.0025)
+DELAYS_S: Final = np.arange(0.0, 0.42, 0.01)
+USED_S: Final = 1.2
+"""The fit uses so much of the record before the joint has moved by `FOOT_SHARE` of its way, and all after it."""
+FOOT_SHARE: Final = 0.1
+MAX_GAIN_RATIO: Final = 5.0
+"""A full speed is believed up to this many times the profile's, or this part of it."""
+SUITED_DEADBAND: Final = 0.045
+SUITED_GAIN: Final = 1.6
+SUITED_DELAY_S: Final = 0.17
+"""Differences from the profile, and the dead time, up to which a controller's laws and monitors take it for the same
+valve: the spread of one machine's kind, and what the search itself may be wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoughSide:
+    """One side of a valve: dead-band [share of the stroke], full speed [rad/s, m/s] and dead time [s]."""
+
+    deadband: float
+    full_speed: float
+    delay_s: float
+
+
+def rough_side(test: SpoolTestRecord) -> RoughSide:
+    """What the search to one side tells."""
+    side = test.side
+    way = side * (test.position - float(np.mean(test.position[:10])))
+    if test.spool is None:
+        best = min((_fit(side * test.command, way, delay_s) for delay_s in DELAYS_S), key=lambda found: found[0])
+        return RoughSide(best[1], best[2], max(best[3] - OIL_S - SPOOL_LAG_S, 0.0))
+    _, deadband, full_speed, _ = min(
+        (_fit(side * test.spool, way, s) for s in (0.0, OIL_S)), key=lambda found: found[0]
+    )
+    return RoughSide(deadband, full_speed, _spool_delay_s(test))
+
+
+def _fit(spool: np.ndarray, way: np.ndarray, delay_s: float) -> tuple[float, float, float, float]:
+    """Misfit, dead-band and full speed of the best parabola for a delay of ``way`` behind ``spool``; the delay."""
+    shift = round(delay_s / GRID_S)
+    moved = np.concatenate([np.zeros(shift), spool])[: len(way)]
+    first = int(np.argmax(way > FOOT_SHARE * float(np.max(way))))
+    used = slice(max(0, first - round(USED_S / GRID_S)), None)
+    edges = HALF_PLAY + DEADBANDS[:, None]
+    opening = np.clip(moved[None, :] - edges, 0.0, None) / (1.0 - edges)
+    ways = np.cumsum(opening, axis=1)[:, used] * GRID_S
+    wanted = way[used]
+    gains = np.maximum(ways @ wanted, 0.0) / np.maximum(np.sum(ways**2, axis=1), 1e-12)
+    misfits = np.sum((gains[:, None] * ways - wanted[None, :]) ** 2, axis=1)
+    best = int(np.argmin(misfits))
+    return float(misfits[best]), float(DEADBANDS[best]), float(gains[best]), delay_s
+
+
+def _spool_delay_s(test: SpoolTestRecord) -> float:
+    """Dead time of a reported spool behind its command, s."""
+    assert test.spool is not None
+    step_s = GRID_S / FINE_FACTOR
+    time_s = np.arange(len(test.fine_command)) * step_s
+    at_s = time_s[FINE_FACTOR - 1 :: FINE_FACTOR]
+    late_s = np.arange(0.0, 0.45, 0.005)
+    misfits = [float(np.sum((np.interp(at_s - s, time_s, test.fine_command) - test.spool) ** 2)) for s in late_s]
+    return max(float(late_s[int(np.argmin(misfits))]) - SPOOL_LAG_S, 0.0)
+
+
+def rough_spec(which: Joint, spec: JointSpec, plus: SpoolTestRecord, minus: SpoolTestRecord) -> JointSpec:
+    """The joint with the valve that the searches to both sides have shown; speeds where a lever has its nominal arm."""
+    sides = (rough_side(plus), rough_side(minus))
+    arm = lever_share(spec.valve, float(np.mean(plus.position)))
+    known = (spec.valve.full_speed_plus, spec.valve.full_speed_minus)
+    fulls = [
+        min(max(arm * s.full_speed, known[i] / MAX_GAIN_RATIO), known[i] * MAX_GAIN_RATIO) for i, s in enumerate(sides)
+    ]
+    valve = msgspec.structs.replace(
+        spec.valve,
+        deadband_plus_pct=100.0 * sides[0].deadband,
+        deadband_minus_pct=100.0 * sides[1].deadband,
+        full_speed_plus=fulls[0],
+        full_speed_minus=fulls[1],
+        delay_s=0.5 * (sides[0].delay_s + sides[1].delay_s),
+    )
+    return msgspec.structs.replace(spec, valve=valve)
+
+
+def suits(profile: JointSpec, found: JointSpec) -> bool:
+    """Whether the profile's valve is near enough to the one that was found to move the joint by its map."""
+    a, b = profile.valve, found.valve
+    deadbands = ((a.deadband_plus_pct, b.deadband_plus_pct), (a.deadband_minus_pct, b.deadband_minus_pct))
+    fulls = ((a.full_speed_plus, b.full_speed_plus), (a.full_speed_minus, b.full_speed_minus))
+    near = all(abs(x - y) <= 100.0 * SUITED_DEADBAND for x, y in deadbands)
+    alike = all(1.0 / SUITED_GAIN <= x / y <= SUITED_GAIN for x, y in fulls)
+    return near and alike and b.delay_s <= SUITED_DELAY_S
+
 
 SLOW_SHARE, NARROW_PCT = 0.6, 5.0
 """A side of a valve with less than this share of the profile's full speed is slow: on what a sweep lets through its

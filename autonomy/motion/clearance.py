@@ -3,6 +3,11 @@
 Every part keeps a margin; near the ends of a motion it may be as near to an obstacle as it is there, for a grapple goes
 into bunks and over logs.  The hanging grapple leans as a pendulum of the shortest and of the longest period would under
 this pin.  No clock, no randomness.
+
+Distances between a moving crane and obstacles: swept capsules against boxes, capsules and the ground.
+
+Distances are exact for every sample, negative inside capsules and the ground (0 inside a box), and vectorized; the
+motion of a part between two samples is bounded by its greatest displacement.  Lengths in m.
 """
 
 from __future__ import annotations
@@ -16,10 +21,132 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.distances import motion_between_samples, obstacle_distances
-from autonomy.motion.obstacles import CollisionScene, HeldLog, swept_capsules
+from autonomy.motion.obstacles import CollisionScene, Ground, HeldLog, ObstacleArrays, SweptCapsules, swept_capsules
 from autonomy.motion.time_law import PENDULUM_S
 from autonomy.motion.trajectory import Trajectory
+
+_SMALL: Final = 1e-12
+
+
+def segment_segment(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> np.ndarray:
+    """Distances of segments p0-p1 and q0-q1 (..., 3), exact, also for points and parallels."""
+    u, v, w = p1 - p0, q1 - q0, p0 - q0
+    a, b, c = _dot(u, u), _dot(u, v), _dot(v, v)
+    d, e = _dot(u, w), _dot(v, w)
+    det = a * c - b * b
+    s = np.where(det > _SMALL * np.maximum(a * c, _SMALL), (b * e - c * d) / np.maximum(det, _SMALL), 0.0)
+    s = np.clip(s, 0.0, 1.0)
+    t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
+    s = np.clip((b * t - d) / np.maximum(a, _SMALL), 0.0, 1.0)
+    t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
+    result: np.ndarray = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    return result
+
+
+def segment_box(p0: np.ndarray, p1: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Distances of segments (..., 3) and boxes of half edges (..., 3) about the origin, exact; 0 inside.
+
+    The squared distance along the segment is convex, and quadratic between the crossings of the faces' planes; the zero
+    of its piecewise linear slope is the nearest point.
+    """
+    way = p1 - p0
+    safe = np.where(np.abs(way) > _SMALL, way, 1.0)
+    crossings = np.concatenate([(half - p0) / safe, (-half - p0) / safe], axis=-1)
+    crossings = np.where(np.concatenate([np.abs(way) > _SMALL] * 2, axis=-1), crossings, 0.0)
+    ends = np.zeros((*crossings.shape[:-1], 1))
+    t = np.sort(np.clip(np.concatenate([ends, crossings, ends + 1.0], axis=-1), 0.0, 1.0), axis=-1)
+
+    def out(at: np.ndarray) -> np.ndarray:
+        points = p0[..., None, :] + at[..., None] * way[..., None, :]
+        result: np.ndarray = points - np.clip(points, -half[..., None, :], half[..., None, :])
+        return result
+
+    slope = np.sum(out(t) * way[..., None, :], axis=-1)
+    k = np.clip(np.sum(slope < 0.0, axis=-1), 1, t.shape[-1] - 1)[..., None]
+    s0, s1 = np.take_along_axis(slope, k - 1, -1), np.take_along_axis(slope, k, -1)
+    t0, t1 = np.take_along_axis(t, k - 1, -1), np.take_along_axis(t, k, -1)
+    rise = s1 - s0
+    best = np.where(s0 >= 0.0, t0, np.where(s1 <= 0.0, t1, t0 - s0 * (t1 - t0) / np.where(rise > _SMALL, rise, 1.0)))
+    result: np.ndarray = np.linalg.norm(out(best)[..., 0, :], axis=-1)
+    return result
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    result: np.ndarray = np.einsum("...i,...i->...", a, b)
+    return result
+
+
+def clearances(scene: CollisionScene, body: SweptCapsules, near_m: float = np.inf) -> np.ndarray:
+    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the capsules (`CollisionScene.names`).
+
+    Beyond ``near_m`` a value may be less than the distance, but not less than ``near_m``.
+    """
+    return obstacle_distances(scene.arrays, body, np.array(near_m))
+
+
+def obstacle_distances(things: ObstacleArrays, body: SweptCapsules, near_m: np.ndarray) -> np.ndarray:
+    """The same for obstacles as arrays; ``near_m`` broadcasts to (n, m, 1)."""
+    limit = near_m + body.radius[:, None]
+    middle, way = (body.a + body.b) / 2, (body.b - body.a) / 2
+    columns = [_height_above_ground(things.ground, body.a, body.b)]
+    # Axis by axis, a part and an obstacle are at least as far apart as their bounding boxes.
+    x, y, z = (middle[..., i, None] - things.center[:, i] for i in range(3))
+    cos_, sin_ = things.turn.T
+    x, y = cos_ * x + sin_ * y, cos_ * y - sin_ * x
+    wx, wy, wz = (way[..., i, None] for i in range(3))
+    wx, wy = cos_ * wx + sin_ * wy, cos_ * wy - sin_ * wx
+    hx, hy, hz = things.half.T
+    far = _gap_length(np.abs(x) - np.abs(wx) - hx, np.abs(y) - np.abs(wy) - hy, np.abs(z) - np.abs(wz) - hz)
+    i, m, k = np.nonzero(far < limit)
+    at, to = np.stack([x[i, m, k], y[i, m, k], z[i, m, k]], -1), np.stack([wx[i, m, k], wy[i, m, k], wz[i, m, 0]], -1)
+    far[i, m, k] = segment_box(at - to, at + to, things.half[k])
+    columns.append(far)
+    far = _gap_length(
+        *(
+            np.abs(middle[..., i, None] - things.middle[:, i]) - np.abs(way[..., i, None]) - np.abs(things.along[:, i])
+            for i in range(3)
+        )
+    )
+    far -= things.radius
+    i, m, k = np.nonzero(far < limit)
+    begin, end = things.middle[k] - things.along[k], things.middle[k] + things.along[k]
+    far[i, m, k] = segment_segment(body.a[i, m], body.b[i, m], begin, end) - things.radius[k]
+    columns.append(far)
+    result: np.ndarray = np.concatenate(columns, axis=2) - body.radius[:, None]
+    return result
+
+
+def _gap_length(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Length of a gap (n, m, k) from its components along the axes; negative components count as 0."""
+    x, y, z = np.maximum(x, 0.0), np.maximum(y, 0.0), np.maximum(z, 0.0)
+    result: np.ndarray = np.sqrt(x * x + y * y + z * z)
+    return result
+
+
+def _height_above_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Least height of both ends and the middle above the ground, (n, m, 1)."""
+    heights = []
+    for share in (0.0, 0.5, 1.0):
+        p = a + share * (b - a)
+        heights.append(p[..., 2] - (ground(p[..., 0], p[..., 1]) if callable(ground) else ground))
+    result: np.ndarray = np.min(np.stack(heights, axis=-1), axis=-1)[..., None]
+    return result
+
+
+def motion_between_samples(body: SweptCapsules) -> np.ndarray:
+    """By how much a part may be nearer between two samples than at either, (n, m): half of its displacement."""
+    move = np.maximum(np.linalg.norm(np.diff(body.a, axis=0), axis=2), np.linalg.norm(np.diff(body.b, axis=0), axis=2))
+    nothing = np.zeros((1, move.shape[1]))
+    result: np.ndarray = 0.5 * np.maximum(np.concatenate([nothing, move]), np.concatenate([move, nothing]))
+    return result
+
+
+def least_clearance(scene: CollisionScene, body: SweptCapsules) -> tuple[float, str, str, int]:
+    """The least clearance [m], the part, the obstacle, and the sample."""
+    apart = clearances(scene, body)
+    i, m, k = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    return float(apart[i, m, k]), body.names[m], scene.names[k], int(i)
+
 
 MARGIN_M: Final = 0.10
 """Least clearance along the path, beyond the predicted swing; near its ends a part may be as near to an obstacle as it

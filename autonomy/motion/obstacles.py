@@ -1,7 +1,7 @@
 """Collision geometry: obstacles as boxes, capsules and the ground, and the moving crane as swept capsules.
 
 Everything that moves is a capsule: boom, stick with telescope, the hanging grapple and the log in it.  Everything that
-stands still is a box turned about the vertical, a capsule (logs, trees) or the ground.  ``autonomy.motion.distances``
+stands still is a box turned about the vertical, a capsule (logs, trees) or the ground.  ``autonomy.motion.clearance``
 computes their distances.  Crane base frame, m and rad.
 """
 

@@ -75,9 +75,9 @@ class Guard:
 
     __slots__ = (
         "_a", "_agreed_ns", "_apart_ns", "_armed", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
-        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_motion",
-        "_now_ns", "_open_pct", "_operated_ns", "_own_keys", "_profile_check", "_punctuality", "_reach", "_reset_seen",
-        "_sent", "_status", "_stopped_ns", "_supply", "_watches", "axis", "events", "latched", "verdict",
+        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_now_ns", "_open_pct",
+        "_operated_ns", "_own_keys", "_profile_check", "_punctuality", "_reach", "_reset_seen", "_sent", "_status",
+        "_stopped_ns", "_supply", "_watches", "axis", "events", "joints", "latched", "motion", "verdict",
     )  # fmt: skip
 
     def __init__(self, envelope: Envelope, layouts: dict[str, Layout], latched: bool = False) -> None:
@@ -97,7 +97,7 @@ class Guard:
         self._sent = [SentMessage(layouts[name], period_ns) for name, period_ns in sent]
         self._own_keys = (*(message.layout.key for message in self._sent), HEARTBEAT_KEY)
         sensed = {axis.number: MeasuredJoint(axis, layouts[axis.message]) for axis in axes if axis.message}
-        self._joints = {joint.layout.key: joint for joint in sensed.values()}
+        self.joints = {joint.layout.key: joint for joint in sensed.values()}
         fields_a, fields_b = layouts["ValveCmdA"].fields, layouts["ValveCmdB"].fields
         missing = [axis.signal for axis in axes if axis.signal not in fields_a and axis.signal not in fields_b]
         if missing:
@@ -107,13 +107,13 @@ class Guard:
             self._a: [c for c in self._commands if c.axis.signal in fields_a],
             self._b: [c for c in self._commands if c.axis.signal in fields_b],
         }
-        self._motion: list[tuple[WatchedMessage, MotionWatch]] = []
+        self.motion: list[tuple[WatchedMessage, MotionWatch]] = []
         spools = [(axis.number, axis.signal, min(axis.deadbands_pct), axis.closing_ns) for axis in axes]
         spools.append((GRAPPLE_AXIS, "Grapple", GRAPPLE_DEADBAND_PCT, GRAPPLE_CLOSING_NS))
         for number, signal, deadband_pct, closing_ns in spools:
             feedback = next(m for m in self._feedback if f"Spool{signal}" in m.layout.fields)
             field = feedback.layout.fields[f"Spool{signal}"]
-            self._motion.append((feedback, MotionWatch(number, field, deadband_pct, closing_ns, sensed.get(number))))
+            self.motion.append((feedback, MotionWatch(number, field, deadband_pct, closing_ns, sensed.get(number))))
         self._reach, self._profile_check = Reach(envelope), envelope.profile_check
         self._grapple_field = fields_b["Grapple"]
         self.verdict, self.axis = Verdict.NO_COMMAND, NO_AXIS
@@ -160,7 +160,7 @@ class Guard:
     @property
     def keys_of_buses(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Keys to receive from crane0 and from mach0: the watched ones, and the guard's own, which nobody may send."""
-        keys = (*self._watches, *self._joints, *self._own_keys)
+        keys = (*self._watches, *self.joints, *self._own_keys)
         return tuple(k for k in keys if not k & EXTENDED), tuple(k for k in keys if k & EXTENDED)
 
     @property
@@ -171,7 +171,7 @@ class Guard:
     def _receive(self, frame: Frame, now_ns: int) -> Finding:
         watch = self._watches.get(frame.key)
         if watch is None:
-            joint = self._joints.get(frame.key)
+            joint = self.joints.get(frame.key)
             if joint is not None:
                 joint.receive(frame, now_ns)
             return (Verdict.OTHER_GUARD, NO_AXIS) if frame.key in self._own_keys else FINE
@@ -239,26 +239,19 @@ class Guard:
             self._agreed_ns = now_ns
         return FINE if neutral else self._check_commanded(now_ns)
 
-    def shares(self) -> dict[str, float]:
-        """What was measured of the joints over what is a fault, 1 and more, by the fault."""
-        return {
-            "guard: joint moves with its valve shut": max(watch.share() for _, watch in self._motion),
-            "guard: joint too fast": max((joint.share() for joint in self._joints.values()), default=0.0),
-        }
-
     def _check_motion(self, heard: bool, now_ns: int, elapsed_s: float) -> Finding:
         """Motion that nobody commands, or too fast a one; the valve node obeys only what is heard, and in its mode."""
         words = {message: None if message.old(now_ns) else message.word for message in self._feedback}
         follows = heard and self._a.raw("Mode") == _SPOOL
         first = FINE
-        for feedback, watch in self._motion:
+        for feedback, watch in self.motion:
             if watch.number == GRAPPLE_AXIS:
                 command = _GRAPPLE_SIDE[self._b.raw("GrappleMode")] if heard else 0.0
             else:
                 command = self._commands[watch.number].percent if follows else 0.0
             found = watch.check(command, words[feedback], now_ns, elapsed_s)
             first = found if first is FINE else first
-        for joint in self._joints.values():
+        for joint in self.joints.values():
             if joint.too_fast() and first is FINE:
                 first = Verdict.OVERSPEED, joint.axis.number
         return first
@@ -273,7 +266,7 @@ class Guard:
             return Verdict.DISAGREE, NO_AXIS
         if self.enabled and not self._armed and not self._stopping(now_ns):
             return Verdict.NOT_ARMED, NO_AXIS
-        for joint in self._joints.values():
+        for joint in self.joints.values():
             if joint.silent(now_ns):
                 return Verdict.ENCODER, joint.axis.number
         self._beyond = 0 if (found := self._check_place()) is FINE else self._beyond + 1
@@ -281,12 +274,12 @@ class Guard:
 
     def _check_place(self) -> Finding:
         """Rules on where the crane is and whereto its commands lead."""
-        for joint in self._joints.values():
+        for joint in self.joints.values():
             outward = self._commands[joint.axis.number].percent * joint.axis.sign
             beyond = joint.position - joint.axis.upper if outward > 0.0 else joint.axis.lower - joint.position
             if outward and beyond > RANGE_MARGIN_UNITS:
                 return Verdict.OUTSIDE, joint.axis.number
-        at = [joint.position for joint in self._joints.values() if joint.axis.number < 4]
+        at = [joint.position for joint in self.joints.values() if joint.axis.number < 4]
         deeper = len(at) == 4 and self._reach.deeper(at, [command.speed for command in self._commands[:4]])
         return (Verdict.REACH, NO_AXIS) if deeper else FINE
 

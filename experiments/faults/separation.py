@@ -44,7 +44,14 @@ class Separation:
             self._take({"encoder noisy": controller.estimators[j].noise_share()}, j.name.lower(), now_ns)
         if controller.vehicle is not None:
             self._take(controller.vehicle.monitor.shares(now_ns), "carrier", now_ns)
-        self._take(self._guard.shares(), "guard", now_ns)
+        guard = self._guard
+        self._take(
+            {
+                "guard: joint moves with its valve shut": max(watch.share() for _, watch in guard.motion),
+                "guard: joint too fast": max((joint.share() for joint in guard.joints.values()), default=0.0),
+            },
+            "guard", now_ns,
+        )  # fmt: skip
         if now_ns >= self._ends_ns:
             self._ends_ns = now_ns + SECOND_NS
             for name, share in self._second.items():

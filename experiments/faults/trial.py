@@ -2,6 +2,8 @@
 
 A child process continues the machine of its parent, so all injections of a scene share its start-up; the parent stays
 at the moment of the fork.  The same scene, case and seed give the same outcome, in a child as in a fresh process.
+
+Whether an injection was answered as the catalogue promises.  Pure: an outcome in, a verdict out.
 """
 
 from __future__ import annotations
@@ -12,14 +14,13 @@ import math
 import os
 import signal
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any, Final
 
 from autonomy.crane_job.phases import Phase
 from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
-from experiments.faults.judgement import judge
 from experiments.faults.running import Running, build, warm
 from hil.faults.catalogue import CASES, Where
 from hil.faults.draws import Injection
@@ -28,6 +29,57 @@ from hil.harness.lockstep import SLICE_NS, START_NS
 from machine.joints import JOINTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+
+SEVERITY: Final = {"D": 1, "H": 2, "R1": 3, "R0": 4}
+STOPS: Final = ("H", "R1", "R0")
+T_MS: Final = 5.0
+NODE_MS: Final = 200.0
+"""Bound of a dead controller: the valve node's own time-out makes the valves neutral."""
+
+
+def judge(outcome: Mapping[str, Any]) -> dict[str, Any]:
+    """``detect_ms`` (None: never), ``verdict`` and ``missed`` of an outcome.
+
+    Verdicts: ok; late (after the bound); undetected; weak (a milder reaction than promised); tripped (a stop where
+    nothing may stop); far (more tip travel than promised).  All but ok count as missed.
+    """
+    expected, reached = outcome["expected"], outcome["reached"]
+    due_ms = outcome.get("due_ms", 0.0)
+    # A fault between two ticks is met by the next; where the bound does not begin, any reaction is in time.
+    bound_ms = outcome["bound_ms"] + outcome["seen_ms"] + T_MS + (math.inf if due_ms is None else due_ms)
+    stops = [reached[r] for r in STOPS if r in reached]
+    match expected:
+        case "NONE":
+            return _answer(min(stops) if stops else None, "tripped" if stops else "ok")
+        case "REFUSED":
+            refused = outcome["refused_ms"]
+            if stops:
+                return _answer(refused, "tripped")
+            return _answer(refused, _timed(refused, bound_ms))
+        case "X":
+            return _answer(reached.get("X"), _timed(reached.get("X"), bound_ms))
+        case "NODE":
+            return _answer(outcome["valves_ms"], _timed(outcome["valves_ms"], bound_ms))
+    enough = [ms for r, ms in reached.items() if SEVERITY.get(r, 0) >= SEVERITY[expected]]
+    if not enough:
+        return _answer(min(reached.values(), default=None), "weak" if reached else "undetected")
+    detect_ms = min(enough)
+    verdict = _timed(detect_ms, bound_ms)
+    limit_m = outcome["tip_limit_m"]
+    if verdict == "ok" and limit_m is not None and outcome["astray_m"] > limit_m:
+        verdict = "far"
+    return _answer(detect_ms, verdict)
+
+
+def _timed(found_ms: float | None, bound_ms: float) -> str:
+    if found_ms is None:
+        return "undetected"
+    return "ok" if found_ms <= bound_ms else "late"
+
+
+def _answer(detect_ms: float | None, verdict: str) -> dict[str, Any]:
+    return {"detect_ms": detect_ms, "verdict": verdict, "missed": verdict != "ok"}
+
 
 EARLIEST_S, LATEST_S = 0.0, 2.0
 """When the injection comes after the fork."""

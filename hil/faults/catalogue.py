@@ -49,7 +49,7 @@ class Case:
 
     ``physics``: the fault acts on oil or steel, so the plant with physics runs; otherwise the kinematic machine does.
     ``blind``: what is not seen, and why, in a sentence for the evidence page.  ``blind_in``: the works in which a miss
-    is that named blind spot, ``blind_as``: the verdicts that are it in every work (`experiments.faults.judgement`),
+    is that named blind spot, ``blind_as``: the verdicts that are it in every work (`experiments.faults.trial`),
     ``blind_most_m``: the greatest harm that it explains [m]; any other miss is unexplained.
     """
 

@@ -3,7 +3,7 @@
 PX4's words (docs.px4.io, "System Failure Injection") are kept unchanged: off, stuck, garbage, wrong, slow, delayed,
 intermittent.  A fault is found by its name (`encoder-stuck`) or by component and word (`encoder-lift stuck`).  One row
 here is one fault; what it does is in `sim.plant_faults` (the machine), `hil.wire.faults` (the bus),
-`hil.faults.datagrams` (the planner's datagrams) and `hil.faults.injector` (processes).
+`hil.faults.injector` (the planner's datagrams) and `hil.faults.injector` (processes).
 """
 
 from __future__ import annotations

@@ -3,19 +3,22 @@
 Input is a run's directory or one ``run.mcap``; the profile, the DBC and every input come from the recording.  The same
 code gives the same bytes, so the first tick that differs is where today's controller decides differently.  The state
 cannot be reconstructed across missing ticks: a replay ends there and reports them.
+
+Describes how the recorded and the replayed outputs of a tick differ.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.dbc.codec import resolve
+from can_dbc.dbc.codec import Database, load, resolve
+from can_dbc.frame import RawFrame, describe
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import RecordRefused, TickRecord
@@ -24,11 +27,48 @@ from controller.config import load as load_settings
 from controller.process.tick_recording import restore_inputs, transmitted
 from controller.step import Controller, step
 from controller.tick import Inputs
-from hil.replay.difference import differing_lines
 from hil.replay.recording import PROFILE_FILE, manifest_of, messages
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
 from recorder.recorder import TICK
+
+Outputs = tuple[Sequence[RawFrame], Sequence[RawFrame], bytes, bytes]
+"""Frames on crane0, frames on mach0, crane report, vehicle report."""
+
+
+def differing_lines(recorded: Outputs, replayed: Outputs) -> dict[str, list[str]]:
+    """The outputs of either side in words, without the lines that both have."""
+    databases = load("crane"), load("machine")
+    lines = []
+    for crane, machine, *reports in (recorded, replayed):
+        described = [_frame_text(databases[0], *frame) for frame in crane] + [
+            _frame_text(databases[1], *frame) for frame in machine
+        ]
+        lines.append(described + [line for report in reports for line in _report_text(report)])
+    before, now = lines
+    return {
+        "recorded": [line for line in before if line not in now] or before,
+        "replayed": [line for line in now if line not in before] or now,
+    }
+
+
+def _frame_text(database: Database, key: int, data: bytes) -> str:
+    codec = database.find(key)
+    raw = f"{describe(key)}#{data.hex().upper()}"
+    if codec is None or len(data) != codec.length:
+        return raw
+    values = codec.named(codec.decode(data))
+    return f"{raw} {codec.name} " + " ".join(f"{name}={value:g}" for name, value in values.items())
+
+
+def _report_text(report: bytes) -> list[str]:
+    if not report:
+        return []
+    try:
+        return [str(datagrams.decode(report))]
+    except DatagramRefused:
+        return [f"report {report.hex()}"]
+
 
 _RATE_TICKS: Final = 64
 """Ticks that determine the control rate."""

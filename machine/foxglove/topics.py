@@ -15,37 +15,216 @@ topic               schema                      contents
 ==================  ==========================  ==============================================================
 
 Times are those under which the messages are logged: UTC in a live run, monotonic in lockstep [ns].  Pure.
+
+The planner's map of the logs, and where the machine stands on it, in the frame ``map``.
+
+``map`` is level, x to the east and y to the north of the first place that is told, z = 0 on the ground.  The machine is
+drawn level on it, and a log as a cylinder that lies on it: a mission report has neither heights nor slopes.
+
+The machine as simple bodies in the frames of `machine.geometry.link_frames`, for the 3-D panel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import cos, isfinite, pi, radians, sin, sqrt
 from typing import Final, NamedTuple, Protocol
 
 from foxglove import Schema
 from foxglove.messages import (
+    Color,
     CompressedImage,
+    CubePrimitive,
+    CylinderPrimitive,
+    Duration,
     FrameTransform,
     FrameTransforms,
     JointState,
     JointStates,
+    KeyValuePair,
     LocationFix,
     Log,
     LogLevel,
+    Pose,
     Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneEntityDeletionType,
     SceneUpdate,
     Timestamp,
     Vector3,
 )
 
-from machine.foxglove.log_map import LogMap, LogsReport, PlaceReport
-from machine.foxglove.scene import machine_scene
-from machine.geometry.link_frames import link_frames
-from machine.joints import JOINTS
-from machine.profile import Profile
+from machine.geometry.carrier import axis_from_antenna, pivot_height_m, rear_from_base
+from machine.geometry.link_frames import BASE, link_frames
+from machine.geometry.map_projection import MapProjection
+from machine.joints import JOINTS, Joint
+from machine.profile import Carrier, Profile, joint_limits
 from machine.status.explanation import describe
 from machine.status.modes import Mode
+
+Size = tuple[float, float, float]
+CRANE: Final = Color(r=0.88, g=0.64, b=0.18, a=1.0)
+STEEL: Final = Color(r=0.55, g=0.59, b=0.62, a=1.0)
+BUNK: Final = Color(r=0.29, g=0.35, b=0.32, a=1.0)
+GROUND: Final = Color(r=0.13, g=0.19, b=0.16, a=0.6)
+GROUND_M: Final = 20.0
+FOREVER: Final = Duration(sec=0, nsec=0)
+
+
+def machine_scene(profile: Profile, stamp: Timestamp) -> SceneUpdate:
+    """Column, boom, stick, telescope, grapple and bunk, each as an entity of its own that stays; the same each time."""
+    kin, bunk = profile.kinematics, profile.bunk
+    longest_m = joint_limits(profile)[Joint.EXT][1]
+    bodies = [
+        ("boom", _along_x(kin.a2_m, 0.0, 0.0, 0.25, CRANE)),
+        ("stick", _along_x(kin.d4_m, 0.0, kin.a3_m, 0.2, CRANE)),
+        ("pin", _along_x(longest_m, -longest_m, 0.0, 0.12, STEEL)),
+        ("grapple", _cube((0.7, 0.18, 0.2), (0.0, 0.0, 0.0), CRANE)),
+    ]
+    column = CylinderPrimitive(
+        pose=_pose((0.0, 0.0, 0.5 * kin.d1_m)), size=Vector3(x=0.4, y=0.4, z=max(kin.d1_m, 0.1)),
+        bottom_scale=1.0, top_scale=1.0, color=CRANE,
+    )  # fmt: skip
+    x, y = bunk.center_m
+    floor = _cube((bunk.length_m, bunk.width_m, 0.1), (x, y, bunk.floor_z_m - 0.05), BUNK, bunk.yaw_rad)
+    entities = [_entity(frame, frame, stamp, cubes=[body]) for frame, body in bodies]
+    entities.append(_entity("column", "column", stamp, cylinders=[column]))
+    entities.append(_entity("bunk", BASE, stamp, cubes=[floor]))
+    if profile.carrier is None:
+        ground = _cube((GROUND_M, GROUND_M, 0.02), (0.0, 0.0, profile.workspace.ground_z_m - 0.01), GROUND)
+        entities.append(_entity("ground", BASE, stamp, cubes=[ground]))
+    return SceneUpdate(deletions=[], entities=entities)
+
+
+def _entity(
+    name: str,
+    frame: str,
+    stamp: Timestamp,
+    cubes: list[CubePrimitive] | None = None,
+    cylinders: list[CylinderPrimitive] | None = None,
+) -> SceneEntity:
+    return SceneEntity(
+        timestamp=stamp, frame_id=frame, id=name, lifetime=FOREVER, frame_locked=True, cubes=cubes or [],
+        cylinders=cylinders or [],
+    )  # fmt: skip
+
+
+def _along_x(length_m: float, from_m: float, z_m: float, thick_m: float, color: Color) -> CubePrimitive:
+    return _cube((length_m, thick_m, thick_m), (from_m + 0.5 * length_m, 0.0, z_m), color)
+
+
+def _cube(size_m: Size, center_m: Size, color: Color, yaw_rad: float = 0.0) -> CubePrimitive:
+    return CubePrimitive(
+        pose=_pose(center_m, yaw_rad), size=Vector3(x=size_m[0], y=size_m[1], z=size_m[2]), color=color
+    )
+
+
+def _pose(center_m: Size, yaw_rad: float = 0.0) -> Pose:
+    turn = Quaternion(x=0.0, y=0.0, z=sin(yaw_rad / 2), w=cos(yaw_rad / 2))
+    return Pose(position=Vector3(x=center_m[0], y=center_m[1], z=center_m[2]), orientation=turn)
+
+
+MAP: Final = "map"
+LOG: Final = Color(r=0.54, g=0.35, b=0.21, a=1.0)
+TARGET: Final = Color(r=1.0, g=0.62, b=0.77, a=1.0)
+GIVEN_UP: Final = Color(r=0.55, g=0.55, b=0.55, a=0.5)
+_LYING: Final = sqrt(0.5)
+
+
+class MappedLog(Protocol):
+    """`can_dbc.messages.mission.KnownLog`."""
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def place(self) -> tuple[float, float]: ...
+    @property
+    def bearing_deg(self) -> float: ...
+    @property
+    def length_m(self) -> float: ...
+    @property
+    def diameter_m(self) -> float: ...
+    @property
+    def misses(self) -> int: ...
+    @property
+    def given_up(self) -> bool: ...
+
+
+class LogsReport(Protocol):
+    """`can_dbc.messages.mission.MissionReport`."""
+
+    @property
+    def logs(self) -> Sequence[MappedLog]: ...
+    @property
+    def targets(self) -> Sequence[int]: ...
+
+
+class PlaceReport(Protocol):
+    """`can_dbc.messages.vehicle.VehicleReport`."""
+
+    @property
+    def latitude_deg(self) -> float: ...
+    @property
+    def longitude_deg(self) -> float: ...
+    @property
+    def heading_rad(self) -> float: ...
+    @property
+    def articulation_rad(self) -> float: ...
+    @property
+    def heights_m(self) -> Sequence[float]: ...
+
+
+class LogMap:
+    """Draws one machine's map."""
+
+    def __init__(self, carrier: Carrier) -> None:
+        self._carrier = carrier
+        self._ground = MapProjection()
+
+    def base_in_map(self, report: PlaceReport, stamp: Timestamp) -> FrameTransform | None:
+        """The crane's base frame in ``map``; None while position, heading or articulation is unknown."""
+        known = (report.latitude_deg, report.longitude_deg, report.heading_rad, report.articulation_rad)
+        if not all(map(isfinite, known)):
+            return None
+        here = self._ground.metres(report.latitude_deg, report.longitude_deg)
+        east, north = axis_from_antenna(self._carrier, here, report.heading_rad)
+        heights = [height for height in report.heights_m if isfinite(height)] or [self._carrier.arm_transport_m]
+        yaw = 0.5 * pi - report.heading_rad - report.articulation_rad
+        x, y, z = rear_from_base(self._carrier, (0.0, 0.0, 0.0))
+        turned = yaw + self._carrier.crane_yaw_rad
+        return FrameTransform(
+            timestamp=stamp, parent_frame_id=MAP, child_frame_id=BASE,
+            translation=Vector3(
+                x=east + cos(yaw) * x - sin(yaw) * y, y=north + sin(yaw) * x + cos(yaw) * y,
+                z=pivot_height_m(self._carrier, sum(heights) / len(heights)) + z,
+            ),
+            rotation=Quaternion(x=0.0, y=0.0, z=sin(turned / 2), w=cos(turned / 2)),
+        )  # fmt: skip
+
+    def logs(self, report: LogsReport, stamp: Timestamp) -> SceneUpdate:
+        """All logs of the map in place of those of before: each an entity, the targets and those given up by colour."""
+        return SceneUpdate(
+            deletions=[SceneEntityDeletion(timestamp=stamp, type=SceneEntityDeletionType.All, id="")],
+            entities=[self._entity(log, log.number in report.targets, stamp) for log in report.logs],
+        )
+
+    def _entity(self, log: MappedLog, is_target: bool, stamp: Timestamp) -> SceneEntity:
+        x, y = self._ground.metres(*log.place)
+        yaw = radians(90.0 - log.bearing_deg)
+        # A cylinder stands; it is laid along x (a quarter turn about y) and then turned about z.
+        laid = Quaternion(x=-_LYING * sin(yaw / 2), y=_LYING * cos(yaw / 2), z=_LYING * sin(yaw / 2),
+                          w=_LYING * cos(yaw / 2))  # fmt: skip
+        body = CylinderPrimitive(
+            pose=Pose(position=Vector3(x=x, y=y, z=0.5 * log.diameter_m), orientation=laid),
+            size=Vector3(x=log.diameter_m, y=log.diameter_m, z=log.length_m), bottom_scale=1.0, top_scale=1.0,
+            color=TARGET if is_target else GIVEN_UP if log.given_up else LOG,
+        )  # fmt: skip
+        return SceneEntity(
+            timestamp=stamp, frame_id=MAP, id=f"log {log.number}", lifetime=Duration(sec=0, nsec=0), frame_locked=True,
+            metadata=[KeyValuePair(key="missed grasps", value=str(log.misses))], cylinders=[body],
+        )  # fmt: skip
+
 
 ENCODING: Final = "protobuf"
 MOTION_PERIOD_NS: Final = 50_000_000

@@ -18,8 +18,7 @@ from autonomy.perception.fitting.cylinder import (
     surface_depth,
 )
 from autonomy.perception.fitting.cylinder_fit import fit_cylinder
-from autonomy.perception.fitting.initial_cylinder import initial_cylinder
-from autonomy.perception.fitting.log_fragments import implausibility
+from autonomy.perception.fitting.measure import implausibility, initial_cylinder
 from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
 from sim.camera.scene import BUNK, SceneBuilder

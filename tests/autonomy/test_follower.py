@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.navigation import speed
 from autonomy.navigation.clothoid_path import Path, drivable_path
 from autonomy.navigation.follower import FollowerState, follow_path
-from autonomy.navigation.path_drive import PathDrive
+from autonomy.navigation.path_drive import MIN_SPEED_SHARE, PathDrive, Rocking, terrain_speed_share, tip_margin_m
 from tests.autonomy.driven_carrier import CARRIER, SQUARE, at
 
 # -- follower
@@ -78,31 +77,31 @@ def test_a_standing_machine_is_not_steered() -> None:
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.6, 0.6))
 def test_leaning_reduces_the_margin_and_the_speed(roll: float, pitch: float, bend: float) -> None:
-    level = speed.tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend))
-    leans = speed.tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend, roll_rad=roll, pitch_rad=pitch))
-    more = speed.tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend, roll_rad=3 * roll, pitch_rad=pitch))
+    level = tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend))
+    leans = tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend, roll_rad=roll, pitch_rad=pitch))
+    more = tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend, roll_rad=3 * roll, pitch_rad=pitch))
     if abs(roll) > 0.1 and abs(bend) < 0.1:
         assert more < leans
     assert 0.5 < level < 1.1
-    assert 0.0 <= speed.terrain_speed_share(leans, 0.0) <= 1.0
-    assert speed.terrain_speed_share(leans, 0.2) <= speed.terrain_speed_share(leans, 0.0)
+    assert 0.0 <= terrain_speed_share(leans, 0.0) <= 1.0
+    assert terrain_speed_share(leans, 0.2) <= terrain_speed_share(leans, 0.0)
 
 
 def test_the_margin_of_a_level_machine_is_half_its_track() -> None:
-    assert speed.tip_margin_m(CARRIER, at(0, 0, 0)) == pytest.approx(0.5 * CARRIER.track_width_m)
-    right_down = speed.tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2))
-    assert speed.tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2), -1.0) > right_down  # a bend to the right helps
-    assert speed.tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2), 1.0) < right_down
+    assert tip_margin_m(CARRIER, at(0, 0, 0)) == pytest.approx(0.5 * CARRIER.track_width_m)
+    right_down = tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2))
+    assert tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2), -1.0) > right_down  # a bend to the right helps
+    assert tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2), 1.0) < right_down
 
 
 def test_rocking_reduces_the_speed_for_a_while() -> None:
-    rocking = speed.Rocking()
+    rocking = Rocking()
     for i in range(60):
         rate = rocking.step(at(0, 0, 0, roll_rad=0.02 * (i % 2), stamp_ns=10**9 + i * 50_000_000))
-    assert speed.terrain_speed_share(1.0, rate) == pytest.approx(speed.MIN_SPEED_SHARE)
+    assert terrain_speed_share(1.0, rate) == pytest.approx(MIN_SPEED_SHARE)
     for i in range(60, 400):
         rate = rocking.step(at(0, 0, 0, stamp_ns=10**9 + i * 50_000_000))
-    assert speed.terrain_speed_share(1.0, rate) == 1.0
+    assert terrain_speed_share(1.0, rate) == 1.0
 
 
 def test_close_to_tipping_the_machine_does_not_drive() -> None:

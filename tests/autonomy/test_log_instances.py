@@ -18,7 +18,7 @@ from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from machine.geometry.optics import Intrinsics
 from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture
-from training.detection.targets import targets
+from training.detection.segmentation import targets
 
 CROSSED = (((80, 80), 0.3, 100, 12), ((80, 80), 1.7, 90, 12))
 PARALLEL = (((80, 60), 0.2, 100, 12), ((80, 73), 0.2, 100, 12), ((80, 86), 0.2, 100, 12))

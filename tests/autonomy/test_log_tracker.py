@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.fitting.cylinder import Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
-from autonomy.perception.fitting.log_fragments import fragment_groups, joined_cylinder, same_log
+from autonomy.perception.fitting.measure import fragment_groups, joined_cylinder, same_log
 from autonomy.perception.log_list.estimate import END, START, LogEstimate
 from autonomy.perception.tracking.log_filter import CameraErrors
 from autonomy.perception.tracking.log_tracker import LOST_MISSES, LogTracker

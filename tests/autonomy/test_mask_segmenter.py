@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from autonomy.networks.graph import parameter_count
-from autonomy.perception.segmentation.kernel_masks import kernel_logs
 from autonomy.perception.segmentation.mask_network import FEATURES, KERNEL, mask_input, mask_network
-from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter, decoded
+from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter, decoded, kernel_logs
 from autonomy.perception.segmentation.network import COS2, MAPS, MASK
 from machine.geometry.optics import Intrinsics
 

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize_scalar
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.distances import clearances, least_clearance, motion_between_samples, segment_box, segment_segment
+from autonomy.motion.clearance import clearances, least_clearance, motion_between_samples, segment_box, segment_segment
 from autonomy.motion.obstacles import (
     Box,
     Capsule,

@@ -11,8 +11,7 @@ import pytest
 from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.motion import clearance
 from autonomy.motion.arm import Arm
-from autonomy.motion.clearance import clearance_reserve
-from autonomy.motion.distances import clearances
+from autonomy.motion.clearance import clearance_reserve, clearances
 from autonomy.motion.obstacles import Capsule, CollisionScene, HeldLog, collision_scene, swept_capsules, tree_capsule
 from autonomy.motion.path_search import PathBlocked, plan_path
 from autonomy.motion.pose import Pose

@@ -18,9 +18,9 @@ from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, make_seg
 from autonomy.perception.segmentation.watershed import boundary_map, watershed
 from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture
-from training.detection import segment_scorers
-from training.detection.segment_scorers import quality_examples
-from training.detection.targets import targets
+from training.detection import scorer_weights
+from training.detection.scorer_weights import quality_examples
+from training.detection.segmentation import targets
 
 ROOM = np.ones((20, 60), bool)
 
@@ -146,7 +146,7 @@ def test_a_merged_segment_has_the_borders_of_both():
 
 def test_examples_have_both_answers():
     foreground, ids = foreground_of_logs(*CROSSED)
-    pairs = segment_scorers.merge_examples(foreground, ids, np.random.default_rng(1))
+    pairs = scorer_weights.merge_examples(foreground, ids, np.random.default_rng(1))
     assert pairs.features.shape[1] == len(PAIR_FEATURES) and set(pairs.target) == {0.0, 1.0}
     whole = quality_examples(foreground, ids, shipped_scorers().merge)
     assert whole.features.shape == (2, len(SEGMENT_FEATURES)) and (whole.target > 0.85).all()

@@ -7,9 +7,9 @@ import random
 import msgspec
 import pytest
 
+from autonomy.calibration.procedure_spools import rough_side, rough_spec, suits
 from autonomy.calibration.spool_program import WIGGLE_TOP_PCT, SpoolProgram, wiggle
 from autonomy.calibration.spool_run import CLOSE_S
-from autonomy.calibration.valve_search import rough_side, rough_spec, suits
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from tests.autonomy.valve_stand_in import StandIn

@@ -18,12 +18,11 @@ from starlette.websockets import WebSocketDisconnect
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
-from console.access import FAILURES_NS, MAX_FAILURES, MAX_PAGES, SESSION_NS
+from console.access import FAILURES_NS, LEASE_NS, MAX_FAILURES, MAX_PAGES, SESSION_NS, ControlLease
 from console.access_guards import TOKEN_HEADER
 from console.accounts import Accounts, AccountsRefused, Role, account_line, read_accounts, with_account
 from console.audit import MAX_REFUSED, AuditLog
 from console.console import Console
-from console.lease import LEASE_NS, ControlLease
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.codes import coded

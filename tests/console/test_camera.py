@@ -11,10 +11,10 @@ from starlette.testclient import TestClient
 from can_dbc.messages.grasp import ChosenGrasp, encode_grasp
 from can_dbc.messages.picture import PictureFacts, PictureLog, encode_picture
 from console.access import VISITOR
-from console.camera_state import NO_CAMERA, NO_DETECTOR, NO_PICTURE, SILENT, SILENT_NS, WAITING, CameraState
+from console.camera import NO_CAMERA, NO_DETECTOR, NO_PICTURE, SILENT, SILENT_NS, WAITING, CameraState
 from console.console import Console
-from console.grasp_state import TIMEOUT_NS, GraspState
 from console.server import create_app
+from console.state import TIMEOUT_NS, GraspState
 from machine.geometry import grapple
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.console.played_detector import detector

@@ -14,8 +14,7 @@ from starlette.testclient import TestClient
 
 from can_dbc.messages.crane import LinkWatch, OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
-from console.console import Console
-from console.page_watch import CLOSED_PAGES, MIN_BEAT_NS, PageWatch
+from console.console import CLOSED_PAGES, MIN_BEAT_NS, Console, PageWatch
 from console.state import CraneState
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.console.page_client import BROWSING, page_client, socket_of

@@ -12,8 +12,7 @@ from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import encode_mission
 from console.access_guards import TOKEN_HEADER
 from console.console import Console
-from console.shift import MIN_RATE_NS, Shift
-from console.state import CraneState
+from console.state import MIN_RATE_NS, CraneState, Shift
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack

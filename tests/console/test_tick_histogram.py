@@ -6,7 +6,7 @@ import json
 
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, Timing
-from console.tick_histogram import EDGES_US, SHOWN, histograms
+from console.state import EDGES_US, SHOWN, histograms
 
 
 def test_every_duration_is_in_the_bar_of_its_size(timing) -> None:

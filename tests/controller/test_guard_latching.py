@@ -172,7 +172,7 @@ def test_a_joint_that_was_moved_far_by_hand_lever_can_be_reset_where_it_stands()
 def test_a_rotator_that_the_logs_turn_is_no_motion_without_a_command_and_one_that_spins_is():
     traffic = Traffic().good()
     place = traffic.encoder["EncRot"]
-    unit_rad = next(j.axis.unit for j in traffic.guard._joints.values() if j.axis.number == 4)
+    unit_rad = next(j.axis.unit for j in traffic.guard.joints.values() if j.axis.number == 4)
     for k in range(75):
         traffic.encoder["EncRot"] = place + round(0.002 * k / abs(unit_rad))
         assert traffic.tick() is Verdict.GOOD

@@ -10,6 +10,7 @@ from controller.estimation.speed_monitor import (
     DEADBAND_PCT,
     FAST_PRESSED_S,
     FAST_S,
+    HELD_PRESSED_S,
     LEARNED_S,
     SLOW_S,
     STOOD_S,
@@ -111,6 +112,17 @@ def test_a_joint_that_jaws_throw_is_no_runaway_and_one_that_goes_on_is():
     ticks = round(FAST_PRESSED_S / T_S)
     assert {watched.step(0.0, 0.6 * LIMIT, pressed=True) for _ in range(ticks - 1)} == {Reason.NONE}
     assert Reason.JOINT_RUNAWAY in {watched.step(0.0, 0.6 * LIMIT, pressed=True) for _ in range(3)}
+
+
+@pytest.mark.parametrize("share", [-0.5, 0.0, 0.5], ids=["pushed back", "held", "slowed"])
+def test_a_joint_that_a_pile_holds_is_no_fault_and_one_that_it_holds_for_long_is(share):
+    watched, speed = knowing(0.6 * LIMIT), 0.6 * LIMIT
+    ticks = round(HELD_PRESSED_S / T_S)
+    assert {watched.step(speed, share * speed, pressed=True) for _ in range(ticks - 2)} == {Reason.NONE}
+    for _ in range(60):
+        reason = watched.step(speed, share * speed, pressed=True)
+    assert reason is not Reason.NONE
+    assert first(knowing(speed), speed, share * speed)[0] is not Reason.NONE, "at once, where nothing presses"
 
 
 def test_a_reset_forgets_the_motion_and_keeps_what_was_learned():

@@ -12,12 +12,11 @@ from controller.config import load as load_settings
 from controller.transitions import OPERATING
 from experiments.faults.evidence import Evidence
 from experiments.faults.experiment import nominal_plan, plan, scenes_of
-from experiments.faults.judgement import judge
 from experiments.faults.metrics import METRICS, gather, is_blind
 from experiments.faults.pages import _example, blind_spots, evidence, separations, table
 from experiments.faults.running import HeldSwing, Swing, build, warm
 from experiments.faults.separation import Separation, merged
-from experiments.faults.trial import in_child, inject
+from experiments.faults.trial import in_child, inject, judge
 from hil.faults.catalogue import BY_NAME, CASES
 from hil.faults.order import parse
 from hil.faults.table import FaultError

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.common.errors import ExperimentError
 from experiments.common.registry import Options
-from experiments.generalization.experiment import MISSIONS, jobs_of, page_of
+from experiments.generalization.experiment import MISSIONS, jobs_of, page_of, scenes_of, wrong_values
 from experiments.generalization.matrix import (
     COMBINED,
     NOMINAL,
@@ -24,7 +24,6 @@ from experiments.generalization.matrix import (
 from experiments.generalization.metrics import OVERALL, gather, sentences
 from experiments.generalization.mission import MISSION, drawn_mission
 from experiments.generalization.plots import draw
-from experiments.generalization.trial import scenes_of, wrong_values
 from hil.missions.site import site_of
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile

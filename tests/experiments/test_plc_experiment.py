@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from experiments.plc.metrics import METRICS, PATHS, gather
-from experiments.plc.trial import slope
+from experiments.plc.experiment import METRICS, PATHS, gather, slope
 
 
 def outcome(success: bool, rests_mm: list[float]) -> dict[str, Any]:

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from autonomy.missions.validation import problems_of
-from experiments.productivity.experiment import AMOUNTS, QUICK, plan
+from experiments.productivity.experiment import AMOUNTS, KINDS, QUICK, plan, task
 from experiments.productivity.metrics import METRICS, cycles, gather
 from experiments.productivity.plots import draw
-from experiments.productivity.tasks import KINDS, task
 from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")

@@ -142,7 +142,7 @@ def watched(
     settings = Settings(profile, profile_hash(profile), profile.rate_hz)
     guard = build_guard(profile_path(name))
     if blind:
-        guard._motion.clear()
+        guard.motion.clear()
     system = Lockstep(settings, guard, plant, planner, operator, Observer(None, [reports.append]))
     return Watched(system, plant, InProcessBus(system.core, "witness", receive_own=True), reports)
 

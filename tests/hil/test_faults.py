@@ -12,9 +12,8 @@ from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramFault, DatagramRefused
 from hil.faults.catalogue import BY_NAME, CASES, Where
-from hil.faults.datagrams import effect_of
 from hil.faults.draws import Scene
-from hil.faults.injector import Injector
+from hil.faults.injector import Injector, effect_of
 from hil.faults.order import Order, make, parse
 from hil.faults.table import FAULTS, Edge, FaultError, Word, find
 from hil.faults.wire_faults import wire_fault

@@ -9,8 +9,8 @@ import pytest
 
 from host.exit_codes import CommandFailed, ExitCode
 from host.release.gate import HOLD_NS, LIMIT_NS, Gate, Passage, ServiceReading, lacking
-from host.release.steps import ROLLBACK, UPDATE, Step, after_interruption
 from host.release.trees import State, Trees
+from host.release.updater import ROLLBACK, UPDATE, Step, after_interruption
 from tests.codes import coded
 from tests.host.small_releases import DEAD, GOOD, NotedProgram, NotedServices, install, keys, small_bundle, updater
 

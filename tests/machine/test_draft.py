@@ -14,8 +14,7 @@ from machine.draft.profile_text import profile_text
 from machine.draft.questions import Question, answers_text, example, merged, put, questions
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
-from sim.draft.least_inertia import least_inertia
-from sim.draft.urdf import crane_urdf
+from sim.draft.truth import crane_urdf, least_inertia
 from sim.truth.load import load_truth
 from tests.codes import coded
 from tests.machine.own_machine import answers

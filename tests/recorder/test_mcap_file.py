@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from recorder.mcap_file import McapFile
+from recorder.segment import McapFile
 
 TOPICS = ("/crane0/raw", "/crane0/ValveCmd", "/manifest")
 TIMES = st.integers(0, 2**40)

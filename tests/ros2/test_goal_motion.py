@@ -16,10 +16,9 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from ros2.execution.execution import TrajectoryExecution
+from ros2.execution.execution import MotionCheck, TrajectoryExecution
 from ros2.execution.goal_motion import goal_motion
 from ros2.execution.goal_refused import GoalRefused
-from ros2.execution.motion_check import MotionCheck
 from ros2.execution.tolerances import beyond, tolerances_of
 from ros2.interfaces.control import ErrorCode, Goal
 from tests.codes import coded

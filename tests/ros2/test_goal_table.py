@@ -7,7 +7,7 @@ import pytest
 from ros2.interfaces.action import CancelCode, GoalInfo, Status
 from ros2.interfaces.builtin import UUID, time_of
 from ros2.interfaces.control import Result
-from ros2.wire.goal_table import ALL, KEPT, GoalTable
+from ros2.wire.action_server import ALL, KEPT, GoalTable
 
 A, B, C = (bytes([i]) * 16 for i in (1, 2, 3))
 DONE = Result(0, "done")

@@ -15,9 +15,8 @@ from hil.missions.site import site_of
 from machine.loading.profile_file import load_profile
 from sim.errors import PlantError
 from sim.ground.terrain import KINDS, Terrain
-from sim.site.laying import MAX_ATTEMPTS, laid_at_rest
 from sim.site.log_supply import LogSupplier
-from sim.site.site_file import Site
+from sim.site.site_file import MAX_ATTEMPTS, Site, laid_at_rest
 from sim.wood.log_shape import LogSpec
 from tests.codes import coded
 

@@ -13,9 +13,8 @@ from machine.loading.profile_file import load_profile
 from machine.profile import joint
 from sim.errors import PlantError
 from sim.plc.command_arbiter import MS
-from sim.plc.law import RESOLUTION_M, RESOLUTION_RAD, stop_band
 from sim.plc.plant import PlcPlant
-from sim.plc.program import CYCLE_NS, MOTION_ALLOWED, Inputs, Program
+from sim.plc.program import CYCLE_NS, MOTION_ALLOWED, RESOLUTION_M, RESOLUTION_RAD, Inputs, Program, stop_band
 from tests.codes import coded
 
 PROFILE = load_profile("palms_471")

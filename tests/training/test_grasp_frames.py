@@ -23,7 +23,7 @@ from sim.camera.scene import Ground, LogPose, SceneBuilder
 from tests.codes import numbers_in
 from timberhand.commands import train
 from training.grasp.label_kernel import draw, evaluate_candidate, facts_of
-from training.grasp.physical_frames import LOW_PX, frames
+from training.grasp.physical_weights import LOW_PX, frames
 from training.pictures.piles import Pile
 
 GROUND = -1.39

@@ -11,8 +11,7 @@ from tests.training.drawn_logs import perfect_maps, picture
 from training.common.loop import Schedule
 from training.detection import segmentation
 from training.detection.augmentation import augmented, recoloured
-from training.detection.segmentation import batches, loss, run
-from training.detection.targets import targets
+from training.detection.segmentation import batches, loss, run, targets
 from training.pictures.labels import IGNORED
 
 LOGS = (((90.0, 100.0), 0.4, 120, 14), ((140.0, 120.0), 1.2, 100, 16))

@@ -7,10 +7,9 @@ from machine.geometry.optics import Intrinsics
 from training.pictures.piles import settle
 from training.pictures.samples import read, sample, write
 from training.pictures.traced import shapes
-from training.pictures.traced.packing import FLOATS
 from training.pictures.traced.scenes import Assets, Format, describe, log_poses
 from training.pictures.traced.staging import pieces
-from training.pictures.traced.tracer import packed
+from training.pictures.traced.tracer import FLOATS, packed
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,22 @@
-"""Cylinder fits of all masks of a frame: initial cylinders, visible contours, fits, merged fragments, rejections."""
+"""Cylinder fits of all masks of a frame: initial cylinders, visible contours, fits, merged fragments, rejections.
+
+The initial cylinder of a fit, from a mask and its depth.
+
+Stereo depth errs by about z^2 sigma_d / (f B), and neighbouring pixels err alike: at 5 m by as much as half a log's
+radius.  Surface normals of single points are useless at that noise.  Therefore the radius comes from the width of the
+mask and the tilt from a line through disparities.
+
+Plausibility of fits, and fits that are fragments of one log.
+
+A log that lies behind another one can show as two masks.  Fragments of one log lie on one line, have the same width,
+and miss the ends that face each other.  Paper A's two failures with real logs came from a width greater than the
+length, which turns the axis by 90 degrees: such fits are rejected.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -11,16 +25,159 @@ from scipy.ndimage import label
 
 from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, content_window
 from autonomy.perception.fitting.contour import Contour, StereoSensor, log_contour
-from autonomy.perception.fitting.cylinder import Cylinder
+from autonomy.perception.fitting.cylinder import MIN_PIXELS, Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit, fit_cylinder
-from autonomy.perception.fitting.initial_cylinder import initial_cylinder
-from autonomy.perception.fitting.log_fragments import (
-    MAX_LENGTH_M,
-    fragment_groups,
-    implausibility,
-    joined_cylinder,
-)
 from machine.geometry.optics import Intrinsics
+
+MAX_ANGLE_RAD: Final = math.radians(6.0)  # between the axes of fragments, beside their uncertainty
+MAX_GAP_M: Final = 1.5
+MAX_RADIUS_DIFFERENCE: Final = 0.35  # of two fragments, as a share of the larger radius
+MAX_DIRECTION_SIGMA_RAD: Final = 0.25  # of a usable axis
+MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 0.45  # of anything that the crane lifts
+MAX_LENGTH_M: Final = 8.0  # of logs that a crane loads
+MIN_EXPLAINED: Final = 0.5  # share of the contour
+
+
+@dataclass(frozen=True, slots=True)
+class Implausibility:
+    """Why a fit is not a log."""
+
+    code: str
+    sentence: str
+
+
+def implausibility(fit: CylinderFit) -> Implausibility | None:
+    """Why a fit is not a log; None when it is plausible."""
+    body = fit.body
+    if 2.0 * body.radius_m >= body.length_m:
+        return Implausibility("too-wide", f"{2 * body.radius_m:.2f} m wide and {body.length_m:.2f} m long: not a log")
+    if not MIN_RADIUS_M <= body.radius_m <= MAX_RADIUS_M:
+        return Implausibility("bad-width", f"{2 * body.radius_m:.2f} m wide: outside the range of logs")
+    if body.length_m > MAX_LENGTH_M:
+        return Implausibility("too-long", f"{body.length_m:.1f} m long: longer than any log")
+    if fit.explained < MIN_EXPLAINED:
+        return Implausibility("bad-contour", f"a cylinder explains only {100 * fit.explained:.0f} % of its contour")
+    if math.sqrt(max(np.diag(fit.covariance)[2:4].max(), 0.0)) > MAX_DIRECTION_SIGMA_RAD:
+        return Implausibility("unknown-direction", "too little of it is visible to determine its direction")
+    return None
+
+
+def same_log(a: CylinderFit, b: CylinderFit) -> bool:
+    """Whether two fits are fragments of one log whose middle is hidden."""
+    first, second = a.body, b.body
+    between = second.center_m - first.center_m
+    way = between / max(1e-9, float(np.linalg.norm(between)))
+    tilt = MAX_ANGLE_RAD + 2.0 * math.sqrt(max(np.diag(a.covariance)[2:4].max(), 0.0))
+    tilt_b = MAX_ANGLE_RAD + 2.0 * math.sqrt(max(np.diag(b.covariance)[2:4].max(), 0.0))
+    # The shorter a fragment, the less certain its own axis: the line between the middles must lie along both.
+    if _angle(first.axis, way) > tilt or _angle(second.axis, way) > tilt_b:
+        return False
+    wide, narrow = max(first.radius_m, second.radius_m), min(first.radius_m, second.radius_m)
+    if wide - narrow > MAX_RADIUS_DIFFERENCE * wide:
+        return False
+    gap = float(np.linalg.norm(between)) - 0.5 * (first.length_m + second.length_m)
+    facing_a = a.ends_seen[1] if first.axis @ way > 0.0 else a.ends_seen[0]
+    facing_b = b.ends_seen[0] if second.axis @ way > 0.0 else b.ends_seen[1]
+    return gap < MAX_GAP_M and not facing_a and not facing_b
+
+
+def joined_cylinder(a: Cylinder, b: Cylinder) -> Cylinder:
+    """The initial cylinder of a log with two fragments: from the far end of one to the far end of the other."""
+    way = b.center_m - a.center_m
+    ends = np.concatenate([_ends(a), _ends(b)])
+    along = ends @ way
+    start, end = ends[np.argmin(along)], ends[np.argmax(along)]
+    length = float(np.linalg.norm(end - start))
+    radius = (a.radius_m * a.length_m + b.radius_m * b.length_m) / (a.length_m + b.length_m)
+    return Cylinder(0.5 * (start + end), (end - start) / length, -0.5 * length, 0.5 * length, radius)
+
+
+def fragment_groups(fits: Mapping[int, CylinderFit]) -> list[list[int]]:
+    """The numbers of the fits, in groups of one log each; the numbers ascend."""
+    owner = {i: i for i in fits}
+    for i in owner:
+        for j in owner:
+            if i < j and owner[i] != owner[j] and same_log(fits[i], fits[j]):
+                old = owner[j]
+                owner.update({k: owner[i] for k, group in owner.items() if group == old})
+    return [[i for i in owner if owner[i] == group] for group in sorted(set(owner.values()))]
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    return math.acos(min(1.0, abs(float(a @ b))))
+
+
+def _ends(body: Cylinder) -> np.ndarray:
+    return np.stack([body.point_m + body.start_m * body.axis, body.point_m + body.end_m * body.axis])
+
+
+RANSAC_PAIRS: Final = 48
+_EPSILON: Final = 1e-12
+
+
+def initial_cylinder(
+    mask: np.ndarray, depth_m: np.ndarray, pin: Intrinsics, slack_1_m: float, seed: int = 0
+) -> Cylinder | None:
+    """A cylinder from a mask (H, W) bool and depth (H, W) [m]; None when too little depth is known.
+
+    The axis in the picture is the mask's principal axis.  A line through inverse depth along it is found by RANSAC over
+    ``RANSAC_PAIRS`` pairs with inliers within ``slack_1_m`` [1/m].  The radius is half the mask's width.
+    """
+    v, u = np.nonzero(mask)
+    if len(u) < MIN_PIXELS:
+        return None
+    middle = np.array([u.mean(), v.mean()])
+    du, dv = u - middle[0], v - middle[1]
+    values, vectors = np.linalg.eigh(np.array([[du @ du, du @ dv], [du @ dv, dv @ dv]]) / len(u))
+    way = vectors[:, 1]
+    along, inverse = du * way[0] + dv * way[1], 1.0 / depth_m[v, u]
+    known = np.isfinite(inverse)
+    if np.count_nonzero(known) < MIN_PIXELS:
+        return None
+    a, b = ransac_line(along[known], inverse[known], slack_1_m, seed)
+    low, high = float(along.min()) - 0.5, float(along.max()) + 0.5
+    width_px = min(len(u) / (high - low), math.sqrt(12.0 * max(values[0], 0.1)) * 1.3)
+    far = 0.02 * max(a, 0.02)
+
+    def axis_point(t: float) -> np.ndarray:
+        return pin.deproject(middle[0] + t * way[0], middle[1] + t * way[1], 1.0 / max(a + b * t, far))
+
+    span = axis_point(high) - axis_point(low)
+    mid = axis_point(0.5 * (low + high))
+    # Seen along its axis, the mask extends beyond the middle of both ends by the visible part of the end faces.
+    slant = abs(float(span @ mid)) / float(np.linalg.norm(span) * np.linalg.norm(mid))
+    inset = min(0.5 * width_px * slant, 0.4 * (high - low))
+    start, end = axis_point(low + inset), axis_point(high - inset)
+    mid = 0.5 * (start + end)
+    axis, length = end - start, float(np.linalg.norm(end - start))
+    if not math.isfinite(length) or length < 1e-6:
+        return None
+    axis /= length
+    radius = 0.5 * width_px * float(mid[2]) / pin.fx_px
+    deeper = across_view(axis, mid)[1]
+    mid = mid + radius * deeper * math.copysign(1.0, float(deeper @ mid))
+    return Cylinder(mid, axis, -0.5 * length, 0.5 * length, radius)
+
+
+def ransac_line(x: np.ndarray, y: np.ndarray, slack: float, seed: int) -> tuple[float, float]:
+    """Intercept a and slope b of y = a + b x through most of the points: RANSAC, then least squares over inliers."""
+    rng = np.random.default_rng(seed)
+    i, j = rng.integers(0, len(x), (2, RANSAC_PAIRS))
+    apart = x[j] - x[i]
+    ok = np.abs(apart) > 0.2 * (x.max() - x.min())
+    slopes = np.where(ok, (y[j] - y[i]) / np.where(ok, apart, 1.0), 0.0)
+    starts = np.where(ok, y[i] - slopes * x[i], np.median(y))
+    step = max(1, len(x) // 100)
+    counts = np.count_nonzero(np.abs(y[::step] - starts[:, None] - slopes[:, None] * x[::step]) < slack, axis=1)
+    best = int(np.argmax(counts))
+    inside = np.abs(y - starts[best] - slopes[best] * x) < slack
+    x, y = x[inside], y[inside]
+    if len(x) < 3:
+        return float(starts[best]), float(slopes[best])
+    from_middle = x - x.mean()
+    slope = float(from_middle @ y) / max(float(from_middle @ from_middle), _EPSILON)
+    return float(y.mean()) - slope * float(x.mean()), slope
+
 
 MARGIN_PX: Final = 8  # of the window that is cut out around a mask
 

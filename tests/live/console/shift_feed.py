@@ -145,7 +145,7 @@ def _known(number: int) -> KnownLog:
 class FedConsole(Console):
     """A console whose page makes the time go by; make it with ``clock=lambda: feed.now_ns`` and an ``operator``.
 
-    With an operator's socket the page answers states (`console.page_watch`), which tells how far it is.
+    With an operator's socket the page answers states (`console.console`), which tells how far it is.
     """
 
     feed: ShiftFeed | None = None

@@ -14,8 +14,7 @@ from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
 from experiments.faults import experiment, files
 from experiments.faults.experiment import _limited, plan
-from experiments.faults.judgement import judge
-from experiments.faults.trial import in_child
+from experiments.faults.trial import in_child, judge
 from hil.faults.catalogue import BY_NAME
 from tests.codes import coded
 

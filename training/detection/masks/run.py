@@ -1,4 +1,9 @@
-"""The training run of the mask network: any device, by steps or by minutes, with an average of the weights."""
+"""The training run of the mask network: any device, by steps or by minutes, with an average of the weights.
+
+What cameras and weather do to windows: depth errors, colours, fog, rain, sun in the lens, lost senses.
+
+The loss of the mask network: of its maps, of where kernels are, and of the masks that kernels make.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +13,273 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
+from torch.nn import functional as F
 
 from autonomy.networks.graph import fingerprint
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.segmentation.mask_network import mask_network
+from autonomy.perception.segmentation.mask_network import (
+    CHANNELS,
+    FEATURES,
+    KERNEL_STRIDE,
+    PIXELS_PER_M_UNIT,
+    PLACE_PX,
+    mask_network,
+)
+from autonomy.perception.segmentation.network import (
+    HEIGHT_RANGE_M,
+    HEIGHT_UNIT_M,
+    MAPS,
+    MIN_COLOUR_SPREAD,
+    MIN_KNOWN_SHARE,
+    STRIDE,
+)
 from training.common.loop import channels_last, deferred_interrupt
-from training.detection.masks.bank import Bank, windows
-from training.detection.masks.disturbances import Chance, inputs
-from training.detection.masks.goals import goals
-from training.detection.masks.losses import loss
+from training.detection.masks.bank import Bank, Windows, windows
+from training.detection.masks.goals import Goals, goals
+
+PEAK_WEIGHT: Final = 20.0
+EDGE_WEIGHT, BETWEEN_WEIGHT = 3.0, 8.0
+OFFSET_SHARE, ANGLE_SHARE, PEAK_SHARE, EDGE_SHARE = 0.1, 1.0, 0.4, 1.0
+MAPS_SHARE, HEAT_SHARE, KERNEL_SHARE = 0.5, 1.0, 3.0
+KERNELS_OF_A_LOG: Final = 2
+KERNELS_OF_A_PICTURE: Final = 20
+
+
+def loss(
+    out: dict[str, torch.Tensor], g: Goals, generator: torch.Generator
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """The loss of a batch, and its parts for the record."""
+    maps, kernels = out["maps"].float(), out["kernels"].float()
+    parts = {"maps": maps_loss(maps, g), "heat": heat_loss(kernels[:, 0], g),
+             "kernel": kernel_loss(maps[:, len(MAPS) :], kernels[:, 1:], g, generator)}  # fmt: skip
+    total = MAPS_SHARE * parts["maps"] + HEAT_SHARE * parts["heat"] + KERNEL_SHARE * parts["kernel"]
+    return total, {name: part.detach() for name, part in parts.items()}
+
+
+def maps_loss(found: torch.Tensor, g: Goals) -> torch.Tensor:
+    """Cross entropy of mask, peaks and edges, distances of offsets and angles."""
+    weight, angle_weight, meeting = g.weights.unbind(1)
+    own = weight * g.valid
+
+    def entropy(i: int, factor: torch.Tensor) -> torch.Tensor:
+        error = F.binary_cross_entropy_with_logits(found[:, i], g.maps[:, i], reduction="none")
+        return (error * factor).sum() / (factor.detach() > 0).sum().clamp(min=1)
+
+    probability, truth = torch.sigmoid(found[:, 0]) * g.wood, g.maps[:, 0] * g.wood
+    shared, sizes = (probability * truth).sum((1, 2)), (probability + truth).sum((1, 2))
+    value = 4.0 * entropy(0, weight * g.wood) / 2.0 + (1.0 - 2.0 * (shared + 1.0) / (sizes + 2.0)).mean()
+    for i in (1, 6):
+        value = value + PEAK_SHARE * entropy(i, own * (1.0 + PEAK_WEIGHT * g.maps[:, i]))
+    value = value + EDGE_SHARE * entropy(7, own * (1.0 + EDGE_WEIGHT * g.maps[:, 7] + BETWEEN_WEIGHT * meeting))
+    inside = (g.maps[:, 4:6].abs().sum(1) > 0) * g.valid
+    miss = torch.log1p((found[:, 2:4] - g.maps[:, 2:4]).abs().sum(1))
+    value = value + OFFSET_SHARE * (miss * inside).sum() / (inside.sum() + 1.0)
+    angle = (found[:, 4:6] - g.maps[:, 4:6]).abs().sum(1) * angle_weight * g.valid
+    return value + ANGLE_SHARE * angle.sum() / ((angle_weight * g.valid).sum() + 1e-3)
+
+
+def heat_loss(heat: torch.Tensor, g: Goals) -> torch.Tensor:
+    """Focal loss of a ridge, as for centres of objects."""
+    cell = KERNEL_STRIDE // STRIDE
+    open_ = (F.avg_pool2d(g.valid[:, None], cell)[:, 0] > 0.6).float()
+    p = torch.sigmoid(heat).clamp(1e-5, 1 - 1e-5)
+    sure = (g.heat > 0.75).float()
+    hit = -((1 - p) ** 2) * torch.log(p) * sure
+    miss = -((1 - g.heat) ** 4) * p**2 * torch.log(1 - p) * (1 - sure)
+    return ((hit + miss) * open_).sum() / sure.sum().clamp(min=1.0)
+
+
+def kernel_loss(features: torch.Tensor, kernels: torch.Tensor, g: Goals, generator: torch.Generator) -> torch.Tensor:
+    """Dice and cross entropy of the masks of a few kernels of every log."""
+    b, n = g.masks.shape[:2]
+    columns = kernels.shape[3]
+    # For every log, cells near its middle, at random.
+    numbers = torch.arange(n, device=features.device)[None, :, None, None]
+    own = (g.owner[:, None] == numbers) * g.heat[:, None]
+    noise = torch.rand(own.shape, generator=generator, device=own.device)
+    value, cell = (own * (0.6 + 0.8 * noise)).flatten(2).topk(KERNELS_OF_A_LOG, dim=2)
+    least = torch.tensor([0.05] + [0.35] * (KERNELS_OF_A_LOG - 1), device=value.device)
+    value = torch.where((value > least) & (g.counts > 0)[..., None], value, torch.zeros_like(value))
+    value, which = value.flatten(1).topk(KERNELS_OF_A_PICTURE, dim=1)
+    use, log, at = (value > 0).float(), which // KERNELS_OF_A_LOG, cell.flatten(1).gather(1, which)
+    k = kernels.flatten(2).gather(2, at[:, None].expand(-1, kernels.shape[1], -1)).transpose(1, 2)
+    logits = mask_logits(features, k, at // columns, at % columns)
+    rows = torch.arange(b, device=log.device)[:, None]
+    truth, valid = g.masks[rows, log], g.valid[:, None]
+    p = torch.sigmoid(logits) * valid
+    shared, sizes = (p * truth).sum((2, 3)), (p.square() + truth).sum((2, 3))
+    dice = 1.0 - (2.0 * shared + 2.0) / (sizes + 2.0)
+    weight = (g.valid * (0.08 + g.maps[:, 0] + 2.0 * g.weights[:, 2]))[:, None]
+    entropy = (F.binary_cross_entropy_with_logits(logits, truth, reduction="none") * weight).sum((2, 3))
+    each = dice + 0.5 * entropy / (truth.sum((2, 3)) + 60.0)
+    return (each * use).sum() / use.sum().clamp(min=1.0)
+
+
+def mask_logits(features: torch.Tensor, kernels: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
+    """Logits (B, K, h, w) of the masks of kernels (B, K, KERNEL) at cells (B, K)."""
+    h, w = features.shape[2:]
+    middle, half = KERNEL_STRIDE / 2.0 - 0.5, 0.5 * (STRIDE - 1)
+    x = torch.arange(w, device=features.device) * STRIDE + half - (column[..., None] * KERNEL_STRIDE + middle)
+    y = torch.arange(h, device=features.device) * STRIDE + half - (row[..., None] * KERNEL_STRIDE + middle)
+    x, y = (x / PLACE_PX)[:, :, None, :], (y / PLACE_PX)[:, :, :, None]
+    a, b, c, d, e, one = kernels[..., FEATURES:, None, None].unbind(2)
+    flat = torch.einsum("bkc,bchw->bkhw", kernels[..., :FEATURES], features)
+    return flat + (a * x + c * x * x) + (b * y + e * y * y + one) + (d * y) * x
+
+
+NO_DEPTH_SHARE, NO_COLOUR_SHARE = 0.24, 0.05
+EXACT_SHARE = 0.35  # of windows with exact depth that keep it
+
+
+class Chance:
+    """Random tensors on a device."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self._generator, self.device = generator, generator.device
+
+    def uniform(self, *shape: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
+        """Uniform numbers."""
+        return low + (high - low) * torch.rand(*shape, generator=self._generator, device=self.device)
+
+    def normal(self, *shape: int) -> torch.Tensor:
+        """Standard normal numbers."""
+        return torch.randn(*shape, generator=self._generator, device=self.device)
+
+    def some(self, count: int, share: float) -> torch.Tensor:
+        """Which of ``count`` it happens to, as 0 or 1."""
+        return (self.uniform(count) < share).float()
+
+    def smooth(self, count: int, side: int, cell: int) -> torch.Tensor:
+        """Smooth noise (count, side, side) of about unit variance, ``cell`` pixels wide."""
+        small = self.normal(count, 1, side // cell + 2, side // cell + 2)
+        return 1.4 * F.interpolate(small, (side, side), mode="bicubic", align_corners=False)[:, 0]
+
+
+def disturbed_depth(w: Windows, chance: Chance) -> torch.Tensor:
+    """Depth (B, C, C) [m], NaN unknown, as a stereo camera of unknown quality delivers it."""
+    b, side = w.ids.shape[0], w.ids.shape[-1]
+    z = w.depth_m
+    rough = (1.0 - chance.some(b, EXACT_SHARE)) * (~w.sensed).float()  # a sensed picture has its own errors
+    inverse = torch.nan_to_num(1.0 / z, nan=0.0)
+    # Near surfaces grow over those behind them.
+    for reach in (3, 5, 9):
+        use = (chance.some(b, 0.3) * rough)[:, None, None] * (chance.smooth(b, side, 8) > 0.0).float()
+        grown = F.max_pool2d(inverse[:, None], reach, 1, reach // 2)[:, 0]
+        inverse = torch.where((use > 0) & (grown - inverse > 0.02), grown, inverse)
+    # Disparity errs by pixels of a camera with some baseline: coarse and fine, and in steps.
+    per_px = torch.exp(chance.uniform(b, low=math.log(0.008), high=math.log(0.05)))[:, None, None]  # 1/m for each pixel
+    sigma = torch.exp(chance.uniform(b, low=math.log(0.02), high=math.log(0.5)))[:, None, None] * rough[:, None, None]
+    error = 0.7 * chance.smooth(b, side, 6) + 0.5 * chance.smooth(b, side, 16) + 0.3 * chance.normal(b, side, side)
+    noisy = inverse + per_px * sigma * error
+    step = per_px * chance.uniform(b, low=0.05, high=0.6)[:, None, None]
+    stepped = (chance.some(b, 0.3) * rough)[:, None, None]
+    noisy = torch.where(stepped > 0, torch.round(noisy / step) * step, noisy)
+    scale = 1.0 + 0.03 * chance.normal(b)[:, None, None] * rough[:, None, None]
+    known = (inverse > 0) & (noisy > 0.02)
+    holes = chance.smooth(b, side, 10) > (3.0 - 1.9 * chance.uniform(b) * rough)[:, None, None]
+    big = chance.smooth(b, side, 48) > (3.2 - 1.8 * chance.some(b, 0.3) * chance.uniform(b))[:, None, None]
+    # What one eye cannot see: a strip beside every near edge.
+    jump = F.pad(inverse[:, :, 1:] - inverse[:, :, :-1], (0, 1)) > 0.03
+    strip = (
+        F.max_pool2d(jump.float()[:, None], (1, 7), 1, (0, 3))[:, 0] * (chance.some(b, 0.5) * rough)[:, None, None] > 0
+    )
+    far = chance.uniform(b, low=6.0, high=40.0)[:, None, None]
+    dark = (w.rgb.mean(1) < 0.06) & ((chance.some(b, 0.2) * rough)[:, None, None] > 0)
+    z = scale / noisy.clamp(min=1e-3)
+    known = known & ~holes & ~big & ~strip & ~dark & (z < far)
+    return torch.where(known, z, torch.full_like(z, math.nan))
+
+
+def disturbed_colour(w: Windows, chance: Chance) -> torch.Tensor:
+    """Colours (B, 3, C, C), 0..1, of another camera, day and weather."""
+    b, side, x = w.ids.shape[0], w.ids.shape[-1], w.rgb
+    many = (slice(None), None, None, None)
+    # Each log in a colour of its own, now and then; the ground's hue apart from the logs'.
+    tint = torch.exp(chance.normal(b, 256, 3) * torch.tensor([0.22, 0.18, 0.25], device=x.device)) * torch.exp(
+        0.35 * chance.normal(b, 256, 1)
+    )
+    tint = 1.0 + (tint - 1.0) * chance.some(b, 0.4)[:, None, None]
+    x = x * tint.gather(1, w.ids.flatten(1).long()[..., None].expand(-1, -1, 3)).permute(0, 2, 1).view_as(x)
+    angle = chance.normal(b) * 0.3 * chance.some(b, 0.5) + chance.some(b, 0.08) * chance.uniform(b, low=-3.1, high=3.1)
+    c, s = torch.cos(angle), torch.sin(angle)
+    eye, third = torch.eye(3, device=x.device), torch.full((3, 3), 1.0 / 3.0, device=x.device)
+    cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]], device=x.device) / math.sqrt(3.0)
+    mix = c[:, None, None] * eye + (1 - c)[:, None, None] * third + s[:, None, None] * cross
+    fade = torch.where(chance.uniform(b) < 0.1, torch.zeros(b, device=x.device), chance.uniform(b, low=0.4, high=1.5))[
+        :, None, None
+    ]
+    mix = (fade * eye + (1 - fade) * third) @ mix
+    mix = mix * torch.exp(0.15 * chance.normal(b, 3, 1))
+    x = torch.einsum("bij,bjhw->bihw", mix, x).clamp(0, 2)
+    x = x ** torch.exp(0.4 * chance.normal(b))[many] * torch.exp(0.4 * chance.normal(b))[many]
+    x = x + 0.08 * chance.normal(b)[many] * chance.some(b, 0.5)[many]
+    # Uneven light: shade of trees, lamps.
+    x = x * torch.exp(0.25 * chance.smooth(b, side, 40) * chance.some(b, 0.3)[:, None, None])[:, None]
+    # Fog grows with depth.
+    z = torch.nan_to_num(w.depth_m, nan=30.0)[:, None]
+    clear = torch.exp(-z / torch.exp(chance.uniform(b, low=math.log(4.0), high=math.log(40.0)))[many])
+    fog = chance.uniform(b, low=0.5, high=1.0)[many]
+    x = torch.where(chance.some(b, 0.15)[many] > 0, fog + (x - fog) * clear, x)
+    # Lens: blur of motion or focus, drops of rain, sun.
+    soft = F.avg_pool2d(F.avg_pool2d(x, 3, 1, 1, count_include_pad=False), 3, 1, 1, count_include_pad=False)
+    x = x + (soft - x) * (chance.uniform(b) * chance.some(b, 0.45))[many]
+    line = F.avg_pool2d(x, (1, 9), 1, (0, 4), count_include_pad=False)
+    tall = F.avg_pool2d(x, (9, 1), 1, (4, 0), count_include_pad=False)
+    which = chance.uniform(b)[many]
+    x = torch.where(which < 0.05, line, torch.where(which < 0.1, tall, x))
+    drop = (chance.smooth(b, side, 24) > 1.9 - 0.7 * chance.uniform(b)[:, None, None]).float() * chance.some(b, 0.1)[
+        :, None, None
+    ]
+    wide = F.avg_pool2d(soft, 15, 1, 7, count_include_pad=False)
+    x = x + (1.15 * wide - x) * drop[:, None]
+    at = chance.uniform(b, 2, low=-0.2, high=1.2) * side
+    rows = torch.arange(side, device=x.device)
+    away = (
+        (rows[None, None] - at[:, 0, None, None]) ** 2 + (rows[None, :, None] - at[:, 1, None, None]) ** 2
+    ).sqrt() / side
+    flare = torch.exp(-away / chance.uniform(b, low=0.05, high=0.5)[:, None, None]) * chance.uniform(b)[:, None, None]
+    x = x + (flare * chance.some(b, 0.1)[:, None, None])[:, None]
+    grain = torch.exp(chance.uniform(b, low=math.log(0.004), high=math.log(0.06)))[many] * chance.some(b, 0.6)[many]
+    x = x + grain * chance.normal(*x.shape)
+    blocks = F.interpolate(F.avg_pool2d(x, 2), scale_factor=2.0, mode="bilinear", align_corners=False)
+    x = torch.where(chance.some(b, 0.12)[many] > 0, blocks, x)
+    return x.clamp(0.0, 1.0)
+
+
+def inputs(w: Windows, chance: Chance, disturb: bool = True) -> torch.Tensor:
+    """The network's input (B, 6, C, C); as ``mask_network.mask_input`` with all disturbances."""
+    b = w.ids.shape[0]
+    z = disturbed_depth(w, chance) if disturb else w.depth_m
+    rgb = disturbed_colour(w, chance) if disturb else w.rgb
+    known = torch.isfinite(z)
+    # The plane as found in the picture: a little off.
+    off = (0.02 * chance.normal(b) * float(disturb))[:, None, None]
+    lean = (1.0 + 0.01 * chance.normal(b) * float(disturb))[:, None, None]
+    height = (1.0 - lean * z * w.slope) / w.size[:, None, None] + off
+    per_m = torch.log2(w.focal_px[:, None, None] / PIXELS_PER_M_UNIT / z.clamp(min=0.1))
+    if disturb:
+        lost = chance.some(b, NO_DEPTH_SHARE)[:, None, None] > 0
+        known = known & ~lost
+    known = known & torch.isfinite(height)
+    out = torch.zeros(b, CHANNELS, *w.ids.shape[1:], device=rgb.device)
+    out[:, 3] = torch.where(known, height.clamp(*HEIGHT_RANGE_M) / HEIGHT_UNIT_M, 0.0)
+    out[:, 4] = torch.where(known, per_m, 0.0)
+    out[:, 5] = known.float()
+    share = torch.where((known.float().mean((1, 2)) > MIN_KNOWN_SHARE)[:, None, None], known.float(), 1.0)[:, None]
+    total = share.sum((2, 3), keepdim=True)
+    grey = 255.0 * rgb
+    mean = (grey * share).sum((2, 3), keepdim=True) / total
+    spread = (((grey - mean) ** 2 * share).sum((2, 3), keepdim=True) / total).sqrt()
+    colour = (grey - mean) / (spread + MIN_COLOUR_SPREAD)
+    if disturb:
+        blind = (chance.some(b, NO_COLOUR_SHARE) * known.any(2).any(1).float())[:, None, None, None]
+        colour = torch.where(blind > 0, torch.zeros_like(colour), colour)
+    out[:, :3] = colour
+    return out
 
 
 @dataclass(frozen=True, slots=True)
