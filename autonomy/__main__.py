@@ -1,7 +1,8 @@
 """The planning process: controller reports and log lists in, setpoints out, events as JSON lines.
 
 ``python -m autonomy --profile palms_471 --controller 127.0.0.1:47001 --report-port 47002 --scene 127.0.0.1:47003``
-loads one log into the bunk; with ``--mission FILE`` and a machine that drives, it executes the mission.  With
+loads one log into the bunk; with ``--mission FILE`` and a machine that drives, it executes the mission.
+``--planner`` chooses the grasp planner (`autonomy.grasp.planners`).  With
 ``--memory`` the detector is one that looks ahead (`autonomy.perception`, ``--driving``).
 ``--tell HOST:PORT`` receives a mission report and the chosen grasp twice a second, and ``--order-port`` accepts
 operator commands from this computer only (`can_dbc.messages.mission` and `can_dbc.messages.grasp` define them).
@@ -26,12 +27,14 @@ import time
 
 from autonomy.manager.checkpoint_file import MissionFinished
 from autonomy.missions.model import MissionError
+from autonomy.networks.weights import WeightsError
 from autonomy.process.command_line import arguments
 from autonomy.process.event_output import emit
 from autonomy.process.exit_codes import BUSY, CONFIGURATION, FAILED, FINE, INTERRUPTED, SAFETY
 from autonomy.process.job_setup import make_job, uploaded_missions
 from autonomy.process.planner_process import PlannerProcess
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
+from runtime.plugins import PluginError
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -50,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         job = make_job(options, profile, options.lease_ms * 1_000_000, key)
         uploads = uploaded_missions(options, profile, options.lease_ms * 1_000_000, key)
-    except MissionError as error:
+    except (MissionError, PluginError, WeightsError) as error:
         return _complain(str(error))
     except MissionFinished as finished:
         emit("done", reason=str(finished))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from autonomy.grasp.planners import NAMES, SEARCH, PlannerChoice, PlannerError
 from autonomy.manager.transition_table import TABLES
 from can_dbc.messages.udp_address import address_argument
 
@@ -23,6 +24,11 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--missions", type=Path, metavar="DIR", help="wait for a mission of this folder to be uploaded")
     parser.add_argument("--progress", type=Path, help="checkpoint file of the mission, from which it is resumed")
     parser.add_argument("--manager", choices=TABLES, default="ours", help="transition table of the activity manager")
+    parser.add_argument("--planner", default=SEARCH, help=f"grasp planner: {', '.join(NAMES)}, or of another package")
+    parser.add_argument(
+        "--virtual-cameras", type=int, default=1, metavar="N",
+        help="places of the virtual camera over which a network's predictions are averaged",
+    )  # fmt: skip
     parser.add_argument(
         "--memory", action="store_true",
         help="the detector's camera looks ahead of the driving machine, and the crane works from memory",
@@ -38,6 +44,10 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--lease-ms", type=int, default=200, help="validity of a setpoint")
     parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     options = parser.parse_args(argv)
+    try:
+        options.planner = PlannerChoice(options.planner, options.virtual_cameras).check()
+    except PlannerError as error:
+        parser.error(str(error))
     if options.progress is not None and (options.mission is None or options.order_port is None):
         parser.error("--progress needs --mission and --order-port: a resumed mission waits for the command Auto")
     if options.missions is not None and (options.mission is not None or options.order_port is None):

@@ -29,10 +29,11 @@ def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: 
 
     Raises:
         MissionError: the mission or its checkpoint cannot be used.
+        PluginError, WeightsError: the grasp planner cannot be loaded.
         MissionFinished: the mission of the checkpoint is finished.
     """
     if options.mission is None and options.missions is None:
-        code, selector = profile_hash(profile), PlannerSelection(SamplingPlanner())
+        code, selector = profile_hash(profile), PlannerSelection(options.planner.make())
         return SingleLogJob(Activity(profile, code, CraneJob(log_id=options.log), lease_ns, key, selector))
     if profile.carrier is None:
         raise MissionError(
@@ -72,7 +73,7 @@ def _manager(
     checkpoint: Checkpoint | None = None,
 ) -> ActivityManager:  # fmt: skip
     return ActivityManager(
-        profile, profile_hash(profile), mission, TABLES[options.manager], PlannerSelection(SamplingPlanner()), key=key,
-        lease_ns=lease_ns, uses_memory=options.memory,
+        profile, profile_hash(profile), mission, TABLES[options.manager], PlannerSelection(options.planner.make()),
+        key=key, lease_ns=lease_ns, uses_memory=options.memory,
         unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())), progress=checkpoint,
     )  # fmt: skip

@@ -1,14 +1,12 @@
 """Foreign methods, found by entry point: a package that names one in its pyproject.toml is compared with ours.
 
-Group ``timberhand.grasp_planners``: a factory without arguments that returns a grasp planner (`GraspPlanner` of
-`autonomy.grasp.planner`).  Group ``timberhand.log_detectors``: a factory without arguments that returns a
-`LogPictureDetector`.
+Group ``timberhand.grasp_planners``: `autonomy.grasp.planners`.  Group ``timberhand.log_detectors``: a factory without
+arguments that returns a `LogPictureDetector`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -18,10 +16,9 @@ from typing import Any, Final, Protocol
 
 from autonomy.perception.camera.frame import RgbdFrame
 from experiments.common.errors import ExperimentError
+from runtime.plugins import PluginError, load_plugin
 
-GRASP_PLANNERS: Final = "timberhand.grasp_planners"
 LOG_DETECTORS: Final = "timberhand.log_detectors"
-NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,18 +55,7 @@ def load(group: str, name: str) -> Any:
     Raises:
         ExperimentError: no installed package has such an entry point, several have, or it cannot be loaded.
     """
-    found = entry_points(group=group)
-    its = [point for point in found if point.name == name]
-    if len(its) != 1 or not NAME.fullmatch(name):
-        known = ", ".join(sorted(point.name for point in found)) or "none"
-        raise ExperimentError(
-            "plugin.unknown",
-            f"{len(its)} installed packages have an entry point {name!r} in {group} (installed: {known}); exactly one "
-            "must, with a name of small letters, digits, - and _",
-        )
     try:
-        return its[0].load()()
-    except Exception as error:
-        raise ExperimentError(
-            "plugin.unusable", f"the entry point {its[0].value} of {group} cannot be loaded: {error!r}"
-        ) from error
+        return load_plugin(group, name)
+    except PluginError as error:
+        raise ExperimentError(error.code, str(error)) from error

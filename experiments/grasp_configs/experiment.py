@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
+from autonomy.grasp.planners import GRASP_PLANNERS
 from experiments.common import overview, plugins, pool
 from experiments.common.errors import ExperimentError
 from experiments.common.individuals import calibrated
@@ -247,7 +248,7 @@ def compare(options: Options, console: Console) -> Result:
         planner_named(options.planner)
     if options.detector and options.detector not in POSE_SOURCES:
         plugins.load(plugins.LOG_DETECTORS, options.detector)
-    besides = plugins.identity(plugins.GRASP_PLANNERS, options.planner)
+    besides = plugins.identity(GRASP_PLANNERS, options.planner)
     besides += plugins.identity(plugins.LOG_DETECTORS, options.detector)
     attempts = options.trials or (1 if options.quick else PAPER_ATTEMPTS)
     with checkpoint(options, besides, [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:

@@ -10,18 +10,17 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from autonomy.crane_job.activity import SETTLE_AFTER_ARRIVAL_NS, Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.cnn_planner import CnnPlanner
-from autonomy.grasp.network import WEIGHTS, GraspNet
 from autonomy.grasp.planner import GraspCandidate, GraspPlanner, GraspRequest
-from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.planners import GRASP_PLANNERS, SEARCH, PlannerChoice
+from autonomy.grasp.planners import NETWORKS as WEIGHT_FILES
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.motion.motion_planner import TimeOptimalPlanner
+from autonomy.networks.weights import SHIPPED
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from controller.config import Settings
@@ -46,7 +45,8 @@ LIMIT_NS: Final = 60_000_000_000
 HELD_NS: Final = 2_000_000_000
 SEEDS_PER_ATTEMPT: Final = 16
 SEGMENTATION: Final = "logs_rgbd.safetensors"
-NETWORKS: Final = {"cnn": "grasp_cornell", "cnn_physical": "grasp_physical"}
+NETWORKS: Final = {"cnn": "cnn", "cnn_physical": "cnn-physical"}
+"""Names of the networks' planners in the results, and in `autonomy.grasp.planners`."""
 
 
 @dataclass(slots=True)
@@ -119,16 +119,11 @@ class TimedPlanner:
         return self.proposal
 
 
-@cache
-def _network(name: str) -> GraspNet:
-    return GraspNet.shipped(WEIGHTS.with_name(f"{name}.safetensors"))
-
-
 def weights_of(poses: str, planner: str) -> bool:
     """Whether the weights that a pair of the ablation needs exist."""
-    needed = [f"{NETWORKS[planner]}.safetensors"] if planner in NETWORKS else []
+    needed = [WEIGHT_FILES[NETWORKS[planner]]] if planner in NETWORKS else []
     needed += [SEGMENTATION] if poses in ("ours", "faithful") else []
-    return all(WEIGHTS.with_name(name).exists() for name in needed)
+    return all((SHIPPED / name).exists() for name in needed)
 
 
 def planner_named(name: str) -> GraspPlanner:
@@ -138,11 +133,9 @@ def planner_named(name: str) -> GraspPlanner:
         WeightsError: the network's weights are missing or damaged.
         ExperimentError: there is no such planner.
     """
-    if name == "search":
-        return SamplingPlanner()
-    if name not in NETWORKS:
-        return plugins.load(plugins.GRASP_PLANNERS, name)  # type: ignore[no-any-return]
-    return CnnPlanner(_network(NETWORKS[name]), by_rule=name == "cnn_physical")
+    if name == SEARCH or name in NETWORKS:
+        return PlannerChoice(NETWORKS.get(name, name)).make()
+    return plugins.load(GRASP_PLANNERS, name)  # type: ignore[no-any-return]
 
 
 def attempt(job: Job) -> dict[str, Any]:

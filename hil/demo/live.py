@@ -8,6 +8,7 @@ from typing import Final
 
 from rich.console import Console
 
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from hil.demo.summary import Summary, is_settled, outcome_sentence
 from hil.harness.display import Display
 from hil.harness.live import LiveOptions, LiveRun
@@ -56,6 +57,7 @@ def run_live(
     plc_link: str = "modbus",
     camera: str = "",
     foxglove_port: int = 0,
+    planner: PlannerChoice = OUR_PLANNER,
 ) -> Summary:
     """Run the job as separate processes in real time.
 
@@ -68,4 +70,6 @@ def run_live(
         name, profile, seed, truth, bus, directory, page, limit_s, max_stops, plc_link, camera, foxglove_port
     )
     with Display(console, f"{profile.title}: one log into the bunk, live, seed {seed}") as display:
-        return OneLogRun(options, display).run()
+        run = OneLogRun(options, display)
+        run.planner_arguments += planner.arguments()
+        return run.run()

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.grasp.selection import PlannerSelection
 from can_dbc.messages.crane import OperatorAction, StateReport
 from controller.config import Settings
@@ -62,11 +62,12 @@ def run_lockstep(
     orders: Sequence[Order] = (),
     max_stops: int = MAX_STOPS,
     companion: Companion | None = None,
+    planner: PlannerChoice = OUR_PLANNER,
 ) -> Summary:
     """Run the job in one process on virtual time; the same seed leaves the same bytes in ``directory``.
 
     With ``camera`` the planner gets the logs detected through it, without it their true poses.  ``orders``:
-    faults to inject.  ``max_stops``: as in `Operator`.
+    faults to inject.  ``max_stops``: as in `Operator`.  ``planner`` chooses the grasp planner.
 
     Raises:
         CommandFailed: profile, truth, camera or directory cannot be used.
@@ -77,13 +78,14 @@ def run_lockstep(
         plant = Plant(profile, seed, truth) if profile.plc is None else BridgedPlant(profile, seed, truth)
         buses = tuple(name for name in (profile.crane_bus, profile.machine_bus) if name)
         detector = _camera_detector(plant, profile, camera, seed) if camera else None
+        selector = PlannerSelection(planner.make())
         recorder = Recorder(directory, profile, describe_run(profile, buses, seed))
     except (ValueError, RecordingRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         time = "lockstep" if companion is None else "paced"
         with Display(console, f"{profile.title}: one log into the bunk, {time}, seed {seed}") as display:
-            job = _Job(name, profile, plant, recorder, display, detector, max_stops, companion)
+            job = _Job(name, profile, plant, recorder, display, detector, max_stops, companion, selector)
             if orders:
                 job.system.operator.watches = any(order.fault == "operator-off" for order in orders)
                 Injector(job.system, orders)
@@ -111,13 +113,14 @@ class _Job:
         detector: LogDetector | None,
         max_stops: int,
         companion: Companion | None,
+        selector: PlannerSelection,
     ) -> None:
         settings = Settings(profile, profile_hash(profile), profile.rate_hz)
         self._display, self._companion = display, companion
         self._mode: int = -1
         self._phase = self._grasp = ""
         self._closings = 0
-        self.activity = Activity(profile, profile_hash(profile), grasp_selector=PlannerSelection(SamplingPlanner()))
+        self.activity = Activity(profile, profile_hash(profile), grasp_selector=selector)
         self.system = Lockstep(
             settings,
             build_guard(profile_path(name)),

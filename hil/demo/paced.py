@@ -22,6 +22,7 @@ from typing import Final
 from rich.console import Console
 
 from autonomy.crane_job.activity import Activity
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.perception.log_list.datagrams import LogListError, decode_request, encode_error, encode_logs
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.process.grasp_publisher import chosen_grasp
@@ -223,6 +224,7 @@ def run_paced(
     console: Console,
     camera: str = "",
     foxglove_port: int = 0,
+    planner: PlannerChoice = OUR_PLANNER,
 ) -> Summary:
     """Run the job in paced virtual time; ``page`` is the port of the operator's page, 0: none.
 
@@ -254,7 +256,16 @@ def run_paced(
 
             companion = Paced(pace, link, bool(camera), start, lambda: _check(processes))
         summary = run_lockstep(
-            name, seed, truth, directory, limit_s, console, camera, max_stops=max_stops, companion=companion
+            name,
+            seed,
+            truth,
+            directory,
+            limit_s,
+            console,
+            camera,
+            max_stops=max_stops,
+            companion=companion,
+            planner=planner,
         )
         return replace(summary, paced=True, behind_s=pace.behind_ns / 1e9)
 

@@ -210,13 +210,13 @@ class LiveRun(ABC, Generic[Outcome]):
         self._processes.await_message("recorder", "ready", START_S)
         self._processes.set_fifo_priority("recorder", RECORDER_PRIORITY)
         plant = (*self._profile, "--seed", options.seed, "--truth", options.truth, "--port", ports["sim"])
+        pictures = ("--camera", ports["pictures"]) if options.camera else ()
         if options.profile.plc is None:
-            pictures = ("--camera", ports["pictures"]) if options.camera else ()
             self._start("sim", "sim", *plant, *bus, *pictures, *self.plant_arguments)
             self._processes.await_message("sim", "ready", START_S)
         else:
             link = f"--{options.plc_link}"
-            self._start("sim", "sim.plc", *plant, link, f"{HOST}:0")
+            self._start("sim", "sim.plc", *plant, link, f"{HOST}:0", *pictures)
             listening = self._processes.await_message("sim", "ready", START_S)["ready"]
             self._start("plc", "controller.plc", *self._profile, *bus, link, f"{HOST}:{listening[options.plc_link]}")
             self._processes.await_message("plc", "ready", START_S)

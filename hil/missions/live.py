@@ -16,6 +16,7 @@ import msgspec
 from rich.console import Console
 
 from autonomy.calibration.profile_file import Change, write_profile
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.manager.tally import Load
 from autonomy.missions.model import ForwardingMission
 from controller.guard.__main__ import profile_path
@@ -77,13 +78,13 @@ class LiveMission(LiveRun[MissionSummary]):
 
     def __init__(
         self, options: LiveOptions, display: Display, file: Path, mission: ForwardingMission, manager: str, logs: int,
-        terrain: str = "flat", detector: str = PERFECT,
+        terrain: str = "flat", detector: str = PERFECT, planner: PlannerChoice = OUR_PLANNER,
     ) -> None:  # fmt: skip
         super().__init__(_with_camera(options, detector), display)
         site = options.directory / SITE
         site_of(mission, options.profile, options.seed, options.truth, logs, terrain).save(site)
         self.plant_arguments = ("--site", site)
-        self.planner_arguments = ("--mission", file, "--manager", manager)
+        self.planner_arguments = ("--mission", file, "--manager", manager, *planner.arguments())
         if detector != PERFECT:
             self.planner_arguments += ("--memory",)
             surveyed = write_surveyed(options, options.directory / SURVEYED_PROFILE)
@@ -133,7 +134,7 @@ class LiveMission(LiveRun[MissionSummary]):
 
 def run_live_mission(
     file: Path, mission: ForwardingMission, options: LiveOptions, manager: str, logs: int, console: Console,
-    terrain: str = "flat", detector: str = PERFECT,
+    terrain: str = "flat", detector: str = PERFECT, planner: PlannerChoice = OUR_PLANNER,
 ) -> MissionSummary:  # fmt: skip
     """Run the mission as separate processes in real time.
 
@@ -144,7 +145,7 @@ def run_live_mission(
     title = f"{options.profile.title}: {mission.name or 'a mission'}, live, seed {options.seed}"
     with Display(console, title) as display:
         try:
-            run = LiveMission(options, display, file, mission, manager, logs, terrain, detector)
+            run = LiveMission(options, display, file, mission, manager, logs, terrain, detector, planner)
         except ValueError as error:
             raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
         return run.run()

@@ -13,6 +13,8 @@ from pathlib import Path
 from rich.console import Console
 
 from autonomy.grasp.pile_planner import PilePlanner
+from autonomy.grasp.planner import GraspPlanner
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
@@ -64,11 +66,12 @@ def run_mission(
     console: Console,
     detector: str = "perfect",
     terrain: str = "flat",
+    planner: PlannerChoice = OUR_PLANNER,
 ) -> MissionSummary:
     """Run the mission on virtual time; ``logs`` > 0 lays that many along the route instead of those of the mission.
 
     ``manager`` names a transition table, ``detector`` a detector of `hil.missions.detectors`, ``terrain`` a kind of
-    ground of `sim.ground.terrain`.
+    ground of `sim.ground.terrain`, ``planner`` the planner of grasps from the ground.
 
     Raises:
         CommandFailed: profile, truth or mission cannot be used.
@@ -76,6 +79,7 @@ def run_mission(
     profile = load_profile(name)
     try:
         site = site_of(mission, profile, seed, truth, logs, terrain)
+        grasp_planner = planner.make()
         plant = site.plant(profile, truth, seed)
         buses = tuple(bus for bus in (profile.crane_bus, profile.machine_bus) if bus)
         recorder = Recorder(directory, profile, describe_run(profile, buses, seed))
@@ -83,7 +87,9 @@ def run_mission(
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         with Display(console, f"{profile.title}: {mission.name or 'a mission'}, lockstep, seed {seed}") as display:
-            run = MissionRun(mission, name, profile, plant, recorder, display, manager, site, detector, seed)
+            run = MissionRun(
+                mission, name, profile, plant, recorder, display, manager, site, detector, seed, grasp_planner
+            )
             summary = run.run(limit_s, str(directory))
         report_loads(directory, run.manager.tally.loads, mission, profile, EPOCH, START_NS)
         return summary
@@ -106,6 +112,7 @@ class MissionRun:
         site: Site,
         detector: str = "perfect",
         seed: int = 0,
+        planner: GraspPlanner | None = None,
     ) -> None:
         self._display, self._mode = display, -1
         self._vehicle: VehicleReport | None = None
@@ -116,7 +123,7 @@ class MissionRun:
         code = profile_hash(profile)
         uses_memory = detector != "perfect"
         self.manager = ActivityManager(
-            profile, code, mission, TABLES[manager], selector=PlannerSelection(SamplingPlanner()),
+            profile, code, mission, TABLES[manager], selector=PlannerSelection(planner or SamplingPlanner()),
             uses_memory=uses_memory,
             unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
         )  # fmt: skip

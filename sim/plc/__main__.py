@@ -1,7 +1,8 @@
 """The live plant behind a PLC: ``python -m sim.plc --profile P --modbus 127.0.0.1:1502 --udp 127.0.0.1:1503``.
 
 Like ``python -m sim``, but without CAN: the emulated PLC reads the sensors and drives the valves; clients command it
-over Modbus/TCP or cyclic UDP, in the role that the profile's [plc] defines.  ``--port`` answers the same JSON requests.
+over Modbus/TCP or cyclic UDP, in the role that the profile's [plc] defines.  ``--port`` answers the same JSON requests,
+and ``--camera`` serves camera pictures, which have a network of their own on such a machine.
 It prints ``ready`` with the ports in use on stdout.  Loopback only unless ``--allow-network`` is given; datagrams from
 a network need a key, or ``--no-key``, and Modbus has none.  Exit codes: 0 stopped, 2 usage, 3 profile or truth, 4 an
 address that cannot be used.
@@ -31,10 +32,16 @@ from sim.process.live_plant import LivePlant
 
 
 class LivePlc(LivePlant):
-    """A plant and its PLC in real time; the network is served between the physics' steps."""
+    """A plant and its PLC in real time; the network is served between the physics' steps.
 
-    def __init__(self, plant: PlcPlant, port: int | None, loop: asyncio.AbstractEventLoop) -> None:
-        super().__init__(plant, {}, port)
+    ``cameras``: TCP port of the cameras' pictures, whose noise follows ``seed``.
+    """
+
+    def __init__(
+        self, plant: PlcPlant, port: int | None, loop: asyncio.AbstractEventLoop, seed: int = 0,
+        cameras: int | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(plant, {}, port, seed, cameras)
         self._loop = loop
         self._program = plant.plc
         self._now_ns = 0
@@ -105,6 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--allow-network", action="store_true", help="listen on an address that others can reach")
     parser.add_argument("--key-file", type=Path, help="file with the key that authenticates the datagrams")
     parser.add_argument("--no-key", action="store_true", help="accept datagrams of other hosts without a key")
+    parser.add_argument("--camera", type=int, help="TCP port on the loopback interface for camera pictures")
     parser.add_argument("--port", type=int, help="UDP port on the loopback interface for JSON requests")
     options = parser.parse_args(arguments)
     if options.modbus is None and options.udp is None:
@@ -125,7 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
         order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
         key = None if options.key_file is None else read_key(options.key_file)
         plant = PlcPlant(profile, options.seed, options.truth, options.logs, role=role, order=order, key=key)
-        live = LivePlc(plant, options.port, loop)
+        live = LivePlc(plant, options.port, loop, options.seed, options.camera)
         ports = live.open(options.modbus, options.udp)
         signal.signal(signal.SIGTERM, live.stop)
         signal.signal(signal.SIGINT, live.stop)

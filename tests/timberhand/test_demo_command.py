@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from autonomy.grasp.planners import PlannerChoice
 from hil.demo.summary import Summary
 from host.exit_codes import CommandFailed, ExitCode
 from host.lateness import NEED
@@ -68,6 +69,29 @@ def test_the_look_is_taken_only_where_it_decides(words: str, kinds: list[str], r
     assert ran == kinds
 
 
+@pytest.mark.parametrize("kind", ["lockstep", "no-live", "live"])
+def test_the_planner_and_paper_as_machine_reach_the_run(
+    kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[object] = []
+
+    def take_place(*given: object, **more: object) -> Summary:
+        seen.extend((*given, *more.values()))
+        return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
+
+    for name in ("live", "lockstep", "paced"):
+        monkeypatch.setattr(f"hil.demo.{name}.run_{name}", take_place)
+    words = ["demo", f"--{kind}", "--out", str(tmp_path)]
+    if kind == "live":
+        words += ["--bus", "wire"]
+    CliRunner().invoke(app, [*words, "--planner", "cnn-physical", "--virtual-cameras", "3"])
+    assert PlannerChoice("cnn-physical", 3) in seen
+    seen.clear()
+    CliRunner().invoke(app, [*words, "--paper-a"])
+    for value in (PlannerChoice("cnn", 1), "stick", str(tmp_path / "palms_471_plc.toml")):
+        assert value in seen
+
+
 def test_inside_the_lab_no_look_is_taken(ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TIMBERHAND_LAB", "uml")
     CliRunner().invoke(app, ["demo", "--bus", "wire", "--out", str(tmp_path)])
@@ -91,6 +115,11 @@ def test_a_computer_that_holds_the_period_runs_live(
         ("--bus vcan --no-live", "demo.live-vcan"),
         ("--no-live --plc --plc-link udp", "demo.paced-udp"),
         ("--no-live --inject encoder-lift:stuck@1s", "demo.inject-live"),
+        ("--planner nobody", "planner.unknown"),
+        ("--virtual-cameras 5", "planner.no-virtual-camera"),
+        ("--planner cnn --virtual-cameras 0", "planner.virtual-cameras"),
+        ("--paper-a --planner cnn-physical", "demo.paper-a"),
+        ("--paper-a --plc-role valves", "demo.paper-a"),
     ],
 )
 def test_what_would_be_ignored_is_refused(words: str, code: str, ran: list[str], tmp_path: Path) -> None:

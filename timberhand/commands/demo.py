@@ -14,12 +14,15 @@ import typer
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
     FoxglovePortOption,
+    GraspPlannerOption,
     MaxStopsOption,
     PageOption,
     PagePortOption,
     ProfileOption,
     SummaryOption,
     TruthOption,
+    VirtualCamerasOption,
+    planner_of,
     truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
@@ -77,6 +80,16 @@ def demo(
     camera: Annotated[
         str, typer.Option(help="Detect the logs with this camera of the profile (default: true log poses).")
     ] = "",
+    planner: GraspPlannerOption = "search",
+    virtual_cameras: VirtualCamerasOption = 1,
+    paper_a: Annotated[
+        bool,
+        typer.Option(
+            "--paper-a",
+            help="Paper A's machine whole: the camera on the stick, its network, the loops in a PLC at 50 Hz; as "
+            "--camera stick --planner cnn --plc.",
+        ),
+    ] = False,
     faults: Annotated[
         list[str] | None,
         typer.Option(
@@ -104,6 +117,10 @@ def demo(
       timberhand demo --plc                  a PLC closes the joint loops
 
       timberhand demo --camera stick         a camera detects the log
+
+      timberhand demo --planner cnn          paper A's network plans the grasp
+
+      timberhand demo --paper-a --lockstep   paper A's machine, whole
     """
     from rich.console import Console
 
@@ -111,6 +128,16 @@ def demo(
 
     if refused := refusal(live, lockstep, bus, plc and plc_link is PlcLink.UDP):
         raise refused
+    if paper_a:
+        if profile != "palms_471" or planner != "search" or camera or plc_role is not PlcRole.REFERENCES:
+            raise CommandFailed(
+                "demo.paper-a",
+                "--paper-a chooses machine, camera, planner and the PLC's role; leave out --profile, --camera, "
+                "--planner and --plc-role",
+                ExitCode.USAGE,
+            )
+        camera, planner, plc = "stick", "cnn", True
+    chosen = planner_of(planner, virtual_cameras)
     if not lockstep:
         enter_lab(bus, clock, detects=bool(camera))
     try:
@@ -118,12 +145,6 @@ def demo(
         cameras = machine.cameras
     except ProfileError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
-    if camera and plc:
-        raise CommandFailed(
-            "demo.camera-with-plc",
-            f"--camera {camera}: the emulated PLC has no camera; use --camera or --plc, not both",
-            ExitCode.USAGE,
-        )
     if camera and camera not in cameras:
         raise CommandFailed(
             "demo.no-camera",
@@ -159,14 +180,24 @@ def demo(
 
         try:
             orders = [parse(text, seed) for text in faults or ()]
-            summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera, orders)
+            summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera, orders, planner=chosen)
         except FaultError as error:
             raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     elif paced:
         from hil.demo.paced import run_paced
 
         summary = run_paced(
-            profile, seed, truth, directory, page, limit_s, max_stops, screen, camera, foxglove if page else 0
+            profile,
+            seed,
+            truth,
+            directory,
+            page,
+            limit_s,
+            max_stops,
+            screen,
+            camera,
+            foxglove if page else 0,
+            chosen,
         )
     else:
         from hil.demo.live import run_live
@@ -184,6 +215,7 @@ def demo(
             plc_link.value,
             camera,
             foxglove,
+            chosen,
         )
     summary.show(screen)
     summary.save(directory / "summary.json")

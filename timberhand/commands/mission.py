@@ -12,6 +12,7 @@ import typer
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
     FoxglovePortOption,
+    GraspPlannerOption,
     MaxStopsOption,
     PageOption,
     PagePortOption,
@@ -20,6 +21,8 @@ from timberhand.commands.options import (
     Terrain,
     TerrainOption,
     TruthOption,
+    VirtualCamerasOption,
+    planner_of,
     truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
@@ -62,6 +65,8 @@ def run(
         DetectorKind,
         typer.Option(help="Log detector: perfect, or the front camera with paper B's or our own pipeline."),
     ] = DetectorKind.PERFECT,
+    planner: GraspPlannerOption = "search",
+    virtual_cameras: VirtualCamerasOption = 1,
     logs: Annotated[
         int, typer.Option(min=0, help="Lay this many logs along the route instead of those of the mission.")
     ] = 0,
@@ -105,6 +110,7 @@ def run(
     from autonomy.missions.model import MissionError
     from machine.loading.profile_file import ProfileError, load_profile
 
+    chosen = planner_of(planner, virtual_cameras)
     if not lockstep:
         enter_lab(bus, clock, detects=detector is not DetectorKind.PERFECT)
     try:
@@ -125,7 +131,7 @@ def run(
 
         summary = run_mission(
             mission, profile, seed, truth, TABLES[manager], logs, directory, limit_s, screen, DETECTORS[detector],
-            terrain.value,
+            terrain.value, chosen,
         )  # fmt: skip
     else:
         from hil.harness.live import LiveOptions
@@ -136,7 +142,7 @@ def run(
             profile, machine, seed, truth, bus.value, directory, page, limit_s, max_stops, foxglove_port=foxglove
         )
         summary = run_live_mission(
-            file, mission, options, TABLES[manager], logs, screen, terrain.value, DETECTORS[detector]
+            file, mission, options, TABLES[manager], logs, screen, terrain.value, DETECTORS[detector], chosen
         )
     summary.show(screen)
     summary.save(directory / "summary.json")

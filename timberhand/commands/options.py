@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+
+if TYPE_CHECKING:
+    from autonomy.grasp.planners import PlannerChoice
 
 
 class Terrain(StrEnum):
@@ -47,6 +50,21 @@ FoxglovePortOption = Annotated[
 MaxStopsOption = Annotated[
     int, typer.Option("--max-stops", help="Stops after which the emulated operator gives up (live).")
 ]
+GraspPlannerOption = Annotated[
+    str,
+    typer.Option(
+        "--planner", metavar="NAME",
+        help="Planner of grasps from the ground: search (ours), cnn (paper A's network), cnn-physical (the same, "
+        "trained on grasps of the plant), or one of another package.",
+    ),
+]  # fmt: skip
+VirtualCamerasOption = Annotated[
+    int,
+    typer.Option(
+        "--virtual-cameras", metavar="N",
+        help="With a network: places of the virtual camera over which its predictions are averaged.",
+    ),
+]  # fmt: skip
 PlannerOption = Annotated[
     str, typer.Option("--planner", help="grasp-configs: a foreign grasp planner, by entry point, compared with ours.")
 ]
@@ -59,6 +77,20 @@ def check_foreign(experiment: str, planner: str, detector: str) -> None:
     """Refuse a foreign method where nothing would use it."""
     if (planner or detector) and experiment != "grasp-configs":
         raise typer.BadParameter("--planner and --detector are options of grasp-configs")
+
+
+def planner_of(name: str, virtual_cameras: int) -> PlannerChoice:
+    """The choice of ``--planner`` and ``--virtual-cameras``.
+
+    Raises:
+        CommandFailed: there is no such planner, or it has no virtual camera.
+    """
+    from autonomy.grasp.planners import PlannerChoice, PlannerError
+
+    try:
+        return PlannerChoice(name, virtual_cameras).check()
+    except PlannerError as error:
+        raise CommandFailed.from_error(error, ExitCode.USAGE) from None
 
 
 def truth_of(profile: str, truth: str) -> str:

@@ -15,12 +15,13 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from autonomy.grasp.planner import GraspRequest, NoGrasp
+from autonomy.grasp.planners import GRASP_PLANNERS
 from autonomy.motion.arm import Arm
 from autonomy.perception.camera.frame import RgbdFrame
 from autonomy.perception.log_list.observation import LogObservation
 from experiments.common import plugins
 from experiments.common.errors import ExperimentError
-from experiments.common.plugins import GRASP_PLANNERS, SeenLog
+from experiments.common.plugins import SeenLog
 from experiments.common.registry import Options
 from experiments.grasp_configs import pose_sources
 from experiments.grasp_configs.experiment import compare, jobs_of

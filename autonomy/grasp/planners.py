@@ -1,0 +1,103 @@
+"""Grasp planners by name: our search, paper A's network, and those of other packages.
+
+``search`` looks for the best grasp by the capture rule (`autonomy.grasp.sampling_planner`).  ``cnn`` is paper A's chain
+(section II): virtual scene, depth image, network trained on Cornell's pictures.  ``cnn-physical`` is the same network
+trained on grasps of the plant, with the height from the capture rule.  Any other name is an entry point of the group
+``timberhand.grasp_planners``, a factory without arguments that returns a `GraspPlanner`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from autonomy.grasp.planner import GraspPlanner
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.networks.weights import SHIPPED
+from runtime.errors import CodedError
+from runtime.plugins import load_plugin
+
+if TYPE_CHECKING:
+    from autonomy.grasp.network import GraspNet
+
+GRASP_PLANNERS: Final = "timberhand.grasp_planners"
+SEARCH: Final = "search"
+PHYSICAL: Final = "cnn-physical"
+NETWORKS: Final = {"cnn": "grasp_cornell.safetensors", PHYSICAL: "grasp_physical.safetensors"}
+"""Planners with a network, and their weights."""
+NAMES: Final = (SEARCH, *NETWORKS)
+MAX_VIRTUAL_CAMERAS: Final = 32
+
+
+class PlannerError(CodedError, ValueError):
+    """There is no such planner, or it has no virtual camera to move."""
+
+
+class PlannerChoice(NamedTuple):
+    """A planner's name, and over how many places of the virtual camera a network's predictions are averaged."""
+
+    name: str = SEARCH
+    virtual_cameras: int = 1
+
+    def check(self) -> PlannerChoice:
+        """The choice itself; nothing is loaded.
+
+        Raises:
+            PlannerError: there is no such planner, or it has no virtual camera.
+        """
+        if self.name not in NAMES and not entry_points(group=GRASP_PLANNERS, name=self.name):
+            foreign = sorted({point.name for point in entry_points(group=GRASP_PLANNERS)})
+            raise PlannerError(
+                "planner.unknown",
+                f"there is no grasp planner {self.name!r}; there are: {', '.join((*NAMES, *foreign))}",
+            )
+        if not 1 <= self.virtual_cameras <= MAX_VIRTUAL_CAMERAS:
+            raise PlannerError(
+                "planner.virtual-cameras",
+                f"{self.virtual_cameras} virtual cameras: the network's predictions can be averaged over 1 to "
+                f"{MAX_VIRTUAL_CAMERAS}",
+            )
+        if self.virtual_cameras > 1 and self.name not in NETWORKS:
+            raise PlannerError(
+                "planner.no-virtual-camera",
+                f"the planner {self.name!r} has no virtual camera; those with one are: {', '.join(NETWORKS)}",
+            )
+        return self
+
+    def make(self) -> GraspPlanner:
+        """The planner.
+
+        Raises:
+            PlannerError: as `check`.
+            PluginError: the package's planner cannot be loaded.
+            WeightsError: the network's weights are missing or damaged.
+        """
+        self.check()
+        if self.name == SEARCH:
+            return SamplingPlanner()
+        if self.name not in NETWORKS:
+            return load_plugin(GRASP_PLANNERS, self.name)  # type: ignore[no-any-return]
+        from autonomy.grasp.cnn_planner import CnnPlanner
+
+        return CnnPlanner(network(NETWORKS[self.name]), self.name == PHYSICAL, self.virtual_cameras)
+
+    def arguments(self) -> tuple[str, ...]:
+        """The words that choose this planner on the command line of `autonomy`; none for the default."""
+        words = () if self.name == SEARCH else ("--planner", self.name)
+        return words if self.virtual_cameras == 1 else (*words, "--virtual-cameras", str(self.virtual_cameras))
+
+
+OUR_PLANNER: Final = PlannerChoice()
+
+
+@cache
+def network(weights: str) -> GraspNet:
+    """Paper A's network with shipped weights.
+
+    Raises:
+        WeightsError: they are missing or damaged.
+    """
+    from autonomy.grasp.network import GraspNet  # loads OpenVINO, which a search does not need
+
+    return GraspNet.shipped(SHIPPED / weights)

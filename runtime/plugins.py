@@ -1,0 +1,38 @@
+"""Foreign methods, found by entry point: a package names a factory without arguments in its pyproject.toml."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+from runtime.errors import CodedError
+
+NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]*")
+
+
+class PluginError(CodedError, ValueError):
+    """An entry point cannot be used; the sentence says why, and which there are."""
+
+
+def load_plugin(group: str, name: str) -> Any:
+    """What the factory of an entry point makes.
+
+    Raises:
+        PluginError: no installed package has such an entry point, several have, or it cannot be loaded.
+    """
+    known = entry_points(group=group)
+    points = [point for point in known if point.name == name]
+    if len(points) != 1 or not NAME.fullmatch(name):
+        names = ", ".join(sorted(point.name for point in known)) or "none"
+        raise PluginError(
+            "plugin.unknown",
+            f"{len(points)} installed packages have an entry point {name!r} in {group} (installed: {names}); exactly "
+            "one must, with a name of small letters, digits, - and _",
+        )
+    try:
+        return points[0].load()()
+    except Exception as error:
+        raise PluginError(
+            "plugin.unusable", f"the entry point {points[0].value} of {group} cannot be loaded: {error!r}"
+        ) from error
