@@ -30,7 +30,8 @@ _MODE: Final = re.compile(r"^ *[0-9.]+ s +(STOP|FAULT): (.*)$", re.MULTILINE)
 
 def command(kind: str, seed: int, out: Path) -> list[str]:
     """The user's command line for one run."""
-    job = ["mission", "run", MISSION, "--logs", str(MISSION_LOGS)] if kind == "mission" else ["demo"]
+    mission = ["mission", "run", MISSION, "--logs", str(MISSION_LOGS), "--detector", "perfect"]
+    job = mission if kind == "mission" else ["demo"]
     return [
         sys.executable, "-m", "timberhand", *job, "--bus", "vcan", "--seed", str(seed), "--no-console",
         "--out", str(out),

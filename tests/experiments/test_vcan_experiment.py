@@ -76,6 +76,6 @@ def test_the_page_has_a_line_for_every_seed() -> None:
 
 def test_the_command_is_the_one_that_a_user_types() -> None:
     assert command("mission", 4, Path("x"))[3:] == [
-        "mission", "run", "docs/examples/paper_b.geojson", "--logs", "3", "--bus", "vcan", "--seed", "4",
-        "--no-console", "--out", "x",
+        "mission", "run", "docs/examples/paper_b.geojson", "--logs", "3", "--detector", "perfect", "--bus", "vcan",
+        "--seed", "4", "--no-console", "--out", "x",
     ]  # fmt: skip

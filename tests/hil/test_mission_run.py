@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from hil.missions.summary import MissionSummary
 from host.exit_codes import ExitCode
 from tests.hil.short_missions import mission_file
 from timberhand.cli import app
@@ -27,6 +28,32 @@ def test_a_machine_without_a_carrier_drives_no_mission(tmp_path: Path) -> None:
         app, ["mission", "run", str(path), "--lockstep", "--profile", "palms_471", "--out", str(tmp_path / "run")]
     )
     assert getattr(result.exception, "code", "") == "mission.stationary-machine"
+
+
+@pytest.mark.parametrize(
+    ("words", "detector", "planner", "cheats"),
+    [
+        ((), "ours", ("search", 1), False),
+        (("--detector", "perfect"), "perfect", ("search", 1), True),
+        (("--detector", "paper-b", "--planner", "cnn", "--virtual-cameras", "3"), "faithful", ("cnn", 3), False),
+    ],
+)
+def test_the_machine_sees_with_its_own_camera_and_perfect_sight_is_called_a_cheat(
+    words: tuple[str, ...], detector: str, planner: tuple[str, int], cheats: bool, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    given: list[object] = []
+
+    def take_place(*arguments: object) -> MissionSummary:
+        given.extend(arguments)
+        return MissionSummary(True, "", 0, 0, 0, {}, 1.0, 0.0, 0, 0, (), str(tmp_path))
+
+    monkeypatch.setattr("hil.missions.lockstep.run_mission", take_place)
+    path = mission_file(tmp_path / "mission.geojson")
+    done = CliRunner().invoke(app, ["mission", "run", str(path), "--lockstep", *words, "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert detector in given and planner in given
+    assert ("--detector perfect cheats" in done.output) is cheats
 
 
 @pytest.mark.long

@@ -40,9 +40,9 @@ class ManagerKind(StrEnum):
 class DetectorKind(StrEnum):
     """The detector that finds the logs."""
 
-    PERFECT = "perfect"
-    PAPER_B = "paper-b"
     OWN = "own"
+    PAPER_B = "paper-b"
+    PERFECT = "perfect"
 
 
 TABLES: Final = {ManagerKind.OWN: "ours", ManagerKind.PAPER_B: "paper-b"}
@@ -63,8 +63,11 @@ def run(
     ] = ManagerKind.OWN,
     detector: Annotated[
         DetectorKind,
-        typer.Option(help="Log detector: perfect, or the front camera with paper B's or our own pipeline."),
-    ] = DetectorKind.PERFECT,
+        typer.Option(
+            help="What finds the logs: the front camera with our own or paper B's pipeline; perfect cheats with the "
+            "plant's truth."
+        ),
+    ] = DetectorKind.OWN,
     planner: GraspPlannerOption = "search",
     virtual_cameras: VirtualCamerasOption = 1,
     logs: Annotated[
@@ -98,7 +101,7 @@ def run(
 
       timberhand mission run docs/examples/paper_b.geojson --bus vcan
 
-      timberhand mission run docs/examples/paper_b.geojson --detector own
+      timberhand mission run docs/examples/paper_b.geojson --detector perfect
 
       timberhand mission run docs/examples/paper_b.geojson --manager paper-b
     """
@@ -126,6 +129,8 @@ def run(
     mission = draft.mission
     for problem in draft.warnings:
         screen.print(f"warning: {problem}", style="yellow", markup=False, soft_wrap=True)
+    if detector is DetectorKind.PERFECT:
+        screen.print("--detector perfect cheats: the planner is told where the logs truly lie", style="yellow")
     if lockstep:
         from hil.missions.lockstep import run_mission
 
