@@ -324,6 +324,14 @@ def test_configuration_errors_have_codes_and_exit_codes(tmp_path, capsys):
     assert capsys.readouterr().err.count("guard: ") == 2
 
 
+def test_the_guard_tells_how_near_its_joints_come_to_a_fault():
+    traffic = Traffic()
+    assert not any(watch.share() for _, watch in traffic.guard.motion), "nothing is known yet"
+    traffic.tick(60)
+    shares = [joint.share() for joint in traffic.guard.joints.values()]
+    assert shares and max(shares + [watch.share() for _, watch in traffic.guard.motion]) < 0.5
+
+
 def test_what_judges_has_at_most_650_lines_of_code():
     """Without blank lines, comments and docstrings, so that explaining a rule costs nothing.
 

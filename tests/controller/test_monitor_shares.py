@@ -5,6 +5,7 @@ from itertools import count
 
 import pytest
 
+from can_dbc.messages.crane import GrappleCommand
 from controller.estimation.drift_monitor import DriftMonitor
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.estimation.noise_monitor import NoiseMonitor
@@ -96,3 +97,6 @@ def test_every_monitor_of_a_machine_tells_its_share_and_a_good_one_is_far_from_i
             shares["noise"] = max(controller.estimators[j].noise_share(), shares.get("noise", 0.0))
     assert len(shares) == 13
     assert max(shares.values()) < 0.8, shares
+    bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)])
+    against = [("joint against its command" in controller.joint_watch.shares(j)) for j in range(len(SPECS))]
+    assert against == [True, True, True, True, False], "logs between the tongs turn the rotator"
