@@ -21,6 +21,7 @@ from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
 from can_dbc.messages.key_file import write_key
+from can_dbc.messages.operator_link import guard_path
 from can_dbc.timing.page import Timing, TimingRefused, read_timing
 from experiments.common import host_activity
 from experiments.timing.events import Events, Stall, Stop, losses_between
@@ -111,6 +112,7 @@ class TimingTestbed:
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
         self.page, self.key_file = self._private / "controller.timing", self._private / "key"
+        self._operators = self._private / "controller.operator"
         self.family = ProcessGroup(directory, environment={"TIMBERHAND_WIRE_DIR": str(self._private)})
         self.helpers = ProcessGroup(directory, own_sessions=False)
 
@@ -140,7 +142,7 @@ class TimingTestbed:
         addresses = {n: f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}" for n in names}
         buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
         control, reports = free_udp_ports(2)
-        ticks, operators = (self._private / f"controller.{kind}" for kind in ("ticks", "operator"))
+        ticks, operators = self._private / "controller.ticks", self._operators
         keyed = ("--key-file", write_key(self.key_file))
         if not vcan:
             rates = dict(s.bitrates)
@@ -326,3 +328,4 @@ class TimingTestbed:
         self.helpers.stop_all(())
         self.family.stop_all(END_ORDER)
         shutil.rmtree(self._private, ignore_errors=True)
+        shutil.rmtree(guard_path(self._operators).parent, ignore_errors=True)

@@ -95,13 +95,17 @@ def shared_memory() -> set[str]:
 
 
 def running() -> dict[int, str]:
-    """Every process of this run but this one: its number and its command."""
+    """Every process of this run but this one, and the trackers of its shared memory, which end with it: its number and
+    its command.
+    """
     tag = f"{TAG}={os.environ.get(TAG)}".encode()
     found: dict[int, str] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             if tag in (folder / "environ").read_bytes().split(b"\0") and int(folder.name) != os.getpid():
-                found[int(folder.name)] = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()[:200]
+                command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()[:200]
+                if not ("resource_tracker import main" in command and next(parents(int(folder.name))) == os.getpid()):
+                    found[int(folder.name)] = command
     return found
 
 

@@ -54,12 +54,17 @@ class Started:
         self.url = f"http://127.0.0.1:{port}/"
 
     def answers(self) -> bool:
-        """Whether the page is served; raises AssertionError with what the command said when it has ended."""
+        """Whether the page is served and its address is printed.
+
+        Raises:
+            AssertionError: the command has ended, with what it said.
+        """
         assert self.process.poll() is None, self.said.read_text()
         with contextlib.suppress(OSError), urllib.request.urlopen(f"{self.url}static/icon.svg", timeout=20) as answer:
-            if printed := re.search(rf"{self.url}\?\S+", self.said.read_text()):
-                note(printed[0])
-            return bool(answer.status == 200)
+            printed = re.search(rf"({self.url}(?:\?[^\s\"]+)?)[\s\"]", self.said.read_text())
+            if printed:
+                note(printed[1])
+            return answer.status == 200 and printed is not None
         return False
 
     def interrupt(self) -> None:
