@@ -4,14 +4,9 @@ A session is opened by a person: with the accounts by name and password, on this
 which is drawn at the start and stands in the address that the console prints.  A cookie keeps the session.  A page of a
 session asks for a token of its own, which every command and the websocket must carry: a page of another site cannot
 read it, so it can command nothing even where the browser adds the cookie.  Without a session whoever is on this machine
-looks, and presses STOP.  The control lease belongs to one page (`console.access`).
+looks, and presses STOP.  The control lease belongs to one page.
 
 Pure but for the tokens' randomness; `console.access_routes` and `console.access_guards` are the shell.
-
-The control lease: which one page may command the machine now.  Pure.
-
-A page takes it on purpose, and keeps it while it shows signs of life; without one for `LEASE_NS` nobody has it.
-Whoever takes it from another names the page that has it, so that a click on an outdated display takes nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +20,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from console.accounts import Accounts, Person, Role
+
+# -- The control lease: which one page may command the machine now.  Pure.
+#
+# A page takes it on purpose, and keeps it while it shows signs of life; without one for `LEASE_NS` nobody has it.
+# Whoever takes it from another names the page that has it, so that a click on an outdated display takes nothing.
+
 
 LEASE_NS: Final = 4_000_000_000
 """So long the lease outlives its page: enough to go from one page of the console to another."""
@@ -60,6 +61,9 @@ class ControlLease:
         """The page does not need it any more."""
         if self.holder(now_ns) == page:
             self._page = 0
+
+
+# -- Who is at which page
 
 
 SESSION_NS: Final = 12 * 3600 * 1_000_000_000

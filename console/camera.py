@@ -2,11 +2,6 @@
 
 ``/api/camera`` says what belongs to the newest picture, ``/api/camera/NUMBER`` is its JPEG.  However many pages ask,
 the detector is asked at most twice a second, and answers beside its own work: controller and planner take no part.
-
-The camera's newest picture for the page: what belongs to it, and where the chosen grasp is in it.  Pure.
-
-The picture comes from the log detector (`can_dbc.messages.picture`).  The grasp is in the crane's base frame, so it is
-drawn only while the machine stands where the picture was taken.
 """
 
 from __future__ import annotations
@@ -23,6 +18,12 @@ from starlette.routing import Route
 
 from can_dbc.messages.picture import PictureFacts, PictureRefused, decode_picture, encode_picture_request
 from console.state import CraneState
+
+# -- The camera's newest picture for the page: what belongs to it, and where the chosen grasp is in it.  Pure.
+#
+# The picture comes from the log detector (`can_dbc.messages.picture`).  The grasp is in the crane's base frame, so
+# it is drawn only while the machine stands where the picture was taken.
+
 
 SILENT_NS: Final = 5_000_000_000
 """A detector that has not answered for this long is said not to answer; a detection takes a second or two."""
@@ -121,6 +122,9 @@ def _projected(facts: PictureFacts, points_m: list[list[float]]) -> list[list[fl
             return None
         found.append([round(facts.fx_px * x / z + facts.cx_px, 1), round(facts.fy_px * y / z + facts.cy_px, 1)])
     return found
+
+
+# -- The camera's picture on the page
 
 
 ASK_PERIOD_NS: Final = 450_000_000

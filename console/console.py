@@ -2,13 +2,6 @@
 
 One ``OperatorCommand`` datagram per command goes to the controller's operator socket, one ``MissionCommand`` or
 ``MissionUpload`` datagram to the planner.  `console.server` shows it as web pages.
-
-The pages that watch the machine: which heartbeats go on to the controller, and when the watch ends.  Pure.
-
-An open page that may command answers the state that it receives several times a second; each answer is a heartbeat of
-its browser, stamped with the time at which that state left.  So a cut network ends the heartbeats although this server
-runs on, and answers that waited in a slow one are as old as they are.  A page that is closed on purpose says so; it
-ends the watch unless another page is open, or has fallen silent so lately that its loss is still to be seen.
 """
 
 from __future__ import annotations
@@ -36,6 +29,15 @@ from console.can_tap import CanTap
 from console.foxglove_server import FoxgloveServer
 from console.state import CraneState
 from machine.profile import Profile
+
+# -- The pages that watch the machine: which heartbeats go on to the controller, and when the watch ends.  Pure.
+#
+# An open page that may command answers the state that it receives several times a second; each answer is a
+# heartbeat of its browser, stamped with the time at which that state left.  So a cut network ends the heartbeats
+# although this server runs on, and answers that waited in a slow one are as old as they are.  A page that is closed
+# on purpose says so; it ends the watch unless another page is open, or has fallen silent so lately that its loss is
+# still to be seen.
+
 
 MIN_BEAT_NS: Final = WATCH_PERIOD_NS * 3 // 4
 """However many pages are open, the controller gets no more heartbeats than about one page's."""
@@ -91,6 +93,9 @@ class PageWatch:
         """Pages that have been silent for the limit: the controller has held by now, or another page watches."""
         for page in [p for p, heard_ns in self._heard_ns.items() if now_ns - heard_ns >= self._limit_ns]:
             del self._heard_ns[page]
+
+
+# -- The console
 
 
 Address = tuple[str, int]

@@ -3,10 +3,6 @@
 Planning needs no controller and no network.  Every POST needs the role operator, an upload the control lease as well;
 its body is limited, and its JSON is checked against the mission's schema; a refusal is one sentence, with a code where
 a mission is at fault.  Checks run one after another in a thread beside the server, so that STOP never waits for one.
-
-What the plan page is told about a mission: errors and warnings with the part that each is about, time and wood.
-
-The checks are those of ``timberhand plan check``.  Pure; a large mission takes seconds.
 """
 
 from __future__ import annotations
@@ -35,6 +31,12 @@ from console.access import Access
 from console.access_guards import page_of, person_of
 from console.accounts import Role
 from machine.profile import Carrier, Profile
+
+# -- What the plan page is told about a mission: errors and warnings with the part that each is about, time and
+# wood.
+#
+# The checks are those of ``timberhand plan check``.  Pure; a large mission takes seconds.
+
 
 MAX_FINDINGS = 100
 
@@ -106,6 +108,9 @@ def _told(findings: list[Finding]) -> list[dict[str, Any]]:
         {"code": f.code, "sentence": f.sentence, "part": None if f.key is None else list(f.key)}
         for f in findings[:MAX_FINDINGS]
     ]
+
+
+# -- The requests of the plan page
 
 
 MAX_BODY_BYTES: Final = MAX_JSON_BYTES

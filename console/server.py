@@ -12,11 +12,6 @@ a page that shows a panel says so there and gets its data (`console.panel`).
 STOP is accepted from every page that the console serves, at once and without more.  Everything else needs a session
 that a person opened, a page's token and a role, and what can move the machine the control lease as well
 (`console.access`).  All resources are served from the package; no other host is contacted.
-
-The page's buttons to try to break a live run: asks the desk of faults, and follows what becomes of each.
-
-The harness of a live run gives the desk's socket (`--faults`); the console of a machine has none, and then these
-addresses do not exist.  A fault needs the control lease.
 """
 
 from __future__ import annotations
@@ -54,6 +49,12 @@ from console.panel import Panel, panel_data, panels_of
 from console.plan_api import PlanApi
 from console.state import CraneState, describe_machine
 from console.true_logs import TrueLogs
+
+# -- The page's buttons to try to break a live run: asks the desk of faults, and follows what becomes of each.
+#
+# The harness of a live run gives the desk's socket (`--faults`); the console of a machine has none, and then these
+# addresses do not exist.  A fault needs the control lease.
+
 
 ANSWER_S: Final = 6.0
 MAX_ANSWER_BYTES: Final = 65_536
@@ -98,6 +99,9 @@ async def _ask(desk: Path, request: dict[str, str]) -> dict[str, Any]:
 
 def _error(told: dict[str, Any]) -> str:
     return str(told.get("error") or "The run's desk of faults gave no answer.")
+
+
+# -- The server of the operator's web page
 
 
 PERIOD_S: Final = 0.05

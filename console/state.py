@@ -2,15 +2,6 @@
 
 Pure: datagrams and integer times in, JSON-ready dictionaries out.  An unknown number (NaN) becomes None.  Peaks (tick
 time, delay) are maxima of the last second, because the page is updated less often than the controller reports.
-
-The chosen grasp for the page, in the crane's base frame; pure, like `console.state`.
-
-The histograms of the timing page, coarse enough for a plot: counts between 1, 2 and 5 of each decade.  Pure.
-
-The numbers of a shift: logs, volume, stops, metres driven and working time, from the reports as they arrive.  Pure.
-
-A shift begins with the console's first report of the controller or when a person begins a new one, and counts whether a
-page is open or not.  Of a mission that had begun before, only what follows is counted.
 """
 
 from __future__ import annotations
@@ -41,6 +32,13 @@ from machine.profile import Profile, joint
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import STALE_INPUT_NAMES
+
+# -- The numbers of a shift: logs, volume, stops, metres driven and working time, from the reports as they arrive.
+# Pure.
+#
+# A shift begins with the console's first report of the controller or when a person begins a new one, and counts
+# whether a page is open or not.  Of a mission that had begun before, only what follows is counted.
+
 
 MIN_RATE_NS: Final = 300_000_000_000
 """Volume per hour is told from this time on: before, a single log decides it."""
@@ -115,6 +113,9 @@ class Shift:
         }
 
 
+# -- The histograms of the timing page, coarse enough for a plot: counts between 1, 2 and 5 of each decade.  Pure.
+
+
 EDGES_US: Final = tuple(step * 10**power for power in range(6) for step in (1, 2, 5))[:16]
 """Upper edges 1 us to 100 ms; what is longer is in one more bar."""
 SHOWN: Final = {
@@ -145,6 +146,9 @@ def histograms(timing: Timing) -> dict[str, Any]:
         summary = durations.summary()
         found.append({"name": name, "words": words, "counts": counts, **summary})
     return {"edges_us": list(EDGES_US), "period_us": timing.facts.period_ns / 1e3, "of": found}
+
+
+# -- The chosen grasp for the page, in the crane's base frame; pure, like `console.state`.
 
 
 TIMEOUT_NS: Final = 1_500_000_000
@@ -186,6 +190,9 @@ class GraspState:
             "logs": list(g.logs),
             "reason": g.reason,
         }  # fmt: skip
+
+
+# -- The page's state of controller and crane, from the newest reports
 
 
 REPORT_TIMEOUT_NS: Final = 300_000_000

@@ -15,11 +15,6 @@ stamp; the recorder has no clock.  Outputs, in one directory:
 
 A chunk ends at least every 200 ms of recorded time, and live it is flushed to the disk, so that a killed process or a
 power cut loses at most 250 ms.  A full disk costs records, counted in ``dropped``, and nothing else.
-
-Decodes the frames of a bus for a recording: message name, and values under their DBC names.
-
-Values are physical and unchecked (``codec.decode``): a recording shows what was on the bus, including values out of
-range and frames that a receiver refuses.  Only a frame of wrong length has no values.
 """
 
 from __future__ import annotations
@@ -55,6 +50,11 @@ from recorder.stop_files import TICK as TICK
 from recorder.stop_files import StopFiles
 from recorder.stop_recorder import StopRecorder
 from runtime.errors import CodedError
+
+# -- Decodes the frames of a bus for a recording: message name, and values under their DBC names.
+#
+# Values are physical and unchecked (``codec.decode``): a recording shows what was on the bus, including values out
+# of range and frames that a receiver refuses.  Only a frame of wrong length has no values.
 
 
 class BusSignals:
@@ -94,6 +94,9 @@ def json_schema(codec: MessageCodec) -> bytes:
         text = "; ".join(part for part in (signal.comment, signal.unit and f"[{signal.unit}]", table) if part)
         properties[signal.name] = {"type": "number", "description": text}
     return msgspec.json.encode({"type": "object", "description": codec.comment, "properties": properties})
+
+
+# -- The recorder
 
 
 STOPS_NAME: Final = "stops"

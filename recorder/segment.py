@@ -1,10 +1,4 @@
-"""One MCAP file that grows by commits: each one is a chunk with its CRC, complete on the disk or not there at all.
-
-Writes the same bytes as ``mcap.writer.Writer`` with chunks and every index, at a fraction of its cost per message.
-
-The library packs a message field by field, which took a fifth of a lockstep run.  Here a message is one ``struct``;
-records that come once per chunk or file are written by the library.
-"""
+"""One MCAP file that grows by commits: each one is a chunk with its CRC, complete on the disk or not there at all."""
 
 from __future__ import annotations
 
@@ -32,6 +26,13 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from recorder.files import CommitFile
+
+# -- Writes the same bytes as ``mcap.writer.Writer`` with chunks and every index, at a fraction of its cost per
+# message.
+#
+# The library packs a message field by field, which took a fifth of a lockstep run.  Here a message is one
+# ``struct``; records that come once per chunk or file are written by the library.
+
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_BYTES: Final = 22  # of a message's record before its data
@@ -161,6 +162,9 @@ def _bytes(record: McapRecord) -> bytes:
     record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
+
+
+# -- One MCAP file that grows by commits
 
 
 class Segment:

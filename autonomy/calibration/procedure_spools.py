@@ -1,18 +1,6 @@
 """The part of a calibration run that moves joints by their spools: programs, travels, and what a wiggle teaches.
 
 See `autonomy.calibration.procedure.Calibration`, of which this is one half.
-
-What the first, gentle opening of a valve tells of it: dead-band, full speed and dead time, roughly.
-
-The search (`autonomy.calibration.spool_program.wiggle`) knows nothing: the spool opens slowly from neutral until the
-encoder has moved a little, to either side.  On such a ramp a valve moves its joint along a parabola, whose foot is the
-dead-band and whose curvature is the gain; so both come from one short motion, well enough to plan the tests that
-measure them (dead-band within 2 % of the stroke, full speed within a third).  The dead time is that of the spool where
-the valve node reports it, else it is fitted with the rest.
-
-The profile is not asked.  Whether it may stay in force for ordinary motions is judged by `suits`: a controller whose
-map is farther off would neither follow nor believe what it sees, and the crane travels by its spools instead
-(`autonomy.calibration.spool_travel`).
 """
 
 from __future__ import annotations
@@ -35,6 +23,19 @@ from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, joint
 from machine.sensing.weighing import lever_share
+
+# -- What the first, gentle opening of a valve tells of it: dead-band, full speed and dead time, roughly.
+#
+# The search (`autonomy.calibration.spool_program.wiggle`) knows nothing: the spool opens slowly from neutral until
+# the encoder has moved a little, to either side.  On such a ramp a valve moves its joint along a parabola, whose
+# foot is the dead-band and whose curvature is the gain; so both come from one short motion, well enough to plan the
+# tests that measure them (dead-band within 2 % of the stroke, full speed within a third).  The dead time is that of
+# the spool where the valve node reports it, else it is fitted with the rest.
+#
+# The profile is not asked.  Whether it may stay in force for ordinary motions is judged by `suits`: a controller
+# whose map is farther off would neither follow nor believe what it sees, and the crane travels by its spools
+# instead (`autonomy.calibration.spool_travel`).
+
 
 OIL_S: Final = 0.08
 """Delay of oil, pump and steel between a spool and its joint, roughly."""
@@ -132,6 +133,9 @@ def suits(profile: JointSpec, found: JointSpec) -> bool:
     near = all(abs(x - y) <= 100.0 * SUITED_DEADBAND for x, y in deadbands)
     alike = all(1.0 / SUITED_GAIN <= x / y <= SUITED_GAIN for x, y in fulls)
     return near and alike and b.delay_s <= SUITED_DELAY_S
+
+
+# -- The part of a calibration run that moves joints by their spools
 
 
 SLOW_SHARE, NARROW_PCT = 0.6, 5.0

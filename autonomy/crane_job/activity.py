@@ -8,8 +8,6 @@ follows.
 A controller that stops, faults or falls silent pauses the activity; when it is armed again, the activity plans the
 interrupted phase again from the measured pose.  Every phase has a time limit.  Failure: ``failure`` holds the reason
 that ended the job, after a smooth stop along the path.
-
-State of one crane job: its parts, and what a manager and an operator read of it.
 """
 
 from __future__ import annotations
@@ -47,6 +45,8 @@ from machine.joints import JOINTS, Joint
 from machine.profile import Profile
 from machine.status.modes import Mode
 from runtime.errors import Problem
+
+# -- State of one crane job: its parts, and what a manager and an operator read of it.
 
 
 class ActivityState:
@@ -172,6 +172,9 @@ class ActivityState:
         self._failure = problem
         self.phase = Phase.FAILED
         self._elapsed_s = 0.0
+
+
+# -- One crane job as a state machine
 
 
 SETTLE_AFTER_ARRIVAL_NS: Final = 300_000_000

@@ -6,12 +6,6 @@ perception and crane are uncertain about.  Among equally probable grasps the one
 nearer to the wood's middle.  A machine on wheels does not know the height of the ground: the undersides of logs that
 lie on no other give it. Where a camera measured the logs, jaws that come down on a pile penetrate it, and the planner
 always proposes a grasp. Inputs: log list, with covariances where perception gives them.  Failure: ``NoGrasp``.
-
-Extraction grasp: draws a log off the end of a row that is too wide for the grapple.
-
-One open jaw penetrates the valley between the log and its neighbour until its tip is beside them rather than on them;
-the other comes down on free ground beyond.  Closing, they roll the log away from the row until both are under it.  Jaws
-around the whole row would instead stall at its sides, pull, and slip off over it.
 """
 
 from __future__ import annotations
@@ -46,6 +40,13 @@ from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.estimate import RADIUS
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.kinematics import Unreachable
+
+# -- Extraction grasp: draws a log off the end of a row that is too wide for the grapple.
+#
+# One open jaw penetrates the valley between the log and its neighbour until its tip is beside them rather than on
+# them; the other comes down on free ground beyond.  Closing, they roll the log away from the row until both are
+# under it.  Jaws around the whole row would instead stall at its sides, pull, and slip off over it.
+
 
 SUCCESS_PROBABILITY: Final = 0.9
 """In the plant's rows of three: 14 of 14 at the first try."""
@@ -93,6 +94,9 @@ def extract_end_log(
                 float(x), float(y), yaw, lowest_m, (i,), SUCCESS_PROBABILITY, reason, penetrates=True, extracts=True
             )
     return None
+
+
+# -- Sampling-based grasp planner
 
 
 DRAW_COUNT: Final = 32

@@ -53,9 +53,9 @@ class LogKnowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Checkpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Checkpoint of the mission with the digest ``mission``.
 
-    ``landing``, ``served`` and ``rounds`` are as in `autonomy.manager.world_model`; ``left`` is None before the route
-    was begun; ``rotator`` is the state of one without an encoder.  ``clock_ns`` and ``unix_ns`` are the same moment by
-    the process's clock and as Unix time, so that times survive a restart of the computer.
+    ``landing``, ``served`` and ``rounds`` are as in `autonomy.manager.sorting`; ``left`` is None before the route was
+    begun; ``rotator`` is the state of one without an encoder.  ``clock_ns`` and ``unix_ns`` are the same moment by the
+    process's clock and as Unix time, so that times survive a restart of the computer.
     """
 
     mission: str

@@ -1,11 +1,4 @@
-"""The load: what is on board, whether more is wanted, which logs may share a grasp, and the booking of each grasp.
-
-Logs that fell off the machine, told by a camera that only looks ahead.
-
-Such a camera sees neither the bunk nor what falls beside it.  But it has seen the ground before the machine drove over
-it: a log that lies where the loaded bunk has been, and that was not mapped when the machine stood there, was not there.
-On the next lap it is seen, and it came from the load.
-"""
+"""The load: what is on board, whether more is wanted, which logs may share a grasp, and the booking of each grasp."""
 
 from __future__ import annotations
 
@@ -30,6 +23,13 @@ from autonomy.navigation.clothoid_path import Point2
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from machine.profile import Bunk, Profile
+
+# -- Logs that fell off the machine, told by a camera that only looks ahead.
+#
+# Such a camera sees neither the bunk nor what falls beside it.  But it has seen the ground before the machine drove
+# over it: a log that lies where the loaded bunk has been, and that was not mapped when the machine stood there, was
+# not there. On the next lap it is seen, and it came from the load.
+
 
 STEP_M: Final = 0.5
 """The bunk's place is kept every so often on the way, ..."""
@@ -89,6 +89,9 @@ class FallenLogs:
         off = log.center_m[:2] - place.middle_m
         along = float(off @ place.along)
         return abs(along) < self._half_m[0] and math.sqrt(max(0.0, float(off @ off) - along**2)) < self._half_m[1]
+
+
+# -- The load
 
 
 LOOKS: Final = 4

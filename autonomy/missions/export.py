@@ -3,11 +3,6 @@
 Only GeoJSON holds everything.  ``export`` says in words what a format leaves out; what it does write is read back to
 the same mission (`autonomy.missions.mission_file.read`).  Heights are left out everywhere but in GeoJSON, because the
 other formats' heights are above sea level.
-
-Writes GPX 1.1 and KML 2.2; `autonomy.missions.gpx_kml` reads both back.
-
-In KML every property is extended data, including ``role``, so that only options and heights are lost.  In GPX the route
-is a route, and landings and logs are waypoints whose ``type`` is their role.
 """
 
 from __future__ import annotations
@@ -22,6 +17,12 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from autonomy.missions import geojson
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, MissionError, Options, Point, all_points
 from autonomy.missions.qgc_plan import DO_CHANGE_SPEED, NAV_WAYPOINT
+
+# -- Writes GPX 1.1 and KML 2.2; `autonomy.missions.gpx_kml` reads both back.
+#
+# In KML every property is extended data, including ``role``, so that only options and heights are lost.  In GPX the
+# route is a route, and landings and logs are waypoints whose ``type`` is their role.
+
 
 _NO_XML: Final = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 cannot hold (section 2.2)."""
@@ -108,6 +109,9 @@ def _bytes(root: Element) -> bytes:
     indent(root)
     data: bytes = tostring(root, encoding="utf-8", xml_declaration=True)
     return data + b"\n"
+
+
+# -- Missions for other programs
 
 
 _MAV_FRAME_GLOBAL_RELATIVE_ALT: Final = 3

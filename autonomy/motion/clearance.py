@@ -3,11 +3,6 @@
 Every part keeps a margin; near the ends of a motion it may be as near to an obstacle as it is there, for a grapple goes
 into bunks and over logs.  The hanging grapple leans as a pendulum of the shortest and of the longest period would under
 this pin.  No clock, no randomness.
-
-Distances between a moving crane and obstacles: swept capsules against boxes, capsules and the ground.
-
-Distances are exact for every sample, negative inside capsules and the ground (0 inside a box), and vectorized; the
-motion of a part between two samples is bounded by its greatest displacement.  Lengths in m.
 """
 
 from __future__ import annotations
@@ -24,6 +19,12 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.obstacles import CollisionScene, Ground, HeldLog, ObstacleArrays, SweptCapsules, swept_capsules
 from autonomy.motion.time_law import PENDULUM_S
 from autonomy.motion.trajectory import Trajectory
+
+# -- Distances between a moving crane and obstacles: swept capsules against boxes, capsules and the ground.
+#
+# Distances are exact for every sample, negative inside capsules and the ground (0 inside a box), and vectorized;
+# the motion of a part between two samples is bounded by its greatest displacement.  Lengths in m.
+
 
 _SMALL: Final = 1e-12
 
@@ -146,6 +147,9 @@ def least_clearance(scene: CollisionScene, body: SweptCapsules) -> tuple[float, 
     apart = clearances(scene, body)
     i, m, k = np.unravel_index(int(np.argmin(apart)), apart.shape)
     return float(apart[i, m, k]), body.names[m], scene.names[k], int(i)
+
+
+# -- Clearance of a motion from all obstacles, with the swing of the grapple that the motion causes
 
 
 MARGIN_M: Final = 0.10

@@ -1,7 +1,4 @@
-"""A drive along a planned path (ours): path following, with the speed limited by bends, ground and the next stop.
-
-Speed limits: bends, tip-over margin, rough ground, distance to the stop.
-"""
+"""A drive along a planned path (ours): path following, with the speed limited by bends, ground and the next stop."""
 
 from __future__ import annotations
 
@@ -17,6 +14,9 @@ from autonomy.navigation.follower import FollowerState, SteeringCommand, follow_
 from can_dbc.messages.vehicle import Steering
 from machine.geometry.carrier import ARMS, hub_m, pivot_height_m, rear_from_front
 from machine.profile import Carrier
+
+# -- Speed limits: bends, tip-over margin, rough ground, distance to the stop.
+
 
 MASS_HEIGHT_M: Final = 0.55
 """Height of the centre of mass above the pivots, crane in transport pose, bunk full (assumed)."""
@@ -107,6 +107,9 @@ def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
 def stopping_speed_m_s(left_m: float) -> float:
     """Speed with ``left_m`` to go: constant deceleration that ends in a creep."""
     return max(CREEP_M_S, math.sqrt(2.0 * BRAKING_M_S2 * max(0.0, left_m)))
+
+
+# -- A drive along a planned path (ours)
 
 
 MAX_SIGMA_M: Final = 0.25

@@ -1,10 +1,4 @@
-"""One calibration of one individual machine in lockstep, compared with the hidden ground truth.
-
-True angle of a rotator without an encoder when a planner commands quarter turns, with any profile of its machine.
-
-Controller, guard, bus and plant are those of every lockstep run; the turns go through the control laws, as a planner's
-do. The plant is built from the profile as shipped: a calibration changes the controller's profile, not the machine.
-"""
+"""One calibration of one individual machine in lockstep, compared with the hidden ground truth."""
 
 from __future__ import annotations
 
@@ -40,6 +34,14 @@ from machine.profile import Profile
 from machine.status.modes import Mode
 from sim.plant import Plant
 from sim.world import STEP_S
+
+# -- True angle of a rotator without an encoder when a planner commands quarter turns, with any profile of its
+# machine.
+#
+# Controller, guard, bus and plant are those of every lockstep run; the turns go through the control laws, as a
+# planner's do. The plant is built from the profile as shipped: a calibration changes the controller's profile, not
+# the machine.
+
 
 QUARTER_RAD: Final = pi / 2
 TURNS_RAD: Final = (QUARTER_RAD, 0.0, -QUARTER_RAD, 0.0)
@@ -113,6 +115,9 @@ def turn_errors(job: Job, path: Path) -> list[float]:
 
 def _pressed(action: OperatorAction, report: StateReport) -> None:
     """The emulated operator prints nothing."""
+
+
+# -- One calibration of one individual machine in lockstep, compared with the hidden ground truth
 
 
 TESTED_SPOOL: Final = 0.45

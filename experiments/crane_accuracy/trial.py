@@ -1,10 +1,4 @@
-"""The two kinds of jobs: calibrate an individual machine, and run the motions of a variant on it.
-
-The testbed: a machine on its virtual buses with the planner of the experiment, sampled while it moves.
-
-Controller, guard, CAN bytes and plant are those of every lockstep run (`hil.harness.lockstep`).  The plant is built
-from the profile as shipped: a calibration changes the controller's profile, not the machine.
-"""
+"""The two kinds of jobs: calibrate an individual machine, and run the motions of a variant on it."""
 
 from __future__ import annotations
 
@@ -41,6 +35,12 @@ from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from sim.plant import Plant
+
+# -- The testbed: a machine on its virtual buses with the planner of the experiment, sampled while it moves.
+#
+# Controller, guard, CAN bytes and plant are those of every lockstep run (`hil.harness.lockstep`).  The plant is
+# built from the profile as shipped: a calibration changes the controller's profile, not the machine.
+
 
 CYCLE_S: Final = 60.0
 """Longer than any motion there and back with its rests; a machine that needs more has failed."""
@@ -141,6 +141,9 @@ class AccuracyTestbed:
 
 def _pressed(action: OperatorAction, report: StateReport) -> None:
     """The emulated operator prints nothing."""
+
+
+# -- The two kinds of jobs
 
 
 def perform(job: Job) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 A child process continues the machine of its parent, so all injections of a scene share its start-up; the parent stays
 at the moment of the fork.  The same scene, case and seed give the same outcome, in a child as in a fresh process.
-
-Whether an injection was answered as the catalogue promises.  Pure: an outcome in, a verdict out.
 """
 
 from __future__ import annotations
@@ -29,6 +27,9 @@ from hil.harness.lockstep import SLICE_NS, START_NS
 from machine.joints import JOINTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+
+# -- Whether an injection was answered as the catalogue promises.  Pure: an outcome in, a verdict out.
+
 
 SEVERITY: Final = {"D": 1, "H": 2, "R1": 3, "R0": 4}
 STOPS: Final = ("H", "R1", "R0")
@@ -79,6 +80,9 @@ def _timed(found_ms: float | None, bound_ms: float) -> str:
 
 def _answer(detect_ms: float | None, verdict: str) -> dict[str, Any]:
     return {"detect_ms": detect_ms, "verdict": verdict, "missed": verdict != "ok"}
+
+
+# -- One injection
 
 
 EARLIEST_S, LATEST_S = 0.0, 2.0

@@ -2,11 +2,6 @@
 
 ``--trials`` is the number of drawn machines, and of missions, at most `MISSIONS`; every end is one machine.
 ``--quick``: the combination of late and wide valves, one drawn machine and one short mission.
-
-One machine with one truth: calibrated, then some logs or a mission with what the calibration has written.
-
-Outcome: whether a profile was written, and if not, what was said; how wrong its valves are against the truth; and for
-every job whether the log lies in the bunk, whether the machine says so, its closings, stops and time.
 """
 
 from __future__ import annotations
@@ -50,6 +45,12 @@ from hil.calibration.crane import run_lockstep as calibrate
 from hil.demo.lockstep import run_lockstep as load_one_log
 from hil.replay.recording import PROFILE_FILE
 from machine.loading.beside import carry_envelope
+
+# -- One machine with one truth: calibrated, then some logs or a mission with what the calibration has written.
+#
+# Outcome: whether a profile was written, and if not, what was said; how wrong its valves are against the truth; and
+# for every job whether the log lies in the bunk, whether the machine says so, its closings, stops and time.
+
 
 LIMIT_S: Final = 180.0
 SCENES: Final = 100
@@ -126,6 +127,9 @@ def wrong_values(result: CalibrationResult, truth: dict[str, Any]) -> list[str]:
         if one.delay is not None and abs(one.delay.delay_s - valve["delay_s"]) > WRONG_DELAY_S:
             wrong.append(f"{name}: dead time {one.delay.delay_s:.3f} s, true {valve['delay_s']:.3f} s")
     return wrong
+
+
+# -- Does it work in a world that it has never seen? Truths at both ends of every parameter, then all drawn
 
 
 DRAWN_MACHINES: Final = 20

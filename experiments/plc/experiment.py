@@ -1,9 +1,4 @@
-"""The PLC experiment: compares the PLC path with the CAN path in lockstep, with the same jobs, seeds and machines.
-
-Metrics of the PLC experiment with their limits, and the page that shows them.
-
-One job on one command path in lockstep: success, accuracy and latency as plain data.
-"""
+"""The PLC experiment: compares the PLC path with the CAN path in lockstep, with the same jobs, seeds and machines."""
 
 from __future__ import annotations
 
@@ -40,6 +35,9 @@ from machine.geometry.kinematics import pin_position
 from machine.status.modes import Mode
 from recorder.recorder import Recorder
 from sim.plant import Plant
+
+# -- One job on one command path in lockstep: success, accuracy and latency as plain data.
+
 
 LIMIT_NS: Final = 150_000_000_000
 SETTLE_NS: Final = 3_000_000_000
@@ -151,6 +149,9 @@ def slope(x: list[float], y: list[float]) -> float:
     return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / square if square else math.nan
 
 
+# -- Metrics of the PLC experiment with their limits, and the page that shows them.
+
+
 PATHS: Final = {
     "can": "CAN, valve node",
     "references": "PLC closes the loops, Modbus/TCP",
@@ -216,6 +217,9 @@ def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
             f"{path}_measured_ms": mean([t["age_ms"] for t in trials]),
         }
     return metrics
+
+
+# -- The PLC experiment
 
 
 TRIALS: Final = 20

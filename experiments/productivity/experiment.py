@@ -1,9 +1,4 @@
-"""The productivity experiment: single logs, piles, and unloading at a landing.
-
-One task of the whole machine in lockstep, as plain data.
-
-The tasks: route, landing and logs for one machine and seed.
-"""
+"""The productivity experiment: single logs, piles, and unloading at a landing."""
 
 from __future__ import annotations
 
@@ -34,6 +29,9 @@ from sim.scenes.arrangements import LogSampler, arrangement
 from sim.site.site_file import Site
 from sim.wood.log_shape import LogSpec
 from sim.wood.stacking import upon
+
+# -- The tasks: route, landing and logs for one machine and seed.
+
 
 BEFORE_M: Final = 10.0
 """Route before the first log."""
@@ -120,11 +118,17 @@ def _at(
     return arrangement(kind, profile, wood, seed, count, at=at, yaw_rad=yaw + rng.choice((0.0, math.pi)))
 
 
+# -- One task of the whole machine in lockstep, as plain data.
+
+
 def perform(job: Job) -> dict[str, Any]:
     """``options``: profile, truth, amount, way, limit_s; the kind of the job is that of the task."""
     o = job.options
     mission, site = task(job.kind, profile_named(o["profile"]), o["truth"], job.seed, o["amount"])
     return run_mission(job, mission, site)
+
+
+# -- The productivity experiment
 
 
 TRIALS: Final = 1

@@ -1,11 +1,6 @@
 """Carries out orders on a lockstep run: a `hil.harness.lockstep.Disturbance`.
 
 ``attach`` hangs it on a run; `order` adds orders at any time.  The same orders, seeds and run give the same bytes.
-
-What can be wrong with a planner's datagrams on their way to the controller (docs/reference/safety.md, 24 to 28, 45).
-
-Each fault is a function of the datagrams of one tick.  Values are changed in a decoded message, which is encoded again:
-checksum and form are right, unless they are the fault.
 """
 
 from __future__ import annotations
@@ -29,6 +24,13 @@ from hil.plc.bridged_plant import BridgedPlant
 from hil.wire.faults import FOREVER_NS
 from sim.errors import PlantError
 from sim.plant_faults import PlantFault, begin
+
+# -- What can be wrong with a planner's datagrams on their way to the controller (docs/reference/safety.md, 24 to
+# 28, 45).
+#
+# Each fault is a function of the datagrams of one tick.  Values are changed in a decoded message, which is encoded
+# again: checksum and form are right, unless they are the fault.
+
 
 Effect = Callable[[int, list[bytes]], list[bytes]]
 """Time [ns] and the datagrams sent to those that arrive."""
@@ -149,6 +151,9 @@ def _forged(random: Random, key: bytes | None) -> Effect:
         return out
 
     return effect
+
+
+# -- Carries out orders on a lockstep run
 
 
 _NOTHING: Final[Callable[[], None]] = lambda: None  # noqa: E731

@@ -3,8 +3,6 @@
 Input is a run's directory or one ``run.mcap``; the profile, the DBC and every input come from the recording.  The same
 code gives the same bytes, so the first tick that differs is where today's controller decides differently.  The state
 cannot be reconstructed across missing ticks: a replay ends there and reports them.
-
-Describes how the recorded and the replayed outputs of a tick differ.
 """
 
 from __future__ import annotations
@@ -31,6 +29,9 @@ from hil.replay.recording import PROFILE_FILE, manifest_of, messages
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
 from recorder.recorder import TICK
+
+# -- Describes how the recorded and the replayed outputs of a tick differ.
+
 
 Outputs = tuple[Sequence[RawFrame], Sequence[RawFrame], bytes, bytes]
 """Frames on crane0, frames on mach0, crane report, vehicle report."""
@@ -68,6 +69,9 @@ def _report_text(report: bytes) -> list[str]:
         return [str(datagrams.decode(report))]
     except DatagramRefused:
         return [f"report {report.hex()}"]
+
+
+# -- Replays a recorded run
 
 
 _RATE_TICKS: Final = 64

@@ -2,12 +2,6 @@
 
 Before the release in use has changed, a failure leaves everything as it was; after that it changes back.  One at a
 time: the folder of the releases is locked (flock(2)).
-
-The update as data: its steps in order, and pure decisions about them.
-
-Power may fail before, in or after every step.  Up to `Step.SWITCH` the old release is in use, from then on the new
-one; there is nothing in between, because `Step.SWITCH` is one rename.  From `Step.TRY` to `Step.ACCEPT` the disk says
-where to return to, and the next start of the computer judges the release (`after_interruption`).
 """
 
 from __future__ import annotations
@@ -29,6 +23,12 @@ from host.release import bundle as bundles
 from host.release.gate import Gate, Passage
 from host.release.services import Services, refuse_while_armed
 from host.release.trees import CURRENT, MARKER, TRIAL, State, Trees
+
+# -- The update as data: its steps in order, and pure decisions about them.
+#
+# Power may fail before, in or after every step.  Up to `Step.SWITCH` the old release is in use, from then on the
+# new one; there is nothing in between, because `Step.SWITCH` is one rename.  From `Step.TRY` to `Step.ACCEPT` the
+# disk says where to return to, and the next start of the computer judges the release (`after_interruption`).
 
 
 class Step(StrEnum):
@@ -82,6 +82,9 @@ def after_interruption(state: State) -> tuple[Step, ...]:
 def needs_return(state: State) -> bool:
     """Whether a failure now has changed the release in use, so that it must be changed back."""
     return state.trial is not None and state.trial != state.current
+
+
+# -- Carries out the steps of an update, of a rollback, and of what a power cut left
 
 
 PLACE: Final = Path("/opt/timberhand")

@@ -15,13 +15,6 @@ topic               schema                      contents
 ==================  ==========================  ==============================================================
 
 Times are those under which the messages are logged: UTC in a live run, monotonic in lockstep [ns].  Pure.
-
-The planner's map of the logs, and where the machine stands on it, in the frame ``map``.
-
-``map`` is level, x to the east and y to the north of the first place that is told, z = 0 on the ground.  The machine is
-drawn level on it, and a log as a cylinder that lies on it: a mission report has neither heights nor slopes.
-
-The machine as simple bodies in the frames of `machine.geometry.link_frames`, for the 3-D panel.
 """
 
 from __future__ import annotations
@@ -62,6 +55,9 @@ from machine.joints import JOINTS, Joint
 from machine.profile import Carrier, Profile, joint_limits
 from machine.status.explanation import describe
 from machine.status.modes import Mode
+
+# -- The machine as simple bodies in the frames of `machine.geometry.link_frames`, for the 3-D panel.
+
 
 Size = tuple[float, float, float]
 CRANE: Final = Color(r=0.88, g=0.64, b=0.18, a=1.0)
@@ -123,6 +119,13 @@ def _cube(size_m: Size, center_m: Size, color: Color, yaw_rad: float = 0.0) -> C
 def _pose(center_m: Size, yaw_rad: float = 0.0) -> Pose:
     turn = Quaternion(x=0.0, y=0.0, z=sin(yaw_rad / 2), w=cos(yaw_rad / 2))
     return Pose(position=Vector3(x=center_m[0], y=center_m[1], z=center_m[2]), orientation=turn)
+
+
+# -- The planner's map of the logs, and where the machine stands on it, in the frame ``map``.
+#
+# ``map`` is level, x to the east and y to the north of the first place that is told, z = 0 on the ground.  The
+# machine is drawn level on it, and a log as a cylinder that lies on it: a mission report has neither heights nor
+# slopes.
 
 
 MAP: Final = "map"
@@ -224,6 +227,9 @@ class LogMap:
             timestamp=stamp, frame_id=MAP, id=f"log {log.number}", lifetime=Duration(sec=0, nsec=0), frame_locked=True,
             metadata=[KeyValuePair(key="missed grasps", value=str(log.misses))], cylinders=[body],
         )  # fmt: skip
+
+
+# -- What Foxglove and Lichtblick show of a machine, from the controller's reports
 
 
 ENCODING: Final = "protobuf"

@@ -4,11 +4,6 @@ The crane follows the goal's motion on a clock that waits for joints that fall b
 (`autonomy.crane_job.trajectory_tracker`).  A goal that is cancelled, or whose client is gone, ends in a smooth stop on
 its path, and then in a hold.  Once the crane holds no setpoint is sent: the last one said that it is final, so the end
 of its lease is no fault.  When the controller stops, or refuses, the goal ends with the controller's reason.
-
-A goal's motion before it begins: the checks that the controller's gate makes of its setpoints, over all of it.
-
-The gate remains the judge: it checks every setpoint again when it comes.  Here a goal that it would refuse half way is
-refused before the crane moves.  Accelerations the gate does not check; here they must be within the profile's.
 """
 
 from __future__ import annotations
@@ -39,6 +34,13 @@ from ros2.execution.tolerances import Tolerances, beyond, tolerances_of
 from ros2.interfaces.action import Status
 from ros2.interfaces.builtin import NS_PER_S, nanoseconds
 from ros2.interfaces.control import ErrorCode, Goal
+
+# -- A goal's motion before it begins: the checks that the controller's gate makes of its setpoints, over all of it.
+#
+# The gate remains the judge: it checks every setpoint again when it comes.  Here a goal that it would refuse half
+# way is refused before the crane moves.  Accelerations the gate does not check; here they must be within the
+# profile's.
+
 
 ROUNDING_SHARE: Final = 1.0 + 1e-6
 _UNKNOWN: Final = (nan,) * N_JOINTS
@@ -92,6 +94,9 @@ class MotionCheck:
         setpoint = CraneSetpoint(0, 0, 0, 0, GrappleCommand.NEUTRAL, final, knots)
         self._trajectory.load_and_check(setpoint, self._candidate, _UNKNOWN, _UNKNOWN, 0)
         self._workspace.check(knots)
+
+
+# -- The execution of one goal after the other
 
 
 HOLD_NS: Final = 500_000_000

@@ -8,16 +8,6 @@ A client that is gone is noticed by two signs.  Its writer disappears: at once w
 (Cyclone 10 s) when it is killed.  Or feedback is not acknowledged any more: every action client has a reliable reader
 of it, and DDS acknowledges for the process as long as it runs.  DDS tells only whether all readers have acknowledged,
 so the second sign counts once they did, and one that is gone from an earlier goal delays it until its lease is over.
-
-The goals of an action server and their statuses, as ``rcl_action`` keeps them.
-
-Pure: identifiers and times in, statuses out.  The results of the last `KEPT` goals are kept for clients that ask late.
-
-A service on DDS as ``rmw_cyclonedds_cpp`` maps it: two topics, and a header before each request and response.
-
-The header is a number of the client and one of the call, which the response returns (``serdata.hpp``,
-``cdds_request_header_t``).  Fast DDS sends them beside the data instead, so its services are other ones on the wire:
-a client of this server needs ``RMW_IMPLEMENTATION=rmw_cyclonedds_cpp``.
 """
 
 from __future__ import annotations
@@ -54,6 +44,13 @@ from ros2.interfaces.control import (
 )
 from ros2.wire.node import Node, send
 from ros2.wire.qos import latched, reliable
+
+# -- A service on DDS as ``rmw_cyclonedds_cpp`` maps it: two topics, and a header before each request and response.
+#
+# The header is a number of the client and one of the call, which the response returns (``serdata.hpp``,
+# ``cdds_request_header_t``).  Fast DDS sends them beside the data instead, so its services are other ones on the
+# wire: a client of this server needs ``RMW_IMPLEMENTATION=rmw_cyclonedds_cpp``.
+
 
 _DEPTH: Final = 10
 _64_BITS: Final = (1 << 64) - 1
@@ -115,6 +112,12 @@ class ServiceServer(Generic[Request, Response]):
     def callers(self) -> set[int]:
         """The writers of the clients that are there."""
         return {handle & _64_BITS for handle in self._reader.get_matched_publications()}
+
+
+# -- The goals of an action server and their statuses, as ``rcl_action`` keeps them.
+#
+# Pure: identifiers and times in, statuses out.  The results of the last `KEPT` goals are kept for clients that ask
+# late.
 
 
 KEPT: Final = 16
@@ -186,6 +189,9 @@ class GoalTable:
     def statuses(self) -> list[GoalStatus]:
         """The status of every goal."""
         return [GoalStatus(self.info(name), goal.status) for name, goal in self._goals.items()]
+
+
+# -- The server of one FollowJointTrajectory action on DDS
 
 
 SILENCE_NS: Final = 1_000_000_000

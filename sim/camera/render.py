@@ -1,8 +1,6 @@
 """The analytic renderer: a scene and a view in, colour, depth and instances out.  Exact; `sim.camera.noise` adds noise.
 
 Equal inputs give equal bytes on one machine and build.
-
-First pass of the ground: which pixels see it, and their inverse depth; buffers and codes as in `visibility`.
 """
 
 from __future__ import annotations
@@ -21,6 +19,8 @@ from sim.camera.shading import GRAIN_PX, shade
 from sim.camera.shadow import MAP_PX, shadow_map
 from sim.camera.textures import textures
 from sim.camera.visibility import GROUND_CODE, NEAR_M, SKY_CODE, draw_objects
+
+# -- First pass of the ground: which pixels see it, and their inverse depth; buffers and codes as in `visibility`.
 
 
 @njit(cache=True)
@@ -163,6 +163,9 @@ def draw_plane(
             if code[row, x] == SKY_CODE and s > 1e-4:
                 inverse[row, x] = s
                 code[row, x] = GROUND_CODE
+
+
+# -- The analytic renderer
 
 
 NEAREST_PLANE_M = 0.05  # least height above the plane beyond the grid at which it is drawn

@@ -1,18 +1,4 @@
-"""The truth of a drafted machine, complete: with the inertias that follow from its own links.
-
-Half the smallest inertia that each function shows its drive, in poses over its whole range (`sim.truth`).
-
-Every joint is free and at rest, without gravity: a torque on one of them for a moment, and its acceleration, give the
-inertia that this drive feels while all others give way.
-
-The truth of a machine as TOML, from the answers of its questionnaire: what a virtual individual of it is like.
-
-What nobody asks for is scaled from the two shipped machines, whose figures agree within a third when taken per mass,
-per oil or per moment (docs/reference/machines.md, docs/reference/plant-model.md).  The individual differs a little from
-its profile, as a real one does, so that a calibration has something to find.
-
-The crane of a machine as URDF, for other tools: the plant's links and joints with a rigid column.
-"""
+"""The truth of a drafted machine, complete: with the inertias that follow from its own links."""
 
 from __future__ import annotations
 
@@ -36,6 +22,8 @@ from sim.bullet.urdf import JointDef, urdf_text
 from sim.mechanics.crane import FLEX_JOINTS, crane_links
 from sim.truth.load import Truth
 
+# -- The crane of a machine as URDF, for other tools: the plant's links and joints with a rigid column.
+
 
 def crane_urdf(profile: Profile, truth: Truth) -> str:
     """The robot ``NAME``.  Its joints have the names and ranges of the profile's; ``hanger`` is the hanger pin."""
@@ -48,6 +36,13 @@ def _outward(profile: Profile, joint: JointDef) -> JointDef:
         return replace(joint, kind="fixed")
     spec = profile.joints.get(joint.name)
     return joint if spec is None else replace(joint, lower=spec.lower, upper=spec.upper)
+
+
+# -- The truth of a machine as TOML, from the answers of its questionnaire: what a virtual individual of it is like.
+#
+# What nobody asks for is scaled from the two shipped machines, whose figures agree within a third when taken per
+# mass, per oil or per moment (docs/reference/machines.md, docs/reference/plant-model.md).  The individual differs a
+# little from its profile, as a real one does, so that a calibration has something to find.
 
 
 STOP_MARGIN: Final = 0.03
@@ -279,6 +274,12 @@ def _encoder(answers: Answers, which: Joint) -> str:
     ))  # fmt: skip
 
 
+# -- Half the smallest inertia that each function shows its drive, in poses over its whole range (`sim.truth`).
+#
+# Every joint is free and at rest, without gravity: a torque on one of them for a moment, and its acceleration, give
+# the inertia that this drive feels while all others give way.
+
+
 POSES_PER_JOINT: Final = 4
 JAWS: Final = (0.0, 0.5, 1.0)
 """Shares of the tongs' travel."""
@@ -317,6 +318,9 @@ def _inertia(client: BulletClient, body: Body, pose: dict[str, float], joints: t
     client.stepSimulation()
     rates = dict(zip(body.names, (s[1] for s in body.states()), strict=True))
     return STEP_S / (sum(rates[j] for j in joints) / len(joints))
+
+
+# -- The truth of a drafted machine, complete
 
 
 _UNKNOWN: Final = dict.fromkeys(("slew", "lift", "tilt", "ext", "rot", "grapple"), 1.0)

@@ -4,13 +4,6 @@
 two flat triangles that meet on the diagonal from (i + 1, j) to (i, j + 1), exactly as in Bullet's heightfield, so
 tyres and logs touch the same surface.  Outside the grid the ground continues at the height of its edge; Bullet's body
 ends there.
-
-Ground that is drawn from a seed: a slope, undulation, the ruts of earlier machines, stones and stumps.
-
-Numbers are those of ground on which a forwarder works without trouble: obstacles of 10 to 30 cm, some 6 in 100 m^2
-(Eriksson, Nilsson and Skramo 1978, The Inter-Nordic project of terrain and machines, Acta Forestalia Fennica 164,
-https://doi.org/10.14214/aff.7598, classify ground by such counts), ruts no deeper than 15 cm.  Heights of a grid are
-added to; the grid's middle node is the origin, and a wider grid changes nothing nearer by.
 """
 
 from __future__ import annotations
@@ -26,6 +19,14 @@ from numpy.typing import NDArray
 from sim.bullet.client import BulletClient
 from sim.errors import PlantError
 from sim.geometry.shape import Vector
+
+# -- Ground that is drawn from a seed: a slope, undulation, the ruts of earlier machines, stones and stumps.
+#
+# Numbers are those of ground on which a forwarder works without trouble: obstacles of 10 to 30 cm, some 6 in 100
+# m^2 (Eriksson, Nilsson and Skramo 1978, The Inter-Nordic project of terrain and machines, Acta Forestalia Fennica
+# 164, https://doi.org/10.14214/aff.7598, classify ground by such counts), ruts no deeper than 15 cm.  Heights of a
+# grid are added to; the grid's middle node is the origin, and a wider grid changes nothing nearer by.
+
 
 Heights = NDArray[np.float64]
 
@@ -119,6 +120,9 @@ def _raise(heights: Heights, cell_m: float, x_m: float, y_m: float, height_m: fl
         for j in range(max(0, j0 - span), min(len(heights), j0 + span + 1)):
             away = math.hypot((i - half) * cell_m - x_m, (j - half) * cell_m - y_m) / radius_m
             heights[i, j] += height_m * max(0.0, 1.0 - away * away)
+
+
+# -- The ground
 
 
 class Soil(NamedTuple):

@@ -2,11 +2,6 @@
 
 It serves as a calibration rig: the same nodes on the same buses for a few multiplications per step.  The hydraulics
 show fixed pressures.  The grapple opens and closes with its times of the profile.
-
-A carrier that rolls without slip on a level plane: the kinematic world's replacement for the physical carrier.
-
-Its speed follows the vehicle node with limited acceleration, its heading follows the articulation, and its height
-the arms.  Frames and names as in `sim.mechanics.carrier`; SI units.
 """
 
 from __future__ import annotations
@@ -29,6 +24,12 @@ from sim.emulation import EmulatedMachine
 from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
 from sim.nodes.valve import CYCLE_NS, FUNCTIONS
 from sim.truth.load import Truth, load_truth
+
+# -- A carrier that rolls without slip on a level plane: the kinematic world's replacement for the physical carrier.
+#
+# Its speed follows the vehicle node with limited acceleration, its heading follows the articulation, and its height
+# the arms.  Frames and names as in `sim.mechanics.carrier`; SI units.
+
 
 ACCELERATION_M_S2: Final = 0.8
 BRAKE_M_S2: Final = 3.0
@@ -80,6 +81,9 @@ class RollingCarrier:
         up = pivot_height_m(self._c, sum(self.arm_heights_m) / len(ARMS))
         x, y = self.x_m - ahead * math.cos(self.heading_rad), self.y_m - ahead * math.sin(self.heading_rad)
         return (x, y, up), rpy_quaternion(*self.attitude(half))
+
+
+# -- A world without physics
 
 
 REST_PA = 1.0e6

@@ -4,13 +4,6 @@ Pure.  A write changes the writer's own draft of the command block; writing a se
 the draft, as a whole or not at all.  The commander keeps the command until its heartbeat has been missing for the
 watchdog's time, or its connection has ended; until then others may read, and their writes are answered "busy".  A
 value out of range is refused, latched as a fault, and changes nothing; nothing is clamped.
-
-The PLC's half of the handshake over UDP: sessions, numbers that only increase, and proof that a datagram is new.
-
-Pure.  A hello (session 0, neutral) gets an offer: a number that was never used.  The first command with that number
-opens the session and ends the one before; it must be neutral too.  Within a session a command counts when its number is
-greater than every one before, whatever the silence between, and when it echoes a reply of the last 50 ms.  So a
-recorded datagram never counts again: not after a silence, not after a restart of either side.
 """
 
 from __future__ import annotations
@@ -23,6 +16,15 @@ from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import DatagramRefused, Header, decode_command
 from can_dbc.plc.map import Bounds, Command, Fault, MapError, Mode, WordOrder
 from can_dbc.plc.modbus import RegisterRefused
+
+# -- The PLC's half of the handshake over UDP: sessions, numbers that only increase, and proof that a datagram is
+# new.
+#
+# Pure.  A hello (session 0, neutral) gets an offer: a number that was never used.  The first command with that
+# number opens the session and ends the one before; it must be neutral too.  Within a session a command counts when
+# its number is greater than every one before, whatever the silence between, and when it echoes a reply of the last
+# 50 ms.  So a recorded datagram never counts again: not after a silence, not after a restart of either side.
+
 
 MAX_ECHO_NS = 50_000_000
 SENT_COUNT = 64  # replies whose time is kept
@@ -89,6 +91,9 @@ class Session:
         behind = self._replies - echo
         known = 0 <= behind < min(self._replies, SENT_COUNT)
         return known and now_ns - self._sent_ns[echo % SENT_COUNT] <= MAX_ECHO_NS
+
+
+# -- The PLC's command arbiter
 
 
 MS = 1_000_000

@@ -3,13 +3,6 @@
 Pure: ``scan(now_ns)``.  HOLD is neutral; a command that is armed and at most 50 ms old makes it EXECUTE; an older one
 ramps to neutral within 40 ms and holds.  A heartbeat that is missing for the watchdog's time (300 ms), or an open
 emergency stop, makes it SAFE at once, and only a reset edge of a command that is not armed ends that.
-
-The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm
-(docs/reference/machines.md sections 1.6 and 4)::
-
-    v = qd_ref + Kp (q_ref - q) + Kd (qd_ref - qd),   u = DBinv(v / full speed)
-
-Own code and own gains of the emulated PLC: it shares nothing with the controller's law.
 """
 
 from __future__ import annotations
@@ -36,6 +29,14 @@ from machine.joints import JOINTS
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import JointSpec, Profile, Valve, joint
 from sim.plc.command_arbiter import MS, CommandArbiter
+
+# -- The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm
+# (docs/reference/machines.md sections 1.6 and 4)::
+#
+#     v = qd_ref + Kp (q_ref - q) + Kd (qd_ref - qd),   u = DBinv(v / full speed)
+#
+# Own code and own gains of the emulated PLC: it shares nothing with the controller's law.
+
 
 RESOLUTION_RAD = math.radians(0.1)
 RESOLUTION_M = 1e-4
@@ -114,6 +115,9 @@ def valve_opening(valve: Valve, velocity: float) -> float:
     share = min(share, 1.0)
     edge = deadband + (1.0 - deadband) * max(share, LINEAR_SHARE)
     return sign * (edge if share > LINEAR_SHARE else edge * share / LINEAR_SHARE)
+
+
+# -- The PLC program
 
 
 CYCLE_NS = 10 * MS

@@ -1,11 +1,6 @@
 """The site of a mission as a file: where on the Earth the machine starts, and the logs that lie there.
 
 ``python -m sim --site FILE`` reads it; it is JSON.
-
-Lays the logs of a site so that they stay where they are laid: a log that rolls away is laid anew, as a person would.
-
-A log lies safest along the slope: it cannot roll along its own axis.  So one that rolls is turned towards the line of
-steepest fall, and laid a little aside when it still does not rest.
 """
 
 from __future__ import annotations
@@ -24,6 +19,13 @@ from sim.ground.terrain import Terrain
 from sim.plant import Plant
 from sim.wood.log_shape import LogSpec
 from sim.wood.logs import reach_m
+
+# -- Lays the logs of a site so that they stay where they are laid: a log that rolls away is laid anew, as a person
+# would.
+#
+# A log lies safest along the slope: it cannot roll along its own axis.  So one that rolls is turned towards the
+# line of steepest fall, and laid a little aside when it still does not rest.
+
 
 MAX_ATTEMPTS: Final = 6
 ROLLED_M: Final = 1.0
@@ -81,6 +83,9 @@ def _fall_rad(terrain: Terrain, x_m: float, y_m: float) -> float:
     """Direction in which the ground falls most [rad]."""
     h, d = terrain.height, SLOPE_SPAN_M
     return math.atan2(h(x_m, y_m - d) - h(x_m, y_m + d), h(x_m - d, y_m) - h(x_m + d, y_m))
+
+
+# -- The site of a mission as a file
 
 
 @dataclass(frozen=True, slots=True)

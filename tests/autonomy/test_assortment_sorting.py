@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.sorting import Sorting
 from autonomy.manager.transition_table import State
-from autonomy.manager.world_model import Sorting
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder

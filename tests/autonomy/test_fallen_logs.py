@@ -11,8 +11,8 @@ import pytest
 
 from autonomy.manager.load_bookkeeping import MAX_PLACES, MIN_HITS, FallenLogs, LoadBookkeeping
 from autonomy.manager.log_map import LogMap, MappedLog
+from autonomy.manager.sorting import Sorting
 from autonomy.manager.tally import LoadedLog
-from autonomy.manager.world_model import Sorting
 from autonomy.missions.model import ForwardingMission, Point
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mapped_logs import base, lying

@@ -17,9 +17,9 @@ from autonomy.manager.load_bookkeeping import LOOKS, LoadBookkeeping
 from autonomy.manager.load_detector import MIN_WEIGHED, WoodScale, gripped_by_weight
 from autonomy.manager.log_map import LogMap
 from autonomy.manager.log_memory import PERIOD_NS, Grip, LogMemory
+from autonomy.manager.sorting import Sorting
 from autonomy.manager.tally import LoadedLog
 from autonomy.manager.transition_table import State
-from autonomy.manager.world_model import Sorting
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.motion.arm import Arm
 from machine.loading.profile_file import load_profile

@@ -10,10 +10,12 @@ import pytest
 
 from controller.config import load as load_settings
 from controller.transitions import OPERATING
+from experiments.common.pool import Job
+from experiments.faults import nominal
 from experiments.faults.evidence import Evidence
 from experiments.faults.experiment import nominal_plan, plan, scenes_of
 from experiments.faults.metrics import METRICS, gather, is_blind
-from experiments.faults.pages import _example, blind_spots, evidence, separations, table
+from experiments.faults.pages import _example, blind_spots, evidence, separations, table, work_page
 from experiments.faults.running import HeldSwing, Swing, build, warm
 from experiments.faults.separation import Separation, merged
 from experiments.faults.trial import in_child, inject, judge
@@ -134,6 +136,31 @@ def test_an_armed_machine_tells_the_shares_of_its_monitors_and_a_disarmed_one_no
         machine.system.advance()
     assert {"carrier too fast", "guard: joint too fast", "joint stuck", "spool open"} <= separation.shares.keys()
     assert all(sum(one["bins"]) >= 3 and one["most"] < 1.0 for one in separation.shares.values())
+
+
+@pytest.mark.parametrize(("scene", "text"), [("individual", None), ("calibrated", "its own profile")])
+def test_a_mission_counts_as_work_with_what_it_believes_and_what_lies_in_the_bunk(
+    scene: str, text: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = build("drive aoro_fc8")
+    driven: list[Job] = []
+
+    def run_mission(job: Job, mission: object, site: object, attach: Any) -> dict[str, Any]:
+        driven.append(job)
+        attach(machine.system)
+        for _ in range(800):
+            machine.system.advance()
+        return {"finished": True, "failure": "", "loaded": 2, "stops": 0, "given_up": {}, "logs": [{"in_bunk": True}]}
+
+    monkeypatch.setattr(nominal, "run_mission", run_mission)
+    monkeypatch.setattr(nominal, "calibrated", lambda job: {"profile": "its own profile", "failure": None})
+    told = nominal.perform(Job("m", "nominal", 3, {"scene": f"mission aoro_fc8 {scene}", "seconds": 1.0}))
+    assert (told["loaded"], told["in_bunk"], told["trips"]) == (2, 1, []) and told["seconds"] == pytest.approx(1.0)
+    assert driven[0].options.get("text") == text and driven[0].options["eyes"] == "ours"
+    monkeypatch.setattr(nominal, "calibrated", lambda job: {"profile": None, "failure": "a stuck valve"})
+    if text:
+        failed = nominal.perform(Job("m", "nominal", 3, {"scene": f"mission aoro_fc8 {scene}", "seconds": 1.0}))
+        assert "trips" not in failed and "a stuck valve" in work_page([failed])
 
 
 def test_a_held_swing_ends_at_rest_without_a_step() -> None:

@@ -104,7 +104,9 @@ def running() -> dict[int, str]:
         with contextlib.suppress(OSError):
             if tag in (folder / "environ").read_bytes().split(b"\0") and int(folder.name) != os.getpid():
                 command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()[:200]
-                if not ("resource_tracker import main" in command and next(parents(int(folder.name))) == os.getpid()):
+                if not (
+                    "resource_tracker import main" in command and next(parents(int(folder.name)), 0) == os.getpid()
+                ):
                     found[int(folder.name)] = command
     return found
 

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from experiments.common.registry import EXPERIMENTS
-from timberhand.commands.options import DetectorOption, PlannerOption, ProfileOption, TruthOption, check_foreign
+from timberhand.commands.options import (
+    ForeignDetectorOption,
+    ForeignPlannerOption,
+    ProfileOption,
+    TruthOption,
+    check_foreign,
+)
 
 if TYPE_CHECKING:
     from experiments.common.campaign import Campaign
@@ -35,8 +41,8 @@ def campaign(
     profile: ProfileOption = "palms_471",
     quick: Annotated[bool, typer.Option(help="The trials of the experiment's --quick.")] = False,
     out: Annotated[Path | None, typer.Option(help="Directory of the campaign (default: runs/campaign/NAME).")] = None,
-    planner: PlannerOption = "",
-    detector: DetectorOption = "",
+    planner: ForeignPlannerOption = "",
+    detector: ForeignDetectorOption = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print campaign.json on stdout.")] = False,
 ) -> None:
     """Perform many trials, on all cores or on a Ray cluster, and keep them.

@@ -12,8 +12,8 @@ import typer
 
 from experiments.common.registry import EXPERIMENTS
 from timberhand.commands.options import (
-    DetectorOption,
-    PlannerOption,
+    ForeignDetectorOption,
+    ForeignPlannerOption,
     ProfileOption,
     TruthOption,
     check_foreign,
@@ -75,8 +75,8 @@ def experiment(
         Path | None,
         typer.Option(help="grasp-network: folder of Cornell samples on which to evaluate the shipped weights."),
     ] = None,
-    planner: PlannerOption = "",
-    detector: DetectorOption = "",
+    planner: ForeignPlannerOption = "",
+    detector: ForeignDetectorOption = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")] = False,
 ) -> None:
     """Run an experiment, evaluate its figures, and write result.json and plots.

@@ -65,10 +65,10 @@ VirtualCamerasOption = Annotated[
         help="With a network: places of the virtual camera over which its predictions are averaged.",
     ),
 ]  # fmt: skip
-PlannerOption = Annotated[
+ForeignPlannerOption = Annotated[
     str, typer.Option("--planner", help="grasp-configs: a foreign grasp planner, by entry point, compared with ours.")
 ]
-DetectorOption = Annotated[
+ForeignDetectorOption = Annotated[
     str, typer.Option("--detector", help="grasp-configs: a foreign log detector, by entry point, compared with ours.")
 ]
 

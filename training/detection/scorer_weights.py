@@ -1,9 +1,4 @@
-"""The weight files of the segment scorers, from drawn pictures that the segmentation network was not trained on.
-
-Training of the segment scorers: which segments are one log, and how well a segment overlaps a log.
-
-The examples come from the maps of the segmentation network on labelled pictures.
-"""
+"""The weight files of the segment scorers, from drawn pictures that the segmentation network was not trained on."""
 
 from __future__ import annotations
 
@@ -36,6 +31,11 @@ from training.common.model_card import Card, write
 from training.common.progress import progress_bar
 from training.pictures.labels import IGNORED
 from training.pictures.shards import SHARD, pictures, shard
+
+# -- Training of the segment scorers: which segments are one log, and how well a segment overlaps a log.
+#
+# The examples come from the maps of the segmentation network on labelled pictures.
+
 
 ROUNDS: Final = 3  # for each picture: once with all its segments, and twice with some of them merged
 STOP_PROBABILITY: Final = 0.25  # that merging stops after each merge
@@ -133,6 +133,9 @@ def train_scorer(
     schedule = Schedule(steps, 1e-2, weight_decay=1e-3)
     train(net, batch, loss, schedule, None, f"{network.name}, seed {seed}", network.name, console)
     return net.eval().arrays()
+
+
+# -- The weight files of the segment scorers, from drawn pictures that the segmentation network was not trained on
 
 
 SIZE_PX: Final = 608

@@ -1,8 +1,6 @@
 """Training of the segmentation network: loss, batches and the run.
 
 Pictures come from a function of their number; this module does not know how they are made or stored.
-
-Targets of the segmentation network's eight maps, with weights.
 """
 
 from __future__ import annotations
@@ -36,6 +34,9 @@ from training.pictures.labels import (
     START_V,
     Labelled,
 )
+
+# -- Targets of the segmentation network's eight maps, with weights.
+
 
 PEAK_SIGMA_PX: Final = 1.5  # of the peaks at centres and ends [pixels of the maps]
 SMALL_WEIGHT, OUTLINE_WEIGHT = 10.0, 2.0
@@ -129,6 +130,9 @@ def _add_peak(heat: np.ndarray, u_px: float, v_px: float) -> None:
     dx, dy = np.arange(x0, x1) - x, np.arange(y0, y1)[:, None] - y
     peak = np.exp(-(dx * dx + dy * dy) / (2.0 * PEAK_SIGMA_PX * PEAK_SIGMA_PX))
     np.maximum(heat[y0:y1, x0:x1], peak, out=heat[y0:y1, x0:x1])
+
+
+# -- Training of the segmentation network
 
 
 PEAK_WEIGHT: Final = 20.0

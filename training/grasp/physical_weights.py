@@ -2,13 +2,6 @@
 
 Network, loss and schedule are the same, and ``autonomy.grasp.cnn_planner`` uses the weights like the paper's.  The
 piles come from ``training.pictures.piles``.
-
-Training frames for the grasp network with physical labels: settled piles, the virtual camera, the label rule.
-
-The input is what the planner renders: logs as perfect, shortened cylinders seen from 3 m above.  The labels are the
-probability that a grasp at a pixel holds, from samples of the errors of perception and crane, and the closing
-direction.  This rule never evaluates an experiment (docs/reference/perception.md section 6).  Frames are at the
-network's own 100 x 100.
 """
 
 from __future__ import annotations
@@ -36,6 +29,14 @@ from training.grasp import network_training
 from training.grasp.label_kernel import draw, facts_of, label
 from training.grasp.network_training import LEARNING_RATE
 from training.pictures.piles import CHUNK, HELD_OUT, piles, profile_of
+
+# -- Training frames for the grasp network with physical labels: settled piles, the virtual camera, the label rule.
+#
+# The input is what the planner renders: logs as perfect, shortened cylinders seen from 3 m above.  The labels are
+# the probability that a grasp at a pixel holds, from samples of the errors of perception and crane, and the closing
+# direction.  This rule never evaluates an experiment (docs/reference/perception.md section 6).  Frames are at the
+# network's own 100 x 100.
+
 
 LOW_PX: Final = SIDE_PX // POOL
 GRID_PX: Final = 4
@@ -149,6 +150,9 @@ _UP: Final = _interpolation_matrix()
 def _interpolated_labels(grid: np.ndarray) -> np.ndarray:
     labels: np.ndarray = _UP @ grid.astype(np.float32) @ _UP.T
     return labels
+
+
+# -- Paper A's network trained on physical labels of settled piles instead of Cornell rectangles
 
 
 MACHINE: Final = "palms_471"

@@ -1,17 +1,4 @@
-"""Cylinder fits of all masks of a frame: initial cylinders, visible contours, fits, merged fragments, rejections.
-
-The initial cylinder of a fit, from a mask and its depth.
-
-Stereo depth errs by about z^2 sigma_d / (f B), and neighbouring pixels err alike: at 5 m by as much as half a log's
-radius.  Surface normals of single points are useless at that noise.  Therefore the radius comes from the width of the
-mask and the tilt from a line through disparities.
-
-Plausibility of fits, and fits that are fragments of one log.
-
-A log that lies behind another one can show as two masks.  Fragments of one log lie on one line, have the same width,
-and miss the ends that face each other.  Paper A's two failures with real logs came from a width greater than the
-length, which turns the axis by 90 degrees: such fits are rejected.
-"""
+"""Cylinder fits of all masks of a frame: initial cylinders, visible contours, fits, merged fragments, rejections."""
 
 from __future__ import annotations
 
@@ -28,6 +15,13 @@ from autonomy.perception.fitting.contour import Contour, StereoSensor, log_conto
 from autonomy.perception.fitting.cylinder import MIN_PIXELS, Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit, fit_cylinder
 from machine.geometry.optics import Intrinsics
+
+# -- Plausibility of fits, and fits that are fragments of one log.
+#
+# A log that lies behind another one can show as two masks.  Fragments of one log lie on one line, have the same
+# width, and miss the ends that face each other.  Paper A's two failures with real logs came from a width greater
+# than the length, which turns the axis by 90 degrees: such fits are rejected.
+
 
 MAX_ANGLE_RAD: Final = math.radians(6.0)  # between the axes of fragments, beside their uncertainty
 MAX_GAP_M: Final = 1.5
@@ -111,6 +105,13 @@ def _ends(body: Cylinder) -> np.ndarray:
     return np.stack([body.point_m + body.start_m * body.axis, body.point_m + body.end_m * body.axis])
 
 
+# -- The initial cylinder of a fit, from a mask and its depth.
+#
+# Stereo depth errs by about z^2 sigma_d / (f B), and neighbouring pixels err alike: at 5 m by as much as half a
+# log's radius.  Surface normals of single points are useless at that noise.  Therefore the radius comes from the
+# width of the mask and the tilt from a line through disparities.
+
+
 RANSAC_PAIRS: Final = 48
 _EPSILON: Final = 1e-12
 
@@ -177,6 +178,9 @@ def ransac_line(x: np.ndarray, y: np.ndarray, slack: float, seed: int) -> tuple[
     from_middle = x - x.mean()
     slope = float(from_middle @ y) / max(float(from_middle @ from_middle), _EPSILON)
     return float(y.mean()) - slope * float(x.mean()), slope
+
+
+# -- Cylinder fits of all masks of a frame
 
 
 MARGIN_PX: Final = 8  # of the window that is cut out around a mask

@@ -2,8 +2,6 @@
 
 A coarse view shows where wood may be; a window around it is seen once more, as large as the network's picture allows.
 Where a picture has depth, what has none is no log: sky, glare and mist have no shape.
-
-Logs from the mask network's kernels: a mask for each place where a log's middle may be, the best of them kept.
 """
 
 from __future__ import annotations
@@ -36,6 +34,9 @@ from autonomy.perception.segmentation.resize import doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import LogSegment
 from autonomy.perception.segmentation.watershed import boundary_map, sigmoid, watershed
 from machine.geometry.optics import Intrinsics
+
+# -- Logs from the mask network's kernels: a mask for each place where a log's middle may be, the best of them kept.
+
 
 MIN_HEAT: Final = 0.12
 MAX_KERNELS: Final = 160
@@ -144,6 +145,9 @@ def _logits(
     places = np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)]).astype(np.float32)
     weights = np.concatenate([kernels[:FEATURES], about]).astype(np.float32)
     return np.asarray(weights.T @ np.concatenate([features, places]))
+
+
+# -- The mask segmenter
 
 
 SIZE_PX: Final = 320  # of the coarse view

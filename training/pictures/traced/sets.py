@@ -1,7 +1,4 @@
-"""The picture sets of the mask network: path-traced by the own tracer or by Blender, analytic, and by pybullet.
-
-Sets of samples: scenes drawn by the own tracer, and piles drawn by the analytic renderer, in parallel, resumable.
-"""
+"""The picture sets of the mask network: path-traced by the own tracer or by Blender, analytic, and by pybullet."""
 
 from __future__ import annotations
 
@@ -29,6 +26,10 @@ from training.pictures.traced.blender.matching import matched_depth
 from training.pictures.traced.developing import developed
 from training.pictures.traced.scenes import Assets, Format, describe, log_poses, view_of
 from training.pictures.traced.tracer import Tracer, compiler, library
+
+# -- Sets of samples: scenes drawn by the own tracer, and piles drawn by the analytic renderer, in parallel,
+# resumable.
+
 
 DRAWN_OF_A_FILE: Final = 8
 FIRST_DRAWN: Final = 48  # scenes before them, while the analytic renderer is being compiled
@@ -118,6 +119,9 @@ def _one(job: tuple[str, int]) -> str:
     if kind == "traced":
         return traced_file(_STATE["folder"], number, _STATE["piles"], _STATE["form"], _STATE["code"]).name
     return drawn_file(_STATE["folder"], number, _STATE["piles"], _STATE["form"].size_px).name
+
+
+# -- The picture sets of the mask network
 
 
 OWN, BLENDER, ANY = "own", "blender", "any"

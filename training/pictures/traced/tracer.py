@@ -2,8 +2,6 @@
 
 It knows no photographs and no skies but its own; in exchange it draws barks and soils that nobody named.  The library
 is compiled on first use: by nvcc for a GPU, by g++ for the processor.
-
-Looks as the rows of numbers that the tracer's kernel reads (``struct Look`` in ``kernel/surfaces.h``).
 """
 
 from __future__ import annotations
@@ -20,6 +18,9 @@ from typing import Any, Final
 import numpy as np
 
 from training.pictures.traced.staging import pieces
+
+# -- Looks as the rows of numbers that the tracer's kernel reads (``struct Look`` in ``kernel/surfaces.h``).
+
 
 BARK_KINDS: Final = ("scaly", "plated", "furrowed", "birch", "smooth", "peeled", "wild")
 KINDS: Final = (*BARK_KINDS, "earth", "leaves", "stones", "needles", "leaf", "paint", "ground")
@@ -55,6 +56,9 @@ def _tones(tones: Any, count: int) -> list[float]:
     rows = list(tones)[:count] or [[0.3, 0.3, 0.3]]
     rows += [rows[-1]] * (count - len(rows))
     return [float(c) for row in rows for c in row]
+
+
+# -- The project's own path tracer (``kernel/``)
 
 
 GPU: Final = Path("/dev/nvidiactl")
