@@ -137,7 +137,7 @@ class JointWatch:
                 continue  # what an encoder did that jumped or was lost is no motion
             neutral = crane.spools_pct[j] == 0.0 and not (loops and loops[j].value())
             velocity = estimator.velocity
-            reason = monitor.step(crane.commands[j], velocity)
+            reason = monitor.step(crane.commands[j], velocity, pressed and j == _ROT)
             tested = crane.spool_run.tested(j, now_ns)
             if tested:
                 monitor.forgive()

@@ -55,6 +55,8 @@ BEYOND_STEPS: Final = 2
 """Steps in a row in which the crane must be where it must not: one sample that jumps is an encoder's fault."""
 GRAPPLE_DEADBAND_PCT: Final = 10.0
 GRAPPLE_CLOSING_NS: Final = 250_000_000
+PRESSED_NS: Final = 1_200_000_000
+"""A joint comes to rest on its oil within this time after jaws have moved, half of its slowest period."""
 _NEUTRAL, _SPOOL = 0, 2
 _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
 _GRAPPLE_SIDE: Final = (0.0, 1.0, -1.0, -1.0)
@@ -75,9 +77,9 @@ class Guard:
 
     __slots__ = (
         "_a", "_agreed_ns", "_apart_ns", "_armed", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
-        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_now_ns", "_open_pct",
-        "_operated_ns", "_own_keys", "_profile_check", "_punctuality", "_reach", "_reset_seen", "_sent", "_status",
-        "_stopped_ns", "_supply", "_watches", "axis", "events", "joints", "latched", "motion", "verdict",
+        "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_jaws_ns", "_now_ns",
+        "_open_pct", "_operated_ns", "_own_keys", "_profile_check", "_punctuality", "_reach", "_reset_seen", "_sent",
+        "_status", "_stopped_ns", "_supply", "_watches", "axis", "events", "joints", "latched", "motion", "verdict",
     )  # fmt: skip
 
     def __init__(self, envelope: Envelope, layouts: dict[str, Layout], latched: bool = False) -> None:
@@ -122,6 +124,7 @@ class Guard:
         self._now_ns = self._calm_ns = self._heartbeat_ns = 0
         self._heard_ns = -SILENCE_NS - 1
         self._clear_ns = self._agreed_ns = 0
+        self._jaws_ns = -PRESSED_NS - 1
         self._apart_ns = APART_PERIODS * envelope.period_ns
         self._armed, self._operated_ns, self._open_pct, self._stopped_ns = False, 0, 0.0, -PERSON_CARRIER_NS
         self.latched, self._reset_seen = latched, True  # a button that is down already is no edge
@@ -244,16 +247,20 @@ class Guard:
         words = {message: None if message.old(now_ns) else message.word for message in self._feedback}
         follows = heard and self._a.raw("Mode") == _SPOOL
         first = FINE
+        pressed = now_ns - self._jaws_ns <= PRESSED_NS
         for feedback, watch in self.motion:
             if watch.number == GRAPPLE_AXIS:
                 command = _GRAPPLE_SIDE[self._b.raw("GrappleMode")] if heard else 0.0
+                if command != 0.0:
+                    self._jaws_ns = now_ns
             else:
                 command = self._commands[watch.number].percent if follows else 0.0
-            found = watch.check(command, words[feedback], now_ns, elapsed_s)
+            found = watch.check(command, words[feedback], now_ns, elapsed_s, pressed)
             first = found if first is FINE else first
         for joint in self.joints.values():
             if joint.too_fast() and first is FINE:
                 first = Verdict.OVERSPEED, joint.axis.number
+            joint.expect(self._commands[joint.axis.number].speed if follows else 0.0)
         return first
 
     def _check_commanded(self, now_ns: int) -> Finding:

@@ -7,7 +7,7 @@ from typing import Final
 from can_dbc.frame import Frame
 from controller.guard.envelope import Axis
 from controller.guard.layout import Field, Layout
-from controller.guard.verdicts import Verdict
+from controller.guard.verdicts import ROTATOR_AXIS, Verdict
 
 ENCODER_TIMEOUT_NS: Final = 90_000_000
 """The controller stops on a lost encoder within 100 ms; the guard enforces it."""
@@ -15,6 +15,11 @@ SPEED_FACTOR: Final = 1.1
 """A joint may swing and ring, and lasts nowhere above this share of its speed limit, ..."""
 SPEED_SLACK_S: Final = 0.02
 """... by more than the way of this time at its limit: 5 times what ordinary work needs (docs/how-to/guard.md)."""
+ROTATOR_MOVED_RAD: Final = 0.2
+"""Logs turn the rotator against its shut valve: 0.02 rad tripped in an ordinary grasp, and one that caught at a stake
+turned it back by 1.4 rad/s when it came free, 0.06 rad more than its speed limit allows."""
+ASKED_SHARE: Final = 0.5
+"""A rotator that its valve is asked to turn by less than this share of its speed limit is turned by a log."""
 FAST_FRAMES: Final = 3
 """Frames in a row: one sample that jumps is an encoder's fault."""
 RATE_CREDIT_S: Final = 0.04
@@ -102,6 +107,12 @@ class MeasuredJoint:
         way = self._speed * (self.stamp_ns - before_ns) * 1e-9
         self._place += min(max(self.position - self._place, -way), way)
         self._fast = self._fast + 1 if abs(self.position - self._place) > self._slack else 0
+
+    def expect(self, speed: float) -> None:
+        """The speed that the valve is asked to give [rad/s, m/s]; a rotator that goes on without it follows a log."""
+        if self.axis.number == ROTATOR_AXIS:
+            asked = abs(speed) > ASKED_SHARE * self.axis.speed_limit
+            self._slack = SPEED_SLACK_S * self.axis.speed_limit if asked else ROTATOR_MOVED_RAD
 
     def share(self) -> float:
         """How far it was too fast, over what is too far."""

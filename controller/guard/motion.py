@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from typing import Final
 
-from controller.guard.joints import MeasuredJoint
+from controller.guard.joints import ROTATOR_MOVED_RAD, MeasuredJoint
 from controller.guard.layout import Field
 from controller.guard.verdicts import FINE, ROTATOR_AXIS, Finding, Verdict
 
 REST_NS: Final = 500_000_000
 MOVED_UNITS: Final = 0.02
 """[rad, m]"""
-ROTATOR_MOVED_RAD: Final = 0.2
-"""Tongs that close about logs turn the rotator against its shut valve: 0.02 rad tripped in an ordinary grasp."""
+PRESSED_FACTOR: Final = 2.0
+"""Jaws that work or hold press logs against other logs, ground and stakes, and move the joints on their oil by more: a
+slew by 18 mrad in a mission, a rotator by 0.22 rad."""
 CREEP_SHARE: Final = 0.05
 MOVED_STEPS: Final = 3
 """Steps of the guard in a row for which a joint must be away: one sample that jumps is an encoder's fault."""
@@ -28,7 +29,8 @@ class MotionWatch:
     """One function: its spool's feedback ``field``, and its joint if an encoder measures it."""
 
     __slots__ = (
-        "_away", "_closing_ns", "_creep_s", "_field", "_joint", "_moved", "_opened_ns", "_place", "_shut_pct", "number",
+        "_away", "_closing_ns", "_creep_s", "_far", "_field", "_joint", "_moved", "_opened_ns", "_place", "_shut_pct",
+        "number",
     )  # fmt: skip
 
     def __init__(
@@ -37,7 +39,7 @@ class MotionWatch:
         self.number = number
         self._field, self._shut_pct, self._closing_ns, self._joint = field, shut_pct, closing_ns, joint
         self._creep_s = CREEP_SHARE * joint.axis.speed_limit if joint is not None else 0.0
-        self._moved = ROTATOR_MOVED_RAD if number == ROTATOR_AXIS else MOVED_UNITS
+        self._moved = self._far = ROTATOR_MOVED_RAD if number == ROTATOR_AXIS else MOVED_UNITS
         self._opened_ns = [0, 0]  # when it was last commanded to the minus and to the plus side
         self._place: float | None = None  # not known yet
         self._away = 0
@@ -45,10 +47,13 @@ class MotionWatch:
     def share(self) -> float:
         """How far the joint has moved without a command, over what is too far."""
         joint, place = self._joint, self._place
-        return 0.0 if joint is None or place is None else abs(joint.position - place) / self._moved
+        return 0.0 if joint is None or place is None else abs(joint.position - place) / self._far
 
-    def check(self, command: float, feedback_word: int | None, now_ns: int, elapsed_s: float) -> Finding:
-        """One step; ``command`` is what the valve node may follow now, ``feedback_word`` None when it is not known."""
+    def check(
+        self, command: float, feedback_word: int | None, now_ns: int, elapsed_s: float, pressed: bool = False
+    ) -> Finding:
+        """One step; ``command`` is what the valve node may follow now, ``feedback_word`` None when it is not known.
+        ``pressed``: the jaws work or hold, or did a moment ago; where the joint is at the end of that is its place."""
         opened_ns = self._opened_ns
         if command != 0.0:
             opened_ns[command > 0.0] = now_ns
@@ -61,12 +66,14 @@ class MotionWatch:
         joint = self._joint
         if joint is None:
             return FINE
-        if self._place is None or now_ns - max(opened_ns) <= REST_NS or joint.silent(now_ns):
+        released = self._far > self._moved and not pressed
+        self._far = self._moved * PRESSED_FACTOR if pressed else self._moved
+        if self._place is None or now_ns - max(opened_ns) <= REST_NS or released or joint.silent(now_ns):
             self._place, self._away = None if joint.silent(now_ns) else joint.position, 0
             return FINE
         creep = self._creep_s * elapsed_s
         self._place += min(max(joint.position - self._place, -creep), creep)
-        self._away = self._away + 1 if abs(joint.position - self._place) > self._moved else 0
+        self._away = self._away + 1 if abs(joint.position - self._place) > self._far else 0
         if self._away < MOVED_STEPS:
             return FINE
         self._place, self._away = joint.position, 0  # found; where it stands now is its place, so that a reset can work

@@ -45,6 +45,9 @@ KP_ROTATOR_1_S = 1.5
 """A log in the tongs swings about the rotator, which at 3 1/s feeds the swing (one job of twenty, sampled machines)."""
 KD = 0.1
 STOP_BAND_S = 0.01
+SPEED_SHARE = 0.92
+"""Of the speed limit: a joint that lags catches up no faster, since an individual machine's valve gives up to 1.1 times
+what it is asked for, and the guard stops a joint that lasts above 1.1 times its limit (docs/how-to/guard.md)."""
 ACCELERATION_LIMIT_FACTOR = 4.0
 END_GAIN_1_S = 4.0
 LINEAR_SHARE = 0.01
@@ -99,7 +102,7 @@ class PdLaw:
             command = 0.0 if self._resting else v_ref + self._kp_1_s * error + KD * (v_ref - self._filtered)
             command = min(command, max(0.0, (spec.upper - self.position) * END_GAIN_1_S))
             command = max(command, min(0.0, (spec.lower - self.position) * END_GAIN_1_S))
-        limit = SPEED_HEADROOM_SHARE * spec.speed_limit * speed
+        limit = SPEED_SHARE * spec.speed_limit * speed
         change = ACCELERATION_LIMIT_FACTOR * spec.acceleration_limit * elapsed_s
         command = min(max(command, -limit), limit)
         self._command = min(max(command, self._command - change), self._command + change)

@@ -156,6 +156,23 @@ def test_a_joint_that_lasts_above_its_speed_is_told_once(counts: int, told_at: i
     assert (told.index(True) if told_at else any(told)) == (told_at or False)
 
 
+@pytest.mark.parametrize(
+    ("number", "asked_rad_s", "told"),
+    [(4, 0.1, False), (4, -0.1, False), (4, 0.101, True), (4, -0.101, True), (3, 0.0, True)],
+)
+def test_a_rotator_that_its_valve_does_not_turn_follows_a_log(number: int, asked_rad_s: float, told: bool) -> None:
+    """The log turns it by 0.1 rad at once; 0.004 rad are the slack of a joint that its valve moves."""
+    joint = MeasuredJoint(AXIS._replace(number=number), ENCODER)
+    joint.expect(asked_rad_s)
+    for k in range(4):
+        joint.receive(encoder_frame(8192 + (k > 0) * 100, k + 1, (1000 + 5 * k) * MS), (1000 + 5 * k) * MS)
+    assert joint.too_fast() is told
+    joint.expect(asked_rad_s)
+    for k in range(4):
+        joint.receive(encoder_frame(8192 + 100 + (k > 0) * 250, 9 + k, (1100 + 5 * k) * MS), (1100 + 5 * k) * MS)
+    assert joint.too_fast(), "no log turns it as fast as that"
+
+
 @pytest.mark.parametrize(("gap_ms", "told"), [(89, True), (90, False)])
 def test_where_a_joint_is_after_its_encoder_was_silent_is_its_place(gap_ms: int, told: bool) -> None:
     joint = MeasuredJoint(AXIS, ENCODER)
@@ -199,12 +216,14 @@ def test_a_spool_outside_its_range_or_unknown_tells_nothing() -> None:
     assert watch.check(0.0, None, 1000 * MS, 0.005) is FINE
 
 
-@pytest.mark.parametrize(("number", "limit"), [(1, 0.02), (4, 0.2)])
-def test_a_joint_at_rest_may_be_away_from_its_place_for_two_steps(number: int, limit: float) -> None:
+@pytest.mark.parametrize(
+    ("number", "pressed", "limit"), [(1, False, 0.02), (1, True, 0.04), (4, False, 0.2), (4, True, 0.4)]
+)
+def test_a_joint_at_rest_may_be_away_from_its_place_for_two_steps(number: int, pressed: bool, limit: float) -> None:
     for moved, verdict in ((limit - 1e-6, None), (limit + 1e-3, Verdict.MOVING)):
         watch, joint = resting(number)
         joint.position = moved
-        found = [watch.check(0.0, None, 1505 * MS + k, 0.0) for k in range(4)]
+        found = [watch.check(0.0, None, 1505 * MS + k, 0.0, pressed) for k in range(4)]
         assert found == ([FINE] * 4 if verdict is None else [FINE, FINE, (verdict, number), FINE])
 
 

@@ -186,3 +186,19 @@ def test_the_pin_may_not_enter_a_box():
         assert verdicts[lift_rad_s] == (abs(x) < 0.4 and abs(y) < 0.4 and -1.39 < z < 1.2)
     assert sorted(verdicts.values()) == [False, True]
     assert not reach.deeper(q, [0.0] * 4)
+
+
+@pytest.mark.parametrize("grapple_mode", [1, 2, 3])
+def test_jaws_that_work_or_hold_move_a_joint_by_more_until_a_moment_later(grapple_mode):
+    """By 0.03 rad, on oil and steel; later it is a motion again."""
+    traffic = Traffic().good()
+    traffic.tick(100)
+    traffic.b["GrappleMode"] = grapple_mode
+    traffic.tick(10)
+    traffic.b["GrappleMode"] = 0
+    traffic.tick(100)
+    assert slide(traffic, 0.1, 60) == 0
+    traffic.tick(180)
+    assert traffic.guard.verdict is Verdict.GOOD, "it stands where it was pressed to"
+    assert slide(traffic, 0.1, 60) > 0
+    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.MOVING, 1)

@@ -103,3 +103,14 @@ def test_reset_clears_the_history():
     monitor.reset()
     assert [monitor.step(0.0, 0.0) for _ in range(100)] == [Reason.NONE] * 100
     assert EARLY_DELAY_S < LATE_DELAY_S
+
+
+@pytest.mark.parametrize(("yields", "limit_rad"), [(False, 0.06), (True, 0.4)])
+def test_a_rotator_that_a_log_turns_runs_away_by_more(yields, limit_rad):
+    """A quarter of its speed limit is no runaway; what it turns beyond that counts."""
+    spec, velocity = SPECS[4], 1.25 * SPECS[4].speed_limit
+    monitor = MotionMonitor(spec, PERIOD_S)
+    ticks = next(k for k in range(1, 400) if monitor.step(0.0, velocity, yields) is Reason.JOINT_RUNAWAY)
+    memory_s = 0.5
+    beyond_rad = memory_s * (1.0 - math.exp(-ticks * PERIOD_S / memory_s)) * spec.speed_limit
+    assert beyond_rad == pytest.approx(limit_rad * spec.speed_limit, abs=2.0 * PERIOD_S * spec.speed_limit)
