@@ -24,7 +24,8 @@ STOPPING_NS: Final = 1_500_000_000
 """... for longer than this: its brake stops it from full speed in less than a second."""
 BOTH_NS: Final = 300_000_000
 """Crane and carrier may overlap for the ramp of a stop."""
-BEND_MARGIN_RAD: Final = 0.08
+BEND_MARGIN_RAD: Final = 0.02
+"""Inside the hard stops, which begin 0.03 rad past the limit; the controller commands nothing outward at the limit."""
 RATE_FACTOR: Final = 3.0
 """A speed command may grow this many times faster than the carrier accelerates."""
 _TOLERANCE: Final = 1.001  # the rounding of a signal

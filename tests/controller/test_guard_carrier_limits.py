@@ -171,8 +171,8 @@ def test_a_motion_needs_a_known_state(state: dict, command: dict) -> None:
 )
 @pytest.mark.parametrize("side", [1, -1])
 def test_it_may_bend_as_far_as_its_limit_and_a_margin(beyond: int, rate_rad_s: float, outward: bool, side: int) -> None:
-    raw = next(r for r in range(5800, 9000) if r * 0.0001 - 0.08 + 0.08 == r * 0.0001)
-    mach0 = Mach0(LIMITS._replace(articulation_limit_rad=raw * 0.0001 - 0.08))
+    raw = next(r for r in range(5800, 9000) if r * 0.0001 - 0.02 + 0.02 == r * 0.0001)
+    mach0 = Mach0(LIMITS._replace(articulation_limit_rad=raw * 0.0001 - 0.02))
     bend_rad = side * (raw + beyond) * 0.0001
     found = mach0.check(VehCmd=ROLLING | {"ArticRate": side * rate_rad_s}, VehStat={"Articulation": bend_rad})
     assert found == ((Verdict.OUTSIDE, STEER_AXIS) if outward else FINE)
