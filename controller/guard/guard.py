@@ -65,11 +65,10 @@ _RELEASED, _PRESSED = 1, 1
 _PERSON = (1, 2)  # yes, and faulty: a detector that has failed sees nobody
 _ARM, _ENDS = 1, (2, 3)
 """A person's ARM; DISARM and STOP.  RESET ends nothing: a machine that works goes on."""
+_COMMANDS: Final = ("ValveCmdA", "ValveCmdB")
 _OPERATING: Final = (2, 3)
 """CtrlStatus.Mode: armed, run."""
-MESSAGES: Final = (
-    "ValveCmdA", "ValveCmdB", "EstopStat", "CtrlStatus", "ValveFbA", "ValveFbB", "GuardStat", "GuardPilot",
-)  # fmt: skip
+MESSAGES: Final = (*_COMMANDS, "EstopStat", "CtrlStatus", "ValveFbA", "ValveFbB", "GuardStat", "GuardPilot")
 
 
 class Guard:
@@ -105,10 +104,8 @@ class Guard:
         if missing:
             raise GuardConfigError("guard.no-command-signal", f"crane.dbc: no valve command is called {missing[0]}.")
         self._commands = [CommandedAxis(axis, (fields_a | fields_b)[axis.signal]) for axis in axes]
-        self._commands_of = {
-            self._a: [c for c in self._commands if c.axis.signal in fields_a],
-            self._b: [c for c in self._commands if c.axis.signal in fields_b],
-        }
+        carried = ((self._a, fields_a), (self._b, fields_b))
+        self._commands_of = {watch: [c for c in self._commands if c.axis.signal in fields] for watch, fields in carried}
         self.motion: list[tuple[WatchedMessage, MotionWatch]] = []
         spools = [(axis.number, axis.signal, min(axis.deadbands_pct), axis.closing_ns) for axis in axes]
         spools.append((GRAPPLE_AXIS, "Grapple", GRAPPLE_DEADBAND_PCT, GRAPPLE_CLOSING_NS))
@@ -122,9 +119,8 @@ class Guard:
         self.events = 0
         self._supply, self._beyond = False, 0
         self._now_ns = self._calm_ns = self._heartbeat_ns = 0
-        self._heard_ns = -SILENCE_NS - 1
+        self._heard_ns, self._jaws_ns = -SILENCE_NS - 1, -PRESSED_NS - 1
         self._clear_ns = self._agreed_ns = 0
-        self._jaws_ns = -PRESSED_NS - 1
         self._apart_ns = APART_PERIODS * envelope.period_ns
         self._armed, self._operated_ns, self._open_pct, self._stopped_ns = False, 0, 0.0, -PERSON_CARRIER_NS
         self.latched, self._reset_seen = latched, True  # a button that is down already is no edge
@@ -210,7 +206,8 @@ class Guard:
             self._heard_ns = now_ns
         motion = self._check_motion(heard, now_ns, elapsed_s)
         neutral = self._neutral()
-        carrier = FINE if self._carrier is None else self._carrier.check(heard and self._crane_moves(), now_ns)
+        moves = heard and any(abs(command.opening) > HELD_PCT for command in self._commands)
+        carrier = FINE if self._carrier is None else self._carrier.check(moves, now_ns)
         if estop_old:
             self._reset_seen = True
             return Verdict.ESTOP_LOST, NO_AXIS
@@ -248,14 +245,11 @@ class Guard:
         follows = heard and self._a.raw("Mode") == _SPOOL
         first = FINE
         pressed = now_ns - self._jaws_ns <= PRESSED_NS
+        jaws = _GRAPPLE_SIDE[self._b.raw("GrappleMode")] if heard else 0.0
+        self._jaws_ns = now_ns if jaws else self._jaws_ns
+        percents = [*(command.percent if follows else 0.0 for command in self._commands), jaws]
         for feedback, watch in self.motion:
-            if watch.number == GRAPPLE_AXIS:
-                command = _GRAPPLE_SIDE[self._b.raw("GrappleMode")] if heard else 0.0
-                if command != 0.0:
-                    self._jaws_ns = now_ns
-            else:
-                command = self._commands[watch.number].percent if follows else 0.0
-            found = watch.check(command, words[feedback], now_ns, elapsed_s, pressed)
+            found = watch.check(percents[watch.number], words[feedback], now_ns, elapsed_s, pressed)
             first = found if first is FINE else first
         for joint in self.joints.values():
             if joint.too_fast() and first is FINE:
@@ -304,9 +298,6 @@ class Guard:
         since_ns, most_pct = now_ns - self._stopped_ns, max(STOP_SHARE * self._open_pct, STOP_PCT)
         return since_ns <= STOP_NS or (since_ns <= RAMP_NS and self._opening_pct() <= most_pct)
 
-    def _crane_moves(self) -> bool:
-        return any(abs(command.opening) > HELD_PCT for command in self._commands)
-
     def _settle(self, verdict: Verdict, axis: int, pressed: bool, now_ns: int) -> bool:
         """A broken rule counts at once; the return needs a while of neutral commands, and a person if it latches.
 
@@ -320,13 +311,11 @@ class Guard:
             neutral = self._neutral() and not (self._carrier and (self._carrier.driven or self._carrier.raised))
             if not neutral:
                 self._calm_ns = now_ns + CALM_NS
-            if self.latched:
-                self.latched = not (pressed and neutral)
+            self.latched = self.latched and not (pressed and neutral)
             if self.latched or now_ns < self._calm_ns:
                 verdict = Verdict.LATCHED if self.latched else Verdict.CALMING
         supply = not self.latched and now_ns - self._heard_ns <= SILENCE_NS
         changed = verdict is not self.verdict or supply != self._supply
-        if verdict is not self.verdict:
-            self.events = (self.events + 1) & 0xFF
+        self.events = (self.events + (verdict is not self.verdict)) & 0xFF
         self.verdict, self.axis, self._supply = verdict, axis, supply
         return changed

@@ -110,9 +110,8 @@ class MeasuredJoint:
 
     def expect(self, speed: float) -> None:
         """The speed that the valve is asked to give [rad/s, m/s]; a rotator that goes on without it follows a log."""
-        if self.axis.number == ROTATOR_AXIS:
-            asked = abs(speed) > ASKED_SHARE * self.axis.speed_limit
-            self._slack = SPEED_SLACK_S * self.axis.speed_limit if asked else ROTATOR_MOVED_RAD
+        follows = self.axis.number == ROTATOR_AXIS and abs(speed) <= ASKED_SHARE * self.axis.speed_limit
+        self._slack = ROTATOR_MOVED_RAD if follows else SPEED_SLACK_S * self.axis.speed_limit
 
     def share(self) -> float:
         """How far it was too fast, over what is too far."""

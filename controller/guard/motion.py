@@ -29,8 +29,7 @@ class MotionWatch:
     """One function: its spool's feedback ``field``, and its joint if an encoder measures it."""
 
     __slots__ = (
-        "_away", "_closing_ns", "_creep_s", "_far", "_field", "_joint", "_moved", "_opened_ns", "_place", "_shut_pct",
-        "number",
+        "_away", "_closing_ns", "_far", "_field", "_joint", "_moved", "_opened_ns", "_place", "_shut_pct", "number",
     )  # fmt: skip
 
     def __init__(
@@ -38,7 +37,6 @@ class MotionWatch:
     ) -> None:
         self.number = number
         self._field, self._shut_pct, self._closing_ns, self._joint = field, shut_pct, closing_ns, joint
-        self._creep_s = CREEP_SHARE * joint.axis.speed_limit if joint is not None else 0.0
         self._moved = self._far = ROTATOR_MOVED_RAD if number == ROTATOR_AXIS else MOVED_UNITS
         self._opened_ns = [0, 0]  # when it was last commanded to the minus and to the plus side
         self._place: float | None = None  # not known yet
@@ -49,16 +47,14 @@ class MotionWatch:
         joint, place = self._joint, self._place
         return 0.0 if joint is None or place is None else abs(joint.position - place) / self._far
 
-    def check(
-        self, command: float, feedback_word: int | None, now_ns: int, elapsed_s: float, pressed: bool = False
-    ) -> Finding:
-        """One step; ``command`` is what the valve node may follow now, ``feedback_word`` None when it is not known.
+    def check(self, command: float, word: int | None, now_ns: int, elapsed_s: float, pressed: bool = False) -> Finding:
+        """One step; ``command``: what the valve node may follow now; ``word``: its feedback, or None.
         ``pressed``: the jaws work or hold, or did a moment ago; where the joint is at the end of that is its place."""
         opened_ns = self._opened_ns
         if command != 0.0:
             opened_ns[command > 0.0] = now_ns
-        if feedback_word is not None:
-            raw = self._field.raw(feedback_word)
+        if word is not None:
+            raw = self._field.raw(word)
             spool_pct = raw * self._field.scale
             uncommanded = now_ns - opened_ns[spool_pct > 0.0] > self._closing_ns
             if uncommanded and abs(spool_pct) > self._shut_pct and self._field.inside(raw):
@@ -71,7 +67,7 @@ class MotionWatch:
         if self._place is None or now_ns - max(opened_ns) <= REST_NS or released or joint.silent(now_ns):
             self._place, self._away = None if joint.silent(now_ns) else joint.position, 0
             return FINE
-        creep = self._creep_s * elapsed_s
+        creep = CREEP_SHARE * joint.axis.speed_limit * elapsed_s
         self._place += min(max(joint.position - self._place, -creep), creep)
         self._away = self._away + 1 if abs(joint.position - self._place) > self._far else 0
         if self._away < MOVED_STEPS:

@@ -59,9 +59,7 @@ class WatchedMessage:
 
     def __init__(self, layout: Layout, gap: Verdict = Verdict.GOOD, corrupt: Verdict = Verdict.GOOD) -> None:
         if not layout.data_ids or not layout.timeout_ns:
-            raise GuardConfigError(
-                "guard.message-unprotected", "crane.dbc or machine.dbc: a message lacks Data IDs or a time-out."
-            )
+            raise GuardConfigError("guard.message-unprotected", "A DBC lacks a message's Data IDs or its time-out.")
         self.layout = layout
         self.breaks = (gap, corrupt)
         self.word = self.stamp_ns = self.steps = 0

@@ -7,8 +7,7 @@ from typing import Final
 
 NO_AXIS: Final = 15
 """``FaultAxis``: 0 to 4 are the joints; ..."""
-ROTATOR_AXIS, GRAPPLE_AXIS, AUX_AXIS = 4, 5, 6
-DRIVE_AXIS, STEER_AXIS, ARMS_AXIS = 7, 8, 9
+ROTATOR_AXIS, GRAPPLE_AXIS, AUX_AXIS, DRIVE_AXIS, STEER_AXIS, ARMS_AXIS = 4, 5, 6, 7, 8, 9
 
 
 class Verdict(IntEnum):
