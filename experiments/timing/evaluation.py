@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -17,8 +18,8 @@ import numpy as np
 from can_dbc.timing.durations import BINS, Durations, edge_ns
 from can_dbc.timing.page import Facts
 from experiments.common.result import Metric
-from experiments.timing.events import explained
-from experiments.timing.measurement import MeasurementWindow, pooled
+from experiments.timing.events import Events, event_metrics, explained
+from experiments.timing.measurement import MeasurementWindow
 from experiments.timing.metrics import METRICS
 
 QUIET_LONGEST_SHARE: Final = 0.2
@@ -40,8 +41,64 @@ STILL_P99_NS: Final = 100_000
 replaced the tick's data in the caches, or the hypervisor's time counts as the thread's."""
 STILL_PRESSURE: Final = 0.3
 """Share of time in which a process waits for a processor; the testbed itself causes about half of it."""
+MIN_PLAIN_MISSED: Final = 100.0
+"""Deadlines that the sleep loop has to miss before one percent of them means something."""
 RESAMPLE_COUNT: Final = 400
 EDGES_NS: Final = np.array([0, *(edge_ns(i) for i in range(BINS))], float)
+OTHERS: Final = ("machine_frames_lost", "machine_stalls", "records_lost")
+"""Counters of emulated machine and observer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Measurements of one testbed; ``calls``: system calls by name, and the number of ticks that made them."""
+
+    quiet: list[MeasurementWindow]
+    loaded: list[MeasurementWindow]
+    calls: tuple[dict[str, int], float] | None = None
+    events: Events = field(default_factory=Events)
+    instructions: float = math.nan
+    """Instructions of the controller's thread per period over the quiet windows; NaN if the host does not count."""
+    others: Mapping[str, float] = field(default_factory=dict)
+    """The counters `OTHERS` over the whole measurement."""
+
+
+def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[MeasurementWindow]]:
+    """All metrics of the testbeds at 200 Hz and at 1 kHz, and the windows that were compared."""
+    compared, enough = compared_windows(slow.quiet)
+    pressures = [w.host.pressure for w in slow.quiet if w.host.pressure is not None]
+    metrics = {
+        **process_metrics(slow.quiet),
+        "host_verdict": float(enough),
+        "windows": float(len(slow.quiet)),
+        "quiet_windows": float(sum(map(quiet, slow.quiet))),
+        "steal_ms": sum(w.host.steal_ms for w in slow.quiet),
+        "pressure": sum(pressures) / len(pressures) if pressures else math.nan,
+        **spread_us("tick", pooled([w.durations["tick"] for w in compared])),
+        **spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in compared])),
+        **cost_metrics("tick_cpu", slow.quiet),
+        **cost_metrics("tick1k_cpu", fast.quiet),
+        **host_speed(slow.quiet),
+        **wakeups("", compared),
+        **wakeups("_loaded", slow.loaded),
+        **wakeups("1k", fast.quiet),
+        **loaded("", slow.loaded),
+        **loaded("_1k", fast.loaded),
+        **event_metrics([slow.events, fast.events]),
+        **system_call_metrics(slow.calls),
+        **{name: sum(m.others.get(name, 0.0) for m in (slow, fast)) for name in OTHERS},
+        "period_us": slow.quiet[0].end.period_ns / 1e3,
+        "judged_cycles": float(sum(w.ticks + w.missed for w in compared)),
+        "missed": float(sum(w.missed for w in compared)),
+        "ticks_1k": float(sum(w.ticks for w in fast.quiet)),
+        "missed_1k": float(sum(w.missed for w in fast.quiet)),
+    }
+    for name, share in (("p50", 0.5), ("p99", 0.99)):
+        ours, theirs = [w.durations["wake"] for w in compared], [w.cyclictest for w in compared]
+        metrics |= ratio(f"wakeup_{name}_ratio", ours, theirs, share)
+    if not math.isnan(slow.instructions):
+        metrics["tick_instructions"] = slow.instructions
+    return metrics, compared
 
 
 def quiet(window: MeasurementWindow) -> bool:
@@ -51,6 +108,15 @@ def quiet(window: MeasurementWindow) -> bool:
         window.cyclictest.longest_ns <= QUIET_LONGEST_SHARE * period_ns
         and window.cyclictest.quantile_ns(0.99) <= QUIET_P99_SHARE * period_ns
         and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
+    )
+
+
+def still(window: MeasurementWindow) -> bool:
+    """Whether the host left the processor and its caches alone, as far as cyclictest, steal and pressure tell."""
+    return (
+        window.cyclictest.quantile_ns(0.99) <= STILL_P99_NS
+        and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
+        and (window.host.pressure or 0.0) <= STILL_PRESSURE
     )
 
 
@@ -89,25 +155,23 @@ def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     }
 
 
-def still(window: MeasurementWindow) -> bool:
-    """Whether the host left the processor and its caches alone, as far as cyclictest, steal and pressure tell."""
-    return (
-        window.cyclictest.quantile_ns(0.99) <= STILL_P99_NS
-        and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
-        and (window.host.pressure or 0.0) <= STILL_PRESSURE
-    )
+def pooled(histograms: Sequence[Durations]) -> Durations:
+    """The sum of histograms."""
+    bins = np.sum([np.zeros(BINS), *(np.asarray(h.bins) for h in histograms)], axis=0).astype(np.uint64)
+    longest_ns = max((h.longest_ns for h in histograms), default=0)
+    return Durations(bins.tobytes(), longest_ns, sum(h.total_ns for h in histograms))
 
 
 def quantile_us(bins: np.ndarray, share: float, longest_ns: float) -> float:
     """A quantile [us], interpolated linearly inside its bin; NaN without entries."""
-    total = bins.sum()
-    if not total:
+    if not bins.any():
         return math.nan
+    tops = np.minimum(EDGES_NS[1:], longest_ns)
+    tops[-1] = longest_ns  # of the bin that holds the rest
     cumulated = np.cumsum(bins)
-    i = int(np.searchsorted(cumulated, share * total))
-    low, high = EDGES_NS[i], min(EDGES_NS[i + 1], max(longest_ns, EDGES_NS[i])) if i < BINS - 1 else longest_ns
-    inside = (share * total - (cumulated[i] - bins[i])) / bins[i]
-    return float(low + inside * (high - low)) / 1e3
+    i = int(np.searchsorted(cumulated, share * cumulated[-1]))
+    inside = (share * cumulated[-1] - (cumulated[i] - bins[i])) / bins[i]
+    return float(EDGES_NS[i] + inside * (max(tops[i], EDGES_NS[i]) - EDGES_NS[i])) / 1e3
 
 
 def spread_us(name: str, histogram: Durations) -> dict[str, float]:
@@ -115,7 +179,7 @@ def spread_us(name: str, histogram: Durations) -> dict[str, float]:
     bins, longest = np.array(histogram.bins), histogram.longest_ns
     shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
     found = {f"{name}_{k}_us": quantile_us(bins, share, longest) for k, share in shares.items()}
-    return found | {f"{name}_max_us": longest / 1e3 if histogram.count else math.nan}
+    return found | {f"{name}_max_us": longest / 1e3 if bins.any() else math.nan}
 
 
 def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], share: float) -> dict[str, float]:
@@ -127,8 +191,7 @@ def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], sha
         up, down = (quantile_us(side[picked].sum(0), share, top) for side, top in zip((a, b), tops, strict=True))
         return up / down if down else math.nan
 
-    n = len(ours)
-    rng = np.random.default_rng(1)
+    n, rng = len(ours), np.random.default_rng(1)
     drawn = [of(rng.integers(0, n, n)) for _ in range(RESAMPLE_COUNT)]
     low, high = np.quantile(drawn, (0.025, 0.975))
     return {name: of(np.arange(n)), f"{name}_low": float(low), f"{name}_high": float(high), f"{name}_n": float(n)}
@@ -171,61 +234,18 @@ def block_growth(readings: Sequence[Facts]) -> float:
     return float(min(blocks[half:]) - min(blocks[:half]))
 
 
-def host_metrics(windows: Sequence[MeasurementWindow], enough: bool) -> dict[str, float]:
-    """Metrics of the host."""
-    seconds = sum(w.host.seconds for w in windows)
-    pressures = [w.host.pressure for w in windows if w.host.pressure is not None]
-    return {
-        "host_verdict": float(enough),
-        "windows": float(len(windows)),
-        "quiet_windows": float(sum(map(quiet, windows))),
-        "steal_ms": sum(w.host.steal_ms for w in windows),
-        "measured_s": seconds,
-        "pressure": sum(pressures) / len(pressures) if pressures else math.nan,
-        "load_average": max(w.host.load for w in windows),
-    }
+def system_call_metrics(calls: tuple[dict[str, int], float] | None) -> dict[str, float]:
+    """System calls per tick, in total and by name; NaN if the process cannot be traced."""
+    by_name, ticks = calls or ({}, math.nan)
+    each = {f"syscalls_{name}": count / ticks for name, count in by_name.items()}
+    return {"syscalls_per_tick": sum(by_name.values()) / ticks, **each}
 
 
-def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
-    """The metrics that a run with these values cannot decide, with the reason."""
-    found: dict[str, str] = {}
-    noisy = "cyclictest itself was late: the host is too noisy"
-    ticks = metrics["ticks"]
-    for name in ("wakeup_p50_ratio", "wakeup_p99_ratio"):
-        if not metrics["host_verdict"]:
-            found[name] = noisy
-        elif metrics["judged_cycles"] < MIN_RATIO_CYCLES:
-            found[name] = f"{metrics['judged_cycles']:.0f} cycles are too few; at least {MIN_RATIO_CYCLES} are needed"
-    if not metrics["host_verdict"] and metrics["missed"]:
-        found["missed"] = noisy
-    elif metrics["judged_cycles"] < MIN_MISS_CYCLES and not metrics["missed"]:
-        found["missed"] = f"{metrics['judged_cycles']:.0f} cycles are too few; at least {MIN_MISS_CYCLES} are needed"
-    for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
-        if ticks < MIN_STEADY_TICKS and metrics[name] <= 0.0:
-            found[name] = f"{ticks:.0f} ticks are too few; at least {MIN_STEADY_TICKS} are needed"
-    cost = (("tick_cpu_p50_us", ticks), ("tick_cpu_p99_us", ticks), ("tick1k_cpu_p99_us", metrics.get("ticks_1k", 0.0)))
-    for name, count in cost:
-        most = next(m.most for m in METRICS if m.name == name) or math.inf
-        if count < MIN_CPU_TICKS:
-            found[name] = f"{count:.0f} ticks are too few; at least {MIN_CPU_TICKS} are needed"
-        elif metrics[name] > most and not metrics[f"{name.partition('_p')[0]}_host_still"]:
-            found[name] = "even the quietest windows were noisy, and noise adds to the processor time"
-    found |= explained(metrics)
-    if not metrics["host_verdict"] and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
-        found["sample_to_command_p99_us"] = noisy
-    ours, plain = metrics["missed_loaded"], metrics["missed_loaded_plain"]
-    if ours and metrics["missed_loaded_cyclictest"] >= ours:
-        found["missed_loaded_share"] = "cyclictest missed as many deadlines: the host withheld the processor"
-    elif plain < 100.0 and ours * 100.0 <= plain:
-        why = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
-        found["missed_loaded_share"] = why
-    return unmeasured(METRICS, metrics) | found
-
-
-def unmeasured(definitions: Iterable[Metric], metrics: Mapping[str, float]) -> dict[str, str]:
-    """The metrics with a limit that have no value: inconclusive, with the reason."""
-    missing = [m.name for m in definitions if m.limit_text() and math.isnan(metrics.get(m.name, math.nan))]
-    return dict.fromkeys(missing, "it could not be measured here")
+def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, Durations]:
+    """Histograms of controller, cyclictest and sleep loop over all windows."""
+    histograms = [(w.durations["wake"], w.cyclictest, w.sleep_loop.lateness) for w in windows]
+    ours, theirs, plain = (pooled(column) for column in zip(*histograms, strict=True))
+    return ours, theirs, plain
 
 
 def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
@@ -237,22 +257,57 @@ def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]
 
 def loaded(end: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     """Missed deadlines of the three loops under load; ``end`` is the suffix of the metric names."""
-    ours = sum(w.missed for w in windows)
-    plain = sum(w.sleep_loop.missed for w in windows)
-    theirs = sum(w.cyclictest.periods(w.end.period_ns) for w in windows)
+    ours, plain = sum(w.missed for w in windows), sum(w.sleep_loop.missed for w in windows)
     return {
         f"missed_loaded{end}": float(ours),
         f"missed_loaded_plain{end}": float(plain),
-        f"missed_loaded_cyclictest{end}": float(theirs),
+        f"missed_loaded_cyclictest{end}": float(sum(w.cyclictest.periods(w.end.period_ns) for w in windows)),
         f"missed_loaded{end}_share": ours / plain if plain else math.nan,
-        f"cycles_loaded{end}": float(sum(w.ticks + w.missed for w in windows)),
     }
 
 
-def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, Durations]:
-    """Histograms of controller, cyclictest and sleep loop over all windows."""
-    return (
-        pooled([w.durations["wake"] for w in windows]),
-        pooled([w.cyclictest for w in windows]),
-        pooled([w.sleep_loop.lateness for w in windows]),
-    )
+def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
+    """The metrics that a run with these values cannot decide, with the reason."""
+    found: dict[str, str] = {}
+    noisy = "cyclictest itself was late: the host is too noisy"
+    quiet_host, cycles, ticks = metrics["host_verdict"], metrics["judged_cycles"], metrics["ticks"]
+
+    def need(name: str, count: float, least: int, unit: str) -> bool:
+        if count < least:
+            found[name] = f"{count:.0f} {unit} are too few; at least {least} are needed"
+        return count < least
+
+    for name in ("wakeup_p50_ratio", "wakeup_p99_ratio"):
+        if not quiet_host:
+            found[name] = noisy
+        else:
+            need(name, cycles, MIN_RATIO_CYCLES, "cycles")
+    if not metrics["missed"]:
+        need("missed", cycles, MIN_MISS_CYCLES, "cycles")
+    elif not quiet_host:
+        found["missed"] = noisy
+    for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
+        if metrics[name] <= 0.0:
+            need(name, ticks, MIN_STEADY_TICKS, "ticks")
+    cost = {"tick_cpu_p50_us": ticks, "tick_cpu_p99_us": ticks, "tick1k_cpu_p99_us": metrics.get("ticks_1k", 0.0)}
+    for name, count in cost.items():
+        most = next(m.most for m in METRICS if m.name == name) or math.inf
+        enough = not need(name, count, MIN_CPU_TICKS, "ticks")
+        if enough and metrics[name] > most and not metrics[f"{name.partition('_p')[0]}_host_still"]:
+            found[name] = "even the quietest windows were noisy, and noise adds to the processor time"
+    found |= explained(metrics)
+    if not quiet_host and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
+        found["sample_to_command_p99_us"] = noisy
+    ours, plain = metrics["missed_loaded"], metrics["missed_loaded_plain"]
+    if ours and metrics["missed_loaded_cyclictest"] >= ours:
+        found["missed_loaded_share"] = "cyclictest missed as many deadlines: the host withheld the processor"
+    elif plain < MIN_PLAIN_MISSED and ours * 100.0 <= plain:
+        why = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
+        found["missed_loaded_share"] = why
+    return unmeasured(METRICS, metrics) | found
+
+
+def unmeasured(definitions: Iterable[Metric], metrics: Mapping[str, float]) -> dict[str, str]:
+    """The metrics with a limit that have no value: inconclusive, with the reason."""
+    missing = [m.name for m in definitions if m.limit_text() and math.isnan(metrics.get(m.name, math.nan))]
+    return dict.fromkeys(missing, "it could not be measured here")

@@ -6,7 +6,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,9 +16,9 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
-from experiments.timing import evaluation, plots, reference_loops
-from experiments.timing.events import Events, event_metrics
-from experiments.timing.measurement import MeasurementWindow, load, measure, pooled, system_calls
+from experiments.timing import evaluation, plots
+from experiments.timing.evaluation import OTHERS, Measured, gather, pooled
+from experiments.timing.measurement import MeasurementWindow, load, measure, missing_tools, system_calls
 from experiments.timing.metrics import CONCLUSION, INTRODUCTION, METRICS, SECTIONS
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
 from hil.tick.instructions import INSTRUCTIONS, count, open_counter
@@ -31,10 +31,6 @@ FAST_HZ: Final = 1000
 FAST_BITRATE: Final = 4_000_000
 OVERHEAD_S: Final = 5.0
 """A window waits for cyclictest's full second and for the controller's timing page at both ends."""
-
-
-OTHERS: Final = ("machine_frames_lost", "machine_stalls", "records_lost")
-"""Counters of emulated machine and observer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,27 +56,13 @@ QUICK: Final = Plan(1, 5.0, 1, 3.0, 1.0, 1.0), Plan(1, 3.0, 1, 3.0, 1.0)
 """At 200 Hz and at 1 kHz."""
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """Measurements of one testbed; ``calls``: system calls by name, and the number of ticks that made them."""
-
-    quiet: list[MeasurementWindow]
-    loaded: list[MeasurementWindow]
-    calls: tuple[dict[str, int], float] | None = None
-    events: Events = field(default_factory=Events)
-    instructions: float = math.nan
-    """Instructions of the controller's thread per period over the quiet windows; NaN if the host does not count."""
-    others: Mapping[str, float] = field(default_factory=dict)
-    """The counters `OTHERS` over the whole measurement."""
-
-
 def run(options: Options, console: Console) -> Result:
     """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
         CommandFailed: a tool is missing or a process does not run.
     """
-    if missing := reference_loops.missing_tools():
+    if missing := missing_tools():
         tools, packages = ", ".join(missing), " ".join(missing.values())
         raise CommandFailed(
             "timing.tools-missing", f"timing needs {tools}: apt-get install {packages}", ExitCode.CONFIGURATION
@@ -158,7 +140,7 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
         def windows(kind: str, number: int, length_s: float) -> list[MeasurementWindow]:
             done: list[MeasurementWindow] = []
             for i in range(number):
-                status.update(f"{what}: {kind} window {i + 1} of {number}{_last(done)}")
+                status.update(f"{what}: {kind} window {i + 1} of {number}")
                 done.append(measure(testbed, length_s, directory))
             return done
 
@@ -183,49 +165,6 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
         return Measured(quiet, pressed, calls, events, instructions, others)
 
 
-def _last(done: list[MeasurementWindow]) -> str:
-    if not done:
-        return ""
-    last = (done[-1].durations["wake"], done[-1].cyclictest, done[-1].durations["cpu"])
-    wake, theirs, cpu = (histogram.quantile_ns(0.99) / 1e3 for histogram in last)
-    return f" (p99 of the last: late {wake:.0f} us, cyclictest {theirs:.0f} us, tick {cpu:.0f} us)"
-
-
-def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[MeasurementWindow]]:
-    """All metrics of both testbeds, and the windows that were compared."""
-    compared, enough = evaluation.compared_windows(slow.quiet)
-    ours, theirs = [w.durations["wake"] for w in compared], [w.cyclictest for w in compared]
-    metrics = {
-        **evaluation.process_metrics(slow.quiet),
-        **evaluation.host_metrics(slow.quiet, enough),
-        **evaluation.spread_us("tick", pooled([w.durations["tick"] for w in compared])),
-        **evaluation.spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in compared])),
-        **evaluation.cost_metrics("tick_cpu", slow.quiet),
-        **evaluation.cost_metrics("tick1k_cpu", fast.quiet),
-        **evaluation.host_speed(slow.quiet),
-        **evaluation.wakeups("", compared),
-        **evaluation.wakeups("_loaded", slow.loaded),
-        **evaluation.wakeups("1k", fast.quiet),
-        **evaluation.loaded("", slow.loaded),
-        **evaluation.loaded("_1k", fast.loaded),
-        **event_metrics([slow.events, fast.events]),
-        **system_call_metrics(slow.calls),
-        "period_us": slow.quiet[0].end.period_ns / 1e3,
-        "judged_cycles": float(sum(w.ticks + w.missed for w in compared)),
-        "missed": float(sum(w.missed for w in compared)),
-        "missed_everywhere": float(sum(w.missed for w in slow.quiet)),
-        "ticks_1k": float(sum(w.ticks for w in fast.quiet)),
-        "missed_1k": float(sum(w.missed for w in fast.quiet)),
-    }
-    for name, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999)):
-        metrics |= evaluation.ratio(f"wakeup_{name}_ratio", ours, theirs, share)
-    for name in OTHERS:
-        metrics[name] = sum(m.others.get(name, 0.0) for m in (slow, fast))
-    if not math.isnan(slow.instructions):
-        metrics["tick_instructions"] = slow.instructions
-    return metrics, compared
-
-
 def compiled_ratios(quick: bool, console: Console) -> dict[str, float]:
     """How many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the kept recordings.
 
@@ -244,15 +183,6 @@ def compiled_ratios(quick: bool, console: Console) -> dict[str, float]:
         ticks, rounds = (300, 1) if quick else (2000, 3)
         rows = [compare.compare_cost(place, ticks, rounds, status.update) for place in places]
     return {name: float(min(row[name] for row in rows)) for name in names}
-
-
-def system_call_metrics(calls: tuple[dict[str, int], float] | None) -> dict[str, float]:
-    """System calls per tick, in total and by name; NaN if the process cannot be traced."""
-    if calls is None:
-        return {"syscalls_per_tick": math.nan}
-    by_name, ticks = calls
-    each = {f"syscalls_{name}": count / ticks for name, count in by_name.items()}
-    return {"syscalls_per_tick": sum(by_name.values()) / ticks, **each}
 
 
 def frame_costs(quick: bool, console: Console) -> dict[str, float]:

@@ -20,7 +20,7 @@ from typing import Final
 from can_dbc.bus.factory import VCAN_NAMES
 from experiments.timing import evaluation
 from experiments.timing.events import losses_between
-from experiments.timing.measurement import measure, pooled
+from experiments.timing.measurement import measure
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
 from host.doctor.facts import UNLIMITED, Facts, interrupt_counts
 from host.doctor.timing import PRIORITY
@@ -148,7 +148,7 @@ def measure_computer(
     ours, theirs, plain = evaluation.loops(windows)
     late = evaluation.spread_us("late", ours)
     beside = evaluation.spread_us("reference", theirs if with_cyclictest else plain)
-    cost = evaluation.spread_us("tick", pooled([w.durations["cpu"] for w in windows]))
+    cost = evaluation.spread_us("tick", evaluation.pooled([w.durations["cpu"] for w in windows]))
     process = evaluation.process_metrics(windows)
     figures = Figures(
         seconds=sum(w.host.seconds for w in windows),
@@ -174,7 +174,7 @@ def measure_computer(
         load_before=load_before,
         emulated=facts.machine == "user-mode Linux",
     )
-    reasons = tuple(sorted(reason.name for reason in testbed.stop_reasons))
+    reasons = tuple(sorted({stop.reason.name for stop in testbed.events.stops}))
     interrupts = {name: n - before.get(name, 0) for name, n in after.items() if n > before.get(name, 0)}
     return Measured(figures, bus, profile, testbed.cpu, windows[-1].end.tick, reasons, interrupts)
 

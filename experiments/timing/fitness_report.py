@@ -14,7 +14,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from experiments.timing.fitness import Judgement, Measured, Verdict, disturbances, judge, overall
-from host.doctor.facts import UNLIMITED, Computer, Facts
+from host.doctor.facts import Computer, Facts
 from host.doctor.finding import Finding, Severity
 
 REMOVED: Final = "(removed)"
@@ -75,7 +75,8 @@ def text_of(data: dict[str, Any]) -> str:
     for j in data["judgements"]:
         lines.append(f"| {j['topic']} | **{j['verdict']}** | {_cell(j['sentence'])} | {_cell(j['advice'])} |")
     lines += ["", "## Computer", "", "| fact | value |", "|---|---|"]
-    lines += [f"| {name} | {_cell(value)} |" for name, value in _facts(data).items()]
+    parts = [data["computer"], data["settings"], data["measured"] or {}, (data["measured"] or {}).get("figures", {})]
+    lines += [f"| {name} | {_cell(value)} |" for part in parts for name, value in part.items() if name != "figures"]
     lines += ["", "## Settings to change, the most useful first", ""]
     wanted = [f for f in data["findings"] if f["severity"] != Severity.FINE.name.lower()]
     for f in wanted:
@@ -95,43 +96,7 @@ def read_data(text: str) -> dict[str, Any]:
     return data
 
 
-def _facts(data: dict[str, Any]) -> dict[str, object]:
-    c, s, m = data["computer"], data["settings"], data["measured"]
-    shown: dict[str, object] = {
-        "processor": f"{c['processor']}, {c['processors']} of them, {c['memory_mb']} MB of memory",
-        "kernel": f"{s['release']}, {c['kernel_version']}; preemption: {s['preemption'] or 'unknown'}",
-        "hardware": s["machine"] or "real",
-        "governor": ", ".join(sorted(set(s["governors"].values()))) or "none reported",
-        "clock source": s["clock_source"] or "unknown",
-        "isolated processors": _list(s["isolated"]),
-        "without timer tick": _list(s["tickless"]),
-        "boot words": " ".join(c["boot_words"]) or "none",
-        "interrupts": f"{len(c['interrupts'])} of {c['interrupts_all']} may use the controller's processor; new ones "
-                      f"use mask {c['new_interrupts'] or 'unknown'}; irqbalance: {'yes' if s['irqbalance'] else 'no'}",
-        "limits": f"rtprio {_limit(s['rtprio_limit'])}, memlock {_limit(s['memlock_limit'])}; throttling "
-                  f"{s['rt_runtime_us']} of {s['rt_period_us']} us",
-        "idle states": ", ".join(f"{i['name']} {i['latency_us']} us" for i in s["idle"] if not i["disabled"]) or "none",
-    }  # fmt: skip
-    if m:
-        f = m["figures"]
-        busiest = sorted(m["interrupts"].items(), key=lambda item: -item[1])[:6]
-        shown |= {
-            "measured": f"{f['seconds']:.0f} s of {m['profile']} on {m['bus']}, processor {m['cpu']}, {m['tick']}",
-            "granted": f"SCHED_FIFO {'yes' if f['fifo'] else 'no'}, {f['locked_kb']} kB of memory locked",
-            "steal": f"{f['steal_ms']:.0f} ms",
-            "interrupts meanwhile": ", ".join(f"{name} {n}" for name, n in busiest) or "none counted",
-            "stops": ", ".join(m["stop_reasons"]) or "none",
-        }
-    return shown
-
-
 def _cell(value: object) -> str:
-    return str(value).replace("|", "\\|").replace("\n", " ")
-
-
-def _list(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers)) or "none"
-
-
-def _limit(value: int | None) -> str:
-    return "unknown" if value is None else "unlimited" if value == UNLIMITED else str(value)
+    """Lists as words; a line feed or a column's mark would end the cell."""
+    text = ", ".join(map(str, value)) if isinstance(value, list | dict) else str(value)
+    return text.replace("|", "\\|").replace("\n", " ")

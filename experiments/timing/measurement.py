@@ -1,28 +1,50 @@
-"""Measurement windows: histograms of controller, cyclictest and sleep loop and the host's activity, all over the same
-seconds."""
+"""Measurement windows of the timing testbed: controller, cyclictest and sleep loop over the same seconds.
+
+cyclictest (Debian package rt-tests) runs at the controller's priority on its core.  Its wake-ups lie at a fixed
+distance from the ticks, while the controller sleeps; otherwise two threads of one priority on one core would delay each
+other.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import os
+import re
+import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import numpy as np
-
-from can_dbc.timing.durations import Durations
+from can_dbc.timing.durations import Durations, bin_of
 from can_dbc.timing.page import Facts, Timing
 from experiments.common import host_activity
-from experiments.timing import reference_loops
-from experiments.timing.reference_loops import SleepLoopReport
 from experiments.timing.testbed import TimingTestbed
 from host.exit_codes import CommandFailed, ExitCode
 
+PRIORITY: Final = 80
+"""SCHED_FIFO priority of the controller and of cyclictest."""
+QUIET_PHASE: Final = 0.8
+"""Phase in the controller's period at which cyclictest wakes: after the tick and after SYNC."""
+MAX_LATENESS_US: Final = 100_000
+START_S: Final = 2.2
+"""cyclictest starts at a full second, the next one or the one after."""
 GRACE_S: Final = 60.0
 """Helpers of normal priority end late on a host under heavy load."""
 LOAD_SETTLES_S: Final = 2.0
+TOOLS: Final = {"cyclictest": "rt-tests", "stress-ng": "stress-ng", "strace": "strace"}
+_CALLS: Final = re.compile(r"^\s*[\d.]+\s+[\d.]+\s+\d+\s+(\d+)\s+(?:\d+\s+)?(\w+)\s*$", re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True)
+class SleepLoopReport:
+    """Lateness and missed deadlines of the sleep loop; processor time of one of its cycles [us]."""
+
+    lateness: Durations
+    missed: int
+    cpu_us: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,20 +69,30 @@ class MeasurementWindow:
         return self.end.missed - self.begin.missed
 
 
+def missing_tools() -> dict[str, str]:
+    """Missing programs with their Debian packages."""
+    return {tool: package for tool, package in TOOLS.items() if shutil.which(tool) is None}
+
+
 def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclictest: bool = True) -> MeasurementWindow:
     """Measure one window of this length, plus one or two seconds.
 
     cyclictest starts before the window and ends after it, so that it sees every stall of the host within.  Without it
     its histogram is empty.
     """
-    report = directory / "cyclictest.json"
+    report, period_ns = directory / "cyclictest.json", testbed.setting.period_ns
     report.unlink(missing_ok=True)
-    period_ns = testbed.setting.period_ns
     if with_cyclictest:
-        reference_loops.start_cyclictest(testbed.helpers, testbed.cpu, period_ns, testbed.stamp_ns, report)
-        testbed.wait(reference_loops.START_S)
+        testbed.helpers.launch(
+            "cyclictest", "cyclictest", "-q", "-m", "-t", 1, "-a", testbed.cpu, "-p", PRIORITY, "--policy", "fifo",
+            "-i", period_ns // 1000, "--secaligned", offset_us(testbed.stamp_ns, period_ns),
+            "-h", MAX_LATENESS_US, "--histfile=/dev/null", f"--json={report}",
+        )  # fmt: skip
+        testbed.wait(START_S)
     first, begin = host_activity.sample(), testbed.fresh_timing()
-    reference_loops.start_sleep_loop(testbed.helpers, period_ns, seconds, testbed.cpu)
+    loop = ("--period-us", period_ns // 1000, "--seconds", seconds)
+    child = testbed.helpers.start("sleep-loop", "experiments.timing.sleep_loop", *loop)
+    os.sched_setaffinity(child.process.pid, {testbed.cpu})
     output = testbed.await_end("sleep-loop", seconds + GRACE_S)
     end, last = testbed.fresh_timing(), host_activity.sample()
     if with_cyclictest:
@@ -69,10 +101,33 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
         begin=begin.facts,
         end=end.facts,
         durations=between(begin, end),
-        cyclictest=reference_loops.read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
-        sleep_loop=reference_loops.read_sleep_loop(output),
+        cyclictest=read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
+        sleep_loop=read_sleep_loop(output),
         host=host_activity.between(first, last),
     )
+
+
+def offset_us(stamp_ns: int, period_ns: int) -> int:
+    """Offset of cyclictest from the full second so that it wakes `QUIET_PHASE` of a period after the ticks."""
+    return round((stamp_ns + QUIET_PHASE * period_ns) % period_ns / 1000) % (period_ns // 1000)
+
+
+def read_cyclictest(report: str) -> Durations:
+    """The histogram of a finished run, from its JSON report."""
+    thread = json.loads(report)["thread"]["0"]
+    found = Durations(longest_ns=1000 * int(thread["max"]), total_ns=round(1000 * thread["avg"] * thread["cycles"]))
+    for late_us, n in thread["histogram"].items():
+        found.bins[bin_of(1000 * int(late_us))] += int(n)
+    found.bins[-1] += max(0, int(thread["cycles"]) - found.count)
+    return found
+
+
+def read_sleep_loop(output: dict[str, Any]) -> SleepLoopReport:
+    """Parse the output of the sleep loop."""
+    lateness = Durations(longest_ns=output["longest_ns"])
+    for i, n in output["bins"].items():
+        lateness.bins[int(i)] = n
+    return SleepLoopReport(lateness, output["missed"], output["cpu_us"])
 
 
 def between(begin: Timing, end: Timing) -> dict[str, Durations]:
@@ -80,18 +135,17 @@ def between(begin: Timing, end: Timing) -> dict[str, Durations]:
     return {name: end.durations[name] - begin.durations[name] for name in end.durations}
 
 
-def pooled(histograms: Sequence[Durations]) -> Durations:
-    """The sum of histograms."""
-    if not histograms:
-        return Durations()
-    bins = np.sum([np.frombuffer(h.bins, np.uint64) for h in histograms], axis=0, dtype=np.uint64)
-    return Durations(bins.tobytes(), max(h.longest_ns for h in histograms), sum(h.total_ns for h in histograms))
-
-
 @contextlib.contextmanager
 def load(testbed: TimingTestbed, seconds: float) -> Iterator[None]:
-    """Keep every core busy for the block, which may last up to ``seconds``."""
-    child = reference_loops.start_load(testbed.helpers, seconds)
+    """Keep every core and the memory busy for the block, which may last up to ``seconds``.
+
+    The load is in the session of the sleep loop, as if both were started from one terminal.
+    """
+    cores = len(os.sched_getaffinity(0))
+    memory = ("--vm", 1, "--vm-bytes", "128m")
+    child = testbed.helpers.launch(
+        "load", "stress-ng", "--quiet", "--cpu", cores, *memory, "--timeout", f"{seconds:.0f}s"
+    )
     testbed.wait(LOAD_SETTLES_S)
     try:
         yield
@@ -123,6 +177,11 @@ def system_calls(testbed: TimingTestbed, seconds: float, directory: Path) -> tup
     passed_s = time.monotonic() - begin_s
     testbed.helpers.stop("strace")
     missed = testbed.fresh_timing().facts.missed - begin.missed
-    calls = reference_loops.count_calls(table.read_text()) if table.exists() else {}
+    calls = count_calls(table.read_text()) if table.exists() else {}
     ticks = passed_s * testbed.setting.rate_hz - missed
     return (calls, ticks) if calls and ticks > 0 else None
+
+
+def count_calls(summary: str) -> dict[str, int]:
+    """System calls by name, from the table that ``strace -c`` prints."""
+    return {name: int(calls) for calls, name in _CALLS.findall(summary) if name != "total"}

@@ -47,6 +47,8 @@ def _missed(end: str, where: str) -> tuple[Metric, ...]:
     )
 
 
+_LOST = "Frames refused by a bus or lost before they were read"
+_INTERPRETER = "Kept recordings, both in turn (`timberhand bench tick`), the smaller ratio of the two machines."
 OWN: Final = Section(
     "Cost of the controller",
     "Page faults, garbage collection and system calls do not depend on the host's noise, so their limits hold on any "
@@ -60,52 +62,38 @@ OWN: Final = Section(
     "that processor stand still just before. The whole forwarder is on both buses and moves with every control law "
     "active; reports and a record of every tick leave the process as on the machine.",
     (
-        Metric("tick_cpu_p50_us", "CPU time of a tick, median", "us",
-               "The thread's own clock (CLOCK_THREAD_CPUTIME_ID) around the tick, 200 Hz, quietest windows.",
-               most=150.0),
+        Metric("tick_cpu_p50_us", "CPU time of a tick, median", "us", "The thread's own clock, 200 Hz.", most=150.0),
         Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us", "The limit is 6 % of the period.", most=300.0),
         Metric("tick_cpu_all_p50_us", "CPU time of a tick in all windows, median", "us", "Noisy windows included."),
         Metric("tick_cpu_all_p99_us", "CPU time of a tick in all windows, p99", "us", "Noisy windows included."),
-        Metric("tick_cpu_in_plain", "CPU time of a tick in cycles of the sleep loop", "x",
-               "Medians of the same window; the median of all windows. It says what the controller costs, whatever "
-               "the host's speed."),
-        Metric("plain_cpu_us", "CPU time of a cycle of the sleep loop, quietest windows", "us",
-               "How fast the host was: waking, reading the clock three times, counting."),
-        Metric("plain_cpu_all_us", "CPU time of a cycle of the sleep loop, all windows", "us",
-               "The same, the median of all windows."),
+        Metric("tick_cpu_in_plain", "CPU time of a tick in cycles of the sleep loop", "x", "Median of all windows."),
+        Metric("plain_cpu_us", "CPU time of a cycle of the sleep loop, quietest windows", "us", "The host's speed."),
+        Metric("plain_cpu_all_us", "CPU time of a cycle of the sleep loop, all windows", "us", "Their median."),
         Metric("tick_p50_us", "Tick by the wall clock, median", "us", "From its first to its last stage."),
         Metric("tick_p99_us", "Tick by the wall clock, p99", "us", "As for the median."),
         Metric("tick_cpu_max_us", "CPU time of a tick, longest", "us", "Quietest windows."),
-        Metric("tick_instructions", "Instructions of the controller per tick", "",
-               "perf_event_open(2), its waits for SYNC and tick included; left out where the host counts none."),
-        Metric("compiled_ratio_cold", "Interpreter over compiled tick, cold caches", "x",
-               "The kept recordings replayed by both in turn (`timberhand bench tick`), caches evicted before each "
-               "tick; the smaller ratio of the two machines.", least=2.0),
-        Metric("compiled_ratio_hot", "Interpreter over compiled tick, hot caches", "x", "The same, replayed at once.",
-               least=2.0),
+        Metric("tick_instructions", "Instructions of the controller per tick", "", "perf_event_open(2), with waits."),
+        Metric("compiled_ratio_cold", "Interpreter over compiled tick, cold caches", "x", _INTERPRETER, least=2.0),
+        Metric("compiled_ratio_hot", "Interpreter over compiled tick, hot caches", "x", _INTERPRETER, least=2.0),
         Metric("tick1k_cpu_p99_us", "CPU time of a tick at 1 kHz, fixed crane, p99", "us",
                "The limit is 25 % of the period; quietest windows. The wire bus runs at 4 Mbit/s: ten frames of 8 "
                "bytes per millisecond do not fit on a CAN bus of 1 Mbit/s.", most=250.0),
-        Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage over all quiet windows.",
-               scale=100.0),
+        Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage, quiet windows.", scale=100.0),
         Metric("frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's own counters."),
-        Metric("frames_lost", "Frames refused by a bus or lost before they were read", "",
-               "The controller's own counters, 200 Hz and 1 kHz, quiet and loaded.", most=0.0),
+        Metric("frames_lost", _LOST, "", "The controller's own counters, whole measurement.", most=0.0),
         Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "",
                "No witness saw a stall before that is long enough to fill the transmit queue, or of 25 ms.", most=0.0),
         Metric("machine_frames_lost", "Frames lost by the emulated machine", "", "Its own counters."),
         Metric("records_lost", "Tick records lost on the way to the observer", "", "By their nominal times."),
-        Metric("stalls", "Stalls of a processor that a witness saw", "", "5 ms or longer, whole measurement."),
+        Metric("stalls", "Stalls of a processor that a witness saw", "", "3 ms or longer, whole measurement."),
         Metric("stall_max_ms", "Longest of them", "ms", "By the witness's own lateness."),
         Metric("page_faults", "Page faults", "", "Minor and major, all quiet windows.", most=0.0),
         Metric("gc_runs", "Runs of the garbage collector", "", "All quiet windows.", most=0.0),
         Metric("allocated_blocks_growth", "Growth of allocated memory blocks", "",
                "Blocks of the interpreter: minimum of the second half of the windows less minimum of the first half.",
                most=0.0),
-        Metric("resident_growth_kb", "Growth of resident memory", "kB", "From the first to the last reading.",
-               most=0.0),
-        Metric("syscalls_per_tick", "System calls per tick", "",
-               "Counted by strace for a few seconds after the measurement.", most=60.0),
+        Metric("resident_growth_kb", "Growth of resident memory", "kB", "First to last reading.", most=0.0),
+        Metric("syscalls_per_tick", "System calls per tick", "", "By strace, after the measurement.", most=60.0),
         Metric("voluntary_switches_per_tick", "Voluntary context switches per tick", "",
                "One wait for SYNC and one for the tick.", most=2.05),
         Metric("involuntary_switches_per_tick", "Involuntary context switches per tick", "",
@@ -113,6 +101,7 @@ OWN: Final = Section(
     ),
     (("stages.png", "Duration of the stages of a tick: median, p99 and longest (log scale)."),),
 )  # fmt: skip
+_BOOTSTRAP = "Interpolated inside the bins of 1 us; interval by bootstrap over the windows."
 WAKEUPS: Final = Section(
     "Wake-ups compared with cyclictest",
     "The lateness of a wake-up depends more on the host than on the controller. Therefore cyclictest (rt-tests, in C, "
@@ -126,12 +115,10 @@ WAKEUPS: Final = Section(
         Metric("quiet_windows", "Quiet windows", "", "The rule above."),
         Metric("windows", "All windows", "", "Quiet and noisy ones."),
         *_lateness("", ""),
-        Metric("wakeup_p50_ratio", "Ratio of the medians, controller over cyclictest", "x",
-               "Interpolated inside the bins of 1 us; interval by bootstrap over the windows.", most=1.5),
-        Metric("wakeup_p99_ratio", "Ratio of the p99", "x", "As for the medians.", most=2.0),
+        Metric("wakeup_p50_ratio", "Ratio of the medians, controller over cyclictest", "x", _BOOTSTRAP, most=1.5),
+        Metric("wakeup_p99_ratio", "Ratio of the p99", "x", _BOOTSTRAP, most=2.0),
         Metric("judged_cycles", "Cycles compared", "", "Ticks of the controller in the windows that are compared."),
-        Metric("missed", "Deadlines missed in these cycles", "",
-               "Whole periods skipped; the limit is zero in 100,000 cycles.", most=0.0),
+        Metric("missed", "Deadlines missed in these cycles", "", "The limit is zero in 100,000 cycles.", most=0.0),
         Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat, all processors, all windows."),
         Metric("pressure", "Share of time in which a process waited for a processor", "%", "/proc/pressure/cpu.",
                scale=100.0),
@@ -151,8 +138,7 @@ LOADED: Final = Section(
         Metric("missed_1k", "Deadlines missed by the controller at 1 kHz, quiet", "", "Fixed crane."),
         *_missed("_1k", " at 1 kHz"),
         Metric("stops", "Stops of the machine in the whole measurement", "",
-               "200 Hz and 1 kHz, quiet and loaded; the supervisor stops a machine whose inputs or loop are late.",
-               most=0.0),
+               "The supervisor stops a machine whose inputs or loop are late.", most=0.0),
         Metric("stops_unexplained", "Stops without a stall of the host", "",
                "No witness saw a stall of 10 ms or more in the 0.45 s before.", most=0.0),
     ),
@@ -170,10 +156,7 @@ LATENCY: Final = Section(
                most=5.0, clocked=True),
         Metric("rx_decode_pythoncan_us", "Receiving and decoding one frame, python-can", "us", "The same frames."),
     ),
-    (
-        ("sample-to-command.png", "From the encoders' sample to the valve command."),
-        ("ages.png", "Age of every input when a tick used it: newest and longest."),
-    ),
+    (("ages.png", "Age of every input when a tick used it: newest and longest."),),
 )  # fmt: skip
 SECTIONS: Final = (OWN, WAKEUPS, LOADED, LATENCY)
 METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)

@@ -11,7 +11,7 @@ import math
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,8 +41,6 @@ BITRATES: Final = (("crane0", 4_000_000), ("mach0", 250_000))
 """A CAN bus of 1 Mbit/s carries the traffic of crane0 up to 400 Hz; at 1 kHz the wire stands in for a faster one."""
 CARRIER_FUNCTIONS: Final = 8
 """Articulation, drive and six swing arms."""
-FIGURES: Final = ("frames_per_s", "cpu_p50_us", "cpu_p99_us", "cpu_share", "ticks", "missed")
-"""Of a `RatePoint`; those of the forwarder at the highest rate are metrics."""
 CRANE_COUNTS: Final = (1, 2, 3, 4, 6, 8, 10, 12, 16)
 TRIES: Final = 3
 """A number of controllers fails only if it fails this often: a stall of the host looks the same as too many."""
@@ -56,18 +54,13 @@ MAX_RESIDUAL: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class RatePoint:
-    """One machine at one rate: what its controller cost, and what was lost or stopped."""
+    """One machine at one rate: what its controller cost (metrics by name), and what was lost or stopped."""
 
     machine: str
     rate_hz: int
-    cpu_share: float
-    frames_per_s: float
-    cpu_p50_us: float
-    cpu_p99_us: float
-    ticks: int
-    missed: int
-    events: Events
-    tick: str
+    figures: dict[str, float]
+    events: Events = field(default_factory=Events)
+    tick: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +130,9 @@ def measure_rate(machine: str, rate_hz: int, seconds: float, directory: Path) ->
         testbed.wait(seconds)
         end = testbed.fresh_timing()
         testbed.wait(0.5)
-    cpu = spread_us("cpu", between(begin, end)["cpu"])
-    load = load_metrics(begin.facts, end.facts)
-    return RatePoint(
-        machine, rate_hz, load["cpu_share"], load["frames_per_s"], cpu["cpu_p50_us"], cpu["cpu_p99_us"],
-        end.facts.ticks - begin.facts.ticks, end.facts.missed - begin.facts.missed, testbed.events, end.facts.tick,
-    )  # fmt: skip
+    figures = spread_us("cpu", between(begin, end)["cpu"]) | load_metrics(begin.facts, end.facts)
+    figures |= {n: float(getattr(end.facts, n) - getattr(begin.facts, n)) for n in ("ticks", "missed")}
+    return RatePoint(machine, rate_hz, figures, testbed.events, end.facts.tick)
 
 
 def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[CranePoint]:
@@ -206,21 +196,20 @@ def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[st
     """All metrics."""
     fast = next(p for p in points if p.machine == FORWARDER and p.rate_hz == max(q.rate_hz for q in points))
     metrics = {
-        **{f"forwarder1k_{name}": float(getattr(fast, name)) for name in FIGURES},
+        **{f"forwarder1k_{name}": value for name, value in fast.figures.items()},
         **event_metrics([p.events for p in points]),
         "differing_ticks": float(sum(c.differing for c in cranes)),
     }
     for machine in MACHINES:
-        mine = [p for p in points if p.machine == machine]
-        slope, intercept, residual = fit([p.frames_per_s for p in mine], [p.cpu_share for p in mine])
+        mine = {p.rate_hz: p.figures for p in points if p.machine == machine}
+        lines = [[f[name] for f in mine.values()] for name in ("frames_per_s", "cpu_share")]
+        slope, intercept, residual = fit(*lines)
         metrics |= {f"{machine}_frame_us": slope * 1e6, f"{machine}_rest_share": intercept}
         metrics[f"{machine}_frame_residual"] = residual
-        metrics |= {f"{machine}_{p.rate_hz}_cpu_share": p.cpu_share for p in mine}
-        metrics |= {f"{machine}_{p.rate_hz}_frames_per_s": p.frames_per_s for p in mine}
-        carried = [c for c in cranes if c.machine == machine and c.carried]
-        metrics[f"{machine}_cranes"] = float(max((c.cranes for c in carried), default=0))
-        slow = next((p for p in mine if p.rate_hz == 200), None)
-        metrics[f"{machine}_cranes_bound"] = math.floor(0.95 / slow.cpu_share) if slow else math.nan
+        metrics |= {f"{machine}_{hz}_{n}": f[n] for hz, f in mine.items() for n in ("cpu_share", "frames_per_s")}
+        carried = [c.cranes for c in cranes if c.machine == machine and c.carried]
+        metrics[f"{machine}_cranes"] = float(max(carried, default=0))
+        metrics[f"{machine}_cranes_bound"] = math.floor(0.95 / mine[200]["cpu_share"]) if 200 in mine else math.nan
     slope, _, residual = fit([float(c.functions) for c in cranes], [c.cpu_us for c in cranes])
     return metrics | {"function_us": slope, "function_residual": residual}
 
@@ -246,8 +235,7 @@ FAST: Final = Section(
         Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage.", scale=100.0),
         Metric("forwarder1k_ticks", "Ticks", "", "Executed."),
         Metric("forwarder1k_missed", "Missed periods", "", "The host's stalls included."),
-        Metric("frames_lost", "Frames refused or lost, all machines and rates", "", "The controller's own counters.",
-               most=0.0),
+        Metric("frames_lost", "Frames refused or lost, all machines and rates", "", "Its own counters.", most=0.0),
         Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "", "By the witness.", most=0.0),
         Metric("stops", "Stops, all machines and rates", "", "By the controller's reports.", most=0.0),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness.", most=0.0),
@@ -312,26 +300,24 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
 
 
 def draw(points: Sequence[RatePoint], cranes: Sequence[CranePoint], path: Path) -> None:
-    """Both lines."""
+    """Load against frames for each machine, and cost against functions for all controllers, with their lines."""
     with sheet(path, 2, height=3.4) as axes:
         for machine, colour in zip(MACHINES, (OIL, MOSS), strict=True):
-            mine = [p for p in points if p.machine == machine]
-            _line(axes[0], [p.frames_per_s for p in mine], [100 * p.cpu_share for p in mine], colour, machine)
+            mine = [p.figures for p in points if p.machine == machine]
             ours = [c for c in cranes if c.machine == machine]
+            frames, loads = ([f[name] for f in mine] for name in ("frames_per_s", "cpu_share"))
+            axes[0].plot(frames, [100 * share for share in loads], "o", color=colour, label=machine)
             axes[1].plot([c.functions for c in ours], [c.cpu_us for c in ours], "o", color=colour, label=machine)
-        _line(axes[1], [float(c.functions) for c in cranes], [c.cpu_us for c in cranes], STEEL, "", marker="")
+            _line(axes[0], frames, [100 * share for share in loads], colour)
+        _line(axes[1], [float(c.functions) for c in cranes], [c.cpu_us for c in cranes], STEEL)
         axes[1].axhline(PERIOD_NS / 1e3, color=RUST, ls="--", lw=0.8)
-        axes[0].set_xlabel("frames per second")
-        axes[0].set_ylabel("CPU load [%]")
-        axes[1].set_xlabel("functions on one processor at 200 Hz")
-        axes[1].set_ylabel("CPU time per period [us]")
+        axes[0].set(xlabel="frames per second", ylabel="CPU load [%]")
+        axes[1].set(xlabel="functions on one processor at 200 Hz", ylabel="CPU time per period [us]")
         for axis in axes:
             axis.legend()
 
 
-def _line(axis: Any, x: Sequence[float], y: Sequence[float], colour: str, label: str, marker: str = "o") -> None:
-    if marker:
-        axis.plot(x, y, marker, color=colour, label=label)
+def _line(axis: Any, x: Sequence[float], y: Sequence[float], colour: str) -> None:
     slope, intercept, _ = fit(x, y)
     if math.isfinite(slope):
         ends = np.array([min(x), max(x)])

@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import os
 import random
 import socket
-import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
@@ -29,12 +27,10 @@ from can.interfaces.socketcan import SocketcanBus
 from can_dbc.bus.base import DRAIN_LIMIT, BusStats
 from can_dbc.bus.factory import kernel_has_can, open_bus
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
-from can_dbc.bus.wire_client import WireClient
 from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.protocols.e2e import Checker, Sender
 from experiments.common.errors import ExperimentError
-from hil.wire.server import Server
 from host.exit_codes import CommandFailed, ExitCode
 
 DRAIN_FRAMES: Final = 14
@@ -47,26 +43,15 @@ QUIET_S: Final = 0.1
 _SO_TIMESTAMPNS: Final = 35
 
 
-class Traffic:
+def traffic(database: Database) -> Iterator[RawFrame]:
     """Frames that the controller receives on crane0, by cycle time, with valid values and running E2E counters."""
-
-    def __init__(self, database: Database) -> None:
-        rng = random.Random(1)
-        received = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
-        self._messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in received]
-        self._frames = self._endless()
-
-    def take(self, count: int) -> list[RawFrame]:
-        """The next frames on the bus."""
-        return [next(self._frames) for _ in range(count)]
-
-    def _endless(self) -> Iterator[RawFrame]:
-        now_ns = 0
-        while True:
-            for codec, payload, sender in self._messages:
-                if now_ns % codec.cycle_time_ns == 0:
-                    yield codec.key, sender.protect(payload) if sender else payload
-            now_ns += TICK_NS
+    rng = random.Random(1)
+    received = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
+    messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in received]
+    for now_ns in itertools.count(0, TICK_NS):
+        for codec, payload, sender in messages:
+            if now_ns % codec.cycle_time_ns == 0:
+                yield codec.key, sender.protect(payload) if sender else payload
 
 
 class Reader:
@@ -110,8 +95,8 @@ class Lane:
 def measure(frames: int, rounds: int) -> dict[str, Any]:
     """Measure every available path alternately, in rounds of ``frames`` frames each.
 
-    ``metrics``: ``rx_us`` and ``rx_decode_us`` of the fast path, the same with the name of each other path, and
-    ``rx_decode_ratio``, python-can's cost by ours.  ``lab``: measured in user-mode Linux, where a system call costs a
+    ``metrics``: ``rx_us`` and ``rx_decode_us`` of the fast path, the same of python-can's, and ``rx_decode_ratio``,
+    its cost by ours.  ``lab``: measured in user-mode Linux, where a system call costs a
     hundred times as much, so that only the ratio is meaningful.  Raises `CommandFailed` when the bus is in
     use.
     """
@@ -128,14 +113,14 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
                     f"{lane.label}: the bus is in use; stop what runs on it, then measure.",
                     ExitCode.BUS,
                 )
-        traffic = {lane.name: Traffic(database) for lane in lanes}
+        supply = {lane.name: traffic(database) for lane in lanes}
         readers = {lane.name: Reader(database) for lane in lanes}
         gc.collect()
         gc.disable()
         stack.callback(gc.enable)
         for _ in range(rounds):
             for lane in lanes:
-                rx_ns, decode_ns = _round(lane, traffic[lane.name], readers[lane.name], frames, clock)
+                rx_ns, decode_ns = _round(lane, supply[lane.name], readers[lane.name], frames, clock)
                 samples.setdefault(f"rx_{lane.name}_us", []).append(rx_ns / frames / 1000)
                 samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
     for name, reader in readers.items():
@@ -151,14 +136,16 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _round(lane: Lane, traffic: Traffic, reader: Reader, frames: int, clock: Callable[[], int]) -> tuple[int, int]:
+def _round(
+    lane: Lane, supply: Iterator[RawFrame], reader: Reader, frames: int, clock: Callable[[], int]
+) -> tuple[int, int]:
     """Time [ns] of receiving, and of checking and decoding, for one round."""
     _discard(lane)  # on an interface every socket received the frames of the other paths
     read = reader.read_messages if lane.messages else reader.read
     rx_ns = decode_ns = 0
     for start in range(0, frames, DRAIN_FRAMES):
         wanted = min(DRAIN_FRAMES, frames - start)
-        lane.send(traffic.take(wanted))
+        lane.send(list(itertools.islice(supply, wanted)))
         received: list[Any] = []
         begin_ns = clock()
         lane.drain(received)
@@ -186,11 +173,11 @@ def _discard(lane: Lane) -> int:
         count += len(scrap)
 
 
-def _lanes(stack: contextlib.ExitStack) -> list[Lane]:
-    """Every path of this machine: ours, python-can's, the wire's."""
+def _lanes(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
+    """Both paths of this machine: ours and python-can's."""
     present = {name for _, name in socket.if_nameindex()} if kernel_has_can() else set()
     interface = next((name for name in ("vcan0", "vcan1") if name in present), None)
-    return [*(_on_pairs(stack) if interface is None else _on_interface(interface, stack)), _wire(stack)]
+    return _on_pairs(stack) if interface is None else _on_interface(interface, stack)
 
 
 def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
@@ -241,41 +228,6 @@ def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
         Lane("ours", "ours on an AF_UNIX pair", through(to_ours), drain),
         Lane("pythoncan", "python-can on an AF_UNIX pair", through(to_theirs), _recv_all(_OnPair(theirs)), True),
     )
-
-
-def _wire(stack: contextlib.ExitStack) -> Lane:
-    """A client of a wire bus whose daemon runs in this process, so that the bus time is not measured."""
-    directory = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    server = Server("bench", 1_000_000, directory)
-    stack.callback(server.close)
-    greeting = threading.Thread(target=_greet, args=(server,))
-    greeting.start()
-    former = os.environ.get("TIMBERHAND_WIRE_DIR")
-    os.environ["TIMBERHAND_WIRE_DIR"] = str(directory)
-    try:
-        client = stack.enter_context(WireClient("bench"))
-    finally:
-        os.environ.pop("TIMBERHAND_WIRE_DIR")
-        if former is not None:
-            os.environ["TIMBERHAND_WIRE_DIR"] = former
-    greeting.join()
-    (member,) = server.members.values()
-    sender = server.core.attach("sender", queue_limit=DRAIN_FRAMES)
-
-    def send(frames: list[RawFrame]) -> None:
-        for key, data in frames:
-            server.core.submit(sender, key, data)
-        server.core.advance(server.core.now_ns + DRAIN_FRAMES * TICK_NS)
-        member.write()
-
-    return Lane("wire", "client of the wire", send, client.drain)
-
-
-def _greet(server: Server) -> None:
-    server.accept()
-    (member,) = server.members.values()
-    while not server.core.nodes:
-        member.read()
 
 
 def _recv_all(bus: can.BusABC) -> Callable[[list[Any]], object]:

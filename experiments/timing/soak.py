@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,11 +19,11 @@ from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
 from experiments.timing.evaluation import MIN_STEADY_TICKS, block_growth, spread_us
+from experiments.timing.events import event_metrics
 from experiments.timing.measurement import between
 from experiments.timing.plots import draw_exceeded
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
 from machine.loading.profile_file import load_profile
-from machine.status.reasons import Reason
 from runtime.plot_style import OIL, TIMBER, sheet
 
 MINUTES: Final = 30.0
@@ -32,17 +33,8 @@ READING_PERIOD_S: Final = 5.0
 MIN_READINGS: Final = 20
 """Minimum number of readings; a short run reads more often."""
 MIN_ACTIVE_SHARE: Final = 0.5
-LATENESS_REASONS: Final = frozenset({
-    Reason.ESTOP_LOST, Reason.GUARD_LOST, Reason.GUARD_REFUSES, Reason.ENCODER_LOST, Reason.VALVE_FEEDBACK_LOST,
-    Reason.PRESSURE_LOST, Reason.CARRIER_LOST, Reason.SWING_ARMS_LOST, Reason.GNSS_LOST, Reason.ENGINE_LOST,
-    Reason.SAFETY_NODE_LOST, Reason.ENCODER_NODE_LOST, Reason.PRESSURE_NODE_LOST, Reason.LOOP_LATE,
-    Reason.LOOP_STALLED, Reason.COMPUTER_STALLED, Reason.INPUTS_LOST, Reason.LEASE_LOST,
-})  # fmt: skip
-"""Reasons for a stop because something was late; if no frame is lost, the host stalled one of the processes."""
-LOSSES: Final = ("gaps", "gaps_rig", "unanswered", "frames_lost", "records_lost")
 FLAT_KB: Final = 64.0
 """Tolerance for resident memory: it is counted in pages, some of them shared."""
-
 JITTER_BLOCKS: Final = 8.0
 """Blocks that come and go between readings; a leak of one block per second exceeds this even in a short run."""
 STOP_BLOCKS: Final = 40.0
@@ -54,9 +46,8 @@ MEMORY: Final = Section(
     "The interpreter's memory blocks come and go, so their minima are compared.",
     (
         Metric("controller_growth_kb", "Growth of the controller's resident memory", "kB",
-               "getrusage and /proc/PID/status.", most=FLAT_KB),
-        Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS of /proc/PID/status.",
-               most=FLAT_KB),
+               "VmRSS of /proc/PID/status.", most=FLAT_KB),
+        Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS.", most=FLAT_KB),
         Metric("allocated_blocks_growth", "Growth of allocated memory blocks in the controller", "",
                "sys.getallocatedblocks, from the timing page.", most=0.0),
         Metric("gc_runs", "Runs of the garbage collector", "", "In the controller.", most=0.0),
@@ -74,8 +65,7 @@ FRAMES: Final = Section(
         Metric("received", "Frames received by the controller", "", "All buses."),
         Metric("sent", "Frames sent by the controller", "", "All buses."),
         Metric("gaps", "Gaps in its protected frames, received and sent", "", "By the bus observer.", most=0.0),
-        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", "By the emulated machine.",
-               most=0.0),
+        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", "By itself.", most=0.0),
         Metric("damaged", "Frames with a wrong CRC", "", "By both.", most=0.0),
         Metric("unanswered", "SYNCs not answered by an encoder", "", "By the bus observer.", most=0.0),
         Metric("frames_lost", "Frames refused by a bus or lost before they were read", "",
@@ -91,6 +81,7 @@ TIMES: Final = Section(
         Metric("ticks", "Ticks", "", "Executed."),
         Metric("missed", "Missed periods", "", "Whole periods skipped."),
         Metric("stops", "Stops of the machine", "", "The emulated operator arms it again after each."),
+        Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness of the testbed."),
         Metric("active_share", "Share of the readings in which the machine moved", "%",
                "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
                least=MIN_ACTIVE_SHARE, scale=100.0),
@@ -145,11 +136,12 @@ def run(options: Options, console: Console) -> Result:
         counted = testbed.counters()
         counted.subtract(before)
     durations = between(begin, end)
+    told = event_metrics([testbed.events])
     metrics = {
         "minutes": minutes,
         "ticks": float(end.facts.ticks - begin.facts.ticks),
         "missed": float(end.facts.missed - begin.facts.missed),
-        "stops": float(len(testbed.events.stops)),
+        **{name: told[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
         "steal_ms": host_activity.between(first, host_activity.sample()).steal_ms,
         **memory(readings),
@@ -169,10 +161,10 @@ def run(options: Options, console: Console) -> Result:
             "bus": options.bus,
             "rate_hz": str(profile.rate_hz),
             "lab": " in user-mode Linux" if os.environ.get("TIMBERHAND_LAB") == "uml" else "",
-            "modes": "; ".join(testbed.modes),
+            "events": "; ".join(testbed.events.sentences()),
             "tick": readings[-1].facts.tick,
         },
-        undecided=undecided(metrics, testbed.stop_reasons),
+        undecided=undecided(metrics),
     )
     options.out.mkdir(parents=True, exist_ok=True)
     draw_memory(readings, options.out / "memory.png")
@@ -193,16 +185,12 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     return Page("Soak test", CONCLUSION, INTRODUCTION, SECTIONS, setting, "make soak")
 
 
-def undecided(metrics: dict[str, float], stop_reasons: set[Reason]) -> dict[str, str]:
-    """The metrics that this run cannot decide, with the reason.
-
-    ``stop_reasons``: why the machine stopped.  Late inputs without a lost frame are caused by the host alone.
-    """
+def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
+    """The metrics that this run cannot decide, with the reason; stops are the host's if a witness saw it stall."""
     found = {}
-    late = bool(stop_reasons) and stop_reasons <= LATENESS_REASONS and not any(metrics[name] for name in LOSSES)
-    if metrics["active_share"] < MIN_ACTIVE_SHARE and late:
-        found["active_share"] = "the host stalled the processes: inputs were late, none was lost"
-    most = STOP_BLOCKS if stop_reasons else JITTER_BLOCKS
+    if metrics["active_share"] < MIN_ACTIVE_SHARE and metrics["stops"] and not metrics["stops_unexplained"]:
+        found["active_share"] = f"the host withheld a processor for up to {metrics['stall_max_ms']:.0f} ms"
+    most = STOP_BLOCKS if metrics["stops"] else JITTER_BLOCKS
     if metrics["ticks"] < MIN_STEADY_TICKS and 0.0 < metrics["allocated_blocks_growth"] <= most:
         found["allocated_blocks_growth"] = f"{metrics['ticks']:.0f} ticks are too few to detect a leak"
     return found
@@ -210,17 +198,14 @@ def undecided(metrics: dict[str, float], stop_reasons: set[Reason]) -> dict[str,
 
 def read(testbed: TimingTestbed, at_s: float) -> Reading:
     """Read a running testbed."""
-    pids = {name: child.process.pid for name, child in testbed.family.children.items()}
-    controller_kb, guard_kb = (resident_kb(pids[name]) for name in ("controller", "guard"))
-    return Reading(at_s, testbed.timing().facts, controller_kb, guard_kb, testbed.mode)
+    controller, guard = (resident_kb(testbed.family.children[n].process.pid) for n in ("controller", "guard"))
+    return Reading(at_s, testbed.timing().facts, controller, guard, testbed.mode)
 
 
 def resident_kb(pid: int) -> int:
     """VmRSS of a process."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1])
-    return 0
+    found = re.search(r"^VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    return int(found[1]) if found else 0
 
 
 def memory(readings: Sequence[Reading]) -> dict[str, float]:
@@ -233,7 +218,6 @@ def memory(readings: Sequence[Reading]) -> dict[str, float]:
         "guard_growth_kb": float(max(r.guard_kb for r in late) - max(r.guard_kb for r in early)),
         "allocated_blocks_growth": block_growth([r.facts for r in readings]),
         "gc_runs": float(last.gc_runs - first.gc_runs),
-        "minor_faults": float(last.minor_faults - first.minor_faults),
         "major_faults": float(last.major_faults - first.major_faults),
     }
 
@@ -245,7 +229,6 @@ def frames(counted: Counter[str], begin: Facts, end: Facts) -> dict[str, float]:
     return {
         **{name: float(counted[name]) for name in names},
         "frames_lost": float(lost + counted["machine_frames_lost"]),
-        "rig_stalls": float(counted["machine_stalls"]),
     }
 
 

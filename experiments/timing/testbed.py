@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -42,6 +42,7 @@ WITNESS_US: Final = {"witness": 1000, "witness-controller": 2000}
 """Longest periods of the witnesses, at most the controller's: a stall is seen shorter by up to one period.  Beside the
 controller the witness wakes below it and less often, so that it does not disturb it."""
 END_ORDER: Final = ("setpoints", "controller", "guard", "observer", "machine", "wire")
+STOPPED: Final = ("STOP", "FAULT")
 START_S: Final = 60.0
 ACTIVE_S: Final = 60.0
 PAGE_S: Final = 5.0
@@ -72,29 +73,10 @@ def cores() -> tuple[int, set[int]]:
     return available[-1], set(available[:-1]) or {available[-1]}
 
 
-class OwnLoad:
-    """Share of a processor that processes used: the largest of the last few seconds."""
-
-    def __init__(self) -> None:
-        self._seen: list[tuple[float, float]] = []
-
-    def update(self, pids: Sequence[int]) -> None:
-        """Read their processor times; at most twice a second."""
-        now_s = time.monotonic()
-        if not self._seen or now_s - self._seen[-1][0] >= 0.5:
-            self._seen = [*self._seen[-6:], (now_s, sum(map(host_activity.cpu_s, pids)))]
-
-    @property
-    def share(self) -> float:
-        """1.0 is a whole processor."""
-        return max(((b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(self._seen)), default=0.0)
-
-
 class TimingTestbed:
     """A running testbed.
 
-    ``helpers`` are processes that run beside it for a while (`experiments.timing.reference_loops`).  ``status`` holds
-    the newest message of each process, ``modes`` every change of mode, ``stop_reasons`` why the machine stopped, and
+    ``helpers`` are processes that run beside it for a while.  ``status`` holds the newest message of each process, and
     ``events`` what was lost, stopped or stalled.
     """
 
@@ -102,12 +84,10 @@ class TimingTestbed:
         self.setting = setting
         self.cpu, self.others = cores()
         self.status: dict[str, dict[str, Any]] = {}
-        self.modes: list[str] = []
-        self.stop_reasons: set[Reason] = set()
         self.events = Events()
         self._last: Timing | None = None
         self._was = ""
-        self._load = OwnLoad()
+        self._cpu_s: list[tuple[float, float]] = []
         directory.mkdir(parents=True, exist_ok=True)
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
@@ -196,19 +176,19 @@ class TimingTestbed:
             CommandFailed: one of them has ended.
         """
         gone = self.family.dead()
-        self._load.update([c.process.pid for n, c in self.family.children.items() if n in BUS_CORE])
+        now_s = time.monotonic()
+        if not self._cpu_s or now_s - self._cpu_s[-1][0] >= 0.5:
+            used = (host_activity.cpu_s(c.process.pid) for n, c in self.family.children.items() if n in BUS_CORE)
+            self._cpu_s = [*self._cpu_s[-6:], (now_s, sum(used))]
         for name, message in self.family.messages():
             self.status[name] = self.status.get(name, {}) | message
             if "stall_ns" in message:
                 cpu = min(self.others) if name == "witness" else self.cpu
-                own = self._load.share if name == "witness" else 0.0
+                own = self._own_share() if name == "witness" else 0.0
                 self.events.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"], own))
             if name == "setpoints" and message.get("event") == "mode":
-                self.modes.append(f"{message['mode']}: {message['why']}")
-                if message["mode"] in ("STOP", "FAULT"):
-                    if self._was not in ("STOP", "FAULT"):
-                        self.events.stops.append(Stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
-                    self.stop_reasons.add(Reason(message["reason"]))
+                if message["mode"] in STOPPED and self._was not in STOPPED:
+                    self.events.stops.append(Stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
                 self._was = message["mode"]
         if gone is not None:
             code = gone.process.returncode
@@ -216,6 +196,10 @@ class TimingTestbed:
             raise CommandFailed(
                 "timing-testbed.process-ended", f"{gone.name} ended on the timing testbed: {gone.complaint()}", known
             )
+
+    def _own_share(self) -> float:
+        """Share of their processor that the processes of `BUS_CORE` used: the largest of the last few seconds."""
+        return max(((b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(self._cpu_s)), default=0.0)
 
     @property
     def mode(self) -> str:

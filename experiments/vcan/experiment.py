@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any, Final
 
 from rich.console import Console
@@ -29,11 +28,6 @@ CLOCKS: Final = ("real", "simulated", "native")
 SEED_FIGURES: Final = (
     "done", "stops", "leases_lost", "refused", "missed_ticks", "seconds", "wall_s", "steal_ms", "lost_ms", "longest_ms",
 )  # fmt: skip
-COLUMNS: Final = {
-    "leases lost": ("leases_lost", "{:.0f}"), "refused": ("refused", "{:.0f}"), "machine time": ("seconds", "{:.1f} s"),
-    "wall time": ("wall_s", "{:.1f} s"), "steal": ("steal_ms", "{:.0f} ms"), "lost": ("lost_ms", "{:.0f} ms"),
-}  # fmt: skip
-"""Of the table of seeds, after run, seed, clock, done and stops."""
 CONCLUSION: Final = tuple(
     f"{title}: {{{kind}_runs}} runs, {{{kind}_done}} done, {{{kind}_stops}} stops; {{{kind}_real}} in real time, "
     f"{{{kind}_simulated}} in simulated time."
@@ -136,23 +130,9 @@ def environment_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
-    *kinds, host = SECTIONS
-    sections = (*kinds, replace(host, text=f"Seed by seed:\n\n{seed_table(result)}"))
     e = result.environment
     setting = (
         f"Commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}; "
         f"witness at {e['probe']}."
     )
-    return Page("Live runs on SocketCAN", CONCLUSION, INTRODUCTION, sections, setting)
-
-
-def seed_table(result: Result) -> str:
-    """One line per run, as Markdown."""
-    lines = [f"| run | seed | clock | done | stops | {' | '.join(COLUMNS)} |", f"|{'---|' * (5 + len(COLUMNS))}"]
-    runs = [words for name in result.metrics if len(words := name.split("_")) == 3 and words[2] == "clock"]
-    for kind, seed, _ in sorted(runs, key=lambda words: (words[0], int(words[1]))):
-        value = {name: result.metrics[f"{kind}_{seed}_{name}"] for name in (*SEED_FIGURES, "clock")}
-        rest = " | ".join(form.format(value[name]) for name, form in COLUMNS.values())
-        done, clock = "yes" if value["done"] else "no", CLOCKS[int(value["clock"])]
-        lines.append(f"| {kind} | {seed} | {clock} | {done} | {value['stops']:.0f} | {rest} |")
-    return "\n".join(lines)
+    return Page("Live runs on SocketCAN", CONCLUSION, INTRODUCTION, SECTIONS, setting)

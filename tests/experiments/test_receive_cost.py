@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from itertools import islice
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 from can_dbc.dbc.codec import load
 from can_dbc.protocols.e2e import Checker, Status
 from experiments.timing import receive_cost
-from experiments.timing.receive_cost import LIMIT_US, Traffic, measure
+from experiments.timing.receive_cost import LIMIT_US, measure, traffic
 from host.exit_codes import ExitCode
 from timberhand.commands.bench import app
 
@@ -25,7 +26,7 @@ def test_the_traffic_is_what_the_controller_receives() -> None:
     received = {c.key: c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders}
     per_second = sum(10**9 // codec.cycle_time_ns for codec in received.values())
     checkers = {key: Checker(codec.data_ids) for key, codec in received.items() if codec.data_ids}
-    frames = Traffic(database).take(per_second * TICKS // 200)
+    frames = list(islice(traffic(database), per_second * TICKS // 200))
     for key, count in Counter(key for key, _ in frames).items():
         assert abs(count - TICKS * 5_000_000 / received[key].cycle_time_ns) <= 1
     first = set()
@@ -34,7 +35,7 @@ def test_the_traffic_is_what_the_controller_receives() -> None:
         if key in checkers:
             assert checkers[key].check(data) is (Status.OK if key in first else Status.INITIAL)
             first.add(key)
-    assert frames == Traffic(database).take(len(frames))
+    assert frames == list(islice(traffic(database), len(frames)))
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,11 @@ from can_dbc.timing.page import STAGES, BusCounters, Facts, ProcessCounters
 from experiments.common import host_activity
 from experiments.common.host_activity import HostActivity
 from experiments.common.result import evaluate
-from experiments.timing import evaluation, events, experiment, reference_loops
+from experiments.timing import evaluation, events, measurement
 from experiments.timing.bus_observer import Continuity
-from experiments.timing.measurement import MeasurementWindow, pooled
-from experiments.timing.metrics import METRICS, SECTIONS
-from experiments.timing.reference_loops import SleepLoopReport
+from experiments.timing.evaluation import pooled
+from experiments.timing.measurement import MeasurementWindow, SleepLoopReport
+from experiments.timing.metrics import METRICS
 from hil.tick import instructions
 from machine.status.reasons import Reason
 
@@ -69,9 +69,9 @@ def window(
 
 
 def metrics_of(quiet: list[MeasurementWindow], loaded: list[MeasurementWindow]) -> dict[str, float]:
-    slow = experiment.Measured(quiet, loaded, ({"clock_nanosleep": 4000, "recvmsg": 8000}, 2000.0))
-    fast = experiment.Measured(quiet[:1], loaded[:1])
-    return experiment.gather(slow, fast)[0]
+    slow = evaluation.Measured(quiet, loaded, ({"clock_nanosleep": 4000, "recvmsg": 8000}, 2000.0))
+    fast = evaluation.Measured(quiet[:1], loaded[:1])
+    return evaluation.gather(slow, fast)[0]
 
 
 def judged(metrics: dict[str, float]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -97,22 +97,22 @@ def test_steal_is_read_where_it_is_reported():
 
 @pytest.mark.parametrize(("stamp_ns", "period_ns"), [(7_001_234_567, 5_000_000), (12_000_999_999, 1_000_000)])
 def test_cyclictest_wakes_at_a_fixed_distance_from_the_ticks(stamp_ns, period_ns):
-    offset_ns = 1000 * reference_loops.offset_us(stamp_ns, period_ns)
+    offset_ns = 1000 * measurement.offset_us(stamp_ns, period_ns)
     assert 0 <= offset_ns < period_ns
     distance = (offset_ns - stamp_ns) % period_ns
-    assert distance == pytest.approx(reference_loops.QUIET_PHASE * period_ns, abs=1000)
+    assert distance == pytest.approx(measurement.QUIET_PHASE * period_ns, abs=1000)
 
 
 def test_cyclictests_report_becomes_a_histogram():
     thread = {"cycles": 10, "min": 12, "max": 200_001, "avg": 20.0, "histogram": {"12": 6, "1500": 3}}
-    found = reference_loops.read_cyclictest(json.dumps({"thread": {"0": thread}}))
+    found = measurement.read_cyclictest(json.dumps({"thread": {"0": thread}}))
     assert found.count == 10 and found.longest_ns == 200_001_000
     assert found.over(100_000_000 - 1) == 1 and found.over(PERIOD_NS) == 1
     assert found.quantile_ns(0.5) == 13_000
 
 
 def test_the_output_of_the_sleep_loop_becomes_a_histogram():
-    plain = reference_loops.read_sleep_loop({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4, "cpu_us": 21.5})
+    plain = measurement.read_sleep_loop({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4, "cpu_us": 21.5})
     assert plain.cpu_us == 21.5
     assert plain.lateness.count == 3 and plain.missed == 4
 
@@ -126,7 +126,7 @@ def test_system_calls_are_counted_from_the_tables_rows():
         "------ ----------- ----------- --------- --------- ----------------\n"
         "100.00    0.000500           0      1200       300 total\n"
     )
-    assert reference_loops.count_calls(table) == {"clock_nanosleep": 300, "recvmsg": 900}
+    assert measurement.count_calls(table) == {"clock_nanosleep": 300, "recvmsg": 900}
 
 
 def test_histograms_add_up():
@@ -249,8 +249,8 @@ def outcome_of(stalls: list[events.Stall]) -> tuple[dict[str, float], tuple[str,
     stop = events.Stop(10_000_000_000, Reason.ESTOP_LOST, "gone")
     told = events.Events([stop], lost, stalls)
     assert len(told.sentences()) == 2
-    slow = experiment.Measured([window()], [window()], events=told)
-    metrics = experiment.gather(slow, experiment.Measured([window()], [window()]))[0]
+    slow = evaluation.Measured([window()], [window()], events=told)
+    metrics = evaluation.gather(slow, evaluation.Measured([window()], [window()]))[0]
     return metrics, *judged(metrics)
 
 
@@ -298,7 +298,7 @@ def test_the_kernel_counts_what_a_thread_executes():
 
 
 def test_a_metric_without_a_value_is_inconclusive():
-    metrics = metrics_of([window()], [window()]) | experiment.system_call_metrics(None)
+    metrics = metrics_of([window()], [window()]) | evaluation.system_call_metrics(None)
     missed, open_ = judged(metrics)
     assert "syscalls_per_tick" in open_ and "syscalls_per_tick" not in missed
 
@@ -314,7 +314,6 @@ def test_all_metric_names_exist():
     }  # fmt: skip
     assert {f.name for f in METRICS} <= set(metrics) | frames | bench
     assert len({f.name for f in METRICS}) == len(METRICS)
-    assert len({file for s in SECTIONS for file, _ in s.plots}) == 4
 
 
 def test_blocks_that_come_and_go_are_no_growth():

@@ -14,9 +14,14 @@ from experiments.timing.rates import METRICS, CranePoint, RatePoint
 from machine.status.reasons import Reason
 
 
+def figures(rate_hz: int, cpu_share: float) -> dict[str, float]:
+    load = {"cpu_share": cpu_share, "frames_per_s": 15.0 * rate_hz, "ticks": 10.0 * rate_hz, "missed": 0.0}
+    return load | {"cpu_p50_us": 90.0, "cpu_p99_us": 120.0}
+
+
 def points(cpu_share: Callable[[int], float], events: Events | None = None) -> list[RatePoint]:
     return [
-        RatePoint(m, hz, cpu_share(hz), 15.0 * hz, 90.0, 120.0, 10 * hz, 0, events or Events(), "compiled")
+        RatePoint(m, hz, figures(hz, cpu_share(hz)), events or Events(), "compiled")
         for m in rates.MACHINES
         for hz in rates.RATES_HZ
     ]

@@ -221,26 +221,26 @@ def test_growth_compares_the_halves_of_a_run():
     assert soak.memory(growing)["allocated_blocks_growth"] == 5.0
 
 
+def soaked(**changed: float) -> dict[str, float]:
+    still = {"active_share": 1.0, "ticks": 4000.0, "allocated_blocks_growth": 0.0}
+    return still | {"stops": 0.0, "stops_unexplained": 0.0, "stall_max_ms": 80.0} | changed
+
+
 def test_a_machine_stopped_by_the_host_alone_is_inconclusive():
-    still = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 0.2, "ticks": 4000.0, "allocated_blocks_growth": 0.0}
-    late = {Reason.ENCODER_LOST, Reason.LOOP_LATE}
-    assert "active_share" in soak.undecided(still, late)
-    assert not soak.undecided(still, late | {Reason.JOINT_RUNAWAY})  # the laws stopped it
-    assert not soak.undecided(still, set())  # without a reason
-    assert not soak.undecided(still | {"unanswered": 1.0}, late)  # an input is missing, not late
-    assert not soak.undecided(still | {"active_share": 0.9}, late)
+    assert "active_share" in soak.undecided(soaked(active_share=0.2, stops=2.0))
+    assert not soak.undecided(soaked(active_share=0.2, stops=2.0, stops_unexplained=1.0))
+    assert not soak.undecided(soaked(active_share=0.2))  # without a stop
+    assert not soak.undecided(soaked(active_share=0.9, stops=2.0))
 
 
 def test_only_a_long_soak_detects_a_small_leak():
-    moving = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 1.0, "ticks": 4000.0, "allocated_blocks_growth": 2.0}
-    assert "allocated_blocks_growth" in soak.undecided(moving, set())
-    assert not soak.undecided(moving | {"allocated_blocks_growth": 20.0}, set())
-    stopped = moving | {"allocated_blocks_growth": 15.0}
-    assert "allocated_blocks_growth" in soak.undecided(stopped, {Reason.VALVE_FEEDBACK_LOST}) and not soak.undecided(
-        stopped, set()
-    )
-    assert not soak.undecided(stopped | {"allocated_blocks_growth": 50.0}, {Reason.VALVE_FEEDBACK_LOST})
-    assert not soak.undecided(moving | {"ticks": 360_000.0}, set())
+    name = "allocated_blocks_growth"
+    assert name in soak.undecided(soaked(allocated_blocks_growth=2.0))
+    assert not soak.undecided(soaked(allocated_blocks_growth=20.0))
+    assert name in soak.undecided(soaked(allocated_blocks_growth=15.0, stops=1.0))
+    assert not soak.undecided(soaked(allocated_blocks_growth=15.0))
+    assert not soak.undecided(soaked(allocated_blocks_growth=50.0, stops=1.0))
+    assert not soak.undecided(soaked(allocated_blocks_growth=2.0, ticks=360_000.0))
 
 
 def test_the_commands_have_help_and_refuse_an_unknown_bus():

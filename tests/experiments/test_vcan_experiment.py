@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.common.result import evaluate, make_result
-from experiments.common.result_page import markdown
-from experiments.vcan.experiment import METRICS, environment_of, gather, noisy, page_of
+from experiments.common.result import evaluate
+from experiments.vcan.experiment import METRICS, gather, noisy
 from experiments.vcan.trial import command, read_output, read_summary
 from machine.status.explanation import describe
 from machine.status.reasons import Reason
@@ -60,18 +58,6 @@ def test_a_stop_on_a_quiet_host_misses_the_limit_and_simulated_time_never_counts
 def test_a_run_that_is_not_done_is_missed_on_any_host() -> None:
     failed = {"demo-1": outcome(done=False, clock="simulated")}
     assert "demo_done" in evaluate(METRICS, gather(failed), noisy(failed))[0]
-
-
-def test_the_page_has_a_line_for_every_seed() -> None:
-    outcomes = {f"{kind}-{i}": outcome(kind, i, "simulated" if i == 2 else "real") for kind in ("demo", "mission")
-                for i in (1, 2)}  # fmt: skip
-    result = make_result(
-        "vcan", METRICS, gather(outcomes), profile="palms_471", seed=1, trials=2, more=environment_of(outcomes),
-        noisy=noisy(outcomes),
-    )  # fmt: skip
-    text = markdown(replace(result, commit="abc"), page_of(result, {}))
-    rows = {tuple(cell.strip() for cell in line.split("|")[1:4]) for line in text.splitlines()}
-    assert {("demo", "2", "simulated"), ("mission", "1", "real")} <= rows and result.inconclusive
 
 
 def test_the_command_is_the_one_that_a_user_types() -> None:
