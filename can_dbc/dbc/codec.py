@@ -20,7 +20,7 @@ import functools
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -120,7 +120,10 @@ def _shipped(name: str) -> Database:
 
 
 def _read(path: Path) -> Database:
-    messages = [usable(message, path) for message in parse(path).messages]
+    database = parse(path)
+    messages = [usable(message, path) for message in database.messages]
+    if _is_j1939(database):
+        messages = [replace(m, by_pgn=True) if m.key & EXTENDED else m for m in messages]
     for what, counts in (
         ("name", Counter(m.name for m in messages)),
         ("identifier", Counter(describe(m.key) for m in messages)),
@@ -136,6 +139,16 @@ def _read(path: Path) -> Database:
         # two layouts for one PGN differ by source address, so only the exact identifier can tell them apart
         MappingProxyType({k: m for m in messages if m.by_pgn and pgns[k := pgn_key(m.key)] == 1}),
     )
+
+
+def _is_j1939(database: Any) -> bool:
+    """Whether a database is of J1939 as a whole: it says so, and not of each message with ``VFrameFormat``."""
+    if database.dbc is None:  # a KCD
+        return False
+    given, known = database.dbc.attributes, database.dbc.attribute_definitions
+    protocol = given.get("ProtocolType") or known.get("ProtocolType")
+    value = "" if protocol is None else getattr(protocol, "value", None) or getattr(protocol, "default_value", "")
+    return "VFrameFormat" not in known and str(value).upper() == "J1939"
 
 
 def usable(message: Any, path: Path) -> MessageCodec:

@@ -2,8 +2,9 @@
 
 ``receive`` accepts every frame and returns the message that it completes: broadcast (BAM), and addressed (RTS/CTS),
 where a CTS may ask for frames again.  It listens only and sends nothing.  A message is complete only of all its frames
-in order, each at most 1.25 s after the one before and none stamped before it; ``lost`` counts the others.  Messages of
-the extended protocol (ETP, longer) are counted in ``extended`` and not decoded.
+in order, each at most 1.25 s after the one before and none stamped before it; ``lost`` counts the others, and
+``unopened`` the frames of data that belong to no message under way, because its opening was not heard or it is lost.
+Messages of the extended protocol (ETP, longer) are counted in ``extended`` and not decoded.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Transport:
 
     def __init__(self) -> None:
         self._open: dict[tuple[int, int], _Session] = {}
-        self.lost = self.extended = 0
+        self.lost = self.extended = self.unopened = 0
 
     def receive(self, key: int, data: bytes, now_ns: int) -> Transported | None:
         """The message that this frame completes; a frame that is none of the transport's changes nothing."""
@@ -93,6 +94,7 @@ class Transport:
     def _data(self, source: int, destination: int, data: bytes, now_ns: int) -> Transported | None:
         session = self._open.get((source, destination))
         if session is None:
+            self.unopened += 1
             return None
         number = len(session.parts) + 1
         in_time = session.newest_ns <= now_ns <= session.newest_ns + MAX_GAP_NS

@@ -114,6 +114,7 @@ class Decoder:
         return {name: self.counts[name] for name in names} | {
             "lost_fast_packets": sum(bus.reassembler.lost for bus in buses),
             "lost_transported": sum(bus.transport.lost for bus in buses),
+            "unopened_transported": sum(bus.transport.unopened for bus in buses),
             "extended_transported": sum(bus.transport.extended for bus in buses),
             "interfaces": {name: bus.frames for name, bus in sorted(self._buses.items()) if name},
             "messages": dict(sorted(self.messages.items())),

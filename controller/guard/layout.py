@@ -55,8 +55,8 @@ class Layout:
 def read_layouts(path: Path, names: list[str]) -> dict[str, Layout]:
     """Read the layouts of the named messages; raises GuardConfigError."""
     try:
-        text = path.read_text(encoding="cp1252")
-    except (OSError, UnicodeError) as error:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")  # what is read here is ASCII
+    except OSError as error:
         raise GuardConfigError("guard.dbc-unreadable", f"{path}: cannot be read: {error}.") from error
     try:
         return {name: _layout(text, name, path) for name in names}

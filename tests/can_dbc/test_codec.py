@@ -382,3 +382,27 @@ FIND_CASES = [
 def test_find_matches_exactly_or_by_pgn(name: str, key: int, expected: str | None) -> None:
     found = shipped(name).find(key)
     assert (found and found.name) == expected
+
+
+PROTOCOL = 'BA_DEF_ "ProtocolType" STRING ;\nBA_DEF_DEF_ "ProtocolType" "";\nBA_ "ProtocolType" "J1939";\n'
+
+
+@pytest.mark.parametrize(
+    ("attributes", "by_pgn"),
+    [
+        (PROTOCOL, True),
+        (PROTOCOL.replace('DEF_ "ProtocolType" ""', 'DEF_ "ProtocolType" "J1939"').rpartition("BA_ ")[0], True),
+        (PROTOCOL.replace('"J1939"', '"CANopen"'), False),
+        (PROTOCOL + 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+         'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";\n', False),
+        ("", False),
+    ],
+)  # fmt: skip
+def test_a_database_of_j1939_as_a_whole_is_matched_by_pgn(tmp_path: Path, attributes: str, by_pgn: bool) -> None:
+    path = tmp_path / "j1939.dbc"
+    signal = ' SG_ S : 0|8@1+ (1,0) [0|255] "" E\n'
+    path.write_text(f'VERSION ""\nBU_: E\nBO_ 2364540158 A: 8 E\n{signal}\nBO_ 5 B: 8 E\n{signal}\n{attributes}')
+    database = codec.load(path)
+    assert database.find(0x18F00421 | EXTENDED) == (database.message("A") if by_pgn else None)
+    assert database.find(0x0CF004FE | EXTENDED) == database.message("A")
+    assert not database.message("B").by_pgn

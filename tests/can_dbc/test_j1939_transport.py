@@ -102,6 +102,14 @@ def test_silence_a_clock_set_back_an_abort_and_impossible_sizes_lose_the_message
     assert heard(wrong, [control(32, 20, 2, DM1, ENGINE, 255), *parts(TEXT, ENGINE, 255)]) == [] and wrong.lost == 1
 
 
+def test_frames_whose_opening_was_not_heard_are_counted() -> None:
+    transport = tp.Transport()
+    assert heard(transport, parts(TEXT, ENGINE, 255)) == [] and (transport.unopened, transport.lost) == (3, 0)
+    damaged = broadcast(TEXT)
+    del damaged[1]
+    assert heard(transport, damaged) == [] and (transport.unopened, transport.lost) == (4, 1)
+
+
 def test_extended_transport_is_counted() -> None:
     transport = tp.Transport()
     key = join_id(7, tp.EXTENDED_CONNECTION_PGN, ENGINE, TOOL)

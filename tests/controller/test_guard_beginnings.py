@@ -241,6 +241,13 @@ def test_a_signal_has_1_to_64_bits_of_a_frame_and_no_offset(tmp_path: Path, sign
             read_layouts(path, ["One"])
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
+def test_a_database_is_read_whatever_the_encoding_of_its_units_and_comments(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "one.dbc"
+    path.write_text('BO_ 5 One: 8 Node\n SG_ X : 0|8@1+ (1,0) [0|1] "°C" Node\n\nCM_ "Öl";\n', encoding=encoding)
+    assert list(read_layouts(path, ["One"])["One"].fields) == ["X"]
+
+
 def test_the_numbers_of_the_verdicts_are_those_that_recordings_hold() -> None:
     """They are on both buses (GuardStat, GuardAlive): a new rule gets a new number, and none is used again."""
     names = (

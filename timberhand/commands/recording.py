@@ -115,11 +115,13 @@ def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> No
         f"{summary['error_frames']} error frames, "
         f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} malformed records"
     )
-    if summary["transported"] or summary["lost_transported"] or summary["extended_transported"]:
+    if any(
+        summary[name] for name in ("transported", "lost_transported", "unopened_transported", "extended_transported")
+    ):
         console.print(
             f"J1939 transport protocol: {summary['transported']} messages, {summary['unknown_transported']} of them "
-            f"unknown, {summary['lost_transported']} lost, {summary['extended_transported']} of the extended protocol "
-            "not decoded"
+            f"unknown, {summary['lost_transported']} lost, {summary['unopened_transported']} frames of data without an "
+            f"opening, {summary['extended_transported']} messages of the extended protocol not decoded"
         )
     if len(summary["interfaces"]) > 1:
         counts = ", ".join(f"{name} {count} frames" for name, count in summary["interfaces"].items())
