@@ -14,8 +14,8 @@ takes it while the machine is not armed and stands (`autonomy.process.upload`).
 Events on stdout: ``phase``, ``grasp`` (logs, reason and probability), ``paused`` (reason), ``running``, ``refused`` (a
 setpoint, with the controller's reason number), ``detector`` (an invalid log list); of a mission ``state``, ``load``
 (logs on board), ``order`` (an operator command, and why it is refused), ``upload`` (a mission's file, and why it is
-refused), ``resumed`` (the counts so far), ``progress`` (why no checkpoint can be written); ``done``, ``failed``
-(reason).
+refused), ``mission`` (notes and warnings: what its file holds and the mission does not), ``resumed`` (the counts so
+far), ``progress`` (why no checkpoint can be written); ``done``, ``failed`` (reason).
 SIGTERM and SIGINT stop crane and machine smoothly.  Exit codes: `autonomy.process.exit_codes`, and 2 for usage.
 """
 

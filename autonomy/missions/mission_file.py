@@ -1,7 +1,7 @@
 """Mission files: reads any supported format into a validated mission, or reports every problem with its line.
 
 The format is detected from the content, not from the name: GeoJSON, QGroundControl ``.plan``, GPX, KML, and StanForD
-2010 ``hpr`` for logs only.
+2010 ``hpr`` for logs only; each also in a zip or gzip file (``.kmz``, ``.hprz``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from autonomy.missions.features import Draft, merged
 from autonomy.missions.gpx_kml import read_gpx, read_kml
 from autonomy.missions.hpr import HPR, read_hpr
 from autonomy.missions.model import ForwardingMission, MissionError
-from autonomy.missions.source import json_document, read_bytes
+from autonomy.missions.source import json_document, read_bytes, unpacked, utf_8
 from autonomy.missions.validation import problems_of
 from autonomy.missions.xml_tree import root_name, tree
 
@@ -52,15 +52,19 @@ def load_mission(
 
 def read(data: bytes, name: str) -> Draft:
     """The mission in the bytes of a file, not yet validated; ``name`` is the file's name in errors."""
+    data, name, notes = unpacked(data, name)
+    draft = _read_unpacked(utf_8(data, name), name)
+    draft.notes += notes
+    return draft
+
+
+def _read_unpacked(data: bytes, name: str) -> Draft:
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")[:4]
     if not start:
         raise MissionError("mission.empty-file", "is empty", name)
-    if start.startswith(b"PK"):
-        sentence = "is a zip file, such as an .hprz or a .kmz; unpack it and give the file inside"
-        raise MissionError("mission.zip-file", sentence, name)
     if start.startswith(_XML_BEGINS):
         return _read_xml(data, name)
-    if start.startswith(b"{") and not start.startswith(b"{\0"):
+    if start.startswith(b"{"):
         return _read_json(data, name)
     raise MissionError(
         "mission.unknown-format",

@@ -1,8 +1,8 @@
 """QGroundControl ``.plan``: JSON; positions are latitude, longitude, height.
 
 Read: waypoints, the ground speed, fences (polygons and circles).  Heights are flight altitudes and are ignored, as are
-all commands that a forwarder cannot execute; notes list what was ignored.  A mission has one speed: of several that
-hold on its legs the slowest is taken, which is a warning.
+all commands that a forwarder cannot execute: those that would move or hold the vehicle are warnings, all others notes.
+A mission has one speed: of several that hold on its legs the slowest is taken, which is a warning.
 """
 
 from __future__ import annotations
@@ -19,6 +19,15 @@ from autonomy.missions.source import Source
 NAV_WAYPOINT: Final = 16
 NAV_SPLINE_WAYPOINT: Final = 82
 DO_CHANGE_SPEED: Final = 178
+TAKEOFFS: Final = frozenset({22, 84})
+PLACES: Final = frozenset(range(NAV_WAYPOINT, 96)) - TAKEOFFS
+CONDITIONS: Final = range(112, 160)
+"""MAV_CMD: commands that go to a place, and commands that wait for something."""
+DRIVES: Final = {
+    **dict.fromkeys((32, 33, 34, 192), "moves to another place"), 177: "jump", 191: "go-around", 193: "pause",
+    194: "reverse", 207: "fence switch", 224: "jump", 601: "jump", 42702: "script",
+}  # fmt: skip
+"""MAV_CMD: other commands that change where or when the vehicle drives, and what they do."""
 GROUND_SPEED: Final = 1
 NO_CHANGE, DEFAULT_SPEED = -1, -2
 GLOBAL_FRAMES: Final = frozenset({0, 3, 5, 6, 10, 11})
@@ -56,6 +65,8 @@ def read(document: dict[str, Any], source: Source) -> Draft:
     rally = document.get("rallyPoints")
     if isinstance(rally, dict) and rally.get("points"):
         draft.notes.append("rally points ignored")
+    if fence.get("breachReturn"):
+        draft.notes.append("the point to return to from outside the fence ignored")
     return draft
 
 
@@ -66,6 +77,7 @@ class _Reader:
         self.source = source
         self.shapes: list[Shape] = []
         self.left_out: Counter[str] = Counter()
+        self.not_driven: dict[str, list[Path]] = {}
         self.speeds_m_s: list[float | None] = []
         self.other_speed: Path | None = None
 
@@ -84,6 +96,9 @@ class _Reader:
         if self.other_speed is not None:
             sentence = "this speed is no ground speed (type 1) and is not used; set the ground speed"
             draft.warn("plan.speed-type", self.other_speed, sentence)
+        for what, paths in self.not_driven.items():
+            sentence = f"{len(paths)} × {what}: a mission does not have it, and the machine drives on without it"
+            draft.warn("plan.not-driven", paths[0], sentence)
 
     def items(self, items: list[Any]) -> None:
         """The route: every waypoint item in its order."""
@@ -98,7 +113,7 @@ class _Reader:
                 raise self.source.error("plan.item", path, "this is not a mission item")
             command, given = item.get("command"), item.get("params")
             if item.get("type") == "ComplexItem":
-                self.left_out[str(item.get("complexItemType", "complex item"))[:40]] += 1
+                self.not_driven.setdefault(str(item.get("complexItemType", "complex item"))[:40], []).append(path)
             elif command in (NAV_WAYPOINT, NAV_SPLINE_WAYPOINT):
                 if not isinstance(given, list) or len(given) < 6:
                     sentence = "a waypoint has seven params; the 5th and 6th are its position"
@@ -108,6 +123,8 @@ class _Reader:
                     sentence = "the frame of this waypoint is not latitude and longitude; use a global frame"
                     raise self.source.error("plan.frame", path, sentence)
                 route.append(self.position(given[4:6], (*path, "params")))
+                if (_number(given[0]) and given[0] > 0) or item.get("autoContinue") is False:
+                    self.not_driven.setdefault("wait at a waypoint", []).append(path)
                 self.speeds_m_s.append(speed)
             elif command == DO_CHANGE_SPEED and isinstance(given, list) and len(given) > 1 and _number(given[1]):
                 if given[1] == NO_CHANGE:
@@ -116,6 +133,9 @@ class _Reader:
                     speed = None if given[1] == DEFAULT_SPEED else float(given[1])
                 else:
                     self.other_speed = path
+            elif _number(command) and (command in PLACES or command in CONDITIONS or command in DRIVES):
+                does = DRIVES.get(command, "wait" if command in CONDITIONS else "movement")
+                self.not_driven.setdefault(f"{does} (command {command})"[:80], []).append(path)
             else:
                 self.left_out[f"command {command}"[:40]] += 1
         if len(route) > 1:

@@ -1,13 +1,17 @@
-"""A mission file as text: its size limits, and the line of every value in it.
+"""A mission file as text: its size limits, what it is packed in, and the line of every value in it.
 
 ``Place`` is a line number, or the path of a value in a JSON document, whose line is only looked up for an error.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import struct
 import sys
+import zipfile
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,11 +26,17 @@ MAX_XML_BYTES: Final = 64 << 20
 """A harvester's production file of a whole stand has 3 to 15 MB."""
 MAX_VALUES: Final = 500_000
 """Lists and objects in a JSON file; 50 000 logs have four each."""
+MAX_PACKED: Final = 1000
+"""Entries of a zip file; a KMZ has one for each of its pictures."""
+MAX_MEMBERS: Final = 16
+"""Pieces of a gzip file, each of which is copied."""
 MAX_SHOWN: Final = 10
 MAX_LINED_CHARS: Final = 1 << 20
 """In a longer text no line is looked for: every level of it is read again, which takes a second in 6 MB."""
 
 Place = int | tuple[str | int, ...] | None
+_ZIP, _GZIP = b"PK", b"\x1f\x8b"
+_MISSION_NAMES: Final = (".kml", ".hpr", ".gpx", ".geojson", ".json", ".plan", ".xml")
 _SPACE: Final = re.compile(r"[ \t\r\n]*")
 _BYTE: Final = re.compile(r"(.*) \(byte (\d+)\)$")
 _DECODER: Final = json.JSONDecoder()
@@ -78,9 +88,98 @@ def read_bytes(path: str | Path) -> bytes:
     except ValueError as error:  # a NUL in the name
         raise MissionError("mission.unreadable", f"cannot be read: {error}", str(path)) from None
     if len(data) > MAX_XML_BYTES:
-        sentence = f"is larger than {MAX_XML_BYTES >> 20} MB; a mission has some kB"
-        raise MissionError("mission.too-large", sentence, str(path))
+        raise _too_large(str(path))
     return data
+
+
+def unpacked(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
+    """The mission in a zip (``.kmz``, ``.hprz``) or gzip file, its name in errors, and notes; another file as it is.
+
+    Raises:
+        MissionError: damaged, encrypted, larger than any mission, an archive in an archive, or not one mission.
+    """
+    if data.startswith(_ZIP):
+        inner, inside, notes = _from_zip(data, name)
+    elif data.startswith(_GZIP):
+        inner, inside, notes = _from_gzip(data, name), name, []
+    else:
+        return data, name, []
+    if inner.startswith((_ZIP, _GZIP)):
+        raise MissionError("mission.archive", "holds an archive again; unpack it and give the file inside", inside)
+    return inner, inside, notes
+
+
+def _from_zip(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
+    if data.count(b"PK\x01\x02") > MAX_PACKED:  # the mark of an entry in the directory
+        sentence = f"is a zip file of more than {MAX_PACKED} files; unpack it and give the mission"
+        raise MissionError("mission.archive", sentence, name)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            files = [e for e in archive.infolist() if not e.is_dir() and not e.filename.startswith("__MACOSX/")]
+            found = [e for e in files if e.filename.lower().endswith(_MISSION_NAMES)]
+            found = [e for e in found if e.filename.lower() == "doc.kml"] or found
+            if len(found) != 1:
+                sentence = f"is a zip file with {len(found) or 'no'} missions in it; unpack it and give one of them"
+                raise MissionError("mission.archive", sentence, name)
+            entry = found[0]
+            if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                sentence = "is a zip file that is encrypted or packed in an unusual way; unpack it and give the mission"
+                raise MissionError("mission.archive", sentence, name)
+            with archive.open(entry) as file:
+                inner = file.read(MAX_XML_BYTES + 1)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, OSError, ValueError, EOFError, struct.error) as error:
+        sentence = f"is a zip file that is damaged or cut off ({error}); copy it anew"
+        raise MissionError("mission.archive", sentence, name) from None
+    inside = f"{name}/{' '.join(entry.filename.split())[:80]}"
+    if len(inner) > MAX_XML_BYTES:
+        raise _too_large(inside)
+    rest = len(files) - 1
+    return inner, inside, [f"{rest} other file{'' if rest == 1 else 's'} in the zip file ignored"] if rest else []
+
+
+def _from_gzip(data: bytes, name: str) -> bytes:
+    found = b""
+    try:
+        for _ in range(MAX_MEMBERS):
+            unpacker = zlib.decompressobj(wbits=31)
+            found += unpacker.decompress(data, MAX_XML_BYTES + 1 - len(found))
+            if len(found) > MAX_XML_BYTES:
+                raise _too_large(name)
+            if not unpacker.eof:
+                raise MissionError("mission.archive", "is a gzip file that is cut off; copy it anew", name)
+            data = unpacker.unused_data
+            if not data.startswith(_GZIP):
+                if data.strip(b"\0"):
+                    break
+                return found
+    except zlib.error as error:
+        raise MissionError("mission.archive", f"is a gzip file that is damaged ({error}); copy it anew", name) from None
+    raise MissionError("mission.archive", "is a gzip file of several pieces; unpack it and give the file inside", name)
+
+
+def _too_large(name: str, limit: int = MAX_XML_BYTES) -> MissionError:
+    sentence = f"is larger than {limit >> 20} MB; a mission has some kB"
+    return MissionError("mission.too-large", sentence, name)
+
+
+def utf_8(data: bytes, name: str) -> bytes:
+    """JSON in UTF-16 as UTF-8; everything else as it is: an XML file says itself what it is written in.
+
+    Raises:
+        MissionError: JSON in damaged UTF-16.
+    """
+    marked = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    encoding = "utf-16" if marked else "utf-16-be" if data[:1] == b"\0" else "utf-16-le" if data[1:2] == b"\0" else ""
+    if not encoding or not data[:256].decode(encoding, "ignore").lstrip().startswith("{"):
+        return data
+    if len(data) > 2 * MAX_JSON_BYTES + 2:
+        raise _too_large(name, MAX_JSON_BYTES)
+    try:
+        return data.decode(encoding).encode()
+    except UnicodeError as error:
+        at = getattr(error, "start", 0)
+        sentence = f"is no UTF-16 text from byte {at} on; if it was not cut off, save it with the encoding UTF-8"
+        raise MissionError("mission.encoding", sentence, name) from None
 
 
 def json_document(data: bytes, name: str) -> tuple[Any, Source]:
@@ -90,8 +189,7 @@ def json_document(data: bytes, name: str) -> tuple[Any, Source]:
         MissionError: not UTF-8, too large, nested too deeply, or not JSON; NaN and Infinity are not JSON (RFC 8259).
     """
     if len(data) > MAX_JSON_BYTES:
-        sentence = f"is larger than {MAX_JSON_BYTES >> 20} MB; a mission has some kB"
-        raise MissionError("mission.too-large", sentence, name)
+        raise _too_large(name, MAX_JSON_BYTES)
     if data.count(b"[") + data.count(b"{") > MAX_VALUES:
         sentence = f"has more than {MAX_VALUES} lists and objects; thin it out, or split the mission"
         raise MissionError("mission.too-many-values", sentence, name)

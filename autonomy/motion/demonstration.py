@@ -66,7 +66,9 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
     codecs = {database.messages[e.message].key: (i, e, database.messages[e.message]) for i, e in enumerate(encoders)}
     samples: list[tuple[list[int], list[float]]] = [([], []) for _ in AXES]
     received = [0 for _ in AXES]
+    heard, ends_ns = 0, (1 << 63, -1 << 63)
     for stamp_ns, key, data in frames:
+        heard, ends_ns = heard + 1, (min(ends_ns[0], stamp_ns), max(ends_ns[1], stamp_ns))
         found = codecs.get(key)
         if found is None or len(data) != found[2].length:
             continue
@@ -77,13 +79,13 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
         samples[i][0].append(stamp_ns)
         counts = int(codec.named(codec.decode(data))["Position"])
         samples[i][1].append(position_from_counts(encoder, counts))
+    if heard > 1 and ends_ns[0] == ends_ns[1]:
+        sentence = f"the recording has no time stamps at its {heard} frames; record it with them (candump -L)"
+        raise RecordingRefused("demonstration.no-stamps", sentence)
     for j, e, n, (stamps, _) in zip(AXES, encoders, received, samples, strict=True):
         if n > 1 and len(stamps) < 2:
-            raise RecordingRefused(
-                "demonstration.no-stamps",
-                f"the recording has no time stamps that advance at its {n} frames {e.message}; "
-                "record it with them (candump -L)",
-            )
+            sentence = f"the time stamps of the recording do not advance at its {n} frames {e.message}; record it anew"
+            raise RecordingRefused("demonstration.no-stamps", sentence)
         if n < 2:
             raise RecordingRefused(
                 "demonstration.encoder-missing",

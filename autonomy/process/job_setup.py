@@ -19,13 +19,13 @@ from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, MissionError
 from autonomy.process.event_output import emit
 from autonomy.process.jobs import ForwardingJob, Job, SingleLogJob
-from autonomy.process.upload import UploadedMissions, WaitingJob
+from autonomy.process.upload import UploadedMissions, WaitingJob, tell_losses
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 
 
 def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: bytes | None) -> Job:
-    """The job of a command line; emits ``resumed`` when a mission is resumed.
+    """The job of a command line; emits ``mission`` for what its file loses and ``resumed`` when a mission is resumed.
 
     Raises:
         MissionError: the mission or its checkpoint cannot be used.
@@ -43,7 +43,9 @@ def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: 
     if options.mission is None:
         return WaitingJob()
     site = (profile.carrier.site_lat_deg, profile.carrier.site_lon_deg)
-    mission = load_mission(options.mission, route_wanted=True, site=site).mission
+    draft = load_mission(options.mission, route_wanted=True, site=site)
+    tell_losses(draft)
+    mission = draft.mission
     checkpoint = None
     if options.progress is not None:
         checkpoint = read_checkpoint(options.progress, mission, time.monotonic_ns(), time.time_ns())

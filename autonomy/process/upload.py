@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from autonomy.manager.checkpoint import Checkpoint
+from autonomy.missions.features import Draft
 from autonomy.missions.folder import MissionFolder
 from autonomy.missions.mission_file import read, verify
 from autonomy.missions.model import ForwardingMission
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.standpoint import Standpoint
+from autonomy.process.event_output import emit
 from autonomy.process.jobs import Job, JobEvent
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.grasp import ChosenGrasp
@@ -89,7 +91,14 @@ class UploadedMissions:
             raise UploadRefused("upload.other-file", sentence)
         draft = read(data, upload.name)
         verify(draft, route_wanted=True, site=self.site)
+        tell_losses(draft)
         return self.job_of(draft.mission)
+
+
+def tell_losses(draft: Draft) -> None:
+    """Emit ``mission``: what of its file the mission does not have, and where it will be driven otherwise."""
+    if draft.notes or draft.warnings:
+        emit("mission", notes=draft.notes or None, warnings=[str(problem) for problem in draft.warnings] or None)
 
 
 class WaitingJob:

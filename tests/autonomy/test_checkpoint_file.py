@@ -180,6 +180,20 @@ def test_the_process_reports_a_finished_mission(tmp_path: Path, capsys) -> None:
     assert event["event"] == "done" and 3 in numbers_in(event["reason"])
 
 
+def test_the_process_tells_what_a_mission_does_not_have_of_its_file(tmp_path: Path, capsys) -> None:
+    document = json.loads(EXAMPLE.read_text())
+    route = next(f["geometry"] for f in document["features"] if f["geometry"]["type"] == "LineString")
+    beside = {"type": "Point", "coordinates": route["coordinates"][0]}
+    document["features"].append({"type": "Feature", "properties": {}, "geometry": beside})
+    file = tmp_path / "mission.geojson"
+    file.write_text(json.dumps(document))
+    path = kept(tmp_path / "p", some(load_mission(EXAMPLE).mission, finished=True))
+    assert start(path, "--mission", str(file)) == FINE
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [event["event"] for event in events] == ["mission", "done"]
+    assert len(events[0]["notes"]) == 1 and "warnings" not in events[0]
+
+
 def test_the_process_refuses_an_unwritable_checkpoint(tmp_path: Path, capsys) -> None:
     assert start(tmp_path / "none" / "p") == CONFIGURATION
     assert capsys.readouterr().err.count("\n") == 1

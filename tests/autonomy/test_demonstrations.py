@@ -89,7 +89,7 @@ def test_an_encoder_without_frames_is_named() -> None:
 
 
 def test_a_log_without_time_stamps_is_named_so() -> None:
-    bare = [Frame(0, frame.key, frame.data) for frame in frames(shown())]
+    bare = [Frame(0, frame.key, frame.data) for frame in frames(shown(), without=Joint.SLEW)]
     with pytest.raises(RecordingRefused, check=coded("demonstration.no-stamps")):
         joint_track(PROFILE, CRANE, bare)
 

@@ -19,10 +19,12 @@ from tests.autonomy.mission_texts import (
     feature,
     gpx,
     gpx_points,
+    item,
     kml,
     kml_coordinates,
     line,
     lon_lat,
+    plan,
     polygon,
 )
 from tests.codes import coded, numbers_in
@@ -133,7 +135,7 @@ def test_not_utf_8() -> None:
     data = collection(line(name="x")).replace(b'"x"', b'"H\xf6rnefors"')
     number = 1 + data[: data.index(b"\xf6")].count(b"\n")
     assert codes(data) == ["encoding"] and place(data) == f"m:{number}"
-    assert codes("{}".encode("utf-16-le") + b"\x00") == ["unknown-format"]
+    assert codes("{}".encode("utf-16-le") + b"\x00") == ["encoding"]
     latin = gpx("<metadata><name>H\xf6rnefors</name></metadata>" + f"<rte>{gpx_points('rtept')}</rte>").decode()
     named = latin.replace("UTF-8", "ISO-8859-1").encode("latin-1")
     assert good(named).mission.name == "Hörnefors"
@@ -141,6 +143,14 @@ def test_not_utf_8() -> None:
     assert codes(latin.encode("latin-1")) == ["encoding"]
     assert codes(latin.encode("utf-16")) == ["encoding"]  # says UTF-8 and is not
     assert codes(latin.replace("UTF-8", "no-such").encode()) == ["encoding"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
+def test_json_in_every_encoding(encoding: str) -> None:
+    for text in (collection(line()).decode(), plan(list(map(item, ROUTE))).decode()):
+        assert_route(good(text.encode(encoding)).mission)
+        assert codes(text.encode(encoding)[:-31]) == ["not-json" if encoding == "utf-8-sig" else "encoding"]
+    assert good(collection(line()).decode().encode("utf-16-be")).notes == []
 
 
 @pytest.mark.parametrize(
@@ -176,7 +186,7 @@ def test_files_cut_off_and_files_of_other_kinds(tmp_path: Path) -> None:
     data = collection(line())
     assert codes(data[:-20]) == ["not-json"] and place(data[:-20]) == f"m:{1 + data[:-20].count(NEWLINE)}"
     assert codes(gpx(f"<rte>{gpx_points('rtept')}</rte>")[:-8]) == ["not-xml"]
-    assert codes(b"PK\x03\x04rest") == ["zip-file"]
+    assert codes(b"PK\x03\x04rest") == ["archive"]
     assert codes(b"<html><body/></html>") == ["unknown-xml"]
     assert codes(b"QGC WPL 110\n") == ["unknown-format"]
     with pytest.raises(MissionError, check=coded("mission.unreadable")):

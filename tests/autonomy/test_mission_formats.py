@@ -101,7 +101,8 @@ def test_a_plan_has_speed_and_fences_and_notes_on_ignored_items() -> None:
     assert [fence.keep_out for fence in draft.mission.fences] == [False, True]
     away = [math.hypot(*e) for e in SITE.points_enu(draft.mission.fences[1].corners)[:, :2]]
     assert min(away) * math.cos(math.pi / 48) == pytest.approx(4.0)  # the polygon goes round the circle
-    assert [note.split()[:3] for note in draft.notes] == [["1", "×", "command"], ["1", "×", "survey"]]
+    assert [note.split()[:3] for note in draft.notes] == [["1", "×", "command"]]
+    assert [problem.code for problem in draft.warnings] == ["plan.not-driven"]  # the survey
 
 
 def test_a_hole_keeps_out_and_rings_run_counter_clockwise() -> None:

@@ -62,3 +62,28 @@ def test_several_keep_in_fences(firmware: int, warned: list[str]) -> None:
     data = plan([A, B, C], polygons=polygons).replace(b'"items"', b'"firmwareType": %d, "items"' % firmware, 1)
     draft = good(data)
     assert [problem.code for problem in draft.warnings] == warned and len(draft.notes) == 1
+
+
+WAIT = A | {"params": [5, *A["params"][1:]]}
+
+
+@pytest.mark.parametrize(
+    ("extra", "warned", "noted"),
+    [
+        ([], 0, 0),
+        ([item(ROUTE[0], 22)], 0, 1),  # a take-off
+        ([item(at(0, 0), 19)], 1, 0),  # a loiter
+        ([item(at(0, 0), 19), item(at(1, 0), 19), item(at(1, 0), 20)], 2, 0),  # and the way home
+        ([{"type": "SimpleItem", "command": 177, "frame": 2, "params": [1, 3, 0, 0, 0, 0, 0]}], 1, 0),  # a jump
+        ([{"type": "SimpleItem", "command": 112, "frame": 2, "params": [9, 0, 0, 0, 0, 0, 0]}], 1, 0),  # a delay
+        ([{"type": "SimpleItem", "command": 206, "frame": 2, "params": [9, 0, 0, 0, 0, 0, 0]}], 0, 1),  # a camera
+        ([{"type": "ComplexItem", "complexItemType": "survey"}], 1, 0),
+        ([WAIT], 1, 0),
+        ([A | {"autoContinue": False}], 1, 0),
+        ([{"type": "SimpleItem", "command": "x" * 999}, {"type": "SimpleItem", "command": None}], 0, 2),
+    ],
+)
+def test_items_that_are_no_waypoints(extra: list[dict[str, Any]], warned: int, noted: int) -> None:
+    draft = good(plan([*extra, *([] if extra[:1] and extra[0].get("command") == 16 else [A]), B, C]))
+    assert [problem.code for problem in draft.warnings] == ["plan.not-driven"] * warned and len(draft.notes) == noted
+    assert len(draft.mission.waypoints) == 3

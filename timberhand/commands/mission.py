@@ -127,6 +127,8 @@ def run(
     directory = out or new_directory(f"mission-{file.stem}-{manager.value}-seed{seed}")
     screen = Console(stderr=as_json)
     mission = draft.mission
+    for note in draft.notes:
+        screen.print(f"note: {note}", style="yellow", markup=False, soft_wrap=True)
     for problem in draft.warnings:
         screen.print(f"warning: {problem}", style="yellow", markup=False, soft_wrap=True)
     if detector is DetectorKind.PERFECT:
