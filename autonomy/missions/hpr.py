@@ -32,7 +32,7 @@ _WANTED: Final = frozenset({
     "StemCoordinates", "Coordinates", "Latitude", "Longitude", "SingleTreeProcessedStem", "MultiTreeProcessedStem",
     "Log", "LogKey", "LogVolume", "LogMeasurement", "LogDiameter", "LogLength", "ObjectDefinition", "ObjectName",
 })  # fmt: skip
-_LIMITS: Final = {"Log": (MAX_LOGS, "logs"), "Stem": (MAX_LOGS, "stems"), ANY: (1_000_000, "elements")}
+_LIMITS: Final = {"Log": (MAX_LOGS, "logs"), "Stem": (MAX_LOGS, "stems"), ANY: (400_000, "elements")}
 _MIDDLE: Final = ("Mid ob", "Mid ub")
 _ENDS: Final = ("Butt ob", "Top ob")
 

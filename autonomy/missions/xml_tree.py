@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 from xml.etree.ElementTree import ParseError
 from xml.parsers.expat import errors as xml_errors
 
@@ -18,7 +18,12 @@ from defusedxml.ElementTree import DefusedXMLParser
 
 from autonomy.missions.model import MissionError
 
-MAX_ELEMENTS: Final = 2_000_000
+MAX_ELEMENTS: Final = 1_000_000
+MAX_ATTRIBUTES: Final = 1_000_000
+MAX_TEXT: Final = 16 << 20
+"""Characters in the kept elements; 100 000 positions with all their digits have 6 million."""
+MAX_TOKEN_BYTES: Final = 1 << 18
+"""Of one tag or comment, which the parser takes whole."""
 MAX_DEPTH: Final = 100
 ANY: Final = "*"
 """Key of the limit on all kept elements."""
@@ -34,21 +39,20 @@ _CUT: Final = frozenset(
 """What the parser says of a document that ends too early."""
 
 
+_NO_CHILDREN: Final[Any] = ()
+_NO_ATTRIBUTES: Final[dict[str, str]] = {}
+
+
 @dataclass(slots=True)
 class Element:
-    """An element: its local name, namespace, attributes by local name, text before its first child, line."""
+    """An element: its local name, namespace, attributes by local name, line, text before its first child, children."""
 
     name: str
     namespace: str
     attributes: dict[str, str]
     line: int
-    parts: list[str] = field(default_factory=list)
-    children: list[Element] = field(default_factory=list)
-
-    @property
-    def text(self) -> str:
-        """The text before the first child."""
-        return "".join(self.parts)
+    text: str = ""
+    children: list[Element] = _NO_CHILDREN
 
     def all(self, *names: str) -> Iterator[Element]:
         """The children of these names."""
@@ -79,8 +83,9 @@ class _Builder:
         self.outside = 0
         self.more = 0
         self.counts: dict[str, int] = {}
-        self.elements = 0
+        self.elements = self.attributes = self.characters = 0
         self.skipping = 0
+        self.parts: list[str] = []
         self.open: list[Element] = []
         self.root: Element | None = None
         self.line: Callable[[], int] = lambda: 0
@@ -90,6 +95,9 @@ class _Builder:
         self.elements += 1
         if self.elements > MAX_ELEMENTS:
             raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_ELEMENTS} elements")
+        self.attributes += len(attributes)
+        if self.attributes > MAX_ATTRIBUTES:
+            raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_ATTRIBUTES} attributes")
         if self.skipping:
             self.skipping += 1
             return
@@ -100,6 +108,7 @@ class _Builder:
             if self.outside > MAX_DEPTH:
                 raise TooMany("mission.nesting", self.line(), "is nested deeper than any mission")
             return
+        self._end_text()
         if self.open and name not in self.wanted:
             self.skipping = 1
             return
@@ -111,9 +120,10 @@ class _Builder:
                 self.counts[counted] = self.counts.get(counted, 0) + 1
                 if self.counts[counted] > limit:
                     raise TooMany("mission.too-many-elements", self.line(), f"has more than {limit} {what}")
-        local = {key.rpartition("}")[2]: value for key, value in attributes.items()}
+        local = {key.rpartition("}")[2]: value for key, value in attributes.items()} or _NO_ATTRIBUTES
         element = Element(name, namespace.lstrip("{"), local, self.line())
         if self.open:
+            self.open[-1].children = self.open[-1].children or []
             self.open[-1].children.append(element)
         else:
             self.root = element
@@ -126,12 +136,21 @@ class _Builder:
         elif not self.open:
             self.outside -= 1
         else:
+            self._end_text()
             self.open.pop()
 
     def data(self, text: str) -> None:
         """Text of the open element."""
         if self.open and not self.skipping and not self.open[-1].children:
-            self.open[-1].parts.append(text)
+            self.parts.append(text)
+            self.characters += len(text)
+            if self.characters > MAX_TEXT:
+                raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_TEXT >> 20} MB of text")
+
+    def _end_text(self) -> None:
+        if self.parts:
+            self.open[-1].text += "".join(self.parts)
+            self.parts.clear()
 
     def close(self) -> Element | None:
         """The tree."""
@@ -165,6 +184,9 @@ def tree(
     try:
         for start in range(0, len(data), _CHUNK):
             parser.feed(data[start : start + _CHUNK])
+            if start + _CHUNK - parser.parser.CurrentByteIndex > MAX_TOKEN_BYTES + _CHUNK:
+                sentence = f"has a tag or comment of more than {MAX_TOKEN_BYTES >> 10} kB"
+                raise TooMany("mission.too-many-elements", builder.line(), sentence)
         root = parser.close()
     except DefusedXmlException:
         raise MissionError(

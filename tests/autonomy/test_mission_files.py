@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from autonomy.missions import gpx_kml
+from autonomy.missions import gpx_kml, xml_tree
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import MissionError, Point
 from tests.autonomy.mission_checks import assert_route, codes, good, place, refused
@@ -180,6 +180,33 @@ def test_entity_expansion(declared: str) -> None:
 def test_why_a_file_is_not_xml(old: str, new: str, code: str, line: int) -> None:
     data = gpx(f"<rte>{gpx_points('rtept')}</rte>").decode().replace(old, new, 1).encode()
     assert codes(data) == [code] and place(data) == f"m:{line}"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "<wpt " + " ".join(f'a{i}="1"' for i in range(60_000)) + "/>",
+        "<!--" + "x" * 700_000 + "-->",
+        "<metadata><name>" + "x" * (17 << 20) + "</name></metadata>",
+    ],
+    ids=["attributes", "comment", "text"],
+)
+def test_a_tag_a_comment_and_the_text_have_bounds(body: str) -> None:
+    assert codes(gpx(body)) == ["too-many-elements"]
+
+
+def test_the_attributes_of_all_elements_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = gpx(f"<rte>{gpx_points('rtept')}</rte>")
+    good(data)
+    monkeypatch.setattr(xml_tree, "MAX_ATTRIBUTES", 5)
+    assert codes(data) == ["too-many-elements"]
+
+
+def test_text_in_pieces_is_whole() -> None:
+    name = "a &amp; b " * 9000
+    assert good(gpx(f"<metadata><name>{name}</name></metadata><rte>{gpx_points('rtept')}</rte>")).mission.name == (
+        name.replace("&amp;", "&").strip()
+    )
 
 
 def test_files_cut_off_and_files_of_other_kinds(tmp_path: Path) -> None:
