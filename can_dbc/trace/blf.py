@@ -210,7 +210,9 @@ class _Reader:
             raise _Damaged(f"{where}: a CAN object of {size} bytes")
         if kind == blf.CAN_FD_MESSAGE_64:
             valid, outside = self.waiting[at + body + 2], self.waiting[at + body + 35]
-            if valid > MAX_DATA or outside > size or head_bytes > size:
+            first = body + NEEDED[kind]
+            beyond = outside > size and first + valid > size  # else only the offset is wrong
+            if valid > MAX_DATA or beyond or 0 < outside < first or head_bytes > size:
                 raise _Damaged(f"{where}: a CAN FD object of {valid} bytes")
         flags, _, _, stamp = STAMPS[version].unpack_from(self.waiting, at + blf.OBJ_HEADER_BASE_STRUCT.size)
         if stamp >= 1 << 63:  # before the start: Vector's loggers keep what came before the trigger

@@ -147,3 +147,14 @@ def test_damage_anywhere_invents_no_frame(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         found = list(islice(read_trace(path), len(whole)))
         assert len(found) <= 40
+
+
+@pytest.mark.parametrize(("outside", "cut", "read"), [(0, 0, 1), (136, 0, 1), (238, 0, 1), (238, 8, 0), (60, 0, 0)])
+def test_the_place_of_extra_data_of_a_can_fd_object_may_be_wrong(outside: int, cut: int, read: int) -> None:
+    """A sample of python-can says 238 in an object of 144 bytes that holds all of its 64."""
+    body = blf.CAN_FD_MSG_64_STRUCT.pack(1, 15, 64, 0, 0x185, 0, 0, 0, 0, 0, 0, 0, 0, outside, 0) + bytes(range(64))
+    stamp = blf.OBJ_HEADER_V1_STRUCT.pack(blf.TIME_ONE_NANS, 0, 0, MS)
+    size = 32 + len(body) - cut
+    head = blf.OBJ_HEADER_BASE_STRUCT.pack(b"LOBJ", 32, 1, size, blf.CAN_FD_MESSAGE_64)
+    found = list(reader.read_blf(file(container((head + stamp + body)[:size]), 1), []))
+    assert [isinstance(r, Frame) for r in found] == [bool(read)]
