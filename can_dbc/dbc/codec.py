@@ -196,6 +196,9 @@ def _line_of(reason: str, text: str) -> str:
 def compile_one(message: Any, path: Path) -> MessageCodec:
     """The codec of one cantools message; ``path`` is named in errors."""
     signals = _signals(message)
+    for s in signals:
+        if s.shift < 0 or s.shift + s.bits > 8 * message.length:
+            raise DbcError("dbc.invalid", f"{path}: the signal {s.name} does not fit in message {message.name}")
     decode, receive, encode, source = compile_message(message.name, message.length, signals)
     attributes = {k: a.value for k, a in message.dbc.attributes.items()} if message.dbc else {}
     return MessageCodec(

@@ -319,6 +319,7 @@ BROKEN = [
         ("f.dbc:5: ",),
     ),
     ('BO_ 1 M: 1 A\n SG_ X : 0|9@1+ (1,0) [0|0] "" A\n', "dbc.invalid", ("f.dbc:5: ",)),
+    ('BO_ 1 M: 8 A\n SG_ X : -1|8@1+ (1,0) [0|0] "" A\n', "dbc.invalid", ("X",)),
     ("BO_ 1 M: 1 A\nBO_ 1 N: 1 A\n", "dbc.duplicate", ("001",)),
     ('BO_ 1 M: 1 A\n SG_ X : 0|8@1+ (1,0) [0|1e400] "" A\n', "dbc.invalid", ("M",)),
     ("BO_ 1 M: 1 A\nBO_ 2 M: 1 A\n", "dbc.duplicate", ("M",)),
