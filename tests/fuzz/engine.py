@@ -6,7 +6,7 @@ known inputs: bits, bytes, numbers, words of the format, pieces of other inputs,
 inputs.
 
 A contract is broken by an exception that is not the documented one, by an input that takes longer than `HANG_S` of
-processor time, and by memory that grows.
+processor time or more memory than `MEMORY_BYTES` while it is judged, and by memory that grows.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
-HANG_S = 10.0
+HANG_S = 2.0
+MEMORY_BYTES = 200 << 20
+"""Of one input, beside what the process has already."""
 KNOWN_LIMIT = 512
 FOREVER = 1 << 62
 GROWTH_BYTES = 96 << 20
@@ -187,8 +189,16 @@ def _change(rng: random.Random, made: bytearray, other: bytes, words: Sequence[b
             made[at % size] = (made[at % size] + rng.choice((-1, 1))) & 0xFF
 
 
+def _mapped_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
 def _resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def _peak_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 
 def _alarm(_number: int, _frame: FrameType | None) -> None:
@@ -199,18 +209,27 @@ def judged(run: Run, data: bytes) -> Hashable:
     """The judgement of one input.
 
     Raises:
-        Broken: the target raised, or hung.
+        Broken: the target raised, hung, or took too much memory.
     """
+    had = _peak_bytes(), _resident_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (_mapped_bytes() + 2 * MEMORY_BYTES, limits[1]))
     signal.signal(signal.SIGVTALRM, _alarm)
     signal.setitimer(signal.ITIMER_VIRTUAL, HANG_S)
     try:
-        return run(data)
+        fate = run(data)
+        if _peak_bytes() > had[0] and _peak_bytes() - had[1] > MEMORY_BYTES:
+            raise Broken(f"an input took {(_peak_bytes() - had[1]) >> 20} MiB of memory")
+        return fate
     except Hang as hang:
         raise Broken(str(hang)) from hang
+    except Broken:
+        raise
     except Exception as error:
         raise Broken(f"{type(error).__name__}: {error}") from error
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def fuzz(

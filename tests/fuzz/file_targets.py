@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
+import io
+import os
 import random
 import re
 import shutil
+import zipfile
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +26,7 @@ from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
 from can_dbc.dbc.codec import Database, DbcError, EncodeRefused, FrameRefused
 from can_dbc.dbc.codec import load as load_dbc
 from can_dbc.trace.candump import read_trace
+from can_dbc.trace.decoder import Decoder
 from can_dbc.trace.records import MalformedRecord
 from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
@@ -50,7 +55,8 @@ def other_values(
 
     def changed(data: bytes) -> bytes:
         if not texts:
-            texts.extend((text, list(re.finditer(value, text, re.MULTILINE))) for text in seeds())
+            every = ((text, list(re.finditer(value, text, re.MULTILINE))) for text in seeds())
+            texts.extend((text, found) for text, found in every if len(found) >= 3)  # not those that are packed
         rng = random.Random(data)
         if rng.random() < 0.2:
             return data
@@ -63,7 +69,24 @@ def other_values(
 
 
 def mission_seeds() -> list[bytes]:
-    return [path.read_bytes() for path in sorted(EXAMPLES.iterdir()) if path.stat().st_size < 40_000]
+    """The examples, also packed and in UTF-16, and those of the folder of reports, where there is one."""
+    plain = [path.read_bytes() for path in sorted(EXAMPLES.iterdir()) if path.stat().st_size < 40_000]
+    texts = [data.decode().encode("utf-16") for data in plain if data.startswith(b"{")]
+    return [*plain, *texts, gzip.compress(plain[0]), *map(zipped, plain[:2]), *reports(*MISSION_SUFFIXES)]
+
+
+def zipped(data: bytes) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(zipfile.ZipInfo("doc.kml"), data)
+    return made.getvalue()
+
+
+def reports(*suffixes: str) -> list[bytes]:
+    """The small files of public reports with these suffixes, "" of none; nothing where they are not at hand."""
+    folder = Path(os.environ.get("TIMBERHAND_DATA", "none")) / "reports"
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [path.read_bytes() for path in found if path.suffix in suffixes]
 
 
 def mission(data: bytes) -> Hashable:
@@ -107,11 +130,16 @@ def repaired(read: tuple[Path, int]) -> Hashable:
     return before > 0, complete, bool(made)
 
 
+MISSION_SUFFIXES = (".gpx", ".kml", ".plan", ".hpr", ".hprz", ".geojson")
 TRACES = (
     b"(1700000000.123456) can0 210#0011223344556677\n(1700000000.2) can0 18FF2F27#R\n",
     b"  can0  210   [8]  00 11 22 33 44 55 66 77\n (0.000100)  can0  TX - -  210  [2]  AA BB   '..'\n",
     b"   1)      1059.9  Rx         0210  8  00 11 22 33 44 55 66 77\n",
     b"17:33:21.107 R 19F51323 01 2F 30 70 00 2F 30 70\n",
+    b" (2023-11-14 22:13:20.000100) can0 20000088 [8] 00 00 08 00 00 00 00 00 ERRORFRAME\n\tprotocol-violation{}\n",
+    b";$FILEVERSION=2.1\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n 1 10.0 DT 1 0210 Rx - 2 00 FC\n 2 12.0 RR 1 0210 Rx - 8\n",
+    b";$FILEVERSION=1.1\n  1) 10.0  Rx  0210  2  00 FC\n  2) 15.0  Warng  FFFFFFFF  4  00 00 00 08  BUSHEAVY\n",
+    "(1.000000) can0 210#00\n".encode("utf-16"),
 )
 ASC = (
     b"date Mon Jun 1 12:00:00.000 am 2026\nbase hex  timestamps absolute\n"
@@ -127,6 +155,34 @@ def blf_seed() -> bytes:
         for k in range(20):
             writer.on_message_received(can.Message(timestamp=1.0 + k, arbitration_id=0x210, data=bytes(8)))
     return path.read_bytes()
+
+
+def decoded(path: Path) -> Hashable:
+    """A trace through the decoder with every shipped database."""
+    decoder = Decoder(["machine", "gnss"])
+    for entry in decoder.run(read_trace(path)):
+        assert entry.text() is not None and entry.as_dict()
+    told = decoder.summary()
+    names = (
+        "frames",
+        "broken",
+        "refused",
+        "lost_fast_packets",
+        "transported",
+        "lost_transported",
+        "unopened_transported",
+    )
+    return tuple(min(told[name], 2) for name in names)
+
+
+def bus_seeds() -> list[bytes]:
+    """A DM1 by the transport protocol of J1939 and a fast packet of NMEA 2000, on two buses."""
+    lines = [
+        "1CECFF00#200A0002FFCAFE00", "1CEBFF00#0104FF6E00040507", "1CEBFF00#0208090AFFFFFFFF",
+        "0DF8051C#E02B0000FF4CC0EB", "0DF8051C#E1FF000000000000", "09F8011C#0000000000000000",
+    ]  # fmt: skip
+    log = "".join(f"({i}.0{i}) can{bus} {line}\n" for bus in (0, 1) for i, line in enumerate(lines))
+    return [log.encode(), *reports(".log")]
 
 
 def counted(records: Iterable[Any]) -> Hashable:
@@ -263,9 +319,10 @@ _GUARD_PROFILE = of_file("fuzz.toml", GuardConfigError, build, guards)
 FILES = (
     _files("mission-file", lambda: mission, mission_seeds, _JSON + _XML, rb"[:,>\"] *([-0-9.]+|\"[^\"]*\")"),
     _files("recording", of_file("run.mcap", NotMcap, read_recording, repaired), recording_seeds),
-    _files("trace-text", of_file("trace.log", (), read_trace, counted), lambda: list(TRACES)),
-    _files("trace-asc", of_file("trace.asc", (), read_trace, counted), lambda: [ASC], max_bytes=4096),
-    _files("trace-blf", of_file("trace.blf", (), read_trace, counted), lambda: [blf_seed()]),
+    _files("trace-text", of_file("trace.log", (), read_trace, counted), lambda: [*TRACES, *reports(".trc")]),
+    _files("trace-asc", of_file("trace.asc", (), read_trace, counted), lambda: [ASC, *reports(".asc")], max_bytes=4096),
+    _files("trace-blf", of_file("trace.blf", (), read_trace, counted), lambda: [blf_seed(), *reports(".blf")]),
+    _files("trace-decoded", of_file("trace.log", (), decoded, tuple), bus_seeds),
     _files("dbc", of_file("fuzz.dbc", DbcError, load_dbc, used), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
     _files("profile", _PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     _files("guard-dbc", of_file("guard.dbc", (), guard_dbc, tuple), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),

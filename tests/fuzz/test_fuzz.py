@@ -12,7 +12,7 @@ from tests.fuzz.engine import FOREVER, REGRESSIONS, Broken, Target, fuzz, judged
 RUNS = {
     "controller-loader": 120, "controller-forwarder": 80, "guard": 300, "dbc": 60, "profile": 60, "guard-profile": 60,
     "guard-envelope": 100, "guard-dbc": 300, "trace-asc": 300, "recording": 600, "mission-file": 1000,
-    "timing-page": 1500,
+    "timing-page": 1500, "trace-decoded": 300,
 }  # fmt: skip
 SAVED = [(path.parent.name, path) for path in sorted(REGRESSIONS.glob("*/*.inputs"))]
 
@@ -80,6 +80,25 @@ def test_a_hang_is_a_broken_contract(monkeypatch: pytest.MonkeyPatch) -> None:
     result = fuzz(target, runs=1)
     assert result.failure
     assert judged(lambda data: data, b"x") == b"x"
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_an_input_that_takes_much_memory_is_a_broken_contract(hidden: bool) -> None:
+    def start():
+        def run(data: bytes) -> object:
+            if not data.startswith(b"bomb"):
+                return 0
+            try:
+                return len(bytes(1000 << 20))
+            except MemoryError:
+                if not hidden:
+                    raise
+                return len(b"x" * (300 << 20))
+
+        return run
+
+    target = Target("takes", "inputs", start, lambda: [b"", b"bomb"])
+    assert fuzz(target, runs=1).failure == "" and fuzz(target, runs=2).failure
 
 
 def test_a_result_that_grows_memory_is_a_broken_contract(monkeypatch: pytest.MonkeyPatch) -> None:
