@@ -34,6 +34,10 @@ PCAN_VIEW: Final = re.compile(
 YACHT_DEVICES: Final = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) [RT] ([0-9A-Fa-f]{8})((?: [0-9A-Fa-f]{2}){0,8})\s*$")
 PAYLOAD: Final = re.compile(r"(?:#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)(?:_[0-9A-Fa-f])?$")
 MAX_DATA: Final = 64
+PACKED: Final = {b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip"}
+MAX_STAMP_NS: Final = 1 << 63
+MAX_OTHER_LINES: Final = 10_000
+"""After so many lines without a single frame the rest of a file is not read."""
 MAX_LINE: Final = 2048
 """Characters; a CAN FD frame of 64 bytes with everything that the formats add has less than 500."""
 PCAN_COLUMNS: Final = {
@@ -56,6 +60,8 @@ def read_trace(path: Path) -> Trace:
         from can_dbc.trace.blf import read_blf
 
         return Trace(partial(read_blf, content))
+    if (packed := next((kind for mark, kind in PACKED.items() if content.startswith(mark)), None)) is not None:
+        return Trace(lambda _: iter([MalformedRecord(0, f"a {packed} file; unpack it and give the log inside")]))
     lines = decoded(content, "utf-8").splitlines()
     return Trace(partial(_asc if path.suffix.lower() == ".asc" else _text, lines))
 
@@ -65,11 +71,14 @@ def read_trace(path: Path) -> Trace:
 
 def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
     pcan = Pcan()
-    error_frame = False
+    error_frame, found = False, False
     for number, raw in enumerate(lines, 1):
         line = raw.strip()
         if not line or line[0] == "#":
             continue
+        if number > MAX_OTHER_LINES and not found:
+            yield MalformedRecord(number, f"no frame in the {number - 1} lines before; the rest is not read")
+            break
         if line[0] == ";":
             pcan.header(line)
         elif error_frame and raw[0] == "\t":
@@ -77,7 +86,7 @@ def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | Malformed
         elif len(line) > MAX_LINE:
             yield MalformedRecord(number, line[:MAX_LINE])
         elif (frame := parse_line(line) or pcan.frame(line)) is not None:
-            error_frame = bool(frame.key & ERROR)
+            error_frame, found = bool(frame.key & ERROR), True
             yield frame
         elif not pcan.other(line):
             yield MalformedRecord(number, line)
@@ -128,7 +137,10 @@ def _frame(
         key = value & (ERROR | EXTENDED_MASK) if value & ERROR else value & EXTENDED_MASK | EXTENDED
     else:
         key = value & STANDARD_MASK
-    return TraceFrame(_nanoseconds(stamp), key | (REMOTE if remote else 0), payload, interface)
+    stamp_ns = _nanoseconds(stamp)
+    if stamp_ns >= MAX_STAMP_NS:
+        return None
+    return TraceFrame(stamp_ns, key | (REMOTE if remote else 0), payload, interface)
 
 
 def _nanoseconds(text: str) -> int:
@@ -190,6 +202,8 @@ class Pcan:
             return None
         stamp, bus = _milliseconds(cells["O"]), cells.get("B", "")
         if kind in PCAN_ERRORS or identifier == "FFFFFFFF":
+            if _nanoseconds(stamp) >= MAX_STAMP_NS:
+                return None
             shown = re.match(r"(?:[0-9A-Fa-f]{2}\b\s*){0,8}", data)
             return TraceFrame(_nanoseconds(stamp), ERROR, bytes.fromhex(shown[0]) if shown else b"", bus)
         if kind not in PCAN_DATA or not re.fullmatch(r"[0-9A-Fa-f]{4}|[0-9A-Fa-f]{8}", identifier):
@@ -223,6 +237,10 @@ def _asc(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedR
             yield MalformedRecord(number, line[:MAX_LINE])
             continue
         stamp_ns = _nanoseconds(timed[1]) + (stamp_ns if relative else 0)
+        if abs(stamp_ns) >= MAX_STAMP_NS:
+            yield MalformedRecord(number, line[:MAX_LINE])
+            stamp_ns = 0
+            continue
         frame = _asc_frame(timed[2], base, stamp_ns)
         if frame is not None:
             yield frame

@@ -176,3 +176,32 @@ def test_a_message_of_j1939_is_no_fast_packet(tmp_path: Path) -> None:
     assert (summary["lost_fast_packets"], summary["transported"], summary["refused"], summary["decoded"]) == (
         0, 0, 0, 3,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t.log", "(99999999999.0) can0 185#00\n"),
+        ("t.log", "(" + "9" * 900 + ") can0 185#00\n"),
+        ("t.trc", ";$FILEVERSION=1.1\n  1)  99999999999999.0  Rx  0210  2  00 FC\n"),
+        ("t.trc", ";$FILEVERSION=1.1\n  1)  99999999999999.0  Error  0008  4  00 19 08 08\n"),
+        ("t.asc", ASC.format("relative") + " 99999999999.0 1  185 Rx d 1 00\n"),
+    ],
+)
+def test_a_stamp_that_no_clock_has_is_malformed(tmp_path: Path, name: str, text: str) -> None:
+    assert [type(record) for record in write(tmp_path / name, text)] == [MalformedRecord]
+
+
+@pytest.mark.parametrize("content", [b"\x1f\x8b\x08rest", b"PK\x03\x04rest"])
+def test_a_packed_log_is_named_so(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "t.log"
+    path.write_bytes(content)
+    (record,) = read_trace(path)
+    assert isinstance(record, MalformedRecord) and record.line == 0
+
+
+def test_a_text_without_frames_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(candump, "MAX_OTHER_LINES", 5)
+    frame = "(1.0) can0 185#00\n"
+    assert len(list(write(tmp_path / "t.log", "x\n" * 9 + frame))) == 6
+    assert len(list(write(tmp_path / "t.log", frame + "x\n" * 9 + frame))) == 11
