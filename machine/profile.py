@@ -7,7 +7,7 @@ control rate works.  Positions and speeds without a unit in their name are in ra
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 
@@ -75,16 +75,22 @@ class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lever: tuple[float, ...] = ()
 
 
+OWN_LAWS: Final = ("pd", "pid", "sliding_mode", "super_twisting")
+JOINT_LAWS: Final = "timberhand.joint_laws"
+"""Entry points of other laws: a factory that takes the `Law` and returns a `controller.laws.feedback.Feedback`."""
+
+
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A joint's control law (docs/reference/machines.md section 4).
 
+    ``kind`` is one of `OWN_LAWS`, or an entry point of the group `JOINT_LAWS`.
     ``kp_1_s`` [1/s] is the gain of every ``kind`` for small errors, ``kd`` [-] the gain of the error rate of PD and
     PID, ``layer`` [unit] the boundary layer of the sliding-mode laws.  ``damping_per_bar`` [unit/s per bar] damps
     vibrations of the load pressure.  Within ``stop_band`` [unit] a joint at rest is not corrected.
     ``velocity_filter_s`` filters the velocity where a PLC runs the law.
     """
 
-    kind: Literal["pd", "pid", "sliding_mode", "super_twisting"]
+    kind: str
     kp_1_s: float
     kd: float
     layer: float

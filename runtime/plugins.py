@@ -1,4 +1,4 @@
-"""Foreign methods, found by entry point: a package names a factory without arguments in its pyproject.toml."""
+"""Foreign methods, found by entry point: a package names a factory in its pyproject.toml (docs/how-to/extend.md)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class PluginError(CodedError, ValueError):
     """An entry point cannot be used; the sentence says why, and which there are."""
 
 
-def load_plugin(group: str, name: str) -> Any:
-    """What the factory of an entry point makes.
+def load_plugin(group: str, name: str, *arguments: Any) -> Any:
+    """What the factory of an entry point makes of the arguments; most take none.
 
     Raises:
         PluginError: no installed package has such an entry point, several have, or it cannot be loaded.
@@ -31,7 +31,7 @@ def load_plugin(group: str, name: str) -> Any:
             "one must, with a name of small letters, digits, - and _",
         )
     try:
-        return points[0].load()()
+        return points[0].load()(*arguments)
     except Exception as error:
         raise PluginError(
             "plugin.unusable", f"the entry point {points[0].value} of {group} cannot be loaded: {error!r}"

@@ -1,9 +1,10 @@
-"""Four feedback laws that turn a joint's error into a velocity correction, behind one interface.
+"""Feedback laws that turn a joint's error into a velocity correction, behind one interface: four own, and foreign ones.
 
 All are of the velocity type (docs/reference/machines.md section 4) and share one budget: ``kp_1_s`` is the small-signal
 gain inside the ``layer``, which `timberhand bench loop-design` bounds; how a law uses it is written here and nowhere
 else.  Sliding mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales
-2015, whose equations were not available.
+2015, whose equations were not available.  Any other ``kind`` is an entry point of the group ``timberhand.joint_laws``,
+a factory that takes the `Law` and returns a `Feedback` (docs/how-to/extend.md).
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from __future__ import annotations
 import math
 from typing import Final, Protocol
 
-from machine.profile import Law
+from controller.config import ConfigError
+from machine.profile import JOINT_LAWS, Law
+from runtime.plugins import PluginError, load_plugin
 
 REACHING_SHARE: Final = 0.5
 """Share of the budget in the switching term; the rest is the proportional term lambda e."""
@@ -122,12 +125,49 @@ class SuperTwisting:
         return self._lambda * error + self._kd * error_rate + reaching
 
 
+class Foreign:
+    """The law of another package.
+
+    It raises what that law raises, and ArithmeticError where it returns no finite number: the controller then ends, and
+    the valves are neutral when the next command is missing.
+    """
+
+    __slots__ = ("_kind", "_law")
+
+    def __init__(self, law: Law) -> None:
+        self._kind = law.kind
+        try:
+            self._law: Feedback = load_plugin(JOINT_LAWS, law.kind, law)
+        except PluginError as error:
+            raise ConfigError(error.code, str(error)) from error
+
+    def reset(self) -> None:
+        self._law.reset()
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        velocity = float(self._law.step(error, error_rate, elapsed_s, frozen))
+        if not math.isfinite(velocity):
+            raise ArithmeticError(f"the joint law {self._kind!r} returned {velocity}, not a velocity; correct the law")
+        return velocity
+
+
 LAWS: Final[dict[str, type[Pd] | type[Pid] | type[SlidingMode] | type[SuperTwisting]]] = {
     "pd": Pd,
     "pid": Pid,
     "sliding_mode": SlidingMode,
     "super_twisting": SuperTwisting,
 }
+"""The laws named in `machine.profile.OWN_LAWS`."""
+
+
+def law_of(law: Law) -> Pd | Pid | SlidingMode | SuperTwisting | Foreign:
+    """The law that a profile names.
+
+    Raises:
+        ConfigError: no installed package has such a law, or it cannot be loaded.
+    """
+    own = LAWS.get(law.kind)
+    return own(law) if own is not None else Foreign(law)
 
 
 def _within(value: float, limit: float) -> float:

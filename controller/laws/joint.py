@@ -18,7 +18,7 @@ from typing import Final
 from controller.laws.command_bound import CommandBound
 from controller.laws.delay_compensation import DelayCompensation
 from controller.laws.end_positioning import EndPositioning
-from controller.laws.feedback import LAWS
+from controller.laws.feedback import law_of
 from controller.laws.valve_map import ValveMap
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import JointSpec
@@ -73,7 +73,7 @@ class JointLaw:
     def __init__(self, spec: JointSpec, valve_map: ValveMap, period_s: float) -> None:
         law, valve = spec.law, spec.valve
         reaction_s = valve.delay_s + valve.lag_s
-        self._feedback = LAWS[law.kind](law)
+        self._feedback = law_of(law)
         self._flight = DelayCompensation(reaction_s, period_s)
         self._vibration = VibrationFilter()
         self._end_positioning = EndPositioning(spec)

@@ -1,6 +1,7 @@
 """The bridge process: ``python -m controller.plc --profile P --bus crane0=wire:crane0 --modbus 127.0.0.1:1502``.
 
-Emulates the machine's nodes on crane0 from the answers of a PLC on Ethernet, and passes the supervised commands on.
+Emulates the machine's nodes on crane0 from the answers of a PLC on Ethernet, or of a machine of one's own
+(``--machine``, `can_dbc.plc.machine`), and passes the supervised commands on.
 One asyncio loop, one thread.  Prints ``ready`` on stdout when it is on the bus, and one JSON line on stderr at its
 end.  It connects to loopback addresses only unless ``--allow-network`` is given; datagrams on a network need a key, or
 ``--no-key``, and Modbus has none.  Exit codes: 0 ended by SIGTERM, 2 usage, 3 configuration, 4 no bus or address at the
@@ -26,16 +27,18 @@ from can_dbc.dbc.codec import DbcError, load
 from can_dbc.frame import Frame
 from can_dbc.messages.key_file import KeyFileError, read_key
 from can_dbc.messages.udp_address import address_argument
+from can_dbc.plc.machine import MACHINES
 from can_dbc.plc.map import WordOrder
 from can_dbc.plc.modbus import is_loopback
 from controller.config import ConfigError
 from controller.plc.bridge import Bridge
 from controller.plc.handshake import Handshake
-from controller.plc.links import ModbusLink, UdpLink
+from controller.plc.links import Link, MachineLink, ModbusLink, UdpLink
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, prepare, stop_garbage_collection
 from machine.loading.profile_file import ProfileError, load_profile
 from runtime.allocator import keep_memory
+from runtime.plugins import PluginError, load_plugin
 
 STEP_S: Final = 0.005
 PRIORITY: Final = 70
@@ -56,6 +59,7 @@ def parser() -> argparse.ArgumentParser:
     link = made.add_mutually_exclusive_group(required=True)
     link.add_argument("--modbus", type=address_argument, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
     link.add_argument("--udp", type=address_argument, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
+    link.add_argument("--machine", metavar="NAME", help="a machine of another package, by its entry point")
     made.add_argument("--word-order", choices=("high", "low"), default="high", help="which half of 32 bits comes first")
     made.add_argument("--allow-network", action="store_true", help="the PLC may be on another host")
     made.add_argument("--key-file", type=Path, help="file with the key that authenticates the datagrams")
@@ -87,7 +91,7 @@ class Process:
         refused = f" {shake.replayed} old datagrams were refused." if shake.replayed else ""
         return f"{answers}{refused} The bus is {bus.stats.state.name}."
 
-    async def run(self, link: ModbusLink | UdpLink) -> None:
+    async def run(self, link: Link) -> None:
         """Run until cancelled."""
         loop = asyncio.get_running_loop()
         listening = -1
@@ -129,7 +133,7 @@ def summary(bridge: Bridge) -> str:
     )  # fmt: skip
 
 
-async def _until_ended(process: Process, link: ModbusLink | UdpLink, ended: list[int]) -> None:
+async def _until_ended(process: Process, link: Link, ended: list[int]) -> None:
     loop, task = asyncio.get_running_loop(), asyncio.create_task(process.run(link))
 
     def end(number: int) -> None:
@@ -166,10 +170,10 @@ def main(arguments: list[str] | None = None) -> int:
     name, _, where = options.bus.partition("=")
     if options.bus and (name != "crane0" or not where):
         made.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
-    host, port = options.modbus or options.udp
-    if options.modbus and options.key_file is not None:
-        made.error("--key-file: Modbus has no authentication; give --udp, or no key")
-    if not is_loopback(host):
+    host, port = options.modbus or options.udp or ("", 0)
+    if not options.udp and options.key_file is not None:
+        made.error("--key-file: only datagrams are authenticated; give --udp, or no key")
+    if host and not is_loopback(host):
         _check_network(made, options, host)
     keep_memory()
     ended: list[int] = []
@@ -178,15 +182,20 @@ def main(arguments: list[str] | None = None) -> int:
         key = None if options.key_file is None else read_key(options.key_file)
         shake = Handshake(order, key=key, first_sequence=secrets.randbits(31))
         bridge = Bridge(load_profile(options.profile), load("crane"), shake)
+        machine = load_plugin(MACHINES, options.machine) if options.machine else None
         with open_bus(where or default_address("crane0"), tx_queue=TX_QUEUE, participant="plc") as bus:
             if not options.no_realtime:
                 for refusal in prepare(PRIORITY):
                     sys.stderr.write(f"plc: not granted: {refusal}\n")
-            link = ModbusLink(bridge, host, port) if options.modbus else UdpLink(bridge, host, port)
+            link: Link
+            if machine is not None:
+                link = MachineLink(bridge, machine)
+            else:
+                link = ModbusLink(bridge, host, port) if options.modbus else UdpLink(bridge, host, port)
             stop_garbage_collection()
             asyncio.run(_until_ended(Process(bridge, bus), link, ended))
         sys.stderr.write(f"plc: {summary(bridge)}\n")
-    except (ConfigError, DbcError, KeyFileError, ProfileError) as error:
+    except (ConfigError, DbcError, KeyFileError, PluginError, ProfileError) as error:
         sys.stderr.write(f"plc: {error}\n")
         return 3
     except (BusError, OSError) as error:

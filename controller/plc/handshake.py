@@ -13,11 +13,13 @@ sides only increase, whatever the silence between; after 300 ms without a good a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from can_dbc.plc import datagram
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import DatagramRefused, Header
+from can_dbc.plc.machine import Machine
 from can_dbc.plc.map import Command, Feedback, MapError, State, WordOrder
 from can_dbc.timing.durations import Durations
 
@@ -35,7 +37,7 @@ _SENT_COUNT: Final = 64
 class Handshake:
     """One exchange with a PLC.  ``feedback`` is its newest good answer, None before the first.
 
-    ``sessions`` counts the conversations that began: sessions over UDP, connections over Modbus/TCP.  ``replayed``
+    ``sessions`` counts the conversations that began: sessions over UDP, connections otherwise.  ``replayed``
     counts datagrams that were good and old: of another session, with a number that is not new, or to an old command.
     """
 
@@ -65,7 +67,7 @@ class Handshake:
         return now_ns - self._acknowledged_ns <= FRESH_NS and self._acknowledged_ns > 0
 
     def connected(self) -> None:
-        """A Modbus connection has been made."""
+        """A connection has been made."""
         self.sessions += 1
 
     def registers(self, command: Command, now_ns: int) -> list[int]:
@@ -83,6 +85,12 @@ class Handshake:
         data = datagram.encode_command(header, command if self._session else Command(), self._key)
         self._note_sent(now_ns)
         return data
+
+    def exchange(self, machine: Machine, command: Command, now_ns: int) -> bool:
+        """One exchange with a machine in this process, which takes every command; raises what it raises."""
+        self._note_sent(now_ns)
+        machine.act(command)
+        return self._accept(replace(machine.observe(), accepted=self._sequence & 0xFFFF), now_ns)
 
     def accept_registers(self, registers: Sequence[int], now_ns: int) -> bool:
         """Use the status block of an exchange; False, and nothing used, when it is of another map or late."""

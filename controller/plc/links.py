@@ -1,4 +1,4 @@
-"""The two links to the PLC, each a coroutine beside the bridge: one exchange every 10 ms, nothing queued.
+"""The links to the PLC or to a machine of one's own, each a coroutine beside the bridge: an exchange every 10 ms.
 
 A connection that fails is closed at once and tried again after a pause that grows to a second.  The bridge detects the
 loss by the age of the last answer, not by the connection.
@@ -12,6 +12,7 @@ import socket
 import time
 from typing import Final
 
+from can_dbc.plc.machine import Machine
 from can_dbc.plc.map import MapError, check_identity
 from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
 from controller.plc.bridge import EXCHANGE_NS, Bridge
@@ -80,6 +81,35 @@ class ModbusLink:
         self._client.close()
 
 
+class MachineLink:
+    """A machine in this process (`can_dbc.plc.machine`)."""
+
+    def __init__(self, bridge: Bridge, machine: Machine) -> None:
+        self._bridge, self._machine = bridge, machine
+
+    async def run(self) -> None:
+        """Run until cancelled; an error of the machine that is no OSError ends the bridge."""
+        shake, pause = self._bridge.handshake, PAUSE_S
+        while True:
+            try:
+                self._machine.connect()
+                shake.connected()
+                pause, timer = PAUSE_S, ExchangeTimer()
+                while True:
+                    now_ns = time.monotonic_ns()
+                    shake.exchange(self._machine, self._bridge.command(now_ns), now_ns)
+                    await timer.wait()
+            except OSError as error:
+                shake.exchange_failed(f"The machine cannot be reached: {error}")
+                self.close()
+            await asyncio.sleep(pause)
+            pause = min(2.0 * pause, MAX_PAUSE_S)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._machine.disconnect()
+
+
 class UdpLink:
     """Cyclic datagrams, 100 Hz each way, from a socket that is bound to this PLC's address."""
 
@@ -115,3 +145,6 @@ class UdpLink:
         with contextlib.suppress(RuntimeError):
             asyncio.get_running_loop().remove_reader(self._socket.fileno())
         self._socket.close()
+
+
+Link = ModbusLink | UdpLink | MachineLink

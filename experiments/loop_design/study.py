@@ -15,6 +15,8 @@ import control
 import numpy as np
 
 from controller.config import Settings
+from controller.laws.feedback import LAWS
+from experiments.common.errors import ExperimentError
 from experiments.common.worlds import home_at, profile_named, trial_world
 from experiments.loop_design.loop import FREQUENCY_RAD_S, Array, LawResponse, Margins, Spool, margins, open_loop
 from experiments.loop_design.mechanics import Mechanics, mechanics
@@ -161,7 +163,17 @@ def case_set(source: str, truth: str = "nominal") -> CaseSet:
 
 
 def study(profile: Profile, work: CaseSet) -> list[JointStudy]:
-    """Study every joint with an encoder, with the gains of the profile."""
+    """Study every joint with an encoder, with the gains of the profile.
+
+    Raises:
+        ExperimentError: a joint has a law of another package, whose response nobody knows here.
+    """
+    foreign = sorted({spec.law.kind for name, spec in profile.joints.items() if name in work.places} - LAWS.keys())
+    if foreign:
+        raise ExperimentError(
+            "loop-design.foreign-law",
+            f"the response of the law {foreign[0]!r} is not known, only those of {', '.join(LAWS)}; try it in lockstep",
+        )
     return [_joint(profile, name, work) for name in work.places]
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from importlib.metadata import entry_points
 from itertools import pairwise
 from math import dist, hypot
 from typing import Final
@@ -18,6 +19,8 @@ from machine.joints import N_JOINTS, Joint
 from machine.loading.problem import Problem
 from machine.loading.ranges import ANGLE_RANGE, TURN_RAD, Range, check_range, out_of_range
 from machine.profile import (
+    JOINT_LAWS,
+    OWN_LAWS,
     Camera,
     Carrier,
     CarrierValve,
@@ -126,6 +129,10 @@ def _joint_problems(which: Joint, spec: JointSpec) -> Iterator[Problem]:
     yield from check_range(f"{path}.law.stop_band", spec.law.stop_band, (1e-5, 0.05, unit))
     yield from check_range(f"{path}.law.layer", spec.law.layer, (1e-4, 0.5, unit))
     yield from _valve_problems(path, spec, speed)
+    if spec.law.kind not in OWN_LAWS and not entry_points(group=JOINT_LAWS, name=spec.law.kind):
+        foreign = sorted(point.name for point in entry_points(group=JOINT_LAWS))
+        text = f'there is no joint law "{spec.law.kind}"; there are: {", ".join((*OWN_LAWS, *foreign))}'
+        yield Problem("profile.law-unknown", f"{path}.law.kind", text)
     if spec.encoder is not None:
         messages = tuple(_ENCODER_MESSAGES)
         yield from _encoder_problems(f"{path}.encoder", kind, (spec.lower, spec.upper), spec.encoder, unit, messages)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -18,9 +20,12 @@ from can_dbc.protocols.canopen import parse_heartbeat
 from can_dbc.protocols.e2e import Checker, Sender, Status
 from controller.config import ConfigError
 from controller.crane.startup import Startup
+from controller.plc import __main__ as process
+from controller.plc import links
 from controller.plc.__main__ import summary
 from controller.plc.bridge import Bridge, role_of
 from controller.plc.handshake import Handshake
+from hil.plc.profile import write_plc_profile
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
 from machine.status.modes import Mode as ControllerMode
@@ -508,3 +513,61 @@ def test_the_summary_of_an_exchange_is_json_with_the_emergency_stop_frame_as_hex
     rig.run(100)
     told = json.loads(summary(rig.bridge))
     assert told["answers"] > 0 and told["feedback"]["estop_frame"] == rig.feedback.estop_frame.hex()
+
+
+# -- a machine in this process -----------------------------------------------------------------------------------------
+
+
+class Flaky:
+    """Refuses its first connection, is lost at its third sample, and ends the test at its fifth."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def _note(self, call: str) -> int:
+        self.calls.append(call)
+        return self.calls.count(call)
+
+    def connect(self) -> None:
+        if self._note("connect") == 1:
+            raise ConnectionRefusedError("nobody listens")
+
+    def act(self, command: Command) -> None:
+        self._note("act")
+
+    def observe(self) -> Feedback:
+        count = self._note("observe")
+        if count == 3:
+            raise TimeoutError("no answer")
+        if count == 5:
+            raise asyncio.CancelledError
+        return Feedback(heartbeat=count, state=State.HOLD)
+
+    def disconnect(self) -> None:
+        self._note("disconnect")
+
+
+def test_a_machine_is_connected_again_after_every_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def at_once(_: float) -> None:
+        pass
+
+    monkeypatch.setattr(links.asyncio, "sleep", at_once)
+    bridge, machine = Bridge(profile("valves"), DATABASE), Flaky()
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(links.MachineLink(bridge, machine).run())
+    lost = ["connect", "disconnect"], ["connect", "act", "observe", "act", "observe", "act", "observe", "disconnect"]
+    assert machine.calls == [*lost[0], *lost[1], "connect", "act", "observe", "act", "observe"]
+    shake = bridge.handshake
+    assert (shake.sessions, shake.sent, shake.answers, shake.dropped) == (2, 5, 3, 2)
+    assert shake.feedback is not None and shake.feedback.accepted == 4, "the number of the command that it has executed"
+
+
+def test_a_machine_that_is_not_installed_ends_the_bridge_before_it_opens_a_bus(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(process, "keep_memory", lambda: None)
+    monkeypatch.setattr(process, "open_bus", lambda *_, **__: pytest.fail("a bus was opened"))
+    path = write_plc_profile("palms_471", "valves", tmp_path)
+    assert process.main(["--profile", str(path), "--machine", "nobody"]) == 3
+    with pytest.raises(SystemExit, match="2"):
+        process.main(["--profile", str(path), "--machine", "nobody", "--key-file", str(path)])

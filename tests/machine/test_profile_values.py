@@ -56,6 +56,7 @@ VALUES = [
      ("8200", "0.000383495", "+-1.572", "-1.74533..1.74533")),
     ({"joints.ext.encoder.total_counts": 204800},
      "profile.encoder-too-short", "joints.ext.encoder.total_counts", ("204800", "5e-06", "0.13..1.8")),
+    ({"joints.ext.law.kind": "nobody"}, "profile.law-unknown", "joints.ext.law.kind", ('"nobody"', "pid")),
     ({"joints.ext.kind": "revolute"}, "profile.joint-kind", "joints.ext.kind", ('"revolute"',)),
     ({"bunk.floor_z_m": -1.5}, "profile.bunk-below-ground", "bunk.floor_z_m", ("-1.5", "-1.39")),
     ({"timeouts.lease_max_ms": 5000}, "profile.out-of-range", "timeouts.lease_max_ms", ("5000", "20..500")),

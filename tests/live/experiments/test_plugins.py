@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,11 +15,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from autonomy.grasp.planner import GraspRequest, NoGrasp
 from autonomy.grasp.planners import GRASP_PLANNERS
-from autonomy.motion.arm import Arm
 from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.log_list.observation import LogObservation
 from experiments.common import plugins
 from experiments.common.errors import ExperimentError
 from experiments.common.plugins import SeenLog
@@ -26,12 +24,10 @@ from experiments.common.registry import Options
 from experiments.grasp_configs import pose_sources
 from experiments.grasp_configs.experiment import compare, jobs_of
 from host.exit_codes import ExitCode
-from machine.loading.profile_file import load_profile
 from tests.codes import coded
 from timberhand.cli import app
 
-EXAMPLE = Path(__file__).parents[3] / "docs" / "plugin-example"
-CLI_LIMIT = 100
+EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "extend"
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +36,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     there = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "install"]
     copy = there / "source"
-    copy.mkdir()
-    for name in ("pyproject.toml", "pca_grasp.py"):
-        (copy / name).write_bytes((EXAMPLE / name).read_bytes())
+    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     subprocess.run([*pip, "--no-deps", "--no-build-isolation", "--target", there / "lib", copy], check=True)
     return there / "lib"
 
@@ -50,26 +44,6 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(package))
-
-
-def log(x: float, y: float, yaw: float = 0.0) -> LogObservation:
-    return LogObservation(0, (x, y, -0.9), (float(np.cos(yaw)), float(np.sin(yaw)), 0.0), 3.0, 0.2)
-
-
-@pytest.mark.usefixtures("installed")
-def test_the_example_grasps_across_the_principal_axis_of_what_fits() -> None:
-    planner, arm = plugins.load(GRASP_PLANNERS, "pca"), Arm(load_profile("palms_471"))
-    found = planner(GraspRequest(arm, [log(4.0, 0.0), log(4.0, 0.25), log(4.0, 2.5), log(4.0, -0.5, 1.2)], 0.0))
-    assert sorted(found.logs) == [0, 1] and abs(found.y_m - 0.125) < 0.01 and abs(found.x_m - 4.0) < 0.01
-    assert abs(np.cos(found.yaw_rad)) < 0.01, "the jaws open across logs that lie along x"
-    with pytest.raises(NoGrasp):
-        planner(GraspRequest(arm, [log(40.0, 0.0)], 0.0))
-    with pytest.raises(NoGrasp):
-        planner(GraspRequest(arm, [log(4.0, 0.0)], 0.0, stay=(0,)))
-
-
-def test_the_example_is_short() -> None:
-    assert len((EXAMPLE / "pca_grasp.py").read_text().splitlines()) <= CLI_LIMIT
 
 
 @pytest.mark.usefixtures("installed")
@@ -95,7 +69,7 @@ def test_an_unknown_or_broken_method_is_refused_with_what_is_installed(
 @pytest.mark.usefixtures("installed")
 def test_another_content_of_the_method_is_another_run() -> None:
     name, value, digest = plugins.identity(GRASP_PLANNERS, "pca")
-    assert (name, value, len(digest)) == ("pca-grasp0.1", "pca_grasp:PcaPlanner", 64)
+    assert (name, value, len(digest)) == ("my-crane0.1", "my_crane.planner:PcaPlanner", 64)
     assert plugins.identity(GRASP_PLANNERS, "") == ()
 
 
