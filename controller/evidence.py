@@ -14,9 +14,8 @@ from controller.bus_io.message_state import MessageState, Signal, or_nan
 from controller.carrier.monitors import BEND_MARGIN_RAD, DISAGREE_RAD
 from controller.carrier.vehicle import Vehicle
 from controller.config import Settings
-from controller.crane.inputs import CraneInputs, spool_signals
+from controller.crane.inputs import HEARTBEAT_TIMEOUT_NS, CraneInputs, spool_signals
 from controller.crane.motion import Crane
-from controller.crane.nodes import HEARTBEAT_TIMEOUT_NS
 from controller.estimation.joint_estimator import JointEstimator
 from controller.requests.gate import RequestGate
 from controller.supervisor import (

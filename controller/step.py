@@ -63,7 +63,7 @@ class Controller:
     """
 
     __slots__ = (
-        "_last_ns", "_receive_sdo", "_reporter", "_sensed", "_settings", "carrier_bus", "crane", "crane_bus_monitor",
+        "_last_ns", "_period_ns", "_receive_sdo", "_reporter", "_sensed", "carrier_bus", "crane", "crane_bus_monitor",
         "crane_inputs", "estimators", "evidence", "gate", "inputs_in_use", "joint_watch", "outputs", "startup",
         "supervisor", "valve_watch", "vehicle", "writer",
     )  # fmt: skip
@@ -82,7 +82,7 @@ class Controller:
         specs = [joint(profile, j) for j in JOINTS]
         check_nodes(database, profile)
         period_s = settings.period_ns * 1e-9
-        self._settings = settings
+        self._period_ns = settings.period_ns
         self.crane_inputs = CraneInputs(database, profile)
         self.crane_bus_monitor = BusMonitor(0)
         carrier, articulation = profile.carrier, self.crane_inputs.articulation
@@ -125,7 +125,7 @@ class Controller:
 
     def elapse(self, now_ns: int) -> int:
         """Time since the previous tick [ns], bounded after a pause."""
-        elapsed_ns = min(now_ns - self._last_ns, MAX_ELAPSED_PERIODS * self._settings.period_ns)
+        elapsed_ns = min(now_ns - self._last_ns, MAX_ELAPSED_PERIODS * self._period_ns)
         self._last_ns = now_ns
         return elapsed_ns
 
@@ -177,7 +177,7 @@ class Controller:
     def accept(self, inputs: Inputs, now_ns: int) -> None:
         """Accept or refuse every datagram, the operator's first, and handle the reset button."""
         # After a skip the nominal time is less than one period behind the clock, however long the stall was.
-        late_ns = min(max(inputs.late_ns, 0), self._settings.period_ns)
+        late_ns = min(max(inputs.late_ns, 0), self._period_ns)
         for data in inputs.operator:
             self._accept(data, True, now_ns, late_ns)
         for data in inputs.datagrams:
@@ -284,7 +284,7 @@ class Controller:
 
     def supervise(self, inputs: Inputs, now_ns: int) -> None:
         """Check inputs, leases, a running spool test, the carrier and the joints; update the mode and its evidence."""
-        supervisor, period_ns = self.supervisor, self._settings.period_ns
+        supervisor, period_ns = self.supervisor, self._period_ns
         supervisor.supervise(inputs.late_ns, period_ns, now_ns)
         if supervisor.mode is _ACTIVE:
             self._check_leases(now_ns)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from can_dbc.messages.crane import CraneSetpoint
-from controller.crane.trajectory import Trajectory, extremes, peak_speed
+from controller.crane.reference_governor import Trajectory, extremes, peak_speed
 from controller.requests.setpoint_gate import RequestRefused
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint

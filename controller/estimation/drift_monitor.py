@@ -1,7 +1,7 @@
 """Drift monitor: does a joint creep away, by its encoder, while its valve is shut?  (docs/reference/safety.md case 3)
 
 An encoder that drifts slowly looks like a joint that moves.  While the reference stands, the law pulls the joint back
-by small pulses (`controller.laws.end_positioning`), so that the error stays small and nothing else shows: the real
+by small pulses (`controller.laws.joint.EndPositioning`), so that the error stays small and nothing else shows: the real
 joint wanders with the drift.  What shows is that the joint goes one way whenever its valve is shut and is commanded the
 other way whenever it is open.  Both ways are summed in leaky integrals.  A valve that leaks as fast looks the same, and
 deserves the same.  While the reference moves, the valve is open and the monitor is blind; what was commanded then is

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from controller.laws.delay_compensation import DelayCompensation
+from controller.laws.joint import DelayCompensation
 from machine.profile import Carrier
 
 ANGLE_GAIN: Final = 0.75

@@ -7,7 +7,7 @@ a free pendulum turns in its phase plane (theta, theta'/w) by w t.  (For small w
 
 The pin's displacement is pulled back with `RETURN_1_S`, so it ends where it began; this leads by atan(RETURN_1_S / w),
 which the prediction subtracts.  Displacement and velocity are added to the reference of the joint laws, which follow
-them and have nothing to correct.  At the end both are exactly zero, and `controller.laws.end_positioning` continues.
+them and have nothing to correct.  At the end both are exactly zero, and end positioning continues.
 
 Tangential swing is damped by the slew, radial swing by stick and telescope: one moves the pin across the stick, the
 other along it, nearly at right angles in every pose, so a level motion is never singular.  The boom, which carries most

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from controller.config import Settings
+from controller.crane.reference_governor import TimeScaling
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.laws.crane import LOADS, CraneLaw
-from controller.laws.time_scaling import TimeScaling
 from experiments.common.errors import ExperimentError
 from machine.joints import JOINTS, N_JOINTS
 from machine.loading.profile_file import profile_hash

@@ -9,10 +9,16 @@ from hypothesis import strategies as st
 
 from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.crane import FLOW_SHARE, CraneLaw
-from controller.laws.delay_compensation import DelayCompensation
-from controller.laws.end_positioning import INCH_SHARE, MAX_OPENING_SHARE, EndPositioning
 from controller.laws.feedback import INTEGRAL_SHARE, LAWS, PID_SHARE
-from controller.laws.joint import ACCELERATION_FACTOR, JointLaw, VibrationFilter
+from controller.laws.joint import (
+    ACCELERATION_FACTOR,
+    INCH_SHARE,
+    MAX_OPENING_SHARE,
+    DelayCompensation,
+    EndPositioning,
+    JointLaw,
+    VibrationFilter,
+)
 from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, Joint
 from machine.motion_limits import SPEED_HEADROOM_SHARE

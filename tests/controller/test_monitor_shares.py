@@ -7,8 +7,8 @@ import pytest
 
 from can_dbc.messages.crane import GrappleCommand
 from controller.estimation.drift_monitor import DriftMonitor
+from controller.estimation.joint_estimator import NoiseMonitor
 from controller.estimation.motion_monitor import MotionMonitor
-from controller.estimation.noise_monitor import NoiseMonitor
 from controller.estimation.speed_monitor import WINDOW_S, SpeedMonitor
 from controller.estimation.spool_monitor import SpoolMonitor
 from controller.estimation.standstill_monitor import StandstillMonitor

@@ -6,7 +6,7 @@ from collections import deque
 import pytest
 
 from controller.estimation.motion_monitor import EARLY_DELAY_S, LATE_DELAY_S, MotionMonitor
-from controller.laws.end_positioning import INCH_SHARE
+from controller.laws.joint import INCH_SHARE
 from machine.status.faults import FAULTS
 from machine.status.reasons import Reason
 from tests.controller.bench import SPECS, T

@@ -2,7 +2,7 @@
 
 from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import Emergency, emergency_frame, heartbeat_frame
-from controller.crane.nodes import HEARTBEAT_TIMEOUT_NS, NodeMonitor
+from controller.crane.inputs import HEARTBEAT_TIMEOUT_NS, NodeMonitor
 from machine.status.reasons import Reason
 from tests.controller.bench import MS, Bench
 

@@ -8,7 +8,7 @@ import pytest
 
 from controller.config import Settings
 from controller.crane.reference_governor import GROWTH_FACTOR
-from controller.laws.command_bound import LEAST_SHARE, MOST_SHARE, CommandBound
+from controller.laws.joint import LEAST_SHARE, MOST_SHARE, CommandBound
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from machine.status.reasons import Reason

@@ -12,7 +12,7 @@ from can_dbc.messages.crane import OperatorAction, StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import DatagramFault
 from can_dbc.messages.vehicle import DriveSetpoint, Steering
-from controller.crane.trajectory import extremes, hermite, peak_speed
+from controller.crane.reference_governor import extremes, hermite, peak_speed
 from machine.joints import Joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason

@@ -7,9 +7,15 @@ import pytest
 
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot
 from controller.config import Settings
-from controller.crane.reference_governor import ReferenceGovernor
-from controller.crane.trajectory import HISTORY_KNOTS, Trajectory
-from controller.laws.time_scaling import FLOW_SHARE, MAX_BEHIND_NS, RATE_CHANGE_1_S, TimeScaling
+from controller.crane.reference_governor import (
+    FLOW_SHARE,
+    HISTORY_KNOTS,
+    MAX_BEHIND_NS,
+    RATE_CHANGE_1_S,
+    ReferenceGovernor,
+    TimeScaling,
+    Trajectory,
+)
 from controller.laws.valve_map import ValveMap
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
