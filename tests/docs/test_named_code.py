@@ -55,3 +55,13 @@ def test_every_file_and_name_on_a_page_exists(page: str) -> None:
 def test_a_wrong_name_is_noticed() -> None:
     text = "`controller.step.stepp` `hil/none.py` `sim.nowhere.at`\n| x | `controller/step.py` | `Nobody.at_all` |\n"
     assert len(missing(text)) == 5
+
+
+def test_a_walk_of_the_tour_names_at_most_twelve_files() -> None:
+    walks = (ROOT / "docs" / "tour.md").read_text().split("\n## Walk ")[1:]
+    assert [len(set(FILE.findall(walk))) <= 12 for walk in walks] == [True] * 3
+
+
+def test_the_glossary_is_short_enough_to_be_read() -> None:
+    terms = re.findall(r"(?m)^\| (?!term \|)[^|]+ \|", (ROOT / "docs" / "glossary.md").read_text())
+    assert 100 < len(terms) <= 150
