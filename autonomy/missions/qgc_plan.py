@@ -111,7 +111,8 @@ class _Reader:
             path: Path = ("mission", "items", i)
             if not isinstance(item, dict):
                 raise self.source.error("plan.item", path, "this is not a mission item")
-            command, given = item.get("command"), item.get("params")
+            command: Any = item.get("command")
+            given = item.get("params")
             if item.get("type") == "ComplexItem":
                 self.not_driven.setdefault(str(item.get("complexItemType", "complex item"))[:40], []).append(path)
             elif command in (NAV_WAYPOINT, NAV_SPLINE_WAYPOINT):
