@@ -34,8 +34,9 @@ from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.layout import GuardConfigError, read_layouts
 from controller.guard.operator import OperatorActions
 from controller.process.bus_link import BusLink
-from controller.process.realtime import Notifier, prepare, sleep_until, stop_garbage_collection
+from controller.process.realtime import prepare, sleep_until, stop_garbage_collection
 from runtime.allocator import keep_memory
+from runtime.notifier import Notifier
 
 PERIOD_NS: Final = 5_000_000
 PRIORITY: Final = 85

@@ -35,9 +35,10 @@ from controller.plc.bridge import Bridge
 from controller.plc.handshake import Handshake
 from controller.plc.links import Link, MachineLink, ModbusLink, UdpLink
 from controller.process.bus_link import BusLink
-from controller.process.realtime import Notifier, prepare, stop_garbage_collection
+from controller.process.realtime import prepare, stop_garbage_collection
 from machine.loading.profile_file import ProfileError, load_profile
 from runtime.allocator import keep_memory
+from runtime.notifier import Notifier
 from runtime.plugins import PluginError, load_plugin
 
 STEP_S: Final = 0.005

@@ -20,11 +20,11 @@ from controller.guard.__main__ import run as run_guard
 from controller.guard.latch_file import LatchFile
 from controller.guard.operator import OperatorActions
 from controller.process.loop import Loop
-from controller.process.realtime import Notifier
 from controller.process.timing import LoopTiming
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
 from machine.status.modes import Mode
+from runtime.notifier import Notifier
 from tests.codes import numbers_in
 
 MS = 1_000_000
