@@ -21,7 +21,9 @@ from can_dbc.timing.page import Facts, InputAge, Timing, TimingRefused, default_
 from host.exit_codes import ExitCode
 from host.systemd import last_journal_line, show_all
 
-NAMES: Final = ("controller", "guard", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0", "update")
+NAMES: Final = (
+    "controller", "guard", "perception", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0", "update",
+)  # fmt: skip
 PROPERTIES: Final = (
     "Id", "Type", "LoadState", "ActiveState", "SubState", "Result", "ExecMainStatus", "NRestarts", "StatusText",
     "StateChangeTimestampMonotonic", "ExecMainExitTimestampMonotonic",

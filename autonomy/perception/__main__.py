@@ -10,14 +10,17 @@ there is no reply.  A request without joints, as from a page that only displays 
 for a picture the last measured one (``can_dbc.messages.picture``).  ``--frames`` is the address of a server of frames
 (``can_dbc.messages.rgbd``), ``zed`` for a Stereolabs camera on this computer, or a folder of frames.
 
-JSON lines on stdout: ``ready`` with the port, ``trouble`` with its reason.  SIGTERM and SIGINT end the process.
-Exit codes: 0 ended, 2 usage, 3 profile, camera or weights, 4 port.
+JSON lines on stdout: ``ready`` with the port, ``trouble`` with its reason.  systemd is told that it is ready, how many
+lists it makes, and ten times a second that it lives (`runtime.notifier`): a camera that hangs ends that.  SIGTERM and
+SIGINT end the process.  Exit codes: 0 ended, 2 usage, 3 profile, name of the camera, frames or weights, 4 port, or a
+camera that cannot be opened now.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import select
 import signal
 import socket
 import sys
@@ -25,7 +28,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import msgspec
 import numpy as np
@@ -49,8 +52,12 @@ from machine.geometry.optics import Intrinsics
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
 from runtime.allocator import keep_memory
+from runtime.notifier import Notifier
 
 EXIT_OK, EXIT_CONFIGURATION, EXIT_PORT = 0, 3, 4
+COMES_BACK: Final = "camera-source.not-opened"
+"""Code of a camera that is not there now."""
+POLL_S: Final = 0.1
 FRAME_TIMEOUT_S: Final = 0.5
 FRAME_PX: Final = 608
 """Size of paper B's pictures."""
@@ -98,27 +105,78 @@ def write_line(**fields: object) -> None:
     sys.stdout.flush()
 
 
+class Requests(Protocol):
+    """`StandingRequests` or `DrivingRequests`."""
+
+    lists: int
+
+    @property
+    def log_count(self) -> int:
+        """Number of logs in the last list."""
+
+    @property
+    def problem(self) -> str:
+        """Why there is no list now."""
+
+    def answer_waiting(self) -> None:
+        """Answer the requests that wait."""
+
+
+class StatusText:
+    """The status for systemd and ``timberhand service status``: lists per second since the last call, or trouble."""
+
+    def __init__(self, camera: str, requests: Requests, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._camera, self._requests, self._clock_ns = camera, requests, now_ns
+        self._lists, self._begin_ns = 0, now_ns()
+
+    def __call__(self) -> str:
+        """One line."""
+        requests, now_ns = self._requests, self._clock_ns()
+        rate_hz = 1e9 * (requests.lists - self._lists) / max(now_ns - self._begin_ns, 1)
+        self._lists, self._begin_ns = requests.lists, now_ns
+        if requests.problem:
+            return f"No logs: {requests.problem}"
+        if not requests.lists:
+            return f"Camera {self._camera} waits for a planner."
+        return f"Camera {self._camera}: {requests.log_count} logs, {rate_hz:.1f} lists per second."
+
+
+def serve(link: socket.socket, requests: Requests, notifier: Notifier, signals: list[int]) -> None:
+    """Reply until a signal arrives."""
+    while not signals:
+        notifier.tick_done(time.monotonic_ns(), True)
+        if select.select([link], [], [], POLL_S)[0]:
+            requests.answer_waiting()
+    notifier.stopping()
+
+
 MASKS: Final = {"masks": "rgbd", "masks-depth": "depth", "masks-colour": "colour"}
 """Variants of the mask network by their mode: for looks that the drawn pictures do not have."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run until a signal arrives; returns the exit code."""
+def command_line() -> argparse.ArgumentParser:
+    """The options."""
     parser = argparse.ArgumentParser(
         prog="python -m autonomy.perception", description="Detect logs in the pictures of a camera."
     )
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
-    parser.add_argument("--camera", required=True, help="name of the camera in the profile")
+    parser.add_argument("--camera", help="name of the camera in the profile (default: its first one)")
     parser.add_argument("--frames", required=True, metavar="HOST:PORT|zed|FOLDER", help="source of the pictures")
     parser.add_argument("--port", type=int, default=0, help="UDP port of the log list (default: any free port)")
     parser.add_argument("--variant", choices=("rgbd", "depth", *MASKS), default="rgbd", help="network and its input")
     parser.add_argument("--driving", action="store_true", help="the machine drives, and its planner says where it is")
     parser.add_argument("--localizer", choices=LOCALIZERS, default="ours", help="with --driving: how masks become logs")
     parser.add_argument("--weights", type=Path, help="weights of the network (default: the shipped weights)")
-    options = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run until a signal arrives; returns the exit code."""
+    options = command_line().parse_args(argv)
     keep_memory()
     try:
         profile = load_profile(options.profile)
+        options.camera = options.camera or next(iter(profile.cameras), "")
         if options.camera not in profile.cameras:
             known = ", ".join(profile.cameras) or "none"
             return _fail(f"{profile.name} has no camera {options.camera!r}; it has: {known}")
@@ -129,7 +187,7 @@ def main(argv: list[str] | None = None) -> int:
             segmenter = LogSegmenter(options.variant, options.weights)
         source = open_source(options.frames, options.camera, profile)
     except (ProfileError, WeightsError, SourceError) as error:
-        return _fail(str(error))
+        return _fail(str(error), EXIT_PORT if error.code == COMES_BACK else EXIT_CONFIGURATION)
     warm_up(segmenter)
     segment = segmenter.segment
     signals: list[int] = []
@@ -147,13 +205,15 @@ def main(argv: list[str] | None = None) -> int:
             pictures.keep(picture, time.monotonic_ns())
 
         try:
+            requests: Requests
             if options.driving:
                 localizer = LOCALIZERS[options.localizer](profile)
                 detector = DrivingLogDetector(profile, options.camera, source, segment, localizer, measured)
-                DrivingRequests(detector, link, partial(asked_ns, source), write_trouble, pictures).serve(signals)
+                requests = DrivingRequests(detector, link, partial(asked_ns, source), write_trouble, pictures)
             else:
                 still = LogDetector(profile, options.camera, source, segment, measured)
-                StandingRequests(still, link, write_trouble, pictures).serve(signals)
+                requests = StandingRequests(still, link, write_trouble, pictures)
+            serve(link, requests, Notifier(StatusText(options.camera, requests)), signals)
         finally:
             source.close()
     return EXIT_OK

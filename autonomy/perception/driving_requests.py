@@ -7,7 +7,6 @@ standpoint, as from a page that only displays logs, gets the last list in the ba
 
 from __future__ import annotations
 
-import select
 import socket
 import time
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.shown_picture import NewestPicture
 from autonomy.perception.sources.camera_source import CameraSource
 
-POLL_S: Final = 0.2
 MAX_REQUEST_BYTES: Final = 2048
 Address = tuple[str, int]
 
@@ -60,12 +58,18 @@ class DrivingRequests:
         self._logs: tuple[LogObservation, ...] = ()
         self._base: Pose | None = None
         self._reported = ""
+        self.lists = 0
+        """Number of lists that were measured."""
 
-    def serve(self, signals: list[int]) -> None:
-        """Reply until a signal arrives."""
-        while not signals:
-            if select.select([self._link], [], [], POLL_S)[0]:
-                self.answer_waiting()
+    @property
+    def log_count(self) -> int:
+        """Number of logs in the last list."""
+        return len(self._logs)
+
+    @property
+    def problem(self) -> str:
+        """Why the last picture gave no list; empty when it did."""
+        return self._reported
 
     def answer_waiting(self) -> None:
         """Answer the requests that wait: one picture for the newest standpoint, the last list for every page."""
@@ -103,6 +107,7 @@ class DrivingRequests:
         logs = self._detector.detect_in_plane(standing, request.q)
         if logs is not None:
             self._logs, self._base = logs, standpoint.base
+            self.lists += 1
             self._send(encode_logs(logs, in_plane=True), sender)
         problem = self._detector.problem
         if problem and problem != self._reported:

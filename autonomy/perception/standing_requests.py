@@ -8,7 +8,6 @@ waiting behind detections.
 from __future__ import annotations
 
 import math
-import select
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,6 @@ from autonomy.perception.log_list.datagrams import LogListError, decode_request,
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.shown_picture import NewestPicture
 
-POLL_S: Final = 0.2
 MAX_REQUEST_BYTES: Final = 2048
 Address = tuple[str, int]
 
@@ -49,12 +47,18 @@ class StandingRequests:
     ) -> None:
         self._detector, self._link, self._report, self._pictures = detector, link, report, pictures
         self._reported = ""
+        self.lists = 0
+        """Number of lists that were measured."""
 
-    def serve(self, signals: list[int]) -> None:
-        """Reply until a signal arrives."""
-        while not signals:
-            if select.select([self._link], [], [], POLL_S)[0]:
-                self.answer_waiting()
+    @property
+    def log_count(self) -> int:
+        """Number of logs in the last list."""
+        return len(self._detector.logs)
+
+    @property
+    def problem(self) -> str:
+        """Why the last request for a detection gave no list; empty when it did, or the crane moved."""
+        return self._detector.problem
 
     def answer_waiting(self) -> None:
         """Answer the requests that wait: a detection for the newest joints, the last list for every page."""
@@ -80,6 +84,7 @@ class StandingRequests:
     def _detect(self, q: tuple[float, ...], sender: Address) -> None:
         logs = self._detector.detect(q, time.monotonic_ns())
         if logs is not None:
+            self.lists += 1
             self._send(encode_logs(logs), sender)
         problem = self._detector.problem
         if problem and problem != self._reported:

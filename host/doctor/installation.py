@@ -1,4 +1,4 @@
-"""Checks the installation: Python, packages, the compiled tick, profiles, buses, vcan lab, directories, ports, key.
+"""Checks the installation: Python, packages, the compiled tick, profiles, buses, camera, lab, places, ports, key.
 
 Reads the running system.  Only what prevents every run is a FAULT: a missing package, a profile that does not load.
 Packages and versions come from the metadata of the distribution.
@@ -6,6 +6,7 @@ Packages and versions come from the metadata of the distribution.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
@@ -45,7 +46,7 @@ ADVICE, CHANGE, FAULT = Severity.ADVICE, Severity.CHANGE, Severity.FAULT
 
 def examine() -> tuple[Finding, ...]:
     """All findings, in the order in which to correct them."""
-    before = (python(), *packages(), tick(), *profiles(), *buses(), vcan_lab(), kernel_of_lab())
+    before = (python(), *packages(), tick(), *profiles(), *buses(), *camera(), vcan_lab(), kernel_of_lab())
     return (*before, *places(), ports(), *key(), *signed())
 
 
@@ -131,6 +132,25 @@ def buses() -> Iterator[Finding]:
             wrong = f"{setting}={address} in {CONF}, but there is no interface {name}"
             commands = (f"sudo nano {CONF}", "ip -brief link show type can")
             yield Finding("buses", CHANGE, wrong, "the controller service finds its bus", commands)
+
+
+def camera() -> Iterator[Finding]:
+    """The camera of the services, by the settings: whether what delivers its pictures is there."""
+    settings = _settings()
+    if "SCENE" not in settings:
+        return
+    gain, change = "the planner is told where logs lie", f"sudo nano {CONF}"
+    name, frames = settings.get("CAMERA", ""), settings.get("CAMERA_FRAMES", "")
+    if not frames:
+        wrong = f"CAMERA_FRAMES is empty in {CONF}, so another program must detect logs at {settings['SCENE']}"
+        yield Finding("camera", ADVICE, wrong, gain, (change,))
+    elif frames == "zed" and importlib.util.find_spec("pyzed") is None:
+        wrong = "CAMERA_FRAMES=zed, and the ZED SDK's Python API (pyzed) is not installed beside this program"
+        yield Finding("camera", CHANGE, wrong, gain, ("python /usr/local/zed/get_python_api.py", change))
+    elif "/" in frames and not Path(frames).is_dir():
+        yield Finding("camera", CHANGE, f"CAMERA_FRAMES={frames} is no folder", gain, (f"ls -ld {frames}", change))
+    else:
+        yield fine("camera", f"{name or 'the first of the profile'}, with pictures from {frames}")
 
 
 def vcan_lab() -> Finding:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, TextIO
 
 from can_dbc.messages.key_file import SERVICE_KEY, read_key
-from host.service_lab import authority, lost_bus, trial, updates
+from host.service_lab import authority, lost_bus, perception, trial, updates
 from host.service_lab.pilot import Pilot
 from host.systemd import journal, main_pid, process_facts, show, systemctl
 from recorder.mcap_scan import Stored, scan
@@ -28,7 +28,9 @@ from recorder.recorder import TIMING
 
 PROGRAM: Final = "/opt/timberhand/current/bin/timberhand"
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
-SERVICES: Final = ("controller", "guard", "recorder", "autonomy", "console")
+SERVICES: Final = ("controller", "guard", "perception", "recorder", "autonomy", "console")
+PLANT_PORT: Final = 24720
+CAMERA_PORT: Final = 24721
 FIFO: Final = {"controller": 80, "guard": 85}
 READY_S: Final = 2.0
 SLOW_PYTHON_S: Final = 0.3
@@ -115,6 +117,8 @@ def change_settings(check: Check) -> dict[str, str]:
     text = CONF.read_text()
     check.expect("\nCONTROLLER_OPTIONS=\n" in text, "the settings have no CONTROLLER_OPTIONS")
     CONF.write_text(text.replace("\nCONTROLLER_OPTIONS=\n", "\nCONTROLLER_OPTIONS=--cpu 0 --dma-latency\n"))
+    check.expect("\nCAMERA_FRAMES=zed\n" in text, "the settings have no CAMERA_FRAMES")
+    CONF.write_text(CONF.read_text().replace("\nCAMERA_FRAMES=zed\n", f"\nCAMERA_FRAMES=127.0.0.1:{CAMERA_PORT}\n"))
     return dict(line.partition("=")[::2] for line in CONF.read_text().splitlines() if line and line[0] != "#")
 
 
@@ -185,13 +189,14 @@ def _state(page: str) -> Any:
 
 
 def wait_for_work(check: Check, page: str) -> None:
-    """Start the target; wait until the services without READY notification work: page, recorder, planner."""
+    """Start the target; wait until page, recorder, planner and perception work."""
     started = systemctl("start", "timberhand.target")
     check.expect(started.returncode == 0, f"the target does not start: {started.stderr}")
     checks: dict[str, Callable[[], object]] = {
         # Page and recorder read the controller's timing page as different users.
         "console": lambda: _state(page)["timing"],
         "recorder": lambda: any(map(has_timing, Path("/var/lib/timberhand").glob("*/run.mcap"))),
+        "perception": lambda: show(perception.UNIT, "ActiveState")["ActiveState"] == "active",
         "autonomy": lambda: any('"event":"phase"' in line for line in journal("timberhand-autonomy.service")),
     }
     limit_s = time.monotonic() + WORK_S
@@ -336,11 +341,12 @@ def run(check: Check, order: dict[str, str]) -> None:
     conf = change_settings(check)
     bus_without_interface(check)
     plug_in(check)
-    plant_port = int(conf["SCENE"].rpartition(":")[2])
-    plant = start_plant(check, str(plant_port))
+    plant = start_plant(check, str(PLANT_PORT))
     cold_start(check)
     inspect(check, f"http://127.0.0.1:{conf['CONSOLE_PORT']}/")
     check_status_command(check)
+    for name, value in perception.try_perception(CAMERA_PORT, check.expect, check.step).items():
+        check.result["figures"][f"perception_{name}"] = value
     for name, value in updates.try_updates(order, plant, check.expect, check.step).items():
         check.result["figures"][f"update_{name}"] = value
     systemctl("stop", "timberhand-autonomy.service")  # the pilot replaces the planner
@@ -348,7 +354,7 @@ def run(check: Check, order: dict[str, str]) -> None:
     pilot = Pilot(conf["PROFILE"], ports[0], authority.OPERATORS, ports[1], conf["CRANE_BUS"], read_key(SERVICE_KEY))
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PILOT_PRIORITY))
     end_services(check, pilot)
-    buses_lost(check, pilot, plant_port)
+    buses_lost(check, pilot, PLANT_PORT)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     plant.terminate()
     CONF.write_text(shipped)

@@ -142,6 +142,19 @@ def test_a_zed_that_cannot_be_opened_is_late_or_disconnected() -> None:
         ZedCamera("front", sdk=fake_sdk(grabbed="UNPLUGGED", opened=False)).frame()
 
 
+def test_a_zed_that_was_pulled_is_opened_again_when_it_is_back() -> None:
+    sdk = fake_sdk(grabbed="UNPLUGGED", opened=False)
+    camera = ZedCamera("front", sdk=sdk)
+    with pytest.raises(SourceError, check=coded("camera-source.disconnected")):
+        camera.frame()
+    sdk.Camera.open = lambda _self, _settings: "CAMERA NOT DETECTED"
+    with pytest.raises(SourceError, check=coded("camera-source.not-opened")):
+        camera.frame()
+    sdk.Camera.open, sdk.Camera.grab = (lambda _self, _settings: "SUCCESS"), (lambda _self: "SUCCESS")
+    frame = camera.frame()
+    assert frame is not None and frame.stamp_ns == 77
+
+
 def test_a_zed_without_its_sdk_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyzed", None)
     with pytest.raises(SourceError, check=coded("camera-source.no-sdk")) as told:

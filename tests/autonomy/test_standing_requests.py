@@ -67,6 +67,7 @@ def test_of_waiting_requests_only_the_newest_gets_a_detection(served: Served) ->
         served.asker.recv(4096)
     served.asker.send(encode_request(Q[3]))
     served.requests.answer_waiting()
+    assert (served.requests.lists, served.requests.log_count, served.requests.problem) == (1, 1, "")
     assert decode_logs(served.asker.recv(4096)) == (LOG,)
 
 
@@ -85,6 +86,6 @@ def test_a_problem_is_reported_once_and_a_bad_request_is_answered(served: Served
         served.detector.detected.clear()
         served.asker.send(encode_request(Q[0]))
         served.requests.answer_waiting()
-    assert served.troubles == ["no picture"]
+    assert served.troubles == ["no picture"] and served.requests.lists == 0
     with pytest.raises(LogListError, check=coded("log-list.detector-error")):
         decode_logs(served.asker.recv(4096))

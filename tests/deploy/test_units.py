@@ -16,8 +16,8 @@ CONF = dict(
     if not line.startswith("#") and line
 )
 EXPOSURE = {
-    "controller": 1.3, "guard": 1.0, "autonomy": 0.9, "recorder": 1.1, "console": 1.1, "plc": 1.4, "can@": 1.1,
-    "update": 1.2,
+    "controller": 1.3, "guard": 1.0, "autonomy": 1.0, "recorder": 1.1, "console": 1.1, "plc": 1.4, "can@": 1.1,
+    "update": 1.2, "perception": 1.5,
 }  # fmt: skip
 """Exposure of each unit by systemd-analyze, of 10; at most 1.5."""
 EPHEMERAL = 32768
@@ -29,8 +29,11 @@ INTENDED = {
     "IPAddressAllow",
     "PrivateUsers",
     "CapabilityBoundingSet",
+    "MemoryDenyWriteExecute",
+    "PrivateDevices",
 }
-"""Hardening settings that may differ between units: FIFO, CAN, network, and interface configuration."""
+"""Hardening settings that may differ between units: FIFO, CAN, network, interface configuration, compiled
+networks, and cameras."""
 
 
 def short(unit: Path) -> str:
@@ -61,6 +64,9 @@ def test_the_hardening_is_the_same_everywhere() -> None:
             more.add("SystemCallFilter=sched_setscheduler sched_setaffinity mlockall")
         if short(unit) == "controller":
             more |= {"BindPaths=-/dev/cpu_dma_latency", "DeviceAllow=/dev/cpu_dma_latency rw"}
+        if short(unit) == "perception":
+            devices = ("usb_device", "video4linux", "hidraw", "nvidia*")
+            more |= {f"DeviceAllow=char-{device} rw" for device in devices}
         if short(unit) == "update":
             more.add("ReadWritePaths=/opt/timberhand")
         assert body - common == more, unit.name
@@ -79,9 +85,17 @@ def test_only_the_control_processes_are_real_time_and_the_guard_has_the_highest_
         assert setting(unit, "LimitMEMLOCK") == ["infinity"]
 
 
+def test_only_what_runs_networks_may_make_machine_code_and_only_the_camera_sees_devices() -> None:
+    loose = {short(unit) for unit in UNITS if setting(unit, "MemoryDenyWriteExecute") == ["no"]}
+    assert loose == {"perception", "autonomy"}
+    assert {short(unit) for unit in UNITS if setting(unit, "PrivateDevices") == ["no"]} == {"perception"}
+    unit = DEPLOY / "units/timberhand-perception.service"
+    assert setting(unit, "Type") == ["notify"] and int(setting(unit, "WatchdogSec")[0]) <= 10
+
+
 def test_every_process_has_its_own_user_created_by_the_installation() -> None:
     users = [setting(unit, "User")[0] for unit in UNITS]
-    made = set(re.findall(r"^u (\S+)", (DEPLOY / "system/sysusers.conf").read_text(), re.MULTILINE))
+    made = set(re.findall(r'^u (\S+) - "[^"]+" \S+ -$', (DEPLOY / "system/sysusers.conf").read_text(), re.MULTILINE))
     assert len(set(users)) == len(users)
     assert set(users) == made | {"root"}
     assert setting(DEPLOY / "units/timberhand-update.service", "User") == ["root"], "nobody else changes the release"
@@ -134,7 +148,9 @@ def test_the_ports_of_the_settings_may_be_opened_by_the_services_that_use_them()
     for name, value in CONF.items():
         if name.endswith("_PORT"):
             assert int(value) in ranges["tcp" if name == "CONSOLE_PORT" else "udp"], name
-    users = {"controller": {"udp"}, "autonomy": {"udp"}, "recorder": {"udp"}, "console": {"udp", "tcp"}}
+    users = {name: {"udp"} for name in ("controller", "perception", "autonomy", "recorder")} | {
+        "console": {"udp", "tcp"}
+    }
     for unit in UNITS:
         allowed = {
             f"ipv4:{kind}:{ports[0]}-{ports[-1]}"

@@ -258,6 +258,26 @@ def test_the_key_of_the_services_is_there_and_secret(
     assert (found.severity, sentence in found.sentence) == (severity, True)
 
 
+@pytest.mark.parametrize(
+    ("camera", "frames", "severity"),
+    [
+        ("stick", "", Severity.ADVICE),
+        ("stick", "zed", Severity.CHANGE),
+        ("stick", "/no/such/folder", Severity.CHANGE),
+        ("stick", "127.0.0.1:24711", Severity.FINE),
+    ],
+)
+def test_what_delivers_the_pictures_is_looked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, camera: str, frames: str, severity: Severity
+) -> None:
+    monkeypatch.setattr(installation, "CONF", tmp_path / "timberhand.conf")
+    assert list(installation.camera()) == []
+    text = f"CAMERA={camera}\nCAMERA_FRAMES={frames}\nSCENE=127.0.0.1:24710\n"
+    (tmp_path / "timberhand.conf").write_text(text)
+    (found,) = installation.camera()
+    assert found.severity is severity
+
+
 def test_a_missing_package_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     needs = ["no-such-thing>=1", "typer>=999", "pybullet; extra == 'sim'", "nor-this-one; extra == 'sim'"]
     monkeypatch.setattr(installation.metadata, "requires", lambda _: needs)

@@ -44,6 +44,7 @@ def test_the_shipped_settings_have_no_problem() -> None:
         (changed("PROFILE", "aoro_fc8"), "MACHINE_BUS", "MACHINE_BUS="),
         (changed("PROFILE", "palms"), "PROFILE=palms", "PROFILE"),
         (changed("PLC", "--modbus 192.168.7.2:502"), "[plc]", "PLC="),
+        (changed("CAMERA", "moon"), "d435", "CAMERA="),
         (TEXT + "CRANE_BUSS=x\n", "CRANE_BUS", "CRANE_BUSS"),
         (TEXT + "KEY_OPTIONS=\n", "KEY_OPTIONS", "KEY_OPTIONS"),
         (TEXT + "CRANE_BUS = x\n", "CRANE_BUS", "CRANE_BUS = x"),

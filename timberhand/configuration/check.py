@@ -104,12 +104,16 @@ def _machine(settings: dict[str, Setting], named: Setting) -> Iterator[Problem]:
 
 
 def _fit(settings: dict[str, Setting], profile: Profile) -> Iterator[Problem]:
-    """Whether buses and PLC are those of the machine."""
+    """Whether buses, camera and PLC are those of the machine."""
     bus = settings.get("MACHINE_BUS")
     if bus is not None and profile.carrier is not None and not bus.value:
         yield Problem(bus.line, f"{profile.name} drives and needs MACHINE_BUS, as in socketcan:mach0")
     if bus is not None and profile.carrier is None and bus.value:
         yield Problem(bus.line, f"{profile.name} stands and has no machine bus; leave MACHINE_BUS empty")
+    camera = settings.get("CAMERA")
+    if camera is not None and camera.value and camera.value not in profile.cameras:
+        known = ", ".join(profile.cameras) or "none"
+        yield Problem(camera.line, f"{profile.name} has no camera {camera.value}; it has: {known}")
     plc = settings.get("PLC")
     if plc is not None and plc.value and profile.plc is None:
         yield Problem(plc.line, f"{profile.name} has no [plc] table (docs/how-to/plc.md); add it, or leave PLC empty")

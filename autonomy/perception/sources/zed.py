@@ -15,7 +15,8 @@ from machine.geometry.optics import Intrinsics
 class ZedCamera:
     """The rectified left picture and the depth registered to it; ``name`` is the camera's name in the profile.
 
-    ``sdk`` defaults to ``pyzed.sl``.  The intrinsics are the SDK's for the delivered resolution.
+    ``sdk`` defaults to ``pyzed.sl``.  The intrinsics are the SDK's for the delivered resolution.  A camera that was
+    disconnected is opened again by the next call of `frame` at which it is there.
 
     Raises:
         SourceError: the SDK is missing, or the camera cannot be opened.
@@ -34,30 +35,37 @@ class ZedCamera:
         settings.camera_fps = rate_hz
         settings.coordinate_units = sl.UNIT.METER
         settings.depth_mode = sl.DEPTH_MODE.ULTRA
-        self._camera = sl.Camera()
-        state = self._camera.open(settings)
-        if state != sl.ERROR_CODE.SUCCESS:
+        self._settings, self._camera = settings, sl.Camera()
+        self._picture, self._depth = sl.Mat(), sl.Mat()
+        self._open()
+
+    def _open(self) -> None:
+        state = self._camera.open(self._settings)
+        if state != self._sl.ERROR_CODE.SUCCESS:
             raise SourceError(
                 "camera-source.not-opened",
-                f"camera {name} cannot be opened: {state}; check its cable and that no other process uses it",
+                f"camera {self._name} cannot be opened: {state}; check its cable and that no other process uses it",
             )
         configuration = self._camera.get_camera_information().camera_configuration
         left, size = configuration.calibration_parameters.left_cam, configuration.resolution
         pin = Intrinsics(int(size.width), int(size.height), *(float(v) for v in (left.fx, left.fy, left.cx, left.cy)))
-        self._pin = pin
-        self._picture, self._depth = sl.Mat(), sl.Mat()
+        self._pin, self._lost = pin, False
 
     def frame(self) -> RgbdFrame | None:
         """The next frame; None when the camera delivered none in time.
 
         Raises:
-            SourceError: the camera is disconnected.
+            SourceError: the camera is disconnected, or not back yet.
         """
         sl, camera = self._sl, self._camera
+        if self._lost:
+            self._open()
         state = camera.grab()
         if state != sl.ERROR_CODE.SUCCESS:
             if camera.is_opened():
                 return None
+            self._lost = True
+            camera.close()
             raise SourceError(
                 "camera-source.disconnected", f"camera {self._name} is disconnected: {state}; check its cable"
             )

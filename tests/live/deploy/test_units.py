@@ -13,6 +13,7 @@ import pytest
 from typer.main import get_command
 
 from autonomy.__main__ import arguments as autonomy_arguments
+from autonomy.perception.__main__ import command_line as perception_parser
 from console.__main__ import command_line as console_command_line
 from controller.plc.__main__ import parser as plc_parser
 from controller.process.command import parser as controller_parser
@@ -32,8 +33,8 @@ CONF = dict(
     if not line.startswith("#") and line
 )
 EXPOSURE = {
-    "controller": 1.3, "guard": 1.0, "autonomy": 0.9, "recorder": 1.1, "console": 1.1, "plc": 1.4, "can@": 1.1,
-    "update": 1.2,
+    "controller": 1.3, "guard": 1.0, "autonomy": 1.0, "recorder": 1.1, "console": 1.1, "plc": 1.4, "can@": 1.1,
+    "update": 1.2, "perception": 1.5,
 }  # fmt: skip
 """Exposure of each unit by systemd-analyze, of 10; at most 1.5."""
 CREDENTIALS = "/run/credentials"
@@ -127,6 +128,19 @@ def test_the_programs_accept_the_arguments_of_their_units() -> None:
     assert {port for _, port in planner.tell} == reports - {planner.report_port}, "page and recorder get its missions"
     page = console_command_line().parse_args(words(unit / "timberhand-console.service")[3:])
     assert (page.bus, page.report_port in reports) == (["crane0=socketcan:crane0"], True)
+
+
+def test_the_camera_answers_where_planner_and_page_ask() -> None:
+    unit = DEPLOY / "units/timberhand-perception.service"
+    given = words(unit, PERCEPTION_OPTIONS="--driving", CAMERA="front")
+    options = perception_parser().parse_args(given[3:])
+    assert given[:3] == ["-P", "-m", "autonomy.perception"]
+    assert f"127.0.0.1:{options.port}" == CONF["SCENE"]
+    assert (options.camera, options.frames, options.driving) == ("front", "zed", True)
+    assert "--camera" not in words(unit)
+    planner = autonomy_arguments(words(DEPLOY / "units/timberhand-autonomy.service")[3:])
+    assert planner.scene == ("127.0.0.1", options.port)
+    assert setting(unit, "ExecCondition") == ["/bin/sh -c 'test -n \"$CAMERA_FRAMES\"'"]
 
 
 def test_page_and_planner_share_the_folder_of_missions_as_the_settings_show() -> None:

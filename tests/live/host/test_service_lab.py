@@ -31,5 +31,7 @@ def test_the_valves_are_neutral_after_every_failure_of_controller_guard_and_bus(
     figures = result["figures"]
     assert figures["controller_locked_kb"] > 0 and figures["guard_locked_kb"] > 0
     assert {"update_refused_s", "update_stays_s", "update_return_s"} <= figures.keys()
+    seen = {f"perception_{name}" for name in ("seen_s", "kill_back_s", "hang_back_s", "pulled_told_s", "pulled_back_s")}
+    assert seen <= figures.keys()
     if result["inconclusive"]:
         pytest.skip(f"inconclusive: {result['inconclusive']}")
