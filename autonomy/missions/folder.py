@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,7 +62,8 @@ class MissionFolder:
         path = self._file(name)
         draft = path.with_name(f".{name}.{os.getpid()}")
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            if not self.path.is_dir():
+                self.path.mkdir(parents=True)
             draft.write_bytes(data)
             draft.chmod(FILE_MODE)
             if replace:
@@ -69,12 +71,15 @@ class MissionFolder:
             else:
                 os.link(draft, path)
         except FileExistsError:
+            if not self.path.is_dir():
+                raise MissionError("missions.not-written", f"{self.path} is no folder", name) from None
             sentence = "exists already; choose another name, or replace it"
             raise MissionError("missions.exists", sentence, name) from None
         except OSError as error:
             raise MissionError("missions.not-written", f"cannot be written: {error.strerror}", name) from None
         finally:
-            draft.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a folder that may not be entered holds no draft
+                draft.unlink(missing_ok=True)
 
     def _file(self, name: str) -> Path:
         if not FILE_NAME.fullmatch(name):

@@ -77,6 +77,8 @@ class PlannerProcess:
         self._request_ns = self._report_ns = 0
         self._uploads, self._machine = uploads, MachineAtRest()
         self._answer: dict[str, Any] = {}
+        self._askers: list[Address] = []
+        """Who sent the commands that have not been answered yet."""
         self._joints: tuple[float, ...] = ()
         self._emitted: dict[str, object] = {}
 
@@ -144,13 +146,14 @@ class PlannerProcess:
                 emit("progress", reason=reason)
 
     def _execute_commands(self, now_ns: int) -> None:
-        for data in _received(self._commands):
+        for data, sender in _received_from(self._commands):
             try:
                 command = self._receiver.accept(data, now_ns)
             except CommandRefused as error:
                 emit("order", order=None, refused=str(error))
                 continue
             self._report_ns = 0  # the operator sees the result at once
+            self._askers.append(sender)
             if isinstance(command, MissionUpload):
                 self._take(command, now_ns)
                 continue
@@ -174,7 +177,10 @@ class PlannerProcess:
         emit("upload", name=upload.name, refused=refused or None, code=code or None)
 
     def _report_mission(self, now_ns: int) -> None:
-        if not self._watchers:
+        told = [(self._link, watcher) for watcher in self._watchers]
+        told += [(self._commands, asker) for asker in self._askers]
+        self._askers = []
+        if not told:
             return
         self._sequence += 1
         sent = []
@@ -183,9 +189,9 @@ class PlannerProcess:
         if (report := self._job.report(now_ns)) is not None:
             report = msgspec.structs.replace(report, **self._answer)
             sent.append(encode_mission(report, self._sequence, self._hash, now_ns, self._key))
-        for watcher in self._watchers:
+        for link, to in told:
             for data in sent:
-                self._send(lambda d, to=watcher: self._link.sendto(d, to), data)  # type: ignore[misc]
+                self._send(lambda d, link=link, to=to: link.sendto(d, to), data)  # type: ignore[misc]
 
     def _newest_reports(self) -> tuple[StateReport | None, VehicleReport | None]:
         newest, vehicle = None, None
@@ -236,10 +242,14 @@ class PlannerProcess:
 
 
 def _received(link: socket.socket) -> list[bytes]:
+    return [data for data, _ in _received_from(link)]
+
+
+def _received_from(link: socket.socket) -> list[tuple[bytes, Address]]:
     found = []
     while True:
         try:
-            found.append(link.recv(65535))
+            found.append(link.recvfrom(65535))
         except BlockingIOError:
             return found
         except ConnectionRefusedError:

@@ -3,7 +3,7 @@
 It travels as a mission command does (`can_dbc.messages.mission`), in the same envelope and to the same port.  The file
 itself is in a folder that both processes know, so a mission of any size fits, and with a key the digest authenticates
 it.  The planner's next mission report has the upload's sequence number in ``order`` and why it is refused in
-``refusal`` and ``refusal_code``.
+``refusal`` and ``refusal_code``, and also goes to the sender.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""``timberhand mission``: run a whole forwarding mission, and document the activity manager."""
+"""``timberhand mission``: run a whole forwarding mission, order one of a running planner, document the manager."""
 
 from __future__ import annotations
 
 import json
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -27,7 +27,15 @@ from timberhand.commands.options import (
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
 
-app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission; document the activity manager.")
+if TYPE_CHECKING:
+    from machine.profile import Profile
+    from timberhand.mission_orders import PlannerOrders
+
+app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission, or order one of a running planner.")
+MISSIONS: Final = Path("/var/lib/timberhand-missions")
+"""The folder that the services share."""
+ORDER_PORT: Final = 24705
+"""As the shipped settings show it."""
 
 
 class ManagerKind(StrEnum):
@@ -156,6 +164,80 @@ def run(
     if as_json:
         print(json.dumps(asdict(summary)))
     raise typer.Exit(summary.exit_code)
+
+
+OrderPortOption = Annotated[int, typer.Option(help="The planner's --order-port on this computer.")]
+KeyOption = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Key of the planner (default: that of the installed services).")
+]
+
+
+@app.command()
+def start(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Mission file, in any format of `timberhand plan`.")],
+    profile: ProfileOption = "aoro_fc8",
+    missions: Annotated[Path, typer.Option(metavar="DIR", help="The planner's folder of missions.")] = MISSIONS,
+    order_port: OrderPortOption = ORDER_PORT,
+    key_file: KeyOption = None,
+) -> None:
+    """Give a mission to the planner that runs on this computer, and set it to Auto.
+
+    The machine must stand and must not be armed; it drives when an operator arms it. The mission
+    is checked as by `timberhand plan check` first. Exit code 3: the mission is refused; 4: no planner
+    answers; 5: the planner refuses now.
+
+    [bold]Examples[/bold]
+
+      sudo timberhand mission start route.geojson --profile /etc/timberhand/forwarder.toml
+    """
+    from timberhand.mission_orders import checked
+
+    machine, orders = _orders(profile, order_port, key_file)
+    report = orders.start(checked(file, machine), f"{file.stem}.geojson", missions)
+    print(f"{report.name or file.stem}: {report.words}; arm the machine to begin")
+
+
+@app.command()
+def pause(
+    profile: ProfileOption = "aoro_fc8", order_port: OrderPortOption = ORDER_PORT, key_file: KeyOption = None
+) -> None:
+    """Pause the mission of the planner that runs on this computer: crane and machine come to rest."""
+    _order("PAUSE", profile, order_port, key_file)
+
+
+@app.command()
+def resume(
+    profile: ProfileOption = "aoro_fc8", order_port: OrderPortOption = ORDER_PORT, key_file: KeyOption = None
+) -> None:
+    """Set the mission to Auto again, after a pause or a restart of the planner."""
+    _order("AUTO", profile, order_port, key_file)
+
+
+@app.command()
+def abort(
+    profile: ProfileOption = "aoro_fc8", order_port: OrderPortOption = ORDER_PORT, key_file: KeyOption = None
+) -> None:
+    """End the mission: crane and machine come to rest, and the planner ends."""
+    _order("ABORT", profile, order_port, key_file)
+
+
+def _orders(profile: str, order_port: int, key_file: Path | None) -> tuple[Profile, PlannerOrders]:
+    from machine.loading.profile_file import ProfileError, load_profile, profile_hash
+    from timberhand.mission_orders import PlannerOrders, key_of
+
+    try:
+        machine = load_profile(profile)
+    except ProfileError as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    return machine, PlannerOrders(order_port, profile_hash(machine), key_of(key_file))
+
+
+def _order(action: str, profile: str, order_port: int, key_file: Path | None) -> None:
+    from can_dbc.messages.mission import MissionAction
+
+    _, orders = _orders(profile, order_port, key_file)
+    report = orders.order(MissionAction[action])
+    print(f"{report.name}: {report.words}")
 
 
 @app.command()
