@@ -1,7 +1,8 @@
 """Opens a CAN bus by its address; `can_dbc.bus.base` has the contract of every `Bus`.
 
 Address: ``wire:crane0`` (the user-space bus of ``hil.wire``), ``socketcan:vcan0`` (a kernel interface) or
-``<python-can interface>:<channel>``.  `default_address` chooses one for a logical name.
+``<python-can interface>:<channel>``.  ``python-can:`` before an address of the kernel has python-can's socket instead
+of ours: ``python-can:socketcan:can0``.  `default_address` chooses one for a logical name.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Final
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.filters import FilterItem, filter_of
 
+PYTHON_CAN: Final = "python-can:"
 VCAN_NAMES: Final = {"crane0": "vcan0", "mach0": "vcan1"}
 
 
@@ -39,7 +41,7 @@ def open_bus(
     Raises:
         BusError: The bus cannot be opened.
     """
-    backend, _, channel = address.partition(":")
+    backend, _, channel = address.removeprefix(PYTHON_CAN).partition(":")
     wanted = filter_of(filters)
     if not backend or not channel:
         raise BusError(
@@ -48,11 +50,12 @@ def open_bus(
             "interface and its channel, for example virtual:test.",
         )
     # Backends are imported on demand: the guard must not import python-can.
-    if backend == "wire":
+    ours = not address.startswith(PYTHON_CAN)
+    if ours and backend == "wire":
         from can_dbc.bus.wire_client import WireClient
 
         return WireClient(channel, wanted, receive_own, tx_queue, participant)
-    if backend == "socketcan":
+    if ours and backend == "socketcan":
         from can_dbc.bus.socketcan import SocketCanBus
 
         return SocketCanBus(channel, wanted, receive_own)

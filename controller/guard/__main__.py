@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
-from can_dbc.bus.factory import default_address, open_bus
+from can_dbc.bus.factory import PYTHON_CAN, default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame, RawFrame
 from can_dbc.messages.operator_link import default_path as operator_path
 from can_dbc.messages.operator_link import guard_path
@@ -65,8 +65,11 @@ def profile_path(name: str) -> Path:
 
 
 def open_link(address: str, keys: Iterable[int]) -> Bus:
-    """The bus at an address: a kernel's interface by the guard's own socket, the wire by that of its emulation."""
-    backend, _, interface = address.partition(":")
+    """The bus at an address: a kernel's interface by the guard's own socket, the wire by that of its emulation.
+
+    Also where the other processes use python-can's socket: guard and controller must not share a fault.
+    """
+    backend, _, interface = address.removeprefix(PYTHON_CAN).partition(":")
     return GuardSocket(interface, keys) if backend == "socketcan" and interface else open_bus(address, filters=keys)
 
 

@@ -4,7 +4,8 @@ Every path gets the crane0 traffic of one tick outside the clock, then receives 
 does (E2E check, `MessageCodec.receive`), on the clock of the process's own CPU time.  If the kernel has CAN, the
 frames travel over an interface.  If it has none, an AF_UNIX datagram pair carries the same struct can_frame with the
 same time stamps, and the code on top is the same: ours (`can_dbc.bus.frame_socket`) as python-can's (its `SocketcanBus`
-with that socket in place of its own).  Results are medians over rounds, in microseconds per frame.
+with that socket in place of its own); ``pythoncan_bus`` is python-can behind the contract of a `Bus`, as every process
+has it with ``--bus python-can:socketcan:can0``.  Results are medians over rounds, in microseconds per frame.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from can_dbc.bus.base import DRAIN_LIMIT, BusStats
-from can_dbc.bus.factory import kernel_has_can, open_bus
+from can_dbc.bus.factory import PYTHON_CAN, kernel_has_can, open_bus
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
+from can_dbc.bus.python_can_bus import PythonCanBus
 from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.protocols.e2e import Checker, Sender
@@ -173,18 +175,19 @@ def _discard(lane: Lane) -> int:
         count += len(scrap)
 
 
-def _lanes(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
-    """Both paths of this machine: ours and python-can's."""
+def _lanes(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
+    """Every path of this machine: ours, python-can's, python-can as a bus."""
     present = {name for _, name in socket.if_nameindex()} if kernel_has_can() else set()
     interface = next((name for name in ("vcan0", "vcan1") if name in present), None)
     return _on_pairs(stack) if interface is None else _on_interface(interface, stack)
 
 
-def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
+def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, ...]:
     """Ours and python-can's on a virtual kernel CAN interface."""
     sender = stack.enter_context(open_bus(f"socketcan:{interface}", filters=[]))
     ours = stack.enter_context(open_bus(f"socketcan:{interface}"))
     theirs = stack.enter_context(can.Bus(interface="socketcan", channel=interface))
+    bus = stack.enter_context(open_bus(f"{PYTHON_CAN}socketcan:{interface}"))
 
     def send(frames: list[RawFrame]) -> None:
         if sender.send_all(frames) != len(frames):
@@ -195,6 +198,7 @@ def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, La
     return (
         Lane("ours", f"ours on {interface}", send, ours.drain),
         Lane("pythoncan", f"python-can on {interface}", send, _recv_all(theirs), True),
+        Lane("pythoncan_bus", f"--bus {PYTHON_CAN}socketcan:{interface}", send, bus.drain),
     )
 
 
@@ -207,10 +211,23 @@ class _OnPair(SocketcanBus):
         self._is_filtered = self._is_shutdown = True
 
 
-def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
-    """Ours and python-can's, each on an AF_UNIX datagram pair."""
-    (ours, to_ours), (theirs, to_theirs) = (socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2))
-    for end in (ours, to_ours, theirs, to_theirs):
+class _BusOnPair(PythonCanBus):
+    """python-can behind our contract, on a given socket."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        super().__init__("socketcan", "pair")
+
+    def _open(self) -> can.BusABC:
+        return _OnPair(self._sock)
+
+
+def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
+    """Ours, python-can's and python-can as a bus, each on an AF_UNIX datagram pair."""
+    (ours, to_ours), (theirs, to_theirs), (behind, to_behind) = (
+        socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)
+    )
+    for end in (ours, to_ours, theirs, to_theirs, behind, to_behind):
         stack.enter_context(end)
     link, stats = FrameSocket(ours), BusStats()
 
@@ -227,6 +244,7 @@ def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, Lane]:
     return (
         Lane("ours", "ours on an AF_UNIX pair", through(to_ours), drain),
         Lane("pythoncan", "python-can on an AF_UNIX pair", through(to_theirs), _recv_all(_OnPair(theirs)), True),
+        Lane("pythoncan_bus", "--bus python-can:... on an AF_UNIX pair", through(to_behind), _BusOnPair(behind).drain),
     )
 
 

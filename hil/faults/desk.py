@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus.factory import VCAN_NAMES
+from can_dbc.bus.factory import PYTHON_CAN, VCAN_NAMES
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import parse
 from hil.faults.table import FAULTS, Edge, FaultError
@@ -68,7 +68,7 @@ def answer(request: dict[str, Any], run: Path) -> dict[str, Any]:
 def _emulated(run: Path) -> LiveTarget:
     """The live run, if nothing of it can be a machine; raises FaultError."""
     target = LiveTarget.of(run)
-    virtual = {f"socketcan:{name}" for name in VCAN_NAMES.values()}
+    virtual = {f"{ours}socketcan:{name}" for name in VCAN_NAMES.values() for ours in ("", PYTHON_CAN)}
     for bus, address in target.buses.items():
         if not address.startswith("wire:") and address not in virtual:
             raise FaultError("fault.real-bus-page", f"{bus} is {address}, which may be a machine; nothing is injected")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from autonomy.crane_job.phases import Phase
-from can_dbc.bus.factory import VCAN_NAMES, kernel_has_can
+from can_dbc.bus.factory import PYTHON_CAN, VCAN_NAMES, kernel_has_can
 from can_dbc.messages import datagrams, operator_link
 from can_dbc.messages.crane import OperatorAction, StateReport
 from can_dbc.messages.envelope import DatagramRefused
@@ -78,6 +78,8 @@ def _address(name: str, backend: str) -> str:
             return f"wire:{name}"
         case "vcan":
             return f"socketcan:{VCAN_NAMES[name]}"
+        case "python-can":
+            return f"{PYTHON_CAN}socketcan:{VCAN_NAMES[name]}"
         case _:  # never a real interface: an emulated machine must not join a bus with a real one
             interfaces = {interface for _, interface in socket.if_nameindex()}
             there = kernel_has_can() and VCAN_NAMES[name] in interfaces
@@ -91,7 +93,7 @@ def uses_wire(profile: Profile, backend: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """Options of a live run; ``bus`` is "wire", "vcan" or "auto"; ``console_port`` 0 means no page.
+    """Options of a live run; ``bus`` is "wire", "vcan", "python-can" or "auto"; ``console_port`` 0 means no page.
 
     ``max_stops``: the emulated operator arms again after this many stops.  ``plc_link``, "modbus" or "udp", is used
     when the profile has a PLC.  ``camera`` names the camera that detects the logs; without one the plant reports their

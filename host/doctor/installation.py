@@ -20,7 +20,7 @@ from typing import Final
 
 from packaging.requirements import Requirement
 
-from can_dbc.bus.factory import kernel_has_can
+from can_dbc.bus.factory import PYTHON_CAN, kernel_has_can
 from can_dbc.messages.key_file import MIN_KEY_BYTES, SERVICE_KEY
 from controller.guard.__main__ import profile_path
 from host.doctor.finding import Finding, Severity, fine
@@ -127,7 +127,7 @@ def buses() -> Iterator[Finding]:
         yield fine("buses", f"SocketCAN: {', '.join(there) or 'no interface yet'}; the wire")
     for setting in ("CRANE_BUS", "MACHINE_BUS"):
         address = settings.get(setting, "")
-        name = address.removeprefix("socketcan:")
+        name = address.removeprefix(PYTHON_CAN).removeprefix("socketcan:")
         if name != address and name not in interfaces:
             wrong = f"{setting}={address} in {CONF}, but there is no interface {name}"
             commands = (f"sudo nano {CONF}", "ip -brief link show type can")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import pytest
 
 from can_dbc.bus import factory as factory
+from can_dbc.bus import python_can_bus, socketcan
 from can_dbc.bus.base import (
     CRTL_ACTIVE,
     CRTL_PASSIVE,
@@ -169,3 +170,26 @@ def test_a_flush_reads_until_no_frame_waits_for_any_stamps() -> None:
     frames: list[Frame] = []
     assert bus.drain(frames) == 1 and frames[0].data == b"new"
     assert bus.stats.received == 1
+
+
+@pytest.mark.parametrize(
+    ("address", "opened"),
+    [
+        ("socketcan:can0", ("SocketCanBus", "can0")),
+        ("python-can:socketcan:can0", ("PythonCanBus", "socketcan", "can0")),
+        ("kvaser:0", ("PythonCanBus", "kvaser", "0")),
+        ("python-can:kvaser:0", ("PythonCanBus", "kvaser", "0")),
+    ],
+)
+def test_an_address_chooses_our_socket_or_python_cans(
+    monkeypatch: pytest.MonkeyPatch, address: str, opened: tuple[str, ...]
+) -> None:
+    for module, name in ((socketcan, "SocketCanBus"), (python_can_bus, "PythonCanBus")):
+        monkeypatch.setattr(module, name, lambda *given, name=name: (name, *(g for g in given if isinstance(g, str))))
+    assert open_bus(address) == opened
+
+
+@pytest.mark.parametrize("address", ["python-can:", "python-can:socketcan", "python-can:socketcan:"])
+def test_python_can_without_an_interface_is_no_address(address: str) -> None:
+    with pytest.raises(BusError, check=coded("bus.address")):
+        open_bus(address)

@@ -346,3 +346,6 @@ def test_the_guard_opens_its_own_socket_on_a_kernels_interface_only(
     assert process.open_link("socketcan:", [1]) == ("socketcan:", [1])
     opened = process.open_link("socketcan:can0", [1])
     assert isinstance(opened, GuardSocket) and opened.name == "can0" and kernel.opened == 1
+    also = process.open_link("python-can:socketcan:can0", [1])
+    assert isinstance(also, GuardSocket) and also.name == "can0", "guard and controller must not share a fault"
+    assert process.open_link("python-can:kvaser:0", [1]) == ("python-can:kvaser:0", [1])

@@ -27,6 +27,7 @@ def changed(name: str, value: str) -> str:
 
 def test_the_shipped_settings_have_no_problem() -> None:
     assert problems_of(TEXT, TEXT) == []
+    assert problems_of(changed("CRANE_BUS", "python-can:socketcan:crane0"), TEXT) == []
 
 
 @pytest.mark.parametrize(

@@ -235,7 +235,7 @@ def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> Comma
             f"{option}: a run with --lockstep has no other time than its own; use one of the two",
             ExitCode.USAGE,
         )
-    if bus is Backend.VCAN:
+    if bus in (Backend.VCAN, Backend.PYTHON_CAN):
         return CommandFailed(
             "demo.live-vcan",
             f"{option} is for the wire; on vcan use --clock real or --clock simulated",

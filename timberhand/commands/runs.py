@@ -18,11 +18,17 @@ class Backend(StrEnum):
     AUTO = "auto"
     WIRE = "wire"
     VCAN = "vcan"
+    PYTHON_CAN = "python-can"
+    """vcan, through python-can's socket instead of ours."""
 
 
 BusOption = Annotated[
     Backend,
-    typer.Option("--bus", help="CAN backend of a live run: vcan (in user-mode Linux if necessary), wire, or auto."),
+    typer.Option(
+        "--bus",
+        help="CAN backend of a live run: vcan (in user-mode Linux if necessary), python-can (vcan through python-can's "
+        "socket instead of ours), wire, or auto.",
+    ),
 ]
 
 
@@ -57,7 +63,7 @@ def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool
     """
     if "TIMBERHAND_LAB" in os.environ:
         return
-    if bus is Backend.VCAN:
+    if bus in (Backend.VCAN, Backend.PYTHON_CAN):
         from host.vcan_lab.__main__ import vcan
         from host.vcan_lab.spec import DEFAULT_MEM_MB
 

@@ -23,7 +23,7 @@ UDP_PORTS: Final = range(24700, 24800)
 """What the units let the services open."""
 PAGE_PORTS: Final = range(8000, 9000)
 BIT_RATES: Final = (10_000, 1_000_000)
-_BUS: Final = re.compile(r"[a-z][a-z0-9_]*:\S+")
+_BUS: Final = re.compile(r"(python-can:)?[a-z][a-z0-9_]*:\S+")
 _PLACE: Final = re.compile(r"[\w.:\[\]-]+:\d+")
 
 

@@ -61,6 +61,10 @@ def test_a_real_interface_gets_bit_rate_restart_and_a_short_queue(can_up, pretty
     )
 
 
+def test_an_interface_is_set_up_for_python_can_as_for_our_own_socket(can_up) -> None:
+    assert can_up("crane0", VIRTUAL, CRANE_BUS="python-can:socketcan:can0") == (0, ["link set dev can0 up"], "")
+
+
 def test_a_correctly_configured_interface_is_left_alone(can_up) -> None:
     assert can_up("crane0", RUNNING) == (0, [], "")
     wrong = RUNNING | {"linkinfo": REAL["linkinfo"]}

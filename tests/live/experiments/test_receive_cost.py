@@ -19,7 +19,7 @@ def result() -> dict[str, Any]:
 
 
 def test_every_path_receives_every_frame(result: dict[str, Any]) -> None:
-    assert set(result["paths"]) == {"ours", "pythoncan"}
+    assert set(result["paths"]) == {"ours", "pythoncan", "pythoncan_bus"}
     assert {"rx_us", "rx_decode_us", "rx_pythoncan_us", "rx_decode_pythoncan_us"} < set(result["metrics"])
     assert all(value > 0 for value in result["metrics"].values())
 

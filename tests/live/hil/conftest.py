@@ -19,7 +19,7 @@ def wire_dir(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield directory
 
 
-@pytest.fixture(params=["in-process", "wire", "socketcan", "virtual", "plugin"])
+@pytest.fixture(params=["in-process", "wire", "socketcan", "python-can", "virtual", "plugin"])
 def backend(request: pytest.FixtureRequest, wire_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Backend]:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
     name = request.param
@@ -27,6 +27,8 @@ def backend(request: pytest.FixtureRequest, wire_dir: Path, monkeypatch: pytest.
         backend = Backend(name, core=WireCore(BITRATE))
     elif name == "socketcan":
         backend = Backend(name, f"socketcan:{kernel_interface()}")
+    elif name == "python-can":
+        backend = Backend(name, f"python-can:socketcan:{kernel_interface()}")
     else:
         channel = request.node.name if name == "virtual" else "fast"
         backend = Backend(name, f"{'timberhand' if name == 'plugin' else name}:{channel}")
