@@ -13,6 +13,7 @@ import typer
 
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
+    LIVE_ONLY,
     FoxglovePortOption,
     GraspPlannerOption,
     MaxStopsOption,
@@ -23,6 +24,7 @@ from timberhand.commands.options import (
     TruthOption,
     VirtualCamerasOption,
     planner_of,
+    refuse_without_effect,
     truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
@@ -48,6 +50,7 @@ class PlcLink(StrEnum):
 
 
 def demo(
+    context: typer.Context,
     lockstep: Annotated[
         bool, typer.Option(help="Run in virtual time in one process; a seed gives the same bytes every time.")
     ] = False,
@@ -126,6 +129,14 @@ def demo(
 
     from machine.loading.profile_file import ProfileError, load_profile
 
+    if lockstep:
+        refuse_without_effect(context, (*LIVE_ONLY, "plc_link"), "with --lockstep")
+    if not (plc or paper_a):
+        refuse_without_effect(context, ("plc_role", "plc_link"), "without --plc")
+    if not console:
+        refuse_without_effect(context, ("console_port",), "with --no-console")
+    if bus not in (Backend.VCAN, Backend.PYTHON_CAN):
+        refuse_without_effect(context, ("clock",), f"with --bus {bus.value}")
     if refused := refusal(live, lockstep, bus, plc and plc_link is PlcLink.UDP):
         raise refused
     if paper_a:

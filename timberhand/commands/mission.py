@@ -11,6 +11,7 @@ import typer
 
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
+    LIVE_ONLY,
     FoxglovePortOption,
     GraspPlannerOption,
     MaxStopsOption,
@@ -23,6 +24,7 @@ from timberhand.commands.options import (
     TruthOption,
     VirtualCamerasOption,
     planner_of,
+    refuse_without_effect,
     truth_of,
 )
 from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
@@ -61,6 +63,7 @@ DETECTORS: Final = {DetectorKind.PERFECT: "perfect", DetectorKind.PAPER_B: "fait
 
 @app.command()
 def run(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Mission file, in any format of `timberhand plan`.")],
     lockstep: Annotated[
         bool, typer.Option(help="Run in virtual time in one process; a seed gives the same bytes every time.")
@@ -121,6 +124,12 @@ def run(
     from autonomy.missions.model import MissionError
     from machine.loading.profile_file import ProfileError, load_profile
 
+    if lockstep:
+        refuse_without_effect(context, LIVE_ONLY, "with --lockstep")
+    if not console:
+        refuse_without_effect(context, ("console_port",), "with --no-console")
+    if bus not in (Backend.VCAN, Backend.PYTHON_CAN):
+        refuse_without_effect(context, ("clock",), f"with --bus {bus.value}")
     chosen = planner_of(planner, virtual_cameras)
     if not lockstep:
         enter_lab(bus, clock, detects=detector is not DetectorKind.PERFECT)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -106,3 +108,23 @@ def truth_of(profile: str, truth: str) -> str:
         return beside(profile, load_profile(profile).name, truth)
     except ProfileError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+
+
+LIVE_ONLY: Final = ("bus", "clock", "console", "console_port", "foxglove", "max_stops")
+"""Parameters of a live run that a run in lockstep has no use for."""
+
+
+def refuse_without_effect(given: typer.Context, parameters: Iterable[str], where: str) -> None:
+    """Refuse options on the command line that do nothing here; ``where`` ends the sentence, as in "with --lockstep".
+
+    Raises:
+        CommandFailed: one of ``parameters`` was given.
+    """
+    if "TIMBERHAND_LAB" in os.environ:
+        return  # the command was given outside, and judged there
+    for parameter in given.command.params:
+        source = given.get_parameter_source(parameter.name or "")
+        if parameter.name in parameters and source is not None and source.name == "COMMANDLINE":
+            raise CommandFailed(
+                "option.no-effect", f"{parameter.opts[0]} has no effect {where}; leave it out", ExitCode.USAGE
+            )

@@ -1,0 +1,65 @@
+"""Every option of every command is read, and one that has no effect in a mode is refused with exit code 2."""
+
+from __future__ import annotations
+
+import dis
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from host.exit_codes import CommandFailed, ExitCode
+from timberhand.cli import app
+
+VALUES = {
+    "--bus": ("wire",), "--clock": ("real",), "--console": (), "--no-console": (), "--console-port": ("8000",),
+    "--foxglove": ("8765",), "--max-stops": ("3",), "--plc-link": ("modbus",), "--plc-role": ("valves",),
+}  # fmt: skip
+"""A value for each option that some mode has no use for."""
+LIVE = tuple(option for option in VALUES if not option.startswith("--plc"))
+FILE = "docs/examples/paper_b.geojson"
+USELESS = {
+    ("demo", "--lockstep"): (*LIVE, "--plc-link"),
+    ("demo", "--lockstep", "--plc"): (*LIVE, "--plc-link"),
+    ("demo",): ("--plc-role", "--plc-link", "--clock"),
+    ("demo", "--no-console"): ("--console-port",),
+    ("demo", "--bus", "wire"): ("--clock",),
+    ("mission", "run", FILE, "--lockstep"): LIVE,
+    ("mission", "run", FILE): ("--clock",),
+    ("mission", "run", FILE, "--no-console"): ("--console-port",),
+}
+"""What has no effect, by the words before it."""
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command with its words."""
+    if not hasattr(group, "commands"):
+        yield words, group
+        return
+    for name, command in group.commands.items():
+        yield from commands(command, (*words, name))
+
+
+ALL = dict(commands(get_command(app)))
+
+
+@pytest.mark.parametrize("words", ALL, ids=" ".join)
+def test_every_option_has_a_reader(words: tuple[str, ...]) -> None:
+    callback = inspect.unwrap(ALL[words].callback)
+    loaded = {i.argval for i in dis.get_instructions(callback) if i.opname.startswith(("LOAD_FAST", "LOAD_DEREF"))}
+    loaded |= {i.argval for i in dis.get_instructions(callback) if i.opname == "LOAD_CLOSURE"}
+    names = {parameter.name for parameter in ALL[words].params} & set(inspect.signature(callback).parameters)
+    assert names <= loaded, f"nothing reads {names - loaded}"
+
+
+@pytest.mark.parametrize(
+    ("words", "option"), [(words, option) for words, options in USELESS.items() for option in options],
+    ids=lambda part: part if isinstance(part, str) else " ".join(part),
+)  # fmt: skip
+def test_an_option_without_effect_is_refused(words: tuple[str, ...], option: str) -> None:
+    done = CliRunner().invoke(app, [*words, option, *VALUES[option]])
+    assert isinstance(done.exception, CommandFailed), done.output
+    assert (done.exception.code, done.exception.exit_code) == ("option.no-effect", ExitCode.USAGE)
