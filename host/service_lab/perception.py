@@ -54,8 +54,8 @@ def try_perception(port: int, expect: Expect, step: Step) -> dict[str, float]:
     finally:
         camera.kill()
         camera.wait()
-    after = [show(unit, "MainPID", "NRestarts") for unit in OTHERS]
-    expect(after == before, f"controller or guard restarted: {before}, {after}")
+    others = [show(unit, "MainPID", "NRestarts") for unit in OTHERS]
+    expect(others == before, f"controller or guard restarted: {before}, {others}")
     return figures
 
 

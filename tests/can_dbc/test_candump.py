@@ -156,8 +156,8 @@ def test_decoder_counts_everything() -> None:
     summary = decoder.summary()
     assert {k: v for k, v in summary.items() if isinstance(v, int)} == {
         "frames": 7, "decoded": 1, "unknown": 2, "refused": 2, "bad_crc": 1, "error_frames": 1, "broken": 1,
-        "lost_fast_packets": 0, "transported": 0, "unknown_transported": 0, "lost_transported": 0, "unopened_transported": 0,
-        "extended_transported": 0,
+        "lost_fast_packets": 0, "transported": 0, "unknown_transported": 0, "lost_transported": 0,
+        "unopened_transported": 0, "extended_transported": 0,
     }  # fmt: skip
 
 
