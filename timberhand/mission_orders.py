@@ -77,13 +77,12 @@ def checked(file: Path, machine: Profile) -> ForwardingMission:
         CommandFailed: it cannot be driven.
     """
     carrier = machine.carrier
-    if carrier is None:
-        raise CommandFailed(
-            "mission.stationary-machine",
-            f"{machine.name} does not drive; name the profile of the machine with --profile",
-            ExitCode.CONFIGURATION,
-        )
     try:
+        if carrier is None:
+            raise MissionError(
+                "mission.stationary-machine",
+                f"{machine.name} does not drive; name the profile of the machine with --profile",
+            )
         mission = load_mission(file, route_wanted=True, site=(carrier.site_lat_deg, carrier.site_lon_deg)).mission
         review(mission, machine)
     except MissionError as error:
