@@ -124,7 +124,7 @@ class JointWatch:
             if pct != 0.0:
                 open_valves += 1
         shaken = from_outside or open_valves > 0
-        pressed = crane.pressed(now_ns)
+        pressed, pushed = crane.pressed(now_ns), crane.slew_is_pushed()
         self._yield.step(pressed, crane.roll_rad, crane.pitch_rad)
         moving, stands = NO_JOINT, True
         for j in range(N_JOINTS):
@@ -137,7 +137,8 @@ class JointWatch:
                 continue  # what an encoder did that jumped or was lost is no motion
             neutral = crane.spools_pct[j] == 0.0 and not (loops and loops[j].value())
             velocity = estimator.velocity
-            reason = monitor.step(crane.commands[j], velocity, pressed and j == _ROT)
+            yields = (pressed and j == _ROT) or (pushed and j == _SLEW)
+            reason = monitor.step(crane.commands[j], velocity, yields)
             tested = crane.spool_run.tested(j, now_ns)
             if tested:
                 monitor.forgive()

@@ -32,6 +32,7 @@ _FOLLOWS: Final = 1
 _NONE: Final = Reason.NONE
 _ACTIVE: Final = Mode.ACTIVE
 _ROT: Final = int(Joint.ROT)
+_SLEW: Final = int(Joint.SLEW)
 
 
 def allowed_delay_s(spec: JointSpec) -> float:
@@ -92,7 +93,7 @@ class ValveWatch:
             return
         moved_by_law = supervisor.mode is _ACTIVE and crane.leased and not crane.spool_run.running
         limited = self._flow_limited.value() == 1
-        pressed = crane.pressed(now_ns)
+        pressed, pushed = crane.pressed(now_ns), crane.slew_is_pushed()
         for j in range(N_JOINTS):
             spool_pct, expected = self._measured[j].value(), crane.commands[j]
             if spool_pct is not None:
@@ -107,6 +108,6 @@ class ValveWatch:
             if turned or not moved_by_law or limited or not estimator.known or estimator.jumped:
                 self._speeds[j].reset()
                 continue
-            reason = self._speeds[j].step(expected, estimator.velocity, pressed)
+            reason = self._speeds[j].step(expected, estimator.velocity, pressed, j == _SLEW and pushed)
             if reason is not _NONE:
                 supervisor.react_to(reason, j, now_ns)

@@ -38,6 +38,9 @@ IN_PLACE_UNITS: Final = 0.005
 """A setpoint within this of the reference [rad, m] and without velocity keeps the crane in place."""
 LOAD_PERIOD_NS: Final = 20_000_000
 """The load is estimated this often, in step with the state report."""
+PUSHED_BAR: Final = 40.0
+"""Pressure across the slew's motor: braking a log gives 20 bar, tongs that open between a stake and a pile gave 143."""
+_SLEW: Final = int(Joint.SLEW)
 
 
 class Crane:
@@ -45,7 +48,7 @@ class Crane:
 
     __slots__ = (
         "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_lift_a", "_lift_b", "_load",
-        "_load_change", "_load_due", "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed",
+        "_load_change", "_load_due", "_load_updated", "_loads_bar", "_opening_sensed", "_pressure_pairs", "_sensed",
         "_workspace",
         "commands", "governor", "grapple", "law", "lease_end_ns", "leased", "load_kg", "load_moment",
         "pitch_rad", "pressure_monitor", "roll_rad", "spool_run", "spools_pct", "sway",
@@ -70,7 +73,7 @@ class Crane:
         self._pressure_pairs = tuple(pair and (pressures[pair[0]], *pair) for pair in LOADS)
         self._lift_a, self._lift_b = Signal(inputs.pressures[0], "LiftA"), Signal(inputs.pressures[0], "LiftB")
         self.pressure_monitor = PressureMonitor(self._pressure_pairs)
-        self._pressures_bar = [math.nan] * N_JOINTS
+        self._loads_bar = [math.nan] * N_JOINTS
         self._load, self._load_due, self._load_updated = LoadEstimator(profile), PeriodicTimer(LOAD_PERIOD_NS), False
         self._load_change = LoadChange(LOAD_PERIOD_NS * 1e-9)
         self.load_kg = math.nan
@@ -118,6 +121,14 @@ class Crane:
     def pressed(self, now_ns: int) -> bool:
         """Whether jaws that work, or a load that comes or goes, move every joint now or did a moment ago."""
         return self.grapple.presses(now_ns) or self._load_change.recent(now_ns)
+
+    def slew_is_pushed(self) -> bool:
+        """Whether something from outside turns the column: no weight loads it, and its oil resists the motion.
+
+        A valve that drives it has the pressure on the side of the motion (docs/reference/safety.md section 5).
+        """
+        load_bar = self._loads_bar[_SLEW]
+        return self.leased and load_bar * self._estimators[_SLEW].velocity < 0.0 and abs(load_bar) > PUSHED_BAR
 
     # -- reference
 
@@ -253,7 +264,7 @@ class Crane:
     def _run_laws(self, ramp_share: float, cap: float, now_ns: int, elapsed_ns: int) -> None:
         law, governor, inputs = self.law, self.governor, self._inputs
         if self.leased:
-            pressures = self._pressures_bar
+            pressures = self._loads_bar
             for j, source in enumerate(self._pressure_pairs):
                 if source is not None:
                     state, push, against = source

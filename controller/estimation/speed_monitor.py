@@ -96,9 +96,9 @@ class SpeedMonitor:
         self._range.reset(0.0)
         self._stood_s = self._fast_s = self._slow_s = self._backwards_s = 0.0
 
-    def step(self, expected: float, velocity: float, pressed: bool = False) -> Reason:
-        """One period with the speed that belongs to the valve and the measured one [rad/s or m/s], and whether the
-        jaws press on the joint.
+    def step(self, expected: float, velocity: float, pressed: bool = False, pushed: bool = False) -> Reason:
+        """One period with the speed that belongs to the valve and the measured one [rad/s or m/s], whether the jaws
+        press on the joint, and whether it moves against the pressure of its own oil, which no valve does.
         """
         seen, dt = self._range, self._period_s
         seen.add(expected)
@@ -122,7 +122,7 @@ class SpeedMonitor:
         stood = driven and speed < STOOD * low
         backwards = stood and speed < -STOOD * low
         slow = driven and speed < SLOWEST * low - self._slack
-        fast = speed > 2.0 * self._least and speed > FASTEST * high + self._slack
+        fast = not pushed and speed > 2.0 * self._least and speed > FASTEST * high + self._slack
         learns = side >= 0 and most - least < STEADY_SHARE * self._limit
         if learns and not slow and not fast and speed > 0.0:
             self._learn(side, 0.5 * (least + most) - speed)

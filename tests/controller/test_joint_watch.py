@@ -334,3 +334,19 @@ def test_motion_in_a_stop_that_no_lever_explains_is_cut():
     bench.moves_alone[0] = 0.15
     bench.run(200)
     assert bench.mode is Mode.FAULT and bench.reason == Reason.MOVES_WHILE_STOPPED
+
+
+@pytest.mark.parametrize(
+    ("slew_a_bar", "slew_b_bar", "cut"), [(2.0, 140.0, False), (140.0, 2.0, True), (20.0, 50.0, True)]
+)
+def test_a_column_that_is_turned_against_its_oil_is_pushed_and_one_that_its_oil_turns_runs_away(
+    slew_a_bar, slew_b_bar, cut
+):
+    """A jaw that opens between a stake and a pile pushes it for 0.5 s; a valve has the pressure on the other side."""
+    bench = Bench().armed()
+    bench.tick([bench.hold()])
+    bench.changed["PressB"] = {"SlewA": slew_a_bar, "SlewB": slew_b_bar}
+    for k in range(100):
+        bench.moves_alone[Joint.SLEW] = 0.45 * SPECS[0].speed_limit
+        bench.tick([bench.hold()] if k % 10 == 0 else ())
+    assert (bench.reason is Reason.JOINT_RUNAWAY) is cut, bench.reason

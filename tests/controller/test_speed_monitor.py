@@ -114,6 +114,12 @@ def test_a_joint_that_jaws_throw_is_no_runaway_and_one_that_goes_on_is():
     assert Reason.JOINT_RUNAWAY in {watched.step(0.0, 0.6 * LIMIT, pressed=True) for _ in range(3)}
 
 
+def test_a_joint_that_moves_against_the_pressure_of_its_oil_is_no_runaway():
+    watched = monitor()
+    assert {watched.step(0.0, 0.6 * LIMIT, pushed=True) for _ in range(400)} == {Reason.NONE}
+    assert Reason.JOINT_RUNAWAY in {watched.step(0.0, 0.6 * LIMIT) for _ in range(100)}
+
+
 @pytest.mark.parametrize("share", [-0.5, 0.0, 0.5], ids=["pushed back", "held", "slowed"])
 def test_a_joint_that_a_pile_holds_is_no_fault_and_one_that_it_holds_for_long_is(share):
     watched, speed = knowing(0.6 * LIMIT), 0.6 * LIMIT
