@@ -206,8 +206,7 @@ class Guard:
             self._heard_ns = now_ns
         motion = self._check_motion(heard, now_ns, elapsed_s)
         neutral = self._neutral()
-        moves = heard and any(abs(command.opening) > HELD_PCT for command in self._commands)
-        carrier = FINE if self._carrier is None else self._carrier.check(moves, now_ns)
+        carrier = FINE if self._carrier is None else self._carrier.check(heard and self._crane_moves(), now_ns)
         if estop_old:
             self._reset_seen = True
             return Verdict.ESTOP_LOST, NO_AXIS
@@ -297,6 +296,9 @@ class Guard:
         """Whether the spools go to neutral as after a person's STOP."""
         since_ns, most_pct = now_ns - self._stopped_ns, max(STOP_SHARE * self._open_pct, STOP_PCT)
         return since_ns <= STOP_NS or (since_ns <= RAMP_NS and self._opening_pct() <= most_pct)
+
+    def _crane_moves(self) -> bool:
+        return any(abs(command.opening) > HELD_PCT for command in self._commands)
 
     def _settle(self, verdict: Verdict, axis: int, pressed: bool, now_ns: int) -> bool:
         """A broken rule counts at once; the return needs a while of neutral commands, and a person if it latches.

@@ -29,7 +29,7 @@ from autonomy.missions.model import (
 from autonomy.missions.validation import SWAPPED_HINT
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-SAMPLES = {path.name: path.read_bytes() for path in sorted(EXAMPLES.iterdir())}
+SAMPLES = {path.name: path.read_bytes() for path in sorted(EXAMPLES.iterdir()) if path.is_file()}
 SMALL = {name: data for name, data in SAMPLES.items() if len(data) < 40_000}
 WORDS = (
     b"NaN", b"Infinity", b"-1e309", b"1e308", b"null", b"true", b"[]", b"{}", b'"', b"\\", b"\xff", b"\x00", b"\n",

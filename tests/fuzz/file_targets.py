@@ -70,7 +70,7 @@ def other_values(
 
 def mission_seeds() -> list[bytes]:
     """The examples, also packed and in UTF-16, and those of the folder of reports, where there is one."""
-    plain = [path.read_bytes() for path in sorted(EXAMPLES.iterdir()) if path.stat().st_size < 40_000]
+    plain = [path.read_bytes() for path in sorted(EXAMPLES.glob("*.*")) if path.stat().st_size < 40_000]
     texts = [data.decode().encode("utf-16") for data in plain if data.startswith(b"{")]
     return [*plain, *texts, gzip.compress(plain[0]), *map(zipped, plain[:2]), *reports(*MISSION_SUFFIXES)]
 
