@@ -51,6 +51,12 @@ def test_a_database_without_protection_time_out_or_signal_stops_the_start(databa
         build(PROFILE, databases)
 
 
+def test_a_database_that_is_not_there_stops_the_start(databases):
+    (databases / "crane.dbc").unlink()
+    with pytest.raises(GuardConfigError, check=coded("guard.dbc-unreadable")):
+        build(PROFILE, databases)
+
+
 def test_a_frame_that_comes_twice_is_neither_new_nor_a_break():
     traffic = Traffic().good()
     for _ in range(20):
