@@ -165,9 +165,14 @@ def _run(
 
     # A page that keeps its websocket open must not delay the shutdown.
     config = uvicorn.Config(
-        app, log_level="warning", timeout_graceful_shutdown=1, ws="websockets-sansio", server_header=False,
-        ssl_certfile=exposure.tls_cert, ssl_keyfile=exposure.tls_key,
-    )  # fmt: skip
+        app,
+        log_level="warning",
+        timeout_graceful_shutdown=1,
+        ws="websockets-sansio",
+        server_header=False,
+        ssl_certfile=exposure.tls_cert,
+        ssl_keyfile=exposure.tls_key,
+    )
     scheme = "https" if exposure.tls_cert else "http"
     host = f"[{bind}]" if ":" in bind else bind
     query = f"?{ENTRY}={token}" if token else ""

@@ -86,16 +86,24 @@ class CameraState:
             "width_px": facts.width_px,
             "height_px": facts.height_px,
             "logs": [
-                {"id": log.id, "ends_px": log.ends_px, "length_m": log.length_m, "diameter_m": log.diameter_m,
-                 "seen": log.seen}
+                {
+                    "id": log.id,
+                    "ends_px": log.ends_px,
+                    "length_m": log.length_m,
+                    "diameter_m": log.diameter_m,
+                    "seen": log.seen,
+                }
                 for log in facts.logs
             ],
             "moved": moved,
-            "grasp": None if grasp is None else {
+            "grasp": None
+            if grasp is None
+            else {
                 "tips_px": None if moved else _projected(facts, grasp["tips"]),
-                "logs": grasp["logs"], "reason": grasp["reason"],
+                "logs": grasp["logs"],
+                "reason": grasp["reason"],
             },
-        }  # fmt: skip
+        }
 
     def _why_none(self, now_ns: int) -> str:
         if self._without_camera:

@@ -78,11 +78,16 @@ class CommissionApi:
         joints: list[dict[str, Any]] = []
         for j in JOINTS:
             spec, (phase_deg, gain_db) = joint(profile, j), profile_margins(profile, j)
-            joints.append({
-                "name": j.name.lower(), "unit": "m" if spec.kind == "prismatic" else "rad",
-                "senses": spec.encoder is not None, "largest": largest_step(profile, j),
-                "phase_deg": phase_deg, "gain_db": gain_db,
-            })  # fmt: skip
+            joints.append(
+                {
+                    "name": j.name.lower(),
+                    "unit": "m" if spec.kind == "prismatic" else "rad",
+                    "senses": spec.encoder is not None,
+                    "largest": largest_step(profile, j),
+                    "phase_deg": phase_deg,
+                    "gain_db": gain_db,
+                }
+            )
         checks = [{"id": c.id, "title": c.title, "how": c.how, "value": c.value} for c in CHECKS]
         told = {"machine": profile.title, "profile": profile.name, "folder": str(self._work.folder)}
         return JSONResponse(told | {"joints": joints, "checks": checks, "hash": f"{self._work.profile_hash:08x}"})
@@ -157,11 +162,13 @@ class CommissionApi:
         except CodedError as error:
             return PlainTextResponse(f"Not saved: {error}.", 422)
         facts = {
-            "name": name, "saved_at": datetime.now(UTC).isoformat(timespec="seconds"),
-            "saved_by": person_of(request).name, "profile": self._work.profile.name,
+            "name": name,
+            "saved_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "saved_by": person_of(request).name,
+            "profile": self._work.profile.name,
             "profile_hash": f"{self._work.profile_hash:08x}",
             "steps": {j: {"at": s["at"], "amount": s["amount"], **s["figures"]} for j, s in self._work.steps.items()},
-        }  # fmt: skip
+        }
         told = document(protocol, facts)
         try:
             await asyncio.to_thread(_write_once, self._work.folder / f"{name}{SUFFIX}", told)

@@ -135,9 +135,13 @@ class Commissioning:
         return told
 
     def _begin(
-        self, doing: str, run: Procedure, keys: tuple[int, ...], goes_on: Callable[[], bool],
+        self,
+        doing: str,
+        run: Procedure,
+        keys: tuple[int, ...],
+        goes_on: Callable[[], bool],
         finish: Callable[[], str],
-    ) -> None:  # fmt: skip
+    ) -> None:
         assert not self.busy
         self._doing, self._procedure, self._failure, self._said = doing, run, "", ""
         work = (run, keys, goes_on, finish)
@@ -178,11 +182,13 @@ class Commissioning:
         self.steps[found.joint.name.lower()] = {
             "at": datetime.now(UTC).isoformat(timespec="seconds"),
             "amount": found.amount,
-            "figures": {name: _known(getattr(found, name)) for name in (
-                "largest_error", "rest_error", "overshoot", "delay_s", "largest_command_pct")},
+            "figures": {
+                name: _known(getattr(found, name))
+                for name in ("largest_error", "rest_error", "overshoot", "delay_s", "largest_command_pct")
+            },
             "time_s": [_known(t) for t in found.time_s.tolist()],
             "series": {name: [_known(v) for v in values.tolist()] for name, values in found.series.items()},
-        }  # fmt: skip
+        }
         return "The step is made."
 
     def _write(self, run: Calibration) -> str:

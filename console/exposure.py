@@ -46,9 +46,15 @@ class Exposure:
         """
         if (self.tls_cert is None) != (self.tls_key is None):
             raise StartError("console.tls-pair", "give --tls-cert and --tls-key together, or neither of them", 2)
-        missing = [option for option, given in (
-            ("--passwords", self.passwords), ("--tls-cert and --tls-key", self.tls_cert), ("--audit", self.audit),
-        ) if given is None]  # fmt: skip
+        missing = [
+            option
+            for option, given in (
+                ("--passwords", self.passwords),
+                ("--tls-cert and --tls-key", self.tls_cert),
+                ("--audit", self.audit),
+            )
+            if given is None
+        ]
         if missing and not is_local(bind):
             sentence = (
                 f"{bind} is reached from other machines, where the page needs passwords, TLS and an audit log; give "

@@ -47,10 +47,16 @@ class FaultWatch:
         self._at_ns, self._reacted_ns = at_ns, 0
         self._reason, self._from = (last.reason, self._tip(last)) if last else (0, None)
         self._fault = {
-            "title": title, "said": said, "begun_in": mode_name(last.mode) if last else "unknown",
+            "title": title,
+            "said": said,
+            "begun_in": mode_name(last.mode) if last else "unknown",
             "stood": last is not None and last.mode in STOPPED,
-            "stop": None, "ms": None, "before_mm": None, "after_mm": None, "done": False,
-        }  # fmt: skip
+            "stop": None,
+            "ms": None,
+            "before_mm": None,
+            "after_mm": None,
+            "done": False,
+        }
         for report in self._recent:
             self._follow(report)
 

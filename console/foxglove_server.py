@@ -62,9 +62,14 @@ class FoxgloveServer:
         }
         try:
             self._server: WebSocketServer = foxglove.start_server(
-                name=f"timberhand {profile.name}", host=host, port=port, capabilities=[], context=context,
-                message_backlog_size=BACKLOG_MESSAGES, server_listener=_Newcomers(self._topics),
-            )  # fmt: skip
+                name=f"timberhand {profile.name}",
+                host=host,
+                port=port,
+                capabilities=[],
+                context=context,
+                message_backlog_size=BACKLOG_MESSAGES,
+                server_listener=_Newcomers(self._topics),
+            )
         except RuntimeError as error:
             raise OSError(str(error)) from error
 

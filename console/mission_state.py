@@ -40,11 +40,19 @@ DRIVING: Final = {Driving.STANDING: "standing", Driving.DRIVING: "driving", Driv
 INPUT_NAMES: Final = dict(
     zip(
         VEHICLE_INPUTS,
-        ("vehicle state", "front arms", "rear arms", "position", "heading", "turn rate", "position quality",
-         "articulation"),
+        (
+            "vehicle state",
+            "front arms",
+            "rear arms",
+            "position",
+            "heading",
+            "turn rate",
+            "position quality",
+            "articulation",
+        ),
         strict=True,
     )
-)  # fmt: skip
+)
 
 
 def describe_carrier(profile: Profile) -> dict[str, Any] | None:
@@ -53,9 +61,18 @@ def describe_carrier(profile: Profile) -> dict[str, Any] | None:
     if c is None:
         return None
     names = (
-        "front_axle_m", "rear_axle_m", "track_width_m", "wheel_radius_m", "wheel_width_m", "crane_base_m",
-        "crane_yaw_rad", "arm_drop_low_m", "arm_travel_m", "arm_transport_m", "tilt_limit_rad",
-    )  # fmt: skip
+        "front_axle_m",
+        "rear_axle_m",
+        "track_width_m",
+        "wheel_radius_m",
+        "wheel_width_m",
+        "crane_base_m",
+        "crane_yaw_rad",
+        "arm_drop_low_m",
+        "arm_travel_m",
+        "arm_transport_m",
+        "tilt_limit_rad",
+    )
     return {name: getattr(c, name) for name in names} | {"trail_points": TRAIL_POINTS}
 
 
@@ -135,9 +152,26 @@ class MissionState:
         if m is None:
             return None
         same = (
-            "name", "state", "words", "ended", "auto", "single_step", "paused", "waits_for", "failure", "refusal",
-            "loaded", "on_board", "on_board_m3", "unloaded", "missed", "driven_m", "targets", "crane", "closed",
-        )  # fmt: skip
+            "name",
+            "state",
+            "words",
+            "ended",
+            "auto",
+            "single_step",
+            "paused",
+            "waits_for",
+            "failure",
+            "refusal",
+            "loaded",
+            "on_board",
+            "on_board_m3",
+            "unloaded",
+            "missed",
+            "driven_m",
+            "targets",
+            "crane",
+            "closed",
+        )
         return {name: getattr(m, name) for name in same} | {
             "given_up": [{"log": g.log, "reason": g.reason} for g in m.given_up],
             "sigma_m": None if m.here is None else m.here.sigma_m,

@@ -161,15 +161,17 @@ class PlanApi:
 
     async def _settings(self, request: Request) -> Response:
         carrier = self.profile.carrier
-        return JSONResponse({
-            "machine": self.profile.title,
-            "profile": self.profile.name,
-            "site": None if carrier is None else site_of(carrier),
-            "formats": list(FORMATS),
-            "folder": None if self.folder is None else str(self.folder.path),
-            "may_upload": self.folder is not None and self.offer is not None,
-            "may_plan": person_of(request).role >= Role.OPERATOR,
-        })  # fmt: skip
+        return JSONResponse(
+            {
+                "machine": self.profile.title,
+                "profile": self.profile.name,
+                "site": None if carrier is None else site_of(carrier),
+                "formats": list(FORMATS),
+                "folder": None if self.folder is None else str(self.folder.path),
+                "may_upload": self.folder is not None and self.offer is not None,
+                "may_plan": person_of(request).role >= Role.OPERATOR,
+            }
+        )
 
     async def _missions(self, _: Request) -> Response:
         return JSONResponse([] if self.folder is None else await asyncio.to_thread(self.folder.names))

@@ -127,10 +127,12 @@ class ReplayView:
         state |= {
             "entries": len(self._overview.entries),
             "sent_ms": now_ns // 1_000_000,
-            "may_stop": False, "may_command": False, "may_order": False,
+            "may_stop": False,
+            "may_command": False,
+            "may_order": False,
             "timing": self._timing(),
             "replay": {"at_s": self.at_ns / 1e9, "playing": self.playing, "speed": self.speed},
-        }  # fmt: skip
+        }
         if self._history is not None:
             state["history"], self._history = self._history, None
         if self.panel.shown == "can":

@@ -48,10 +48,13 @@ def create_replay_app(
     machine = describe_machine(profile) | {
         "panels": ["error", "timeline", "can"],
         "recording": {
-            "name": name, "note": note, "begin_s": recording.begin_ns / 1e9, "end_s": recording.end_ns / 1e9,
+            "name": name,
+            "note": note,
+            "begin_s": recording.begin_ns / 1e9,
+            "end_s": recording.end_ns / 1e9,
             "moves": bool(overview.trail),
         },
-    }  # fmt: skip
+    }
     page = (STATIC / "index.html").read_text()
 
     async def index(_: Request) -> Response:

@@ -185,9 +185,15 @@ def _commission_routes(console: Console) -> list[Route]:
     from console.commissioning import Commissioning
 
     work = Commissioning(
-        console.profile, console.profile_hash, told.source, told.folder, told.controller, bus, console.key,
+        console.profile,
+        console.profile_hash,
+        told.source,
+        told.folder,
+        told.controller,
+        bus,
+        console.key,
         lambda: console.crane_state.report,
-    )  # fmt: skip
+    )
     return CommissionApi(work, console.access).routes()
 
 

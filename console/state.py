@@ -185,11 +185,13 @@ class GraspState:
         across = (self._half_gap_m * cos(g.yaw_rad), self._half_gap_m * sin(g.yaw_rad))
         return {
             "pin": list(g.pin_m),
-            "tips": [[round(x + s * across[0], 4), round(y + s * across[1], 4), round(z - self._below_m, 4)]
-                     for s in (-1.0, 1.0)],
+            "tips": [
+                [round(x + s * across[0], 4), round(y + s * across[1], 4), round(z - self._below_m, 4)]
+                for s in (-1.0, 1.0)
+            ],
             "logs": list(g.logs),
             "reason": g.reason,
-        }  # fmt: skip
+        }
 
 
 # -- The page's state of controller and crane, from the newest reports

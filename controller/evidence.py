@@ -47,9 +47,14 @@ _BUS_STATES: Final = (Reason.BUS_OFF, Reason.BUS_DOWN, Reason.BUS_PASSIVE)
 _OVERLOADS: Final = (Reason.OVERLOAD, Reason.OVERLOADED)
 _LATE: Final = (Reason.LOOP_LATE, Reason.LOOP_STALLED)
 _MOTIONS: Final = (
-    Reason.JOINT_STUCK, Reason.JOINT_RUNAWAY, Reason.JOINT_REVERSED, Reason.MOVES_WHILE_STOPPED, Reason.ENCODER_NOISY,
-    Reason.ENCODER_DRIFT, Reason.SPEED_WRONG,
-)  # fmt: skip
+    Reason.JOINT_STUCK,
+    Reason.JOINT_RUNAWAY,
+    Reason.JOINT_REVERSED,
+    Reason.MOVES_WHILE_STOPPED,
+    Reason.ENCODER_NOISY,
+    Reason.ENCODER_DRIFT,
+    Reason.SPEED_WRONG,
+)
 _SPOOLS: Final = (Reason.SPOOL_OPEN, Reason.SPOOL_SHUT, Reason.SPOOL_WRONG)
 _STEERINGS: Final = (Reason.STEERING_STUCK, Reason.STEERING_RUNAWAY)
 _SPEEDS: Final = (Reason.CARRIER_RUNAWAY, Reason.CARRIER_STUCK)
@@ -60,11 +65,32 @@ class Evidence:
     """``numbers`` and ``since_ns`` of a reason that slows or stops the machine; empty and 0 with any other."""
 
     __slots__ = (
-        "_alarms", "_articulation", "_carrier_spec", "_channel_a", "_channel_b", "_crane", "_detail", "_estimators",
-        "_exit_code", "_gate", "_guard_axis", "_inputs", "_limits", "_messages", "_period_ns", "_plc_faults",
-        "_reason", "_spools", "_supervisor", "_valve_state", "_vehicle", "_vehicle_fault", "_verdict", "numbers",
+        "_alarms",
+        "_articulation",
+        "_carrier_spec",
+        "_channel_a",
+        "_channel_b",
+        "_crane",
+        "_detail",
+        "_estimators",
+        "_exit_code",
+        "_gate",
+        "_guard_axis",
+        "_inputs",
+        "_limits",
+        "_messages",
+        "_period_ns",
+        "_plc_faults",
+        "_reason",
+        "_spools",
+        "_supervisor",
+        "_valve_state",
+        "_vehicle",
+        "_vehicle_fault",
+        "_verdict",
+        "numbers",
         "since_ns",
-    )  # fmt: skip
+    )
 
     def __init__(
         self,

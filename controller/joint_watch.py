@@ -61,9 +61,23 @@ class JointWatch:
     """All monitors of the crane's joints."""
 
     __slots__ = (
-        "_crane", "_drift", "_estimators", "_frozen_ticks", "_frozen_travel", "_loop_outputs", "_monitors", "_period_s",
-        "_sensed", "_signs", "_standstill", "_stood", "_tests", "_travel", "_was_armed", "_yield",
-    )  # fmt: skip
+        "_crane",
+        "_drift",
+        "_estimators",
+        "_frozen_ticks",
+        "_frozen_travel",
+        "_loop_outputs",
+        "_monitors",
+        "_period_s",
+        "_sensed",
+        "_signs",
+        "_standstill",
+        "_stood",
+        "_tests",
+        "_travel",
+        "_was_armed",
+        "_yield",
+    )
 
     def __init__(
         self,

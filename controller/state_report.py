@@ -28,9 +28,18 @@ class StateReporter:
     """Builds the reports; ``late_ns`` and ``tick_ns`` are the worst since the last one."""
 
     __slots__ = (
-        "_crane", "_due", "_estimators", "_evidence", "_gate", "_inputs", "_sequence", "_settings", "_supervisor",
-        "late_ns", "tick_ns",
-    )  # fmt: skip
+        "_crane",
+        "_due",
+        "_estimators",
+        "_evidence",
+        "_gate",
+        "_inputs",
+        "_sequence",
+        "_settings",
+        "_supervisor",
+        "late_ns",
+        "tick_ns",
+    )
 
     def __init__(
         self,

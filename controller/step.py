@@ -63,10 +63,27 @@ class Controller:
     """
 
     __slots__ = (
-        "_last_ns", "_period_ns", "_receive_sdo", "_reporter", "_sensed", "carrier_bus", "crane", "crane_bus_monitor",
-        "crane_inputs", "estimators", "evidence", "gate", "inputs_in_use", "joint_watch", "outputs", "startup",
-        "supervisor", "valve_watch", "vehicle", "writer",
-    )  # fmt: skip
+        "_last_ns",
+        "_period_ns",
+        "_receive_sdo",
+        "_reporter",
+        "_sensed",
+        "carrier_bus",
+        "crane",
+        "crane_bus_monitor",
+        "crane_inputs",
+        "estimators",
+        "evidence",
+        "gate",
+        "inputs_in_use",
+        "joint_watch",
+        "outputs",
+        "startup",
+        "supervisor",
+        "valve_watch",
+        "vehicle",
+        "writer",
+    )
 
     def __init__(
         self,
@@ -99,9 +116,14 @@ class Controller:
         ]
         self._sensed = [each for each in sensed if each is not None]
         self.supervisor = Supervisor(
-            profile, self.crane_inputs, self.crane_bus_monitor, self.carrier_bus, self.estimators, self.startup,
+            profile,
+            self.crane_inputs,
+            self.crane_bus_monitor,
+            self.carrier_bus,
+            self.estimators,
+            self.startup,
             settings.file_check,
-        )  # fmt: skip
+        )
         self.gate = RequestGate(profile, settings.profile_hash)
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
         # A PLC passes on positions that its own cycle has smoothed: the same count again says nothing of the encoder.
@@ -360,10 +382,14 @@ class Controller:
         if writer.status_due(now_ns):
             frames.append(
                 writer.status(
-                    supervisor.mode, supervisor.reason, supervisor.half_speed, self.stale_mask,
-                    self._reporter.late_ns, inputs.bus.errors,
+                    supervisor.mode,
+                    supervisor.reason,
+                    supervisor.half_speed,
+                    self.stale_mask,
+                    self._reporter.late_ns,
+                    inputs.bus.errors,
                 )
-            )  # fmt: skip
+            )
         self.startup.step(now_ns, frames)
         outputs.sync = writer.heartbeat_and_sync(now_ns, frames)
         bus = self.carrier_bus

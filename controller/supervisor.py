@@ -119,7 +119,7 @@ class Supervisor:
         "stall_ns",
         "worst",
         "worst_detail",
-    )  # fmt: skip
+    )
 
     def __init__(
         self,
@@ -135,9 +135,12 @@ class Supervisor:
         self.crane_inputs = inputs
         self.carrier_inputs = carrier_bus.inputs if carrier_bus is not None else None
         self._enable, self._person, self._reset_button, self._channel_a, self._channel_b = (
-            Signal(inputs.guard, "Enable"), Signal(inputs.estop, "Person"), Signal(inputs.estop, "ResetReq"),
-            Signal(inputs.estop, "ChannelA"), Signal(inputs.estop, "ChannelB"),
-        )  # fmt: skip
+            Signal(inputs.guard, "Enable"),
+            Signal(inputs.estop, "Person"),
+            Signal(inputs.estop, "ResetReq"),
+            Signal(inputs.estop, "ChannelA"),
+            Signal(inputs.estop, "ChannelB"),
+        )
         self._lever = Signal(inputs.estop, "Lever")
         self.guard_check, self.profile_check = Signal(inputs.guard, "ProfileCheck"), profile_check
         self._valve_state, self._echo_counter = Signal(inputs.valve_a, "State"), Signal(inputs.valve_b, "EchoCounter")
@@ -161,9 +164,11 @@ class Supervisor:
             if (spec := joint(profile, j)).encoder is not None
         )
         self._crane_nodes = (
-            (inputs.estop,), (inputs.guard,), (inputs.valve_a, inputs.valve_b),
+            (inputs.estop,),
+            (inputs.guard,),
+            (inputs.valve_a, inputs.valve_b),
             *((state,) for state in sensed if state is not None),
-        )  # fmt: skip
+        )
         """The needed inputs, by the node that sends them."""
         self._carrier_nodes = () if carrier is None else ((carrier.vehicle,), (carrier.arms_a, carrier.arms_b))
         self._latch_ramp_ns = RAMP_NS if profile.plc is None else PLC_RAMP_NS

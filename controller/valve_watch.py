@@ -44,9 +44,16 @@ class ValveWatch:
     """The monitors of all spools and joints."""
 
     __slots__ = (
-        "_crane", "_estimators", "_flow_limited", "_loops_elsewhere", "_measured", "_monitors", "_speeds",
-        "_spools_sensed", "_state",
-    )  # fmt: skip
+        "_crane",
+        "_estimators",
+        "_flow_limited",
+        "_loops_elsewhere",
+        "_measured",
+        "_monitors",
+        "_speeds",
+        "_spools_sensed",
+        "_state",
+    )
 
     def __init__(
         self,
@@ -78,9 +85,13 @@ class ValveWatch:
         opened, shut, wrong = self._monitors[j].shares()
         fast, slow, stood = self._speeds[j].shares()
         return {
-            "spool open": opened, "spool shut": shut, "spool wrong": wrong, "joint too fast for its valve": fast,
-            "joint too slow for its valve": slow, "joint stands while its valve is open": stood,
-        }  # fmt: skip
+            "spool open": opened,
+            "spool shut": shut,
+            "spool wrong": wrong,
+            "joint too fast for its valve": fast,
+            "joint too slow for its valve": slow,
+            "joint stands while its valve is open": stood,
+        }
 
     def step(self, supervisor: Supervisor, now_ns: int) -> None:
         """Watch every valve once and react; after the supervisor has decided on everything else."""

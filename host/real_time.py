@@ -81,8 +81,12 @@ def run_probe(file: str, seconds: float) -> dict[str, Any]:
     """
     done = subprocess.run(
         [sys.executable, "-ISB", file, str(seconds)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True, timeout=_TIMEOUT_S + seconds,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=_TIMEOUT_S + seconds,
         start_new_session=True,
-    )  # fmt: skip
+    )
     found: dict[str, Any] = msgspec.json.decode(done.stdout)
     return found

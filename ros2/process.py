@@ -28,13 +28,17 @@ def domain(text: str) -> int:
 def add_node_options(parser: argparse.ArgumentParser) -> None:
     """The options of a process that is a ROS 2 node."""
     parser.add_argument(
-        "--domain", type=domain, default=os.environ.get("ROS_DOMAIN_ID") or "0",
+        "--domain",
+        type=domain,
+        default=os.environ.get("ROS_DOMAIN_ID") or "0",
         help="ROS 2 domain (default: ROS_DOMAIN_ID, or 0)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--interface", default=LOOPBACK, metavar="ADDRESS",
+        "--interface",
+        default=LOOPBACK,
+        metavar="ADDRESS",
         help="address of the network interface to use (default: this computer only)",
-    )  # fmt: skip
+    )
 
 
 def open_node(name: str, options: argparse.Namespace) -> Node:

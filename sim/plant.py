@@ -152,9 +152,16 @@ class Plant(EmulatedMachine):
             return None
         position, turn = c.pose("rear")
         return VehicleState(
-            position, turn, c.heading_rad, c.roll_rad, -c.pitch_rad, c.speed_m_s, c.articulation_rad,
-            tuple(c.arm_heights_m), tuple(self.world.wheel_loads_n()),
-        )  # fmt: skip
+            position,
+            turn,
+            c.heading_rad,
+            c.roll_rad,
+            -c.pitch_rad,
+            c.speed_m_s,
+            c.articulation_rad,
+            tuple(c.arm_heights_m),
+            tuple(self.world.wheel_loads_n()),
+        )
 
     def tip(self) -> Vector:
         """True position of the hanger pin in the crane's base frame [m]."""

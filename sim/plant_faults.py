@@ -28,9 +28,13 @@ from sim.plant import Plant
 
 End = Callable[[], None]
 ENCODER_MESSAGES: Final = {
-    "slew": "EncSlew", "lift": "EncLift", "tilt": "EncTilt", "ext": "EncExt", "rot": "EncRot",
+    "slew": "EncSlew",
+    "lift": "EncLift",
+    "tilt": "EncTilt",
+    "ext": "EncExt",
+    "rot": "EncRot",
     "articulation": "EncArtic",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,14 +94,24 @@ def a_timing(count: int = 100, **facts: Any) -> Timing:
     now_ns = time.monotonic_ns()  # noqa: TID251  what shows a page compares its time with the clock
     inputs = {f"Input{i}": InputAge(1_000_000, (10 + i) * 1_000_000, 1000) for i in range(7)}
     usual = {
-        "pid": 4711, "started_ns": now_ns - 8000 * 10**9, "written_ns": now_ns, "period_ns": 5_000_000, "ticks": count,
-        "missed": 0, "late": 0, "mode": "STANDBY", "words": "STANDBY. All is well.",
-        "buses": (BusCounters("crane0", "ACTIVE", 12_345_678, 2_345_678, 0, 0, 2, 1),
-                  BusCounters("mach0", "DOWN", 5, 6, 7, 0, 0, 0)),
+        "pid": 4711,
+        "started_ns": now_ns - 8000 * 10**9,
+        "written_ns": now_ns,
+        "period_ns": 5_000_000,
+        "ticks": count,
+        "missed": 0,
+        "late": 0,
+        "mode": "STANDBY",
+        "words": "STANDBY. All is well.",
+        "buses": (
+            BusCounters("crane0", "ACTIVE", 12_345_678, 2_345_678, 0, 0, 2, 1),
+            BusCounters("mach0", "DOWN", 5, 6, 7, 0, 0, 0),
+        ),
         "process": ProcessCounters(800 * 10**9, 100, 2, 3, 4, 5, 6, 61_440),
         "inputs": inputs | {"Never": InputAge()},
-        "longest_ns": tuple(made[n].longest_ns for n in STAGES), "total_ns": tuple(made[n].total_ns for n in STAGES),
-    }  # fmt: skip
+        "longest_ns": tuple(made[n].longest_ns for n in STAGES),
+        "total_ns": tuple(made[n].total_ns for n in STAGES),
+    }
     return Timing(Facts(**(usual | facts)), made)
 
 

@@ -144,9 +144,10 @@ class PlannerOrders:
                     continue
                 if report.refusal:
                     raise CommandFailed(
-                        report.refusal_code or "mission.refused", f"the planner refuses: {report.refusal}",
+                        report.refusal_code or "mission.refused",
+                        f"the planner refuses: {report.refusal}",
                         ExitCode.SAFETY_STOP,
-                    )  # fmt: skip
+                    )
                 return report
         except OSError as error:
             raise CommandFailed(

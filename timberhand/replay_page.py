@@ -43,7 +43,8 @@ def show_recording(
     name = f"{run} · {manifest.start_utc or 'lockstep'}"
     at_ns = None if stop_ns is None else stop_ns - BEFORE_STOP_NS
     try:
-        serve_replay(recording, machine, port=port, name=name, note=note, at_ns=at_ns, bind=bind,
-                     allow_hosts=allow_hosts)  # fmt: skip
+        serve_replay(
+            recording, machine, port=port, name=name, note=note, at_ns=at_ns, bind=bind, allow_hosts=allow_hosts
+        )
     except StartError as error:
         raise CommandFailed.from_error(error, ExitCode(error.exit_code)) from error

@@ -22,12 +22,30 @@ from host.exit_codes import ExitCode
 from host.systemd import last_journal_line, show_all
 
 NAMES: Final = (
-    "controller", "guard", "perception", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0", "update",
-)  # fmt: skip
+    "controller",
+    "guard",
+    "perception",
+    "autonomy",
+    "recorder",
+    "console",
+    "plc",
+    "can@crane0",
+    "can@mach0",
+    "update",
+)
 PROPERTIES: Final = (
-    "Id", "Type", "LoadState", "ActiveState", "SubState", "Result", "ExecMainStatus", "NRestarts", "StatusText",
-    "StateChangeTimestampMonotonic", "ExecMainExitTimestampMonotonic",
-)  # fmt: skip
+    "Id",
+    "Type",
+    "LoadState",
+    "ActiveState",
+    "SubState",
+    "Result",
+    "ExecMainStatus",
+    "NRestarts",
+    "StatusText",
+    "StateChangeTimestampMonotonic",
+    "ExecMainExitTimestampMonotonic",
+)
 SYSTEMD: Final = Path("/run/systemd/system")
 SERVICE_PAGE: Final = Path("/run/timberhand/controller.timing")
 ENDINGS: Final = {
@@ -42,9 +60,12 @@ STALE_NS: Final = 3_000_000_000
 STATE_STYLES: Final = {"running": "green", "done": "green", "failed": "bold red", "restarting": "bold red"}
 MODE_STYLES: Final = {"FAULT": "bold red", "STOP": "bold red", "ACTIVE": "bold green", "ARMED": "bold green"}
 TABLE_ROWS: Final = {
-    "wake": "wake-up late", "sync": "SYNC late", "tick": "tick", "cpu": "tick, CPU",
+    "wake": "wake-up late",
+    "sync": "SYNC late",
+    "tick": "tick",
+    "cpu": "tick, CPU",
     "sample_to_command": "sample to command",
-}  # fmt: skip
+}
 """Durations with a row of their own; the stages of the tick share a line."""
 INPUT_COUNT: Final = 4
 """Number of inputs shown, the oldest first; the JSON has all of them."""
@@ -185,10 +206,11 @@ def _units(units: tuple[Unit, ...]) -> Table:
 def _timing(timing: Timing, before: Timing | None, silent: bool) -> list[RenderableType]:
     facts = timing.facts
     head = Text.assemble(
-        "controller ", (facts.mode, MODE_STYLES.get(facts.mode, "bold")),
+        "controller ",
+        (facts.mode, MODE_STYLES.get(facts.mode, "bold")),
         f", {1e9 / facts.period_ns:.0f} Hz for {duration((facts.written_ns - facts.started_ns) * 1e-9)}",
         f", process {facts.pid}, tick: {facts.tick}",
-    )  # fmt: skip
+    )
     parts: list[RenderableType] = [head, Text(facts.words)]
     if silent:
         parts.append(
@@ -207,10 +229,12 @@ def _counters(facts: Facts, before: Facts | None) -> Text:
         return f"{name} {number(of(facts))}{grown}", "bold yellow" if wrong else ""
 
     return Text.assemble(
-        count("ticks", lambda f: f.ticks, False), " · ",
-        count("missed", lambda f: f.missed, True), " · ",
+        count("ticks", lambda f: f.ticks, False),
+        " · ",
+        count("missed", lambda f: f.missed, True),
+        " · ",
         count("late", lambda f: f.late, True),
-    )  # fmt: skip
+    )
 
 
 def _durations(timing: Timing, before: Timing | None) -> RenderableType:
@@ -275,9 +299,12 @@ def _process(facts: Facts, before: Timing | None) -> Text:
         faults = f"page faults +{number(minor - then.minor_faults)} minor, +{number(major - then.major_faults)} major"
     share = 100.0 * cpu_ns / since_ns if since_ns > 0 else 0.0
     words = (
-        f"memory {process.resident_kb / 1024:.0f} MB", f"CPU {share:.1f} %", faults,
-        f"preempted {number(process.involuntary_switches)} times", f"garbage passes {number(process.gc_runs)}",
-    )  # fmt: skip
+        f"memory {process.resident_kb / 1024:.0f} MB",
+        f"CPU {share:.1f} %",
+        faults,
+        f"preempted {number(process.involuntary_switches)} times",
+        f"garbage passes {number(process.gc_runs)}",
+    )
     return Text(" · ".join(words))
 
 

@@ -66,13 +66,18 @@ def _fit(tests: Sequence[SpoolTestRecord]) -> tuple[float, float, float]:
     best = min(
         (
             least_squares(
-                residuals, (start, 40.0, 0.8), bounds=((0.0, 10.0, 0.3), (MAX_DELAY_S, 150.0, 1.5)),
-                x_scale=(0.01, 10.0, 0.2), loss="soft_l1", diff_step=1e-3, max_nfev=40,
+                residuals,
+                (start, 40.0, 0.8),
+                bounds=((0.0, 10.0, 0.3), (MAX_DELAY_S, 150.0, 1.5)),
+                x_scale=(0.01, 10.0, 0.2),
+                loss="soft_l1",
+                diff_step=1e-3,
+                max_nfev=40,
             )
             for start in _DELAY_GUESSES_S
         ),
         key=lambda found: float(found.cost),
-    )  # fmt: skip
+    )
     delay, omega, zeta = best.x
     misfit = residuals(best.x) * SPOOL_RESOLUTION
     return float(delay), float(2.0 * zeta / omega), float(np.sqrt(np.mean(misfit**2)))

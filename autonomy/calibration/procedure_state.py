@@ -31,12 +31,28 @@ READING_COUNT: Final = 8
 PATIENCE_S: Final = 120.0
 """How long a live run waits, after an interruption, until a person has armed again."""
 
-INTERRUPTIONS: Final = frozenset({
-    Reason.ESTOP_LOST, Reason.GUARD_LOST, Reason.GUARD_REFUSES, Reason.SAFETY_NODE_LOST, Reason.ENCODER_LOST,
-    Reason.ENCODER_NODE_LOST, Reason.VALVE_FEEDBACK_LOST, Reason.PRESSURE_LOST, Reason.PRESSURE_NODE_LOST,
-    Reason.GRAPPLE_STATUS_LOST, Reason.PERSON_IN_ZONE, Reason.BUS_PASSIVE, Reason.SEND_REFUSED, Reason.LOOP_LATE,
-    Reason.LOOP_STALLED, Reason.COMPUTER_STALLED, Reason.INPUTS_LOST, Reason.LEASE_LOST,
-})  # fmt: skip
+INTERRUPTIONS: Final = frozenset(
+    {
+        Reason.ESTOP_LOST,
+        Reason.GUARD_LOST,
+        Reason.GUARD_REFUSES,
+        Reason.SAFETY_NODE_LOST,
+        Reason.ENCODER_LOST,
+        Reason.ENCODER_NODE_LOST,
+        Reason.VALVE_FEEDBACK_LOST,
+        Reason.PRESSURE_LOST,
+        Reason.PRESSURE_NODE_LOST,
+        Reason.GRAPPLE_STATUS_LOST,
+        Reason.PERSON_IN_ZONE,
+        Reason.BUS_PASSIVE,
+        Reason.SEND_REFUSED,
+        Reason.LOOP_LATE,
+        Reason.LOOP_STALLED,
+        Reason.COMPUTER_STALLED,
+        Reason.INPUTS_LOST,
+        Reason.LEASE_LOST,
+    }
+)
 """Reasons of a stop that say nothing about the tested joint."""
 
 

@@ -32,8 +32,9 @@ def result_document(result: CalibrationResult, facts: dict[str, Any], changed: l
             "offset_errors": {j.name.lower(): e for j, e in zip(OFFSETS, s.errors, strict=True)},
             "sag": {name: getattr(s.sag, name) for name in s.sag.__struct_fields__},
             "moments_left_nm": list(s.moments_nm),
-            "before_mm": [1e3 * d for d in s.before_m], "after_mm": [1e3 * d for d in s.after_m],
-        }  # fmt: skip
+            "before_mm": [1e3 * d for d in s.before_m],
+            "after_mm": [1e3 * d for d in s.after_m],
+        }
     document: dict[str, Any] = _rounded(
         {
             **facts,

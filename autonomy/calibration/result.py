@@ -169,8 +169,9 @@ def _pair_problems(name: str, full_speeds: tuple[float, float]) -> Iterator[Prob
 
 def _turn_problems(fit: TurnFit, spec: JointSpec) -> Iterator[Problem]:
     for name, side, nominal in (
-        ("rot plus", fit.plus, spec.valve.full_speed_plus), ("rot minus", fit.minus, spec.valve.full_speed_minus),
-    ):  # fmt: skip
+        ("rot plus", fit.plus, spec.valve.full_speed_plus),
+        ("rot minus", fit.minus, spec.valve.full_speed_minus),
+    ):
         errors = (side.errors[0], side.errors[1] / side.full_speed)
         yield from _side_problems(name, side.deadband, side.full_speed, errors, nominal, MAX_TURN_DEADBAND_ERROR)
         left = max(map(abs, side.left_rad))

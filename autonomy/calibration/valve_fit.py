@@ -36,9 +36,18 @@ _MAX_EVALUATIONS: Final = 60
 PRIOR_WEIGHT: Final = 10.0
 """Weight of the prior against the data: neighbouring residuals are correlated, a hundred of them count as one."""
 _PARAMETER_NAMES: Final = (
-    "deadband_plus", "deadband_minus", "hysteresis", "exponent", "full_plus", "full_minus", "lever", "ring_rad_s",
-    "ring_zeta", "lag_plus_s", "lag_minus_s",
-)  # fmt: skip
+    "deadband_plus",
+    "deadband_minus",
+    "hysteresis",
+    "exponent",
+    "full_plus",
+    "full_minus",
+    "lever",
+    "ring_rad_s",
+    "ring_zeta",
+    "lag_plus_s",
+    "lag_minus_s",
+)
 _SPEED_NAMES: Final = ("speed_plus", "speed_minus")
 
 
@@ -130,10 +139,19 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
     valve = spec.valve
     start = np.array(
         [
-            valve.deadband_plus_pct / 100.0, valve.deadband_minus_pct / 100.0, HYSTERESIS, EXPONENT,
-            valve.full_speed_plus, valve.full_speed_minus, 0.0, 10.0, 0.4, 0.03, 0.03,
+            valve.deadband_plus_pct / 100.0,
+            valve.deadband_minus_pct / 100.0,
+            HYSTERESIS,
+            EXPONENT,
+            valve.full_speed_plus,
+            valve.full_speed_minus,
+            0.0,
+            10.0,
+            0.4,
+            0.03,
+            0.03,
         ]
-    )  # fmt: skip
+    )
     full = start[4:6]
     low = np.array([0.005, 0.005, 0.0, 0.9, *(0.3 * full), -2.0, 2.0, 0.02, 0.0, 0.0])
     high = np.array([0.45, 0.45, 0.1, 1.6, *(3.0 * full), 2.0, 80.0, 3.0, 0.3, 0.3])
@@ -143,8 +161,10 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
 
     def residuals(p: np.ndarray) -> np.ndarray:
         prior = [
-            (p[2] - HYSTERESIS) / HYSTERESIS_SIGMA, (p[3] - EXPONENT) / EXPONENT_SIGMA, p[6] / lever,
-        ]  # fmt: skip
+            (p[2] - HYSTERESIS) / HYSTERESIS_SIGMA,
+            (p[3] - EXPONENT) / EXPONENT_SIGMA,
+            p[6] / lever,
+        ]
         return np.concatenate([*((s.position - s.model(p)) / noise for s in stretches), np.array(prior) * PRIOR_WEIGHT])
 
     found = least_squares(

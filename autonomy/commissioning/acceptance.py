@@ -46,12 +46,19 @@ class Check:
 
 CHECKS: Final = (
     Check("identity", "The machine is the one of the profile", "Compare plate, profile and serial number."),
-    Check("estop", "Emergency stop",
-          "Arm, then press each emergency stop: the page shows ESTOP_PRESSED, pilot supply off; it latches."),
+    Check(
+        "estop",
+        "Emergency stop",
+        "Arm, then press each emergency stop: the page shows ESTOP_PRESSED, pilot supply off; it latches.",
+    ),
     Check("stop", "STOP on the page", "Move a joint, press STOP on every page in use: it stops.", "ms to standstill"),
     Check("link", "Loss of the operator's link", "Armed, cut the network of the page: it holds.", "s until it holds"),
-    Check("controller", "Loss of the controller", "Stop the controller's service while a joint moves: neutral.",
-          "s to standstill"),
+    Check(
+        "controller",
+        "Loss of the controller",
+        "Stop the controller's service while a joint moves: neutral.",
+        "s to standstill",
+    ),
     Check("guard", "Loss of the guard", "Stop the guard's service: neutral, pilot supply off."),
     Check("lever", "Hand levers win", "Armed, move each hand lever: LEVER_MOVED, neutral without a ramp."),
     Check("signs", "Every joint moves the right way", "Step each joint: it goes where its sign says."),
@@ -60,7 +67,7 @@ CHECKS: Final = (
     Check("limits", "Ends of the joints", "Step towards each end: the step is refused or ends before the stop."),
     Check("load", "Load", "Lift a known mass: the page shows it.", "kg shown for kg hung"),
     Check("zone", "The zone is kept clear", "Signs, barriers and the person in charge are in place."),
-)  # fmt: skip
+)
 IDS: Final = tuple(check.id for check in CHECKS)
 Text = Annotated[str, msgspec.Meta(max_length=400)]
 Line = Annotated[str, msgspec.Meta(max_length=80)]
@@ -110,9 +117,14 @@ def judge(protocol: Protocol) -> tuple[Verdict, list[str]]:
     titles = {check.id: check.title for check in CHECKS}
     failed = [f"{titles[e.id]}: failed." for e in protocol.entries if e.result is Result.FAIL]
     missing = [f"{titles[e.id]}: not checked." for e in protocol.entries if e.result is Result.OPEN]
-    missing += [f"{what} is missing." for what, words in (
-        ("The machine's serial number", protocol.machine), ("The inspector's name", protocol.inspector),
-    ) if not words.strip()]  # fmt: skip
+    missing += [
+        f"{what} is missing."
+        for what, words in (
+            ("The machine's serial number", protocol.machine),
+            ("The inspector's name", protocol.inspector),
+        )
+        if not words.strip()
+    ]
     if failed:
         return Verdict.REFUSED, failed + missing
     return (Verdict.INCOMPLETE, missing) if missing else (Verdict.ACCEPTED, [])

@@ -121,9 +121,15 @@ class StepTest:
     """One test.  ``idle``: nothing more will be sent; ``done``: it was made as a whole."""
 
     def __init__(
-        self, profile: Profile, profile_hash: int, which: Joint, amount: float, database: Database,
-        lease_ns: int = 200_000_000, key: bytes | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        profile: Profile,
+        profile_hash: int,
+        which: Joint,
+        amount: float,
+        database: Database,
+        lease_ns: int = 200_000_000,
+        key: bytes | None = None,
+    ) -> None:
         """Step ``which`` by ``amount`` [rad, m].
 
         Raises:
@@ -202,9 +208,11 @@ class StepTest:
         reference, position = (np.array([s[i] for s in self._seen]) for i in (1, 2))
         series = {"reference": reference, "position": position}
         columns = {
-            "command": (self._trace.commands[self.joint], 100.0), "spool": (self._trace.spools[self.joint], 100.0),
-            "pressure_a": (self._pressures.sides[0], 1.0), "pressure_b": (self._pressures.sides[1], 1.0),
-        }  # fmt: skip
+            "command": (self._trace.commands[self.joint], 100.0),
+            "spool": (self._trace.spools[self.joint], 100.0),
+            "pressure_a": (self._pressures.sides[0], 1.0),
+            "pressure_b": (self._pressures.sides[1], 1.0),
+        }
         for name, (column, scale) in columns.items():
             at, values = column.between(self.begun_ns, self._last_ns + 1)
             series[name] = np.interp(times, at, scale * values) if len(at) else np.full_like(times, np.nan)
@@ -214,14 +222,17 @@ class StepTest:
         way = (position - self._start) * np.sign(self.amount)
         out = times <= turn_s
         return StepResult(
-            self.joint, self.amount, times, series,
+            self.joint,
+            self.amount,
+            times,
+            series,
             largest_error=float(np.nanmax(np.abs(error))),
             rest_error=float(max(np.nanmean(np.abs(error[r])) for r in rests)),
             overshoot=float(max(0.0, np.nanmax(way[out]) - abs(self.amount), -np.nanmin(way))),
-            delay_s=_first(times, way, abs(self.amount)) - _first(
-                times, (reference - self._start) * np.sign(self.amount), abs(self.amount)),
+            delay_s=_first(times, way, abs(self.amount))
+            - _first(times, (reference - self._start) * np.sign(self.amount), abs(self.amount)),
             largest_command_pct=float(np.nanmax(np.abs(series["command"]))),
-        )  # fmt: skip
+        )
 
     def _blocked(self, now_ns: int) -> Problem | None:
         report = self._report
@@ -249,8 +260,10 @@ class StepTest:
 
     def _begin(self, now_ns: int) -> bool:
         assert self._report is not None
-        start = [p if isfinite(p) else r if isfinite(r) else 0.0
-                 for p, r in zip(self._report.position, self._report.reference, strict=True)]  # fmt: skip
+        start = [
+            p if isfinite(p) else r if isfinite(r) else 0.0
+            for p, r in zip(self._report.position, self._report.reference, strict=True)
+        ]
         goal = list(start)
         goal[self.joint] += self.amount
         low, high = free_range(self._spec)

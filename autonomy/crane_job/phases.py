@@ -44,7 +44,9 @@ _OPEN, _CLOSE, _HOLD = GrappleCommand.OPEN, GrappleCommand.CLOSE, GrappleCommand
 PHASE_RULES: Final = {
     Phase.LOOK: PhaseRule(_OPEN, 0.0, 5.0, Problem("activity.look-timeout", "the detector sent no log list")),
     Phase.ABOVE: PhaseRule(
-        _OPEN, 0.0, 6.0,
+        _OPEN,
+        0.0,
+        6.0,
         Problem("activity.above-timeout", "the crane did not get above the log with an open grapple"),
     ),
     Phase.DESCEND: PhaseRule(
@@ -55,7 +57,9 @@ PHASE_RULES: Final = {
         _HOLD, 0.0, 5.0, Problem("activity.lift-timeout", "the crane did not lift the log, or no log list came")
     ),
     Phase.CARRY: PhaseRule(
-        _HOLD, 0.0, 6.0,
+        _HOLD,
+        0.0,
+        6.0,
         Problem("activity.carry-timeout", "the crane did not get over the bunk, or no log list came"),
     ),
     Phase.LOWER: PhaseRule(
@@ -66,7 +70,7 @@ PHASE_RULES: Final = {
         _OPEN, 0.1, 6.0, Problem("activity.retreat-timeout", "the crane did not leave the bunk, or no log list came")
     ),
     Phase.STOW: PhaseRule(_HOLD, 0.1, 6.0, Problem("activity.stow-timeout", "the crane did not get over the bunk")),
-}  # fmt: skip
+}
 RESUME_PHASE: Final = {
     Phase.DESCEND: Phase.ABOVE,
     Phase.CLOSE: Phase.ABOVE,

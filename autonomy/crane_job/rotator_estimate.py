@@ -102,9 +102,12 @@ def planning_profile(profile: Profile, rotator: RotatorEstimate) -> Profile:
         return profile
     spec, slower = joint(profile, Joint.ROT), min(*rotator.paces, 1.0)
     limited = replace(
-        spec, lower=spec.lower / 2, upper=spec.upper / 2,
-        speed_limit=slower * spec.speed_limit, acceleration_limit=slower * spec.acceleration_limit,
-    )  # fmt: skip
+        spec,
+        lower=spec.lower / 2,
+        upper=spec.upper / 2,
+        speed_limit=slower * spec.speed_limit,
+        acceleration_limit=slower * spec.acceleration_limit,
+    )
     return replace(profile, joints={**profile.joints, "rot": limited})
 
 

@@ -55,9 +55,13 @@ class BunkLoad:
     """
 
     def __init__(
-        self, bunk: Bunk, logs: Sequence[LogObservation], diameter_m: float, length_m: float,
+        self,
+        bunk: Bunk,
+        logs: Sequence[LogObservation],
+        diameter_m: float,
+        length_m: float,
         slope: tuple[float, float] = (0.0, 0.0),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._radius_m = radius = diameter_m / 2
         half = max(bunk.width_m / 2 - radius, 0.0)
         steps = int(half / GRID_M)

@@ -31,9 +31,13 @@ _END_ERROR_M, _SKEW_ERROR_RAD = 0.05, 0.15
 
 
 def plan_place(
-    arm: Arm, job: CraneJob, grasp: Grasp, logs: Sequence[LogObservation], held_yaw_rad: float | None = None,
+    arm: Arm,
+    job: CraneJob,
+    grasp: Grasp,
+    logs: Sequence[LogObservation],
+    held_yaw_rad: float | None = None,
     stands_rad: float | None = None,
-) -> Pose:  # fmt: skip
+) -> Pose:
     """The pose of the pin in which the grapple may open over the bunk.
 
     ``held_yaw_rad`` is the grapple's yaw while the log was seen to hang in it.  A thin log may lie askew in closed

@@ -132,9 +132,17 @@ class PlannerSelection:
         # A log that lies alone cannot settle: the crane lifts it as it lifts one of `select_direct`.
         top = _highest_point_m(present) if near or others else None
         return Grasp(
-            first, pose, p.support_z_m, offset_along(point, first), tuple(others), top, p.reason, p.probability,
-            p.penetrates, p.extracts,
-        )  # fmt: skip
+            first,
+            pose,
+            p.support_z_m,
+            offset_along(point, first),
+            tuple(others),
+            top,
+            p.reason,
+            p.probability,
+            p.penetrates,
+            p.extracts,
+        )
 
 
 def _highest_point_m(logs: Sequence[LogObservation]) -> float:

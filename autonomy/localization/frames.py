@@ -23,10 +23,17 @@ class Frames:
         self._carrier = carrier
         self._height = location.front_height_m
         z = location.z_m if np.isfinite(location.z_m) else carrier.wheel_radius_m
-        self._values = np.array([
-            location.x_m, location.y_m, z, location.yaw_rad, location.articulation_rad, location.roll_rad,
-            location.pitch_rad,
-        ])  # fmt: skip
+        self._values = np.array(
+            [
+                location.x_m,
+                location.y_m,
+                z,
+                location.yaw_rad,
+                location.articulation_rad,
+                location.roll_rad,
+                location.pitch_rad,
+            ]
+        )
 
     def rear(self) -> Pose:
         """The rear frame; its origin is on the articulation axis."""

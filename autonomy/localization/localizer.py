@@ -238,11 +238,24 @@ class Localizer:
         seen = [State.X, State.Y, State.YAW]
         yaw = wrapped(float(x[State.YAW]))
         return Location(
-            report.stamp_ns, self._status, reason, float(x[State.X]), float(x[State.Y]), self._z[0], yaw,
-            p[np.ix_(seen, seen)], self._z[1], wrapped(yaw + drift_rad(x, self._front_roll_pitch(report)[0])),
-            report.speed_m_s * (1.0 + float(x[State.SCALE])), float(x[State.CURVE]), report.articulation_rad,
-            roll, pitch, self._front_height(report), self._jumps,
-        )  # fmt: skip
+            report.stamp_ns,
+            self._status,
+            reason,
+            float(x[State.X]),
+            float(x[State.Y]),
+            self._z[0],
+            yaw,
+            p[np.ix_(seen, seen)],
+            self._z[1],
+            wrapped(yaw + drift_rad(x, self._front_roll_pitch(report)[0])),
+            report.speed_m_s * (1.0 + float(x[State.SCALE])),
+            float(x[State.CURVE]),
+            report.articulation_rad,
+            roll,
+            pitch,
+            self._front_height(report),
+            self._jumps,
+        )
 
     def _front_roll_pitch(self, report: VehicleReport) -> tuple[float, float]:
         """Roll and pitch of the front half; level while unknown."""

@@ -140,9 +140,7 @@ def predicted_state(carrier: Carrier, noise: NoiseModel, x: Array, odometry: Odo
     added[[s.X, s.Y]] = noise.distance_m**2 * driven + noise.standstill_m**2 * d.seconds
     added[s.YAW] = noise.distance_yaw_rad**2 * driven
     added[s.HEADING] = noise.heading_rad**2 * d.seconds
-    for place, drift in (
-        (s.CURVE, noise.curve), (s.SIDE, noise.side), (s.SCALE, noise.scale), (s.SLIDE, noise.slide)
-    ):  # fmt: skip
+    for place, drift in ((s.CURVE, noise.curve), (s.SIDE, noise.side), (s.SCALE, noise.scale), (s.SLIDE, noise.slide)):
         keep, added[place] = drift.step(driven)
         out[place] *= keep
         jacobian[place, place] = keep
@@ -178,10 +176,12 @@ def predicted_antenna(x: Array, reach: Array) -> tuple[Array, Array]:
     s = State
     c, si = math.cos(x[s.YAW]), math.sin(x[s.YAW])
     ahead, left = reach[0] + x[s.ANTENNA_X], reach[1] + x[s.ANTENNA_Y]
-    shown = np.array([
-        x[s.X] + c * ahead - si * left + x[s.WANDER_X],
-        x[s.Y] + si * ahead + c * left + x[s.WANDER_Y],
-    ])  # fmt: skip
+    shown = np.array(
+        [
+            x[s.X] + c * ahead - si * left + x[s.WANDER_X],
+            x[s.Y] + si * ahead + c * left + x[s.WANDER_Y],
+        ]
+    )
     jacobian = np.zeros((2, SIZE))
     jacobian[:, [s.X, s.Y]] = jacobian[:, [s.WANDER_X, s.WANDER_Y]] = np.eye(2)
     jacobian[:, s.YAW] = -si * ahead - c * left, c * ahead - si * left

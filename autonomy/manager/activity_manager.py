@@ -109,9 +109,18 @@ class ActivityManager:
         self._table, self._key = table, key
         motions = motions or (MovementPrimitivePlanner(load(profile)) if table is PAPER_B else TimeOptimalPlanner())
         self._crane = CraneExecutor(
-            profile, profile_hash, self.world, self.load, selector, unloading_selector or selector, motions, lease_ns,
-            key, progress.rotator if progress else RotatorEstimate(), table is PAPER_B,
-        )  # fmt: skip
+            profile,
+            profile_hash,
+            self.world,
+            self.load,
+            selector,
+            unloading_selector or selector,
+            motions,
+            lease_ns,
+            key,
+            progress.rotator if progress else RotatorEstimate(),
+            table is PAPER_B,
+        )
         options, carrier = mission.options, profile.carrier
         transport, loading = options.transport_height_m, options.loading_height_m
         self._heights = {

@@ -103,10 +103,19 @@ class CraneExecutor:
         onward: Callable[[LogObservation], bool] | None = self._unloads_next if unloads else self._fetches_next
         self._stops = 0
         self.job = Activity(
-            self._profile, self._hash, mission, self._lease_ns, self._key,
-            self._unloading_selector if unloads else choose, self._reference, self._motions,
-            None if self._as_paper_b else onward, mission is None, self.rotator, self._world.slope,
-        )  # fmt: skip
+            self._profile,
+            self._hash,
+            mission,
+            self._lease_ns,
+            self._key,
+            self._unloading_selector if unloads else choose,
+            self._reference,
+            self._motions,
+            None if self._as_paper_b else onward,
+            mission is None,
+            self.rotator,
+            self._world.slope,
+        )
 
     def _unloads_next(self, log: LogObservation) -> bool:
         """Whether the next grasp from the bunk could be of such a log."""

@@ -157,10 +157,17 @@ def listed_log(log: KnownLog, plane: LocalPlane, ground_m: float) -> MappedLog:
     x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
     yaw = 0.0 if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg)
     return MappedLog(
-        0, np.array([x, y, ground_m + 0.5 * d]), np.array([math.cos(yaw), math.sin(yaw), 0.0]),
-        log.length_m or DEFAULT_SIZE_M[0], d, log.sigma_m or LISTED_SIGMA_M, CONFIRMED_HITS, 0,
-        assortment=log.assortment, turn_rad=math.pi if log.bearing_deg is None else 0.0,
-    )  # fmt: skip
+        0,
+        np.array([x, y, ground_m + 0.5 * d]),
+        np.array([math.cos(yaw), math.sin(yaw), 0.0]),
+        log.length_m or DEFAULT_SIZE_M[0],
+        d,
+        log.sigma_m or LISTED_SIGMA_M,
+        CONFIRMED_HITS,
+        0,
+        assortment=log.assortment,
+        turn_rad=math.pi if log.bearing_deg is None else 0.0,
+    )
 
 
 def _observed_log(o: LogObservation, base: Pose, now_ns: int) -> MappedLog:

@@ -111,30 +111,46 @@ class Rule:
 
 RULES: Final[Mapping[State, Rule]] = {
     State.IDLE: Rule("waits for the mode switch to be set to Auto", float("inf"), ""),
-    State.RAISE: Rule("moves the frame to transport height", 30.0, "the swing arms did not reach the transport height",
-                      height=Height.TRANSPORT),
-    State.SEARCH: Rule("follows the waypoints and looks for logs", 20.0, "the machine makes no progress on the route",
-                       drives=True),
+    State.RAISE: Rule(
+        "moves the frame to transport height",
+        30.0,
+        "the swing arms did not reach the transport height",
+        height=Height.TRANSPORT,
+    ),
+    State.SEARCH: Rule(
+        "follows the waypoints and looks for logs", 20.0, "the machine makes no progress on the route", drives=True
+    ),
     State.HALT: Rule("stops before the log", 10.0, "the machine did not come to a stop"),
     State.LOOK: Rule("observes the log at standstill", 15.0, "the log was not observed often enough"),
     State.APPROACH: Rule("drives up to the log", 20.0, "the machine makes no progress towards the log", drives=True),
     State.PASS: Rule("drives past the log", 20.0, "the machine makes no progress past the log", drives=True),
     State.STOP: Rule("stops beside the log", 10.0, "the machine did not come to a stop"),
     State.CHECK: Rule("checks whether a log can be grasped", 15.0, "no log list was received"),
-    State.LOWER: Rule("moves the frame to loading height", 30.0, "the swing arms did not reach the loading height",
-                      height=Height.LOADING),
-    State.COLLECT: Rule("loads a log into the bunk", 180.0, "the crane did not bring the log into the bunk",
-                        crane=True),
-    State.HAUL: Rule("drives the load to the landing", 20.0, "the machine makes no progress towards the landing",
-                     drives=True),
-    State.SETTLE: Rule("moves the frame to loading height at the landing", 30.0,
-                       "the swing arms did not reach the loading height", height=Height.LOADING),
+    State.LOWER: Rule(
+        "moves the frame to loading height",
+        30.0,
+        "the swing arms did not reach the loading height",
+        height=Height.LOADING,
+    ),
+    State.COLLECT: Rule(
+        "loads a log into the bunk", 180.0, "the crane did not bring the log into the bunk", crane=True
+    ),
+    State.HAUL: Rule(
+        "drives the load to the landing", 20.0, "the machine makes no progress towards the landing", drives=True
+    ),
+    State.SETTLE: Rule(
+        "moves the frame to loading height at the landing",
+        30.0,
+        "the swing arms did not reach the loading height",
+        height=Height.LOADING,
+    ),
     State.UNLOAD: Rule("unloads the bunk", 240.0, "the crane did not bring a log to the landing", crane=True),
-    State.STOW: Rule("moves the crane over the bunk", 60.0, "the crane did not reach its stow position over the bunk",
-                     crane=True),
+    State.STOW: Rule(
+        "moves the crane over the bunk", 60.0, "the crane did not reach its stow position over the bunk", crane=True
+    ),
     State.DONE: Rule("has finished", float("inf"), ""),
     State.FAILED: Rule("has failed", float("inf"), ""),
-}  # fmt: skip
+}
 
 Table = Mapping[tuple[State, Event], State]
 

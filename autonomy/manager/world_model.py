@@ -335,9 +335,10 @@ class WorldModel:
         here = self.location
         ahead = np.array([math.cos(here.yaw_rad), math.sin(here.yaw_rad)])
         near = [
-            g for g in self._relevant()
+            g
+            for g in self._relevant()
             if self.is_in_circle(g) or 0.0 < float((g.center_m[:2] - (here.x_m, here.y_m)) @ ahead) <= NEAR_M
-        ]  # fmt: skip
+        ]
         return nearest(near, self.base.position_m[:2])
 
     def next_stop(self, base_at: BaseAt, along_m: float, end_m: float) -> LoadingStop | None:

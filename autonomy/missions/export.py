@@ -156,21 +156,30 @@ def write_plan(mission: ForwardingMission) -> bytes:
         "geoFence": {"circles": [], "polygons": polygons, "version": 2},
         "groundStation": "timberhand",
         "mission": {
-            "cruiseSpeed": mission.options.speed_m_s or 1, "firmwareType": _MAV_AUTOPILOT_ARDUPILOT,
-            "globalPlanAltitudeMode": 1, "hoverSpeed": 1, "items": items,
-            "plannedHomePosition": [*_lat_lon(home), 0], "vehicleType": _MAV_TYPE_GROUND_ROVER, "version": 2,
+            "cruiseSpeed": mission.options.speed_m_s or 1,
+            "firmwareType": _MAV_AUTOPILOT_ARDUPILOT,
+            "globalPlanAltitudeMode": 1,
+            "hoverSpeed": 1,
+            "items": items,
+            "plannedHomePosition": [*_lat_lon(home), 0],
+            "vehicleType": _MAV_TYPE_GROUND_ROVER,
+            "version": 2,
         },
         "rallyPoints": {"points": [], "version": 2},
         "version": 1,
-    }  # fmt: skip
+    }
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _item(command: int, params: list[float | None], number: int) -> dict[str, Any]:
     return {
-        "autoContinue": True, "command": command, "doJumpId": number, "frame": _MAV_FRAME_GLOBAL_RELATIVE_ALT,
-        "params": params, "type": "SimpleItem",
-    }  # fmt: skip
+        "autoContinue": True,
+        "command": command,
+        "doJumpId": number,
+        "frame": _MAV_FRAME_GLOBAL_RELATIVE_ALT,
+        "params": params,
+        "type": "SimpleItem",
+    }
 
 
 def _lat_lon(point: Point) -> list[float]:
@@ -200,8 +209,11 @@ def _left_out(mission: ForwardingMission, holds: frozenset[str]) -> tuple[str, .
 
 _GPX: Final = frozenset({"name", "landings", "logs"})
 _KML: Final = _GPX | {
-    "fences", "names of fences", "bearings and assortments of landings", "sizes, bearings and kinds of logs",
-}  # fmt: skip
+    "fences",
+    "names of fences",
+    "bearings and assortments of landings",
+    "sizes, bearings and kinds of logs",
+}
 _ALL: Final = _KML | {"heights", *(f"options.{name}" for name in Options.__struct_fields__)}
 FORMATS: Final[dict[str, tuple[Callable[[ForwardingMission], bytes], frozenset[str]]]] = {
     "geojson": (geojson.write, _ALL),

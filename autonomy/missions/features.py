@@ -92,11 +92,12 @@ def assemble(
         draft.notes.append(f"{_counted(len(without_role), 'point')} without a role beside the route ignored")
     problems += [
         (
-            line.place, "mission.second-route",
+            line.place,
+            "mission.second-route",
             'is a second route; a mission has one, so delete one of them or give it another "role"',
         )
         for line in lines[1:]
-    ]  # fmt: skip
+    ]
     if lines and points:
         sentence = "is a waypoint beside a route; keep the line or the points, not both"
         problems.append((points[0].place, "mission.waypoint-beside-route", sentence))
@@ -129,9 +130,13 @@ def merged(route: Draft, harvest: Draft) -> Draft:
     both = (*route.mission.logs, *harvest.mission.logs)
     fields = {name: getattr(route.mission, name) for name in ("name", "waypoints", "fences", "landings", "options")}
     return Draft(
-        ForwardingMission(**fields, logs=both), route.source, route.format, dict(route.places),
-        [*route.notes, *harvest.notes], [*route.warnings, *harvest.warnings],
-    )  # fmt: skip
+        ForwardingMission(**fields, logs=both),
+        route.source,
+        route.format,
+        dict(route.places),
+        [*route.notes, *harvest.notes],
+        [*route.warnings, *harvest.warnings],
+    )
 
 
 def _role(shape: Shape, problems: list[tuple[Place, str, str]]) -> str:
@@ -143,8 +148,14 @@ def _role(shape: Shape, problems: list[tuple[Place, str, str]]) -> str:
         sentence = f"role {_abbreviated(role)} is unknown; use one of {', '.join(ROLES)}"
         problems.append((shape.place, "mission.unknown-role", sentence))
         return "none"
-    fits = {"route": ("line",), "waypoint": ("point",), "fence": ("polygon",), "keep-out": ("polygon",),
-            "log": ("point", "line"), "landing": ("point",)}[role]  # fmt: skip
+    fits = {
+        "route": ("line",),
+        "waypoint": ("point",),
+        "fence": ("polygon",),
+        "keep-out": ("polygon",),
+        "log": ("point", "line"),
+        "landing": ("point",),
+    }[role]
     if shape.kind not in fits:
         sentence = f"a {shape.kind} cannot be a {role}; draw a {' or a '.join(fits)}"
         problems.append((shape.place, "mission.role-shape", sentence))

@@ -66,9 +66,17 @@ def write_fpr(loads: Sequence[ForwardedLoad], forwarder: Forwarder, written: dat
     species = {name: i for i, name in enumerate(sorted({p[0] for p in products}), 1)}
     landings = {landing: i for i, landing in enumerate(dict.fromkeys(load.landing for load in loads), 1)}
     root = Element(
-        "ForwardedProduction", xmlns=NAMESPACE, areaUnit="ha", diameterUnit="mm", lengthUnit="cm", volumeUnit="m3",
-        weightUnit="kg", version=VERSION, versionDate=VERSION_DATE, messageType="fpr",
-    )  # fmt: skip
+        "ForwardedProduction",
+        xmlns=NAMESPACE,
+        areaUnit="ha",
+        diameterUnit="mm",
+        lengthUnit="cm",
+        volumeUnit="m3",
+        weightUnit="kg",
+        version=VERSION,
+        versionDate=VERSION_DATE,
+        messageType="fpr",
+    )
     header = SubElement(root, "ForwardedProductionHeader")
     for name in ("CreationDate", "ModificationDate"):
         _add(header, name, written.isoformat())

@@ -24,9 +24,19 @@ from runtime.errors import CodedError
 
 MAX_ELEMENTS: Final = 300_000
 MAX_KML_POSITIONS: Final = 100_000
-_GPX: Final = frozenset({
-    "metadata", "name", "rte", "rtept", "trk", "trkseg", "trkpt", "wpt", "type",
-})  # fmt: skip
+_GPX: Final = frozenset(
+    {
+        "metadata",
+        "name",
+        "rte",
+        "rtept",
+        "trk",
+        "trkseg",
+        "trkpt",
+        "wpt",
+        "type",
+    }
+)
 _GPX_LIMITS: Final = {
     "rtept": (MAX_WAYPOINTS, "points in a route"),
     "trkpt": (MAX_WAYPOINTS, "points in a track"),
@@ -34,16 +44,40 @@ _GPX_LIMITS: Final = {
     ANY: (MAX_ELEMENTS, "elements"),
 }
 _KML_UNUSED: Final = {
-    "GroundOverlay": "image on the ground", "PhotoOverlay": "photo", "ScreenOverlay": "image on the screen",
-    "Model": "model", "Tour": "tour",
-}  # fmt: skip
+    "GroundOverlay": "image on the ground",
+    "PhotoOverlay": "photo",
+    "ScreenOverlay": "image on the screen",
+    "Model": "model",
+    "Tour": "tour",
+}
 MAX_GAP_M: Final = 5.0
 """Segments of a track that begin no farther than this from the end of the one before are one drive [est]."""
-_KML: Final = frozenset({
-    "Document", "Folder", "Placemark", "name", "ExtendedData", "Data", "value", "SchemaData", "SimpleData",
-    "MultiGeometry", "Point", "LineString", "LinearRing", "Polygon", "outerBoundaryIs", "innerBoundaryIs",
-    "coordinates", "Track", "MultiTrack", "coord", "NetworkLink", *_KML_UNUSED,
-})  # fmt: skip
+_KML: Final = frozenset(
+    {
+        "Document",
+        "Folder",
+        "Placemark",
+        "name",
+        "ExtendedData",
+        "Data",
+        "value",
+        "SchemaData",
+        "SimpleData",
+        "MultiGeometry",
+        "Point",
+        "LineString",
+        "LinearRing",
+        "Polygon",
+        "outerBoundaryIs",
+        "innerBoundaryIs",
+        "coordinates",
+        "Track",
+        "MultiTrack",
+        "coord",
+        "NetworkLink",
+        *_KML_UNUSED,
+    }
+)
 _KML_LIMITS: Final = {"Placemark": (MAX_LOGS, "placemarks"), ANY: (MAX_ELEMENTS, "elements")}
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _WORD: Final = re.compile(r"\S+")
@@ -119,10 +153,11 @@ class Gaps:
             return
         widest_m, place = max(self.found, key=lambda gap: gap[0])
         draft.warn(
-            "mission.track-gap", place,
+            "mission.track-gap",
+            place,
             f"the track has {len(self.found) + 1} pieces with up to {widest_m:.0f} m between them, which the machine "
             "drives straight; draw the way across, or delete what does not belong to the route",
-        )  # fmt: skip
+        )
 
 
 def _distance_m(a: Position, b: Position) -> float:

@@ -26,12 +26,36 @@ TIP_SIGMA_M: Final = 4.0
 MACHINE_SIGMA_M: Final = 7.0
 """A log lies within the 10 m of a harvester's crane from the machine [est]."""
 
-_WANTED: Final = frozenset({
-    "Machine", "SpeciesGroupDefinition", "SpeciesGroupKey", "SpeciesGroupName", "ProductDefinition", "ProductKey",
-    "ClassifiedProductDefinition", "UnclassifiedProductDefinition", "ProductName", "Stem", "StemKey", "StemNumber",
-    "StemCoordinates", "Coordinates", "Latitude", "Longitude", "SingleTreeProcessedStem", "MultiTreeProcessedStem",
-    "Log", "LogKey", "LogVolume", "LogMeasurement", "LogDiameter", "LogLength", "ObjectDefinition", "ObjectName",
-})  # fmt: skip
+_WANTED: Final = frozenset(
+    {
+        "Machine",
+        "SpeciesGroupDefinition",
+        "SpeciesGroupKey",
+        "SpeciesGroupName",
+        "ProductDefinition",
+        "ProductKey",
+        "ClassifiedProductDefinition",
+        "UnclassifiedProductDefinition",
+        "ProductName",
+        "Stem",
+        "StemKey",
+        "StemNumber",
+        "StemCoordinates",
+        "Coordinates",
+        "Latitude",
+        "Longitude",
+        "SingleTreeProcessedStem",
+        "MultiTreeProcessedStem",
+        "Log",
+        "LogKey",
+        "LogVolume",
+        "LogMeasurement",
+        "LogDiameter",
+        "LogLength",
+        "ObjectDefinition",
+        "ObjectName",
+    }
+)
 _LIMITS: Final = {"Log": (MAX_LOGS, "logs"), "Stem": (MAX_LOGS, "stems"), ANY: (400_000, "elements")}
 _MIDDLE: Final = ("Mid ob", "Mid ub")
 _ENDS: Final = ("Butt ob", "Top ob")

@@ -45,8 +45,9 @@ def load_mission(
     verify(harvest, route_wanted=False, site=site)
     both = merged(draft, harvest)
     for key, code, sentence in problems_of(both.mission, route_wanted, site):
-        raise MissionError(code, f"{sentence} (of {path} and {logs} together)" if key else sentence,
-                           str(logs if key else path))  # fmt: skip
+        raise MissionError(
+            code, f"{sentence} (of {path} and {logs} together)" if key else sentence, str(logs if key else path)
+        )
     return both
 
 

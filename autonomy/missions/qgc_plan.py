@@ -24,9 +24,16 @@ PLACES: Final = frozenset(range(NAV_WAYPOINT, 96)) - TAKEOFFS
 CONDITIONS: Final = range(112, 160)
 """MAV_CMD: commands that go to a place, and commands that wait for something."""
 DRIVES: Final = {
-    **dict.fromkeys((32, 33, 34, 192), "moves to another place"), 177: "jump", 191: "go-around", 193: "pause",
-    194: "reverse", 207: "fence switch", 224: "jump", 601: "jump", 42702: "script",
-}  # fmt: skip
+    **dict.fromkeys((32, 33, 34, 192), "moves to another place"),
+    177: "jump",
+    191: "go-around",
+    193: "pause",
+    194: "reverse",
+    207: "fence switch",
+    224: "jump",
+    601: "jump",
+    42702: "script",
+}
 """MAV_CMD: other commands that change where or when the vehicle drives, and what they do."""
 GROUND_SPEED: Final = 1
 NO_CHANGE, DEFAULT_SPEED = -1, -2

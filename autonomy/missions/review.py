@@ -146,19 +146,25 @@ def _tight(
     room = {corner.waypoint: corner.switch_m for corner in corners if math.isfinite(corner.switch_m)}
     for corner in corners:
         if math.isinf(corner.switch_m):
-            found.append(Finding(
-                ("waypoint", corner.waypoint), "mission.turn-on-the-spot",
-                f"waypoint {corner.waypoint + 1}: the route turns by {math.degrees(corner.turn_rad):.0f} degrees on "
-                f"the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop",
-            ))  # fmt: skip
+            found.append(
+                Finding(
+                    ("waypoint", corner.waypoint),
+                    "mission.turn-on-the-spot",
+                    f"waypoint {corner.waypoint + 1}: the route turns by {math.degrees(corner.turn_rad):.0f} degrees "
+                    f"on the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop",
+                )
+            )
     for (i, j), length in zip(route_legs, lengths, strict=True):
         needed = room.get(i, 0.0) + room.get(j, 0.0)
         if length < needed:
-            found.append(Finding(
-                ("waypoint", j), "mission.short-leg",
-                f"leg {i + 1} to {j + 1} is {length:.1f} m long and its corners need {needed:.1f} m at a turning "
-                f"radius of {radius_m:.1f} m; the machine will cut or overshoot them",
-            ))  # fmt: skip
+            found.append(
+                Finding(
+                    ("waypoint", j),
+                    "mission.short-leg",
+                    f"leg {i + 1} to {j + 1} is {length:.1f} m long and its corners need {needed:.1f} m at a turning "
+                    f"radius of {radius_m:.1f} m; the machine will cut or overshoot them",
+                )
+            )
     return _few(found)
 
 
@@ -213,10 +219,13 @@ def _logs(
 def _unlisted(mission: ForwardingMission) -> list[Finding]:
     """Assortments to collect that no listed log has."""
     listed = {log.assortment for log in mission.logs}
-    return _few([
-        Finding(None, "mission.unlisted-assortment", f'no log is "{name}", which is to be collected')
-        for name in mission.options.assortments if name not in listed
-    ])  # fmt: skip
+    return _few(
+        [
+            Finding(None, "mission.unlisted-assortment", f'no log is "{name}", which is to be collected')
+            for name in mission.options.assortments
+            if name not in listed
+        ]
+    )
 
 
 def _few(warnings: list[Finding]) -> list[Finding]:

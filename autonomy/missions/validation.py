@@ -90,20 +90,23 @@ def key_text(key: Key) -> str:
 def _counts(mission: ForwardingMission, route_wanted: bool) -> Iterator[Finding]:
     if len(mission.waypoints) > MAX_WAYPOINTS:
         yield Finding(
-            None, "mission.too-many-waypoints",
+            None,
+            "mission.too-many-waypoints",
             f"has {len(mission.waypoints)} waypoints; the limit is {MAX_WAYPOINTS}, so thin the route out",
-        )  # fmt: skip
+        )
     corners = sum(len(fence.corners) for fence in mission.fences)
     if corners > MAX_CORNERS:
         yield Finding(
-            None, "mission.too-many-corners",
+            None,
+            "mission.too-many-corners",
             f"has {corners} corners of fences; the limit is {MAX_CORNERS}, so simplify them",
-        )  # fmt: skip
+        )
     if len(mission.logs) > MAX_LOGS:
         yield Finding(
-            None, "mission.too-many-logs",
+            None,
+            "mission.too-many-logs",
             f"has {len(mission.logs)} logs; the limit is {MAX_LOGS}, so split the mission",
-        )  # fmt: skip
+        )
     if route_wanted and not mission.waypoints:
         yield Finding(None, "mission.no-waypoints", "has no waypoints; draw a route as a line")
 
@@ -114,34 +117,40 @@ def _coordinates(mission: ForwardingMission) -> Iterator[Finding]:
         latitude, longitude, height = at.latitude_deg, at.longitude_deg, at.altitude_m
         if not (math.isfinite(latitude) and math.isfinite(longitude) and math.isfinite(height or 0.0)):
             yield Finding(
-                key, "mission.non-finite-coordinate",
+                key,
+                "mission.non-finite-coordinate",
                 f"{key_text(key)} has a coordinate that is NaN or infinite; survey it again",
-            )  # fmt: skip
+            )
         elif abs(latitude) > 90.0 and abs(latitude) <= 180.0 and abs(longitude) <= 90.0:
             yield Finding(
-                key, "mission.swapped-axes",
+                key,
+                "mission.swapped-axes",
                 f"{key_text(key)} has latitude {latitude:.6f}, which is beyond the poles; {SWAPPED_HINT}",
-            )  # fmt: skip
+            )
         elif abs(latitude) > 360.0 or abs(longitude) > 360.0:
             yield Finding(
-                key, "mission.projected-coordinates",
+                key,
+                "mission.projected-coordinates",
                 f"{key_text(key)} has latitude {latitude:.0f} and longitude {longitude:.0f}; {METRES_HINT}",
-            )  # fmt: skip
+            )
         elif abs(latitude) > 90.0:
             yield Finding(
-                key, "mission.latitude-range",
+                key,
+                "mission.latitude-range",
                 f"{key_text(key)} has latitude {latitude:.6f}; the range is -90 to 90 degrees",
-            )  # fmt: skip
+            )
         elif abs(longitude) > 180.0:
             yield Finding(
-                key, "mission.longitude-range",
+                key,
+                "mission.longitude-range",
                 f"{key_text(key)} has longitude {longitude:.6f}; the range is -180 to 180 degrees",
-            )  # fmt: skip
+            )
         elif height is not None and not HEIGHTS_M[0] <= height <= HEIGHTS_M[1]:
             yield Finding(
-                key, "mission.height-range",
+                key,
+                "mission.height-range",
                 f"{key_text(key)} is {height:.0f} m high; heights are metres, {HEIGHTS_M[0]:.0f}..{HEIGHTS_M[1]:.0f}",
-            )  # fmt: skip
+            )
 
 
 def _options(options: Options) -> Iterator[Finding]:
@@ -165,16 +174,18 @@ def _sizes(mission: ForwardingMission) -> Iterator[Finding]:
             if value is not None and not limits[0] <= value <= limits[1]:
                 hint = " (is it in another unit?)" if value > limits[1] else ""
                 yield Finding(
-                    key, "mission.log-size",
+                    key,
+                    "mission.log-size",
                     f"{key_text(key)}: {name} is {value:g}; logs have {limits[0]:g} to {limits[1]:g} m{hint}",
-                )  # fmt: skip
+                )
                 break
         else:
             if log.length_m is not None and log.diameter_m is not None and log.diameter_m >= log.length_m:
                 yield Finding(
-                    key, "mission.log-shape",
+                    key,
+                    "mission.log-shape",
                     f"{key_text(key)} is {log.length_m:g} m long and {log.diameter_m:g} m thick; correct its size",
-                )  # fmt: skip
+                )
         if log.sigma_m is not None and not 0.0 <= log.sigma_m <= 100.0:
             yield Finding(
                 key, "mission.sigma-range", f"{key_text(key)}: sigma_m is {log.sigma_m:g}; the range is 0 to 100 m"
@@ -188,9 +199,10 @@ def _sizes(mission: ForwardingMission) -> Iterator[Finding]:
             if bearing is not None and not 0.0 <= bearing <= 360.0:
                 key = (name, i)
                 yield Finding(
-                    key, "mission.bearing-range",
+                    key,
+                    "mission.bearing-range",
                     f"{key_text(key)}: bearing_deg is {bearing:g}; the range is 0 to 360, clockwise",
-                )  # fmt: skip
+                )
 
 
 def _anchor(mission: ForwardingMission) -> tuple[str, Point] | None:
@@ -238,9 +250,10 @@ def _at_site(mission: ForwardingMission, site: tuple[float, float] | None) -> It
     away = float(np.linalg.norm(origin.points_enu([Point(anchor[1].latitude_deg, anchor[1].longitude_deg)])))
     if away > MAX_SITE_DISTANCE_M >= swapped_m(origin, anchor[1]):
         yield Finding(
-            None, "mission.swapped-axes",
+            None,
+            "mission.swapped-axes",
             f"the mission is {away / 1000:.0f} km away from the machine's site; {SWAPPED_HINT}",
-        )  # fmt: skip
+        )
 
 
 def _fences(mission: ForwardingMission) -> Iterator[Finding]:
@@ -249,9 +262,10 @@ def _fences(mission: ForwardingMission) -> Iterator[Finding]:
         key: Key = ("fence", i)
         if len(fence.corners) < 3:
             yield Finding(
-                key, "mission.fence-corners",
+                key,
+                "mission.fence-corners",
                 f"{key_text(key)} has {len(fence.corners)} corners; a polygon has at least three",
-            )  # fmt: skip
+            )
             continue
         ring = frame.points_enu(fence.corners)[:, :2]
         steps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
@@ -259,23 +273,26 @@ def _fences(mission: ForwardingMission) -> Iterator[Finding]:
             at = int(np.argmin(steps))
             corner = ("corner", i, (at + 1) % len(ring))
             yield Finding(
-                corner, "mission.duplicate-corner",
+                corner,
+                "mission.duplicate-corner",
                 f"{key_text(corner)} is the same place as corner {at + 1}; delete one of them",
-            )  # fmt: skip
+            )
             continue
         crossed = crossing(ring)
         if crossed is not None:
             a, b = crossed
             yield Finding(
-                ("corner", i, b), "mission.fence-crosses-itself",
+                ("corner", i, b),
+                "mission.fence-crosses-itself",
                 f"{key_text(key)} crosses itself: its edges from corner {a + 1} and from corner {b + 1} meet; "
                 "are two corners in the wrong order?",
-            )  # fmt: skip
+            )
         elif abs(signed_area_m2(ring)) < MIN_FENCE_M2:
             yield Finding(
-                key, "mission.fence-area",
+                key,
+                "mission.fence-area",
                 f"{key_text(key)} encloses less than {MIN_FENCE_M2:g} m2; draw it round the site",
-            )  # fmt: skip
+            )
 
 
 def _route(mission: ForwardingMission) -> Iterator[Finding]:
@@ -284,14 +301,16 @@ def _route(mission: ForwardingMission) -> Iterator[Finding]:
     for i in np.flatnonzero(steps < MIN_WAYPOINT_DISTANCE_M):
         key: Key = ("waypoint", int(i) + 1)
         yield Finding(
-            key, "mission.duplicate-waypoint",
+            key,
+            "mission.duplicate-waypoint",
             f"{key_text(key)} is the same place as waypoint {i + 1}; delete one of them",
-        )  # fmt: skip
+        )
     if mission.options.laps > 1 and len(at) < 2:
         yield Finding(
-            None, "mission.lap-of-one-waypoint",
+            None,
+            "mission.lap-of-one-waypoint",
             f"laps is {mission.options.laps} but there is one waypoint; a round has at least two",
-        )  # fmt: skip
+        )
 
 
 def _assortments(mission: ForwardingMission) -> Iterator[Finding]:
@@ -305,30 +324,34 @@ def _assortments(mission: ForwardingMission) -> Iterator[Finding]:
         return
     if options.logs != "listed":
         yield Finding(
-            None, "mission.assortments-not-listed",
+            None,
+            "mission.assortments-not-listed",
             f'{name} needs the assortment of each log; list the logs and set logs to "listed", or remove {name}',
-        )  # fmt: skip
+        )
     elif mission.logs and not any(log.assortment for log in mission.logs):
         yield Finding(
-            None, "mission.logs-without-assortment",
+            None,
+            "mission.logs-without-assortment",
             f"{name} needs the assortment of each log, but no log has one; give the logs an assortment",
-        )  # fmt: skip
+        )
     if not options.sort_by_assortment:
         return
     if not mission.landings:
         yield Finding(
-            None, "mission.sorting-without-landing",
+            None,
+            "mission.sorting-without-landing",
             "sort_by_assortment is on, but there is no landing to sort to; add landings",
-        )  # fmt: skip
+        )
     elif all(landing.assortments for landing in mission.landings):
         takers = {kind for landing in mission.landings for kind in landing.assortments}
         for i, log in enumerate(mission.logs):
             wanted = not options.assortments or log.assortment in options.assortments
             if log.assortment and wanted and log.assortment not in takers:
                 yield Finding(
-                    ("log", i), "mission.assortment-without-landing",
+                    ("log", i),
+                    "mission.assortment-without-landing",
                     f'log {i + 1} is "{log.assortment}", which no landing accepts; name it at a landing',
-                )  # fmt: skip
+                )
 
 
 def _within(mission: ForwardingMission) -> Iterator[Finding]:
@@ -343,25 +366,28 @@ def _within(mission: ForwardingMission) -> Iterator[Finding]:
         key: Key = ("waypoint", i)
         swapped = SWAPPED_HINT + "; or " if _inside_swapped(mission.waypoints[i], frame, area) else ""
         yield Finding(
-            key, "mission.waypoint-outside-fence",
+            key,
+            "mission.waypoint-outside-fence",
             f"{key_text(key)} is {outside[i]:.1f} m outside of the fence; {swapped}move it or widen the fence",
-        )  # fmt: skip
+        )
     for i, j in legs(mission):
         strayed = area.leaves_m(at[i], at[j]) if outside[i] == outside[j] == 0.0 else 0.0
         if strayed:
             yield Finding(
-                ("waypoint", j), "mission.leg-leaves-fence",
+                ("waypoint", j),
+                "mission.leg-leaves-fence",
                 f"the leg from waypoint {i + 1} to waypoint {j + 1} leaves the fence by {strayed:.1f} m or more; "
                 "put a waypoint where it has to bend",
-            )  # fmt: skip
+            )
     places = frame.points_enu([landing.position for landing in mission.landings])[:, :2]
     for i, away in enumerate(area.outside_m(places)):
         if away > 0.0:
             key = ("landing", i)
             yield Finding(
-                key, "mission.landing-outside-fence",
+                key,
+                "mission.landing-outside-fence",
                 f"{key_text(key)} is {away:.1f} m outside of the fence; move it or widen the fence",
-            )  # fmt: skip
+            )
 
 
 def _inside_swapped(at: Point, frame: LocalFrame, area: Area) -> bool:

@@ -32,10 +32,12 @@ _UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
 _CUT: Final = frozenset(
     xml_errors.codes[text]
     for text in (
-        xml_errors.XML_ERROR_NO_ELEMENTS, xml_errors.XML_ERROR_UNCLOSED_TOKEN, xml_errors.XML_ERROR_PARTIAL_CHAR,
+        xml_errors.XML_ERROR_NO_ELEMENTS,
+        xml_errors.XML_ERROR_UNCLOSED_TOKEN,
+        xml_errors.XML_ERROR_PARTIAL_CHAR,
         xml_errors.XML_ERROR_UNCLOSED_CDATA_SECTION,
     )
-)  # fmt: skip
+)
 """What the parser says of a document that ends too early."""
 
 

@@ -250,6 +250,9 @@ def _sampled(xy: np.ndarray, bends: Sequence[_Bend]) -> Path:
     flat = np.concatenate(s)
     keep = np.concatenate([[True], np.diff(flat) > 1e-9])
     return Path(
-        flat[keep], np.concatenate(points)[keep], np.concatenate(headings)[keep], np.concatenate(curves)[keep],
+        flat[keep],
+        np.concatenate(points)[keep],
+        np.concatenate(headings)[keep],
+        np.concatenate(curves)[keep],
         tuple(corners),
-    )  # fmt: skip
+    )

@@ -112,10 +112,21 @@ class Navigator:
         # Starts from the clock, so that the setpoints of a restarted planner are not taken for a replay.
         self._sequence = self._sequence + 1 if self._sequence else now_ns // 1_000_000 & 0xFFFF_FFFF
         return DriveSetpoint(
-            self._sequence, self._profile_hash, now_ns, self._lease_ns, order.steering, order.latitude_deg,
-            order.longitude_deg, articulation, order.articulation_rate_rad_s, order.speed_m_s,
-            self.heights_m, floats, False, self.level,
-        )  # fmt: skip
+            self._sequence,
+            self._profile_hash,
+            now_ns,
+            self._lease_ns,
+            order.steering,
+            order.latitude_deg,
+            order.longitude_deg,
+            articulation,
+            order.articulation_rate_rad_s,
+            order.speed_m_s,
+            self.heights_m,
+            floats,
+            False,
+            self.level,
+        )
 
     def _begin(self) -> None:
         self.phase, self.reason = Phase.DRIVING, ""

@@ -41,9 +41,15 @@ class TorchNet(nn.Module):
         for layer, sources in self._wired:
             if isinstance(layer, Conv):
                 conv = nn.Conv2d(
-                    widths[sources[0]], layer.out, layer.kernel, layer.stride, layer.padding, layer.dilation,
-                    layer.groups, layer.bias,
-                )  # fmt: skip
+                    widths[sources[0]],
+                    layer.out,
+                    layer.kernel,
+                    layer.stride,
+                    layer.padding,
+                    layer.dilation,
+                    layer.groups,
+                    layer.bias,
+                )
                 self.add_module(layer.name, conv)
             elif isinstance(layer, BatchNorm):
                 self.add_module(layer.name, nn.BatchNorm2d(widths[layer.name], eps=EPSILON))

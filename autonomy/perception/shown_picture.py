@@ -100,10 +100,20 @@ def draw(picture: MeasuredPicture, now_ns: int) -> tuple[PictureFacts, bytes]:
     small = Intrinsics(rgb.shape[1], rgb.shape[0], pin.fx_px / step, pin.fy_px / step, cx_px, cy_px)
     x, y, z = picture.pose.position_m.tolist()
     facts = PictureFacts(
-        1, frame.camera, now_ns, "", small.width_px, small.height_px, small.fx_px, small.fy_px, small.cx_px,
-        small.cy_px, (x, y, z), tuple(picture.pose.rotation.ravel().tolist()),
+        1,
+        frame.camera,
+        now_ns,
+        "",
+        small.width_px,
+        small.height_px,
+        small.fx_px,
+        small.fy_px,
+        small.cx_px,
+        small.cy_px,
+        (x, y, z),
+        tuple(picture.pose.rotation.ravel().tolist()),
         tuple(_log(one, picture.pose, small) for one in picture.logs[:MAX_LOGS]),
-    )  # fmt: skip
+    )
     return facts, _jpeg(rgb)
 
 

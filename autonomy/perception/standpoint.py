@@ -66,6 +66,10 @@ def standpoint(now_ns: int, here: Pose, before: Pose, bends_rad: tuple[float, fl
     rate = 0.0 if seconds <= 0.0 else 1.0 / seconds
     turn = Rotation.from_matrix(here.rotation @ before.rotation.T).as_rotvec()
     return Standpoint(
-        now_ns, here, bends_rad[1], rate * (here.position_m - before.position_m), rate * turn,
+        now_ns,
+        here,
+        bends_rad[1],
+        rate * (here.position_m - before.position_m),
+        rate * turn,
         rate * (bends_rad[1] - bends_rad[0]),
-    )  # fmt: skip
+    )

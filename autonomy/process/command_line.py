@@ -26,13 +26,17 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--manager", choices=TABLES, default="ours", help="transition table of the activity manager")
     parser.add_argument("--planner", default=SEARCH, help=f"grasp planner: {', '.join(NAMES)}, or of another package")
     parser.add_argument(
-        "--virtual-cameras", type=int, default=1, metavar="N",
+        "--virtual-cameras",
+        type=int,
+        default=1,
+        metavar="N",
         help="places of the virtual camera over which a network's predictions are averaged",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--memory", action="store_true",
+        "--memory",
+        action="store_true",
         help="the detector's camera looks ahead of the driving machine, and the crane works from memory",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--tell",
         type=address_argument,

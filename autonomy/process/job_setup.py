@@ -71,11 +71,22 @@ def uploaded_missions(
 
 
 def _manager(
-    options: argparse.Namespace, profile: Profile, mission: ForwardingMission, lease_ns: int, key: bytes | None,
+    options: argparse.Namespace,
+    profile: Profile,
+    mission: ForwardingMission,
+    lease_ns: int,
+    key: bytes | None,
     checkpoint: Checkpoint | None = None,
-) -> ActivityManager:  # fmt: skip
+) -> ActivityManager:
     return ActivityManager(
-        profile, profile_hash(profile), mission, TABLES[options.manager], PlannerSelection(options.planner.make()),
-        key=key, lease_ns=lease_ns, uses_memory=options.memory,
-        unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())), progress=checkpoint,
-    )  # fmt: skip
+        profile,
+        profile_hash(profile),
+        mission,
+        TABLES[options.manager],
+        PlannerSelection(options.planner.make()),
+        key=key,
+        lease_ns=lease_ns,
+        uses_memory=options.memory,
+        unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
+        progress=checkpoint,
+    )

@@ -249,9 +249,12 @@ class ForwardingJob:
         tally = self._manager.tally
         given_up = [{"log": number, "reason": reason} for number, reason in tally.given_up.items()]
         return {
-            "loaded": tally.loaded, "driven_m": round(self._manager.route.driven_m, 1), "given_up": given_up,
-            "loads": msgspec.to_builtins(tally.loads), "remarks": [remark.text for remark in tally.remarks],
-        }  # fmt: skip
+            "loaded": tally.loaded,
+            "driven_m": round(self._manager.route.driven_m, 1),
+            "given_up": given_up,
+            "loads": msgspec.to_builtins(tally.loads),
+            "remarks": [remark.text for remark in tally.remarks],
+        }
 
     def execute(self, command: MissionCommand) -> str:
         """Execute an operator command; an ended mission accepts none."""

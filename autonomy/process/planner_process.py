@@ -52,9 +52,13 @@ class PlannerProcess:
     """
 
     def __init__(
-        self, job: Job, profile_hash: int, options: argparse.Namespace, key: bytes | None = None,
+        self,
+        job: Job,
+        profile_hash: int,
+        options: argparse.Namespace,
+        key: bytes | None = None,
         uploads: UploadedMissions | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._key = key
         self.signals: list[int] = []
         self.foreign = False

@@ -145,11 +145,34 @@ class WaitingJob:
     def report(self, now_ns: int) -> MissionReport:
         """An empty report."""
         return MissionReport(
-            schema=1, name="", state="WAITING", words=WAITING, ended=False, auto=False, single_step=False, paused="",
-            waits_for="", failure="", order=self._command, refusal=self._refusal, loaded=0, on_board=0,
-            on_board_m3=0.0, unloaded=0, missed=0, given_up=(), driven_m=0.0, targets=(), crane="", here=None,
-            route=(), closed=False, fences=(), landings=(), logs=(),
-        )  # fmt: skip
+            schema=1,
+            name="",
+            state="WAITING",
+            words=WAITING,
+            ended=False,
+            auto=False,
+            single_step=False,
+            paused="",
+            waits_for="",
+            failure="",
+            order=self._command,
+            refusal=self._refusal,
+            loaded=0,
+            on_board=0,
+            on_board_m3=0.0,
+            unloaded=0,
+            missed=0,
+            given_up=(),
+            driven_m=0.0,
+            targets=(),
+            crane="",
+            here=None,
+            route=(),
+            closed=False,
+            fences=(),
+            landings=(),
+            logs=(),
+        )
 
     def chosen_grasp(self) -> ChosenGrasp | None:
         """None: the crane does not work."""

@@ -32,9 +32,22 @@ from can_dbc.text import decoded
 from runtime.errors import CodedError
 
 __all__ = [
-    "SHIPPED", "Database", "DbcError", "EncodeRefused", "FrameRefused", "MessageCodec", "Policy", "Refusal",
-    "SignalInfo", "compile_one", "load", "parse", "pgn_key", "resolve", "usable",
-]  # fmt: skip
+    "SHIPPED",
+    "Database",
+    "DbcError",
+    "EncodeRefused",
+    "FrameRefused",
+    "MessageCodec",
+    "Policy",
+    "Refusal",
+    "SignalInfo",
+    "compile_one",
+    "load",
+    "parse",
+    "pgn_key",
+    "resolve",
+    "usable",
+]
 SHIPPED: Final = ("crane", "machine", "gnss")
 PDU2_MASK: Final = EXTENDED | 0x03FF_FF00
 PDU1_MASK: Final = EXTENDED | 0x03FF_0000
@@ -173,9 +186,17 @@ def parse(path: Path, *, strict: bool = True) -> Any:
     except (OSError, UnicodeError) as error:
         raise DbcError("dbc.unreadable", f"{path}: cannot be read: {error}") from error
     except (
-        Error, ValueError, LookupError, TypeError, SyntaxError, AttributeError, ArithmeticError, AssertionError,
-        MemoryError, RecursionError,
-    ) as error:  # fmt: skip
+        Error,
+        ValueError,
+        LookupError,
+        TypeError,
+        SyntaxError,
+        AttributeError,
+        ArithmeticError,
+        AssertionError,
+        MemoryError,
+        RecursionError,
+    ) as error:
         reason = re.sub(r"^(DBC|KCD): ", "", str(error)).strip('"') or type(error).__name__
         raise DbcError("dbc.invalid", f"{path}{_line_of(reason, text)}: {reason}") from error
 

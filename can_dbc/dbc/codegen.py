@@ -32,8 +32,16 @@ from can_dbc.dbc.signals import (
 Values = tuple[Any, ...]
 Decoder = Callable[[bytes], Values]
 Encoder = Callable[..., bytes]
-STRUCT_CODES: Final = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (32, False): "I",
-                       (32, True): "i", (64, False): "Q", (64, True): "q"}  # fmt: skip
+STRUCT_CODES: Final = {
+    (8, False): "B",
+    (8, True): "b",
+    (16, False): "H",
+    (16, True): "h",
+    (32, False): "I",
+    (32, True): "i",
+    (64, False): "Q",
+    (64, True): "q",
+}
 STRUCT_FLOATS: Final = {16: "e", 32: "f", 64: "d"}
 
 
@@ -42,11 +50,18 @@ def compile_message(name: str, length: int, signals: Sequence[SignalInfo]) -> tu
     signals = tuple(signals)
     multiplexed = any(s.parent is not None for s in signals)
     space: dict[str, Any] = {
-        "_integer_raw": integer_raw, "_pack_float": pack_float, "_unpack_float": unpack_float,
-        "_from_bytes": int.from_bytes, "_round": round, "_int": int, "_len": len,
-        "_slow_encode": _slow_encoder(name, length, signals), "_slow_receive": _slow_receiver(signals),
-        "_unknown": _refuser(Refusal.MULTIPLEXER, name), "_length": _refuser(Refusal.LENGTH, name),
-    }  # fmt: skip
+        "_integer_raw": integer_raw,
+        "_pack_float": pack_float,
+        "_unpack_float": unpack_float,
+        "_from_bytes": int.from_bytes,
+        "_round": round,
+        "_int": int,
+        "_len": len,
+        "_slow_encode": _slow_encoder(name, length, signals),
+        "_slow_receive": _slow_receiver(signals),
+        "_unknown": _refuser(Refusal.MULTIPLEXER, name),
+        "_length": _refuser(Refusal.LENGTH, name),
+    }
     aligned = None if multiplexed else _struct_layout(length, signals)
     if aligned is not None:
         space["_unpack"] = aligned.unpack
@@ -305,9 +320,7 @@ def _assemble(
 
 
 def _children(signals: Sequence[SignalInfo], parent: int | None, mux: int | None) -> list[int]:
-    return [
-        i for i, s in enumerate(signals) if s.parent == parent and (mux is None or mux in s.parent_ids)
-    ]  # fmt: skip
+    return [i for i, s in enumerate(signals) if s.parent == parent and (mux is None or mux in s.parent_ids)]
 
 
 def _mux_ids(signals: Sequence[SignalInfo], parent: int) -> set[int]:

@@ -187,10 +187,24 @@ def operator_body(m: OperatorCommand) -> bytes:
 def report_body(m: StateReport) -> bytes:
     """The body of a state report; counters wrap at their width."""
     body = _REPORT.pack(
-        m.mode, m.grapple_state, m.reason, m.setpoint_sequence, m.refusal, m.refused & 0xFFFF, m.stale_mask,
-        *m.position, *m.velocity, *m.reference, m.opening_pct, m.clamp_bar, m.load_kg,
-        m.tick_ns & 0xFFFFFFFF, m.late_ns & 0xFFFFFFFF, m.missed_ticks & 0xFFFFFFFF, m.frames_received & 0xFFFFFFFF,
-    )  # fmt: skip
+        m.mode,
+        m.grapple_state,
+        m.reason,
+        m.setpoint_sequence,
+        m.refusal,
+        m.refused & 0xFFFF,
+        m.stale_mask,
+        *m.position,
+        *m.velocity,
+        *m.reference,
+        m.opening_pct,
+        m.clamp_bar,
+        m.load_kg,
+        m.tick_ns & 0xFFFFFFFF,
+        m.late_ns & 0xFFFFFFFF,
+        m.missed_ticks & 0xFFFFFFFF,
+        m.frames_received & 0xFFFFFFFF,
+    )
     if m.since_ns:
         body += _EVIDENCE.pack(m.since_ns, *m.numbers)
     return body + _LINK.pack(m.operator_link) if m.operator_link else body

@@ -130,10 +130,29 @@ class RecordWriter:
         if size > MAX_BYTES:
             raise RecordRefused("tick-record.too-long", f"the tick's record of {size} bytes is too long")
         _HEAD.pack_into(
-            buffer, 0, MAGIC, VERSION, n_in, n_datagrams, n_out, len(report), now_ns, late_ns, tick_ns, missed_ticks,
-            bus.state, bus.dropped, bus.refused, bus.errors, bus.recoveries,
-            machine_bus.state, machine_bus.dropped, machine_bus.refused, machine_bus.errors, machine_bus.recoveries,
-        )  # fmt: skip
+            buffer,
+            0,
+            MAGIC,
+            VERSION,
+            n_in,
+            n_datagrams,
+            n_out,
+            len(report),
+            now_ns,
+            late_ns,
+            tick_ns,
+            missed_ticks,
+            bus.state,
+            bus.dropped,
+            bus.refused,
+            bus.errors,
+            bus.recoveries,
+            machine_bus.state,
+            machine_bus.dropped,
+            machine_bus.refused,
+            machine_bus.errors,
+            machine_bus.recoveries,
+        )
         at = _HEAD.size
         for stamp_ns, key, data in frames_in:
             _IN.pack_into(buffer, at, stamp_ns, key, 0, len(data), data)
@@ -167,11 +186,22 @@ def encode(tick: TickRecord) -> bytes:
     """The bytes of a tick; raises RecordRefused when they are more than `MAX_BYTES`."""
     return bytes(
         RecordWriter().write(
-            tick.now_ns, tick.late_ns, tick.tick_ns, tick.missed_ticks, tick.bus, tick.machine_bus, tick.frames_in,
-            tick.machine_frames_in, tick.datagrams, tick.frames_out, tick.machine_frames_out, tick.report,
-            tick.vehicle_report, tick.operator,
+            tick.now_ns,
+            tick.late_ns,
+            tick.tick_ns,
+            tick.missed_ticks,
+            tick.bus,
+            tick.machine_bus,
+            tick.frames_in,
+            tick.machine_frames_in,
+            tick.datagrams,
+            tick.frames_out,
+            tick.machine_frames_out,
+            tick.report,
+            tick.vehicle_report,
+            tick.operator,
         )
-    )  # fmt: skip
+    )
 
 
 def decode(data: bytes) -> TickRecord:
@@ -215,7 +245,18 @@ def decode(data: bytes) -> TickRecord:
     if at + n_report > end:
         raise RecordRefused("tick-record.contents", "the contents of the tick record do not match its counts")
     return TickRecord(
-        now_ns, late_ns, tick_ns, missed, BusReading(*counters[:5]), BusReading(*counters[5:]),
-        tuple(frames_in[0]), tuple(frames_in[1]), tuple(datagrams), tuple(frames_out[0]), tuple(frames_out[1]),
-        data[at : at + n_report], data[at + n_report : end], tuple(operator),
-    )  # fmt: skip
+        now_ns,
+        late_ns,
+        tick_ns,
+        missed,
+        BusReading(*counters[:5]),
+        BusReading(*counters[5:]),
+        tuple(frames_in[0]),
+        tuple(frames_in[1]),
+        tuple(datagrams),
+        tuple(frames_out[0]),
+        tuple(frames_out[1]),
+        data[at : at + n_report],
+        data[at + n_report : end],
+        tuple(operator),
+    )

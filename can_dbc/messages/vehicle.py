@@ -111,9 +111,15 @@ class VehicleReport:
 
 
 VEHICLE_INPUTS: Final = (
-    "VehStat", "ArmHeightA", "ArmHeightB", "PositionRapidUpdate", "VesselHeading", "RateOfTurn", "GnssPositionData",
+    "VehStat",
+    "ArmHeightA",
+    "ArmHeightB",
+    "PositionRapidUpdate",
+    "VesselHeading",
+    "RateOfTurn",
+    "GnssPositionData",
     "EncArtic",
-)  # fmt: skip
+)
 """Messages by their bit in ``VehicleReport.stale_mask``."""
 
 
@@ -121,9 +127,16 @@ def drive_body(m: DriveSetpoint) -> bytes:
     """The body of a drive setpoint."""
     flags = _FLOAT_FRONT * m.float_front | _FLOAT_REAR * m.float_rear | _LEVEL * m.level
     return _DRIVE.pack(
-        m.lease_ns // 1000, m.steering, flags, m.latitude_deg, m.longitude_deg, m.articulation_rad,
-        m.articulation_rate_rad_s, m.speed_m_s, *m.heights_m,
-    )  # fmt: skip
+        m.lease_ns // 1000,
+        m.steering,
+        flags,
+        m.latitude_deg,
+        m.longitude_deg,
+        m.articulation_rad,
+        m.articulation_rate_rad_s,
+        m.speed_m_s,
+        *m.heights_m,
+    )
 
 
 def drive_from(common: Common, body: bytes) -> DriveSetpoint:
@@ -137,19 +150,46 @@ def drive_from(common: Common, body: bytes) -> DriveSetpoint:
     finite((latitude, longitude, angle, rate, speed, *heights))
     h1, h2, h3, h4 = heights
     return DriveSetpoint(
-        *common, lease_us * 1000, _STEERINGS[steering], latitude, longitude, angle, rate, speed, (h1, h2, h3, h4),
-        bool(flags & _FLOAT_FRONT), bool(flags & _FLOAT_REAR), bool(flags & _LEVEL),
-    )  # fmt: skip
+        *common,
+        lease_us * 1000,
+        _STEERINGS[steering],
+        latitude,
+        longitude,
+        angle,
+        rate,
+        speed,
+        (h1, h2, h3, h4),
+        bool(flags & _FLOAT_FRONT),
+        bool(flags & _FLOAT_REAR),
+        bool(flags & _LEVEL),
+    )
 
 
 def vehicle_body(m: VehicleReport) -> bytes:
     """The body of a vehicle report."""
     return _VEHICLE.pack(
-        m.drive_sequence, m.driving, m.refusal, m.refused & 0xFFFF, m.fix, m.satellites, m.stale_mask,
-        m.position_ns, m.heading_ns, m.motion_ns,
-        m.latitude_deg, m.longitude_deg, m.altitude_m, m.sigma_m, m.heading_rad, m.yaw_rate_rad_s,
-        m.speed_m_s, m.articulation_rad, m.roll_rad, m.pitch_rad, *m.heights_m,
-    )  # fmt: skip
+        m.drive_sequence,
+        m.driving,
+        m.refusal,
+        m.refused & 0xFFFF,
+        m.fix,
+        m.satellites,
+        m.stale_mask,
+        m.position_ns,
+        m.heading_ns,
+        m.motion_ns,
+        m.latitude_deg,
+        m.longitude_deg,
+        m.altitude_m,
+        m.sigma_m,
+        m.heading_rad,
+        m.yaw_rate_rad_s,
+        m.speed_m_s,
+        m.articulation_rad,
+        m.roll_rad,
+        m.pitch_rad,
+        *m.heights_m,
+    )
 
 
 def vehicle_from(common: Common, body: bytes) -> VehicleReport:
@@ -159,6 +199,26 @@ def vehicle_from(common: Common, body: bytes) -> VehicleReport:
     latitude, longitude, altitude, sigma, heading, yaw_rate, speed, angle, roll, pitch, *heights = values[10:]
     h1, h2, h3, h4 = heights
     return VehicleReport(
-        *common, sequence, driving, refusal, refused, position_ns, latitude, longitude, altitude, fix, satellites,
-        sigma, heading_ns, heading, yaw_rate, motion_ns, speed, angle, roll, pitch, (h1, h2, h3, h4), stale,
-    )  # fmt: skip
+        *common,
+        sequence,
+        driving,
+        refusal,
+        refused,
+        position_ns,
+        latitude,
+        longitude,
+        altitude,
+        fix,
+        satellites,
+        sigma,
+        heading_ns,
+        heading,
+        yaw_rate,
+        motion_ns,
+        speed,
+        angle,
+        roll,
+        pitch,
+        (h1, h2, h3, h4),
+        stale,
+    )

@@ -116,10 +116,13 @@ class ModbusClient:
         """
         return await self._request(
             lambda client: client.readwrite_registers(
-                read_address=STATUS_AT, read_count=STATUS_COUNT, write_address=COMMAND_AT, values=list(command),
+                read_address=STATUS_AT,
+                read_count=STATUS_COUNT,
+                write_address=COMMAND_AT,
+                values=list(command),
                 device_id=UNIT,
             )
-        )  # fmt: skip
+        )
 
     async def status(self) -> list[int]:
         """Reads the status block (FC 3); raises as `exchange` does."""

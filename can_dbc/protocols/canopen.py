@@ -88,16 +88,33 @@ class Emergency(NamedTuple):
 
 
 EMERGENCY_CODES: Final = {
-    0x8110: "CAN overrun", 0x8120: "CAN error passive", 0x8130: "heartbeat or life guard error",
-    0x8140: "recovered from bus-off", 0x8150: "CAN-ID collision", 0x8210: "PDO length too short",
-    0x8220: "PDO too long", 0x8240: "unexpected SYNC length", 0x8250: "RPDO timeout",
-}  # fmt: skip
+    0x8110: "CAN overrun",
+    0x8120: "CAN error passive",
+    0x8130: "heartbeat or life guard error",
+    0x8140: "recovered from bus-off",
+    0x8150: "CAN-ID collision",
+    0x8210: "PDO length too short",
+    0x8220: "PDO too long",
+    0x8240: "unexpected SYNC length",
+    0x8250: "RPDO timeout",
+}
 EMERGENCY_CLASSES: Final = {
-    0x00: "no error, or error reset", 0x10: "generic error", 0x20: "current", 0x30: "voltage", 0x40: "temperature",
-    0x42: "device temperature", 0x50: "device hardware", 0x60: "device software", 0x70: "additional modules",
-    0x80: "monitoring", 0x81: "communication", 0x82: "protocol", 0x90: "external error",
-    0xF0: "additional functions", 0xFF: "device specific",
-}  # fmt: skip
+    0x00: "no error, or error reset",
+    0x10: "generic error",
+    0x20: "current",
+    0x30: "voltage",
+    0x40: "temperature",
+    0x42: "device temperature",
+    0x50: "device hardware",
+    0x60: "device software",
+    0x70: "additional modules",
+    0x80: "monitoring",
+    0x81: "communication",
+    0x82: "protocol",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "device specific",
+}
 
 
 def parse_emergency(key: int, data: bytes) -> Emergency | None:

@@ -23,9 +23,20 @@ from runtime.errors import CodedError
 from runtime.shared_file import SharedFile, shared_path
 
 STAGES: Final = (
-    "wake", "sync", "tick", "cpu", "receive", "decode", "estimate", "supervise", "control", "encode", "send", "record",
+    "wake",
+    "sync",
+    "tick",
+    "cpu",
+    "receive",
+    "decode",
+    "estimate",
+    "supervise",
+    "control",
+    "encode",
+    "send",
+    "record",
     "sample_to_command",
-)  # fmt: skip
+)
 """Measured are: lateness of the tick and of SYNC; the tick by the clock and by CPU time; its stages in order; the time
 from the encoders' sample to the valve command that uses it.
 

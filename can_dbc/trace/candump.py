@@ -41,8 +41,13 @@ MAX_OTHER_LINES: Final = 10_000
 MAX_LINE: Final = 2048
 """Characters; a CAN FD frame of 64 bytes with everything that the formats add has less than 500."""
 PCAN_COLUMNS: Final = {
-    "1.0": "NOIlD", "1.1": "NOTIlD", "1.2": "NOBTIlD", "1.3": "NOBTIRlD", "2.0": "NOTIdlD", "2.1": "NOTBIdRLD",
-}  # fmt: skip
+    "1.0": "NOIlD",
+    "1.1": "NOTIlD",
+    "1.2": "NOBTIlD",
+    "1.3": "NOBTIRlD",
+    "2.0": "NOTIdlD",
+    "2.1": "NOTBIdRLD",
+}
 """Columns of the TRC versions by the letters of the format: number, offset [ms], type, bus, identifier, data."""
 PCAN_DATA: Final = frozenset(("Rx", "Tx", "DT", "FD", "FB", "FE", "BI", "RR"))
 PCAN_ERRORS: Final = frozenset(("Warng", "Error", "ST", "ER"))

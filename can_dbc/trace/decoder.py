@@ -107,9 +107,16 @@ class Decoder:
     def summary(self) -> dict[str, Any]:
         """Counts of the records, by kind and by message."""
         names = (
-            "frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken", "transported",
+            "frames",
+            "decoded",
+            "unknown",
+            "refused",
+            "bad_crc",
+            "error_frames",
+            "broken",
+            "transported",
             "unknown_transported",
-        )  # fmt: skip
+        )
         buses = self._buses.values()
         return {name: self.counts[name] for name in names} | {
             "lost_fast_packets": sum(bus.reassembler.lost for bus in buses),

@@ -39,7 +39,7 @@ class BusMonitor:
         "number",
         "reason",
         "recovered",
-    )  # fmt: skip
+    )
 
     def __init__(self, number: int) -> None:
         self.number = number

@@ -39,9 +39,21 @@ class MessageState:
     """One message; ``values`` is None before the first good frame and when they are stale."""
 
     __slots__ = (
-        "_alive", "_checker", "_index", "_last_alive", "_receive", "bit", "codec", "fresh", "machine", "refused",
-        "repeats", "stamp_ns", "timeout_ns", "values",
-    )  # fmt: skip
+        "_alive",
+        "_checker",
+        "_index",
+        "_last_alive",
+        "_receive",
+        "bit",
+        "codec",
+        "fresh",
+        "machine",
+        "refused",
+        "repeats",
+        "stamp_ns",
+        "timeout_ns",
+        "values",
+    )
 
     def __init__(
         self, codec: MessageCodec, bit: int, *, watched: bool = True, machine: bool = False, timeout_ns: int = 0

@@ -34,10 +34,18 @@ class AddressClaim:
     def __init__(self, database: Database) -> None:
         self._claim, self._request = database.message("AddressClaim"), database.message("Request")
         self._name = encode(
-            self._claim, IdentityNumber=1, ManufacturerCode=_NO_MANUFACTURER, EcuInstance=0, FunctionInstance=0,
-            Function=_MANAGEMENT_COMPUTER, Reserved=0, VehicleSystem=0, VehicleSystemInstance=0,
-            IndustryGroup=_FORESTRY, ArbitraryAddress=0,
-        )  # fmt: skip
+            self._claim,
+            IdentityNumber=1,
+            ManufacturerCode=_NO_MANUFACTURER,
+            EcuInstance=0,
+            FunctionInstance=0,
+            Function=_MANAGEMENT_COMPUTER,
+            Reserved=0,
+            VehicleSystem=0,
+            VehicleSystemInstance=0,
+            IndustryGroup=_FORESTRY,
+            ArbitraryAddress=0,
+        )
         self.restart()
 
     def restart(self) -> None:

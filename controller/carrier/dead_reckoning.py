@@ -52,21 +52,48 @@ class DeadReckoning:
     """``yaw_rad`` of the front half and the front axle's position, NaN while unknown; ``finding`` of this tick."""
 
     __slots__ = (
-        "_against", "_arms", "_axle_m", "_carrier", "_frozen", "_heading", "_heading_off", "_heading_rad",
-        "_inputs", "_latitude", "_longitude", "_method", "_middle_m", "_pitch", "_position_off", "_reference", "_roll",
+        "_against",
+        "_arms",
+        "_axle_m",
+        "_carrier",
+        "_frozen",
+        "_heading",
+        "_heading_off",
+        "_heading_rad",
+        "_inputs",
+        "_latitude",
+        "_longitude",
+        "_method",
+        "_middle_m",
+        "_pitch",
+        "_position_off",
+        "_reference",
+        "_roll",
         "_speed",
-        "east_m", "finding", "heading_off_rad", "heights_m", "latitude_deg", "longitude_deg", "north_m",
-        "position_off_m", "speed_m_s", "steering",
-        "tilt_rad", "yaw_rad", "yaw_rate_rad_s",
-    )  # fmt: skip
+        "east_m",
+        "finding",
+        "heading_off_rad",
+        "heights_m",
+        "latitude_deg",
+        "longitude_deg",
+        "north_m",
+        "position_off_m",
+        "speed_m_s",
+        "steering",
+        "tilt_rad",
+        "yaw_rad",
+        "yaw_rate_rad_s",
+    )
 
     def __init__(self, carrier: Carrier, inputs: CarrierInputs, steering: JointEstimator) -> None:
         self._carrier = carrier
         self._inputs = inputs
         self.steering = steering
         self._speed, self._roll, self._pitch = (
-            Signal(inputs.vehicle, "Speed"), Signal(inputs.arms_b, "Roll"), Signal(inputs.arms_b, "Pitch")
-        )  # fmt: skip
+            Signal(inputs.vehicle, "Speed"),
+            Signal(inputs.arms_b, "Roll"),
+            Signal(inputs.arms_b, "Pitch"),
+        )
         self._arms = [Signal(inputs.arms_a, f"Arm{i + 1}") for i in range(N_ARMS)]
         self._heading, self._reference = Signal(inputs.heading, "Heading"), Signal(inputs.heading, "Reference")
         self._latitude, self._longitude = Signal(inputs.position, "Latitude"), Signal(inputs.position, "Longitude")

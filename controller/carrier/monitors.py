@@ -63,9 +63,21 @@ class VehicleMonitor:
     """`step` returns the (reason, detail) of an armed carrier's fault, (NONE, 0) without one."""
 
     __slots__ = (
-        "_arm_from_m", "_arm_since_ns", "_arms_state", "_articulation", "_carrier", "_disagree_ns", "_fault",
-        "_inputs", "_overspeed_ns", "_recent_command_m_s", "_reckoning", "_steering", "_stuck_ns", "_tilt_ns",
-    )  # fmt: skip
+        "_arm_from_m",
+        "_arm_since_ns",
+        "_arms_state",
+        "_articulation",
+        "_carrier",
+        "_disagree_ns",
+        "_fault",
+        "_inputs",
+        "_overspeed_ns",
+        "_recent_command_m_s",
+        "_reckoning",
+        "_steering",
+        "_stuck_ns",
+        "_tilt_ns",
+    )
 
     def __init__(
         self, carrier: Carrier, inputs: CarrierInputs, reckoning: DeadReckoning, steering: TrackedJoint, period_s: float
@@ -155,13 +167,14 @@ class VehicleMonitor:
         return {
             "carrier too fast": (now_ns - self._overspeed_ns) / RUNAWAY_NS,
             "carrier stuck": (now_ns - self._stuck_ns) / STUCK_NS,
-            "steering stuck": stuck, "steering runs away": max(reversed_, runaway),
+            "steering stuck": stuck,
+            "steering runs away": max(reversed_, runaway),
             "steering disagrees": (now_ns - self._disagree_ns) / DISAGREE_NS,
             "carrier tilted": (now_ns - self._tilt_ns) / TILT_NS,
             "arm stuck": (now_ns - min(self._arm_since_ns)) / ARM_STUCK_NS,
             "position jumps": reckoning.position_off_m / MAX_REPEATED_JUMP_M,
             "heading jumps": reckoning.heading_off_rad / MAX_REPEATED_JUMP_RAD,
-        }  # fmt: skip
+        }
 
     def _reported(self) -> Reason:
         """A fault that carrier or arms report, or that they cannot say whether there is one."""

@@ -31,8 +31,14 @@ class CarrierCommand:
     """
 
     __slots__ = (
-        "arm_spools_pct", "articulation_rate_rad_s", "brake_pct", "float_front", "float_rear", "moving", "speed_m_s",
-    )  # fmt: skip
+        "arm_spools_pct",
+        "articulation_rate_rad_s",
+        "brake_pct",
+        "float_front",
+        "float_rear",
+        "moving",
+        "speed_m_s",
+    )
 
     def __init__(
         self,

@@ -59,10 +59,27 @@ class Vehicle:
     """All state of the carrier; `estimate`, `check` and `control` once per tick, in this gate."""
 
     __slots__ = (
-        "_angle", "_carrier", "_elapsed_s", "_inputs", "_lease_end_ns", "_report_due",
-        "_report_sequence", "_sensed", "_settings", "_waypoint", "arms", "bus", "drive", "driving", "estimator", "gate",
-        "monitor", "reckoning", "setpoint", "steering",
-    )  # fmt: skip
+        "_angle",
+        "_carrier",
+        "_elapsed_s",
+        "_inputs",
+        "_lease_end_ns",
+        "_report_due",
+        "_report_sequence",
+        "_sensed",
+        "_settings",
+        "_waypoint",
+        "arms",
+        "bus",
+        "drive",
+        "driving",
+        "estimator",
+        "gate",
+        "monitor",
+        "reckoning",
+        "setpoint",
+        "steering",
+    )
 
     def __init__(
         self,
@@ -239,9 +256,14 @@ class Vehicle:
     def _command(self, float_front: bool, float_rear: bool) -> None:
         drive = self.drive
         self.bus.command = CarrierCommand(
-            True, self.steering.rate_rad_s, drive.speed_m_s, 100.0 if drive.brake else 0.0,
-            tuple(self.arms.spools_pct), float_front, float_rear,
-        )  # fmt: skip
+            True,
+            self.steering.rate_rad_s,
+            drive.speed_m_s,
+            100.0 if drive.brake else 0.0,
+            tuple(self.arms.spools_pct),
+            float_front,
+            float_rear,
+        )
 
     # -- encode
 
@@ -265,12 +287,29 @@ class Vehicle:
         h1, h2, h3, h4 = reckoning.heights_m
         # By place: CPython 3.11 never reuses a tuple of 20 field names (see `controller.state_report`).
         report = VehicleReport(
-            self._report_sequence, self._settings.profile_hash, now_ns, gate.sequence, int(self.driving),
-            pack(gate.refusal, gate.detail), gate.refused, position.stamp_ns, or_nan(position.get("Latitude")),
-            or_nan(position.get("Longitude")), or_nan(fix.get("Altitude")), reckoning.fix,
+            self._report_sequence,
+            self._settings.profile_hash,
+            now_ns,
+            gate.sequence,
+            int(self.driving),
+            pack(gate.refusal, gate.detail),
+            gate.refused,
+            position.stamp_ns,
+            or_nan(position.get("Latitude")),
+            or_nan(position.get("Longitude")),
+            or_nan(fix.get("Altitude")),
+            reckoning.fix,
             int(fix.get("NumberOfSvs") or 0),
-            _NAN if hdop is None else SIGMA_PER_HDOP_M.get(reckoning.fix, _NAN) * hdop, heading.stamp_ns,
-            or_nan(reckoning.heading_rad), _NAN if rate is None else -rate, vehicle.stamp_ns, reckoning.speed_m_s,
-            self.estimator.position, roll, pitch, (h1, h2, h3, h4), self.stale_mask(),
-        )  # fmt: skip
+            _NAN if hdop is None else SIGMA_PER_HDOP_M.get(reckoning.fix, _NAN) * hdop,
+            heading.stamp_ns,
+            or_nan(reckoning.heading_rad),
+            _NAN if rate is None else -rate,
+            vehicle.stamp_ns,
+            reckoning.speed_m_s,
+            self.estimator.position,
+            roll,
+            pitch,
+            (h1, h2, h3, h4),
+            self.stale_mask(),
+        )
         return encode(report)

@@ -72,7 +72,7 @@ class NodeMonitor:
         "_heartbeats",
         "booted",
         "by_number",
-    )  # fmt: skip
+    )
 
     def __init__(self, encoder_nodes: Sequence[int]) -> None:
         self.by_number = {n: NodeHealth() for n in (*SAFETY_NODES, *PRESSURE_NODES, *encoder_nodes)}

@@ -57,10 +57,29 @@ class LoadMoment:
     """The judgement of one machine: ``overloaded`` now; the moment that was judged last, and its limit [Nm]."""
 
     __slots__ = (
-        "_above", "_ahead", "_empty_bar_nm", "_frames_above", "_heavy", "_kinematics", "_lift_valve", "_nm_1", "_nm_2",
-        "_nm_3", "_ns_1", "_ns_2", "_ns_3", "_per_bar_nm", "_pressed", "_pressed_ns", "_sag", "_stability", "_yaw_rad",
-        "last_nm", "limit_nm", "overloaded",
-    )  # fmt: skip
+        "_above",
+        "_ahead",
+        "_empty_bar_nm",
+        "_frames_above",
+        "_heavy",
+        "_kinematics",
+        "_lift_valve",
+        "_nm_1",
+        "_nm_2",
+        "_nm_3",
+        "_ns_1",
+        "_ns_2",
+        "_ns_3",
+        "_per_bar_nm",
+        "_pressed",
+        "_pressed_ns",
+        "_sag",
+        "_stability",
+        "_yaw_rad",
+        "last_nm",
+        "limit_nm",
+        "overloaded",
+    )
 
     def __init__(self, profile: Profile, stability: Stability) -> None:
         self._kinematics, self._stability = profile.kinematics, stability

@@ -47,12 +47,38 @@ class Crane:
     """All state of the crane's motion, built once; ``leased`` while a setpoint or a spool test is in force."""
 
     __slots__ = (
-        "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_lift_a", "_lift_b", "_load",
-        "_load_change", "_load_due", "_load_updated", "_loads_bar", "_opening_sensed", "_pressure_pairs", "_sensed",
+        "_check",
+        "_estimators",
+        "_final",
+        "_gate",
+        "_grapple_request",
+        "_inputs",
+        "_lift_a",
+        "_lift_b",
+        "_load",
+        "_load_change",
+        "_load_due",
+        "_load_updated",
+        "_loads_bar",
+        "_opening_sensed",
+        "_pressure_pairs",
+        "_sensed",
         "_workspace",
-        "commands", "governor", "grapple", "law", "lease_end_ns", "leased", "load_kg", "load_moment",
-        "pitch_rad", "pressure_monitor", "roll_rad", "spool_run", "spools_pct", "sway",
-    )  # fmt: skip
+        "commands",
+        "governor",
+        "grapple",
+        "law",
+        "lease_end_ns",
+        "leased",
+        "load_kg",
+        "load_moment",
+        "pitch_rad",
+        "pressure_monitor",
+        "roll_rad",
+        "spool_run",
+        "spools_pct",
+        "sway",
+    )
 
     def __init__(
         self, settings: Settings, inputs: CraneInputs, estimators: Sequence[JointEstimator], gate: RequestGate
@@ -273,9 +299,15 @@ class Crane:
             if self.sway is not None:
                 self._damp_sway(self.sway, now_ns, elapsed_s)
             law.step(
-                governor.position, governor.velocity, governor.lead_velocity, self._estimators, pressures, cap,
-                elapsed_s, self.sway,
-            )  # fmt: skip
+                governor.position,
+                governor.velocity,
+                governor.lead_velocity,
+                self._estimators,
+                pressures,
+                cap,
+                elapsed_s,
+                self.sway,
+            )
             clamp, release = inputs.grapple.get("ClampPress"), inputs.pressures[2].get("GrappleB")
             self.grapple.step(self._grapple_request, or_nan(clamp), self.opening_pct(), or_nan(release), now_ns)
         else:

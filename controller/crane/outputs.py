@@ -53,9 +53,19 @@ class CraneWriter:
     """Builds the frames of a tick in a list that the caller owns."""
 
     __slots__ = (
-        "_a", "_b", "_booted", "_grapple", "_heartbeat", "_mode_at", "_places", "_references", "_status", "_status_at",
-        "_status_due", "_sync",
-    )  # fmt: skip
+        "_a",
+        "_b",
+        "_booted",
+        "_grapple",
+        "_heartbeat",
+        "_mode_at",
+        "_places",
+        "_references",
+        "_status",
+        "_status_at",
+        "_status_due",
+        "_sync",
+    )
 
     def __init__(self, database: Database, profile: Profile) -> None:
         codecs = [database.message(name) for name in ("ValveCmdA", "ValveCmdB", "CtrlStatus")]

@@ -258,10 +258,25 @@ class ReferenceGovernor:
     """
 
     __slots__ = (
-        "_before", "_before_speed", "_elapsed_s", "_growth", "_last_ns", "_leads", "_off", "_plan", "_plan_velocity",
-        "_scaling", "_speed", "_unscaled_lead", "_valves", "candidate", "lead_velocity", "position", "trajectory",
+        "_before",
+        "_before_speed",
+        "_elapsed_s",
+        "_growth",
+        "_last_ns",
+        "_leads",
+        "_off",
+        "_plan",
+        "_plan_velocity",
+        "_scaling",
+        "_speed",
+        "_unscaled_lead",
+        "_valves",
+        "candidate",
+        "lead_velocity",
+        "position",
+        "trajectory",
         "velocity",
-    )  # fmt: skip
+    )
 
     def __init__(self, profile: Profile, valves: Sequence[ValveMap], leads_ns: Sequence[int]) -> None:
         self._valves = valves

@@ -84,9 +84,17 @@ class SpoolTestRun:
     """The test in force, or none (``function`` is `NO_FUNCTION`)."""
 
     __slots__ = (
-        "_begun_ns", "_driven_ns", "_last", "_limits", "_n", "_percents", "_tested_ns", "_times_ns", "function",
+        "_begun_ns",
+        "_driven_ns",
+        "_last",
+        "_limits",
+        "_n",
+        "_percents",
+        "_tested_ns",
+        "_times_ns",
+        "function",
         "integrated_rad",
-    )  # fmt: skip
+    )
 
     def __init__(self, profile: Profile) -> None:
         self._limits = tuple(SpoolTestLimits(joint(profile, j)) for j in JOINTS)

@@ -39,11 +39,17 @@ class WorkspaceCheck:
         self._lowest_z_m = profile.workspace.ground_z_m - lift_m - GROUND_MARGIN_M + self._hang_m
         self._boxes = tuple(
             (
-                box.center_m[0], box.center_m[1], cos(box.yaw_rad), sin(box.yaw_rad), box.half_m[0], box.half_m[1],
-                box.center_m[2] - box.half_m[2], box.center_m[2] + box.half_m[2],
+                box.center_m[0],
+                box.center_m[1],
+                cos(box.yaw_rad),
+                sin(box.yaw_rad),
+                box.half_m[0],
+                box.half_m[1],
+                box.center_m[2] - box.half_m[2],
+                box.center_m[2] + box.half_m[2],
             )
             for box in (*stake_walls(profile.bunk), *profile.keep_out.values())
-        )  # fmt: skip
+        )
 
     def check(self, knots: Sequence[Knot]) -> None:
         """Check a trajectory.

@@ -38,8 +38,16 @@ class DriftMonitor:
     """Monitors one joint; `step` tells whether it drifts."""
 
     __slots__ = (
-        "_alone", "_before", "_calm_s", "_commanded", "_decay", "_limit", "_open_s", "_period_s", "_shut_s",
-    )  # fmt: skip
+        "_alone",
+        "_before",
+        "_calm_s",
+        "_commanded",
+        "_decay",
+        "_limit",
+        "_open_s",
+        "_period_s",
+        "_shut_s",
+    )
 
     def __init__(self, spec: TrackedJoint, period_s: float, least_speed: float = 0.0) -> None:
         """``least_speed``: see `controller.estimation.usual_speed`."""

@@ -60,9 +60,23 @@ class NoiseMonitor:
     """Monitors one encoder; ``noisy`` is the finding after `update`."""
 
     __slots__ = (
-        "_allowed", "_before", "_before_that", "_gain", "_least", "_least_share", "_limit", "_max_innovation", "_mean",
-        "_most", "_punctual", "_scatter", "_share", "_toss", "_usual", "noisy",
-    )  # fmt: skip
+        "_allowed",
+        "_before",
+        "_before_that",
+        "_gain",
+        "_least",
+        "_least_share",
+        "_limit",
+        "_max_innovation",
+        "_mean",
+        "_most",
+        "_punctual",
+        "_scatter",
+        "_share",
+        "_toss",
+        "_usual",
+        "noisy",
+    )
 
     def __init__(
         self, noise: float, unit_per_count: float, innovation_ratio: float, period_s: float, punctual: bool = True
@@ -166,9 +180,22 @@ class JointEstimator:
     """Tracks one joint; ``known`` is False until the first sample, and then position and velocity are NaN."""
 
     __slots__ = (
-        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_noise", "_period_s",
-        "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
-    )  # fmt: skip
+        "_alpha",
+        "_beta",
+        "_gate_speed",
+        "_jump_stamps",
+        "_measured",
+        "_measured_ns",
+        "_noise",
+        "_period_s",
+        "_predicted_ns",
+        "_slack",
+        "jumped",
+        "known",
+        "position",
+        "refused",
+        "velocity",
+    )
 
     def __init__(self, spec: TrackedJoint, period_s: float, punctual: bool = True) -> None:
         """``period_s`` is that of the samples, ``punctual`` whether each was measured when its stamp says."""

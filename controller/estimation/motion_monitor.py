@@ -71,7 +71,7 @@ class MotionMonitor:
         "_runaway_s",
         "_usual",
         "expected_velocity",
-    )  # fmt: skip
+    )
 
     def __init__(
         self,

@@ -41,9 +41,19 @@ class CylinderMonitor:
     """The two chambers of one cylinder or motor; ``before_bar`` and ``now_bar`` are those of the last loss."""
 
     __slots__ = (
-        "_a1", "_a2", "_a3", "_b1", "_b2", "_b3", "_last_ns", "_lost", "_other_bar", "_since_ns",
-        "before_bar", "now_bar",
-    )  # fmt: skip
+        "_a1",
+        "_a2",
+        "_a3",
+        "_b1",
+        "_b2",
+        "_b3",
+        "_last_ns",
+        "_lost",
+        "_other_bar",
+        "_since_ns",
+        "before_bar",
+        "now_bar",
+    )
 
     def __init__(self) -> None:
         self.before_bar = self.now_bar = 0.0

@@ -15,8 +15,22 @@ class RecentRange:
     """``low`` and ``high`` of the values of the last ``window_s``."""
 
     # Attributes of a compiled class hold numbers without an object for each; a list would not.
-    __slots__ = ("_high_1", "_high_2", "_high_3", "_high_now", "_left", "_low_1", "_low_2", "_low_3", "_low_now",
-                 "_older_high", "_older_low", "_ticks", "high", "low")  # fmt: skip
+    __slots__ = (
+        "_high_1",
+        "_high_2",
+        "_high_3",
+        "_high_now",
+        "_left",
+        "_low_1",
+        "_low_2",
+        "_low_3",
+        "_low_now",
+        "_older_high",
+        "_older_low",
+        "_ticks",
+        "high",
+        "low",
+    )
 
     def __init__(self, window_s: float, period_s: float) -> None:
         self._ticks = max(1, round(window_s / period_s / PARTS))

@@ -73,9 +73,23 @@ class SpeedMonitor:
     """
 
     __slots__ = (
-        "_backwards_most_s", "_backwards_s", "_doubt", "_fast_most_s", "_fast_s", "_learned_s", "_least", "_limit",
-        "_period_s", "_range", "_shift", "_slack", "_slow_most_s", "_slow_s", "_stood_most_s", "_stood_s",
-    )  # fmt: skip
+        "_backwards_most_s",
+        "_backwards_s",
+        "_doubt",
+        "_fast_most_s",
+        "_fast_s",
+        "_learned_s",
+        "_least",
+        "_limit",
+        "_period_s",
+        "_range",
+        "_shift",
+        "_slack",
+        "_slow_most_s",
+        "_slow_s",
+        "_stood_most_s",
+        "_stood_s",
+    )
 
     def __init__(
         self, valve: Valve, speed_limit: float, period_s: float, window_s: float, least_speed: float = 0.0

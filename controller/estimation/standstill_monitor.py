@@ -46,10 +46,27 @@ class StandstillMonitor:
     """Monitors one joint; ``moves`` tells whether it moves without a command."""
 
     __slots__ = (
-        "_calm_far", "_calm_s", "_closing_s", "_far", "_forget", "_gone_to", "_high", "_low", "_neutral_s", "_noise",
-        "_out", "_out_s", "_peak", "_period_s", "_pressed_far", "_rest_s", "_shaken_far", "_started", "moves",
+        "_calm_far",
+        "_calm_s",
+        "_closing_s",
+        "_far",
+        "_forget",
+        "_gone_to",
+        "_high",
+        "_low",
+        "_neutral_s",
+        "_noise",
+        "_out",
+        "_out_s",
+        "_peak",
+        "_period_s",
+        "_pressed_far",
+        "_rest_s",
+        "_shaken_far",
+        "_started",
+        "moves",
         "quiet_s",
-    )  # fmt: skip
+    )
 
     def __init__(self, spec: TrackedJoint, period_s: float, delay_s: float = 0.0, least_speed: float = 0.0) -> None:
         """``delay_s``: the dead time of the joint's valve by the profile; ``least_speed``: see

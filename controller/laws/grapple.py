@@ -76,7 +76,7 @@ class GrappleLaw:
         "mode",
         "spool_pct",
         "state",
-    )  # fmt: skip
+    )
 
     def __init__(self, grapple: Grapple) -> None:
         self._close_ns = int(grapple.close_time_s * 1e9)

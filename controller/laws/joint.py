@@ -159,9 +159,25 @@ class EndPositioning:
     """End positioning of one joint; `step` returns the velocity to command in place of the law's."""
 
     __slots__ = (
-        "_band", "_before", "_direction", "_distance", "_fast", "_full", "_gain", "_inches", "_lag_s", "_left_s",
-        "_open", "_opened_s", "_phase", "_reaction_s", "_settling_s", "_slow", "_stall_s", "_still_s",
-    )  # fmt: skip
+        "_band",
+        "_before",
+        "_direction",
+        "_distance",
+        "_fast",
+        "_full",
+        "_gain",
+        "_inches",
+        "_lag_s",
+        "_left_s",
+        "_open",
+        "_opened_s",
+        "_phase",
+        "_reaction_s",
+        "_settling_s",
+        "_slow",
+        "_stall_s",
+        "_still_s",
+    )
 
     def __init__(self, spec: JointSpec) -> None:
         valve = spec.valve
@@ -335,10 +351,28 @@ class JointLaw:
     """The law of one joint; ``velocity_command`` is its last command [rad/s, m/s]."""
 
     __slots__ = (
-        "_bound", "_damping", "_end_positioning", "_feedback", "_flight", "_frozen", "_lead", "_lower", "_max_rate",
-        "_max_step", "_plain", "_position", "_speed", "_stood", "_upper", "_valve", "_vibration", "has_encoder",
-        "lead_ns", "velocity_command", "velocity_desired",
-    )  # fmt: skip
+        "_bound",
+        "_damping",
+        "_end_positioning",
+        "_feedback",
+        "_flight",
+        "_frozen",
+        "_lead",
+        "_lower",
+        "_max_rate",
+        "_max_step",
+        "_plain",
+        "_position",
+        "_speed",
+        "_stood",
+        "_upper",
+        "_valve",
+        "_vibration",
+        "has_encoder",
+        "lead_ns",
+        "velocity_command",
+        "velocity_desired",
+    )
 
     def __init__(self, spec: JointSpec, valve_map: ValveMap, period_s: float) -> None:
         law, valve = spec.law, spec.valve

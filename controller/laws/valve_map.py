@@ -28,9 +28,23 @@ class ValveMap:
     """One valve function.  ``arm`` (lever arm) and the speeds at full command are those of the last `set_position`."""
 
     __slots__ = (
-        "_ahead", "_at", "_deadband_minus", "_deadband_plus", "_half", "_inverse", "_last", "_lever", "_linear",
-        "_nominal_minus", "_nominal_plus", "_range", "_sign", "arm", "full_minus", "full_plus",
-    )  # fmt: skip
+        "_ahead",
+        "_at",
+        "_deadband_minus",
+        "_deadband_plus",
+        "_half",
+        "_inverse",
+        "_last",
+        "_lever",
+        "_linear",
+        "_nominal_minus",
+        "_nominal_plus",
+        "_range",
+        "_sign",
+        "arm",
+        "full_minus",
+        "full_plus",
+    )
 
     def __init__(self, valve: Valve) -> None:
         self._sign = valve.sign

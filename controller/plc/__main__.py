@@ -125,13 +125,19 @@ def summary(bridge: Bridge) -> str:
     shake = bridge.handshake
     return json.dumps(
         {
-            "sent": shake.sent, "answers": shake.answers, "refused": shake.refused, "dropped": shake.dropped,
-            "replayed": shake.replayed, "sessions": shake.sessions,
-            "refused_here": bridge.gate.refused, "round_trip": shake.round_trip.summary(), "problem": shake.problem,
+            "sent": shake.sent,
+            "answers": shake.answers,
+            "refused": shake.refused,
+            "dropped": shake.dropped,
+            "replayed": shake.replayed,
+            "sessions": shake.sessions,
+            "refused_here": bridge.gate.refused,
+            "round_trip": shake.round_trip.summary(),
+            "problem": shake.problem,
             "feedback": None if shake.feedback is None else asdict(shake.feedback),
         },
         default=bytes.hex,
-    )  # fmt: skip
+    )
 
 
 async def _until_ended(process: Process, link: Link, ended: list[int]) -> None:

@@ -182,17 +182,25 @@ class Bridge:
             self._messages["ValveFbA"].frame_with(state_of(feedback, self.gate), *unknown),
             self._messages["ValveFbB"].frame_with(
                 feedback.fault_axis if feedback.fault_axis < _NO_AXIS else _NO_AXIS,
-                None, None, None, self.gate.exit, self._counter, 3,
+                None,
+                None,
+                None,
+                self.gate.exit,
+                self._counter,
+                3,
             ),
-        )  # fmt: skip
+        )
 
     def _grapple(self, feedback: Feedback) -> RawFrame:
         rotator = math.degrees(math.remainder(feedback.position[Joint.ROT], math.tau))
         rot_deg = rotator if Joint.ROT in self._encoders else None
         return self._messages["GrappleStat"].frame_with(
-            self._grapple_state(feedback.opening), 100.0 * feedback.opening, feedback.pressure_bar[6], feedback.load_kg,
+            self._grapple_state(feedback.opening),
+            100.0 * feedback.opening,
+            feedback.pressure_bar[6],
+            feedback.load_kg,
             rot_deg,
-        )  # fmt: skip
+        )
 
     def _grapple_state(self, opening: float) -> int:
         """0 unknown, 1 open, 2 opening, 3 closing, 4 closed, 5 holding: by the last command and the opening."""

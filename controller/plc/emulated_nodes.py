@@ -61,16 +61,24 @@ class EmulatedEncoder(EmulatedNode):
             else {(0x6005, 1): round(spec.unit_per_count * 1e9).to_bytes(4, "little")}
         )
         communication: Mapping[tuple[int, int], bytes] = {
-            (0x1800, 1): (_NOT_VALID | cob).to_bytes(4, "little"), (0x1800, 2): b"\x01", (0x1A00, 0): b"\x00",
-        } | {(0x1A00, i): bytes(4) for i in range(1, 5)}  # fmt: skip
+            (0x1800, 1): (_NOT_VALID | cob).to_bytes(4, "little"),
+            (0x1800, 2): b"\x01",
+            (0x1A00, 0): b"\x00",
+        } | {(0x1A00, i): bytes(4) for i in range(1, 5)}
         super().__init__(
             spec.node,
             {
-                (0x1000, 0): spec.device_type.to_bytes(4, "little"), (0x6000, 0): bytes(2), (0x6003, 0): bytes(4),
-                (0x6509, 0): bytes(4), (0x6002, 0): spec.total_counts.to_bytes(4, "little"),
-            } | scale | dict(communication),
-            starts=False, writable=frozenset(communication) | {(0x1017, 0)},
-        )  # fmt: skip
+                (0x1000, 0): spec.device_type.to_bytes(4, "little"),
+                (0x6000, 0): bytes(2),
+                (0x6003, 0): bytes(4),
+                (0x6509, 0): bytes(4),
+                (0x6002, 0): spec.total_counts.to_bytes(4, "little"),
+            }
+            | scale
+            | dict(communication),
+            starts=False,
+            writable=frozenset(communication) | {(0x1017, 0)},
+        )
         self._mapping = TPDO1_MAPPINGS[spec.kind]
 
     def answer(self, position: float, velocity: float, sampled_us: int) -> RawFrame | None:

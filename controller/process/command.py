@@ -52,21 +52,51 @@ def parser() -> argparse.ArgumentParser:
         "--setpoint-port 5005 --report 127.0.0.1:5006 --key-file key",
     )
     made.add_argument("--profile", required=True, help="shipped profile name or TOML file")
-    made.add_argument("--bus", type=bus_address, action="append", default=[], metavar="NAME=ADDRESS",
-                      help="address of crane0 and, on a machine with a carrier, of mach0")  # fmt: skip
+    made.add_argument(
+        "--bus",
+        type=bus_address,
+        action="append",
+        default=[],
+        metavar="NAME=ADDRESS",
+        help="address of crane0 and, on a machine with a carrier, of mach0",
+    )
     made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 chooses a free one")
-    made.add_argument("--operator", type=Path, metavar="FILE",
-                      help="Unix socket for the operator's commands; default: beside the timing page")  # fmt: skip
-    made.add_argument("--report", type=address_argument, action="append", default=[], metavar="HOST:PORT",
-                      help="receiver of state reports; may be given more than once")  # fmt: skip
-    made.add_argument("--record", type=Path, metavar="FILE",
-                      help="ring of tick records in shared memory; default: beside the timing page")  # fmt: skip
+    made.add_argument(
+        "--operator",
+        type=Path,
+        metavar="FILE",
+        help="Unix socket for the operator's commands; default: beside the timing page",
+    )
+    made.add_argument(
+        "--report",
+        type=address_argument,
+        action="append",
+        default=[],
+        metavar="HOST:PORT",
+        help="receiver of state reports; may be given more than once",
+    )
+    made.add_argument(
+        "--record",
+        type=Path,
+        metavar="FILE",
+        help="ring of tick records in shared memory; default: beside the timing page",
+    )
     made.add_argument("--rate", type=int, default=0, metavar="HZ", help="control rate; default: the profile's")
-    made.add_argument("--key-file", type=Path, required=True, metavar="FILE",
-                      help="file with the key of setpoints and reports, 16 bytes or more")  # fmt: skip
+    made.add_argument(
+        "--key-file",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="file with the key of setpoints and reports, 16 bytes or more",
+    )
     made.add_argument("--cpu", type=int, help="processor to run on; use only an isolated one")
-    made.add_argument("--spin-us", type=int, default=0, metavar="US",
-                      help="poll the clock for the last US before a wake-up; on a processor of its own")  # fmt: skip
+    made.add_argument(
+        "--spin-us",
+        type=int,
+        default=0,
+        metavar="US",
+        help="poll the clock for the last US before a wake-up; on a processor of its own",
+    )
     made.add_argument("--dma-latency", action="store_true", help="keep the processors out of deep sleep states")
     made.add_argument("--sync-lead-us", type=int, metavar="US", help="SYNC before the tick; default: 0.6 periods")
     made.add_argument("--timing", type=Path, metavar="FILE", help="file of the timing page; default: in shared memory")
@@ -160,12 +190,17 @@ def summary(loop: Loop) -> str:
     supervisor = loop.controller.supervisor
     return json.dumps(
         {
-            "ticks": loop.ticks, "missed": loop.missed, "late": supervisor.late,
+            "ticks": loop.ticks,
+            "missed": loop.missed,
+            "late": supervisor.late,
             "timing": {METRIC_KEYS[name]: loop.timing.durations[name].summary() for name in STAGES},
-            "unsent": loop.unsent, "unrecorded": loop.unrecorded,
-            "mode": supervisor.mode.name, "reason": supervisor.reason.name, "tick": str(running()),
+            "unsent": loop.unsent,
+            "unrecorded": loop.unrecorded,
+            "mode": supervisor.mode.name,
+            "reason": supervisor.reason.name,
+            "tick": str(running()),
         }
-    )  # fmt: skip
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -189,9 +224,18 @@ def main(arguments: list[str] | None = None) -> int:
         operator = operator_socket(options.operator or operator_path())
         timing = LoopTiming(controller, timing_writer(options.timing))
         loop = Loop(
-            controller, buses, setpoints, operator, options.report, record_ring(options.record), timing,
-            settings.period_ns, lead_ns, sleep=make_sleep(options.spin_us * 1000), key=key,
-        )  # fmt: skip
+            controller,
+            buses,
+            setpoints,
+            operator,
+            options.report,
+            record_ring(options.record),
+            timing,
+            settings.period_ns,
+            lead_ns,
+            sleep=make_sleep(options.spin_us * 1000),
+            key=key,
+        )
     except (ConfigError, DbcError, KeyFileError) as error:
         sys.stderr.write(f"controller: {error}\n")
         return 3

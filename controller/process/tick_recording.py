@@ -15,11 +15,21 @@ from controller.tick import Inputs, Outputs
 def write(writer: RecordWriter, inputs: Inputs, outputs: Outputs, now_ns: int) -> memoryview:
     """Write the record of the tick that was just run; it is valid until the writer's next one."""
     return writer.write(
-        now_ns, inputs.late_ns, inputs.tick_ns, inputs.missed_ticks, inputs.bus, inputs.machine_bus,
-        inputs.frames, inputs.machine_frames, inputs.datagrams, (*outputs.frames, outputs.sync),
-        outputs.machine_frames, outputs.report or b"", outputs.vehicle_report or b"",
+        now_ns,
+        inputs.late_ns,
+        inputs.tick_ns,
+        inputs.missed_ticks,
+        inputs.bus,
+        inputs.machine_bus,
+        inputs.frames,
+        inputs.machine_frames,
+        inputs.datagrams,
+        (*outputs.frames, outputs.sync),
+        outputs.machine_frames,
+        outputs.report or b"",
+        outputs.vehicle_report or b"",
         inputs.operator,
-    )  # fmt: skip
+    )
 
 
 def record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:

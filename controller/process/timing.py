@@ -30,10 +30,34 @@ class LoopTiming:
     """Stopwatch of the loop.  In a tick call `begin`, `lap` after each stage, `command_sent`, `end`."""
 
     __slots__ = (
-        "_at", "_begin_ns", "_clock_ns", "_cpu_begin_ns", "_cpu_ns", "_encoders", "_inputs", "_laps", "_last_ns",
-        "_longest_ns", "_newest_ns", "_previous_sync_ns", "_process", "_states", "_sync_ns", "_tick", "_ticks",
-        "_uses", "_writer", "cpu", "durations", "publish_ns", "sample_to_command", "started_ns", "sync", "tick", "wake",
-    )  # fmt: skip
+        "_at",
+        "_begin_ns",
+        "_clock_ns",
+        "_cpu_begin_ns",
+        "_cpu_ns",
+        "_encoders",
+        "_inputs",
+        "_laps",
+        "_last_ns",
+        "_longest_ns",
+        "_newest_ns",
+        "_previous_sync_ns",
+        "_process",
+        "_states",
+        "_sync_ns",
+        "_tick",
+        "_ticks",
+        "_uses",
+        "_writer",
+        "cpu",
+        "durations",
+        "publish_ns",
+        "sample_to_command",
+        "started_ns",
+        "sync",
+        "tick",
+        "wake",
+    )
 
     def __init__(
         self,
@@ -153,9 +177,15 @@ class LoopTiming:
 def _bus_counters(bus: Bus) -> BusCounters:
     stats = bus.stats
     return BusCounters(
-        bus.name, stats.state.name, stats.received, stats.sent, stats.refused, stats.dropped, stats.error_frames,
+        bus.name,
+        stats.state.name,
+        stats.received,
+        stats.sent,
+        stats.refused,
+        stats.dropped,
+        stats.error_frames,
         stats.recoveries,
-    )  # fmt: skip
+    )
 
 
 class ProcessReader:

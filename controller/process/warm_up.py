@@ -113,10 +113,20 @@ def warm_up(settings: Settings, controller: Controller, key: bytes | None = None
         address = receiver.getsockname()
         operator = Path(folder, "operator")
         loop = Loop(
-            controller, buses, planner, OperatorSocket(operator), [address], RecordRing(Path(folder, "ticks")),
-            LoopTiming(controller), settings.period_ns, settings.sync_lead_ns, clock.__next__,
-            lambda _deadline_ns: None, notify="", key=key,
-        )  # fmt: skip
+            controller,
+            buses,
+            planner,
+            OperatorSocket(operator),
+            [address],
+            RecordRing(Path(folder, "ticks")),
+            LoopTiming(controller),
+            settings.period_ns,
+            settings.sync_lead_ns,
+            clock.__next__,
+            lambda _deadline_ns: None,
+            notify="",
+            key=key,
+        )
         _run_ticks(loop, settings, crane, machine, planner.getsockname(), operator, key)
         loop.shut_down()
         loop.close()
@@ -149,9 +159,19 @@ def _run_ticks(
                 knots = (Knot(0, middle, still), Knot(2 * period_ns, middle, still))
                 crane_setpoint = CraneSetpoint(*stamp, _LEASE_NS, GrappleCommand(k // 4 % 3), False, knots)
                 drive = DriveSetpoint(
-                    *stamp, _LEASE_NS, Steering(k // 8 % 2), 1e-4, 1e-4, 0.1, 0.01, 0.2, (0.35,) * 4, k % 3 == 0,
-                    False, k % 16 == 0,
-                )  # fmt: skip
+                    *stamp,
+                    _LEASE_NS,
+                    Steering(k // 8 % 2),
+                    1e-4,
+                    1e-4,
+                    0.1,
+                    0.01,
+                    0.2,
+                    (0.35,) * 4,
+                    k % 3 == 0,
+                    False,
+                    k % 16 == 0,
+                )
                 messages = [crane_setpoint, drive] if k % 8 == 0 else []
             else:
                 messages = []

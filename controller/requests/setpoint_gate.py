@@ -42,9 +42,16 @@ class SetpointGate:
     """
 
     __slots__ = (
-        "_counted", "_lease_max_ns", "_profile_hash", "_refused_ns", "_sequence", "_stamp_ns", "detail", "refusal",
+        "_counted",
+        "_lease_max_ns",
+        "_profile_hash",
+        "_refused_ns",
+        "_sequence",
+        "_stamp_ns",
+        "detail",
+        "refusal",
         "refused",
-    )  # fmt: skip
+    )
 
     def __init__(self, profile: Profile, profile_hash: int) -> None:
         self._lease_max_ns = profile.timeouts.lease_max_ms * 1_000_000

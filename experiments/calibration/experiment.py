@@ -45,9 +45,14 @@ def run(options: Options, console: Console) -> Result:
             metrics |= metrics_of(short, machines[short], found)
             draw(options.out / f"errors_{short}.png", found)
         result = make_result(
-            "calibration", metrics_in(metrics), metrics, profile=" and ".join(machines.values()), seed=options.seed,
-            trials=trials, more={"truth": truth},
-        )  # fmt: skip
+            "calibration",
+            metrics_in(metrics),
+            metrics,
+            profile=" and ".join(machines.values()),
+            seed=options.seed,
+            trials=trials,
+            more={"truth": truth},
+        )
         for short, found in by_machine.items():
             for outcome in found:
                 if outcome["failure"] or outcome.get("implausible"):

@@ -59,11 +59,13 @@ def sections(found: Mapping[str, float]) -> tuple[Section, ...]:
     """One section for every machine in a result."""
     return tuple(
         Section(
-            _TITLES.get(s, s), _TEXT, _metrics(s, f"{s}_rot_gain_max" in found),
+            _TITLES.get(s, s),
+            _TEXT,
+            _metrics(s, f"{s}_rot_gain_max" in found),
             ((f"errors_{s}.png", "Errors of every joint and side, all trials."),),
         )
         for s in _prefixes(found)
-    )  # fmt: skip
+    )
 
 
 def _prefixes(found: Mapping[str, float]) -> list[str]:
@@ -77,51 +79,115 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
         return Metric(f"{short}_{name}", *rest, **limits)
 
     return (
-        m("complete", "Runs that end with a plausible profile", "%",
-          "No stop, no refused request, and no value that the calibration itself rejects.", least=0.95, scale=100.0),
-        m("deadband_max", "Dead-band, largest error", "% of spool",
-          "Middle of the hysteresis against the truth, both sides of every joint with an encoder, all trials.",
-          most=DEADBAND_PCT),
+        m(
+            "complete",
+            "Runs that end with a plausible profile",
+            "%",
+            "No stop, no refused request, and no value that the calibration itself rejects.",
+            least=0.95,
+            scale=100.0,
+        ),
+        m(
+            "deadband_max",
+            "Dead-band, largest error",
+            "% of spool",
+            "Middle of the hysteresis against the truth, both sides of every joint with an encoder, all trials.",
+            most=DEADBAND_PCT,
+        ),
         m("deadband_rms", "Dead-band, RMS error", "% of spool", "The same values."),
         m("deadband_before", "Dead-band of the shipped profile, largest error", "% of spool", "Before calibration."),
-        m("gain_max", "Full speed, largest error", "%",
-          "Against the plant's own speed at the same place, measured without bus, controller and sensors.",
-          most=GAIN, scale=100.0),
+        m(
+            "gain_max",
+            "Full speed, largest error",
+            "%",
+            "Against the plant's own speed at the same place, measured without bus, controller and sensors.",
+            most=GAIN,
+            scale=100.0,
+        ),
         m("gain_rms", "Full speed, RMS error", "%", "The same values.", scale=100.0),
         m("gain_before", "Full speed of the shipped profile, largest error", "%", "Before calibration.", scale=100.0),
-        m("delay_max", "Dead time, largest error", "ms", "From the command on the bus to the spool, against the truth.",
-          most=DELAY_MS),
+        m(
+            "delay_max",
+            "Dead time, largest error",
+            "ms",
+            "From the command on the bus to the spool, against the truth.",
+            most=DELAY_MS,
+        ),
         m("delay_before", "Dead time of the shipped profile, largest error", "ms", "Before calibration."),
-        m("seconds_max", "Longest calibration", "s",
-          "Simulated time from the first to the last motion, survey included.", most=SECONDS),
-        m("pin_before", "Surveyed pin against encoders before calibration", "mm",
-          "Largest distance, all poses and trials."),
-        m("pin_after", "Surveyed pin against encoders with zeros and sag", "mm",
-          "Largest distance; a reading has 2 mm of noise on every axis."),
-        m("tip_before", "True pin against encoders before calibration, empty", "mm",
-          "Largest distance at eight poses that were not surveyed; four are the goals of paper B."),
-        m("tip_max", "True pin against the calibrated profile, empty, largest", "mm",
-          "The same poses; kinematics with the zeros and the sag of the calibrated profile.", most=TIP_EMPTY_MM),
+        m(
+            "seconds_max",
+            "Longest calibration",
+            "s",
+            "Simulated time from the first to the last motion, survey included.",
+            most=SECONDS,
+        ),
+        m(
+            "pin_before",
+            "Surveyed pin against encoders before calibration",
+            "mm",
+            "Largest distance, all poses and trials.",
+        ),
+        m(
+            "pin_after",
+            "Surveyed pin against encoders with zeros and sag",
+            "mm",
+            "Largest distance; a reading has 2 mm of noise on every axis.",
+        ),
+        m(
+            "tip_before",
+            "True pin against encoders before calibration, empty",
+            "mm",
+            "Largest distance at eight poses that were not surveyed; four are the goals of paper B.",
+        ),
+        m(
+            "tip_max",
+            "True pin against the calibrated profile, empty, largest",
+            "mm",
+            "The same poses; kinematics with the zeros and the sag of the calibrated profile.",
+            most=TIP_EMPTY_MM,
+        ),
         m("tip_rms", "True pin against the calibrated profile, empty, RMS", "mm", "The same values."),
         m("tip_loaded_before", "True pin against encoders before calibration, with 200 kg", "mm", "Largest distance."),
-        m("tip_loaded_max", "True pin against the calibrated profile, with 200 kg, largest", "mm",
-          "The load is known, as from a load cell; the calibration itself has only weighed the empty crane.",
-          most=TIP_LOADED_MM),
+        m(
+            "tip_loaded_max",
+            "True pin against the calibrated profile, with 200 kg, largest",
+            "mm",
+            "The load is known, as from a load cell; the calibration itself has only weighed the empty crane.",
+            most=TIP_LOADED_MM,
+        ),
         m("tip_loaded_rms", "True pin against the calibrated profile, with 200 kg, RMS", "mm", "The same values."),
-        m("give", "Compliance of the column, largest error", "%",
-          "Identified lean per moment over the truth's; it contains what the profile has wrong of the lift cylinder.",
-          scale=100.0),
-        m("load_max", "Load from the lift's pressures, largest error", "kg",
-          "Empty and with 200 kg, the boom coming to rest from above or from below; friction is what remains."),
+        m(
+            "give",
+            "Compliance of the column, largest error",
+            "%",
+            "Identified lean per moment over the truth's; it contains what the profile has wrong of the lift cylinder.",
+            scale=100.0,
+        ),
+        m(
+            "load_max",
+            "Load from the lift's pressures, largest error",
+            "kg",
+            "Empty and with 200 kg, the boom coming to rest from above or from below; friction is what remains.",
+        ),
         m("load_rms", "Load from the lift's pressures, RMS error", "kg", "The same values."),
-        m("zero_slew", "Encoder zero of the slew, largest error", "mrad",
-          "Against the truth, without eccentricity.", scale=1e3),
+        m(
+            "zero_slew",
+            "Encoder zero of the slew, largest error",
+            "mrad",
+            "Against the truth, without eccentricity.",
+            scale=1e3,
+        ),
         m("zero_tilt", "Encoder zero of the tilt, largest error", "mrad", "The same for the stick.", scale=1e3),
-        m("zero_lift", "Encoder zero of the lift, largest error", "mrad",
-          "The same for the boom; a leaning column looks almost like a boom with a wrong zero.", scale=1e3),
+        m(
+            "zero_lift",
+            "Encoder zero of the lift, largest error",
+            "mrad",
+            "The same for the boom; a leaning column looks almost like a boom with a wrong zero.",
+            scale=1e3,
+        ),
         m("zero_ext", "Encoder zero of the telescope, largest error", "mm", "The same for the telescope.", scale=1e3),
         *(_rotator_metrics(m) if blind_rotator else ()),
-    )  # fmt: skip
+    )
 
 
 def rotator_is_blind(profile: str) -> bool:
@@ -132,22 +198,52 @@ def rotator_is_blind(profile: str) -> bool:
 def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
     """Metrics of a rotator without an encoder."""
     return (
-        m("rot_deadband_max", "Rotator without encoder: dead-band, largest error", "% of spool",
-          "From surveyed turns, fitted with the metering curve of the profile, which differs from the truth's.",
-          most=ROT_DEADBAND_PCT),
-        m("rot_deadband_before", "Rotator: dead-band of the shipped profile, largest error", "% of spool",
-          "Before calibration."),
-        m("rot_gain_max", "Rotator without encoder: full speed, largest error", "%",
-          "Against the truth of its valve.", most=GAIN, scale=100.0),
-        m("rot_gain_before", "Rotator: full speed of the shipped profile, largest error", "%",
-          "Before calibration.", scale=100.0),
-        m("rot_quarter_max", "Rotator without encoder: quarter turn, largest error", "%",
-          "True angle of the quarter turns that a planner commands, two to either side: the drift of the dead "
-          "reckoning.", most=ROT_QUARTER, scale=100.0),
+        m(
+            "rot_deadband_max",
+            "Rotator without encoder: dead-band, largest error",
+            "% of spool",
+            "From surveyed turns, fitted with the metering curve of the profile, which differs from the truth's.",
+            most=ROT_DEADBAND_PCT,
+        ),
+        m(
+            "rot_deadband_before",
+            "Rotator: dead-band of the shipped profile, largest error",
+            "% of spool",
+            "Before calibration.",
+        ),
+        m(
+            "rot_gain_max",
+            "Rotator without encoder: full speed, largest error",
+            "%",
+            "Against the truth of its valve.",
+            most=GAIN,
+            scale=100.0,
+        ),
+        m(
+            "rot_gain_before",
+            "Rotator: full speed of the shipped profile, largest error",
+            "%",
+            "Before calibration.",
+            scale=100.0,
+        ),
+        m(
+            "rot_quarter_max",
+            "Rotator without encoder: quarter turn, largest error",
+            "%",
+            "True angle of the quarter turns that a planner commands, two to either side: the drift of the dead "
+            "reckoning.",
+            most=ROT_QUARTER,
+            scale=100.0,
+        ),
         m("rot_quarter_rms", "Rotator: quarter turn, RMS error", "%", "The same values.", scale=100.0),
-        m("rot_quarter_before", "Rotator: quarter turn with the shipped profile, largest error", "%",
-          "Before calibration.", scale=100.0),
-    )  # fmt: skip
+        m(
+            "rot_quarter_before",
+            "Rotator: quarter turn with the shipped profile, largest error",
+            "%",
+            "Before calibration.",
+            scale=100.0,
+        ),
+    )
 
 
 _TITLES: Final = {"palms": "PALMS 4.71", "aoro": "AORO, CRANAB FC8"}

@@ -22,9 +22,15 @@ from sim.world import GRAPPLE_LINKS, STEP_S, World
 
 LOAD_KG: Final = 200.0
 GOALS: Final = (
-    (4.27, 1.86, 1.0), (4.27, -1.86, 1.0), (6.0, 1.86, 1.0), (6.0, -1.86, 1.0),
-    (3.0, 0.8, 1.6), (4.4, -2.4, 2.8), (5.2, 0.0, 1.8), (6.3, -1.0, 2.4),
-)  # fmt: skip
+    (4.27, 1.86, 1.0),
+    (4.27, -1.86, 1.0),
+    (6.0, 1.86, 1.0),
+    (6.0, -1.86, 1.0),
+    (3.0, 0.8, 1.6),
+    (4.4, -2.4, 2.8),
+    (5.2, 0.0, 1.8),
+    (6.3, -1.0, 2.4),
+)
 """Positions ahead of and beside the crane at slew 0 [m]: the four of paper B, and others; some are out of reach for the
 smaller crane, or among the stakes of a machine's bunk.
 """

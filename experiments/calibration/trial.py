@@ -97,9 +97,13 @@ def turn_errors(job: Job, path: Path) -> list[float]:
     try:
         turner, digest = _Turner(profile, plant), profile_hash(profile)
         system = Lockstep(
-            Settings(profile, digest, profile.rate_hz), build_guard(path), plant, turner,
-            Operator(digest, _pressed, max_stops=0), Observer(None, []),
-        )  # fmt: skip
+            Settings(profile, digest, profile.rate_hz),
+            build_guard(path),
+            plant,
+            turner,
+            Operator(digest, _pressed, max_stops=0),
+            Observer(None, []),
+        )
         while not turner.done and system.now_ns < START_NS + int(LONGEST_S * 1e9):
             system.advance()
     finally:

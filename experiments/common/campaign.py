@@ -84,12 +84,18 @@ def run(name: str, options: Options, recordings: int, console: Console) -> tuple
     recorded = record(failed[:recordings], clocked, options, console)
     costs = [t.cost for t in trials if t.cost is not None]
     campaign = Campaign(
-        experiment=name, seed=options.seed, trials=len(trials), workers=len({c.worker for c in costs}),
-        table_sha256=hashlib.sha256(table).hexdigest(), failures=len(failed), recorded=recorded,
-        **_figures(costs), table_bytes=round(len(table) / max(1, len(trials)), 1),
+        experiment=name,
+        seed=options.seed,
+        trials=len(trials),
+        workers=len({c.worker for c in costs}),
+        table_sha256=hashlib.sha256(table).hexdigest(),
+        failures=len(failed),
+        recorded=recorded,
+        **_figures(costs),
+        table_bytes=round(len(table) / max(1, len(trials)), 1),
         kept_bytes=round((options.out / "trials.jsonl").stat().st_size / max(1, len(trials)), 1),
         wall_s=round(time.monotonic() - begun_s, 3),
-    )  # fmt: skip
+    )
     (options.out / SUMMARY).write_text(json.dumps(asdict(campaign), indent=2) + "\n")
     return result, campaign
 
@@ -117,11 +123,12 @@ def record(
             again |= pool.run(function, its, kept, local, "recordings of failed trials", console)
     return tuple(
         FailedTrial(
-            t.job.name, str(folders[t.job.name]),
+            t.job.name,
+            str(folders[t.job.name]),
             line_of(t.job.name, again[t.job.name], clocked) == line_of(t.job.name, t.outcome, clocked),
         )
         for t in failed
-    )  # fmt: skip
+    )
 
 
 def _figures(costs: Sequence[TrialCost]) -> dict[str, Any]:

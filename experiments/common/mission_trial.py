@@ -63,11 +63,15 @@ def run_mission(
             return {
                 **summary_of(summary),
                 "logs": [
-                    {"place_m": [s.x_m, s.y_m, s.yaw_rad], "size_m": [s.length_m, s.diameter_m],
-                     "detected": i in observer.known, "in_bunk": evaluation.logs[i].in_bunk,
-                     "lies_m": [[round(v, 3) for v in at] for at in (lying[i].position_m, *lying[i].ends_m)],
-                     "landed": not evaluation.logs[i].in_bunk
-                     and any(math.dist(lying[i].position_m[:2], at) < LANDED_M for at in landings)}
+                    {
+                        "place_m": [s.x_m, s.y_m, s.yaw_rad],
+                        "size_m": [s.length_m, s.diameter_m],
+                        "detected": i in observer.known,
+                        "in_bunk": evaluation.logs[i].in_bunk,
+                        "lies_m": [[round(v, 3) for v in at] for at in (lying[i].position_m, *lying[i].ends_m)],
+                        "landed": not evaluation.logs[i].in_bunk
+                        and any(math.dist(lying[i].position_m[:2], at) < LANDED_M for at in landings),
+                    }
                     for i, s in enumerate(site.logs)
                 ],
                 "base": plant.base_pose(),
@@ -75,7 +79,7 @@ def run_mission(
                 "grasps": observer.grasps,
                 "path": observer.path,
                 "stands": observer.stands,
-            }  # fmt: skip
+            }
         finally:
             plant.close()
 
@@ -83,11 +87,17 @@ def run_mission(
 def summary_of(summary: MissionSummary) -> dict[str, Any]:
     """The summary of the run as plain data."""
     return {
-        "finished": summary.finished, "failure": summary.failure, "loaded": summary.loaded,
-        "given_up": {str(k): v for k, v in summary.given_up.items()}, "seconds": summary.seconds,
-        "driven_m": round(summary.driven_m, 2), "stops": summary.stops, "refused": summary.refused,
-        "states": [list(s) for s in summary.states], "remarks": list(summary.remarks),
-    }  # fmt: skip
+        "finished": summary.finished,
+        "failure": summary.failure,
+        "loaded": summary.loaded,
+        "given_up": {str(k): v for k, v in summary.given_up.items()},
+        "seconds": summary.seconds,
+        "driven_m": round(summary.driven_m, 2),
+        "stops": summary.stops,
+        "refused": summary.refused,
+        "states": [list(s) for s in summary.states],
+        "remarks": list(summary.remarks),
+    }
 
 
 def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:

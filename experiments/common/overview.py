@@ -92,13 +92,16 @@ def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]
     """The section on later published systems, with our figure that comes nearest to each."""
     by_name = {(name, metric.name): metric for name, _, metric in metrics_of(results)}
     lines = [
-        "## Later published systems", "",
+        "## Later published systems",
+        "",
         "Settings differ, so a row compares questions, not machines. Here everything runs on the bus through "
         "controller and guard, with our own detector and depth camera. "
         "`timberhand experiment grasp-configs --planner NAME` compares another method with ours on "
-        "the same scenes ([campaigns](how-to/campaigns.md)).", "",
-        "| system | setting | measure | published | nearest here | command |", "|---|---|---|---|---|---|",
-    ]  # fmt: skip
+        "the same scenes ([campaigns](how-to/campaigns.md)).",
+        "",
+        "| system | setting | measure | published | nearest here | command |",
+        "|---|---|---|---|---|---|",
+    ]
     for one in LATER:
         name, metric = one.nearest[0], by_name.get(one.nearest)
         if metric is not None:

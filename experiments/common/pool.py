@@ -58,8 +58,13 @@ def run(
     kept = {job.name: found for job in jobs if (found := checkpoint.find(digests[job.name])) is not None}
     checkpoint.done.update({name: trial.outcome for name, trial in kept.items()})
     work = {job.name: partial(measured, partial(_named, function), job) for job in jobs if job.name not in kept}
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-               TimeRemainingColumn())  # fmt: skip
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD_S) as progress:
         task = progress.add_task(title, total=len(jobs), completed=len(kept))
         begun_s = told_s = time.monotonic()

@@ -61,9 +61,15 @@ def run(options: Options, console: Console) -> Result:
         outcomes = texts | pool.run(perform, jobs, kept, options.workers, "runs with motions", console)
         often = str(options.repetitions or REPETITIONS)
         result = make_result(
-            "crane-accuracy", METRICS, gather(outcomes, own_law), profile=name, seed=options.seed, trials=machines,
-            more={"truth": truth, "law": own_law, "repetitions": often}, paper=PAPER,
-        )  # fmt: skip
+            "crane-accuracy",
+            METRICS,
+            gather(outcomes, own_law),
+            profile=name,
+            seed=options.seed,
+            trials=machines,
+            more={"truth": truth, "law": own_law, "repetitions": often},
+            paper=PAPER,
+        )
         draw(outcomes, profile_named(name).kinematics, options.out)
         print_failures(texts, console)
         publish(result, page_of(result, {}), options, console)
@@ -93,9 +99,11 @@ def motions(
             if text is None:
                 continue
             what: dict[str, Any] = {
-                **machine.options, "variant": variant, "visits": pairs,
+                **machine.options,
+                "variant": variant,
+                "visits": pairs,
                 "text": None if variant == UNCALIBRATED else text,
-            }  # fmt: skip
+            }
             if machine is calibrations[0] and variant in TRACED:
                 what["trace"] = next((i for i, (g, load) in enumerate(pairs) if g == TRACED_GOAL and load), None)
             jobs.append(Job(machine.name.replace("calibration", variant), "motions", machine.seed, what))

@@ -38,58 +38,109 @@ def _mm(name: str, title: str, how: str, most: float | None = None) -> Metric:
 
 
 ACCURACY: Final = (
-    _mm("encoder_error_mean_m", "Error by encoders, 3-D, mean",
+    _mm(
+        "encoder_error_mean_m",
+        "Error by encoders, 3-D, mean",
         "Distance of the hanger pin, by the controller's joint positions, from the point to which the encoders were "
-        "commanded; mean over half a second, 3 s after arrival; all machines, goals, repetitions and loads.", 0.010),
+        "commanded; mean over half a second, 3 s after arrival; all machines, goals, repetitions and loads.",
+        0.010,
+    ),
     _mm("encoder_error_xy_mean_m", "Error by encoders, horizontal, mean", "The same points.", 0.007),
     _mm("encoder_error_z_mean_m", "Error by encoders, height, mean", "The same points."),
     _mm("encoder_error_p95_m", "Error by encoders, 3-D, 95th percentile", "The same points.", 0.020),
     _mm("encoder_error_max_m", "Error by encoders, 3-D, worst", "The same points."),
     _mm("encoder_error_empty_mean_m", "Error by encoders, 3-D, grapple empty, mean", "Half of the points."),
     _mm("encoder_error_loaded_mean_m", "Error by encoders, 3-D, with 200 kg, mean", "The other half."),
-    _mm("tip_error_mean_m", "True pin from the goal, 3-D, mean",
-        "Position of the pin in the crane's base frame, from the plant's ground truth; same times.", 0.03),
+    _mm(
+        "tip_error_mean_m",
+        "True pin from the goal, 3-D, mean",
+        "Position of the pin in the crane's base frame, from the plant's ground truth; same times.",
+        0.03,
+    ),
     _mm("tip_error_p95_m", "True pin from the goal, 3-D, 95th percentile", "The same points."),
     _mm("tip_error_empty_mean_m", "True pin from the goal, grapple empty, mean", "Half of the points."),
     _mm("tip_error_loaded_mean_m", "True pin from the goal, with 200 kg, mean", "The other half."),
-    _mm("aim_offset_mean_m", "Offset of the commanded encoder position from the goal, mean",
-        "The correction of the profile's sag model for the lean of the column."),
-    _mm("tip_error_uncorrected_mean_m", "True pin from the goal without sag compensation, mean",
-        "The calibrated profile without its sag table."),
-    _mm("uncompensated_encoder_error_mean_m", "Error by encoders against the goal without sag compensation, mean",
-        "The same motions; the encoders are commanded to the goal itself, as in paper B."),
-    _mm("uncalibrated_error_mean_m", "Error by encoders against the goal before calibration, mean",
-        "The profile as shipped, on the same individuals.", 0.06),
+    _mm(
+        "aim_offset_mean_m",
+        "Offset of the commanded encoder position from the goal, mean",
+        "The correction of the profile's sag model for the lean of the column.",
+    ),
+    _mm(
+        "tip_error_uncorrected_mean_m",
+        "True pin from the goal without sag compensation, mean",
+        "The calibrated profile without its sag table.",
+    ),
+    _mm(
+        "uncompensated_encoder_error_mean_m",
+        "Error by encoders against the goal without sag compensation, mean",
+        "The same motions; the encoders are commanded to the goal itself, as in paper B.",
+    ),
+    _mm(
+        "uncalibrated_error_mean_m",
+        "Error by encoders against the goal before calibration, mean",
+        "The profile as shipped, on the same individuals.",
+        0.06,
+    ),
     _mm("uncalibrated_tip_error_mean_m", "True pin from the goal before calibration, mean", "The same motions."),
-)  # fmt: skip
+)
 MOTION: Final = (
-    Metric("time_ratio", "Motion time over the shortest possible, mean", "",
-           "From the start of the reference until the pin by encoders stays within 20 mm of its end, over the time "
-           "that full joint speeds, joint accelerations and the pump's flow allow for the same path (without jerk "
-           "limit, delay or swing).", most=1.15),
+    Metric(
+        "time_ratio",
+        "Motion time over the shortest possible, mean",
+        "",
+        "From the start of the reference until the pin by encoders stays within 20 mm of its end, over the time "
+        "that full joint speeds, joint accelerations and the pump's flow allow for the same path (without jerk "
+        "limit, delay or swing).",
+        most=1.15,
+    ),
     Metric("time_ratio_p95", "Motion time over the shortest possible, 95th percentile", "", "The same motions."),
     Metric("planned_ratio", "Planned duration over the shortest possible, mean", "", "Duration of the reference."),
     Metric("motion_s", "Motion time, mean", "s", "The same motions."),
     Metric("ended", "Completed motions", "%", "The pin stays within 20 mm of the end.", least=0.99, scale=PERCENT),
-    Metric("limit_cycle_share", "Valve commands that are not zero after settling", "%",
-           "Share of the valve commands on the bus with any joint not exactly zero, from 2 s after arrival on.",
-           most=0.05, scale=PERCENT),
+    Metric(
+        "limit_cycle_share",
+        "Valve commands that are not zero after settling",
+        "%",
+        "Share of the valve commands on the bus with any joint not exactly zero, from 2 s after arrival on.",
+        most=0.05,
+        scale=PERCENT,
+    ),
     Metric("stops", "Controlled stops", "", "All runs of all variants.", most=0),
     Metric("failures", "Failed motions", "", "Stopped, refused or never started; all variants.", most=0),
-    Metric("calibration_failures", "Machines without a calibrated profile", "",
-           "The calibration stopped or rejected a value; such a machine makes no motions.", most=0),
-)  # fmt: skip
+    Metric(
+        "calibration_failures",
+        "Machines without a calibrated profile",
+        "",
+        "The calibration stopped or rejected a value; such a machine makes no motions.",
+        most=0,
+    ),
+)
 SWING: Final = (
-    Metric("sway_residual_deg", "Swing of the grapple, 95th percentile", "deg",
-           "Largest true lean of the grapple from the vertical in both planes, 1 to 3 s after the end of the "
-           "reference, whether or not the pin has settled.", most=3.0),
+    Metric(
+        "sway_residual_deg",
+        "Swing of the grapple, 95th percentile",
+        "deg",
+        "Largest true lean of the grapple from the vertical in both planes, 1 to 3 s after the end of the "
+        "reference, whether or not the pin has settled.",
+        most=3.0,
+    ),
     Metric("sway_residual_mean_deg", "Swing of the grapple, mean", "deg", "The same motions."),
-    Metric("unshaped_sway_residual_deg", "Swing with unshaped references, 95th percentile", "deg",
-           "The same paths in the same time with a time law that ignores the swing."),
+    Metric(
+        "unshaped_sway_residual_deg",
+        "Swing with unshaped references, 95th percentile",
+        "deg",
+        "The same paths in the same time with a time law that ignores the swing.",
+    ),
     Metric("unshaped_sway_residual_mean_deg", "Swing with unshaped references, mean", "deg", "The same motions."),
-    Metric("sway_reduction", "Reduction of the swing by shaping", "%",
-           "One minus the ratio of the two means.", least=0.6, scale=PERCENT),
-)  # fmt: skip
+    Metric(
+        "sway_reduction",
+        "Reduction of the swing by shaping",
+        "%",
+        "One minus the ratio of the two means.",
+        least=0.6,
+        scale=PERCENT,
+    ),
+)
 LAW_NAMES: Final = {"pd": "PD", "smc": "sliding mode", "sta": "super-twisting"}
 
 
@@ -102,9 +153,14 @@ def _law(prefix: str) -> tuple[Metric, ...]:
         _mm(f"{prefix}.tip_error_mean_m", f"{name}: true pin from the goal, mean", how),
         Metric(f"{prefix}.time_ratio", f"{name}: motion time over the shortest possible, mean", "", how),
         Metric(f"{prefix}.sway_residual_deg", f"{name}: swing of the grapple, 95th percentile", "deg", how),
-        Metric(f"{prefix}.limit_cycle_share", f"{name}: valve commands that are not zero after settling", "%", how,
-               scale=PERCENT),
-    )  # fmt: skip
+        Metric(
+            f"{prefix}.limit_cycle_share",
+            f"{name}: valve commands that are not zero after settling",
+            "%",
+            how,
+            scale=PERCENT,
+        ),
+    )
 
 
 SECTIONS: Final = (
@@ -117,14 +173,23 @@ SECTIONS: Final = (
         "this project.",
         ACCURACY,
         (
-            ("histogram.png", "As Fig. 20 of paper B: error by encoders in 3-D, horizontal and in height. Dashed: mean "
-             "of paper B; solid: mean here."),
-            ("points.png", "As Fig. 19 of paper B, enlarged: rest positions of the pin by encoders, from above, "
-                           "relative "
-             "to the commanded point. Squares: empty; x: with 200 kg."),
-            ("true_points.png", "True pin at the same times relative to the goal, from the side. Squares: empty; x: "
-                                "with "
-             "200 kg; light: without sag compensation."),
+            (
+                "histogram.png",
+                "As Fig. 20 of paper B: error by encoders in 3-D, horizontal and in height. Dashed: mean "
+                "of paper B; solid: mean here.",
+            ),
+            (
+                "points.png",
+                "As Fig. 19 of paper B, enlarged: rest positions of the pin by encoders, from above, "
+                "relative "
+                "to the commanded point. Squares: empty; x: with 200 kg.",
+            ),
+            (
+                "true_points.png",
+                "True pin at the same times relative to the goal, from the side. Squares: empty; x: "
+                "with "
+                "200 kg; light: without sag compensation.",
+            ),
         ),
     ),
     Section(
@@ -132,9 +197,14 @@ SECTIONS: Final = (
         "The shortest time is a bound that no machine reaches: full acceleration of every joint from one moment to the "
         "next, the full flow of the pump, and no regard for swing.",
         MOTION,
-        (("motion.png", "One motion to point 3 with 200 kg: path of the pin, its errors, the valve commands, the lean "
-                        "of "
-          "the grapple."),),
+        (
+            (
+                "motion.png",
+                "One motion to point 3 with 200 kg: path of the pin, its errors, the valve commands, the lean "
+                "of "
+                "the grapple.",
+            ),
+        ),
     ),
     Section(
         "Swing of the grapple",
@@ -148,7 +218,7 @@ SECTIONS: Final = (
         "and super-twisting are reconstructions: paper B names them without equations.",
         tuple(m for prefix in LAWS.values() for m in _law(prefix)),
     ),
-)  # fmt: skip
+)
 METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 

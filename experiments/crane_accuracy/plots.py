@@ -51,11 +51,23 @@ def _histogram(own: list[dict[str, Any]], path: Path) -> None:
             axis.axvline(MM * PAPER[name], color=RUST, lw=1.0, ls="--")
             if len(values):
                 axis.axvline(values.mean(), color=TIMBER, lw=1.2)
-                axis.annotate(f"mean {values.mean():.1f}", (values.mean(), 0.82), xycoords=("data", "axes fraction"),
-                              xytext=(4, 0), textcoords="offset points", color=TIMBER)  # fmt: skip
-            axis.annotate(f"paper B {MM * PAPER[name]:.0f}", (MM * PAPER[name], 0.94),
-                          xycoords=("data", "axes fraction"), xytext=(-4, 0), textcoords="offset points", ha="right",
-                          color=RUST)  # fmt: skip
+                axis.annotate(
+                    f"mean {values.mean():.1f}",
+                    (values.mean(), 0.82),
+                    xycoords=("data", "axes fraction"),
+                    xytext=(4, 0),
+                    textcoords="offset points",
+                    color=TIMBER,
+                )
+            axis.annotate(
+                f"paper B {MM * PAPER[name]:.0f}",
+                (MM * PAPER[name], 0.94),
+                xycoords=("data", "axes fraction"),
+                xytext=(-4, 0),
+                textcoords="offset points",
+                ha="right",
+                color=RUST,
+            )
             axis.set(title=title, xlim=(0.0, LONGEST_MM), ylabel="motions")
 
 

@@ -204,10 +204,16 @@ def _outcome(testbed: AccuracyTestbed, traced: int | None) -> dict[str, Any]:
             testbed.trace(run, samples), np.array(run.commanded_m), np.array(run.goal_m), ended_s
         )
         off = np.mean(samples.position[-25:], axis=0) - np.array(run.motion.goal)
-        motions.append({
-            **facts, **found, "failed": False, "planned_s": run.motion.duration_s, "minimum_s": shortest[key],
-            "joints": off[: Joint.ROT].tolist(),
-        })  # fmt: skip
+        motions.append(
+            {
+                **facts,
+                **found,
+                "failed": False,
+                "planned_s": run.motion.duration_s,
+                "minimum_s": shortest[key],
+                "joints": off[: Joint.ROT].tolist(),
+            }
+        )
     outcome = {
         "motions": motions,
         "missing": len(testbed.cycles.visits) - len(motions),

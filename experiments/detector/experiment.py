@@ -60,9 +60,15 @@ def run(options: Options, console: Console) -> Result:
         metrics = gather(list(outcomes.values()), networks) | on_photos(finder("half"), options)
         draw_plots(list(outcomes.values()), networks, options)
         result = make_result(
-            "detector", METRICS, metrics, profile=", ".join(MACHINES), seed=options.seed, trials=trials,
-            more={"truth": options.truth}, paper=PAPER,
-        )  # fmt: skip
+            "detector",
+            METRICS,
+            metrics,
+            profile=", ".join(MACHINES),
+            seed=options.seed,
+            trials=trials,
+            more={"truth": options.truth},
+            paper=PAPER,
+        )
         publish(result, page_of(result, {}), options, console)
     return result
 

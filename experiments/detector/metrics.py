@@ -39,35 +39,52 @@ def _share(name: str, title: str, how: str, least: float | None = None) -> Metri
 
 
 BOXES: Final = (
-    _share("map50", "Boxes, mAP@0.5", "COCO's measure; pictures of 608 px, processed as on the machine: at half size, "
-                                      "and "
-           "regions with wood enlarged.", 0.95),
+    _share(
+        "map50",
+        "Boxes, mAP@0.5",
+        "COCO's measure; pictures of 608 px, processed as on the machine: at half size, "
+        "and "
+        "regions with wood enlarged.",
+        0.95,
+    ),
     _share("map50_95", "Boxes, mAP@0.5:0.95", "Mean over ten minimum overlaps from 0.5 to 0.95.", 0.80),
     _share("recall", "Logs found", "With a score of at least 0.5 and an overlap of at least 0.5."),
     Metric("false_per_picture", "False detections per picture", "", "With a score of at least 0.5."),
-)  # fmt: skip
+)
 LOST: Final = (
-    _share("parted.map50", "Boxes, mAP@0.5, with perfectly separated logs",
-           "All pixels classified as wood, divided into logs by the ground truth."),
+    _share(
+        "parted.map50",
+        "Boxes, mAP@0.5, with perfectly separated logs",
+        "All pixels classified as wood, divided into logs by the ground truth.",
+    ),
     _share("parted.map50_95", "Boxes, mAP@0.5:0.95, with perfectly separated logs", "The same pixels."),
-    _share("found_large", f"Logs found that show at least {LARGE_PX} px",
-           "With an overlap of at least 0.5, at any score."),
-    _share("found_small", f"Logs found that show fewer than {LARGE_PX} px",
-           "With an overlap of at least 0.5, at any score."),
-)  # fmt: skip
+    _share(
+        "found_large", f"Logs found that show at least {LARGE_PX} px", "With an overlap of at least 0.5, at any score."
+    ),
+    _share(
+        "found_small",
+        f"Logs found that show fewer than {LARGE_PX} px",
+        "With an overlap of at least 0.5, at any score.",
+    ),
+)
 MASKS: Final = (
     _share("mask_map50", "Masks, mAP@0.5", "As for boxes, with masks."),
     _share("mask_map50_95", "Masks, mAP@0.5:0.95", "As for boxes, with masks."),
     *(_share(f"{m}.map50", f"Boxes, mAP@0.5, {m}", "On the pictures of one machine.") for m in MACHINES),
-    *(_share(f"{n}.{key}", f"Boxes, {title}, {NAMES[n]}", "The same pictures.")
-      for n in ("double", "whole", "half", "depth", FAITHFUL)
-      for key, title in (("map50", "mAP@0.5"), ("map50_95", "mAP@0.5:0.95"))),
-)  # fmt: skip
+    *(
+        _share(f"{n}.{key}", f"Boxes, {title}, {NAMES[n]}", "The same pictures.")
+        for n in ("double", "whole", "half", "depth", FAITHFUL)
+        for key, title in (("map50", "mAP@0.5"), ("map50_95", "mAP@0.5:0.95"))
+    ),
+)
 PHOTOS: Final = (
     Metric("photos", "Photographs", "", "From TimberSeg's preview sheets; 180 to 500 px wide, without depth."),
-    _share("photos_iou", "Overlap of detected and labelled wood, median",
-           "All masks of a picture together; the labels were derived from coloured overlays."),
-)  # fmt: skip
+    _share(
+        "photos_iou",
+        "Overlap of detected and labelled wood, median",
+        "All masks of a picture together; the labels were derived from coloured overlays.",
+    ),
+)
 METRICS: Final = (*BOXES, *LOST, *MASKS, *PHOTOS)
 SECTIONS: Final = (
     Section(
@@ -78,10 +95,13 @@ SECTIONS: Final = (
         "picture's 370 000 pixels do not count. Paper B's value was measured on its own photographs: the two tests "
         "differ.",
         BOXES,
-        (("precision_recall.png", "Precision and recall, as in Fig. 7 of paper B."),
-         ("found.png", "Logs found in test pictures: boxes, masks, scores and ends; a filled dot is a visible end of "
-                       "the "
-          "log.")),
+        (
+            ("precision_recall.png", "Precision and recall, as in Fig. 7 of paper B."),
+            (
+                "found.png",
+                "Logs found in test pictures: boxes, masks, scores and ends; a filled dot is a visible end of the log.",
+            ),
+        ),
     ),
     Section(
         "Causes of missed logs",
@@ -104,4 +124,4 @@ SECTIONS: Final = (
         "beside the result.",
         PHOTOS,
     ),
-)  # fmt: skip
+)

@@ -29,9 +29,14 @@ MIN_LOG_PX: Final = 100
 SURE: Final = 0.5
 BINS: Final = ((0.5, 0.7), (0.7, 0.85), (0.85, 0.95), (0.95, 1.01))
 TRAINED_SCENES: Final = (
-    "horizontal_grid 4", "vertical_grid 4", "horizontal_grid 6", "vertical_grid 10", "horizontal_grid 8",
-    "vertical_grid 8", "vertical_grid 7",
-)  # fmt: skip
+    "horizontal_grid 4",
+    "vertical_grid 4",
+    "horizontal_grid 6",
+    "vertical_grid 10",
+    "horizontal_grid 8",
+    "vertical_grid 8",
+    "vertical_grid 7",
+)
 """Photographs whose scenes the training has seen; both sheets show some scenes twice."""
 PHOTO_VIEW_RAD: Final = 1.4
 Finder = Callable[[np.ndarray, np.ndarray, Intrinsics], tuple[Instance, ...]]
@@ -86,10 +91,13 @@ def figures(pictures: list[TracedPicture], find: Finder, depth: str) -> dict[str
     whole = curve(boxes, 0.5)
     sure = int(np.count_nonzero(whole.scores >= SURE))
     out = {
-        "pictures": float(len(boxes)), "map50": whole.average, "map50_95": average_precision(boxes),
-        "mask_map50": curve(masks, 0.5).average, "mask_map50_95": average_precision(masks),
+        "pictures": float(len(boxes)),
+        "map50": whole.average,
+        "map50_95": average_precision(boxes),
+        "mask_map50": curve(masks, 0.5).average,
+        "mask_map50_95": average_precision(masks),
         "false_per_picture": sure * (1.0 - float(whole.precision[sure - 1])) / len(boxes) if sure else 0.0,
-    }  # fmt: skip
+    }
     right = np.diff(np.concatenate([[0.0], whole.precision * np.arange(1, len(whole.scores) + 1)]))
     for low, high in BINS:
         own = (whole.scores >= low) & (whole.scores < high)

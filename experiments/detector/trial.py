@@ -17,8 +17,12 @@ from training.common.average_precision import Matches, box_overlaps, mask_overla
 from training.detection.detector_weights import box_of
 
 SIZES: Final = {
-    "rgbd": SIZE_PX, "double": 2 * SIZE_PX, "whole": SIZE_PX, "half": SIZE_PX // 2, "depth": SIZE_PX,
-}  # fmt: skip
+    "rgbd": SIZE_PX,
+    "double": 2 * SIZE_PX,
+    "whole": SIZE_PX,
+    "half": SIZE_PX // 2,
+    "depth": SIZE_PX,
+}
 """Variants by the side [px] of the largest whole picture that the network processes."""
 ENLARGED: Final = ("rgbd", "depth")
 """Variants that also process enlarged regions with wood, as the machine does."""
@@ -82,9 +86,14 @@ def perform(job: Job) -> dict[str, Any]:
         if name == "rgbd":
             found[PARTED] = parted(np.any([i.mask for i in logs], axis=0), masks, boxes)
     return {
-        "machine": job.kind, "kind": seen.kind, "camera": seen.camera, "range_m": seen.range_m,
-        "ignored": ignored.tolist(), "pixels": [int(np.count_nonzero(m)) for m in masks], "found": found,
-    }  # fmt: skip
+        "machine": job.kind,
+        "kind": seen.kind,
+        "camera": seen.camera,
+        "range_m": seen.range_m,
+        "ignored": ignored.tolist(),
+        "pixels": [int(np.count_nonzero(m)) for m in masks],
+        "found": found,
+    }
 
 
 def parted(wood: np.ndarray, masks: list[np.ndarray], boxes: np.ndarray) -> dict[str, Any]:

@@ -58,9 +58,14 @@ def run(options: Options, console: Console) -> Result:
         outcomes = {job.name: kept.done[job.name] for job in jobs if job.name in kept.done}
         metrics = gather(outcomes)
         result = make_result(
-            "faults", METRICS, metrics, profile=", ".join(PROFILES), seed=options.seed, trials=trials,
+            "faults",
+            METRICS,
+            metrics,
+            profile=", ".join(PROFILES),
+            seed=options.seed,
+            trials=trials,
             more={"truth": options.truth},
-        )  # fmt: skip
+        )
         publish(result, page_of(result, {}), options, console)
         write_evidence(outcomes, metrics, options.out / "evidence")
         if options.docs is not None:

@@ -60,12 +60,25 @@ def _outcome(what: str, bound_ms: float, found_ms: float | None, good: bool, sai
     late = found_ms is not None and found_ms > bound_ms
     verdict = "ok" if good and not late else "late" if good else "undetected"
     return {
-        "at_ms": 0.0, "orders": [what], "expected": "REFUSED", "bound_ms": bound_ms, "seen_ms": 0.0,
-        "tip_limit_m": None, "reached": {}, "reason": "", "refused_ms": found_ms, "neutral_ms": None, "valves_ms": None,
-        "travel_m": 0.0, "astray_m": 0.0, "standing": True, "timeline": [[found_ms or 0.0, said]],
+        "at_ms": 0.0,
+        "orders": [what],
+        "expected": "REFUSED",
+        "bound_ms": bound_ms,
+        "seen_ms": 0.0,
+        "tip_limit_m": None,
+        "reached": {},
+        "reason": "",
+        "refused_ms": found_ms,
+        "neutral_ms": None,
+        "valves_ms": None,
+        "travel_m": 0.0,
+        "astray_m": 0.0,
+        "standing": True,
+        "timeline": [[found_ms or 0.0, said]],
         "detect_ms": found_ms,
-        "verdict": verdict, "missed": verdict != "ok",
-    }  # fmt: skip
+        "verdict": verdict,
+        "missed": verdict != "ok",
+    }
 
 
 def wall_clock(random: Random) -> dict[str, Any]:
@@ -176,8 +189,9 @@ def _recording_cut(random: Random) -> dict[str, Any]:
         begin = time.process_time()
         recover(run)
         found_ms = 1e3 * (time.process_time() - begin)
-        last_ns = max((r.log_ns for f in run_files(run) for r in scan(f, {"/crane0/raw"}) if isinstance(r, Stored)),
-                      default=-1)  # fmt: skip
+        last_ns = max(
+            (r.log_ns for f in run_files(run) for r in scan(f, {"/crane0/raw"}) if isinstance(r, Stored)), default=-1
+        )
     committed_ns = max((ns for size, ns in commits if size <= at), default=0)
     good = last_ns >= committed_ns - 250 * MS
     said = f"cut at byte {at}; written until {committed_ns / MS:.0f} ms, read back until {last_ns / MS:.0f} ms"

@@ -15,27 +15,68 @@ HOUR_S: Final = 3600.0
 MIN_INJECTIONS: Final = 4500
 
 CAMPAIGN: Final = (
-    Metric("cases", "Entries of the catalogue that were exercised or counted", "", "Each entry, with or without a "
-           "detector.", least=len(CASES)),
-    Metric("injections", "Injections", "", "Faults injected at random moments; an entry without an input to inject "
-           "into counts as many missed ones.", least=MIN_INJECTIONS),
-    Metric("missed", "Missed injections", "", "Undetected, after the bound, answered more mildly than promised, more "
-           "tip travel than promised, or a stop where nothing may stop."),
-    Metric("blind_missed", "Missed injections in named blind spots", "", "Of them: entries, or works of an entry, for "
-           "which the software has no input or detector; each is named with its harm."),
+    Metric(
+        "cases",
+        "Entries of the catalogue that were exercised or counted",
+        "",
+        "Each entry, with or without a detector.",
+        least=len(CASES),
+    ),
+    Metric(
+        "injections",
+        "Injections",
+        "",
+        "Faults injected at random moments; an entry without an input to inject into counts as many missed ones.",
+        least=MIN_INJECTIONS,
+    ),
+    Metric(
+        "missed",
+        "Missed injections",
+        "",
+        "Undetected, after the bound, answered more mildly than promised, more "
+        "tip travel than promised, or a stop where nothing may stop.",
+    ),
+    Metric(
+        "blind_missed",
+        "Missed injections in named blind spots",
+        "",
+        "Of them: entries, or works of an entry, for "
+        "which the software has no input or detector; each is named with its harm.",
+    ),
     Metric("unexplained", "Missed injections outside the named blind spots", "", "The difference.", most=0.0),
-    Metric("neutral_max_ms", "Longest time to neutral valves after the loss of a needed input", "ms", "From the fault "
-           "to the moment after which the outputs of valve node, vehicle or PLC are neutral for good (ground truth; a "
-           "frame tells it up to its period later). Entries of which a needed input is lost.", most=100.0),
-    Metric("travel_max_m", "Longest way of the tip from the fault to rest", "m", "Hanger pin in the crane's base frame "
-           "by the true joints, intended motion included; all injections that must stop the crane."),
-)  # fmt: skip
+    Metric(
+        "neutral_max_ms",
+        "Longest time to neutral valves after the loss of a needed input",
+        "ms",
+        "From the fault "
+        "to the moment after which the outputs of valve node, vehicle or PLC are neutral for good (ground truth; a "
+        "frame tells it up to its period later). Entries of which a needed input is lost.",
+        most=100.0,
+    ),
+    Metric(
+        "travel_max_m",
+        "Longest way of the tip from the fault to rest",
+        "m",
+        "Hanger pin in the crane's base frame "
+        "by the true joints, intended motion included; all injections that must stop the crane.",
+    ),
+)
 NOMINAL: Final = (
-    Metric("nominal_hours", "Simulated hours of work without a fault", "h", "All stretches, also on rough ground and "
-           "with other individual machines.", least=10.0),
-    Metric("false_trips", "False trips", "", "Stops in those hours; `work-without-faults.md` beside the evidence "
-           "pages names each.", most=0.0),
-)  # fmt: skip
+    Metric(
+        "nominal_hours",
+        "Simulated hours of work without a fault",
+        "h",
+        "All stretches, also on rough ground and with other individual machines.",
+        least=10.0,
+    ),
+    Metric(
+        "false_trips",
+        "False trips",
+        "",
+        "Stops in those hours; `work-without-faults.md` beside the evidence pages names each.",
+        most=0.0,
+    ),
+)
 METRICS: Final = CAMPAIGN + NOMINAL
 
 
@@ -53,13 +94,15 @@ def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     stopping = [o["travel_m"] for c in CASES for o in by_case.get(c.number, []) if o["expected"] in ("H", "R1", "R0")]
     return metrics | {
         "cases": float(sum(metrics[f"{p}_injections"] > 0 for p in prefix)),
-        "injections": total["injections"], "missed": total["missed"], "blind_missed": blind,
+        "injections": total["injections"],
+        "missed": total["missed"],
+        "blind_missed": blind,
         "unexplained": total["missed"] - blind,
         "neutral_max_ms": max((ms for o in promised if (ms := neutral_ms(o)) is not None), default=math.nan),
         "travel_max_m": max(stopping, default=math.nan),
         "nominal_hours": sum(o["seconds"] for o in nominal) / HOUR_S,
         "false_trips": float(sum(len(o["trips"]) for o in nominal)),
-    }  # fmt: skip
+    }
 
 
 def injections_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[int, list[dict[str, Any]]]:
@@ -111,11 +154,14 @@ def case_metrics(case: Case, rows: Sequence[Mapping[str, Any]]) -> dict[str, flo
         return float(np.percentile(times, share)) if times else math.nan
 
     return {
-        f"{p}_injections": float(len(rows)), f"{p}_missed": float(len(missed)),
+        f"{p}_injections": float(len(rows)),
+        f"{p}_missed": float(len(missed)),
         f"{p}_blind_missed": float(len(blind)),
-        f"{p}_p50_ms": at(50), f"{p}_p99_ms": at(99), f"{p}_max_ms": max(times, default=math.nan),
+        f"{p}_p50_ms": at(50),
+        f"{p}_p99_ms": at(99),
+        f"{p}_max_ms": max(times, default=math.nan),
         f"{p}_neutral_max_ms": max(neutral, default=math.nan),
         f"{p}_travel_max_m": max((o["travel_m"] for o in rows), default=math.nan),
         f"{p}_astray_max_m": max((o["astray_m"] for o in rows), default=math.nan),
         f"{p}_harm_m": max(map(harm_m, missed), default=0.0),
-    }  # fmt: skip
+    }

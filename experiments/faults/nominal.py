@@ -77,10 +77,13 @@ class _Trips:
         """What has been counted."""
         system = self._system
         return {
-            "scene": scene, "seed": seed, "seconds": (system.now_ns - START_NS) * 1e-9,
-            "working_s": self.working_ticks * system.period_ns * 1e-9, "trips": self.found,
+            "scene": scene,
+            "seed": seed,
+            "seconds": (system.now_ns - START_NS) * 1e-9,
+            "working_s": self.working_ticks * system.period_ns * 1e-9,
+            "trips": self.found,
             "shares": self.separation.shares,
-        }  # fmt: skip
+        }
 
     def outputs(self, outputs: Outputs, now_ns: int) -> None:
         """The outputs of a tick."""

@@ -128,12 +128,14 @@ def separations(work: Sequence[Mapping[str, Any]]) -> list[str]:
     if not measured:
         return []
     lines = [
-        "## How near work comes to a stop", "",
+        "## How near work comes to a stop",
+        "",
         "A monitor's share is its statistic over its threshold: at 1 it stops or slows the machine. Armed seconds by "
-        "their greatest share, of any joint:", "",
+        "their greatest share, of any joint:",
+        "",
         "| monitor | hours | above 0.5 [s] | above 0.8 [s] | 1 and above [s] | greatest | where |",
         "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     half, most = EDGES.index(0.5) + 1, EDGES.index(0.8) + 1
     for name, one in sorted(merged(measured).items()):
         bins = one["bins"]
@@ -155,21 +157,31 @@ def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str
         "No injection." if not rows else "Missed: none." if not missed else f"Missed: {len(missed)} of {len(rows)}."
     )
     out = [
-        "---", "orphan: true", "---", "", f"# {case.number}: {case.title}", "", verdict, "",
+        "---",
+        "orphan: true",
+        "---",
+        "",
+        f"# {case.number}: {case.title}",
+        "",
+        verdict,
+        "",
         f"Promised: {case.reaction}; bound {case.bound}. Injected as: {kinds or 'nothing'}.",
         "",
-    ]  # fmt: skip
+    ]
     out += [f"Not seen: {case.blind}", ""] if case.blind else []
     out += ["| | |", "|---|---|"]
     for key, title in (
-        ("injections", "Injections"), ("missed", "Missed"), ("blind_missed", "Missed in a named blind spot"),
+        ("injections", "Injections"),
+        ("missed", "Missed"),
+        ("blind_missed", "Missed in a named blind spot"),
         ("p50_ms", "Detection, median [ms]"),
         ("p99_ms", "Detection, 99th percentile [ms]"),
-        ("max_ms", "Detection, longest [ms]"), ("neutral_max_ms", "All valves neutral, longest [ms]"),
+        ("max_ms", "Detection, longest [ms]"),
+        ("neutral_max_ms", "All valves neutral, longest [ms]"),
         ("travel_max_m", "Way of the tip until rest, longest [m]"),
         ("astray_max_m", "Tip astray, largest [m]"),
         ("harm_m", "The same, of missed injections [m]"),
-    ):  # fmt: skip
+    ):
         out.append(f"| {title} | {_number(metrics.get(f'{p}_{key}'))} |")
     out += ["", "| scene | injections | verdicts |", "|---|---|---|"]
     for scene in sorted({o["scene"] for o in rows}):
@@ -193,8 +205,10 @@ def _example(o: Mapping[str, Any]) -> list[str]:
         f"{o['at_ms'] / 1e3:.3f} s; expected {o['expected']} within {o['bound_ms']:.0f} ms{_since(o)}; {detected}; "
         f"way of the tip {o['travel_m']:.3f} m; {'at rest' if o['standing'] else 'not at rest'} at the end; "
         f"verdict {o['verdict']}.",
-        "", "| ms after the fault | |", "|---|---|",
-    ]  # fmt: skip
+        "",
+        "| ms after the fault | |",
+        "|---|---|",
+    ]
     return lines + [f"| {ms:.1f} | {text} |" for ms, text in o["timeline"]]
 
 

@@ -184,9 +184,19 @@ class DrivePlanner:
         self._sequence, self._sent_ns = self._sequence + 1, now_ns
         heights = (self._carrier.arm_transport_m,) * 4
         setpoint = DriveSetpoint(
-            self._sequence, self._hash, now_ns, LEASE_NS, Steering.WAYPOINT, *self._goal, 0.0, 0.0, SPEED_M_S, heights,
-            False, False,
-        )  # fmt: skip
+            self._sequence,
+            self._hash,
+            now_ns,
+            LEASE_NS,
+            Steering.WAYPOINT,
+            *self._goal,
+            0.0,
+            0.0,
+            SPEED_M_S,
+            heights,
+            False,
+            False,
+        )
         return encode(setpoint)
 
 

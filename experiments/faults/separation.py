@@ -50,8 +50,9 @@ class Separation:
                 "guard: joint moves with its valve shut": max(watch.share() for _, watch in guard.motion),
                 "guard: joint too fast": max((joint.share() for joint in guard.joints.values()), default=0.0),
             },
-            "guard", now_ns,
-        )  # fmt: skip
+            "guard",
+            now_ns,
+        )
         if now_ns >= self._ends_ns:
             self._ends_ns = now_ns + SECOND_NS
             for name, share in self._second.items():

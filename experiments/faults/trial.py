@@ -130,14 +130,24 @@ def inject(machine: Running, number: int, seed: str) -> dict[str, Any]:
     before_ms = (at_ns - START_NS) * 1e-6
     travel_m, astray_m, valves_ms, standing, due_ms = _follow(machine, drawn, at_ns)
     outcome = {
-        "seed": seed, "at_ms": round(before_ms, 3), "orders": [_words(o) for o in drawn.orders],
-        "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": drawn.seen_ms,
-        "due_ms": due_ms, "tip_limit_m": drawn.tip_limit_m,
-        "reached": evidence.reached, "reason": evidence.reason, "refused_ms": evidence.refused_ms,
-        "neutral_ms": evidence.neutral_ms if evidence.frames else None, "valves_ms": valves_ms,
-        "travel_m": round(travel_m, 4), "astray_m": round(astray_m, 4), "standing": standing,
+        "seed": seed,
+        "at_ms": round(before_ms, 3),
+        "orders": [_words(o) for o in drawn.orders],
+        "expected": drawn.expected,
+        "bound_ms": drawn.bound_ms,
+        "seen_ms": drawn.seen_ms,
+        "due_ms": due_ms,
+        "tip_limit_m": drawn.tip_limit_m,
+        "reached": evidence.reached,
+        "reason": evidence.reason,
+        "refused_ms": evidence.refused_ms,
+        "neutral_ms": evidence.neutral_ms if evidence.frames else None,
+        "valves_ms": valves_ms,
+        "travel_m": round(travel_m, 4),
+        "astray_m": round(astray_m, 4),
+        "standing": standing,
         "timeline": evidence.timeline[:16],
-    }  # fmt: skip
+    }
     return outcome | judge(outcome)
 
 
@@ -160,11 +170,23 @@ def start(scene: str, number: int, seed: str) -> dict[str, Any]:
                 refused_ms, reason = round((system.now_ns - START_NS) * 1e-6, 3), system.report.reason & 0xFF
     reached = {} if refused_ms is None or armed else {"X": refused_ms}
     outcome = {
-        "seed": seed, "at_ms": 0.0, "orders": [_words(o) for o in drawn.orders],
-        "expected": drawn.expected, "bound_ms": drawn.bound_ms, "seen_ms": 0.0, "tip_limit_m": None, "reached": reached,
-        "reason": Reason(reason).name if reason else "", "refused_ms": refused_ms, "neutral_ms": 0.0, "valves_ms": 0.0,
-        "travel_m": 0.0, "astray_m": 0.0, "standing": not armed, "timeline": machine.evidence.timeline[:16],
-    }  # fmt: skip
+        "seed": seed,
+        "at_ms": 0.0,
+        "orders": [_words(o) for o in drawn.orders],
+        "expected": drawn.expected,
+        "bound_ms": drawn.bound_ms,
+        "seen_ms": 0.0,
+        "tip_limit_m": None,
+        "reached": reached,
+        "reason": Reason(reason).name if reason else "",
+        "refused_ms": refused_ms,
+        "neutral_ms": 0.0,
+        "valves_ms": 0.0,
+        "travel_m": 0.0,
+        "astray_m": 0.0,
+        "standing": not armed,
+        "timeline": machine.evidence.timeline[:16],
+    }
     return outcome | judge(outcome)
 
 

@@ -50,9 +50,15 @@ def run(options: Options, console: Console) -> Result:
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
         outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)
         result = make_result(
-            "forwarding-mission", METRICS, gather(outcomes), profile=name, seed=options.seed, trials=trials,
-            more={"truth": truth, "eyes": DETECTORS["ours"], "machines": str(max(0, len(machines) - 1))}, paper=PAPER,
-        )  # fmt: skip
+            "forwarding-mission",
+            METRICS,
+            gather(outcomes),
+            profile=name,
+            seed=options.seed,
+            trials=trials,
+            more={"truth": truth, "eyes": DETECTORS["ours"], "machines": str(max(0, len(machines) - 1))},
+            paper=PAPER,
+        )
         draw(outcomes, options.out)
         print_failures(outcomes, console)
         publish(result, page_of(result, outcomes), options, console)
@@ -77,9 +83,14 @@ def failed(trial: Trial) -> bool:
 def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[Job]:
     """One mission of the nominal machine on the original field by each method."""
     what: dict[str, Any] = {
-        "profile": profile, "truth": "nominal", "file": str(PAPER_B), "shuffled": False, "short": options.quick,
-        "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None, "limit_s": LIMIT_S,
-    }  # fmt: skip
+        "profile": profile,
+        "truth": "nominal",
+        "file": str(PAPER_B),
+        "shuffled": False,
+        "short": options.quick,
+        "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None,
+        "limit_s": LIMIT_S,
+    }
     ways = ("ours",) if options.quick else ("ours", "paper-b")
     return [Job(f"first/{way}", "mission", options.seed, what | {"way": way, "eyes": DETECTORS[way]}) for way in ways]
 
@@ -104,8 +115,15 @@ def missions(options: Options, profile: str, truth: str, trials: int, machines: 
         if text is None:
             continue
         what: dict[str, Any] = {
-            "profile": profile, "truth": truth, "file": str(PAPER_B), "shuffled": True, "text": text, "way": "ours",
-            "eyes": DETECTORS["ours"], "field": first + MACHINES + i, "limit_s": LIMIT_S,
-        }  # fmt: skip
+            "profile": profile,
+            "truth": truth,
+            "file": str(PAPER_B),
+            "shuffled": True,
+            "text": text,
+            "way": "ours",
+            "eyes": DETECTORS["ours"],
+            "field": first + MACHINES + i,
+            "limit_s": LIMIT_S,
+        }
         jobs.append(Job(f"mission/{i}", "mission", first + i % MACHINES, what))
     return jobs

@@ -34,38 +34,78 @@ CONCLUSION: Final = (
     "{paper:grasp_offset_mean_m}).",
 )
 OURS: Final = (
-    Metric("detected", "Logs detected", "%", "Before the log was taken, the machine's log map held a log within 80 cm "
-                                             "of "
-           "it while it lay in its original place. All our missions.", least=0.99, scale=100.0),
-    Metric("loaded", "Logs loaded", "%", "At the end the log lies between the stakes of the bunk, by the plant's "
-                                         "physics.",
-           least=0.98, scale=100.0),
-    Metric("grasp_offset_mean_m", "Grapple to log, mean", "cm", "Ground truth on top of the log, just before the "
-                                                                "grapple "
-           "is activated: from the point between the open tips to the middle of the log, across, along and up (less "
-           "the planned height); all grasps of one log.", most=0.08, scale=CM),
+    Metric(
+        "detected",
+        "Logs detected",
+        "%",
+        "Before the log was taken, the machine's log map held a log within 80 cm "
+        "of "
+        "it while it lay in its original place. All our missions.",
+        least=0.99,
+        scale=100.0,
+    ),
+    Metric(
+        "loaded",
+        "Logs loaded",
+        "%",
+        "At the end the log lies between the stakes of the bunk, by the plant's physics.",
+        least=0.98,
+        scale=100.0,
+    ),
+    Metric(
+        "grasp_offset_mean_m",
+        "Grapple to log, mean",
+        "cm",
+        "Ground truth on top of the log, just before the "
+        "grapple "
+        "is activated: from the point between the open tips to the middle of the log, across, along and up (less "
+        "the planned height); all grasps of one log.",
+        most=0.08,
+        scale=CM,
+    ),
     Metric("grasp_offset_p95_m", "Grapple to log, 95th percentile", "cm", "The same grasps.", scale=CM),
-    Metric("grasp_offset_across_m", "Grapple to log across the machine, mean absolute", "cm", "The same grasps.",
-           scale=CM),
-    Metric("grasp_offset_along_m", "Grapple to log along the machine, mean absolute", "cm", "The same grasps.",
-           scale=CM),
+    Metric(
+        "grasp_offset_across_m", "Grapple to log across the machine, mean absolute", "cm", "The same grasps.", scale=CM
+    ),
+    Metric(
+        "grasp_offset_along_m", "Grapple to log along the machine, mean absolute", "cm", "The same grasps.", scale=CM
+    ),
     Metric("grasp_offset_up_m", "Grapple to log in height, mean absolute", "cm", "The same grasps.", scale=CM),
-    Metric("faults", "Stops and faults", "", "Times the controller stopped the machine, so that an operator had to "
-                                             "reset "
-           "it; all our missions.", most=0.0),
+    Metric(
+        "faults",
+        "Stops and faults",
+        "",
+        "Times the controller stopped the machine, so that an operator had to reset it; all our missions.",
+        most=0.0,
+    ),
     Metric("refused", "Setpoints refused", "", "All our missions.", most=0.0),
-    Metric("missions", "Missions driven", "", "The one on the original field, and those on other fields, of which 20 "
-                                              "are "
-           "planned."),
-    Metric("finished", "Missions driven to the end of the route", "%", "Share of the missions driven.", least=1.0,
-           scale=100.0),
-    Metric("uncalibrated", "Machines without a calibrated profile", "", "The calibration stopped or rejected a value; "
-           "such a machine drives no mission.", most=0.0),
+    Metric(
+        "missions",
+        "Missions driven",
+        "",
+        "The one on the original field, and those on other fields, of which 20 are planned.",
+    ),
+    Metric(
+        "finished",
+        "Missions driven to the end of the route",
+        "%",
+        "Share of the missions driven.",
+        least=1.0,
+        scale=100.0,
+    ),
+    Metric(
+        "uncalibrated",
+        "Machines without a calibrated profile",
+        "",
+        "The calibration stopped or rejected a value; such a machine drives no mission.",
+        most=0.0,
+    ),
     Metric("missed", "Grasps without a log", "", "All our missions."),
-    Metric("mission_mean_s", "Duration of a mission, mean", "min", "From arming to the end of the route.",
-           scale=1 / 60),
+    Metric(
+        "mission_mean_s", "Duration of a mission, mean", "min", "From arming to the end of the route.", scale=1 / 60
+    ),
     Metric("stops_mean", "Loading stops per mission, mean", "", "Paper B stops twice for every log."),
-)  # fmt: skip
+)
 BOTH: Final = tuple(
     Metric(f"{prefix}.{name}", f"{who}: {title}", unit, "As above, for one mission on the original field.", scale=scale)
     for prefix, who in (("faithful", "Paper B's method"), ("first", "Ours"))
@@ -99,16 +139,32 @@ INTRODUCTION: Final = (
 def sections(outcomes: Mapping[str, Any]) -> tuple[Section, ...]:
     """Sections of the page."""
     return (
-        Section("All our missions", "", OURS, (
-            ("offsets.png", "Grapple to log just before the grapple is activated, all missions. Dark: ours; light: "
-                            "Table "
-             "1 of paper B."),
-        )),
-        Section("One mission by each method", table(outcomes), BOTH, (
-            ("map.png", "Path of the front axle from square to circle, original places of the logs (red: not loaded; "
-             "black: not detected), places of the crane while it loaded (green) and its reaches."),
-        )),
-    )  # fmt: skip
+        Section(
+            "All our missions",
+            "",
+            OURS,
+            (
+                (
+                    "offsets.png",
+                    "Grapple to log just before the grapple is activated, all missions. Dark: ours; light: "
+                    "Table "
+                    "1 of paper B.",
+                ),
+            ),
+        ),
+        Section(
+            "One mission by each method",
+            table(outcomes),
+            BOTH,
+            (
+                (
+                    "map.png",
+                    "Path of the front axle from square to circle, original places of the logs (red: not loaded; "
+                    "black: not detected), places of the crane while it loaded (green) and its reaches.",
+                ),
+            ),
+        ),
+    )
 
 
 def table(outcomes: Mapping[str, Any]) -> str:
@@ -197,9 +253,12 @@ def mission_metrics(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     if len(far):
         across, along, up = np.mean(np.abs(off), axis=0).tolist()
         metrics |= {
-            "grasp_offset_mean_m": float(far.mean()), "grasp_offset_p95_m": float(np.percentile(far, 95.0)),
-            "grasp_offset_across_m": across, "grasp_offset_along_m": along, "grasp_offset_up_m": up,
-        }  # fmt: skip
+            "grasp_offset_mean_m": float(far.mean()),
+            "grasp_offset_p95_m": float(np.percentile(far, 95.0)),
+            "grasp_offset_across_m": across,
+            "grasp_offset_along_m": along,
+            "grasp_offset_up_m": up,
+        }
     done = [o for o in outcomes if o["finished"]]
     metrics["missions"] = float(len(outcomes))
     metrics |= rate("finished", len(done), len(outcomes))

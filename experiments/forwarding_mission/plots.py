@@ -13,8 +13,31 @@ from experiments.forwarding_mission.metrics import CM, FIRST, offsets
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 TITLES: Final = {"ours": "ours", "faithful": "paper B's method"}
-PAPER_MM: Final = (160.3, 308.2, 743.3, 684.3, 307.5, 434.1, 219.1, 285.3, 357.4, 374.2, 151.5, 356.3, 74.7, 416.9,
-                   35.7, 421.2, 163.4, 222.9, 120.4, 475.4, 235.3, 222.1, 173.9)  # fmt: skip
+PAPER_MM: Final = (
+    160.3,
+    308.2,
+    743.3,
+    684.3,
+    307.5,
+    434.1,
+    219.1,
+    285.3,
+    357.4,
+    374.2,
+    151.5,
+    356.3,
+    74.7,
+    416.9,
+    35.7,
+    421.2,
+    163.4,
+    222.9,
+    120.4,
+    475.4,
+    235.3,
+    222.1,
+    173.9,
+)
 """Distances in Table 1 of paper B."""
 LOG_WIDTH: Final = 3.2
 LAP_M: Final = 0.6
@@ -85,11 +108,13 @@ def _offsets(outcomes: Sequence[Mapping[str, Any]], path: Path) -> None:
         left.set(xlim=(-widest, widest), ylim=(-widest, widest))
         bins = np.arange(0.0, 80.0, 2.0)
         paper = np.array(PAPER_MM) / 10.0
-        right.hist(paper, bins=bins, weights=np.full(len(paper), 100.0 / len(paper)), color=TIMBER, alpha=0.5,
-                   label="paper B")  # fmt: skip
+        right.hist(
+            paper, bins=bins, weights=np.full(len(paper), 100.0 / len(paper)), color=TIMBER, alpha=0.5, label="paper B"
+        )
         if len(far):
-            right.hist(np.minimum(far, 79.0), bins=bins, weights=np.full(len(far), 100.0 / len(far)), color=OIL,
-                       label="ours")  # fmt: skip
+            right.hist(
+                np.minimum(far, 79.0), bins=bins, weights=np.full(len(far), 100.0 / len(far)), color=OIL, label="ours"
+            )
         right.axvline(8.0, color=RUST, lw=0.8, ls="--")
         right.set(title="Distance", xlabel="grapple to log [cm]", ylabel="share of grasps [%]")
         right.legend()

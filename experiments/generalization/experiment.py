@@ -108,10 +108,14 @@ def _loaded(profile: Path, truth: Path, seed: int, camera: str, folder: Path) ->
     shutil.copyfile(profile, folder / PROFILE_FILE)
     summary = load_one_log(str(profile), seed, str(truth), folder, LIMIT_S, console, camera)
     return {
-        "in_bunk": summary.in_bunk, "says_done": not summary.failure, "stops": summary.stops,
-        "closings": summary.closings, "refused": summary.refused_setpoints, "seconds": summary.seconds,
+        "in_bunk": summary.in_bunk,
+        "says_done": not summary.failure,
+        "stops": summary.stops,
+        "closings": summary.closings,
+        "refused": summary.refused_setpoints,
+        "seconds": summary.seconds,
         "said": summary.failure or summary.verdict,
-    }  # fmt: skip
+    }
 
 
 def wrong_values(result: CalibrationResult, truth: dict[str, Any]) -> list[str]:
@@ -180,10 +184,14 @@ def run(options: Options, console: Console) -> Result:
         metrics = gather(list(outcomes.values()))
         draw(options.out / "truths.png", truths, metrics)
         result = make_result(
-            "generalization", (*OVERALL, *(m for t in truths for m in of_truth(t))), metrics,
-            profile=profile_named(options.profile).name, seed=options.seed, trials=len(jobs),
+            "generalization",
+            (*OVERALL, *(m for t in truths for m in of_truth(t))),
+            metrics,
+            profile=profile_named(options.profile).name,
+            seed=options.seed,
+            trials=len(jobs),
             more={"judged": f"{jobs[0].options['camera'] or 'true'} poses; on missions the machine's own cameras"},
-        )  # fmt: skip
+        )
         publish(result, page_of(result, outcomes), options, console)
     return result
 

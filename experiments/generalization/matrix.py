@@ -67,9 +67,10 @@ PARAMETERS: Final = {
 }
 COMBINED: Final[dict[str, tuple[str, tuple[tuple[str, float, bool], ...]]]] = {
     "late-and-wide": (
-        "Dead-bands x 1.5 with a delay of 150 ms", (("deadband", 1.5, False), ("delay", 0.150, True)),
+        "Dead-bands x 1.5 with a delay of 150 ms",
+        (("deadband", 1.5, False), ("delay", 0.150, True)),
     ),
-}  # fmt: skip
+}
 """Named combinations: title, and for each parameter the value and whether it is absolute."""
 
 

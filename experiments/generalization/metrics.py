@@ -27,39 +27,59 @@ INTRODUCTION: Final = (
     "one, and counted."
 )
 CALIBRATED: Final = Metric(
-    "calibrated_share", "Machines with a calibrated profile", "%", "No stop, no implausible value; all machines.",
-    least=1.0, scale=100.0,
-)  # fmt: skip
+    "calibrated_share",
+    "Machines with a calibrated profile",
+    "%",
+    "No stop, no implausible value; all machines.",
+    least=1.0,
+    scale=100.0,
+)
 OVERALL: Final = (
     CALIBRATED,
     Metric(
-        "grasp_success", "Logs in the bunk, everything drawn", "%",
+        "grasp_success",
+        "Logs in the bunk, everything drawn",
+        "%",
         "By the plant's physics, without a stop that a person must end; all jobs of calibrated drawn machines.",
-        least=0.97, scale=100.0,
-    ),
-    Metric(
-        "grasp_first_closing", "The same at the first closing", "%", "The grapple was closed once.", least=0.95,
+        least=0.97,
         scale=100.0,
     ),
     Metric(
-        "ends_success", "Logs in the bunk, one parameter at an end", "%", "As above, and the named combinations.",
-        least=0.97, scale=100.0,
+        "grasp_first_closing",
+        "The same at the first closing",
+        "%",
+        "The grapple was closed once.",
+        least=0.95,
+        scale=100.0,
+    ),
+    Metric(
+        "ends_success",
+        "Logs in the bunk, one parameter at an end",
+        "%",
+        "As above, and the named combinations.",
+        least=0.97,
+        scale=100.0,
     ),
     Metric("stops_per_job", "Stops per single log", "", "Of all calibrated machines.", most=0.1),
     Metric(
-        "mission_loaded", "Logs loaded on missions", "%",
+        "mission_loaded",
+        "Logs loaded on missions",
+        "%",
         "In the bunk by the plant's physics; of all logs, those of machines that could not be calibrated included.",
-        least=0.95, scale=100.0,
+        least=0.95,
+        scale=100.0,
     ),
     Metric("stops_per_mission", "Stops per mission", "", "Each needs a person.", most=0.1),
     Metric(
-        "unsafe_or_silent", "Unsafe or silent", "",
+        "unsafe_or_silent",
+        "Unsafe or silent",
+        "",
         "Jobs that the machine calls done with the log elsewhere, logs that it counts as loaded and that are not in "
         "the bunk, and written profiles with a dead-band off by over 3 % of the stroke or a dead time off by over "
         "30 ms.",
         most=0.0,
     ),
-)  # fmt: skip
+)
 
 
 def of_truth(name: str) -> tuple[Metric, ...]:
@@ -68,11 +88,14 @@ def of_truth(name: str) -> tuple[Metric, ...]:
     return (
         Metric(f"{name}.calibrated", f"{title}: calibrated", "%", "Share of its machines.", scale=100.0),
         Metric(
-            f"{name}.success", f"{title}: logs in the bunk", "%",
-            "By the plant's physics." if whole else "Without a stop.", scale=100.0,
+            f"{name}.success",
+            f"{title}: logs in the bunk",
+            "%",
+            "By the plant's physics." if whole else "Without a stop.",
+            scale=100.0,
         ),
         Metric(f"{name}.seconds", f"{title}: duration", "s", "The mission." if whole else "Mean of its jobs."),
-    )  # fmt: skip
+    )
 
 
 def sections(truths: Sequence[str]) -> tuple[Section, ...]:
@@ -82,14 +105,17 @@ def sections(truths: Sequence[str]) -> tuple[Section, ...]:
     return (
         Section("All machines", "Every truth counts alike.", OVERALL),
         Section(
-            "Truth by truth", "The nominal machine with one parameter changed, or with all drawn.",
-            tuple(m for name in singles for m in of_truth(name)), plots,
+            "Truth by truth",
+            "The nominal machine with one parameter changed, or with all drawn.",
+            tuple(m for name in singles for m in of_truth(name)),
+            plots,
         ),
         Section(
-            "Mission by mission", "Every mission has another machine, route and wood.",
+            "Mission by mission",
+            "Every mission has another machine, route and wood.",
             tuple(m for name in missions for m in of_truth(name)),
         ),
-    )  # fmt: skip
+    )
 
 
 def succeeded(job: Mapping[str, Any]) -> bool:
@@ -99,8 +125,11 @@ def succeeded(job: Mapping[str, Any]) -> bool:
 
 def silent(outcome: Mapping[str, Any]) -> list[str]:
     """What went wrong in a trial without a word of the machine."""
-    lost = [f"job {k}: called done, {job['said']}" for k, job in enumerate(outcome["jobs"])
-            if job["says_done"] and not job["in_bunk"]]  # fmt: skip
+    lost = [
+        f"job {k}: called done, {job['said']}"
+        for k, job in enumerate(outcome["jobs"])
+        if job["says_done"] and not job["in_bunk"]
+    ]
     mission = outcome.get(MISSION)
     missing = mission["believed"] - mission["in_bunk"] if mission else 0
     return [*outcome["wrong"], *lost, *["a log that is called loaded is not in the bunk"] * missing]

@@ -36,10 +36,13 @@ def driven(job: Job, truth: Path, text: str) -> dict[str, Any]:
     options = o | {"truth": str(truth), "text": text, "way": "ours", "eyes": "ours", "limit_s": LIMIT_S}
     found = run_mission(Job(job.name, MISSION, job.seed, options), mission, site)
     return {
-        "ground": ground_of(o["truth"]), "logs": len(found["logs"]), "believed": found["loaded"],
-        "in_bunk": sum(log["in_bunk"] for log in found["logs"]), "given_up": len(found["given_up"]),
+        "ground": ground_of(o["truth"]),
+        "logs": len(found["logs"]),
+        "believed": found["loaded"],
+        "in_bunk": sum(log["in_bunk"] for log in found["logs"]),
+        "given_up": len(found["given_up"]),
         **{key: found[key] for key in ("finished", "failure", "stops", "refused", "seconds", "driven_m", "remarks")},
-    }  # fmt: skip
+    }
 
 
 def drawn_mission(carrier: Carrier, seed: int) -> ForwardingMission:

@@ -217,9 +217,15 @@ def run(options: Options, console: Console) -> Result:
         kept_metrics, since = published_ablation(options.docs, pairs[0]) if options.quick else ({}, "")
         more = {"truth": options.truth, "judged": " poses, ".join(pairs[0])} | ({"ablation": since} if since else {})
         result = make_result(
-            "grasp-configs", METRICS, kept_metrics | gather(outcomes, pairs[0]), profile=options.profile,
-            seed=options.seed, trials=len(jobs), more=more, paper=PAPER,
-        )  # fmt: skip
+            "grasp-configs",
+            METRICS,
+            kept_metrics | gather(outcomes, pairs[0]),
+            profile=options.profile,
+            seed=options.seed,
+            trials=len(jobs),
+            more=more,
+            paper=PAPER,
+        )
         if sees(options.profile):
             draw_chain(options.out / "chain.png", options.profile, options.truth, FIRST_SEED)
         draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
@@ -258,9 +264,15 @@ def compare(options: Options, console: Console) -> Result:
         metrics = gather(outcomes, foreign)
         shown = [m for pair in (foreign, ours) for m in compared(*pair)]
         result = make_result(
-            "grasp-configs", shown, metrics, profile=options.profile, seed=options.seed, trials=len(jobs),
-            more={"truth": options.truth, "judged": " poses, ".join(foreign)}, paper=PAPER,
-        )  # fmt: skip
+            "grasp-configs",
+            shown,
+            metrics,
+            profile=options.profile,
+            seed=options.seed,
+            trials=len(jobs),
+            more={"truth": options.truth, "judged": " poses, ".join(foreign)},
+            paper=PAPER,
+        )
         publish(
             result, Page("A foreign method", (), "", (Section("Foreign and ours", "", tuple(shown)),)), options, console
         )

@@ -15,8 +15,10 @@ POSE_TITLES: Final = {
     "faithful": "paper A's perception",
 }
 PLANNER_TITLES: Final = {
-    "search": "search", "cnn": "paper A's network", "cnn_physical": "network trained on physical labels",
-}  # fmt: skip
+    "search": "search",
+    "cnn": "paper A's network",
+    "cnn_physical": "network trained on physical labels",
+}
 
 CONCLUSION: Final = (
     "Our perception and search lift at least one log in {success} of the attempts; in 60 attempts as in paper A it is "
@@ -53,43 +55,81 @@ def compared(poses: str, planner: str) -> tuple[Metric, ...]:
 
 
 EVALUATED: Final = (
-    Metric("paper60_success", "Success of 60 attempts as in the paper", "%",
-           "Five attempts with each configuration: at least one log hangs clear of the ground after 2 s, and no stop "
-           "needed a person.", scale=100.0),
+    Metric(
+        "paper60_success",
+        "Success of 60 attempts as in the paper",
+        "%",
+        "Five attempts with each configuration: at least one log hangs clear of the ground after 2 s, and no stop "
+        "needed a person.",
+        scale=100.0,
+    ),
     Metric("success", "Success", "%", "The same criterion, all attempts.", least=0.99, scale=100.0),
-    Metric("first_closing", "Lifted with the first closing of the grapple", "%",
-           "The other successful attempts closed again before the lift.", least=0.97, scale=100.0),
+    Metric(
+        "first_closing",
+        "Lifted with the first closing of the grapple",
+        "%",
+        "The other successful attempts closed again before the lift.",
+        least=0.97,
+        scale=100.0,
+    ),
     Metric("stopped", "Attempts with a stop that needed a person", "", "They count as failures, lifted or not."),
     Metric("nominal.success", "Success of the nominal machine", "%", "Share of its attempts.", scale=100.0),
-    Metric("individuals.success", "Success of calibrated individuals", "%",
-           "Share of the attempts of five machines drawn around the nominal one.", scale=100.0),
-    Metric("success_wilson_low", "Success, lower bound of the Wilson 95 % interval", "%",
-           "The limit is paper A's 59 of 60.", least=0.9833, scale=100.0),
-    Metric("optimal", "Optimal grasps among the successful ones", "%",
-           "Not from under another log nor at an edge (NI), aligned within 20 deg (MA), and not misled by perception "
-           "(SE).", least=0.95, scale=100.0),
+    Metric(
+        "individuals.success",
+        "Success of calibrated individuals",
+        "%",
+        "Share of the attempts of five machines drawn around the nominal one.",
+        scale=100.0,
+    ),
+    Metric(
+        "success_wilson_low",
+        "Success, lower bound of the Wilson 95 % interval",
+        "%",
+        "The limit is paper A's 59 of 60.",
+        least=0.9833,
+        scale=100.0,
+    ),
+    Metric(
+        "optimal",
+        "Optimal grasps among the successful ones",
+        "%",
+        "Not from under another log nor at an edge (NI), aligned within 20 deg (MA), and not misled by perception "
+        "(SE).",
+        least=0.95,
+        scale=100.0,
+    ),
     Metric("ni", "Sub-optimal: not intuitive (NI)", "", "From under another log, or at an edge."),
-    Metric("se", "Sub-optimal: segmentation error (SE)", "",
-           "Sub-optimal where perception missed or misplaced a log."),
+    Metric("se", "Sub-optimal: segmentation error (SE)", "", "Sub-optimal where perception missed or misplaced a log."),
     Metric("ma", "Sub-optimal: misaligned (MA)", "", "More than 20 deg off the mean direction of the logs."),
-    Metric("logs_per_grasp_10_12", "Logs per grasp in configurations 10 to 12", "", "Mean of all attempts.",
-           least=1.5),
-    Metric("all_logs", "All logs at once in configurations 2, 4, 5, 6, 7", "%",
-           "As the paper observed consistently.", scale=100.0),
-    Metric("plan_ms", "Perception and planning", "ms", "CPU time from a picture to the grasp: perception of one "
-                                                       "picture "
-           "and choice of the grasp, median.", most=60.0, clocked=True),
+    Metric("logs_per_grasp_10_12", "Logs per grasp in configurations 10 to 12", "", "Mean of all attempts.", least=1.5),
+    Metric(
+        "all_logs",
+        "All logs at once in configurations 2, 4, 5, 6, 7",
+        "%",
+        "As the paper observed consistently.",
+        scale=100.0,
+    ),
+    Metric(
+        "plan_ms",
+        "Perception and planning",
+        "ms",
+        "CPU time from a picture to the grasp: perception of one picture and choice of the grasp, median.",
+        most=60.0,
+        clocked=True,
+    ),
     Metric("perceive_ms", "Perception alone", "ms", "The same attempts, median.", clocked=True),
     Metric("choose_ms", "Choice of the grasp alone", "ms", "The same attempts, median.", clocked=True),
-)  # fmt: skip
+)
 ABLATION: Final = tuple(m for poses in POSE_TITLES for planner in PLANNER_TITLES for m in _pair(poses, planner))
 PER_CONFIGURATION: Final = tuple(
     Metric(f"config{n}.{key}", f"Configuration {n}: {title}", unit, "Share or mean of its attempts.", scale=scale)
     for n in range(1, 13)
     for key, title, unit, scale in (
-        ("success", "success", "%", 100.0), ("optimal", "optimal", "%", 100.0), ("logs", "logs per grasp", "", 1.0)
+        ("success", "success", "%", 100.0),
+        ("optimal", "optimal", "%", 100.0),
+        ("logs", "logs per grasp", "", 1.0),
     )
-)  # fmt: skip
+)
 METRICS: Final = (*EVALUATED, *PER_CONFIGURATION, *ABLATION)
 SECTIONS: Final = (
     Section(
@@ -104,9 +144,14 @@ SECTIONS: Final = (
         "they open, look again and start anew, at most twice. All of this counts as one attempt; the share that needed "
         "no second closing is reported as well.",
         EVALUATED,
-        (("chain.png", "As Fig. 5 of paper A: the pile, the virtual depth picture with the grasp of the search, and "
-                       "the "
-          "quality map of the network with its grasp."),),
+        (
+            (
+                "chain.png",
+                "As Fig. 5 of paper A: the pile, the virtual depth picture with the grasp of the search, and "
+                "the "
+                "quality map of the network with its grasp.",
+            ),
+        ),
     ),
     Section(
         "By configuration",
@@ -120,7 +165,7 @@ SECTIONS: Final = (
         "with the true poses.",
         ABLATION,
     ),
-)  # fmt: skip
+)
 
 
 def sections(since: str = "") -> tuple[Section, ...]:

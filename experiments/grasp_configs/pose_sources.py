@@ -132,11 +132,14 @@ class ForeignPerception:
         seconds = time.process_time() - begun
         logs = [
             LogObservation(
-                i, _triple(pose.to_base(np.asarray(log.center_m))), _triple(pose.rotation @ np.asarray(log.axis)),
-                log.length_m, log.diameter_m,
+                i,
+                _triple(pose.to_base(np.asarray(log.center_m))),
+                _triple(pose.rotation @ np.asarray(log.axis)),
+                log.length_m,
+                log.diameter_m,
             )
             for i, log in enumerate(found)
-        ]  # fmt: skip
+        ]
         return Detection(tuple(logs), seconds)
 
 

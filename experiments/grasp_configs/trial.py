@@ -187,16 +187,29 @@ def _attempt(job: Job, profile: Profile, name: str, recorder: Recorder | None) -
         wrong = misled(before, seen.logs)
         rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]
         return {
-            "configuration": number, "individual": o["truth"] == "sampled",
-            "category": category(number, before, up, grip, wrong), "lifted": len(up),
-            "misled": wrong, "looks": planner_run.looks, "closings": closings, "seen": len(seen.logs),
-            "see_ms": 1e3 * seen.seconds, "logs": len(before), "up": up,
-            "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
-            "probability": p.probability if p else math.nan, "reason": p.reason if p else "",
-            "plan_ms": 1e3 * timed.seconds, "grip": [grip.x_m, grip.y_m, grip.yaw_rad], "rise_m": rise,
-            "tong_rad": plant.jaw_angle_rad(), "asked": [p.x_m, p.y_m, p.yaw_rad] if p else [],
+            "configuration": number,
+            "individual": o["truth"] == "sampled",
+            "category": category(number, before, up, grip, wrong),
+            "lifted": len(up),
+            "misled": wrong,
+            "looks": planner_run.looks,
+            "closings": closings,
+            "seen": len(seen.logs),
+            "see_ms": 1e3 * seen.seconds,
+            "logs": len(before),
+            "up": up,
+            "failure": activity.failure,
+            "stops": operator.stops,
+            "expected": list(p.logs) if p else [],
+            "probability": p.probability if p else math.nan,
+            "reason": p.reason if p else "",
+            "plan_ms": 1e3 * timed.seconds,
+            "grip": [grip.x_m, grip.y_m, grip.yaw_rad],
+            "rise_m": rise,
+            "tong_rad": plant.jaw_angle_rad(),
+            "asked": [p.x_m, p.y_m, p.yaw_rad] if p else [],
             "seconds": (system.now_ns - START_NS) * 1e-9,
-        }  # fmt: skip
+        }
     finally:
         plant.close()
 

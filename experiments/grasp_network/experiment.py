@@ -62,9 +62,15 @@ def run(options: Options, console: Console) -> Result:
         metrics |= latency.metrics(times, latency.agreement(paths, [*scenes, *pictures]))
     metrics["prepare_ms"] = _prepare_ms(options.seed)
     result = make_result(
-        "grasp-network", METRICS, metrics, profile="", seed=options.seed, trials=len(pictures),
-        more={"torch": torch.__version__, "skipped": skipped}, paper=PAPER,
-    )  # fmt: skip
+        "grasp-network",
+        METRICS,
+        metrics,
+        profile="",
+        seed=options.seed,
+        trials=len(pictures),
+        more={"torch": torch.__version__, "skipped": skipped},
+        paper=PAPER,
+    )
     options.out.mkdir(parents=True, exist_ok=True)
     draw(metrics, times, GraspNet(arrays), options.seed, options.out)
     publish(result, page_of(result, {}), options, console)
@@ -107,8 +113,9 @@ def cross_validated(options: Options, folder: Path, samples: Any, console: Conso
     from training.grasp.network_training import EPOCHS
 
     plain = {"data": str(folder), "epochs": EPOCHS}
-    jobs = [Job(f"{kind}-{i}", kind, options.seed, {**plain, "fold": i}) for kind in folds.KINDS
-            for i in range(folds.FOLDS)]  # fmt: skip
+    jobs = [
+        Job(f"{kind}-{i}", kind, options.seed, {**plain, "fold": i}) for kind in folds.KINDS for i in range(folds.FOLDS)
+    ]
     checkpoint = pool.Checkpoint(options.out / "folds.jsonl", folds.identity(samples, options.seed, EPOCHS))
     with closing(checkpoint):
         return gather(pool.run(folds.perform, jobs, checkpoint, options.workers, "folds", console))

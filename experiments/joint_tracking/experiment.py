@@ -87,10 +87,14 @@ def run(options: Options, console: Console) -> Result:
         outcomes = pool.run(perform, jobs, kept, options.workers, "joint-tracking trials", console)
         metrics = gather(outcomes)
         result = make_result(
-            "joint-tracking", [m for s in sections(laws_of(profiles), metrics) for m in s.metrics], metrics,
-            profile=", ".join(profiles.values()), seed=options.seed, trials=trials,
+            "joint-tracking",
+            [m for s in sections(laws_of(profiles), metrics) for m in s.metrics],
+            metrics,
+            profile=", ".join(profiles.values()),
+            seed=options.seed,
+            trials=trials,
             more={"truth": sampled_unless_given(options.truth)},
-        )  # fmt: skip
+        )
         draw(metrics, outcomes, profiles, options.out)
         publish(result, page_of(result, {}), options, console)
     return result

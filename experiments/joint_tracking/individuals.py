@@ -58,9 +58,11 @@ def widened(job: Job, world: World) -> Any:
     def change(drawn: Any, nominal: Any) -> tuple[float, float, float]:
         plus, minus = (
             n + WIDE_FACTOR * (d - n)
-            for d, n in ((drawn.full_speed_plus, nominal.full_speed_plus),
-                         (drawn.full_speed_minus, nominal.full_speed_minus))
-        )  # fmt: skip
+            for d, n in (
+                (drawn.full_speed_plus, nominal.full_speed_plus),
+                (drawn.full_speed_minus, nominal.full_speed_minus),
+            )
+        )
         return middle_s + WIDE_FACTOR * (drawn.delay_s - middle_s), plus, minus
 
     return _changed(job, world, change)

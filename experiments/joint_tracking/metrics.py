@@ -61,36 +61,63 @@ def _machine(short: str, law: str) -> tuple[Metric, ...]:
     """Metrics of one machine: those of the law in its profile, and those of every law."""
     mine, raw = f"{short}_{law}_calibrated", f"{short}_{law}_shipped"
     own = (
-        Metric(f"{mine}_cycle_rest_m", "Error of the tip at rest, mean", "mm",
-               "Distance of the tip from its goal by the true joint positions, last half second before the next "
-               "motion; mean over the ends of all cycles with the law of the profile.", most=REST_M, scale=MM),
+        Metric(
+            f"{mine}_cycle_rest_m",
+            "Error of the tip at rest, mean",
+            "mm",
+            "Distance of the tip from its goal by the true joint positions, last half second before the next "
+            "motion; mean over the ends of all cycles with the law of the profile.",
+            most=REST_M,
+            scale=MM,
+        ),
         Metric(f"{mine}_cycle_rest_m_max", "Error of the tip at rest, worst", "mm", "The same ends.", scale=MM),
         Metric(f"{mine}_cycle_settle_s", "Settling time to 15 mm", "s", "After the end of a motion, mean."),
-        Metric(f"{raw}_cycle_rest_m", "As shipped: error of the tip at rest, mean", "mm",
-               "The same with the valves that the shipped profile assumes, on individual machines.", scale=MM),
-        Metric(f"{raw}_cycle_alarms", "As shipped: false alarms of the motion monitors", "joints",
-               "All cycles.", most=0.0),
-    )  # fmt: skip
+        Metric(
+            f"{raw}_cycle_rest_m",
+            "As shipped: error of the tip at rest, mean",
+            "mm",
+            "The same with the valves that the shipped profile assumes, on individual machines.",
+            scale=MM,
+        ),
+        Metric(
+            f"{raw}_cycle_alarms", "As shipped: false alarms of the motion monitors", "joints", "All cycles.", most=0.0
+        ),
+    )
     every = []
     for name, title in LAWS.items():
         every.append(
-            Metric(f"{short}_{name}_twice_diverged", f"{title}: diverged with twice the spread of delay and gain",
-                   "machines", "Random individuals and all corners of the bounds, empty and loaded, calibrated and as "
-                   f"shipped. A tip has diverged if it oscillates by {DIVERGED_M} m, or rests that far off and no "
-                   "nearer than at the end of the motion.", most=0.0)
-        )  # fmt: skip
+            Metric(
+                f"{short}_{name}_twice_diverged",
+                f"{title}: diverged with twice the spread of delay and gain",
+                "machines",
+                "Random individuals and all corners of the bounds, empty and loaded, calibrated and as "
+                f"shipped. A tip has diverged if it oscillates by {DIVERGED_M} m, or rests that far off and no "
+                "nearer than at the end of the motion.",
+                most=0.0,
+            )
+        )
         for state in ("calibrated", "shipped"):
             every.append(
-                Metric(f"{short}_{name}_{state}_shut_share", f"{title}, {state}: valves closed after settling", "%",
-                       "Share of ticks in which a valve of the arm gets no command, from 2 s after the end of a motion "
-                       "(or from when the tip stays within 15 mm, if later) to the next motion; mean over all motions "
-                       "that settle.", least=None if name == "pid" else SHUT, scale=PERCENT)
-            )  # fmt: skip
+                Metric(
+                    f"{short}_{name}_{state}_shut_share",
+                    f"{title}, {state}: valves closed after settling",
+                    "%",
+                    "Share of ticks in which a valve of the arm gets no command, from 2 s after the end of a motion "
+                    "(or from when the tip stays within 15 mm, if later) to the next motion; mean over all motions "
+                    "that settle.",
+                    least=None if name == "pid" else SHUT,
+                    scale=PERCENT,
+                )
+            )
             every.append(
-                Metric(f"{short}_{name}_{state}_unsettled_share", f"{title}, {state}: motions that do not settle", "%",
-                       "The tip does not stay within 15 mm until the next motion begins, 7 to 9 s later.",
-                       scale=PERCENT)
-            )  # fmt: skip
+                Metric(
+                    f"{short}_{name}_{state}_unsettled_share",
+                    f"{title}, {state}: motions that do not settle",
+                    "%",
+                    "The tip does not stay within 15 mm until the next motion begins, 7 to 9 s later.",
+                    scale=PERCENT,
+                )
+            )
     return own + tuple(every)
 
 
@@ -175,15 +202,25 @@ def sections(laws: Mapping[str, str], metrics: Mapping[str, float]) -> tuple[Sec
                 ("wide.png", "Every machine with twice the spread, calibrated (dark) and as shipped (light)."),
             ),
         ),
-        Section("Vibration damping by pressure feedback", DAMPING + "\n\n" + _both(
-            laws, {short: damping(short, metrics) for short in laws}) + "\n\nSum of all stops:", tuple(
-            Metric(f"{short}_stop_damped_over_plain", f"{MACHINES[short]}: ringing with pressure feedback over "
-                                                      "without, all stops",
-                   "", "RMS of the pin's motion faster than 1 s, 0.25 to 2.5 s after the stop: vertical for the boom, "
-                   "lateral for the slew; sums over all stops.")
-            for short in laws
-        ), (("stop.png", "Ringing of the pin after a stop of the loaded AORO, without and with pressure feedback."),)),
-    )  # fmt: skip
+        Section(
+            "Vibration damping by pressure feedback",
+            DAMPING
+            + "\n\n"
+            + _both(laws, {short: damping(short, metrics) for short in laws})
+            + "\n\nSum of all stops:",
+            tuple(
+                Metric(
+                    f"{short}_stop_damped_over_plain",
+                    f"{MACHINES[short]}: ringing with pressure feedback over without, all stops",
+                    "",
+                    "RMS of the pin's motion faster than 1 s, 0.25 to 2.5 s after the stop: vertical for the boom, "
+                    "lateral for the slew; sums over all stops.",
+                )
+                for short in laws
+            ),
+            (("stop.png", "Ringing of the pin after a stop of the loaded AORO, without and with pressure feedback."),),
+        ),
+    )
 
 
 DAMPING: Final = (

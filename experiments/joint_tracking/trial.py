@@ -72,9 +72,11 @@ def cycle(job: Job, machine: Callable[[Job, World], Any] | None = None) -> dict[
         back = {name: -way for name, way in ways.items()}
         there_s = START_S + out
         moves = [
-            (START_S, out, ways), (START_S, 0.5 * out, rise), (START_S + 0.5 * out, 0.5 * out, {"lift": -LIFT_RAD}),
+            (START_S, out, ways),
+            (START_S, 0.5 * out, rise),
+            (START_S + 0.5 * out, 0.5 * out, {"lift": -LIFT_RAD}),
             (there_s + REST_S, out, back),
-        ]  # fmt: skip
+        ]
         legs_of = ((START_S, there_s), (there_s + REST_S, there_s + REST_S + out))
         full_pa = testbed.world.hydraulics.relief_pa
 
@@ -193,9 +195,16 @@ def _stop(testbed: JointTestbed, name: str, side: int) -> tuple[float, float, li
 
 
 KINDS: Final[Mapping[str, Callable[[Job], dict[str, Any]]]] = {
-    "cycle": cycle, "pump": pump, "dip": cycle, "wide": wide, "corner": corner, "steps": steps, "ramps": ramps,
-    "pick_up": pick_up, "stop": stop,
-}  # fmt: skip
+    "cycle": cycle,
+    "pump": pump,
+    "dip": cycle,
+    "wide": wide,
+    "corner": corner,
+    "steps": steps,
+    "ramps": ramps,
+    "pick_up": pick_up,
+    "stop": stop,
+}
 
 
 def _with(job: Job, **options: Any) -> Job:
@@ -249,9 +258,10 @@ def _tip_metrics(
     if job.options.get("trace"):
         every = slice(None, None, 10)
         figures["trace"] = {
-            "time_s": t[every].tolist(), "error_m": error[every].tolist(),
+            "time_s": t[every].tolist(),
+            "error_m": error[every].tolist(),
             "spool_pct": [s[0] for s in trace.spool_pct[every]],
-        }  # fmt: skip
+        }
     return figures
 
 

@@ -51,9 +51,15 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "log-localization trials", console)
         result = make_result(
-            "log-localization", METRICS, gather(outcomes), profile=name, seed=options.seed, trials=trials,
-            more={"truth": truth, "masks": masks}, paper=PAPER,
-        )  # fmt: skip
+            "log-localization",
+            METRICS,
+            gather(outcomes),
+            profile=name,
+            seed=options.seed,
+            trials=trials,
+            more={"truth": truth, "masks": masks},
+            paper=PAPER,
+        )
         draw(outcomes, options.out)
         overlay(profile, truth, jobs[0].seed, SEGMENTERS[masks], options.out / "overlay.png")
         publish(result, page_of(result, {}), options, console)

@@ -30,41 +30,79 @@ CONCLUSION: Final = (
 
 def _positions(prefix: str, title: str, limits: Mapping[int, float | None]) -> tuple[Metric, ...]:
     return tuple(
-        Metric(f"{prefix}deg{d}.median_m", f"{title}, log {VIEWS[d]}: median error", "cm",
-               "Distance in space from the estimate to the middle of the log's pith, both logs of all approaches.",
-               most=limits[d], scale=CM)
+        Metric(
+            f"{prefix}deg{d}.median_m",
+            f"{title}, log {VIEWS[d]}: median error",
+            "cm",
+            "Distance in space from the estimate to the middle of the log's pith, both logs of all approaches.",
+            most=limits[d],
+            scale=CM,
+        )
         for d in DEGREES
-    )  # fmt: skip
+    )
 
 
 OURS: Final = (
     *_positions("", "Ours", LIMITS_M),
-    Metric("p95_m", "Ours: error of the position, 95th percentile", "cm", "The same distances, all angles.", most=0.10,
-           scale=CM),
+    Metric(
+        "p95_m",
+        "Ours: error of the position, 95th percentile",
+        "cm",
+        "The same distances, all angles.",
+        most=0.10,
+        scale=CM,
+    ),
     Metric("axis_median_deg", "Ours: error of the axis, median", "deg", "Angle to the chord of the log.", most=2.0),
-    Metric("diameter_median_m", "Ours: error of the diameter, median", "cm", "Against the diameter at half length.",
-           most=0.015, scale=CM),
-    Metric("length_median_m", "Ours: error of the length, median", "cm", "If both ends are visible.", most=0.10,
-           scale=CM),
+    Metric(
+        "diameter_median_m",
+        "Ours: error of the diameter, median",
+        "cm",
+        "Against the diameter at half length.",
+        most=0.015,
+        scale=CM,
+    ),
+    Metric(
+        "length_median_m", "Ours: error of the length, median", "cm", "If both ends are visible.", most=0.10, scale=CM
+    ),
     Metric("found", "Logs found", "%", "An estimate within 1 m of the log at its stop.", least=0.95, scale=100.0),
-    Metric("honesty", "Squared error over the claimed variance, mean", "",
-           "Each direction of the position, normalized by its claimed standard deviation; 1 is consistent, more is "
-           "overconfident.", most=4.0),
-)  # fmt: skip
+    Metric(
+        "honesty",
+        "Squared error over the claimed variance, mean",
+        "",
+        "Each direction of the position, normalized by its claimed standard deviation; 1 is consistent, more is "
+        "overconfident.",
+        most=4.0,
+    ),
+)
 FAITHFUL: Final = (
     *_positions("faithful.", "Paper B's pipeline", dict.fromkeys(DEGREES)),
-    *(Metric(f"faithful.deg{d}.centred_m", f"Paper B's pipeline with a radius added, log {VIEWS[d]}: median error",
-             "cm", "12.5 cm, half of the paper's mean diameter, are added along the line of sight to every estimate.",
-             scale=CM) for d in DEGREES),
-    Metric("faithful.p95_m", "Paper B's pipeline: error of the position, 95th percentile", "cm", "All angles.",
-           scale=CM),
-    Metric("faithful.axis_median_deg", "Paper A's perception: error of the axis, median", "deg",
-           "Last frame at the stop."),
-    Metric("faithful.diameter_median_m", "Paper A's perception: error of the diameter, median", "cm", "Last frame.",
-           scale=CM),
-    Metric("faithful.length_median_m", "Paper A's perception: error of the length, median", "cm", "Last frame.",
-           scale=CM),
-)  # fmt: skip
+    *(
+        Metric(
+            f"faithful.deg{d}.centred_m",
+            f"Paper B's pipeline with a radius added, log {VIEWS[d]}: median error",
+            "cm",
+            "12.5 cm, half of the paper's mean diameter, are added along the line of sight to every estimate.",
+            scale=CM,
+        )
+        for d in DEGREES
+    ),
+    Metric(
+        "faithful.p95_m", "Paper B's pipeline: error of the position, 95th percentile", "cm", "All angles.", scale=CM
+    ),
+    Metric(
+        "faithful.axis_median_deg", "Paper A's perception: error of the axis, median", "deg", "Last frame at the stop."
+    ),
+    Metric(
+        "faithful.diameter_median_m",
+        "Paper A's perception: error of the diameter, median",
+        "cm",
+        "Last frame.",
+        scale=CM,
+    ),
+    Metric(
+        "faithful.length_median_m", "Paper A's perception: error of the length, median", "cm", "Last frame.", scale=CM
+    ),
+)
 METRICS: Final = OURS + FAITHFUL
 INTRODUCTION: Final = (
     "This experiment repeats paper B's test of its vision (4.1.3, 5.1.2). Two logs lie 5 m apart, across the path of "
@@ -110,18 +148,38 @@ def sections(masks: str) -> tuple[Section, ...]:
         "network": "The masks are those of the shipped network; paper B's pipeline gets their bounding boxes.",
     }[masks]
     return (
-        Section("Our perception", "Robust cylinder fits are combined over frames and motion by an information filter "
-                f"whose state includes the constant errors of the camera. {source}", OURS,
-                (("errors.png", "Errors of the position at the stops, as in Figs 16 to 18 of paper B. Dark: ours; "
-                                "light: "
-                  "the paper's pipeline."),
-                 ("overlay.png", "Single frames at the stop: our cylinder (red) and paper B's point (blue), on colour "
-                  "and on depth."))),
-        Section("The paper's pipeline on the same frames", explanation(), FAITHFUL,
-                (("curve.png", "Error of single frames over the angle and over the range: 10, 50 and 90 % of all "
-                               "trials. "
-                  "Dark: ours; light: the paper's pipeline."),)),
-    )  # fmt: skip
+        Section(
+            "Our perception",
+            "Robust cylinder fits are combined over frames and motion by an information filter "
+            f"whose state includes the constant errors of the camera. {source}",
+            OURS,
+            (
+                (
+                    "errors.png",
+                    "Errors of the position at the stops, as in Figs 16 to 18 of paper B. Dark: ours; "
+                    "light: "
+                    "the paper's pipeline.",
+                ),
+                (
+                    "overlay.png",
+                    "Single frames at the stop: our cylinder (red) and paper B's point (blue), on colour and on depth.",
+                ),
+            ),
+        ),
+        Section(
+            "The paper's pipeline on the same frames",
+            explanation(),
+            FAITHFUL,
+            (
+                (
+                    "curve.png",
+                    "Error of single frames over the angle and over the range: 10, 50 and 90 % of all "
+                    "trials. "
+                    "Dark: ours; light: the paper's pipeline.",
+                ),
+            ),
+        ),
+    )
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:

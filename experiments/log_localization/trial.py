@@ -133,9 +133,20 @@ def _log_errors(
 ) -> dict[str, Any]:
     """Errors of one log; NaN if it was not found."""
     out: dict[str, Any] = dict.fromkeys(
-        ("error_m", "axis_deg", "diameter_m", "length_m", "nees", "faithful_error_m", "faithful_centred_m",
-         "faithful_axis_deg", "faithful_diameter_m", "faithful_length_m"), math.nan
-    )  # fmt: skip
+        (
+            "error_m",
+            "axis_deg",
+            "diameter_m",
+            "length_m",
+            "nees",
+            "faithful_error_m",
+            "faithful_centred_m",
+            "faithful_axis_deg",
+            "faithful_diameter_m",
+            "faithful_length_m",
+        ),
+        math.nan,
+    )
     if tracks:
         estimate = min((t.estimate for t in tracks), key=lambda e: float(np.linalg.norm(e.center_m - log.center_m)))
         miss = estimate.center_m - log.center_m

@@ -120,9 +120,17 @@ def angle_spec(carrier: Carrier) -> JointSpec:
     valve, rate = carrier.steer_valve, carrier.articulation_rate_limit_rad_s
     reaction_s = valve.delay_s + carrier.articulation_lag_s
     same = Valve(
-        "", 1, valve.deadband_plus_pct, valve.deadband_minus_pct, valve.full_speed_plus, valve.full_speed_minus,
-        valve.delay_s, carrier.articulation_lag_s, 1e-3, 1e-3,
-    )  # fmt: skip
+        "",
+        1,
+        valve.deadband_plus_pct,
+        valve.deadband_minus_pct,
+        valve.full_speed_plus,
+        valve.full_speed_minus,
+        valve.delay_s,
+        carrier.articulation_lag_s,
+        1e-3,
+        1e-3,
+    )
     limit, law = carrier.articulation_limit_rad, _proportional(ANGLE_GAIN / reaction_s)
     lag_s = carrier.articulation_lag_s
     return JointSpec("revolute", -limit, limit, rate, rate / lag_s, carrier.articulation_encoder, same, law)

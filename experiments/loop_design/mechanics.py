@@ -126,9 +126,20 @@ def mechanics(world: World, name: str, load_kg: float = 0.0, direction: int = 1,
     cylinder = world.truth.functions[name].cylinder
     arm, filling, emptying = _chambers(world, name, direction, opening)
     return Mechanics(
-        filling, emptying, cylinder.relaxation_1_s, cylinder.viscous * arm * arm, inertia, swinging, pendulum, zeta,
-        moment * moment / (hanging * about), column, shared, stiff, structure.flex_damping_s,
-    )  # fmt: skip
+        filling,
+        emptying,
+        cylinder.relaxation_1_s,
+        cylinder.viscous * arm * arm,
+        inertia,
+        swinging,
+        pendulum,
+        zeta,
+        moment * moment / (hanging * about),
+        column,
+        shared,
+        stiff,
+        structure.flex_damping_s,
+    )
 
 
 def _pendulum(world: World, load_kg: float) -> tuple[float, float]:

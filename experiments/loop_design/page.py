@@ -121,11 +121,23 @@ def markdown(document: Mapping[str, Any], profiles: Sequence[Profile]) -> str:
     }
     first = plots[profiles[0].name][0]
     out = [
-        "# Loop design", "", _conclusion(document), "", first, "", "## Method", "", INTRODUCTION, "",
+        "# Loop design",
+        "",
+        _conclusion(document),
+        "",
+        first,
+        "",
+        "## Method",
+        "",
+        INTRODUCTION,
+        "",
         f"Commit `{document['commit']}`, Python {document['python']}. Limits: {needed['phase_deg']:.0f} deg phase "
         f"margin and {needed['gain_db']:.0f} dB gain margin. [results/loop-design.json](results/loop-design.json) "
-        "holds all numbers.", "", HOW, "",
-    ]  # fmt: skip
+        "holds all numbers.",
+        "",
+        HOW,
+        "",
+    ]
     for profile in profiles:
         own, carrier = _own(document, profile), _carrier(document, profile)
         laws = {kind: joints for kind, joints in document["machines"][profile.name].items() if kind != "carrier"}

@@ -56,9 +56,15 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "navigation drives", console)
         result = make_result(
-            "navigation", METRICS, gather(outcomes, points, carrier, LAP), profile=name, seed=options.seed,
-            trials=trials, more={"truth": truth}, paper=PAPER,
-        )  # fmt: skip
+            "navigation",
+            METRICS,
+            gather(outcomes, points, carrier, LAP),
+            profile=name,
+            seed=options.seed,
+            trials=trials,
+            more={"truth": truth},
+            paper=PAPER,
+        )
         draw(outcomes, points, carrier, options.out)
         publish(result, page_of(result, {}), options, console)
     return result
@@ -81,13 +87,17 @@ def plan(options: Options, profile: str, truth: str, trials: int, points: list[t
     starts = (QUICK_START,) if options.quick else STARTS
     what = {"profile": profile, "truth": truth, "points": [list(p) for p in points]}
     return [
-        Job(f"{method}/{ground}/{trial}/{k}", method, first + trial,
-            what | {"way": method, "terrain": ground, "pose": list(_pose(start))})
+        Job(
+            f"{method}/{ground}/{trial}/{k}",
+            method,
+            first + trial,
+            what | {"way": method, "terrain": ground, "pose": list(_pose(start))},
+        )
         for trial in range(trials)
         for ground in grounds
         for k, start in enumerate(starts)
         for method in METHODS
-    ]  # fmt: skip
+    ]
 
 
 def _pose(start: tuple[float, float, float]) -> Pose:

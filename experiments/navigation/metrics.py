@@ -27,43 +27,99 @@ CONCLUSION: Final = (
     "{heading_deg_per_m} (paper: {paper:heading_deg_per_m}).",
 )
 OURS: Final = (
-    Metric("lateral_p95_m", "Ours: lateral error, 95th percentile", "cm",
-           "True middle of the front axle from the planned path, after the bend at the first waypoint; all grounds, "
-           "starts and laps.", most=0.08, scale=CM),
-    *(Metric(f"{g}.lateral_p95_m", f"Ours on {title}: lateral error, 95th percentile", "cm", "On this ground.",
-             scale=CM)
-      for g, title in GROUNDS.items()),
+    Metric(
+        "lateral_p95_m",
+        "Ours: lateral error, 95th percentile",
+        "cm",
+        "True middle of the front axle from the planned path, after the bend at the first waypoint; all grounds, "
+        "starts and laps.",
+        most=0.08,
+        scale=CM,
+    ),
+    *(
+        Metric(
+            f"{g}.lateral_p95_m", f"Ours on {title}: lateral error, 95th percentile", "cm", "On this ground.", scale=CM
+        )
+        for g, title in GROUNDS.items()
+    ),
     Metric("lateral_max_m", "Ours: largest lateral error", "cm", "All grounds.", scale=CM),
-    Metric("own_p95_m", "Ours: lateral error by the machine's own location, 95th percentile", "cm",
-           "The error of the follower; the rest is localization.", scale=CM),
-    Metric("stop_max_m", "Ours: stopping error along the path, largest", "cm",
-           "Rest position of the front axle at the end of each drive.", most=0.05, scale=CM),
-)  # fmt: skip
+    Metric(
+        "own_p95_m",
+        "Ours: lateral error by the machine's own location, 95th percentile",
+        "cm",
+        "The error of the follower; the rest is localization.",
+        scale=CM,
+    ),
+    Metric(
+        "stop_max_m",
+        "Ours: stopping error along the path, largest",
+        "cm",
+        "Rest position of the front axle at the end of each drive.",
+        most=0.05,
+        scale=CM,
+    ),
+)
 FAITHFUL: Final = (
-    Metric("faithful.lateral_p95_m", "Paper B's law: lateral error on the last lap, 95th percentile", "cm",
-           "From the common path, the mean of the last laps of all starts.", most=0.20, scale=CM),
-    *(Metric(f"{g}.faithful.lateral_p95_m", f"Paper B's law on {title}: lateral error on the last lap, 95th percentile",
-             "cm", "On this ground.", scale=CM) for g, title in GROUNDS.items()),
-    Metric("faithful.coming_p95_m", "Paper B's law: lateral error before the last lap, 95th percentile", "cm",
-           "From the first corner to the last lap: distance between the starts while they converge.", scale=CM),
-    Metric("heading_deg_per_m", "Paper B's law: settling of the heading", "deg/m", "Turn of the front per metre, "
-                                                                                   "between "
-           "10 and 90 % of each corner; median of all corners.", least=9.0),
-    Metric("full_bend_deg_per_m", "Turn at full articulation", "deg/m", "While the articulation is at its limit; "
-                                                                        "median. "
-           "9.03 without slip."),
-)  # fmt: skip
+    Metric(
+        "faithful.lateral_p95_m",
+        "Paper B's law: lateral error on the last lap, 95th percentile",
+        "cm",
+        "From the common path, the mean of the last laps of all starts.",
+        most=0.20,
+        scale=CM,
+    ),
+    *(
+        Metric(
+            f"{g}.faithful.lateral_p95_m",
+            f"Paper B's law on {title}: lateral error on the last lap, 95th percentile",
+            "cm",
+            "On this ground.",
+            scale=CM,
+        )
+        for g, title in GROUNDS.items()
+    ),
+    Metric(
+        "faithful.coming_p95_m",
+        "Paper B's law: lateral error before the last lap, 95th percentile",
+        "cm",
+        "From the first corner to the last lap: distance between the starts while they converge.",
+        scale=CM,
+    ),
+    Metric(
+        "heading_deg_per_m",
+        "Paper B's law: settling of the heading",
+        "deg/m",
+        "Turn of the front per metre, between 10 and 90 % of each corner; median of all corners.",
+        least=9.0,
+    ),
+    Metric(
+        "full_bend_deg_per_m",
+        "Turn at full articulation",
+        "deg/m",
+        "While the articulation is at its limit; median. 9.03 without slip.",
+    ),
+)
 BOTH: Final = (
     Metric("arrived", "Completed drives", "%", "At the last waypoint, or at the end of the path.", 1.0, None, 100.0),
     Metric("stops", "Stops by the supervisor", "", "All drives.", most=0.0),
-    Metric("located_p95_m", "Localization: error of the position, 95th percentile", "cm", "Middle of the front axle in "
-           "the plane, all drives; antennas are mounted up to 3 cm off.", scale=CM),
-    Metric("honesty", "Localization: squared error over the claimed variance, mean", "", "Error of the position over "
-                                                                                         "the "
-           "claimed standard deviation of its worst direction; 2 is consistent in two dimensions, more is "
-           "overconfident.",
-           most=4.0),
-)  # fmt: skip
+    Metric(
+        "located_p95_m",
+        "Localization: error of the position, 95th percentile",
+        "cm",
+        "Middle of the front axle in the plane, all drives; antennas are mounted up to 3 cm off.",
+        scale=CM,
+    ),
+    Metric(
+        "honesty",
+        "Localization: squared error over the claimed variance, mean",
+        "",
+        "Error of the position over "
+        "the "
+        "claimed standard deviation of its worst direction; 2 is consistent in two dimensions, more is "
+        "overconfident.",
+        most=4.0,
+    ),
+)
 METRICS: Final = OURS + FAITHFUL + BOTH
 SECTIONS: Final = (
     Section(
@@ -72,8 +128,10 @@ SECTIONS: Final = (
         "feed-forward of the articulation and feedback on lateral and course error from an extended Kalman filter over "
         "receiver, wheels, articulation and inclination. Bends, slope and ground limit the speed.",
         OURS,
-        (("lateral.png", "Lateral error of our follower along the path, every start; dashed: limit."),
-         ("steering.png", "Articulation along the path from one start: paper B's law and ours.")),
+        (
+            ("lateral.png", "Lateral error of our follower along the path, every start; dashed: limit."),
+            ("steering.png", "Articulation along the path from one start: paper B's law and ours."),
+        ),
     ),
     Section(
         "Paper B's law",
@@ -83,13 +141,18 @@ SECTIONS: Final = (
         "distance to the length of the leg. Therefore the error is measured from the path to which all starts "
         "converge, on the last lap; the part before is reported as well.",
         FAITHFUL,
-        (("paths.png", "As Fig. 13 of paper B: three starts by its law, two laps. Squares: starts; circles: ends; "
-          "diamonds: waypoints."),
-         ("heading.png", "As Fig. 14 of paper B: bearing less heading along the path, the same three starts."),
-         ("all.png", "As Fig. 15 of paper B: all starts, paper B's law and ours.")),
+        (
+            (
+                "paths.png",
+                "As Fig. 13 of paper B: three starts by its law, two laps. Squares: starts; circles: ends; "
+                "diamonds: waypoints.",
+            ),
+            ("heading.png", "As Fig. 14 of paper B: bearing less heading along the path, the same three starts."),
+            ("all.png", "As Fig. 15 of paper B: all starts, paper B's law and ours."),
+        ),
     ),
     Section("Both", "", BOTH),
-)  # fmt: skip
+)
 INTRODUCTION: Final = (
     "This experiment repeats paper B's test of its navigation (4.1.1, 5.1.1): four waypoints on a field of 40 by 30 m "
     "at 63.657853 N, 19.895562 E, two laps from each of six starts, at 2.3 km/h. The whole machine is on its two buses "
@@ -137,8 +200,13 @@ def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carri
     metrics = {f"{g}.lateral_p95_m": _p95(parts) for g, parts in ours.items()}
     metrics |= {f"{g}.faithful.lateral_p95_m": _p95(parts) for g, parts in common.items()}
     every, final = [p for parts in ours.values() for p in parts], [p for parts in common.values() for p in parts]
-    for name, parts in (("lateral_p95_m", every), ("own_p95_m", own), ("located_p95_m", off),
-                        ("faithful.lateral_p95_m", final), ("faithful.coming_p95_m", coming)):  # fmt: skip
+    for name, parts in (
+        ("lateral_p95_m", every),
+        ("own_p95_m", own),
+        ("located_p95_m", off),
+        ("faithful.lateral_p95_m", final),
+        ("faithful.coming_p95_m", coming),
+    ):
         if any(len(p) for p in parts):
             metrics[name] = _p95(parts)
     if every:

@@ -43,9 +43,22 @@ REST_NS: Final = 1_000_000_000
 KEEP_EVERY: Final = 2
 """Every second report is stored."""
 COLUMNS: Final = (
-    "t_s", "x_m", "y_m", "yaw_rad", "bend_rad", "speed_m_s", "seen_x_m", "seen_y_m", "seen_yaw_rad", "sigma_m", "s_m",
-    "off_m", "goal", "wanted_rad", "roll_rad",
-)  # fmt: skip
+    "t_s",
+    "x_m",
+    "y_m",
+    "yaw_rad",
+    "bend_rad",
+    "speed_m_s",
+    "seen_x_m",
+    "seen_y_m",
+    "seen_yaw_rad",
+    "sigma_m",
+    "s_m",
+    "off_m",
+    "goal",
+    "wanted_rad",
+    "roll_rad",
+)
 
 
 class NavigationPlanner:
@@ -108,11 +121,24 @@ class NavigationPlanner:
         goal = self.way.number if isinstance(self.way, WaypointDrive) else -1
         own = (steer.s_m, steer.off_m) if steer else (math.nan, math.nan)
         wanted = steer.articulation_rad if steer else math.nan
-        self.rows.append([
-            (now_ns - START_NS) * 1e-9, x, y, c.heading_rad, c.articulation_rad, c.speed_m_s, location.x_m,
-            location.y_m, location.yaw_rad, location.sigma_m if location.usable else math.nan, *own, goal, wanted,
-            c.roll_rad,
-        ])  # fmt: skip
+        self.rows.append(
+            [
+                (now_ns - START_NS) * 1e-9,
+                x,
+                y,
+                c.heading_rad,
+                c.articulation_rad,
+                c.speed_m_s,
+                location.x_m,
+                location.y_m,
+                location.yaw_rad,
+                location.sigma_m if location.usable else math.nan,
+                *own,
+                goal,
+                wanted,
+                c.roll_rad,
+            ]
+        )
 
 
 def perform(job: Job) -> dict[str, Any]:
@@ -146,10 +172,14 @@ def _driven(job: Job, profile: Profile, recorder: Recorder | None) -> dict[str, 
         at = body.front_axle()
         return {
             "rows": [[round(v, 5) if math.isfinite(v) else None for v in row] for row in planner.rows],
-            "arrived": phase is Phase.ARRIVED, "reason": planner.navigator.reason, "stops": operator.stops,
-            "begin": list(planner.begin), "rest_m": [at[0], at[1]], "rejected": planner.localizer.rejected,
+            "arrived": phase is Phase.ARRIVED,
+            "reason": planner.navigator.reason,
+            "stops": operator.stops,
+            "begin": list(planner.begin),
+            "rest_m": [at[0], at[1]],
+            "rejected": planner.localizer.rejected,
             "seconds": (ended_ns - START_NS) * 1e-9,
-        }  # fmt: skip
+        }
     finally:
         plant.close()
 

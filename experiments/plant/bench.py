@@ -43,15 +43,31 @@ PER_SECOND: Final = round(1.0 / STEP_S)
 MAX_STEAL_SHARE: Final = 0.05  # share of the wall time that the process did not run
 MAX_SPREAD: Final = 0.20  # spread of the fixed work, (p90 - median) / median
 METRICS: Final = (
-    Metric("rtf_crane12", "Real-time factor, crane at work among 12 logs, no camera", "x",
-           "Physics and hydraulics of the fixed crane while it drives its functions among 12 logs.",
-           least=5.0, clocked=True),
-    Metric("rtf_mission", "Real-time factor, forwarder: driving, then crane work, all CAN nodes", "x",
-           "The whole plant behind both buses: 20 s of driving past a row of logs, then a grasp into the bunk.",
-           least=3.0, clocked=True),
-    Metric("camera608_ms", "Camera picture 608 x 608 with depth, 12 logs", "ms",
-           "One frame of the emulated stereo camera: colour, depth and its errors.", most=12.0, clocked=True),
-)  # fmt: skip
+    Metric(
+        "rtf_crane12",
+        "Real-time factor, crane at work among 12 logs, no camera",
+        "x",
+        "Physics and hydraulics of the fixed crane while it drives its functions among 12 logs.",
+        least=5.0,
+        clocked=True,
+    ),
+    Metric(
+        "rtf_mission",
+        "Real-time factor, forwarder: driving, then crane work, all CAN nodes",
+        "x",
+        "The whole plant behind both buses: 20 s of driving past a row of logs, then a grasp into the bunk.",
+        least=3.0,
+        clocked=True,
+    ),
+    Metric(
+        "camera608_ms",
+        "Camera picture 608 x 608 with depth, 12 logs",
+        "ms",
+        "One frame of the emulated stereo camera: colour, depth and its errors.",
+        most=12.0,
+        clocked=True,
+    ),
+)
 
 
 @dataclass(slots=True)

@@ -84,9 +84,16 @@ def run(options: Options, console: Console) -> Result:
         metrics |= speed
         traces |= costs
         result = make_result(
-            "plant", METRICS, metrics, profile=profile_named(options.profile).name, seed=options.seed, trials=trials,
-            more={"truth": options.truth}, paper=PAPER, noisy=noisy,
-        )  # fmt: skip
+            "plant",
+            METRICS,
+            metrics,
+            profile=profile_named(options.profile).name,
+            seed=options.seed,
+            trials=trials,
+            more={"truth": options.truth},
+            paper=PAPER,
+            noisy=noisy,
+        )
         draw(metrics, traces, options.out)
         publish(result, page_of(result, {}), options, console)
     return result

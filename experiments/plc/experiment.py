@@ -133,11 +133,15 @@ def _performed(job: Job, settings: Settings, guard: Guard, recorder: Recorder | 
         while not plant.evaluate().success and system.now_ns < ended_ns + SETTLE_NS:
             system.advance()
         return {
-            "success": bool(activity.done and plant.evaluate().success), "stops": operator.stops,
-            "seconds": (ended_ns - START_NS) * 1e-9, "rests_mm": observer.rests_mm, "squares": observer.squares,
-            "moments": observer.moments, "age_ms": 1e3 * slope(observer.speeds, observer.behind),
+            "success": bool(activity.done and plant.evaluate().success),
+            "stops": operator.stops,
+            "seconds": (ended_ns - START_NS) * 1e-9,
+            "rests_mm": observer.rests_mm,
+            "squares": observer.squares,
+            "moments": observer.moments,
+            "age_ms": 1e3 * slope(observer.speeds, observer.behind),
             "delays_ms": observer.delays_ms,
-        }  # fmt: skip
+        }
     finally:
         plant.close()
 
@@ -174,20 +178,37 @@ INTRODUCTION: Final = (
 
 def _metrics(path: str, title: str) -> Iterator[Metric]:
     yield Metric(
-        f"{path}_success", f"Logs in the bunk: {title}", "%", "Share of the trials, by the plant's ground truth.",
-        least=1.0, scale=100.0,
-    )  # fmt: skip
+        f"{path}_success",
+        f"Logs in the bunk: {title}",
+        "%",
+        "Share of the trials, by the plant's ground truth.",
+        least=1.0,
+        scale=100.0,
+    )
     yield Metric(f"{path}_stops", f"Stops in all trials: {title}", "", "The emulated operator arms again after each.")
     yield Metric(f"{path}_seconds", f"Duration of a job: {title}", "s", "Mean of the trials.")
-    yield Metric(f"{path}_rest_mm", f"Error of the pin at rest, mean: {title}", "mm",
-                 "Hanger pin by the true joints against a reference that has rested for 0.6 s.")  # fmt: skip
+    yield Metric(
+        f"{path}_rest_mm",
+        f"Error of the pin at rest, mean: {title}",
+        "mm",
+        "Hanger pin by the true joints against a reference that has rested for 0.6 s.",
+    )
     yield Metric(f"{path}_rest_max_mm", f"Error of the pin at rest, largest: {title}", "mm", "All rests of all trials.")
-    yield Metric(f"{path}_track_mm", f"Error of the pin in motion, RMS: {title}", "mm",
-                 "Against the reference at the same time.")  # fmt: skip
-    yield Metric(f"{path}_command_ms", f"Latency from command to valve: {title}", "ms",
-                 "From the controller's first command that opens the boom's valve to the output; mean.")  # fmt: skip
-    yield Metric(f"{path}_measured_ms", f"Age of a measurement: {title}", "ms",
-                 "Slope of true less estimated boom angle over its speed, so that offsets do not count.")  # fmt: skip
+    yield Metric(
+        f"{path}_track_mm", f"Error of the pin in motion, RMS: {title}", "mm", "Against the reference at the same time."
+    )
+    yield Metric(
+        f"{path}_command_ms",
+        f"Latency from command to valve: {title}",
+        "ms",
+        "From the controller's first command that opens the boom's valve to the output; mean.",
+    )
+    yield Metric(
+        f"{path}_measured_ms",
+        f"Age of a measurement: {title}",
+        "ms",
+        "Slope of true less estimated boom angle over its speed, so that offsets do not count.",
+    )
 
 
 SECTIONS: Final = (
@@ -234,9 +255,14 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "plc trials", console)
         result = make_result(
-            "plc", METRICS, gather(outcomes), profile=profile_named(options.profile).name, seed=options.seed,
-            trials=trials, more={"truth": options.truth},
-        )  # fmt: skip
+            "plc",
+            METRICS,
+            gather(outcomes),
+            profile=profile_named(options.profile).name,
+            seed=options.seed,
+            trials=trials,
+            more={"truth": options.truth},
+        )
         publish(result, page_of(result, {}), options, console)
     return result
 

@@ -111,9 +111,15 @@ def _bunk(profile: Profile, truth: str, seed: int, rng: random.Random, amount: i
 
 
 def _at(
-    profile: Profile, truth: str, seed: int, kind: str, count: int, at: tuple[float, float], yaw: float,
+    profile: Profile,
+    truth: str,
+    seed: int,
+    kind: str,
+    count: int,
+    at: tuple[float, float],
+    yaw: float,
     rng: random.Random,
-) -> tuple[LogSpec, ...]:  # fmt: skip
+) -> tuple[LogSpec, ...]:
     wood = replace(wood_of(profile.name, truth), length_m=LENGTH_M, diameter_m=DIAMETER_M)
     return arrangement(kind, profile, wood, seed, count, at=at, yaw_rad=yaw + rng.choice((0.0, math.pi)))
 
@@ -156,9 +162,14 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, (), [name], options.truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "runs", console)
         result = make_result(
-            "productivity", METRICS, gather(outcomes, grapple_s), profile=name, seed=options.seed, trials=trials,
+            "productivity",
+            METRICS,
+            gather(outcomes, grapple_s),
+            profile=name,
+            seed=options.seed,
+            trials=trials,
             more={"truth": options.truth, "eyes": "perfect"},
-        )  # fmt: skip
+        )
         draw(outcomes, grapple_s, options.out)
         print_failures(outcomes, console)
         publish(result, page_of(result, {}), options, console)

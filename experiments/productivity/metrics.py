@@ -25,38 +25,60 @@ CONCLUSION: Final = (
     "included, and unloads a full bunk in {unload_s}.",
 )
 CYCLES: Final = (
-    Metric("cycle_median_s", "Crane cycle, one log from the ground into the bunk: median", "s", "From the detection of "
-           "the logs until the crane is clear of the stakes with the log in the bunk; grasps of one log on the route "
-           "of single logs.", most=25.0),
-    Metric("cycle_p90_s", "Crane cycle, one log from the ground into the bunk: 90th percentile", "s",
-           "The same grasps."),
-    Metric("shortest_median_s", "Shortest possible time for the same paths, median", "s", "What joint speeds, joint "
-           "accelerations and the pump's flow allow for the same paths, plus closing and opening of the grapple; "
-           "without detection, settling and jerk limit."),
+    Metric(
+        "cycle_median_s",
+        "Crane cycle, one log from the ground into the bunk: median",
+        "s",
+        "From the detection of "
+        "the logs until the crane is clear of the stakes with the log in the bunk; grasps of one log on the route "
+        "of single logs.",
+        most=25.0,
+    ),
+    Metric(
+        "cycle_p90_s", "Crane cycle, one log from the ground into the bunk: 90th percentile", "s", "The same grasps."
+    ),
+    Metric(
+        "shortest_median_s",
+        "Shortest possible time for the same paths, median",
+        "s",
+        "What joint speeds, joint "
+        "accelerations and the pump's flow allow for the same paths, plus closing and opening of the grapple; "
+        "without detection, settling and jerk limit.",
+    ),
     Metric("over_shortest", "Crane cycle over the shortest possible time, mean", "", "The same grasps."),
     Metric("piles.cycle_median_s", "Crane cycle from a pile: median", "s", "One grasp of any number of logs."),
     Metric("piles.logs_per_grasp", "Logs per grasp from a pile", "", "Grasps with at least one log."),
-)  # fmt: skip
+)
 HOURS: Final = (
-    Metric("logs_per_hour", "Single logs: logs per hour", "", "Loaded logs over the time from the first state after "
-           "arming to the end of the route, driving included."),
+    Metric(
+        "logs_per_hour",
+        "Single logs: logs per hour",
+        "",
+        "Loaded logs over the time from the first state after arming to the end of the route, driving included.",
+    ),
     Metric("m3_per_hour", "Single logs: wood per hour", "m³", "The same time; cylinders of the mid diameter."),
     Metric("crane_logs_per_hour", "Single logs: logs per hour of crane work", "", "The same, without driving."),
     Metric("piles.logs_per_hour", "Piles: logs per hour", "", "As for single logs."),
     Metric("piles.m3_per_hour", "Piles: wood per hour", "m³", "As for single logs."),
-    Metric("loaded", "Logs loaded", "%", "Share of all single logs and logs in piles, by the plant's physics.",
-           scale=100.0),
+    Metric(
+        "loaded", "Logs loaded", "%", "Share of all single logs and logs in piles, by the plant's physics.", scale=100.0
+    ),
     Metric("faults", "Stops and faults", "", "All runs.", most=0.0),
-)  # fmt: skip
+)
 UNLOADING: Final = (
-    Metric("unload_s", "Time to unload a full bunk", "min", "From the start of the first grasp to the end of the last.",
-           scale=1 / 60),
+    Metric(
+        "unload_s",
+        "Time to unload a full bunk",
+        "min",
+        "From the start of the first grasp to the end of the last.",
+        scale=1 / 60,
+    ),
     Metric("unload_logs_per_hour", "Logs per hour while unloading", "", "The same time."),
     Metric("unload_m3_per_hour", "Wood per hour while unloading", "m³", "The same time."),
     Metric("unload_cycle_median_s", "Crane cycle while unloading: median", "s", "One grasp of any number of logs."),
     Metric("unload_logs_per_grasp", "Logs per grasp while unloading", "", "Grasps with at least one log."),
     Metric("unloaded", "Logs delivered to the landing", "%", "Within 3 m of its middle and not on board.", scale=100.0),
-)  # fmt: skip
+)
 METRICS: Final = CYCLES + HOURS + UNLOADING
 INTRODUCTION: Final = (
     "This experiment measures how much wood the machine moves per hour. The nominal machine has three tasks with birch "
@@ -104,12 +126,15 @@ def cycles(outcome: Mapping[str, Any], grapple_s: float) -> Iterator[Cycle]:
 def sections() -> tuple[Section, ...]:
     """Sections of the page."""
     return (
-        Section("Crane cycle", HUMAN, CYCLES, (
-            ("cycles.png", "Every grasp and its phases; black bars: the shortest possible time for the same paths."),
-        )),
+        Section(
+            "Crane cycle",
+            HUMAN,
+            CYCLES,
+            (("cycles.png", "Every grasp and its phases; black bars: the shortest possible time for the same paths."),),
+        ),
         Section("Logs and wood per hour", "", HOURS),
         Section("Unloading", "", UNLOADING),
-    )  # fmt: skip
+    )
 
 
 def gather(outcomes: Mapping[str, Any], grapple_s: float) -> dict[str, float]:

@@ -12,9 +12,16 @@ from experiments.productivity.metrics import EXPERT_S, KIND_TITLES, Cycle, cycle
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 COLOURS: Final = {
-    "LOOK": STEEL, "ABOVE": OIL, "DESCEND": "#5b93b8", "CLOSE": MOSS, "LIFT": "#87a978", "CARRY": TIMBER,
-    "LOWER": "#c29a6b", "OPEN": "#d9c3a5", "RETREAT": "#8a6fae",
-}  # fmt: skip
+    "LOOK": STEEL,
+    "ABOVE": OIL,
+    "DESCEND": "#5b93b8",
+    "CLOSE": MOSS,
+    "LIFT": "#87a978",
+    "CARRY": TIMBER,
+    "LOWER": "#c29a6b",
+    "OPEN": "#d9c3a5",
+    "RETREAT": "#8a6fae",
+}
 MAX_SHOWN_COUNT: Final = 30
 
 

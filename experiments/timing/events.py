@@ -82,17 +82,20 @@ class Events:
             from_ns, to_ns = event.from_ns, event.to_ns
             least_ns = TX_QUEUE_NS if event.refused else LOSING_STALL_NS
         fitting = [
-            s for s in self.stalls
-            if s.own_share < OWN_SHARE and s.length_ns >= least_ns
-            and s.end_ns >= from_ns - REACH_NS and s.end_ns - s.length_ns <= to_ns + STALL_NS
-        ]  # fmt: skip
+            s
+            for s in self.stalls
+            if s.own_share < OWN_SHARE
+            and s.length_ns >= least_ns
+            and s.end_ns >= from_ns - REACH_NS
+            and s.end_ns - s.length_ns <= to_ns + STALL_NS
+        ]
         return max(fitting, key=lambda stall: stall.length_ns, default=None)
 
     def sentences(self) -> list[str]:
         """One sentence for every stop and loss: what, and the stall of the host before it."""
         found: list[tuple[int, str, Stop | Loss]] = [
             (s.at_ns, f"stop, {s.reason.name}: {s.words}", s) for s in self.stops
-        ]  # fmt: skip
+        ]
         found += [(x.to_ns, f"{x.bus}: {x.refused} frames refused, {x.dropped} dropped", x) for x in self.losses]
         return [f"{what} [{_words(self.cause(event))}]" for _, what, event in sorted(found, key=lambda item: item[0])]
 

@@ -230,9 +230,11 @@ def rights(f: Figures) -> Judgement:
         return Judgement("rights", Verdict.GOOD, sentence)
     refused = "; ".join(f.refused) or "no real-time priority or no locked memory"
     return Judgement(
-        "rights", Verdict.UNFIT, f"the system refused: {refused}",
+        "rights",
+        Verdict.UNFIT,
+        f"the system refused: {refused}",
         "run the report with sudo, or give this user the limits of the service (topics priority and memory below)",
-    )  # fmt: skip
+    )
 
 
 def wakeups(f: Figures) -> Judgement:

@@ -59,9 +59,14 @@ def data_of(
         judged = judge(measured.figures)
         more = {"measured": asdict(measured), "disturbed": disturbances(measured.figures)}
     data = {
-        "report": VERSION, "verdict": overall(judged).value, "judgements": [asdict(j) for j in judged], **more,
-        "computer": asdict(computer), "settings": asdict(facts), "findings": [f.document() for f in findings],
-    }  # fmt: skip
+        "report": VERSION,
+        "verdict": overall(judged).value,
+        "judgements": [asdict(j) for j in judged],
+        **more,
+        "computer": asdict(computer),
+        "settings": asdict(facts),
+        "findings": [f.document() for f in findings],
+    }
     found: dict[str, Any] = without_private(data, words)
     return found
 

@@ -84,10 +84,27 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
     report.unlink(missing_ok=True)
     if with_cyclictest:
         testbed.helpers.launch(
-            "cyclictest", "cyclictest", "-q", "-m", "-t", 1, "-a", testbed.cpu, "-p", PRIORITY, "--policy", "fifo",
-            "-i", period_ns // 1000, "--secaligned", offset_us(testbed.stamp_ns, period_ns),
-            "-h", MAX_LATENESS_US, "--histfile=/dev/null", f"--json={report}",
-        )  # fmt: skip
+            "cyclictest",
+            "cyclictest",
+            "-q",
+            "-m",
+            "-t",
+            1,
+            "-a",
+            testbed.cpu,
+            "-p",
+            PRIORITY,
+            "--policy",
+            "fifo",
+            "-i",
+            period_ns // 1000,
+            "--secaligned",
+            offset_us(testbed.stamp_ns, period_ns),
+            "-h",
+            MAX_LATENESS_US,
+            "--histfile=/dev/null",
+            f"--json={report}",
+        )
         testbed.wait(START_S)
     first, begin = host_activity.sample(), testbed.fresh_timing()
     loop = ("--period-us", period_ns // 1000, "--seconds", seconds)

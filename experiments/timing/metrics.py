@@ -75,32 +75,55 @@ OWN: Final = Section(
         Metric("tick_instructions", "Instructions of the controller per tick", "", "perf_event_open(2), with waits."),
         Metric("compiled_ratio_cold", "Interpreter over compiled tick, cold caches", "x", _INTERPRETER, least=2.0),
         Metric("compiled_ratio_hot", "Interpreter over compiled tick, hot caches", "x", _INTERPRETER, least=2.0),
-        Metric("tick1k_cpu_p99_us", "CPU time of a tick at 1 kHz, fixed crane, p99", "us",
-               "The limit is 25 % of the period; quietest windows. The wire bus runs at 4 Mbit/s: ten frames of 8 "
-               "bytes per millisecond do not fit on a CAN bus of 1 Mbit/s.", most=250.0),
+        Metric(
+            "tick1k_cpu_p99_us",
+            "CPU time of a tick at 1 kHz, fixed crane, p99",
+            "us",
+            "The limit is 25 % of the period; quietest windows. The wire bus runs at 4 Mbit/s: ten frames of 8 "
+            "bytes per millisecond do not fit on a CAN bus of 1 Mbit/s.",
+            most=250.0,
+        ),
         Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage, quiet windows.", scale=100.0),
         Metric("frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's own counters."),
         Metric("frames_lost", _LOST, "", "The controller's own counters, whole measurement.", most=0.0),
-        Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "",
-               "No witness saw a stall before that is long enough to fill the transmit queue, or of 25 ms.", most=0.0),
+        Metric(
+            "frames_lost_unexplained",
+            "Lost frames without a stall of the host",
+            "",
+            "No witness saw a stall before that is long enough to fill the transmit queue, or of 25 ms.",
+            most=0.0,
+        ),
         Metric("machine_frames_lost", "Frames lost by the emulated machine", "", "Its own counters."),
         Metric("records_lost", "Tick records lost on the way to the observer", "", "By their nominal times."),
         Metric("stalls", "Stalls of a processor that a witness saw", "", "3 ms or longer, whole measurement."),
         Metric("stall_max_ms", "Longest of them", "ms", "By the witness's own lateness."),
         Metric("page_faults", "Page faults", "", "Minor and major, all quiet windows.", most=0.0),
         Metric("gc_runs", "Runs of the garbage collector", "", "All quiet windows.", most=0.0),
-        Metric("allocated_blocks_growth", "Growth of allocated memory blocks", "",
-               "Blocks of the interpreter: minimum of the second half of the windows less minimum of the first half.",
-               most=0.0),
+        Metric(
+            "allocated_blocks_growth",
+            "Growth of allocated memory blocks",
+            "",
+            "Blocks of the interpreter: minimum of the second half of the windows less minimum of the first half.",
+            most=0.0,
+        ),
         Metric("resident_growth_kb", "Growth of resident memory", "kB", "First to last reading.", most=0.0),
         Metric("syscalls_per_tick", "System calls per tick", "", "By strace, after the measurement.", most=60.0),
-        Metric("voluntary_switches_per_tick", "Voluntary context switches per tick", "",
-               "One wait for SYNC and one for the tick.", most=2.05),
-        Metric("involuntary_switches_per_tick", "Involuntary context switches per tick", "",
-               "Caused by a process of higher priority or by the kernel."),
+        Metric(
+            "voluntary_switches_per_tick",
+            "Voluntary context switches per tick",
+            "",
+            "One wait for SYNC and one for the tick.",
+            most=2.05,
+        ),
+        Metric(
+            "involuntary_switches_per_tick",
+            "Involuntary context switches per tick",
+            "",
+            "Caused by a process of higher priority or by the kernel.",
+        ),
     ),
     (("stages.png", "Duration of the stages of a tick: median, p99 and longest (log scale)."),),
-)  # fmt: skip
+)
 _BOOTSTRAP = "Interpolated inside the bins of 1 us; interval by bootstrap over the windows."
 WAKEUPS: Final = Section(
     "Wake-ups compared with cyclictest",
@@ -120,11 +143,16 @@ WAKEUPS: Final = Section(
         Metric("judged_cycles", "Cycles compared", "", "Ticks of the controller in the windows that are compared."),
         Metric("missed", "Deadlines missed in these cycles", "", "The limit is zero in 100,000 cycles.", most=0.0),
         Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat, all processors, all windows."),
-        Metric("pressure", "Share of time in which a process waited for a processor", "%", "/proc/pressure/cpu.",
-               scale=100.0),
+        Metric(
+            "pressure",
+            "Share of time in which a process waited for a processor",
+            "%",
+            "/proc/pressure/cpu.",
+            scale=100.0,
+        ),
     ),
     (("wakeups.png", "Lateness of wake-ups on a quiet host and with every core loaded; dashed: one period."),),
-)  # fmt: skip
+)
 LOADED: Final = Section(
     "Wake-ups with every core loaded",
     "stress-ng keeps every core and the memory busy. The sleep loop runs during the same seconds on the same core and "
@@ -132,31 +160,63 @@ LOADED: Final = Section(
     (
         *_lateness("_loaded", "", "p50", "p99"),
         *_missed("", ""),
-        Metric("missed_loaded_share", "Deadlines missed, controller over sleep loop", "%", "200 Hz.",
-               most=MAX_MISSED_SHARE, scale=100.0),
+        Metric(
+            "missed_loaded_share",
+            "Deadlines missed, controller over sleep loop",
+            "%",
+            "200 Hz.",
+            most=MAX_MISSED_SHARE,
+            scale=100.0,
+        ),
         *_lateness("1k", " at 1 kHz, quiet", "p99"),
         Metric("missed_1k", "Deadlines missed by the controller at 1 kHz, quiet", "", "Fixed crane."),
         *_missed("_1k", " at 1 kHz"),
-        Metric("stops", "Stops of the machine in the whole measurement", "",
-               "The supervisor stops a machine whose inputs or loop are late.", most=0.0),
-        Metric("stops_unexplained", "Stops without a stall of the host", "",
-               "No witness saw a stall of 10 ms or more in the 0.45 s before.", most=0.0),
+        Metric(
+            "stops",
+            "Stops of the machine in the whole measurement",
+            "",
+            "The supervisor stops a machine whose inputs or loop are late.",
+            most=0.0,
+        ),
+        Metric(
+            "stops_unexplained",
+            "Stops without a stall of the host",
+            "",
+            "No witness saw a stall of 10 ms or more in the 0.45 s before.",
+            most=0.0,
+        ),
     ),
-)  # fmt: skip
+)
 LATENCY: Final = Section(
     "From sample to command",
     "The encoders sample on SYNC; the tick that uses the samples sends the valve command. The wire bus gives every "
     "frame its transmission time.",
     (
-        Metric("sample_to_command_p50_us", "From the encoders' sample to the valve command, median", "us",
-               "From the time stamp of SYNC on the wire bus to the command passed to the bus, 200 Hz, quiet windows."),
-        Metric("sample_to_command_p99_us", "From the encoders' sample to the valve command, p99", "us",
-               "The limit is one period.", most=5000.0, clocked=True),
-        Metric("rx_decode_us", "Receiving and decoding one frame, raw socket", "us", "On this host, per frame.",
-               most=5.0, clocked=True),
+        Metric(
+            "sample_to_command_p50_us",
+            "From the encoders' sample to the valve command, median",
+            "us",
+            "From the time stamp of SYNC on the wire bus to the command passed to the bus, 200 Hz, quiet windows.",
+        ),
+        Metric(
+            "sample_to_command_p99_us",
+            "From the encoders' sample to the valve command, p99",
+            "us",
+            "The limit is one period.",
+            most=5000.0,
+            clocked=True,
+        ),
+        Metric(
+            "rx_decode_us",
+            "Receiving and decoding one frame, raw socket",
+            "us",
+            "On this host, per frame.",
+            most=5.0,
+            clocked=True,
+        ),
         Metric("rx_decode_pythoncan_us", "Receiving and decoding one frame, python-can", "us", "The same frames."),
     ),
     (("ages.png", "Age of every input when a tick used it: newest and longest."),),
-)  # fmt: skip
+)
 SECTIONS: Final = (OWN, WAKEUPS, LOADED, LATENCY)
 METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)

@@ -65,9 +65,21 @@ def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: 
     with TimingTestbed(setting, directory) as testbed:
         testbed.helpers.environment = testbed.family.environment  # the console listens on the same wire
         testbed.helpers.start(
-            "console", "console", "--profile", PROFILE, "--port", port, "--report-port", reports, "--timing",
-            testbed.page, "--bus", "crane0=wire:crane0", "--key-file", testbed.key_file,
-        )  # fmt: skip
+            "console",
+            "console",
+            "--profile",
+            PROFILE,
+            "--port",
+            port,
+            "--report-port",
+            reports,
+            "--timing",
+            testbed.page,
+            "--bus",
+            "crane0=wire:crane0",
+            "--key-file",
+            testbed.key_file,
+        )
         testbed.helpers.await_message("console", "url", START_S)
         for number in range(rounds):
             order = ("none", "open") if number % 2 == 0 else ("open", "none")
@@ -110,10 +122,13 @@ def _window(testbed: TimingTestbed, seconds: float, directory: Path) -> Window:
     traced = system_calls(testbed, seconds, directory)
     ticks = end.ticks - begin.ticks
     return Window(
-        ticks=ticks, missed=end.missed - begin.missed, cpu_us=(end.process.cpu_ns - begin.process.cpu_ns) / ticks / 1e3,
-        frames=(_sent(end) - _sent(begin)) / ticks, instructions=None if executed is None else executed / ticks,
+        ticks=ticks,
+        missed=end.missed - begin.missed,
+        cpu_us=(end.process.cpu_ns - begin.process.cpu_ns) / ticks / 1e3,
+        frames=(_sent(end) - _sent(begin)) / ticks,
+        instructions=None if executed is None else executed / ticks,
         calls=None if traced is None else sum(traced[0].values()) / traced[1],
-    )  # fmt: skip
+    )
 
 
 def _sent(facts: Facts) -> int:

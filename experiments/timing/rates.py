@@ -160,9 +160,16 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
     try:
         for k in range(cranes):
             family.start(
-                f"crane-{k}", "experiments.timing.replayed_crane", recording, "--ticks", ticks, "--cpu", cpu,
-                "--start-at", start_ns + k * PERIOD_NS // cranes,
-            )  # fmt: skip
+                f"crane-{k}",
+                "experiments.timing.replayed_crane",
+                recording,
+                "--ticks",
+                ticks,
+                "--cpu",
+                cpu,
+                "--start-at",
+                start_ns + k * PERIOD_NS // cranes,
+            )
         limit = time.monotonic() + 60.0 + 3.0 * cranes + 3.0 * ticks * PERIOD_NS * 1e-9
         while len(outputs) < cranes:
             for name, message in family.messages():
@@ -240,9 +247,14 @@ FAST: Final = Section(
         Metric("stops", "Stops, all machines and rates", "", "By the controller's reports.", most=0.0),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness.", most=0.0),
     ),
-    (("rates.png", "CPU load against frames per second, and CPU time per period against the functions moved; lines: "
-      "least squares."),),
-)  # fmt: skip
+    (
+        (
+            "rates.png",
+            "CPU load against frames per second, and CPU time per period against the functions moved; lines: "
+            "least squares.",
+        ),
+    ),
+)
 COST: Final = Section(
     "Cost against frames and joints",
     "Both are straight lines: a frame and a function cost the same whether there are few or many. The load against "
@@ -254,15 +266,27 @@ COST: Final = Section(
             for machine, title in MACHINES.items()
             for metric in (
                 Metric(f"{machine}_frame_us", f"{title}: CPU time per frame", "us", "Slope of the line."),
-                Metric(f"{machine}_frame_residual", f"{title}: largest residual", "%", "Of the largest load.",
-                       most=MAX_RESIDUAL, scale=100.0),
+                Metric(
+                    f"{machine}_frame_residual",
+                    f"{title}: largest residual",
+                    "%",
+                    "Of the largest load.",
+                    most=MAX_RESIDUAL,
+                    scale=100.0,
+                ),
             )
         ),
         Metric("function_us", "CPU time per function and period", "us", "Slope of the line, both machines."),
-        Metric("function_residual", "Functions: largest residual", "%", "Of the largest cost.", most=MAX_RESIDUAL,
-               scale=100.0),
+        Metric(
+            "function_residual",
+            "Functions: largest residual",
+            "%",
+            "Of the largest cost.",
+            most=MAX_RESIDUAL,
+            scale=100.0,
+        ),
     ),
-)  # fmt: skip
+)
 CRANES: Final = Section(
     "Cranes on one processor",
     "Controllers with SCHED_FIFO on one processor, each at 200 Hz on recorded inputs, with the system calls of the "
@@ -275,7 +299,7 @@ CRANES: Final = Section(
         Metric("aoro_fc8_cranes_bound", "Forwarders by the bound", "", "From the live load at 200 Hz."),
         Metric("differing_ticks", "Ticks whose outputs differ from the recording", "", "All controllers.", most=0.0),
     ),
-)  # fmt: skip
+)
 SECTIONS: Final = (FAST, COST, CRANES)
 METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 CONCLUSION: Final = (

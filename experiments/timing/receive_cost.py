@@ -133,9 +133,14 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
     metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}
     metrics["rx_decode_ratio"] = metrics["rx_decode_pythoncan_us"] / metrics["rx_decode_us"]
     return {
-        "frames": frames, "rounds": rounds, "clock": clock_name, "lab": os.environ.get("TIMBERHAND_LAB") == "uml",
-        "paths": {lane.name: lane.label for lane in lanes}, "limit_us": LIMIT_US, "metrics": metrics,
-    }  # fmt: skip
+        "frames": frames,
+        "rounds": rounds,
+        "clock": clock_name,
+        "lab": os.environ.get("TIMBERHAND_LAB") == "uml",
+        "paths": {lane.name: lane.label for lane in lanes},
+        "limit_us": LIMIT_US,
+        "metrics": metrics,
+    }
 
 
 def _round(

@@ -45,16 +45,26 @@ MEMORY: Final = Section(
     "Read every few seconds. Growth is the maximum of the second half of the run less the maximum of the first half. "
     "The interpreter's memory blocks come and go, so their minima are compared.",
     (
-        Metric("controller_growth_kb", "Growth of the controller's resident memory", "kB",
-               "VmRSS of /proc/PID/status.", most=FLAT_KB),
+        Metric(
+            "controller_growth_kb",
+            "Growth of the controller's resident memory",
+            "kB",
+            "VmRSS of /proc/PID/status.",
+            most=FLAT_KB,
+        ),
         Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS.", most=FLAT_KB),
-        Metric("allocated_blocks_growth", "Growth of allocated memory blocks in the controller", "",
-               "sys.getallocatedblocks, from the timing page.", most=0.0),
+        Metric(
+            "allocated_blocks_growth",
+            "Growth of allocated memory blocks in the controller",
+            "",
+            "sys.getallocatedblocks, from the timing page.",
+            most=0.0,
+        ),
         Metric("gc_runs", "Runs of the garbage collector", "", "In the controller.", most=0.0),
         Metric("major_faults", "Major page faults", "", "In the controller.", most=0.0),
     ),
     (("memory.png", "Resident memory of controller and guard, and memory blocks of the controller, over the run."),),
-)  # fmt: skip
+)
 FRAMES: Final = Section(
     "Frames",
     "A bus observer reads the controller's record of every tick: all frames that it received and sent, in order. "
@@ -68,11 +78,16 @@ FRAMES: Final = Section(
         Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", "By itself.", most=0.0),
         Metric("damaged", "Frames with a wrong CRC", "", "By both.", most=0.0),
         Metric("unanswered", "SYNCs not answered by an encoder", "", "By the bus observer.", most=0.0),
-        Metric("frames_lost", "Frames refused by a bus or lost before they were read", "",
-               "Controller and emulated machine.", most=0.0),
+        Metric(
+            "frames_lost",
+            "Frames refused by a bus or lost before they were read",
+            "",
+            "Controller and emulated machine.",
+            most=0.0,
+        ),
         Metric("records_lost", "Missing tick records", "", "By their nominal times.", most=0.0),
     ),
-)  # fmt: skip
+)
 TIMES: Final = Section(
     "Timing",
     "The histogram of the whole run. In user-mode Linux a system call costs a hundred times as much as on the host, so "
@@ -82,9 +97,14 @@ TIMES: Final = Section(
         Metric("missed", "Missed periods", "", "Whole periods skipped."),
         Metric("stops", "Stops of the machine", "", "The emulated operator arms it again after each."),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness of the testbed."),
-        Metric("active_share", "Share of the readings in which the machine moved", "%",
-               "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
-               least=MIN_ACTIVE_SHARE, scale=100.0),
+        Metric(
+            "active_share",
+            "Share of the readings in which the machine moved",
+            "%",
+            "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
+            least=MIN_ACTIVE_SHARE,
+            scale=100.0,
+        ),
         Metric("wakeup_p50_us", "Lateness, median", "us", "All ticks."),
         Metric("wakeup_p99_us", "Lateness, p99", "us", "All ticks."),
         Metric("wakeup_max_us", "Lateness, longest", "us", "All ticks."),
@@ -92,7 +112,7 @@ TIMES: Final = Section(
         Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat."),
     ),
     (("lateness.png", "Share of wake-ups later than x."),),
-)  # fmt: skip
+)
 SECTIONS: Final = (FRAMES, MEMORY, TIMES)
 METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 CONCLUSION: Final = (

@@ -136,23 +136,57 @@ class TimingTestbed:
             "machine", "experiments.timing.emulated_machine", "--profile", s.profile, *buses, "--cycle-us", cycle_us
         )
         self._start(
-            "setpoints", "experiments.timing.setpoint_source", "--profile", s.profile,
-            "--controller", f"{HOST}:{control}", "--operator", operators, "--report-port", reports, *keyed,
-        )  # fmt: skip
+            "setpoints",
+            "experiments.timing.setpoint_source",
+            "--profile",
+            s.profile,
+            "--controller",
+            f"{HOST}:{control}",
+            "--operator",
+            operators,
+            "--report-port",
+            reports,
+            *keyed,
+        )
         self._start(
             "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
         )
         guard = self.family.start(
-            "guard", "controller.guard", "--profile", s.profile, *buses, "--rate", s.rate_hz,
-            "--state", self.page.with_suffix(".latched"), "--operator", operators,
-        )  # fmt: skip
+            "guard",
+            "controller.guard",
+            "--profile",
+            s.profile,
+            *buses,
+            "--rate",
+            s.rate_hz,
+            "--state",
+            self.page.with_suffix(".latched"),
+            "--operator",
+            operators,
+        )
         os.sched_setaffinity(guard.process.pid, self.others)
         self.family.start(
-            "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,
-            "--report", f"{HOST}:{reports}", "--record", ticks, "--operator", operators, "--rate", s.rate_hz,
-            "--timing", self.page, *keyed,
-            *(("--cpu", self.cpu) if self.cpu not in self.others else ()), *s.arguments,
-        )  # fmt: skip
+            "controller",
+            "controller",
+            "--profile",
+            s.profile,
+            *buses,
+            "--setpoint-port",
+            control,
+            "--report",
+            f"{HOST}:{reports}",
+            "--record",
+            ticks,
+            "--operator",
+            operators,
+            "--rate",
+            s.rate_hz,
+            "--timing",
+            self.page,
+            *keyed,
+            *(("--cpu", self.cpu) if self.cpu not in self.others else ()),
+            *s.arguments,
+        )
         if not self.until(lambda: self.mode == "ACTIVE" and self.page.exists(), ACTIVE_S):
             raise CommandFailed(
                 "timing-testbed.not-moving",
@@ -215,13 +249,15 @@ class TimingTestbed:
         """What observer and emulated machine have counted so far; a machine alone on its bus has frames refused."""
         seen, rig = (Counter(self.status.get(name, {})) for name in ("observer", "machine"))
         found = Counter({name: seen[name] for name in ("received", "sent", "gaps", "unanswered")})
-        return found + Counter({
-            "damaged": seen["damaged"] + rig["damaged"],
-            "gaps_rig": rig["gaps"],
-            "records_lost": seen["records_lost"] + seen["records_unreadable"],
-            "machine_frames_lost": rig["refused_frames"] + rig["dropped_frames"],
-            "machine_stalls": rig["stalls"],
-        })  # fmt: skip
+        return found + Counter(
+            {
+                "damaged": seen["damaged"] + rig["damaged"],
+                "gaps_rig": rig["gaps"],
+                "records_lost": seen["records_lost"] + seen["records_unreadable"],
+                "machine_frames_lost": rig["refused_frames"] + rig["dropped_frames"],
+                "machine_stalls": rig["stalls"],
+            }
+        )
 
     def take_events(self) -> Events:
         """What was lost, stopped or stalled since the start or the last call."""

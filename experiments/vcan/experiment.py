@@ -26,8 +26,17 @@ MAX_LONGEST_MS: Final = 25.0
 KINDS: Final = {"demo": "one log into the bunk", "mission": "mission with three logs"}
 CLOCKS: Final = ("real", "simulated", "native")
 SEED_FIGURES: Final = (
-    "done", "stops", "leases_lost", "refused", "missed_ticks", "seconds", "wall_s", "steal_ms", "lost_ms", "longest_ms",
-)  # fmt: skip
+    "done",
+    "stops",
+    "leases_lost",
+    "refused",
+    "missed_ticks",
+    "seconds",
+    "wall_s",
+    "steal_ms",
+    "lost_ms",
+    "longest_ms",
+)
 CONCLUSION: Final = tuple(
     f"{title}: {{{kind}_runs}} runs, {{{kind}_done}} done, {{{kind}_stops}} stops; {{{kind}_real}} in real time, "
     f"{{{kind}_simulated}} in simulated time."
@@ -52,10 +61,14 @@ def _metrics(kind: str, title: str) -> Iterator[Metric]:
         yield Metric(f"{kind}_{clock}", f"Runs in {words}: {title}", "", "As announced.")
         yield Metric(f"{kind}_{clock}_stops", f"Stops in {words}: {title}", "", "Of these runs alone.")
     yield Metric(
-        f"{kind}_real_share", f"Share of runs in real time: {title}", "%",
+        f"{kind}_real_share",
+        f"Share of runs in real time: {title}",
+        "%",
         "In user-mode Linux or natively; simulated only where the host's lost time leaves no other choice.",
-        least=1.0, scale=100.0, clocked=True,
-    )  # fmt: skip
+        least=1.0,
+        scale=100.0,
+        clocked=True,
+    )
     yield Metric(f"{kind}_wall_s", f"Duration on the host: {title}", "s", "Mean, with the start of every process.")
 
 
@@ -80,9 +93,15 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, (), ["palms_471", "aoro_fc8"], options.truth, (*LOCKSTEP_SOURCES, "host")) as kept:
         outcomes = pool.run(perform, jobs, kept, Workers(1), "vcan runs", console)
         result = make_result(
-            "vcan", METRICS, gather(outcomes), profile=profile_named(options.profile).name, seed=options.seed,
-            trials=trials, more=environment_of(outcomes), noisy=noisy(outcomes),
-        )  # fmt: skip
+            "vcan",
+            METRICS,
+            gather(outcomes),
+            profile=profile_named(options.profile).name,
+            seed=options.seed,
+            trials=trials,
+            more=environment_of(outcomes),
+            noisy=noisy(outcomes),
+        )
         publish(result, page_of(result, {}), options, console)
     return result
 

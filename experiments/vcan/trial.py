@@ -33,9 +33,18 @@ def command(kind: str, seed: int, out: Path) -> list[str]:
     mission = ["mission", "run", MISSION, "--logs", str(MISSION_LOGS), "--detector", "perfect"]
     job = mission if kind == "mission" else ["demo"]
     return [
-        sys.executable, "-m", "timberhand", *job, "--bus", "vcan", "--seed", str(seed), "--no-console",
-        "--out", str(out),
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "timberhand",
+        *job,
+        "--bus",
+        "vcan",
+        "--seed",
+        str(seed),
+        "--no-console",
+        "--out",
+        str(out),
+    ]
 
 
 def perform(job: Job) -> dict[str, Any]:

@@ -52,9 +52,14 @@ class _Calibrator:
     """The procedure as the planner of the lockstep; it plans with the first report of a machine that is ready."""
 
     def __init__(
-        self, profile: Profile, plant: Plant, seed: int, surveyed: bool, chosen: Collection[Joint],
+        self,
+        profile: Profile,
+        plant: Plant,
+        seed: int,
+        surveyed: bool,
+        chosen: Collection[Joint],
         show: Callable[[CalibrationPlan], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.calibration: Calibration | None = None
         self.plan: CalibrationPlan | None = None
         self.refused: str | None = None

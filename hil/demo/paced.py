@@ -50,8 +50,9 @@ SHOW_NS: Final = 500_000_000
 """Period of the chosen grasp on the page, as in a live run, and of the look at the page's process."""
 REQUEST_BYTES: Final = 2048
 _STAMPS: Final = {
-    StateReport: ("stamp_ns", "since_ns"), VehicleReport: ("stamp_ns", "position_ns", "heading_ns", "motion_ns")
-}  # fmt: skip
+    StateReport: ("stamp_ns", "since_ns"),
+    VehicleReport: ("stamp_ns", "position_ns", "heading_ns", "motion_ns"),
+}
 
 
 class Pace:
@@ -243,11 +244,26 @@ def run_paced(
 
             def start(display: Display) -> None:
                 processes.start(
-                    "console", "console", "--profile", name, "--port", page, "--report-port", reports,
-                    "--operator", operator, "--scene", f"{HOST}:{link.scene_port}",
+                    "console",
+                    "console",
+                    "--profile",
+                    name,
+                    "--port",
+                    page,
+                    "--report-port",
+                    reports,
+                    "--operator",
+                    operator,
+                    "--scene",
+                    f"{HOST}:{link.scene_port}",
                     *(("--foxglove", foxglove_port) if foxglove_port else ()),
-                    "--missions", "missions", "--audit", directory / AUDIT, "--recording", directory,
-                )  # fmt: skip
+                    "--missions",
+                    "missions",
+                    "--audit",
+                    directory / AUDIT,
+                    "--recording",
+                    directory,
+                )
                 processes.set_niceness("console", NICENESS["console"])
                 served = processes.await_message("console", "url", START_S)
                 display.event(f"operator's page: {served['url']}", "bold")

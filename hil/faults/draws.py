@@ -72,9 +72,19 @@ def _arm_joint(random: Random) -> str:
     return random.choice(("slew", "lift", "tilt", "ext"))
 
 
-def _one(random: Random, fault: str, expected: str, bound_ms: float, part: str = "", size: float = math.nan,
-         length_s: float = math.inf, moves: str = "", seen_ms: float = 0.0, tip_limit_m: float | None = None,
-         window_s: float = 0.0) -> Injection:  # fmt: skip
+def _one(
+    random: Random,
+    fault: str,
+    expected: str,
+    bound_ms: float,
+    part: str = "",
+    size: float = math.nan,
+    length_s: float = math.inf,
+    moves: str = "",
+    seen_ms: float = 0.0,
+    tip_limit_m: float | None = None,
+    window_s: float = 0.0,
+) -> Injection:
     order = Order(fault, part, 0.0, length_s, size, random.getrandbits(32))
     return Injection((order,), expected, bound_ms, seen_ms, moves, tip_limit_m, window_s)
 

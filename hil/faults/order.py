@@ -35,9 +35,14 @@ class Order:
 
 
 def make(
-    name: str, word: str = "", part: str = "", at_s: float = 0.0, length_s: float = FOREVER_S, size: float = math.nan,
+    name: str,
+    word: str = "",
+    part: str = "",
+    at_s: float = 0.0,
+    length_s: float = FOREVER_S,
+    size: float = math.nan,
     seed: int = 0,
-) -> Order:  # fmt: skip
+) -> Order:
     """An order from a person's words; a part that is left out is the fault's default.
 
     Raises:

@@ -134,7 +134,7 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "plc-off": FaultKind("plc", Word.OFF, Edge.LINK, "cable is open", not_live="pull its cable or end its process"),
     "process-off": FaultKind("process", Word.OFF, _S, "is killed", Part.PROCESS, "planner"),
     "process-stuck": FaultKind("process", Word.STUCK, _S, "does not run for a while", Part.PROCESS, "controller"),
-}  # fmt: skip
+}
 PROCESSES: Final = ("controller", "guard", "planner")
 
 

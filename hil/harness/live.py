@@ -180,10 +180,12 @@ class LiveRun(ABC, Generic[Outcome]):
     def _write_addresses(self, bus: list[str], ports: dict[str, int]) -> None:
         """Tell other processes where this run can be reached (`hil.faults.live`)."""
         document = {
-            "profile": self._options.profile_name, "ports": ports, "key_file": str(self._key_file),
+            "profile": self._options.profile_name,
+            "ports": ports,
+            "key_file": str(self._key_file),
             "buses": dict(b.split("=", 1) for b in bus[1::2]),
             "pids": {name: child.process.pid for name, child in self._processes.children.items()},
-        }  # fmt: skip
+        }
         (self._options.directory / ADDRESSES).write_text(json.dumps(document, indent=2))
 
     def _start_bus(self) -> list[str]:
@@ -204,11 +206,23 @@ class LiveRun(ABC, Generic[Outcome]):
         """
         options = self._options
         self._start(
-            "recorder", "recorder", *self._profile, *bus, "--out", options.directory, "--seed", options.seed,
+            "recorder",
+            "recorder",
+            *self._profile,
+            *bus,
+            "--out",
+            options.directory,
+            "--seed",
+            options.seed,
             "--no-sync",
-            "--ticks", self._ticks, "--report-port", ports["reports"], *self._timing, *self._keyed,
+            "--ticks",
+            self._ticks,
+            "--report-port",
+            ports["reports"],
+            *self._timing,
+            *self._keyed,
             *(("--pictures", f"{HOST}:{ports['detector']}") if options.camera else ()),
-        )  # fmt: skip
+        )
         self._processes.await_message("recorder", "ready", START_S)
         self._processes.set_fifo_priority("recorder", RECORDER_PRIORITY)
         plant = (*self._profile, "--seed", options.seed, "--truth", options.truth, "--port", ports["sim"])
@@ -239,14 +253,38 @@ class LiveRun(ABC, Generic[Outcome]):
             self._start("faults", "hil.faults", "--run", options.directory, "--socket", self._desk)
             self._processes.await_message("faults", "ready", START_S)
             self._start(
-                "console", "console", *self._profile, "--port", self._options.console_port,
-                "--report-port", ports["page"], "--operator", self._operators, "--planner", f"{HOST}:{ports['orders']}",
-                "--scene", scene, *self._timing, *self._keyed, *bus, "--faults", self._desk, "--missions", "missions",
-                "--truth", f"{HOST}:{ports['sim']}",
+                "console",
+                "console",
+                *self._profile,
+                "--port",
+                self._options.console_port,
+                "--report-port",
+                ports["page"],
+                "--operator",
+                self._operators,
+                "--planner",
+                f"{HOST}:{ports['orders']}",
+                "--scene",
+                scene,
+                *self._timing,
+                *self._keyed,
+                *bus,
+                "--faults",
+                self._desk,
+                "--missions",
+                "missions",
+                "--truth",
+                f"{HOST}:{ports['sim']}",
                 *(("--foxglove", options.foxglove_port) if options.foxglove_port else ()),
-                "--audit", options.directory / AUDIT, "--recording", options.directory,
-                "--controller", control, "--commission", options.directory / "commissioning",
-            )  # fmt: skip
+                "--audit",
+                options.directory / AUDIT,
+                "--recording",
+                options.directory,
+                "--controller",
+                control,
+                "--commission",
+                options.directory / "commissioning",
+            )
             served = self._processes.await_message("console", "url", START_S)
             self._display.event(f"operator's page: {served['url']}", "bold")
             if "foxglove" in served:
@@ -254,11 +292,21 @@ class LiveRun(ABC, Generic[Outcome]):
         told = [ports["page"]] if options.console_port else []
         told += [ports["reports"]] if options.profile.carrier is not None else []  # the recorder keeps the log map
         self._start(
-            "autonomy", "autonomy", *self._profile,
-            "--controller", control, "--report-port", ports["planner"], "--scene", scene,
-            "--order-port", ports["orders"], *self._keyed, *(x for port in told for x in ("--tell", f"{HOST}:{port}")),
+            "autonomy",
+            "autonomy",
+            *self._profile,
+            "--controller",
+            control,
+            "--report-port",
+            ports["planner"],
+            "--scene",
+            scene,
+            "--order-port",
+            ports["orders"],
+            *self._keyed,
+            *(x for port in told for x in ("--tell", f"{HOST}:{port}")),
             *self.planner_arguments,
-        )  # fmt: skip
+        )
         self._processes.await_message("autonomy", "event", START_S)
         self._processes.set_fifo_priority("autonomy", PLANNER_PRIORITY)
 
@@ -269,9 +317,17 @@ class LiveRun(ABC, Generic[Outcome]):
             return ports["sim"]
         frames = f"{HOST}:{ports['pictures']}"
         self._start(
-            "detector", "autonomy.perception", *self._profile, "--camera", camera, "--frames", frames,
-            "--port", ports["detector"], *self.detector_arguments,
-        )  # fmt: skip
+            "detector",
+            "autonomy.perception",
+            *self._profile,
+            "--camera",
+            camera,
+            "--frames",
+            frames,
+            "--port",
+            ports["detector"],
+            *self.detector_arguments,
+        )
         self._display.event(f"camera {camera!r} detects the logs")
         return int(self._processes.await_message("detector", "ready", START_S)["ready"])
 
@@ -281,10 +337,20 @@ class LiveRun(ABC, Generic[Outcome]):
         listeners = [self._socket.getsockname()[1], ports["planner"], ports["reports"]]
         listeners += [ports["page"]] if self._options.console_port else []
         self._start(
-            "controller", "controller", *self._profile, *bus, "--setpoint-port", ports["control"],
-            "--operator", self._operators, "--record", self._ticks, *self._timing, *self._keyed,
+            "controller",
+            "controller",
+            *self._profile,
+            *bus,
+            "--setpoint-port",
+            ports["control"],
+            "--operator",
+            self._operators,
+            "--record",
+            self._ticks,
+            *self._timing,
+            *self._keyed,
             *(x for port in listeners for x in ("--report", f"{HOST}:{port}")),
-        )  # fmt: skip
+        )
 
     def _start(self, name: str, module: str, *arguments: object) -> None:
         self._processes.start(name, module, *arguments)

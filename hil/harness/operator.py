@@ -21,9 +21,7 @@ MAX_STOPS: Final = 20
 """Default number of stops after which the operator gives up."""
 MAX_PRESSES: Final = 90
 """Presses of ARM or RESET that may leave the mode as it is before the operator gives up: three minutes."""
-_BUTTONS: Final = {
-    Mode.STANDBY: OperatorAction.ARM, Mode.STOP: OperatorAction.ARM, Mode.FAULT: OperatorAction.RESET
-}  # fmt: skip
+_BUTTONS: Final = {Mode.STANDBY: OperatorAction.ARM, Mode.STOP: OperatorAction.ARM, Mode.FAULT: OperatorAction.RESET}
 
 
 class Operator:

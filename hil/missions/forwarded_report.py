@@ -32,10 +32,12 @@ def report_loads(
     forwarded = [
         ForwardedLoad(
             tuple(ForwardedLog(x.position, when(x.at_ns), x.volume_m3, assortment=x.assortment) for x in load.logs),
-            mission.landings[load.landing], when(load.at_ns), load.driven_m,
+            mission.landings[load.landing],
+            when(load.at_ns),
+            load.driven_m,
         )
         for load in loads
-    ]  # fmt: skip
+    ]
     who = Forwarder(profile.name, profile.title, mission.name)
     path = directory / NAME
     path.write_bytes(write_fpr(forwarded, who, forwarded[-1].unloaded, f"timberhand {version('timberhand')}"))

@@ -77,9 +77,17 @@ class LiveMission(LiveRun[MissionSummary]):
     """
 
     def __init__(
-        self, options: LiveOptions, display: Display, file: Path, mission: ForwardingMission, manager: str, logs: int,
-        terrain: str = "flat", detector: str = PERFECT, planner: PlannerChoice = OUR_PLANNER,
-    ) -> None:  # fmt: skip
+        self,
+        options: LiveOptions,
+        display: Display,
+        file: Path,
+        mission: ForwardingMission,
+        manager: str,
+        logs: int,
+        terrain: str = "flat",
+        detector: str = PERFECT,
+        planner: PlannerChoice = OUR_PLANNER,
+    ) -> None:
         super().__init__(_with_camera(options, detector), display)
         site = options.directory / SITE
         site_of(mission, options.profile, options.seed, options.truth, logs, terrain).save(site)
@@ -133,9 +141,16 @@ class LiveMission(LiveRun[MissionSummary]):
 
 
 def run_live_mission(
-    file: Path, mission: ForwardingMission, options: LiveOptions, manager: str, logs: int, console: Console,
-    terrain: str = "flat", detector: str = PERFECT, planner: PlannerChoice = OUR_PLANNER,
-) -> MissionSummary:  # fmt: skip
+    file: Path,
+    mission: ForwardingMission,
+    options: LiveOptions,
+    manager: str,
+    logs: int,
+    console: Console,
+    terrain: str = "flat",
+    detector: str = PERFECT,
+    planner: PlannerChoice = OUR_PLANNER,
+) -> MissionSummary:
     """Run the mission as separate processes in real time.
 
     Raises:

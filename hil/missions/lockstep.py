@@ -123,10 +123,14 @@ class MissionRun:
         code = profile_hash(profile)
         uses_memory = detector != "perfect"
         self.manager = ActivityManager(
-            profile, code, mission, TABLES[manager], selector=PlannerSelection(planner or SamplingPlanner()),
+            profile,
+            code,
+            mission,
+            TABLES[manager],
+            selector=PlannerSelection(planner or SamplingPlanner()),
             uses_memory=uses_memory,
             unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
-        )  # fmt: skip
+        )
         self.manager.auto()
         self.plant = plant
         self._recorder, self._code = recorder, code

@@ -42,9 +42,11 @@ def site_of(
     places = [
         LogPlace(
             *origin.local(log.position.latitude_deg, log.position.longitude_deg)[:2],
-            None if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg), log.length_m, log.diameter_m,
+            None if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg),
+            log.length_m,
+            log.diameter_m,
         )
         for log in mission.logs
-    ]  # fmt: skip
+    ]
     laps = mission.options.laps
     return Site(lat, lon, place_logs(profile, truth, seed, places, laps), len(places), laps, terrain)

@@ -60,9 +60,12 @@ def take_picture(profile: Profile, request: PictureRequest, path: Path) -> None:
             foot, _ = world.base_pose()
             aim = (foot[0], foot[1] + (1.5 if profile.carrier is None else 0.0), foot[2] + 1.0)  # between foot and boom
             view = orbit(
-                aim, request.distance_m, math.radians(request.azimuth_deg), math.radians(request.elevation_deg),
+                aim,
+                request.distance_m,
+                math.radians(request.azimuth_deg),
+                math.radians(request.elevation_deg),
                 pinhole(*SIZE_PX, VIEW_RAD),
-            )  # fmt: skip
+            )
             picture = render(scene_from_world(world), view, ImagingConditions()).rgb
         else:
             frame = CameraRig(world, profile, world.truth, request.seed, size_px=None).frame(request.camera, 0)

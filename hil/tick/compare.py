@@ -57,9 +57,10 @@ def need_build() -> str:
     build, reason = find_build()
     if build is None:
         raise CommandFailed(
-            "tick.not-compiled", f"there is no compiled tick to compare ({reason}): timberhand compile",
+            "tick.not-compiled",
+            f"there is no compiled tick to compare ({reason}): timberhand compile",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     return build.key
 
 
@@ -92,10 +93,12 @@ def compare_cost(
         for caches in CACHES
     }
     return {
-        "recording": recording.parent.name, "ticks": turns["interpreter"][0]["ticks"],
+        "recording": recording.parent.name,
+        "ticks": turns["interpreter"][0]["ticks"],
         **{side: _quietest(found) for side, found in turns.items()},
-        **{name: found["ratio"] for name, found in ratios.items()}, "ratios": ratios,
-    }  # fmt: skip
+        **{name: found["ratio"] for name, found in ratios.items()},
+        "ratios": ratios,
+    }
 
 
 def _quietest(turns: list[dict[str, Any]]) -> dict[str, Any]:
@@ -131,9 +134,12 @@ def compare_random(recording: Path, seed: int, ticks: int, progress: Progress) -
             process.kill()
             process.wait()
     return {
-        "recording": recording.parent.name, "seed": seed, "ticks": agreed["ticks"], "modes": agreed["modes"],
+        "recording": recording.parent.name,
+        "seed": seed,
+        "ticks": agreed["ticks"],
+        "modes": agreed["modes"],
         "differs_after": differs_after,
-    }  # fmt: skip
+    }
 
 
 def environment() -> dict[str, Any]:
@@ -147,8 +153,10 @@ def environment() -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "cpus": os.cpu_count(), "mypy": mypy, "evicted_mb": worker.eviction_bytes() >> 20,
-    }  # fmt: skip
+        "cpus": os.cpu_count(),
+        "mypy": mypy,
+        "evicted_mb": worker.eviction_bytes() >> 20,
+    }
 
 
 def _start(side: str, folder: Path | None, *arguments: object) -> subprocess.Popen[str]:
@@ -158,10 +166,12 @@ def _start(side: str, folder: Path | None, *arguments: object) -> subprocess.Pop
         stdout=subprocess.PIPE,
         text=True,
         env={
-            **os.environ, SWITCH: SIDES.get(side, "1"), "OMP_NUM_THREADS": "1",
+            **os.environ,
+            SWITCH: SIDES.get(side, "1"),
+            "OMP_NUM_THREADS": "1",
             "PYTHONPATH": str(folder or source_root()),
         },
-    )  # fmt: skip
+    )
 
 
 def _run(side: str, folder: Path | None, *arguments: object) -> str:

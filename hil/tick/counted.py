@@ -34,13 +34,27 @@ def count(recording: Path, ticks: int, folder: Path) -> dict[str, Any]:
         sentence = "counting needs valgrind: apt-get install valgrind"
         raise CommandFailed("tick.no-valgrind", sentence, ExitCode.CONFIGURATION)
     done = subprocess.run(
-        ["valgrind", "--tool=callgrind", f"--callgrind-out-file={folder / 'callgrind'}", "--cache-sim=yes",
-         "--I1=32768,8,64", "--D1=32768,8,64", f"--LL={worker.COUNTED_CACHE_BYTES},16,64", "--collect-atstart=no",
-         "--toggle-collect=CPyDef_step___step", sys.executable, "-P", worker.__file__, "counted", str(recording),
-         str(ticks)],
-        capture_output=True, text=True,
+        [
+            "valgrind",
+            "--tool=callgrind",
+            f"--callgrind-out-file={folder / 'callgrind'}",
+            "--cache-sim=yes",
+            "--I1=32768,8,64",
+            "--D1=32768,8,64",
+            f"--LL={worker.COUNTED_CACHE_BYTES},16,64",
+            "--collect-atstart=no",
+            "--toggle-collect=CPyDef_step___step",
+            sys.executable,
+            "-P",
+            worker.__file__,
+            "counted",
+            str(recording),
+            str(ticks),
+        ],
+        capture_output=True,
+        text=True,
         env={**os.environ, "PYTHONPATH": str(source_root()), "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+    )
     return {"recording": recording.parent.name, **_per_tick(done.stdout, done.stderr)}
 
 
@@ -58,6 +72,9 @@ def _per_tick(said: str, told: str) -> dict[str, float]:
         )
     n = int(ran[1])
     return {
-        "ticks": n, "instructions": round(totals["Ir"] / n), "code_lines": round(totals["ILmr"] / n),
-        "read_lines": round(totals["DLmr"] / n), "written_lines": round(totals["DLmw"] / n),
-    }  # fmt: skip
+        "ticks": n,
+        "instructions": round(totals["Ir"] / n),
+        "code_lines": round(totals["ILmr"] / n),
+        "read_lines": round(totals["DLmr"] / n),
+        "written_lines": round(totals["DLmw"] / n),
+    }

@@ -25,10 +25,19 @@ def called(recording: Path, folder: Path) -> set[str]:
     """The compiled functions that run in the ticks of a recording, by valgrind's callgrind."""
     out = folder / "callgrind"
     subprocess.run(
-        ["valgrind", "--tool=callgrind", f"--callgrind-out-file={out}", "--collect-atstart=no",
-         "--toggle-collect=CPyDef_step___step*", sys.executable, worker.__file__, "replay", str(recording)],
+        [
+            "valgrind",
+            "--tool=callgrind",
+            f"--callgrind-out-file={out}",
+            "--collect-atstart=no",
+            "--toggle-collect=CPyDef_step___step*",
+            sys.executable,
+            worker.__file__,
+            "replay",
+            str(recording),
+        ],
         check=True,
-    )  # fmt: skip
+    )
     return set(_FUNCTION.findall(out.read_text()))
 
 

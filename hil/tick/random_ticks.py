@@ -30,9 +30,7 @@ class RandomTicks:
 
     def __init__(self, recorded: Sequence[TickRecord], databases: Sequence[Database], seed: int) -> None:
         self._recorded = recorded
-        self._data_ids = {
-            codec.key: codec.data_ids for database in databases for codec in database.messages.values()
-        }  # fmt: skip
+        self._data_ids = {codec.key: codec.data_ids for database in databases for codec in database.messages.values()}
         self._keys = sorted(self._data_ids)
         self._random = random.Random(seed)
 
@@ -60,10 +58,13 @@ class RandomTicks:
             return replace(tick, late_ns=late_ns, missed_ticks=tick.missed_ticks + rng.randrange(3))
         if choice == 4:
             bus = replace(
-                tick.bus, state=rng.randrange(5), dropped=tick.bus.dropped + rng.randrange(2),
-                refused=tick.bus.refused + rng.randrange(2), errors=tick.bus.errors + rng.randrange(3),
+                tick.bus,
+                state=rng.randrange(5),
+                dropped=tick.bus.dropped + rng.randrange(2),
+                refused=tick.bus.refused + rng.randrange(2),
+                errors=tick.bus.errors + rng.randrange(3),
                 recoveries=tick.bus.recoveries + rng.randrange(2),
-            )  # fmt: skip
+            )
             return replace(tick, bus=bus) if rng.random() < 0.5 else replace(tick, machine_bus=bus)
         if rng.random() < 0.3:
             return replace(tick, operator=self._changed_datagrams(list(tick.operator), tick.now_ns))

@@ -36,7 +36,9 @@ def compared(slow: Sequence[float], fast: Sequence[float], at_least: float) -> d
     ratios = [a / b for a, b in zip(slow, fast, strict=True)]
     low, high = median_interval(ratios)
     return {
-        "ratio": round(statistics.median(ratios), 3), "low": round(low, 3),
+        "ratio": round(statistics.median(ratios), 3),
+        "low": round(low, 3),
         "high": round(high, 3) if math.isfinite(high) else None,
-        "at_least": at_least, "verdict": verdict((low, high), at_least),
-    }  # fmt: skip
+        "at_least": at_least,
+        "verdict": verdict((low, high), at_least),
+    }

@@ -55,9 +55,12 @@ def release(wanted: str, progress: Progress) -> Release:
                 archive.extractall(new, filter="data")
     progress(f"compiling the tick of {wanted}, unless it is ready")
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "timberhand", "compile"], cwd=made, capture_output=True, text=True,
+        [sys.executable, "-P", "-m", "timberhand", "compile"],
+        cwd=made,
+        capture_output=True,
+        text=True,
         env={**os.environ, "PYTHONPATH": str(made)},
-    )  # fmt: skip
+    )
     if done.returncode:
         raise _failed(f"the tick of {wanted} does not compile: {done.stderr[-500:].strip()}")
     return Release(f"{wanted} ({commit[:12]})", made)

@@ -86,9 +86,11 @@ def cost(place: Path, limit: int) -> dict[str, Any]:
     gc.freeze()
     gc.disable()
     return {
-        "tick": str(running()), "ticks": len(ticks), "hot": _timed(settings, ticks, lambda: None),
+        "tick": str(running()),
+        "ticks": len(ticks),
+        "hot": _timed(settings, ticks, lambda: None),
         "cold": _timed(settings, ticks, evict),
-    }  # fmt: skip
+    }
 
 
 def counted(place: Path, limit: int) -> dict[str, Any]:
@@ -125,9 +127,12 @@ def replayed(place: Path) -> dict[str, Any]:
         differing += made != (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
         digest.update(digest_of(made))
     return {
-        "tick": str(running()), "machine": platform.machine(), "ticks": len(ticks), "differing": differing,
+        "tick": str(running()),
+        "machine": platform.machine(),
+        "ticks": len(ticks),
+        "differing": differing,
         "digest": digest.hexdigest(),
-    }  # fmt: skip
+    }
 
 
 def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], None]) -> dict[str, Any]:
@@ -152,12 +157,17 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
         wall.append(end - begin - timer_wall)
         cpu.append(cpu_end - cpu_begin - timer_cpu)
         differing += transmitted(outputs) != (
-            tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report
-        )  # fmt: skip
+            tick.frames_out,
+            tick.machine_frames_out,
+            tick.report,
+            tick.vehicle_report,
+        )
     return {
-        "differing": differing, "instructions_p50": sorted(counts)[len(counts) // 2] if counts else None,
-        **_quantiles("", wall), **_quantiles("cpu_", cpu),
-    }  # fmt: skip
+        "differing": differing,
+        "instructions_p50": sorted(counts)[len(counts) // 2] if counts else None,
+        **_quantiles("", wall),
+        **_quantiles("cpu_", cpu),
+    }
 
 
 def _use_huge_pages() -> None:

@@ -28,10 +28,19 @@ from hil.wire.server import Server, serve
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m hil.wire.daemon", description="User-space CAN buses.")
     parser.add_argument("--bus", action="append", required=True, type=_bus, metavar="NAME:BITRATE")
-    parser.add_argument("--join", action="append", default=[], type=_join, metavar="NAME=INTERFACE",
-                        help="let a SocketCAN interface take part")  # fmt: skip
-    parser.add_argument("--dir", type=Path, help="directory of the sockets (default: TIMBERHAND_WIRE_DIR or "
-                        "the user's runtime directory)")  # fmt: skip
+    parser.add_argument(
+        "--join",
+        action="append",
+        default=[],
+        type=_join,
+        metavar="NAME=INTERFACE",
+        help="let a SocketCAN interface take part",
+    )
+    parser.add_argument(
+        "--dir",
+        type=Path,
+        help="directory of the sockets (default: TIMBERHAND_WIRE_DIR or the user's runtime directory)",
+    )
     parser.add_argument("--ready-fd", type=int, help="also write 'ready' to this descriptor and close it")
     options = parser.parse_args(arguments)
     stop, wakeup = socket.socketpair()

@@ -51,9 +51,24 @@ class Node:
     """One participant: its queues, counters and error state; only the core changes it."""
 
     __slots__ = (
-        "done", "dropped", "hold_ns", "name", "queue", "queue_limit", "rec", "receive_own",
-        "refill_ns", "refused", "retiring", "rx", "rx_limit", "segment", "state", "tec", "wanted",
-    )  # fmt: skip
+        "done",
+        "dropped",
+        "hold_ns",
+        "name",
+        "queue",
+        "queue_limit",
+        "rec",
+        "receive_own",
+        "refill_ns",
+        "refused",
+        "retiring",
+        "rx",
+        "rx_limit",
+        "segment",
+        "state",
+        "tec",
+        "wanted",
+    )
 
     def __init__(
         self, name: str, wanted: Container[int] | None, receive_own: bool, queue_limit: int, rx_limit: int

@@ -83,9 +83,12 @@ def _build(root: Path, folder: Path, progress: Progress) -> str:
             for path in sorted(made.rglob(f"*{suffix}"))
         }
         manifest = {
-            "platform": compiled.platform_tag(), "mypy": metadata.version("mypy"), "modules": list(MODULES),
-            "sources": sources, "files": files,
-        }  # fmt: skip
+            "platform": compiled.platform_tag(),
+            "mypy": metadata.version("mypy"),
+            "modules": list(MODULES),
+            "sources": sources,
+            "files": files,
+        }
         (made / compiled.MANIFEST).write_text(json.dumps(manifest, indent=1))
         key = compiled.key_of(manifest)
         target = folder / key
@@ -144,9 +147,12 @@ def _remove_old(folder: Path, key: str) -> None:
 
 def _answer(key: str, folder: Path, begin_s: float, new: bool) -> dict[str, Any]:
     return {
-        "key": key, "folder": str(folder / key), "modules": len(MODULES),
-        "seconds": round(time.monotonic() - begin_s, 1), "new": new,
-    }  # fmt: skip
+        "key": key,
+        "folder": str(folder / key),
+        "modules": len(MODULES),
+        "seconds": round(time.monotonic() - begin_s, 1),
+        "new": new,
+    }
 
 
 def _failed(code: str, sentence: str) -> CommandFailed:

@@ -83,9 +83,12 @@ def main() -> None:
 
     (target,) = sys.argv[1:]
     setup(
-        name="timberhand-compiled-tick", packages=[], py_modules=[], ext_modules=extensions(Path()),
+        name="timberhand-compiled-tick",
+        packages=[],
+        py_modules=[],
+        ext_modules=extensions(Path()),
         script_args=["build_ext", "--build-lib", target],
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

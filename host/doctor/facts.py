@@ -15,11 +15,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-BOOT_WORDS: Final = frozenset({
-    "isolcpus", "nohz_full", "rcu_nocbs", "irqaffinity", "preempt", "threadirqs", "idle", "processor.max_cstate",
-    "intel_idle.max_cstate", "intel_pstate", "amd_pstate", "clocksource", "tsc", "skew_tick", "nosoftlockup",
-    "nmi_watchdog", "mitigations", "maxcpus", "nosmt", "mce",
-})  # fmt: skip
+BOOT_WORDS: Final = frozenset(
+    {
+        "isolcpus",
+        "nohz_full",
+        "rcu_nocbs",
+        "irqaffinity",
+        "preempt",
+        "threadirqs",
+        "idle",
+        "processor.max_cstate",
+        "intel_idle.max_cstate",
+        "intel_pstate",
+        "amd_pstate",
+        "clocksource",
+        "tsc",
+        "skew_tick",
+        "nosoftlockup",
+        "nmi_watchdog",
+        "mitigations",
+        "maxcpus",
+        "nosmt",
+        "mce",
+    }
+)
 """Words of the kernel's command line that change its timing (admin-guide/kernel-parameters)."""
 UNLIMITED: Final = -1
 """A limit of "unlimited"."""

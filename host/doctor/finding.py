@@ -35,9 +35,12 @@ class Finding:
     def document(self) -> dict[str, Any]:
         """The finding as plain values for JSON."""
         return {
-            "what": self.what, "severity": self.severity.name.lower(), "sentence": self.sentence,
-            "gain": self.gain, "commands": list(self.commands),
-        }  # fmt: skip
+            "what": self.what,
+            "severity": self.severity.name.lower(),
+            "sentence": self.sentence,
+            "gain": self.gain,
+            "commands": list(self.commands),
+        }
 
 
 def fine(what: str, sentence: str) -> Finding:
@@ -46,9 +49,11 @@ def fine(what: str, sentence: str) -> Finding:
 
 
 _MARKS = {
-    Severity.FINE: ("✓", "green"), Severity.ADVICE: ("·", "cyan"), Severity.CHANGE: ("!", "bold yellow"),
+    Severity.FINE: ("✓", "green"),
+    Severity.ADVICE: ("·", "cyan"),
+    Severity.CHANGE: ("!", "bold yellow"),
     Severity.FAULT: ("✗", "bold red"),
-}  # fmt: skip
+}
 _CONCLUSIONS = {
     Severity.FINE: "No problems.",
     Severity.ADVICE: "No problems; {} improvement{} (·) possible.",

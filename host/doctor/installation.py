@@ -32,9 +32,11 @@ from host.vcan_lab.spec import LabError, Request
 from machine.loading.profile_file import ProfileError, load_profile, shipped_profiles
 
 EXTRAS: Final = {
-    "sim": "the simulated plant: `make demo`", "autonomy": "the planner", "console": "the operator's page",
+    "sim": "the simulated plant: `make demo`",
+    "autonomy": "the planner",
+    "console": "the operator's page",
     "tools": "plots and pictures",
-}  # fmt: skip
+}
 """The purpose of each optional group of packages."""
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
 DATA: Final = Path("/var/lib/timberhand")

@@ -117,9 +117,10 @@ def program_sums(wheel: Path) -> dict[str, str]:
         names = [name for name in archive.namelist() if not name.endswith(("/", "/RECORD"))]
         if moved := [name for name in names if ".data/" in name]:
             raise CommandFailed(
-                "bundle.data-files", f"{wheel} installs {moved[0]} outside site-packages; build it without",
+                "bundle.data-files",
+                f"{wheel} installs {moved[0]} outside site-packages; build it without",
                 ExitCode.CONFIGURATION,
-            )  # fmt: skip
+            )
         return {name: hashlib.sha256(archive.read(name)).hexdigest() for name in names}
 
 
@@ -132,9 +133,10 @@ def unpack(bundle: Path, folder: Path) -> None:
     """
     if not os.access(bundle, os.R_OK):
         raise CommandFailed(
-            "bundle.unreadable", f"{bundle} cannot be read; name the file that `make bundle` made",
+            "bundle.unreadable",
+            f"{bundle} cannot be read; name the file that `make bundle` made",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     if bundle.is_dir():
         shutil.copytree(bundle, folder)
         return
@@ -154,9 +156,10 @@ def unpack(bundle: Path, folder: Path) -> None:
                     shutil.copyfileobj(source, file)
     except tarfile.TarError:
         raise CommandFailed(
-            "bundle.no-bundle", f"{bundle} is no bundle; name the tar file that `make bundle` made",
+            "bundle.no-bundle",
+            f"{bundle} is no bundle; name the tar file that `make bundle` made",
             ExitCode.CONFIGURATION,
-        ) from None  # fmt: skip
+        ) from None
 
 
 def check(folder: Path, public: Path) -> Release:
@@ -167,18 +170,20 @@ def check(folder: Path, public: Path) -> Release:
     """
     if not (folder / SUMS).is_file():
         raise CommandFailed(
-            "bundle.no-sums", f"{folder} holds no {SUMS}, so it is no bundle; name the file that `make bundle` made",
+            "bundle.no-sums",
+            f"{folder} holds no {SUMS}, so it is no bundle; name the file that `make bundle` made",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     verify(folder / SUMS, public)
     listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))
     unlisted = _files(folder) - listed.keys() - {SUMS, signature_path(Path(SUMS)).name}
     wrong = sums.differing(folder, listed) or sorted(unlisted)
     if wrong:
         raise CommandFailed(
-            "bundle.changed", f"{wrong[0]} in the bundle is not what was signed; get the bundle again",
+            "bundle.changed",
+            f"{wrong[0]} in the bundle is not what was signed; get the bundle again",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     release = Release(**json.loads((folder / MARKER).read_text()))
     if release.machine != platform.machine():
         raise CommandFailed(
@@ -217,20 +222,26 @@ def _add_packages(folder: Path, release: Release, find_links: Path | None, lock:
         command += ["--python-version", "3.11", "--implementation", "cp"]
     try:
         done = subprocess.run(
-            command, input=_locked(folder / release.wheel, lock),
-            capture_output=True, text=True, check=False, timeout=_DOWNLOAD_S,
-        )  # fmt: skip
+            command,
+            input=_locked(folder / release.wheel, lock),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_DOWNLOAD_S,
+        )
     except subprocess.TimeoutExpired:
         raise CommandFailed(
-            "bundle.slow-download", f"the packages did not come within {_DOWNLOAD_S:.0f} s; use --find-links DIR",
+            "bundle.slow-download",
+            f"the packages did not come within {_DOWNLOAD_S:.0f} s; use --find-links DIR",
             ExitCode.CONFIGURATION,
-        ) from None  # fmt: skip
+        ) from None
     if done.returncode:
         reason = next((line for line in reversed(done.stderr.splitlines()) if line.startswith("ERROR")), "no message")
         raise CommandFailed(
-            "bundle.no-packages", f"a package cannot be had: {reason}; name a folder that has it with --find-links",
+            "bundle.no-packages",
+            f"a package cannot be had: {reason}; name a folder that has it with --find-links",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
 
 
 def _locked(wheel: Path, lock: Lock) -> str:
@@ -240,9 +251,10 @@ def _locked(wheel: Path, lock: Lock) -> str:
             return archive.read(name).decode()
     except KeyError:
         raise CommandFailed(
-            "bundle.no-lock", f"{wheel.name} holds no {name}, so no package can be checked; build it anew: make wheel",
+            "bundle.no-lock",
+            f"{wheel.name} holds no {name}, so no package can be checked; build it anew: make wheel",
             ExitCode.CONFIGURATION,
-        ) from None  # fmt: skip
+        ) from None
 
 
 def _add_sbom(folder: Path) -> None:
@@ -254,9 +266,10 @@ def _add_sbom(folder: Path) -> None:
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise CommandFailed(
-            "bundle.no-sbom", f"the list of parts cannot be made: {reason}; pip install 'timberhand[audit]'",
+            "bundle.no-sbom",
+            f"the list of parts cannot be made: {reason}; pip install 'timberhand[audit]'",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
 
 
 def _files(folder: Path) -> set[str]:

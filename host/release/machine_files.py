@@ -48,14 +48,16 @@ def check(folder: Path, public: Path) -> list[str]:
     there = {path.name for path in folder.glob("*.toml")}
     if wrong := sums.differing(folder, listed) or sorted(there - listed.keys()):
         raise CommandFailed(
-            "machine-files.changed", f"{folder / wrong[0]} is not what was signed; sign it again, or restore it",
+            "machine-files.changed",
+            f"{folder / wrong[0]} is not what was signed; sign it again, or restore it",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     if PROFILE not in listed:
         raise CommandFailed(
-            "machine-files.no-profile", f"{folder} holds no {PROFILE}; name the machine's profile so",
+            "machine-files.no-profile",
+            f"{folder} holds no {PROFILE}; name the machine's profile so",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     try:
         load_profile(str(folder / PROFILE))
         read_envelope(folder / PROFILE)
@@ -82,9 +84,10 @@ def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
         _use(place, slot.name)
     except OSError as error:
         raise CommandFailed(
-            "machine-files.not-written", f"{slot} cannot be written: {error.strerror}; nothing has changed",
+            "machine-files.not-written",
+            f"{slot} cannot be written: {error.strerror}; nothing has changed",
             ExitCode.CONFIGURATION,
-        ) from None  # fmt: skip
+        ) from None
     return place / LINK / PROFILE
 
 
@@ -97,9 +100,10 @@ def revert(public: Path, place: Path = PLACE) -> Path:
     slot = place / SLOTS[_in_use(place) == SLOTS[0]]
     if not slot.is_dir():
         raise CommandFailed(
-            "machine-files.no-former", "there are no former machine files to go back to; apply the ones that you want",
+            "machine-files.no-former",
+            "there are no former machine files to go back to; apply the ones that you want",
             ExitCode.CONFIGURATION,
-        )  # fmt: skip
+        )
     check(slot, public)
     _use(place, slot.name)
     return place / LINK / PROFILE

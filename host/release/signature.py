@@ -45,9 +45,10 @@ def make_keys(folder: Path) -> tuple[Path, Path]:
         )
     except FileExistsError:
         raise CommandFailed(
-            "signature.key-exists", f"{private} exists; a new key would be another signer: name another folder",
+            "signature.key-exists",
+            f"{private} exists; a new key would be another signer: name another folder",
             ExitCode.CONFIGURATION,
-        ) from None  # fmt: skip
+        ) from None
     except OSError as error:
         raise CommandFailed(
             "signature.key-not-written", f"{folder} cannot take a key: {error.strerror}", ExitCode.CONFIGURATION

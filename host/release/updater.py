@@ -56,13 +56,28 @@ class Step(StrEnum):
 
 
 _CHANGE: Final = (
-    Step.DISARMED, Step.TRY, Step.STOP, Step.SWITCH, Step.RELOAD, Step.START, Step.GATE, Step.START_OTHERS, Step.ACCEPT,
+    Step.DISARMED,
+    Step.TRY,
+    Step.STOP,
+    Step.SWITCH,
+    Step.RELOAD,
+    Step.START,
+    Step.GATE,
+    Step.START_OTHERS,
+    Step.ACCEPT,
     Step.PRUNE,
-)  # fmt: skip
+)
 _PREPARE: Final = (Step.CHECK, Step.LINKS)
 UPDATE: Final = (
-    Step.DISARMED, Step.CLEAR, Step.UNPACK, Step.VERIFY, Step.BUILD, Step.SEAL, *_PREPARE, *_CHANGE,
-)  # fmt: skip
+    Step.DISARMED,
+    Step.CLEAR,
+    Step.UNPACK,
+    Step.VERIFY,
+    Step.BUILD,
+    Step.SEAL,
+    *_PREPARE,
+    *_CHANGE,
+)
 """To a bundle's release."""
 ROLLBACK: Final = (*_PREPARE, *_CHANGE)
 """To a release that is here already."""
@@ -155,9 +170,10 @@ class Updater:
         previous = self._trees.state().previous
         if previous is None or previous not in self._trees.whole():
             raise CommandFailed(
-                "update.no-previous", "there is no release to go back to; update to the one that you want",
+                "update.no-previous",
+                "there is no release to go back to; update to the one that you want",
                 ExitCode.CONFIGURATION,
-            )  # fmt: skip
+            )
         self._name = previous
         return self._change(ROLLBACK)
 
@@ -177,9 +193,10 @@ class Updater:
         with self._locked():
             if self._trees.state().trial is not None:
                 raise CommandFailed(
-                    "update.unfinished", "an update was interrupted; finish it first: timberhand service resume",
+                    "update.unfinished",
+                    "an update was interrupted; finish it first: timberhand service resume",
                     ExitCode.CONFIGURATION,
-                )  # fmt: skip
+                )
             self._carry_out(steps)
             return self._name
 
@@ -276,9 +293,10 @@ class Updater:
     def _locked(self) -> Iterator[None]:
         if self._trees.state().current is None:
             raise CommandFailed(
-                "update.not-installed", f"there is no installation in {self._trees.place}; see docs/how-to/service.md",
+                "update.not-installed",
+                f"there is no installation in {self._trees.place}; see docs/how-to/service.md",
                 ExitCode.CONFIGURATION,
-            )  # fmt: skip
+            )
         descriptor = os.open(self._trees.place, os.O_RDONLY | os.O_DIRECTORY)
         try:
             try:
@@ -306,6 +324,7 @@ def _run(name: str, command: Sequence[str]) -> None:
 def _of_disk(error: OSError) -> CommandFailed:
     what = "the disk is full; free some space" if error.errno == errno.ENOSPC else f"{error.strerror}; see dmesg"
     return CommandFailed(
-        "update.disk", f"{error.filename or 'a file'} cannot be written: {what}; nothing has changed",
+        "update.disk",
+        f"{error.filename or 'a file'} cannot be written: {what}; nothing has changed",
         ExitCode.CONFIGURATION,
-    )  # fmt: skip
+    )

@@ -19,12 +19,22 @@ from host.vcan_lab.spec import PACKAGE_ROOT, LabError
 CHECKOUT: Final = Path(PACKAGE_ROOT)
 GUEST: Final = Path(__file__).with_name("guest.py")
 ENTRIES: Final = (
-    "controller.__main__", "controller.process.command", "controller.guard.__main__",
-    "experiments.timing.bus_observer", "experiments.timing.emulated_machine", "experiments.timing.fitness_report",
-    "experiments.timing.setpoint_source", "experiments.timing.sleep_loop", "host.doctor.timing",
-    "host.service_lab.trial", "host.vcan_lab.links", "timberhand.cli", "timberhand.commands.doctor", "rich.console",
+    "controller.__main__",
+    "controller.process.command",
+    "controller.guard.__main__",
+    "experiments.timing.bus_observer",
+    "experiments.timing.emulated_machine",
+    "experiments.timing.fitness_report",
+    "experiments.timing.setpoint_source",
+    "experiments.timing.sleep_loop",
+    "host.doctor.timing",
+    "host.service_lab.trial",
+    "host.vcan_lab.links",
+    "timberhand.cli",
+    "timberhand.commands.doctor",
+    "rich.console",
     "ctypes",
-)  # fmt: skip
+)
 """Modules that run in the guest; what they import travels with them."""
 EXCLUDED: Final = ("test", "tests", "idlelib", "tkinter", "ensurepip", "lib2to3", "turtledemo", "site-packages")
 PROGRAMS: Final = ("cyclictest",)
@@ -76,9 +86,12 @@ def make_archive(work: Path, modules: Iterable[Path]) -> Path:
     with archive.open("wb") as out:
         for folder, members in ((Path("/"), names), (own, mine)):
             made = subprocess.run(
-                ["cpio", "--quiet", "-o", "-H", "newc", "-0", "-L"], input="\0".join(members).encode(), cwd=folder,
-                capture_output=True, check=False,
-            )  # fmt: skip
+                ["cpio", "--quiet", "-o", "-H", "newc", "-0", "-L"],
+                input="\0".join(members).encode(),
+                cwd=folder,
+                capture_output=True,
+                check=False,
+            )
             if made.returncode:
                 raise LabError("rt-lab.archive", f"cpio: {made.stderr.decode().strip()[-300:]}")
             out.write(made.stdout)

@@ -39,9 +39,15 @@ def main() -> None:
     order = json.loads(Path("/order.json").read_text())
     sys.path[:0] = order["path"]
     os.environ |= {
-        "PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(order["path"]), "RUNTIME_DIRECTORY": str(RUNTIME),
-        "HOME": "/run", "TMPDIR": "/run", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "TERM": "dumb",
-    }  # fmt: skip
+        "PATH": "/usr/bin:/bin",
+        "PYTHONPATH": ":".join(order["path"]),
+        "RUNTIME_DIRECTORY": str(RUNTIME),
+        "HOME": "/run",
+        "TMPDIR": "/run",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "TERM": "dumb",
+    }
     sys.executable = order["python"]
     result: dict[str, Any] = {"kernel": " ".join((os.uname().release, os.uname().version))}
     try:
@@ -162,9 +168,13 @@ def start(checkout: Path, module: str, *words: object) -> tuple[subprocess.Popen
     notified.bind(place)
     with open(RUNTIME / f"{module}.out", "wb") as out, open(RUNTIME / f"{module}.err", "wb") as err:
         process = subprocess.Popen(
-            [sys.executable, "-m", module, *map(str, words)], cwd=checkout, stdin=subprocess.DEVNULL, stdout=out,
-            stderr=err, env=os.environ | {"NOTIFY_SOCKET": place},
-        )  # fmt: skip
+            [sys.executable, "-m", module, *map(str, words)],
+            cwd=checkout,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            env=os.environ | {"NOTIFY_SOCKET": place},
+        )
     return process, notified
 
 

@@ -26,9 +26,15 @@ MEM_MB: Final = 1536
 NEUTRAL_MS: Final = 100.0
 """Limit for the valves after the controller is killed, as in the service lab."""
 EXPECTED: Final[dict[str, Any]] = {
-    "realtime": "1", "guard_ready": True, "controller_ready": True, "standby": True, "controller_policy": "fifo 80",
-    "guard_policy": "fifo 85", "refused": [], "cyclictest_status": 0,
-}  # fmt: skip
+    "realtime": "1",
+    "guard_ready": True,
+    "controller_ready": True,
+    "standby": True,
+    "controller_policy": "fifo 80",
+    "guard_policy": "fifo 85",
+    "refused": [],
+    "cyclictest_status": 0,
+}
 POSITIVE: Final = ("controller_locked_kb", "guard_locked_kb", "frames", "ticks", "cyclictest_cycles", "opening_pct")
 
 
@@ -80,10 +86,27 @@ def _boot(
     # When emulated, the guest's clock counts instructions, so that a slow host does not delay its loops.
     clock = ["-icount", "shift=0,sleep=off", "-rtc", "clock=vm"] if accelerator == "tcg" else []
     command = [
-        QEMU, "-accel", accelerator, *clock, "-cpu", "max", "-smp", "1", "-m", str(MEM_MB), "-kernel", str(kernel),
-        "-initrd", str(archive), "-append", "console=ttyS0 quiet panic=-1 rdinit=/init", "-nographic", "-no-reboot",
-        "-nic", "none",
-    ]  # fmt: skip
+        QEMU,
+        "-accel",
+        accelerator,
+        *clock,
+        "-cpu",
+        "max",
+        "-smp",
+        "1",
+        "-m",
+        str(MEM_MB),
+        "-kernel",
+        str(kernel),
+        "-initrd",
+        str(archive),
+        "-append",
+        "console=ttyS0 quiet panic=-1 rdinit=/init",
+        "-nographic",
+        "-no-reboot",
+        "-nic",
+        "none",
+    ]
     console: list[str] = []
     result: dict[str, Any] | None = None
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as guest:

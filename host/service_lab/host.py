@@ -97,8 +97,10 @@ def build_wheel(folder: Path) -> Path:
     shutil.copytree(ROOT, source, ignore=LEFT_OUT)
     made = subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", *_build_options(), "-w", folder, source],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if made.returncode:
         reason = (made.stderr.strip().splitlines() or ["no message"])[-1]
         raise LabError("service-lab.wheel-build", f"the wheel cannot be built: {reason}")
@@ -134,9 +136,11 @@ def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) 
         check = CHECK_SERVICE.format(program=program, packages=packages, python=python, order=folder / "order.json")
         (folder / "check.service").write_text(check)
         settings = [
-            f"LAB={folder}", f"ENVIRONMENT={Path(sys.prefix).resolve()}", f"PYTHON={python}",
+            f"LAB={folder}",
+            f"ENVIRONMENT={Path(sys.prefix).resolve()}",
+            f"PYTHON={python}",
             *([f"CHECKOUT={ROOT}"] if CHECKOUT.is_file() else []),
-        ]  # fmt: skip
+        ]
         init = program / "host" / "service_lab" / "init.sh"
         init.chmod(0o755)
         return _boot(init, settings, timeout_s, show_step)
@@ -167,9 +171,14 @@ def _warm_up(python: str, path: str) -> None:
     environment = {"PATH": os.defpath, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     try:
         subprocess.run(
-            [python, "-c", WARM_UP], env=environment, cwd="/", capture_output=True, text=True, check=True,
+            [python, "-c", WARM_UP],
+            env=environment,
+            cwd="/",
+            capture_output=True,
+            text=True,
+            check=True,
             timeout=WARM_UP_S,
-        )  # fmt: skip
+        )
     except subprocess.SubprocessError as error:
         reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
         raise LabError("service-lab.wheel-broken", f"the program in the wheel does not run: {reason}") from error
@@ -179,11 +188,23 @@ def _boot(init: Path, settings: list[str], timeout_s: float, show_step: Callable
     messages, far = os.pipe()
     log = os.memfd_create("kernel log")
     arguments = [
-        f"mem={MEM_MB}M", "root=none", "rootfstype=hostfs", "rootflags=/", "rw",
-        "con=null", "con0=null,fd:1", "ssl=null", f"con1=null,fd:{far}", "uml_dir=/proc/",
-        "quiet", "panic=1", "noreboot", "initcall_blacklist=raid6_select_algo,calibrate_xor_blocks",
-        f"init={init}", *settings,
-    ]  # fmt: skip
+        f"mem={MEM_MB}M",
+        "root=none",
+        "rootfstype=hostfs",
+        "rootflags=/",
+        "rw",
+        "con=null",
+        "con0=null,fd:1",
+        "ssl=null",
+        f"con1=null,fd:{far}",
+        "uml_dir=/proc/",
+        "quiet",
+        "panic=1",
+        "noreboot",
+        "initcall_blacklist=raid6_select_algo,calibrate_xor_blocks",
+        f"init={init}",
+        *settings,
+    ]
     env = {"PATH": os.defpath}
     if shim.needed(Path("/proc/cpuinfo").read_text()):
         env["LD_PRELOAD"] = str(shim.library(shim.user_cache()))
@@ -191,8 +212,14 @@ def _boot(init: Path, settings: list[str], timeout_s: float, show_step: Callable
     assert kernel
     guest = subprocess.Popen(
         [sys.executable, "-ISB", keeper.__file__, kernel, *arguments],
-        stdin=subprocess.PIPE, stdout=log, stderr=log, env=env, cwd="/", start_new_session=True, pass_fds=[far],
-    )  # fmt: skip
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=log,
+        env=env,
+        cwd="/",
+        start_new_session=True,
+        pass_fds=[far],
+    )
     os.close(far)
     try:
         result = _receive(messages, time.monotonic() + timeout_s, show_step)

@@ -99,6 +99,9 @@ def _namespace_fault(request: Request) -> str | None:
     as_root = "root" if request.root else ""
     trial = subprocess.run(
         [sys.executable, "-ISB", "-c", _TRY_NAMESPACE, PACKAGE_ROOT, as_root, *request.links],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     return (trial.stderr.strip().splitlines() or ["no message"])[-1] if trial.returncode else None

@@ -28,9 +28,14 @@ from typing import Any, NoReturn
 from host.vcan_lab import links
 
 MODULES = (
-    "net/can/can", "net/can/can-raw", "net/can/can-bcm", "net/can/can-gw", "net/can/j1939/can-j1939",
-    "drivers/net/can/dev/can-dev", "drivers/net/can/vcan",
-)  # fmt: skip
+    "net/can/can",
+    "net/can/can-raw",
+    "net/can/can-bcm",
+    "net/can/can-gw",
+    "net/can/j1939/can-j1939",
+    "drivers/net/can/dev/can-dev",
+    "drivers/net/can/vcan",
+)
 SETTINGS = {
     "kernel/sched_rt_runtime_us": "-1",  # a FIFO loop is never throttled
     "vm/dirty_writeback_centisecs": "50",  # the host sees written data after a second, not after thirty
@@ -259,12 +264,18 @@ class Supervisor:
             # Keep the object: its destructor would collect the exit status of the command.
             self.command = subprocess.Popen(
                 order["argv"],
-                stdin=subprocess.DEVNULL, stdout=pipes["out"][1], stderr=pipes["err"][1],
-                cwd=order["cwd"], env=order["env"], umask=order["umask"],
-                user=uid, group=gid, extra_groups=groups,
+                stdin=subprocess.DEVNULL,
+                stdout=pipes["out"][1],
+                stderr=pipes["err"][1],
+                cwd=order["cwd"],
+                env=order["env"],
+                umask=order["umask"],
+                user=uid,
+                group=gid,
+                extra_groups=groups,
                 start_new_session=True,
                 preexec_fn=lambda: _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL),
-            )  # fmt: skip
+            )
             self.pid = self.command.pid
         except OSError as reason:
             os.write(self.sinks["err"], f"vcan lab: {reason.filename}: {reason.strerror}\n".encode())

@@ -112,9 +112,12 @@ class Lab:
         out, err, control = passed
         return subprocess.Popen(
             [sys.executable, "-ISB", "-c", RUN_GUEST, PACKAGE_ROOT, str(control), str(out), str(err)],
-            stdin=subprocess.DEVNULL, stdout=self._log, stderr=self._log,
-            start_new_session=True, pass_fds=passed,
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=self._log,
+            start_new_session=True,
+            pass_fds=passed,
+        )
 
     def serve(self) -> None:
         """Forward everything until the guest has closed its channels and all output is written."""

@@ -99,15 +99,29 @@ def kernel_arguments(
     travel = ["time-travel=inf-cpu", f"time-travel-start={VIRTUAL_START_NS}"] if request.time_travel else []
     return [
         f"mem={request.mem_mb}M",
-        "root=none", "rootfstype=hostfs", "rootflags=/", "ro",
-        "con=null", "con0=null,fd:1", "ssl=null",
-        f"con{_CON_OUT}=null,fd:{out_fd}", f"con{_CON_ERR}=null,fd:{err_fd}", f"con{_CON_CONTROL}=fd:{control_fd}",
-        "uml_dir=/proc/", "quiet", "panic=1", "noreboot",
+        "root=none",
+        "rootfstype=hostfs",
+        "rootflags=/",
+        "ro",
+        "con=null",
+        "con0=null,fd:1",
+        "ssl=null",
+        f"con{_CON_OUT}=null,fd:{out_fd}",
+        f"con{_CON_ERR}=null,fd:{err_fd}",
+        f"con{_CON_CONTROL}=fd:{control_fd}",
+        "uml_dir=/proc/",
+        "quiet",
+        "panic=1",
+        "noreboot",
         "initcall_blacklist=raid6_select_algo,calibrate_xor_blocks",
         *travel,
         f"init={_quoted(python)}",
-        "--", "-ISB", "-c", _quoted(RUN_GUEST), _quoted(package_root),
-    ]  # fmt: skip
+        "--",
+        "-ISB",
+        "-c",
+        _quoted(RUN_GUEST),
+        _quoted(package_root),
+    ]
 
 
 def _quoted(text: str) -> str:

@@ -39,9 +39,14 @@ def start(kernel: str, request: Request, passed: tuple[int, int, int], log: int)
     try:
         return subprocess.Popen(
             [sys.executable, "-ISB", keeper.__file__, kernel, *arguments],
-            stdin=subprocess.PIPE, stdout=log, stderr=log,
-            env=env, cwd="/", start_new_session=True, pass_fds=inherited,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            env=env,
+            cwd="/",
+            start_new_session=True,
+            pass_fds=inherited,
+        )
     finally:
         if preload is not None:
             os.close(preload)

@@ -19,10 +19,15 @@ def envelope_kinematics(profile: Profile) -> dict[str, float]:
     """The geometry in the guard's own terms, by key [m, rad]."""
     kin = profile.kinematics
     return {
-        "boom_pin_z_m": kin.d1_m, "boom_pin_r_m": kin.a1_m, "plane_offset_rad": kin.theta1_offset_rad,
-        "boom_m": kin.a2_m, "boom_offset_rad": kin.theta2_offset_rad, "telescope_offset_m": kin.a3_m,
-        "stick_offset_rad": kin.theta3_offset_rad, "stick_m": kin.d4_m,
-    }  # fmt: skip
+        "boom_pin_z_m": kin.d1_m,
+        "boom_pin_r_m": kin.a1_m,
+        "plane_offset_rad": kin.theta1_offset_rad,
+        "boom_m": kin.a2_m,
+        "boom_offset_rad": kin.theta2_offset_rad,
+        "telescope_offset_m": kin.a3_m,
+        "stick_offset_rad": kin.theta3_offset_rad,
+        "stick_m": kin.d4_m,
+    }
 
 
 def envelope_text(profile: Profile) -> str:

@@ -94,19 +94,24 @@ def _kinematics(path: Path, chain: Mapping[str, _Placed]) -> dict[str, float]:
     along, across = (math.cos(pitch), math.sin(pitch)), (-math.sin(pitch), math.cos(pitch))
     r, z = end_r - stick_r, end_z - stick_z
     return {
-        "d1_m": pin_z, "a1_m": pin_r, "theta1_offset_rad": math.atan2(outward[1], outward[0]),
-        "a2_m": math.hypot(stick_r - pin_r, stick_z - pin_z), "theta2_offset_rad": theta2,
-        "a3_m": r * across[0] + z * across[1], "d4_m": r * along[0] + z * along[1],
+        "d1_m": pin_z,
+        "a1_m": pin_r,
+        "theta1_offset_rad": math.atan2(outward[1], outward[0]),
+        "a2_m": math.hypot(stick_r - pin_r, stick_z - pin_z),
+        "theta2_offset_rad": theta2,
+        "a3_m": r * across[0] + z * across[1],
+        "d4_m": r * along[0] + z * along[1],
         "theta3_offset_rad": pitch - theta2 + math.pi / 2.0,
-    }  # fmt: skip
+    }
 
 
 def _below_pin(known: Mapping[str, _Placed]) -> dict[str, float]:
     hanger, fork, rot, tong = (known[name].origin_m for name in BELOW)
     return {
-        "hanger_to_fork_m": math.dist(hanger, fork), "fork_to_rotator_m": math.dist(fork, rot),
+        "hanger_to_fork_m": math.dist(hanger, fork),
+        "fork_to_rotator_m": math.dist(fork, rot),
         "rotator_to_tong_pivot_m": abs(_dot(_minus(tong, rot), known["rot"].axis)),
-    }  # fmt: skip
+    }
 
 
 def _unfit(path: Path, what: str) -> AnswersError:

@@ -39,28 +39,36 @@ def profile_text(answers: Answers, messages: Mapping[int, str]) -> str:
     parts = [
         f"# {answers.title}: profile, drafted by `timberhand machine new`.\n#\n"
         '# SI units: m, rad, s; the telescope ("ext") in m.  Base frame: on the slew axis, z up.\n#\n' + LEGEND + "\n",
-        table("", (
-            ("schema", 1, f"{SET} version of this layout"), ("name", answers.name, GIVEN),
-            ("title", answers.title, GIVEN), ("rate_hz", answers.rate_hz, f"{GIVEN} control rate"),
-            ("crane_bus", "crane0", f"{SET} the machine stands still: no machine bus"),
-        )),
+        table(
+            "",
+            (
+                ("schema", 1, f"{SET} version of this layout"),
+                ("name", answers.name, GIVEN),
+                ("title", answers.title, GIVEN),
+                ("rate_hz", answers.rate_hz, f"{GIVEN} control rate"),
+                ("crane_bus", "crane0", f"{SET} the machine stands still: no machine bus"),
+            ),
+        ),
         table("kinematics", [(key, getattr(kin, key), GIVEN) for key in kin.__struct_fields__]),
         *(_joint_text(j, getattr(answers.joints, j.name.lower()), messages) for j in JOINTS),
         table("hydraulics", [("pump_flow_m3_s", answers.pump.flow_m3_s, GIVEN)]),
         _grapple_text(answers),
         table("bunk", [(key, getattr(answers.bunk, key), GIVEN) for key in answers.bunk.__struct_fields__]),
         table("workspace", [(k, getattr(answers.workspace, k), GIVEN) for k in answers.workspace.__struct_fields__]),
-        table("timeouts", (
-            ("lease_max_ms", 200, f"{SET} a planner sends every 50 ms: three datagrams may be lost"),
-            ("stop_ramp_ms", 150, f"{SET} jerk-limited stop, every function neutral within"),
-            ("operator_link_ms", 1000, f"{SET} an operator who watches sends every 200 ms; 0: not watched"),
-        )),
+        table(
+            "timeouts",
+            (
+                ("lease_max_ms", 200, f"{SET} a planner sends every 50 ms: three datagrams may be lost"),
+                ("stop_ramp_ms", 150, f"{SET} jerk-limited stop, every function neutral within"),
+                ("operator_link_ms", 1000, f"{SET} an operator who watches sends every 200 ms; 0: not watched"),
+            ),
+        ),
         _stability_text(answers),
         *(
             table(f"keep_out.{name}", [(key, getattr(box, key), GIVEN) for key in box.__struct_fields__])
             for name, box in answers.keep_out.items()
         ),
-    ]  # fmt: skip
+    ]
     return "".join(parts).rstrip() + "\n"
 
 
@@ -77,10 +85,16 @@ def _joint_text(which: Joint, joint: JointAnswers, messages: Mapping[int, str]) 
     name = which.name.lower()
     path = f"joints.{name}"
     kind = "prismatic" if which is Joint.EXT else "revolute"
-    text = table(path, (
-        ("kind", kind, SET), ("lower", joint.lower, GIVEN), ("upper", joint.upper, GIVEN),
-        ("speed_limit", joint.speed_limit, GIVEN), ("acceleration_limit", joint.acceleration_limit, GIVEN),
-    ))  # fmt: skip
+    text = table(
+        path,
+        (
+            ("kind", kind, SET),
+            ("lower", joint.lower, GIVEN),
+            ("upper", joint.upper, GIVEN),
+            ("speed_limit", joint.speed_limit, GIVEN),
+            ("acceleration_limit", joint.acceleration_limit, GIVEN),
+        ),
+    )
     if joint.encoder is not None:
         text += _encoder_text(path, joint.encoder, messages)
     plus, minus = flows(joint.drive)
@@ -88,23 +102,40 @@ def _joint_text(which: Joint, joint: JointAnswers, messages: Mapping[int, str]) 
     if joint.drive.lever_at:
         shares = tuple(round(arm / joint.drive.lever_m, 4) for arm in joint.drive.levers_m)
         lever = [("lever_at", joint.drive.lever_at, GIVEN), ("lever", shares, f"{DERIVED} share of the nominal arm")]
-    text += table(f"{path}.valve", (
-        ("signal", name.capitalize(), f"{SET} ValveCmdA or ValveCmdB"),
-        ("sign", 1, f"{SET} positive command, positive motion"),
-        ("deadband_plus_pct", joint.deadband_pct, f"{GIVEN} until calibrated"),
-        ("deadband_minus_pct", joint.deadband_pct, f"{GIVEN} until calibrated"),
-        ("hysteresis_pct", 2.0, START), ("exponent", 1.0, START),
-        ("full_speed_plus", joint.full_speed_plus, GIVEN), ("full_speed_minus", joint.full_speed_minus, GIVEN),
-        ("delay_s", joint.delay_s, GIVEN), ("lag_s", joint.lag_s, GIVEN), ("oil_s", joint.oil_s, GIVEN),
-        ("flow_plus", plus, f"{DERIVED} from the drive"), ("flow_minus", minus, f"{DERIVED} from the drive"), *lever,
-    ))  # fmt: skip
+    text += table(
+        f"{path}.valve",
+        (
+            ("signal", name.capitalize(), f"{SET} ValveCmdA or ValveCmdB"),
+            ("sign", 1, f"{SET} positive command, positive motion"),
+            ("deadband_plus_pct", joint.deadband_pct, f"{GIVEN} until calibrated"),
+            ("deadband_minus_pct", joint.deadband_pct, f"{GIVEN} until calibrated"),
+            ("hysteresis_pct", 2.0, START),
+            ("exponent", 1.0, START),
+            ("full_speed_plus", joint.full_speed_plus, GIVEN),
+            ("full_speed_minus", joint.full_speed_minus, GIVEN),
+            ("delay_s", joint.delay_s, GIVEN),
+            ("lag_s", joint.lag_s, GIVEN),
+            ("oil_s", joint.oil_s, GIVEN),
+            ("flow_plus", plus, f"{DERIVED} from the drive"),
+            ("flow_minus", minus, f"{DERIVED} from the drive"),
+            *lever,
+        ),
+    )
     gain, kd, layer, damping, band = LAWS[which]
     kp = round(min(gain, GAIN_DELAY / joint.delay_s), 3) if joint.delay_s > 0.0 else gain
     tuned = f"{START} check with `timberhand bench loop-design`"
-    return text + table(f"{path}.law", (
-        ("kind", "sliding_mode", SET), ("kp_1_s", kp, tuned), ("kd", kd, START), ("layer", layer, START),
-        ("damping_per_bar", damping, tuned), ("stop_band", band, START), ("velocity_filter_s", 0.03, START),
-    ))  # fmt: skip
+    return text + table(
+        f"{path}.law",
+        (
+            ("kind", "sliding_mode", SET),
+            ("kp_1_s", kp, tuned),
+            ("kd", kd, START),
+            ("layer", layer, START),
+            ("damping_per_bar", damping, tuned),
+            ("stop_band", band, START),
+            ("velocity_filter_s", 0.03, START),
+        ),
+    )
 
 
 def unit_per_count(encoder: EncoderAnswers) -> float:
@@ -116,15 +147,20 @@ def _encoder_text(path: str, encoder: EncoderAnswers, messages: Mapping[int, str
     kind = "rotary" if encoder.unit_m is None else "linear"
     middle = encoder.total_counts // 2 if kind == "rotary" else 0
     zero = middle if encoder.zero_counts is None else encoder.zero_counts
-    return table(f"{path}.encoder", (
-        ("node", encoder.node, GIVEN),
-        ("message", messages.get(encoder.node, str(encoder.node)), f"{DERIVED} crane.dbc, by the node"),
-        ("kind", kind, DERIVED), ("device_type", DEVICE_TYPES[kind], f"{DERIVED} object 1000h (CiA 406)"),
-        ("total_counts", encoder.total_counts, GIVEN), ("unit_per_count", unit_per_count(encoder), DERIVED),
-        ("zero_counts", zero, GIVEN if encoder.zero_counts is not None else f"{SET} preset (6003h)"),
-        ("direction", encoder.direction, GIVEN),
-        ("noise", max(unit_per_count(encoder), 1e-4), f"{START} a count, 1 sigma"),
-    ))  # fmt: skip
+    return table(
+        f"{path}.encoder",
+        (
+            ("node", encoder.node, GIVEN),
+            ("message", messages.get(encoder.node, str(encoder.node)), f"{DERIVED} crane.dbc, by the node"),
+            ("kind", kind, DERIVED),
+            ("device_type", DEVICE_TYPES[kind], f"{DERIVED} object 1000h (CiA 406)"),
+            ("total_counts", encoder.total_counts, GIVEN),
+            ("unit_per_count", unit_per_count(encoder), DERIVED),
+            ("zero_counts", zero, GIVEN if encoder.zero_counts is not None else f"{SET} preset (6003h)"),
+            ("direction", encoder.direction, GIVEN),
+            ("noise", max(unit_per_count(encoder), 1e-4), f"{START} a count, 1 sigma"),
+        ),
+    )
 
 
 def jaw_rows(answers: Answers) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
@@ -151,16 +187,26 @@ def _grapple_text(answers: Answers) -> str:
     grapple = answers.grapple
     keys = ("close_time_s", "open_time_s", "hold_pressure_bar", "opening_sensor")
     angles, gaps, tips = jaw_rows(answers)
-    return table("grapple", [(key, getattr(grapple, key), GIVEN) for key in keys]) + table("grapple.tongs", (
-        ("angle_rad", angles, DERIVED), ("half_gap_m", gaps, DERIVED), ("tip_below_pin_m", tips, DERIVED),
-    ))  # fmt: skip
+    return table("grapple", [(key, getattr(grapple, key), GIVEN) for key in keys]) + table(
+        "grapple.tongs",
+        (
+            ("angle_rad", angles, DERIVED),
+            ("half_gap_m", gaps, DERIVED),
+            ("tip_below_pin_m", tips, DERIVED),
+        ),
+    )
 
 
 def _stability_text(answers: Answers) -> str:
     head, pin = weights_at_pins(answers.masses)
-    return table("stability", (
-        ("head_kg", round(head, 1), f"{DERIVED} links as weights at the two pins"), ("pin_kg", round(pin, 1), DERIVED),
-        ("edge_m", answers.kinematics.a1_m, f"{DERIVED} the boom pin: the lift's moment is the limit"),
-        ("stabilising_nm", answers.masses.lifting_moment_nm, GIVEN), ("slope_nm_rad", 0.0, f"{SET} on its supports"),
-        ("share", STABILITY_SHARE, SET),
-    ))  # fmt: skip
+    return table(
+        "stability",
+        (
+            ("head_kg", round(head, 1), f"{DERIVED} links as weights at the two pins"),
+            ("pin_kg", round(pin, 1), DERIVED),
+            ("edge_m", answers.kinematics.a1_m, f"{DERIVED} the boom pin: the lift's moment is the limit"),
+            ("stabilising_nm", answers.masses.lifting_moment_nm, GIVEN),
+            ("slope_nm_rad", 0.0, f"{SET} on its supports"),
+            ("share", STABILITY_SHARE, SET),
+        ),
+    )

@@ -79,9 +79,12 @@ def machine_scene(profile: Profile, stamp: Timestamp) -> SceneUpdate:
         ("grapple", _cube((0.7, 0.18, 0.2), (0.0, 0.0, 0.0), CRANE)),
     ]
     column = CylinderPrimitive(
-        pose=_pose((0.0, 0.0, 0.5 * kin.d1_m)), size=Vector3(x=0.4, y=0.4, z=max(kin.d1_m, 0.1)),
-        bottom_scale=1.0, top_scale=1.0, color=CRANE,
-    )  # fmt: skip
+        pose=_pose((0.0, 0.0, 0.5 * kin.d1_m)),
+        size=Vector3(x=0.4, y=0.4, z=max(kin.d1_m, 0.1)),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=CRANE,
+    )
     x, y = bunk.center_m
     floor = _cube((bunk.length_m, bunk.width_m, 0.1), (x, y, bunk.floor_z_m - 0.05), BUNK, bunk.yaw_rad)
     entities = [_entity(frame, frame, stamp, cubes=[body]) for frame, body in bodies]
@@ -101,9 +104,14 @@ def _entity(
     cylinders: list[CylinderPrimitive] | None = None,
 ) -> SceneEntity:
     return SceneEntity(
-        timestamp=stamp, frame_id=frame, id=name, lifetime=FOREVER, frame_locked=True, cubes=cubes or [],
+        timestamp=stamp,
+        frame_id=frame,
+        id=name,
+        lifetime=FOREVER,
+        frame_locked=True,
+        cubes=cubes or [],
         cylinders=cylinders or [],
-    )  # fmt: skip
+    )
 
 
 def _along_x(length_m: float, from_m: float, z_m: float, thick_m: float, color: Color) -> CubePrimitive:
@@ -197,13 +205,16 @@ class LogMap:
         x, y, z = rear_from_base(self._carrier, (0.0, 0.0, 0.0))
         turned = yaw + self._carrier.crane_yaw_rad
         return FrameTransform(
-            timestamp=stamp, parent_frame_id=MAP, child_frame_id=BASE,
+            timestamp=stamp,
+            parent_frame_id=MAP,
+            child_frame_id=BASE,
             translation=Vector3(
-                x=east + cos(yaw) * x - sin(yaw) * y, y=north + sin(yaw) * x + cos(yaw) * y,
+                x=east + cos(yaw) * x - sin(yaw) * y,
+                y=north + sin(yaw) * x + cos(yaw) * y,
                 z=pivot_height_m(self._carrier, sum(heights) / len(heights)) + z,
             ),
             rotation=Quaternion(x=0.0, y=0.0, z=sin(turned / 2), w=cos(turned / 2)),
-        )  # fmt: skip
+        )
 
     def logs(self, report: LogsReport, stamp: Timestamp) -> SceneUpdate:
         """All logs of the map in place of those of before: each an entity, the targets and those given up by colour."""
@@ -216,17 +227,25 @@ class LogMap:
         x, y = self._ground.metres(*log.place)
         yaw = radians(90.0 - log.bearing_deg)
         # A cylinder stands; it is laid along x (a quarter turn about y) and then turned about z.
-        laid = Quaternion(x=-_LYING * sin(yaw / 2), y=_LYING * cos(yaw / 2), z=_LYING * sin(yaw / 2),
-                          w=_LYING * cos(yaw / 2))  # fmt: skip
+        laid = Quaternion(
+            x=-_LYING * sin(yaw / 2), y=_LYING * cos(yaw / 2), z=_LYING * sin(yaw / 2), w=_LYING * cos(yaw / 2)
+        )
         body = CylinderPrimitive(
             pose=Pose(position=Vector3(x=x, y=y, z=0.5 * log.diameter_m), orientation=laid),
-            size=Vector3(x=log.diameter_m, y=log.diameter_m, z=log.length_m), bottom_scale=1.0, top_scale=1.0,
+            size=Vector3(x=log.diameter_m, y=log.diameter_m, z=log.length_m),
+            bottom_scale=1.0,
+            top_scale=1.0,
             color=TARGET if is_target else GIVEN_UP if log.given_up else LOG,
-        )  # fmt: skip
+        )
         return SceneEntity(
-            timestamp=stamp, frame_id=MAP, id=f"log {log.number}", lifetime=Duration(sec=0, nsec=0), frame_locked=True,
-            metadata=[KeyValuePair(key="missed grasps", value=str(log.misses))], cylinders=[body],
-        )  # fmt: skip
+            timestamp=stamp,
+            frame_id=MAP,
+            id=f"log {log.number}",
+            lifetime=Duration(sec=0, nsec=0),
+            frame_locked=True,
+            metadata=[KeyValuePair(key="missed grasps", value=str(log.misses))],
+            cylinders=[body],
+        )
 
 
 # -- What Foxglove and Lichtblick show of a machine, from the controller's reports
@@ -330,10 +349,13 @@ class MachineTopics:
         if _due(self._position_ns, time_ns, POSITION_PERIOD_NS):
             self._position_ns = time_ns
             fix = LocationFix(
-                timestamp=stamp, frame_id="antenna", latitude=report.latitude_deg, longitude=report.longitude_deg,
+                timestamp=stamp,
+                frame_id="antenna",
+                latitude=report.latitude_deg,
+                longitude=report.longitude_deg,
                 altitude=report.altitude_m if isfinite(report.altitude_m) else 0.0,
                 heading=report.heading_rad if isfinite(report.heading_rad) else None,
-            )  # fmt: skip
+            )
             found.append(("/position", fix.encode()))
         if self._log_map is not None and _due(self._base_ns, time_ns, MOTION_PERIOD_NS):
             base = self._log_map.base_in_map(report, stamp)
@@ -364,7 +386,9 @@ class MachineTopics:
         return FrameTransforms(
             transforms=[
                 FrameTransform(
-                    timestamp=stamp, parent_frame_id=frame.parent, child_frame_id=frame.child,
+                    timestamp=stamp,
+                    parent_frame_id=frame.parent,
+                    child_frame_id=frame.child,
                     translation=Vector3(x=frame.translation_m[0], y=frame.translation_m[1], z=frame.translation_m[2]),
                     rotation=Quaternion(
                         x=frame.rotation[0], y=frame.rotation[1], z=frame.rotation[2], w=frame.rotation[3]
@@ -372,7 +396,7 @@ class MachineTopics:
                 )
                 for frame in link_frames(self._profile, q)
             ]
-        )  # fmt: skip
+        )
 
 
 def camera_topic(camera: str) -> str:

@@ -16,9 +16,32 @@ from machine.loading.problem import Problem
 from machine.profile import JointSpec
 
 _UNIT_SUFFIXES: Final = (
-    "_rad_s2", "_rad_s", "_deg_s2", "_deg_s", "_m_s2", "_m_s", "_mm_s", "_1_s", "_degrees", "_deg", "_rad",
-    "_mm", "_cm", "_ms", "_ns", "_us", "_hz", "_bar", "_mpa", "_pa", "_pct", "_percent", "_px", "_m", "_s",
-)  # fmt: skip
+    "_rad_s2",
+    "_rad_s",
+    "_deg_s2",
+    "_deg_s",
+    "_m_s2",
+    "_m_s",
+    "_mm_s",
+    "_1_s",
+    "_degrees",
+    "_deg",
+    "_rad",
+    "_mm",
+    "_cm",
+    "_ms",
+    "_ns",
+    "_us",
+    "_hz",
+    "_bar",
+    "_mpa",
+    "_pa",
+    "_pct",
+    "_percent",
+    "_px",
+    "_m",
+    "_s",
+)
 _JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 
 

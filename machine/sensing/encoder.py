@@ -17,8 +17,10 @@ class EncoderScale:
 
     def __init__(self, encoder: Encoder) -> None:
         self._zero, self._direction, self._unit_per_count = (
-            encoder.zero_counts, encoder.direction, encoder.unit_per_count
-        )  # fmt: skip
+            encoder.zero_counts,
+            encoder.direction,
+            encoder.unit_per_count,
+        )
         self._total = encoder.total_counts if encoder.kind == "rotary" else 0
         self._half = self._total // 2
 

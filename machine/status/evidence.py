@@ -19,9 +19,16 @@ _RAD, _RAD_S, _M, _M_S, _NM, _KG, _PCT, _BAR = "rad", "rad/s", "m", "m/s", "Nm",
 _UNIT, _UNIT_S = "joint", "joint/s"
 """rad or m, by the joint that the detail names."""
 _COUNT, _BITS, _REASON = "", "bits", "reason"
-_SHOWN: Final = {_RAD: (180.0 / math.pi, 2, "°"), _RAD_S: (180.0 / math.pi, 2, "°/s"), _M: (1.0, 3, " m"),
-                 _M_S: (1.0, 3, " m/s"), _MS: (1.0, 1, " ms"),
-                 _NM: (1e-3, 1, " kNm"), _KG: (1.0, 0, " kg"), _BAR: (1.0, 1, " bar")}  # fmt: skip
+_SHOWN: Final = {
+    _RAD: (180.0 / math.pi, 2, "°"),
+    _RAD_S: (180.0 / math.pi, 2, "°/s"),
+    _M: (1.0, 3, " m"),
+    _M_S: (1.0, 3, " m/s"),
+    _MS: (1.0, 1, " ms"),
+    _NM: (1e-3, 1, " kNm"),
+    _KG: (1.0, 0, " kg"),
+    _BAR: (1.0, 1, " bar"),
+}
 """By unit: factor, decimals and mark for a person."""
 
 

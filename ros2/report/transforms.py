@@ -76,8 +76,14 @@ def moving_transforms(profile: Profile, q: Sequence[float], articulation_rad: fl
 def quaternion(rotation: np.ndarray) -> Quaternion:
     """The quaternion of a rotation matrix (3, 3), scalar positive (Shepperd 1978)."""
     m = rotation
-    squares = np.array([1.0 + m[0, 0] - m[1, 1] - m[2, 2], 1.0 - m[0, 0] + m[1, 1] - m[2, 2],
-                        1.0 - m[0, 0] - m[1, 1] + m[2, 2], 1.0 + m[0, 0] + m[1, 1] + m[2, 2]])  # fmt: skip
+    squares = np.array(
+        [
+            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
     greatest = int(np.argmax(squares))
     half = 0.5 * sqrt(squares[greatest])
     xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]

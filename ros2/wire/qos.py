@@ -30,8 +30,10 @@ def reliable(depth: int) -> Qos:
 def latched(depth: int) -> Qos:
     """Reliable and transient local: a late reader gets the last ``depth`` samples."""
     return Qos(
-        Policy.Reliability.Reliable(BLOCKED_NS), Policy.Durability.TransientLocal, Policy.History.KeepLast(depth),
-    )  # fmt: skip
+        Policy.Reliability.Reliable(BLOCKED_NS),
+        Policy.Durability.TransientLocal,
+        Policy.History.KeepLast(depth),
+    )
 
 
 def sensor_data() -> Qos:

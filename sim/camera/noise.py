@@ -170,8 +170,19 @@ class StereoNoise:
         wide = _fatten(inverse, truth.edge_jump_px / fb, *truth.edge_px, blots, shift[6], shift[7])
         out = np.empty_like(inverse)
         _matched(
-            wide, fb, pinhole.fx_px / camera.fx_px, truth.disparity_sigma_px, self.scale,
-            camera.depth_min_m, camera.depth_max_m, tile, blots, self._cut, self._plain_cut, _plain(picture.rgb),
-            shift, out,
-        )  # fmt: skip
+            wide,
+            fb,
+            pinhole.fx_px / camera.fx_px,
+            truth.disparity_sigma_px,
+            self.scale,
+            camera.depth_min_m,
+            camera.depth_max_m,
+            tile,
+            blots,
+            self._cut,
+            self._plain_cut,
+            _plain(picture.rgb),
+            shift,
+            out,
+        )
         return out

@@ -248,15 +248,45 @@ def render(scene: Scene, view: View, conditions: ImagingConditions = ImagingCond
     picture = Picture(np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int16))
     where = random.Random(f"grain {frame}")
     shade(
-        inverse, code, eye, turn, *lens,
-        ends, radii, rods.side, rods.along_m, rods.surface, rods.tint, rods.instance,
-        boxes.centre_m, boxes.axes, boxes.half_m, boxes.colour, boxes.instance,
-        ground.heights_m, *grid[:3],
-        kinds.ground, kinds.patch, kinds.bark, kinds.end, kinds.horizon,
-        _grain(), conditions.grain, where.getrandbits(8), where.getrandbits(8),
-        sun, conditions.sun_gain * white, conditions.sky_gain * white, *shadows, x0, y0, cell,
-        picture.rgb, picture.depth_m, picture.mask,
-    )  # fmt: skip
+        inverse,
+        code,
+        eye,
+        turn,
+        *lens,
+        ends,
+        radii,
+        rods.side,
+        rods.along_m,
+        rods.surface,
+        rods.tint,
+        rods.instance,
+        boxes.centre_m,
+        boxes.axes,
+        boxes.half_m,
+        boxes.colour,
+        boxes.instance,
+        ground.heights_m,
+        *grid[:3],
+        kinds.ground,
+        kinds.patch,
+        kinds.bark,
+        kinds.end,
+        kinds.horizon,
+        _grain(),
+        conditions.grain,
+        where.getrandbits(8),
+        where.getrandbits(8),
+        sun,
+        conditions.sun_gain * white,
+        conditions.sky_gain * white,
+        *shadows,
+        x0,
+        y0,
+        cell,
+        picture.rgb,
+        picture.depth_m,
+        picture.mask,
+    )
     return picture
 
 
@@ -282,9 +312,20 @@ def _draw(inverse: np.ndarray, code: np.ndarray, view: View, rods: Rods, boxes: 
     radii = np.stack([rods.radius_start_m, rods.radius_end_m], axis=1)
     axes = np.ascontiguousarray(turn.T @ boxes.axes)
     draw_objects(
-        inverse, code, (ends - eye) @ turn, radii, normals, rods.caps,
-        (boxes.centre_m - eye) @ turn, axes, boxes.half_m, pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px,
-    )  # fmt: skip
+        inverse,
+        code,
+        (ends - eye) @ turn,
+        radii,
+        normals,
+        rods.caps,
+        (boxes.centre_m - eye) @ turn,
+        axes,
+        boxes.half_m,
+        pin.fx_px,
+        pin.fy_px,
+        pin.cx_px,
+        pin.cy_px,
+    )
 
 
 def _middle(scene: Scene, view: View) -> np.ndarray:

@@ -319,9 +319,23 @@ def draw_objects(
         ends, normals, radii = rod_ends[i], rod_normals[i], rod_radii[i]
         value = FIRST_ROD + 3 * i
         draw_rod(
-            inverse, code, value, ends[0], ends[1], radii[0], radii[1], normals[0], normals[1], caps[i],
-            fx, fy, cx, cy, low, high,
-        )  # fmt: skip
+            inverse,
+            code,
+            value,
+            ends[0],
+            ends[1],
+            radii[0],
+            radii[1],
+            normals[0],
+            normals[1],
+            caps[i],
+            fx,
+            fy,
+            cx,
+            cy,
+            low,
+            high,
+        )
     for i in range(centres.shape[0]):
         value = FIRST_ROD + 3 * rods + 6 * i
         draw_box(inverse, code, value, centres[i], axes[i], halves[i], fx, fy, cx, cy, low, high)

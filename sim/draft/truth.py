@@ -70,10 +70,20 @@ CLOSING_RELIEF: Final = 0.87
 """Limit of the grapple's closing port over the pump's relief."""
 GRAPPLE_SPEED: Final = 1.08
 SPREAD: Final = {
-    "mass": 0.15, "flexibility": 0.20, "friction": 0.30, "deadband": 0.20, "gain": 0.20, "hysteresis": 0.40,
-    "delay_min_s": 0.040, "delay_max_s": 0.150, "pump": 0.10, "bulk": 0.16, "offset": 0.003, "eccentricity": 0.5,
+    "mass": 0.15,
+    "flexibility": 0.20,
+    "friction": 0.30,
+    "deadband": 0.20,
+    "gain": 0.20,
+    "hysteresis": 0.40,
+    "delay_min_s": 0.040,
+    "delay_max_s": 0.150,
+    "pump": 0.10,
+    "bulk": 0.16,
+    "offset": 0.003,
+    "eccentricity": 0.5,
     "antenna_m": 0.03,
-}  # fmt: skip
+}
 """As of the shipped machines (docs/reference/machines.md section 14)."""
 
 
@@ -87,43 +97,78 @@ def truth_text(answers: Answers, least_inertia: dict[str, float]) -> str:
         f"# {answers.title}: its nominal individual, for the plant alone; drafted by `timberhand machine new`.\n"
         f"#\n{LEGEND}\n",
         table("", [("machine", answers.name, GIVEN)]),
-        table("home", (
-            ("slew", 0.0, START), ("lift", home.lift, GIVEN), ("tilt", home.tilt, GIVEN), ("ext", home.ext, GIVEN),
-            ("rot", 0.0, START),
-        )),
-        table("steel", (
-            ("bearing_z_m", round(BEARING_SHARE * kin.d1_m, 4), DERIVED), ("beams_m", _beams(answers), DERIVED),
-            ("column_m", round(COLUMN_SHARE * kin.a2_m, 3), DERIVED),
-        )),
+        table(
+            "home",
+            (
+                ("slew", 0.0, START),
+                ("lift", home.lift, GIVEN),
+                ("tilt", home.tilt, GIVEN),
+                ("ext", home.ext, GIVEN),
+                ("rot", 0.0, START),
+            ),
+        ),
+        table(
+            "steel",
+            (
+                ("bearing_z_m", round(BEARING_SHARE * kin.d1_m, 4), DERIVED),
+                ("beams_m", _beams(answers), DERIVED),
+                ("column_m", round(COLUMN_SHARE * kin.a2_m, 3), DERIVED),
+            ),
+        ),
         *(table(f"links.{name}", lines) for name, lines in _links(answers).items()),
-        table("structure", (
-            ("hanger_damping_nm_s_rad", round(0.45 * hanging, 1), DERIVED),
-            ("fork_damping_nm_s_rad", round(0.45 * hanging, 1), DERIVED),
-            ("flex_pitch_nm_rad", stiffness, DERIVED), ("flex_roll_nm_rad", stiffness, DERIVED),
-            ("flex_damping_s", 0.007, START), ("tong_sync_nm_rad", round(900.0 * tongs, 1), DERIVED),
-            ("tong_sync_nm_s_rad", round(6.5 * tongs, 1), DERIVED),
-        )),
-        table("contact", (
-            ("log_friction", 0.8, START), ("ground_friction", 1.0, START), ("tong_friction", 0.5, START),
-            ("bunk_friction", 0.6, START), ("log_rolling_m", 0.02, START),
-        )),
-        table("wood", (
-            ("length_m", wood.length_m, GIVEN), ("diameter_m", wood.diameter_m, GIVEN),
-            ("taper_m_m", (0.003, 0.012), START), ("sweep_max", 0.02, START),
-            ("density_kg_m3", wood.density_kg_m3, GIVEN), ("density_spread", 0.08, START),
-        )),
-        table("supply", (
-            ("sharing", pump.sharing, GIVEN), ("pump_flow_m3_s", pump.flow_m3_s, GIVEN),
-            ("pressure_margin_pa", 2.0e6, START), ("relief_pa", pump.relief_pa, GIVEN),
-            ("shock_pa", pump.relief_pa + SHOCK_OVER_RELIEF_PA, DERIVED), ("tank_pa", 0.2e6, START),
-            ("build_up_s", 0.06, START), ("bulk_modulus_pa", 0.85e9, START), ("leakage_m3_s_pa", 5.0e-16, START),
-        )),
+        table(
+            "structure",
+            (
+                ("hanger_damping_nm_s_rad", round(0.45 * hanging, 1), DERIVED),
+                ("fork_damping_nm_s_rad", round(0.45 * hanging, 1), DERIVED),
+                ("flex_pitch_nm_rad", stiffness, DERIVED),
+                ("flex_roll_nm_rad", stiffness, DERIVED),
+                ("flex_damping_s", 0.007, START),
+                ("tong_sync_nm_rad", round(900.0 * tongs, 1), DERIVED),
+                ("tong_sync_nm_s_rad", round(6.5 * tongs, 1), DERIVED),
+            ),
+        ),
+        table(
+            "contact",
+            (
+                ("log_friction", 0.8, START),
+                ("ground_friction", 1.0, START),
+                ("tong_friction", 0.5, START),
+                ("bunk_friction", 0.6, START),
+                ("log_rolling_m", 0.02, START),
+            ),
+        ),
+        table(
+            "wood",
+            (
+                ("length_m", wood.length_m, GIVEN),
+                ("diameter_m", wood.diameter_m, GIVEN),
+                ("taper_m_m", (0.003, 0.012), START),
+                ("sweep_max", 0.02, START),
+                ("density_kg_m3", wood.density_kg_m3, GIVEN),
+                ("density_spread", 0.08, START),
+            ),
+        ),
+        table(
+            "supply",
+            (
+                ("sharing", pump.sharing, GIVEN),
+                ("pump_flow_m3_s", pump.flow_m3_s, GIVEN),
+                ("pressure_margin_pa", 2.0e6, START),
+                ("relief_pa", pump.relief_pa, GIVEN),
+                ("shock_pa", pump.relief_pa + SHOCK_OVER_RELIEF_PA, DERIVED),
+                ("tank_pa", 0.2e6, START),
+                ("build_up_s", 0.06, START),
+                ("bulk_modulus_pa", 0.85e9, START),
+                ("leakage_m3_s_pa", 5.0e-16, START),
+            ),
+        ),
         *(_function(answers, j, least_inertia) for j in JOINTS),
         _grapple(answers, least_inertia),
         *(_encoder(answers, j) for j in JOINTS),
         table("spread", [(key, value, START) for key, value in SPREAD.items()]),
         "[cameras]\n",
-    ]  # fmt: skip
+    ]
     return "".join(parts).rstrip() + "\n"
 
 
@@ -174,9 +219,10 @@ def _links(answers: Answers) -> dict[str, list[Line]]:
 
 def _link(mass: float, com: Sequence[float], inertia: Iterable[float]) -> list[Line]:
     return [
-        ("mass_kg", round(mass, 2), GIVEN), ("com_m", tuple(round(v, 4) for v in com), DERIVED),
+        ("mass_kg", round(mass, 2), GIVEN),
+        ("com_m", tuple(round(v, 4) for v in com), DERIVED),
         ("inertia_kg_m2", tuple(round(v, 4) for v in inertia), DERIVED),
-    ]  # fmt: skip
+    ]
 
 
 def _areas(drive: DriveAnswers) -> tuple[float, float]:
@@ -213,14 +259,23 @@ def _cylinder(name: str, areas: tuple[float, float], at: Any, arms: Any, nominal
     motor = name in ("slew", "rot", "grapple")
     dead = max(0.5e-3, 0.75 * areas[0]) if motor else max(0.4e-3, 0.14 * areas[0])
     dry = FRICTION_PA[name] * areas[0]
-    return table(f"functions.{name}.cylinder", (
-        ("area_a", areas[0], f"{DERIVED} from the drive"), ("area_b", areas[1], f"{DERIVED} from the drive"),
-        ("dead_volume_m3", round(dead, 6), START), ("arm_at", at, DERIVED), ("arm", arms, DERIVED),
-        ("arm_nominal", nominal, DERIVED), ("coulomb", round(dry, 2), DERIVED),
-        ("stiction", round(STICTION * dry, 2), DERIVED), ("stribeck_speed", STRIBECK[name], START),
-        ("viscous", round(VISCOUS_PA_S[name] * areas[0], 2), DERIVED), ("relaxation_1_s", RELAXATION_1_S[name], START),
-        ("least_inertia", round(inertia, 3), f"{DERIVED} from the links"),
-    ))  # fmt: skip
+    return table(
+        f"functions.{name}.cylinder",
+        (
+            ("area_a", areas[0], f"{DERIVED} from the drive"),
+            ("area_b", areas[1], f"{DERIVED} from the drive"),
+            ("dead_volume_m3", round(dead, 6), START),
+            ("arm_at", at, DERIVED),
+            ("arm", arms, DERIVED),
+            ("arm_nominal", nominal, DERIVED),
+            ("coulomb", round(dry, 2), DERIVED),
+            ("stiction", round(STICTION * dry, 2), DERIVED),
+            ("stribeck_speed", STRIBECK[name], START),
+            ("viscous", round(VISCOUS_PA_S[name] * areas[0], 2), DERIVED),
+            ("relaxation_1_s", RELAXATION_1_S[name], START),
+            ("least_inertia", round(inertia, 3), f"{DERIVED} from the links"),
+        ),
+    )
 
 
 def _valve(name: str, valve: dict[str, float]) -> str:
@@ -238,12 +293,14 @@ def _function(answers: Answers, which: Joint, least_inertia: dict[str, float]) -
         name,
         {
             "delay_s": DELAY * joint.delay_s,
-            "deadband_plus": DEADBANDS[0] * share, "deadband_minus": DEADBANDS[1] * share,
+            "deadband_plus": DEADBANDS[0] * share,
+            "deadband_minus": DEADBANDS[1] * share,
             "full_speed_plus": FULL_SPEEDS[0] * joint.full_speed_plus,
             "full_speed_minus": FULL_SPEEDS[1] * joint.full_speed_minus,
-            "limit_plus_pa": relief, "limit_minus_pa": relief,
+            "limit_plus_pa": relief,
+            "limit_minus_pa": relief,
         },
-    )  # fmt: skip
+    )
 
 
 def _grapple(answers: Answers, least_inertia: dict[str, float]) -> str:
@@ -254,12 +311,16 @@ def _grapple(answers: Answers, least_inertia: dict[str, float]) -> str:
     return _cylinder("grapple", areas, at, [-1.0, -1.0], -1.0, least_inertia["grapple"]) + _valve(
         "grapple",
         {
-            "delay_s": DELAY * answers.joints.rot.delay_s, "deadband_plus": 0.10, "deadband_minus": 0.10,
+            "delay_s": DELAY * answers.joints.rot.delay_s,
+            "deadband_plus": 0.10,
+            "deadband_minus": 0.10,
             "full_speed_plus": GRAPPLE_SPEED * grapple.closed_rad / grapple.open_time_s,
             "full_speed_minus": GRAPPLE_SPEED * grapple.closed_rad / grapple.close_time_s,
-            "limit_plus_pa": relief, "limit_minus_pa": CLOSING_RELIEF * relief, "check_ratio": 3.5,
+            "limit_plus_pa": relief,
+            "limit_minus_pa": CLOSING_RELIEF * relief,
+            "check_ratio": 3.5,
         },
-    )  # fmt: skip
+    )
 
 
 def _encoder(answers: Answers, which: Joint) -> str:
@@ -267,11 +328,16 @@ def _encoder(answers: Answers, which: Joint) -> str:
     if encoder is None:
         return ""
     turns = encoder.unit_m is None
-    return table(f"encoders.{which.name.lower()}", (
-        ("offset", 0.0, START), ("eccentricity", 5.0e-4 if turns else 0.0, START),
-        ("phase_rad", PHASES_RAD[which], START), ("noise", max(0.3 * unit_per_count(encoder), 1e-5), DERIVED),
-        ("latency_s", 0.0025, START),
-    ))  # fmt: skip
+    return table(
+        f"encoders.{which.name.lower()}",
+        (
+            ("offset", 0.0, START),
+            ("eccentricity", 5.0e-4 if turns else 0.0, START),
+            ("phase_rad", PHASES_RAD[which], START),
+            ("noise", max(0.3 * unit_per_count(encoder), 1e-5), DERIVED),
+            ("latency_s", 0.0025, START),
+        ),
+    )
 
 
 # -- Half the smallest inertia that each function shows its drive, in poses over its whole range (`sim.truth`).

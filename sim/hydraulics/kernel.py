@@ -225,10 +225,10 @@ def advance_function(
     damp_a, damp_b = c.relaxation * volume_a / pump.bulk, c.relaxation * volume_b / pump.bulk
     s.pressure_a = chamber(
         a, stiff_a, c.area_a * speed - s.flow_a, in_a, supply, out_a, slope_a, b, damp_a, s.hose_a, pump, balance, h
-    )  # fmt: skip
+    )
     s.pressure_b = chamber(
         b, stiff_b, -c.area_b * speed - s.flow_b, in_b, supply, out_b, slope_b, a, damp_b, s.hose_b, pump, balance, h
-    )  # fmt: skip
+    )
     s.hose_a += h / STEADY_S * (s.pressure_a - s.hose_a)
     s.hose_b += h / STEADY_S * (s.pressure_b - s.hose_b)
     balance.loss += h * rub * speed

@@ -38,9 +38,13 @@ class LivePlc(LivePlant):
     """
 
     def __init__(
-        self, plant: PlcPlant, port: int | None, loop: asyncio.AbstractEventLoop, seed: int = 0,
+        self,
+        plant: PlcPlant,
+        port: int | None,
+        loop: asyncio.AbstractEventLoop,
+        seed: int = 0,
         cameras: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(plant, {}, port, seed, cameras)
         self._loop = loop
         self._program = plant.plc
@@ -81,9 +85,11 @@ class LivePlc(LivePlant):
         """Also the counts of the network."""
         arbiter = self._program.arbiter
         counts = {
-            "accepted": arbiter.accepted, "refused": arbiter.refused, "dropped": arbiter.dropped,
+            "accepted": arbiter.accepted,
+            "refused": arbiter.refused,
+            "dropped": arbiter.dropped,
             "replayed": arbiter.replayed,
-        }  # fmt: skip
+        }
         return super().report() | counts | (asdict(self.modbus.counts) if self.modbus else {})
 
     def close(self) -> None:

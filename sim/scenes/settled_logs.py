@@ -54,9 +54,16 @@ def stereo_noise(
 
 
 def varied_stereo_noise(
-    profile: Profile, camera: str, seed: int, *, sigma: float, edges: tuple[float, float], holes: float,
-    plain_holes: float, correlation_px: float,
-) -> StereoNoise:  # fmt: skip
+    profile: Profile,
+    camera: str,
+    seed: int,
+    *,
+    sigma: float,
+    edges: tuple[float, float],
+    holes: float,
+    plain_holes: float,
+    correlation_px: float,
+) -> StereoNoise:
     """A better or worse camera than the nominal one.
 
     ``sigma``, ``edges`` and ``holes`` are factors of its disparity error, of both its edge widths and of its share of

@@ -57,11 +57,14 @@ def place_logs(
         )
         found.append(
             replace(
-                spec, x_m=x_m, y_m=y_m,
+                spec,
+                x_m=x_m,
+                y_m=y_m,
                 yaw_rad=spec.yaw_rad if place.yaw_rad is None else place.yaw_rad,
-                length_m=place.length_m or spec.length_m, diameter_m=place.diameter_m or spec.diameter_m,
+                length_m=place.length_m or spec.length_m,
+                diameter_m=place.diameter_m or spec.diameter_m,
             )
-        )  # fmt: skip
+        )
     return tuple(found)
 
 

@@ -164,11 +164,19 @@ class LogBodies:
         columns = zip(which, *(c.tolist() for c in (position, turned, z, back - half, back + half, speed)), strict=True)
         return [
             LogState(
-                tuple(at), tuple(turn), tuple(axis), self.scene[i].length_m, self.scene[i].diameter_m, self.masses[i],
-                v, self.scene[i].taper_m_m, self.scene[i].sweep_m, (tuple(butt), tuple(top)),
+                tuple(at),
+                tuple(turn),
+                tuple(axis),
+                self.scene[i].length_m,
+                self.scene[i].diameter_m,
+                self.masses[i],
+                v,
+                self.scene[i].taper_m_m,
+                self.scene[i].sweep_m,
+                (tuple(butt), tuple(top)),
             )
             for i, at, turn, axis, butt, top, v in columns
-        ]  # fmt: skip
+        ]
 
 
 def _times(q: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -78,9 +78,12 @@ def individual(seed: int) -> Individual:
         return bound * max(-1.0, min(1.0, rng.gauss(0.0, 0.5)))
 
     return Individual(
-        (within(0.03), within(0.03)), (within(0.03) - within(0.03)) / 1.8, within(0.005), 1.0 + within(0.3),
+        (within(0.03), within(0.03)),
+        (within(0.03) - within(0.03)) / 1.8,
+        within(0.005),
+        1.0 + within(0.3),
         1.0 + within(0.1),
-    )  # fmt: skip
+    )
 
 
 class Vehicle:
@@ -249,10 +252,31 @@ class Vehicle:
             driving = Driving.BRAKING
         height = self._c.arm_transport_m
         return VehicleReport(
-            self._tick, 0, self.now_ns, s.sequence if s else 0, driving, 0, 0, at, lat, lon, 262.5, self._own.fix, 19,
-            math.nan, at, heading % math.tau, rate, self.now_ns, self._wheel_speed(), self._measured_bend(),
-            roll + self._rng.gauss(0.0, 0.001), pitch + self._rng.gauss(0.0, 0.001), (height,) * 4, 0,
-        )  # fmt: skip
+            self._tick,
+            0,
+            self.now_ns,
+            s.sequence if s else 0,
+            driving,
+            0,
+            0,
+            at,
+            lat,
+            lon,
+            262.5,
+            self._own.fix,
+            19,
+            math.nan,
+            at,
+            heading % math.tau,
+            rate,
+            self.now_ns,
+            self._wheel_speed(),
+            self._measured_bend(),
+            roll + self._rng.gauss(0.0, 0.001),
+            pitch + self._rng.gauss(0.0, 0.001),
+            (height,) * 4,
+            0,
+        )
 
 
 def radius_m(carrier: Carrier) -> float:

@@ -143,9 +143,27 @@ class Crane:
     def _report(self) -> StateReport:
         sensed = tuple(q if joint(self.profile, j).encoder else nan for j, q in zip(JOINTS, self.q, strict=True))
         return StateReport(
-            0, profile_hash(self.profile), self.now_ns, self.mode, 0, self.reason, 0, 119, self.refuses, 0, sensed,
-            tuple(self.v), sensed, self.opening, 0.0, 0.0, 0, 0, 0, 0,
-        )  # fmt: skip
+            0,
+            profile_hash(self.profile),
+            self.now_ns,
+            self.mode,
+            0,
+            self.reason,
+            0,
+            119,
+            self.refuses,
+            0,
+            sensed,
+            tuple(self.v),
+            sensed,
+            self.opening,
+            0.0,
+            0.0,
+            0,
+            0,
+            0,
+            0,
+        )
 
     @property
     def _lift_areas(self) -> float:

@@ -71,9 +71,27 @@ class StandIn:
         state = 5 if self.gripped else 0
         sequence = self.setpoint.sequence if self.setpoint else 0
         return StateReport(
-            0, self.profile_hash, self.now_ns, self.mode, state, 0, sequence, 0, 0, 0, self.q,
-            (0.0,) * 5, self.q, opening if self.feedback else nan, nan, self.load_kg, 0, 0, 0, 0,
-        )  # fmt: skip
+            0,
+            self.profile_hash,
+            self.now_ns,
+            self.mode,
+            state,
+            0,
+            sequence,
+            0,
+            0,
+            0,
+            self.q,
+            (0.0,) * 5,
+            self.q,
+            opening if self.feedback else nan,
+            nan,
+            self.load_kg,
+            0,
+            0,
+            0,
+            0,
+        )
 
     @property
     def load_kg(self) -> float:

@@ -82,11 +82,31 @@ class Forwarder:
         lon = self.plane.longitude_deg + east * self._degrees[1]
         obeys = self.drive is not None
         return VehicleReport(
-            0, self.crane.profile_hash, now_ns, self.drive.sequence if self.drive else 0,
-            Driving.DRIVING if obeys else Driving.STANDING, 0, 0, now_ns, lat, lon, 102.5, 4, 18, 0.01, now_ns,
-            heading_from_yaw(yaw), self._turn_rad_s, now_ns, self.speed_m_s, self.articulation_rad, 0.0, 0.0,
-            tuple(self.heights_m), 0,
-        )  # fmt: skip
+            0,
+            self.crane.profile_hash,
+            now_ns,
+            self.drive.sequence if self.drive else 0,
+            Driving.DRIVING if obeys else Driving.STANDING,
+            0,
+            0,
+            now_ns,
+            lat,
+            lon,
+            102.5,
+            4,
+            18,
+            0.01,
+            now_ns,
+            heading_from_yaw(yaw),
+            self._turn_rad_s,
+            now_ns,
+            self.speed_m_s,
+            self.articulation_rad,
+            0.0,
+            0.0,
+            tuple(self.heights_m),
+            0,
+        )
 
     def seen(self) -> tuple[LogObservation, ...]:
         """What lies near, in the base frame, four times a second."""

@@ -33,10 +33,20 @@ def test_only_a_whole_passed_and_signed_protocol_is_accepted() -> None:
         assert verdict is Verdict.REFUSED and len(reasons) == 1
 
 
-@pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{}", json.dumps(form(verdict="accepted")).encode(),
-                                  json.dumps(form("passed")).encode(), json.dumps(form(machine="x" * 81)).encode(),
-                                  json.dumps(form(entries=form()["entries"][1:])).encode(),
-                                  json.dumps(form(entries=form()["entries"] * 2)).encode()])  # fmt: skip
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"[]",
+        b"\xff",
+        b"{}",
+        json.dumps(form(verdict="accepted")).encode(),
+        json.dumps(form("passed")).encode(),
+        json.dumps(form(machine="x" * 81)).encode(),
+        json.dumps(form(entries=form()["entries"][1:])).encode(),
+        json.dumps(form(entries=form()["entries"] * 2)).encode(),
+    ],
+)
 def test_what_is_no_protocol_is_refused(data: bytes) -> None:
     with pytest.raises(ProtocolRefused):
         read_protocol(data)

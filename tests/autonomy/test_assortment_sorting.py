@@ -185,8 +185,9 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
     assert manager.state is State.DONE, manager.failure
     first, second = (manager.tally.loads[k] for k in (0, 1))
     assert {(load.landing, *(log.assortment for log in load.logs)) for load in (first, second)} == {
-        (0, "saw logs"), (1, "pulpwood"),
-    }  # fmt: skip
+        (0, "saw logs"),
+        (1, "pulpwood"),
+    }
     for number, (x, y, _) in zip((1, 2), landings, strict=True):
         assert math.dist(machine.field[number].center_m[:2], (x, y)) < 1.6
     assert machine.field[3].center_m[:2] == pytest.approx((21.0, 4.4), abs=0.01), "no landing takes it"

@@ -41,9 +41,13 @@ def test_only_the_changed_lines_change_and_carry_the_mark(name: str, tmp_path: P
 
 
 SAG = {
-    "head_rad_m": 0.0023, "pin_rad_m": 0.0017, "rest_rad": 0.011, "load_rad_nm": 1.1e-6, "head_nm_m": 2100.0,
+    "head_rad_m": 0.0023,
+    "pin_rad_m": 0.0017,
+    "rest_rad": 0.011,
+    "load_rad_nm": 1.1e-6,
+    "head_nm_m": 2100.0,
     "pin_nm_m": 1500.0,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", shipped_profiles())
@@ -68,9 +72,13 @@ def test_zeros_and_sag_of_a_survey_are_written_together() -> None:
     )
     assert found["joints", "slew", "encoder", "zero_counts"] == profile.joints["slew"].encoder.zero_counts
     assert {k[-1]: v for k, v in found.items() if k[0] == "sag"} == {
-        "head_rad_m": 0.0054322, "pin_rad_m": 0.0036, "rest_rad": 0.028, "load_rad_nm": 1.2346e-6,
-        "head_nm_m": 4500.0, "pin_nm_m": 3000.0,
-    }  # fmt: skip
+        "head_rad_m": 0.0054322,
+        "pin_rad_m": 0.0036,
+        "rest_rad": 0.028,
+        "load_rad_nm": 1.2346e-6,
+        "head_nm_m": 4500.0,
+        "pin_nm_m": 3000.0,
+    }
 
 
 def test_a_full_speed_is_written_for_the_nominal_arm_of_the_lever() -> None:

@@ -114,11 +114,17 @@ def fake_sdk(state: str = "SUCCESS", grabbed: str = "SUCCESS", opened: bool = Tr
             Camera.closed = True
 
     return SimpleNamespace(
-        InitParameters=SimpleNamespace, Camera=Camera, Mat=Mat, RESOLUTION=SimpleNamespace(HD720="HD720"),
-        UNIT=SimpleNamespace(METER="METER"), DEPTH_MODE=SimpleNamespace(ULTRA="ULTRA"),
-        ERROR_CODE=SimpleNamespace(SUCCESS="SUCCESS"), VIEW=SimpleNamespace(LEFT="LEFT"),
-        MEASURE=SimpleNamespace(DEPTH="DEPTH"), TIME_REFERENCE=SimpleNamespace(IMAGE="IMAGE"),
-    )  # fmt: skip
+        InitParameters=SimpleNamespace,
+        Camera=Camera,
+        Mat=Mat,
+        RESOLUTION=SimpleNamespace(HD720="HD720"),
+        UNIT=SimpleNamespace(METER="METER"),
+        DEPTH_MODE=SimpleNamespace(ULTRA="ULTRA"),
+        ERROR_CODE=SimpleNamespace(SUCCESS="SUCCESS"),
+        VIEW=SimpleNamespace(LEFT="LEFT"),
+        MEASURE=SimpleNamespace(DEPTH="DEPTH"),
+        TIME_REFERENCE=SimpleNamespace(IMAGE="IMAGE"),
+    )
 
 
 def test_a_zed_delivers_its_intrinsics_rgb_and_nan_for_unknown_depth() -> None:

@@ -76,9 +76,15 @@ def test_the_checkpoint_is_written_on_change_and_at_most_once_a_second(tmp_path:
 
 @pytest.mark.parametrize(
     "spoil",
-    [lambda text: text[: len(text) // 2], lambda text: "", lambda text: text.replace('"schema":1', '"schema":2'),
-     lambda text: text.replace('"loaded":3', '"loaded":"three"'), lambda text: "[]", lambda text: "\xff\xfe"],
-)  # fmt: skip
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: text.replace('"schema":1', '"schema":2'),
+        lambda text: text.replace('"loaded":3', '"loaded":"three"'),
+        lambda text: "[]",
+        lambda text: "\xff\xfe",
+    ],
+)
 def test_a_damaged_checkpoint_is_refused(spoil, tmp_path: Path) -> None:
     path = kept(tmp_path / "p", some(listed_mission()))
     path.write_bytes(spoil(path.read_text()).encode("latin-1"))
@@ -120,14 +126,27 @@ PLACE = st.builds(Point, st.floats(-90.0, 90.0), st.floats(-180.0, 180.0))
 TAKEN = st.builds(LoadedLog, PLACE, st.integers(0, 2**62), METRES, TEXT)
 LOAD = st.builds(Load, st.lists(TAKEN, max_size=3).map(tuple), st.integers(0, 2**62), METRES, st.just(0))
 TALLY = st.builds(
-    Tally, NUMBER, NUMBER, NUMBER, NUMBER, NUMBER, METRES, METRES, st.booleans(),
-    st.dictionaries(NUMBER, TEXT, max_size=3), st.lists(LOAD, max_size=3), st.lists(TAKEN, max_size=3), METRES,
-)  # fmt: skip
+    Tally,
+    NUMBER,
+    NUMBER,
+    NUMBER,
+    NUMBER,
+    NUMBER,
+    METRES,
+    METRES,
+    st.booleans(),
+    st.dictionaries(NUMBER, TEXT, max_size=3),
+    st.lists(LOAD, max_size=3),
+    st.lists(TAKEN, max_size=3),
+    METRES,
+)
 LOG = st.builds(KnownLog, PLACE, st.just(""), st.floats(0.0, 360.0), METRES, METRES, TEXT, TEXT)
 KNOWN = st.builds(
-    LogKnowledge, st.lists(NUMBER, max_size=3).map(tuple),
-    st.lists(st.builds(MissedLog, NUMBER, LOG, NUMBER), max_size=3).map(tuple), NUMBER,
-)  # fmt: skip
+    LogKnowledge,
+    st.lists(NUMBER, max_size=3).map(tuple),
+    st.lists(st.builds(MissedLog, NUMBER, LOG, NUMBER), max_size=3).map(tuple),
+    NUMBER,
+)
 LEFT = st.builds(
     RouteRemainder,
     st.integers(0, 2),
@@ -143,9 +162,16 @@ def test_a_written_checkpoint_is_read_back(
 ) -> None:
     told = listed_mission((58.0, 14.0))
     progress = Checkpoint(
-        mission=mission_digest(told), tally=tally, known=known, left=left, landing=landing, served=served,
-        rounds=rounds, driven_m=driven_m, rotator=RotatorEstimate(driven_m, -driven_m, (0.8, 1.1)),
-    )  # fmt: skip
+        mission=mission_digest(told),
+        tally=tally,
+        known=known,
+        left=left,
+        landing=landing,
+        served=served,
+        rounds=rounds,
+        driven_m=driven_m,
+        rotator=RotatorEstimate(driven_m, -driven_m, (0.8, 1.1)),
+    )
     path = kept(tmp_path_factory.getbasetemp() / "p", progress, 7, 11)
     assert read_checkpoint(path, told, 7, 11) == progress
     later = read_checkpoint(path, told, 7 + 1000, 11)
@@ -155,9 +181,24 @@ def test_a_written_checkpoint_is_read_back(
 # ---------------------------------------------------------------------- the process
 def start(progress: Path, *more: str) -> int:
     return main(
-        ["--profile", "aoro_fc8", "--controller", "127.0.0.1:1", "--scene", "127.0.0.1:2", "--report-port", "0",
-         "--order-port", "0", "--mission", str(EXAMPLE), "--progress", str(progress), *more]
-    )  # fmt: skip
+        [
+            "--profile",
+            "aoro_fc8",
+            "--controller",
+            "127.0.0.1:1",
+            "--scene",
+            "127.0.0.1:2",
+            "--report-port",
+            "0",
+            "--order-port",
+            "0",
+            "--mission",
+            str(EXAMPLE),
+            "--progress",
+            str(progress),
+            *more,
+        ]
+    )
 
 
 def test_the_process_refuses_other_and_damaged_checkpoints(tmp_path: Path, capsys) -> None:

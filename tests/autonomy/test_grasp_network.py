@@ -31,8 +31,21 @@ from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.torch_net import random_net
 from tests.codes import coded
 
-TABLE_1 = {"conv1": 1952, "conv2": 12560, "norm2": 32, "conv3": 6416, "conv4": 6416, "norm4": 32, "conv5": 12832,
-           "conv6": 25632, "norm6": 64, "conv7": 12816, "q": 17, "cos2": 17, "sin2": 17}  # fmt: skip
+TABLE_1 = {
+    "conv1": 1952,
+    "conv2": 12560,
+    "norm2": 32,
+    "conv3": 6416,
+    "conv4": 6416,
+    "norm4": 32,
+    "conv5": 12832,
+    "conv6": 25632,
+    "norm6": 64,
+    "conv7": 12816,
+    "q": 17,
+    "cos2": 17,
+    "sin2": 17,
+}
 SHAPE = (1, 1, 300, 300)
 
 

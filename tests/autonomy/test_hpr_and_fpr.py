@@ -151,19 +151,34 @@ WHO = Forwarder("AORO-1", "FC8", "Hörnefors <12> & co")
 
 ORDER = {
     "Machine": [
-        "MachineKey", "MachineUserID", "MachineApplicationVersion", "MachineBaseManufacturer", "MachineBaseModel",
-        "BaseMachineManufacturerID", "OperatorDefinition", "SpeciesGroupDefinition", "ProductDefinition",
-        "ObjectDefinition", "LocationDefinition", "DeliveryDefinition", "Load",
+        "MachineKey",
+        "MachineUserID",
+        "MachineApplicationVersion",
+        "MachineBaseManufacturer",
+        "MachineBaseModel",
+        "BaseMachineManufacturerID",
+        "OperatorDefinition",
+        "SpeciesGroupDefinition",
+        "ProductDefinition",
+        "ObjectDefinition",
+        "LocationDefinition",
+        "DeliveryDefinition",
+        "Load",
     ],
     "Load": ["LoadKey", "OperatorKey", "LoadNumber", "DistanceFromLastUnloading", "UnloadingTime", "PartialLoad"],
     "PartialLoad": [
-        "PartialLoadKey", "DeliveryKey", "LocationKey", "LoadNumberOfItems", "LoadVolume", "LoadingCoordinates",
+        "PartialLoadKey",
+        "DeliveryKey",
+        "LocationKey",
+        "LoadNumberOfItems",
+        "LoadVolume",
+        "LoadingCoordinates",
     ],
     "LoadingCoordinates": ["Latitude", "Longitude", "Altitude", "CoordinateDate"],
     "LocationDefinition": ["LocationUserID", "LocationName", "LocationCoordinates", "LocationKey", "ObjectKey"],
     "ProductDefinition": ["ProductKey", "ClassifiedProductDefinition"],
     "DeliveryDefinition": ["DeliveryKey", "ProductKey"],
-}  # fmt: skip
+}
 """The sequences of the schema (version 3.6), as far as we write them."""
 
 
@@ -191,8 +206,10 @@ def test_the_elements_come_in_the_order_of_the_schema() -> None:
 def test_every_log_has_its_place_time_product_and_volume() -> None:
     root = report()
     parts = root.findall(".//s:PartialLoad", NS)
-    deliveries = {d.findtext("s:DeliveryKey", "", NS): d.findtext("s:ProductKey", "", NS)
-                  for d in root.findall(".//s:DeliveryDefinition", NS)}  # fmt: skip
+    deliveries = {
+        d.findtext("s:DeliveryKey", "", NS): d.findtext("s:ProductKey", "", NS)
+        for d in root.findall(".//s:DeliveryDefinition", NS)
+    }
     assert [deliveries[p.findtext("s:DeliveryKey", "", NS)] for p in parts] == ["31", "31", "11", "1"]
     assert [float(p.findtext("s:LoadVolume", "", NS)) for p in parts] == [0.0982, 0.1, 0.2111, 0.05]
     assert {p.findtext("s:LoadNumberOfItems", "", NS) for p in parts} == {"1"}

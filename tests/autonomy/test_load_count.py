@@ -135,9 +135,15 @@ class Books:
         self.field = LogMap(PROFILE.bunk)
         told = ForwardingMission("test", (Point(0.0, 0.0), Point(0.0, 0.001)))
         self.world: Any = SimpleNamespace(
-            sorting=Sorting(told), in_bunk=0, counted_ns=0, grip=None, log_map=self.field, base=HERE,
-            map_number=lambda listed: listed, plane=SimpleNamespace(geodetic=lambda x, y: (x, y, 0.0)),
-        )  # fmt: skip
+            sorting=Sorting(told),
+            in_bunk=0,
+            counted_ns=0,
+            grip=None,
+            log_map=self.field,
+            base=HERE,
+            map_number=lambda listed: listed,
+            plane=SimpleNamespace(geodetic=lambda x, y: (x, y, 0.0)),
+        )
         self.load = LoadBookkeeping(PROFILE, told, self.world)
         self.now_ns = 0
 

@@ -55,10 +55,23 @@ class Drive:
                 continue
             t = (report.stamp_ns - 10**9) * 1e-9
             rate = 0.5 * self.bend_rad * math.cos(0.5 * t)
-            self.vehicle.order(DriveSetpoint(
-                1, 0, report.stamp_ns, 10**9, Steering.ARTICULATION, 0.0, 0.0, self.bend_rad * math.sin(0.5 * t), rate,
-                self.speed_m_s, (0.35,) * 4, False, False,
-            ))  # fmt: skip
+            self.vehicle.order(
+                DriveSetpoint(
+                    1,
+                    0,
+                    report.stamp_ns,
+                    10**9,
+                    Steering.ARTICULATION,
+                    0.0,
+                    0.0,
+                    self.bend_rad * math.sin(0.5 * t),
+                    rate,
+                    self.speed_m_s,
+                    (0.35,) * 4,
+                    False,
+                    False,
+                )
+            )
             self.report = self.tamper(report)
             out.append(self.localizer.step(self.report))
         return out
@@ -70,9 +83,12 @@ class Drive:
 
 
 @given(
-    st.floats(-80.0, 80.0), st.floats(-179.0, 179.0), st.floats(-500.0, 500.0), st.floats(-500.0, 500.0),
+    st.floats(-80.0, 80.0),
+    st.floats(-179.0, 179.0),
+    st.floats(-500.0, 500.0),
+    st.floats(-500.0, 500.0),
     st.floats(-20.0, 20.0),
-)  # fmt: skip
+)
 def test_the_plane_agrees_with_another_formula_and_inverts(
     lat: float, lon: float, east: float, north: float, up: float
 ) -> None:
@@ -319,9 +335,17 @@ def test_the_first_position_is_the_default_origin() -> None:
 def located(**values: float) -> Location:
     """A location that is good to a millimetre."""
     base = {
-        "x_m": 10.0, "y_m": 5.0, "z_m": 0.8, "yaw_rad": 0.4, "covariance": np.eye(3) * 1e-6, "height_sigma_m": 0.02,
-        "articulation_rad": 0.0, "roll_rad": 0.0, "pitch_rad": 0.0, "front_height_m": CARRIER.arm_transport_m,
-    }  # fmt: skip
+        "x_m": 10.0,
+        "y_m": 5.0,
+        "z_m": 0.8,
+        "yaw_rad": 0.4,
+        "covariance": np.eye(3) * 1e-6,
+        "height_sigma_m": 0.02,
+        "articulation_rad": 0.0,
+        "roll_rad": 0.0,
+        "pitch_rad": 0.0,
+        "front_height_m": CARRIER.arm_transport_m,
+    }
     return Location(1, Status.TRACKING, "", **(base | values))
 
 

@@ -100,8 +100,10 @@ def test_a_listed_log_is_mapped_at_once_and_matched_when_observed() -> None:
 
 
 def test_an_unknown_axis_does_not_split_a_log() -> None:
-    sure, unsure = (tuple(np.diag([0.01] * 2 + [turn**2] * 2 + [0.04] * 2 + [0.01])[np.triu_indices(7)].tolist())
-                    for turn in (0.02, 0.6))  # fmt: skip
+    sure, unsure = (
+        tuple(np.diag([0.01] * 2 + [turn**2] * 2 + [0.04] * 2 + [0.01])[np.triu_indices(7)].tolist())
+        for turn in (0.02, 0.6)
+    )
     for covariance, logs in ((unsure, 1), (sure, 2)):
         field = LogMap(PROFILE.bunk)
         for k, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) * 2):

@@ -83,7 +83,7 @@ def test_the_place_of_a_problem_names_the_file_inside() -> None:
         b"".join(gzip.compress(bytes((c,))) for c in GPX),
         b"\x1f\x8b",
     ],
-)  # fmt: skip
+)
 def test_archives_that_are_refused(data: bytes) -> None:
     assert codes(data) == ["archive"]
 

@@ -22,9 +22,17 @@ WORDS = st.text(st.characters(max_codepoint=0x2FFF, exclude_categories=("C", "Z"
 BEARINGS = st.none() | st.floats(0.0, 360.0)
 LANDINGS = st.builds(Landing, PLACES, WORDS, BEARINGS, st.lists(WORDS.filter(bool), max_size=2).map(tuple))
 LOGS = st.builds(
-    KnownLog, PLACES, WORDS, BEARINGS, st.none() | st.floats(0.5, 9.0), st.none() | st.floats(0.05, 0.4), WORDS, WORDS,
-    st.none() | st.integers(1, 99), st.none() | st.floats(0.0, 9.0),
-)  # fmt: skip
+    KnownLog,
+    PLACES,
+    WORDS,
+    BEARINGS,
+    st.none() | st.floats(0.5, 9.0),
+    st.none() | st.floats(0.05, 0.4),
+    WORDS,
+    WORDS,
+    st.none() | st.integers(1, 99),
+    st.none() | st.floats(0.0, 9.0),
+)
 
 
 @st.composite
@@ -37,10 +45,14 @@ def fences(draw: st.DrawFn) -> Fence:
 
 
 MISSIONS = st.builds(
-    ForwardingMission, WORDS, st.lists(PLACES, max_size=6).map(tuple), st.lists(fences(), max_size=3).map(tuple),
-    st.lists(LANDINGS, max_size=3).map(tuple), st.lists(LOGS, max_size=3).map(tuple),
+    ForwardingMission,
+    WORDS,
+    st.lists(PLACES, max_size=6).map(tuple),
+    st.lists(fences(), max_size=3).map(tuple),
+    st.lists(LANDINGS, max_size=3).map(tuple),
+    st.lists(LOGS, max_size=3).map(tuple),
     st.builds(Options, st.integers(1, 9), st.none() | st.floats(0.1, 3.0), logs=st.sampled_from(["search", "listed"])),
-)  # fmt: skip
+)
 
 
 def without(mission: ForwardingMission, left_out: tuple[str, ...]) -> ForwardingMission:

@@ -85,7 +85,7 @@ def test_a_million_points_are_refused_in_bounded_memory(form: str, monkeypatch: 
         "gpx": lambda: b"<gpx><rte>" + b'<rtept lat="1" lon="2"/>' * count + b"</rte></gpx>",
         "kml": lambda: kml(f"<Placemark><Point><coordinates>{'1,2 ' * count}</coordinates></Point></Placemark>"),
         "plan": lambda: b'{"fileType":"Plan","mission":{"items":[' + b"{}," * count + b"{}]}}",
-    }[form]()  # fmt: skip
+    }[form]()
     tracemalloc.start()
     try:
         (code,) = codes(data)

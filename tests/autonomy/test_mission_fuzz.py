@@ -32,10 +32,33 @@ EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SAMPLES = {path.name: path.read_bytes() for path in sorted(EXAMPLES.iterdir()) if path.is_file()}
 SMALL = {name: data for name, data in SAMPLES.items() if len(data) < 40_000}
 WORDS = (
-    b"NaN", b"Infinity", b"-1e309", b"1e308", b"null", b"true", b"[]", b"{}", b'"', b"\\", b"\xff", b"\x00", b"\n",
-    b"</rte>", b"<trk>", b"&#0;", b"&lol;", b"<!DOCTYPE x>", b"<![CDATA[", b'"role":"log",', b"999999999999", b",",
-    b"\xef\xbb\xbf", b"<?xml version='1.1'?>", b"Stem", b'xmlns="urn:x"',
-)  # fmt: skip
+    b"NaN",
+    b"Infinity",
+    b"-1e309",
+    b"1e308",
+    b"null",
+    b"true",
+    b"[]",
+    b"{}",
+    b'"',
+    b"\\",
+    b"\xff",
+    b"\x00",
+    b"\n",
+    b"</rte>",
+    b"<trk>",
+    b"&#0;",
+    b"&lol;",
+    b"<!DOCTYPE x>",
+    b"<![CDATA[",
+    b'"role":"log",',
+    b"999999999999",
+    b",",
+    b"\xef\xbb\xbf",
+    b"<?xml version='1.1'?>",
+    b"Stem",
+    b'xmlns="urn:x"',
+)
 
 
 def never_a_traceback(data: bytes) -> None:
@@ -124,19 +147,27 @@ def missions(draw: st.DrawFn) -> ForwardingMission:
         fences += [Fence(tuple(hole), True, draw(TEXT))] if draw(st.booleans()) else []
     logs = [
         KnownLog(
-            place(draw(METRES), draw(METRES)), draw(TEXT), draw(maybe(st.floats(0.0, 360.0))),
-            draw(maybe(st.floats(2.1, 10.0))), draw(maybe(st.floats(0.05, 1.0))), draw(TEXT), draw(TEXT),
-            draw(maybe(st.integers(1, 10**6))), draw(maybe(st.floats(0.0, 20.0))),
+            place(draw(METRES), draw(METRES)),
+            draw(TEXT),
+            draw(maybe(st.floats(0.0, 360.0))),
+            draw(maybe(st.floats(2.1, 10.0))),
+            draw(maybe(st.floats(0.05, 1.0))),
+            draw(TEXT),
+            draw(TEXT),
+            draw(maybe(st.integers(1, 10**6))),
+            draw(maybe(st.floats(0.0, 20.0))),
         )
         for _ in range(draw(st.integers(0, 4)))
-    ]  # fmt: skip
+    ]
     landings = [
         Landing(
-            place(draw(METRES), draw(METRES)), draw(TEXT), draw(maybe(st.floats(0.0, 360.0))),
+            place(draw(METRES), draw(METRES)),
+            draw(TEXT),
+            draw(maybe(st.floats(0.0, 360.0))),
             tuple(draw(st.lists(TEXT, max_size=2))),
         )
         for _ in range(draw(st.integers(0, 2)))
-    ]  # fmt: skip
+    ]
     source = draw(st.sampled_from(["search", "listed"]))
     chooses = source == "listed" and (not logs or any(log.assortment for log in logs))
     options = Options(

@@ -140,9 +140,12 @@ def test_a_single_log_job_only_accepts_abort() -> None:
 def test_the_longest_mission_fits_in_a_datagram() -> None:
     corners = tuple(Point(*PLANE.geodetic(9e3 * math.cos(a), 9e3 * math.sin(a))[:2]) for a in np.linspace(0, 6, 2000))
     mission = ForwardingMission(
-        "w" * 500, corners, tuple(Fence(corners[:50], True, '"' * 300) for _ in range(200)),
-        tuple(Landing(corners[0], "x" * 300) for _ in range(90)), options=Options(laps=3),
-    )  # fmt: skip
+        "w" * 500,
+        corners,
+        tuple(Fence(corners[:50], True, '"' * 300) for _ in range(200)),
+        tuple(Landing(corners[0], "x" * 300) for _ in range(90)),
+        options=Options(laps=3),
+    )
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE)
     forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05))
     job = ForwardingJob(manager, mission)

@@ -58,9 +58,17 @@ def unloads(manager: ActivityManager) -> bool:
 @whole
 @pytest.mark.parametrize("landing", [None, (58.0, 14.0)])
 @pytest.mark.parametrize(
-    "left_at", [at(State.SEARCH), at(State.APPROACH), at(State.COLLECT), loaded(1, State.CHECK),
-                loaded(1, State.SEARCH), loaded(1, State.APPROACH), loaded(2, State.STOW)],
-)  # fmt: skip
+    "left_at",
+    [
+        at(State.SEARCH),
+        at(State.APPROACH),
+        at(State.COLLECT),
+        loaded(1, State.CHECK),
+        loaded(1, State.SEARCH),
+        loaded(1, State.APPROACH),
+        loaded(2, State.STOW),
+    ],
+)
 def test_a_resumed_mission_has_the_same_tally(landing, left_at, tmp_path: Path) -> None:
     told = listed_mission(landing)
     machine, manager = begun(told)
@@ -174,8 +182,9 @@ def test_a_resumed_mission_waits_for_auto(tmp_path: Path) -> None:
     assert ForwardingJob(begun(told)[1], told).report(0).auto, "one that begins does not wait"
 
 
-LAPS = ForwardingMission("test", tuple(place(*p) for p in ((10.0, 0.0), (30.0, 0.0), (30.0, 20.0), (10.0, 20.0))),
-                         options=Options(laps=2))  # fmt: skip
+LAPS = ForwardingMission(
+    "test", tuple(place(*p) for p in ((10.0, 0.0), (30.0, 0.0), (30.0, 20.0), (10.0, 20.0))), options=Options(laps=2)
+)
 
 
 @pytest.fixture(scope="module")

@@ -33,8 +33,13 @@ class Way:
 
     def review(self, *logs: KnownLog, fences: tuple[Fence, ...] = (YARD,), **options: object) -> Review:
         mission = ForwardingMission(
-            "way", tuple(at(*p) for p in self.points), fences, (), logs, Options(**options)  # type: ignore[arg-type]
-        )  # fmt: skip
+            "way",
+            tuple(at(*p) for p in self.points),
+            fences,
+            (),
+            logs,
+            Options(**options),  # type: ignore[arg-type]
+        )
         return review(mission, AORO)
 
 
@@ -123,5 +128,7 @@ def test_another_country_and_a_machine_that_does_not_drive() -> None:
 def test_a_warning_names_the_part_that_it_is_about() -> None:
     found = Way([(0, 0), (30, 0), (0, 1)]).review(KnownLog(at(0, 30)), fences=())
     assert [(w.code.removeprefix("mission."), w.key) for w in found.warnings] == [
-        ("turn-on-the-spot", ("waypoint", 1)), ("no-fence", None), ("log-out-of-reach", ("log", 0)),
-    ]  # fmt: skip
+        ("turn-on-the-spot", ("waypoint", 1)),
+        ("no-fence", None),
+        ("log-out-of-reach", ("log", 0)),
+    ]

@@ -26,9 +26,12 @@ from tests.codes import coded, numbers_in
 
 
 def drive(
-    way: PathDrive | WaypointDrive, ground: Ground = FIRM, own: Individual | None = None, seconds: float = 120.0,
+    way: PathDrive | WaypointDrive,
+    ground: Ground = FIRM,
+    own: Individual | None = None,
+    seconds: float = 120.0,
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> tuple[Vehicle, Navigator, list[Location]]:  # fmt: skip
+) -> tuple[Vehicle, Navigator, list[Location]]:
     """A drive on the model to its end."""
     vehicle = Vehicle(CARRIER, pose, ground, own or Individual(), 1)
     localizer, navigator, seen = Localizer(CARRIER, vehicle.plane), Navigator(CARRIER, 7), []
@@ -104,11 +107,31 @@ def test_paper_b_drives_from_waypoint_to_waypoint() -> None:
 def report(**values: float) -> VehicleReport:
     """A machine at the origin of the site that stands and is fine."""
     base = VehicleReport(
-        sequence=1, profile_hash=0, stamp_ns=10**9, drive_sequence=0, driving=Driving.DRIVING, refusal=0, refused=0,
-        position_ns=10**9, latitude_deg=CARRIER.site_lat_deg, longitude_deg=CARRIER.site_lon_deg, altitude_m=260.0,
-        fix=4, satellites=19, sigma_m=0.01, heading_ns=10**9, heading_rad=0.0, yaw_rate_rad_s=0.0, motion_ns=10**9,
-        speed_m_s=0.6, articulation_rad=0.1, roll_rad=0.0, pitch_rad=0.0, heights_m=(0.35,) * 4, stale_mask=0,
-    )  # fmt: skip
+        sequence=1,
+        profile_hash=0,
+        stamp_ns=10**9,
+        drive_sequence=0,
+        driving=Driving.DRIVING,
+        refusal=0,
+        refused=0,
+        position_ns=10**9,
+        latitude_deg=CARRIER.site_lat_deg,
+        longitude_deg=CARRIER.site_lon_deg,
+        altitude_m=260.0,
+        fix=4,
+        satellites=19,
+        sigma_m=0.01,
+        heading_ns=10**9,
+        heading_rad=0.0,
+        yaw_rate_rad_s=0.0,
+        motion_ns=10**9,
+        speed_m_s=0.6,
+        articulation_rad=0.1,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        heights_m=(0.35,) * 4,
+        stale_mask=0,
+    )
     return replace(base, **values)
 
 

@@ -20,7 +20,7 @@ from tests.autonomy.valve_stand_in import LEAD_S, StandIn
 SLEW = load_profile("aoro_fc8").joints["slew"]
 SOFT = StandIn(
     deadbands=(0.05, 0.05), full_speeds=(1.8, 1.7), exponent=1.0, delay_s=0.14, ring_rad_s=2.6, ring_zeta=0.2
-)  # fmt: skip
+)
 GOAL = 0.7
 
 
@@ -28,9 +28,13 @@ def known(valve: StandIn):
     """The joint with a valve as a search has found it."""
     plus, minus = valve.deadbands
     found = msgspec.structs.replace(
-        SLEW.valve, deadband_plus_pct=100.0 * plus, deadband_minus_pct=100.0 * minus,
-        full_speed_plus=valve.full_speeds[0], full_speed_minus=valve.full_speeds[1], delay_s=valve.delay_s,
-    )  # fmt: skip
+        SLEW.valve,
+        deadband_plus_pct=100.0 * plus,
+        deadband_minus_pct=100.0 * minus,
+        full_speed_plus=valve.full_speeds[0],
+        full_speed_minus=valve.full_speeds[1],
+        delay_s=valve.delay_s,
+    )
     return msgspec.structs.replace(SLEW, valve=found)
 
 

@@ -49,8 +49,14 @@ def run(test: StepTest, seconds: float = 30.0, each: Callable[[Lockstep], None] 
     try:
         planner = _Planner(test)
         operator = Operator(HASH, lambda action, report: None, max_stops=0)
-        system = Lockstep(Settings(PROFILE, HASH, PROFILE.rate_hz), build_guard(profile_path("palms_471")), plant,
-                          planner, operator, Observer(None, []))  # fmt: skip
+        system = Lockstep(
+            Settings(PROFILE, HASH, PROFILE.rate_hz),
+            build_guard(profile_path("palms_471")),
+            plant,
+            planner,
+            operator,
+            Observer(None, []),
+        )
         planner.bus = InProcessBus(system.core, "step")
         end_ns = system.now_ns + int(seconds * 1e9)
         while system.now_ns < end_ns and not test.idle:

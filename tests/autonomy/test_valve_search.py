@@ -27,9 +27,10 @@ def any_valve(seed: int) -> StandIn:
         return low * (high / low) ** rng.random()
 
     return StandIn(
-        deadbands=(between(0.03, 0.3), between(0.03, 0.3)), delay_s=between(0.02, 0.25),
+        deadbands=(between(0.03, 0.3), between(0.03, 0.3)),
+        delay_s=between(0.02, 0.25),
         full_speeds=(0.5 * between(1 / 3, 3.0), 0.5 * between(1 / 3, 3.0)),
-    )  # fmt: skip
+    )
 
 
 def searched(valve: StandIn, side: int, seed: int = 0):

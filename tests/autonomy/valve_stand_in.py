@@ -65,6 +65,12 @@ class StandIn:
         # The last of every grid step's fine commands is the one at the grid's time.
         shifted = np.concatenate([np.zeros(FINE_FACTOR - 1), fine])[: count * FINE_FACTOR]
         return SpoolTestRecord(
-            joint, side, kind, times[grid], command[grid], shifted,
-            np.round(spools[grid] / 0.0005) * 0.0005, np.round(position / self.count) * self.count,
-        )  # fmt: skip
+            joint,
+            side,
+            kind,
+            times[grid],
+            command[grid],
+            shifted,
+            np.round(spools[grid] / 0.0005) * 0.0005,
+            np.round(position / self.count) * self.count,
+        )

@@ -37,9 +37,7 @@ def container(data: bytes, *, packed: bool = False, method: int | None = None) -
 
 def file(body: bytes, objects: int = 0, file_bytes: int | None = None) -> bytes:
     size = 144 + len(body) if file_bytes is None else file_bytes
-    head = blf.FILE_HEADER_STRUCT.pack(
-        b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, size, size, objects, 0, *START, *START
-    )  # fmt: skip
+    head = blf.FILE_HEADER_STRUCT.pack(b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, size, size, objects, 0, *START, *START)
     return head.ljust(144, b"\0") + body
 
 
@@ -115,8 +113,9 @@ def test_other_objects_are_a_note_and_error_frames_are_frames() -> None:
     notes: list[str] = []
     found = list(reader.read_blf(file(container(body), 3), notes))
     assert [(f.key, len(f.data), f.interface) for f in found if isinstance(f, TraceFrame)] == [
-        (0x185, 8, "1"), (ERROR, 0, "1"),
-    ]  # fmt: skip
+        (0x185, 8, "1"),
+        (ERROR, 0, "1"),
+    ]
     assert len(notes) == 1 and "65" in notes[0]
 
 

@@ -60,10 +60,14 @@ def test_lines(line: str, expected: tuple[int, int, bytes] | None) -> None:
 
 
 SAMPLES = [
-    ("samples/candumpSample2.txt", 402), ("samples/candumpSample3.txt", 2368), ("samples/candump-fast.txt", 23),
-    ("samples/candump-fast-cr.txt", 23), ("samples/actisense-522.candump.log", 106),
-    ("samples/sample-YDWG02.txt", 31), ("candump2analyzer/tests/pcan-view.in", 10),
-]  # fmt: skip
+    ("samples/candumpSample2.txt", 402),
+    ("samples/candumpSample3.txt", 2368),
+    ("samples/candump-fast.txt", 23),
+    ("samples/candump-fast-cr.txt", 23),
+    ("samples/actisense-522.candump.log", 106),
+    ("samples/sample-YDWG02.txt", 31),
+    ("candump2analyzer/tests/pcan-view.in", 10),
+]
 
 
 @pytest.mark.parametrize(("name", "count"), SAMPLES)
@@ -155,10 +159,20 @@ def test_decoder_counts_everything() -> None:
     assert "LiftB=2 bar" in entries[0].text() and "Status=Ok" in entries[0].text()
     summary = decoder.summary()
     assert {k: v for k, v in summary.items() if isinstance(v, int)} == {
-        "frames": 7, "decoded": 1, "unknown": 2, "refused": 2, "bad_crc": 1, "error_frames": 1, "broken": 1,
-        "lost_fast_packets": 0, "transported": 0, "unknown_transported": 0, "lost_transported": 0,
-        "unopened_transported": 0, "extended_transported": 0,
-    }  # fmt: skip
+        "frames": 7,
+        "decoded": 1,
+        "unknown": 2,
+        "refused": 2,
+        "bad_crc": 1,
+        "error_frames": 1,
+        "broken": 1,
+        "lost_fast_packets": 0,
+        "transported": 0,
+        "unknown_transported": 0,
+        "lost_transported": 0,
+        "unopened_transported": 0,
+        "extended_transported": 0,
+    }
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,12 @@ from tests.codes import coded
 DATA = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can"
 FOREIGN = sorted([*DATA.glob("*/dbc/*.dbc"), *DATA.glob("opendbc/*.dbc"), *DATA.glob("*/kcd/*.kcd")])
 REFUSED_BY_CANTOOLS = {
-    "bad_message_length.dbc", "message_layout.kcd", "hyundai_i30_2014.dbc", "vw_mqb.dbc", "test.dbc",
-}  # fmt: skip
+    "bad_message_length.dbc",
+    "message_layout.kcd",
+    "hyundai_i30_2014.dbc",
+    "vw_mqb.dbc",
+    "test.dbc",
+}
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
 MIXED = """VERSION ""
 NS_ :
@@ -394,11 +398,14 @@ PROTOCOL = 'BA_DEF_ "ProtocolType" STRING ;\nBA_DEF_DEF_ "ProtocolType" "";\nBA_
         (PROTOCOL, True),
         (PROTOCOL.replace('DEF_ "ProtocolType" ""', 'DEF_ "ProtocolType" "J1939"').rpartition("BA_ ")[0], True),
         (PROTOCOL.replace('"J1939"', '"CANopen"'), False),
-        (PROTOCOL + 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
-         'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";\n', False),
+        (
+            PROTOCOL + 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+            'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";\n',
+            False,
+        ),
         ("", False),
     ],
-)  # fmt: skip
+)
 def test_a_database_of_j1939_as_a_whole_is_matched_by_pgn(tmp_path: Path, attributes: str, by_pgn: bool) -> None:
     path = tmp_path / "j1939.dbc"
     signal = ' SG_ S : 0|8@1+ (1,0) [0|255] "" E\n'

@@ -55,9 +55,22 @@ def crane_setpoints(draw: st.DrawFn) -> CraneSetpoint:
 
 heights = st.tuples(*[finite] * 4)
 drive_setpoints = st.builds(
-    DriveSetpoint, u32, u32, stamps, microseconds, st.sampled_from(Steering), finite, finite, finite, finite, finite,
-    heights, st.booleans(), st.booleans(), st.booleans(),
-)  # fmt: skip
+    DriveSetpoint,
+    u32,
+    u32,
+    stamps,
+    microseconds,
+    st.sampled_from(Steering),
+    finite,
+    finite,
+    finite,
+    finite,
+    finite,
+    heights,
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+)
 
 
 @st.composite
@@ -69,18 +82,58 @@ def spool_tests(draw: st.DrawFn) -> SpoolTest:
 
 operator_commands = st.builds(OperatorCommand, u32, u32, stamps, st.sampled_from(OperatorAction))
 reports = st.builds(
-    StateReport, u32, u32, stamps, u8, u8, u16, u32, u16, u16, u16,
-    known_or_nan, known_or_nan, known_or_nan, finite, finite, finite, u32, u32, u32, u32,
+    StateReport,
+    u32,
+    u32,
+    stamps,
+    u8,
+    u8,
+    u16,
+    u32,
+    u16,
+    u16,
+    u16,
+    known_or_nan,
+    known_or_nan,
+    known_or_nan,
+    finite,
+    finite,
+    finite,
+    u32,
+    u32,
+    u32,
+    u32,
     operator_link=st.integers(0, len(LinkWatch) - 1),
-)  # fmt: skip
+)
 maybe = st.floats(allow_infinity=False)
 vehicle_reports = st.builds(
-    VehicleReport, u32, u32, stamps, u32, u8, u16, u16, stamps, maybe, maybe, maybe, u8, u8, maybe, stamps, maybe,
-    maybe, stamps, maybe, maybe, maybe, maybe, st.tuples(*[maybe] * 4), u16,
-)  # fmt: skip
-datagrams = st.one_of(
-    crane_setpoints(), spool_tests(), drive_setpoints, operator_commands, reports, vehicle_reports
-)  # fmt: skip
+    VehicleReport,
+    u32,
+    u32,
+    stamps,
+    u32,
+    u8,
+    u16,
+    u16,
+    stamps,
+    maybe,
+    maybe,
+    maybe,
+    u8,
+    u8,
+    maybe,
+    stamps,
+    maybe,
+    maybe,
+    stamps,
+    maybe,
+    maybe,
+    maybe,
+    maybe,
+    st.tuples(*[maybe] * 4),
+    u16,
+)
+datagrams = st.one_of(crane_setpoints(), spool_tests(), drive_setpoints, operator_commands, reports, vehicle_reports)
 
 
 def a_setpoint(knots: tuple[Knot, ...] | None = None) -> CraneSetpoint:
@@ -208,7 +261,7 @@ def a_drive() -> DriveSetpoint:
     heights = (0.35, 0.36, 0.37, 0.38)
     return DriveSetpoint(
         1, 2, 3, 1_000_000, Steering.ARTICULATION, 63.66, 19.9, 0.1, -0.02, 0.6, heights, False, True, True
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -234,7 +287,7 @@ def test_a_vehicle_report_may_hold_unknown_values() -> None:
     unknown = (nan,) * 4
     report = VehicleReport(
         1, 2, 3, 4, 1, 0, 0, 0, nan, nan, nan, 0, 0, nan, 0, nan, nan, 0, nan, nan, nan, nan, unknown, 0xFF
-    )  # fmt: skip
+    )
     back = decode(encode(report))
     assert isinstance(back, VehicleReport) and math.isnan(back.heights_m[3]) and back.stale_mask == 0xFF
 

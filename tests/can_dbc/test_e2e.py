@@ -44,8 +44,13 @@ def test_sender_counts() -> None:
 
 
 O, L, I, R, W, E = (  # noqa: E741
-    Status.OK, Status.OK_SOME_LOST, Status.INITIAL, Status.REPEATED, Status.WRONG_SEQUENCE, Status.ERROR,
-)  # fmt: skip
+    Status.OK,
+    Status.OK_SOME_LOST,
+    Status.INITIAL,
+    Status.REPEATED,
+    Status.WRONG_SEQUENCE,
+    Status.ERROR,
+)
 X = -1
 SEQUENCES = [
     # counters received (X: bad CRC), statuses, trusted at the end

@@ -58,11 +58,20 @@ def test_a_command_is_decoded(order, sequence, stamp_ns, key) -> None:
 
 @pytest.mark.parametrize(
     "fields",
-    [{"schema": 2}, {"extra": 1}, {"loaded": -1}, {"words": "x" * 121}, {"state": None}, {"route": [[91.0, 0.0]]},
-     {"route": [[0.0]]}, {"route": [[1.0, 2.0]] * 301}, {"driven_m": "far"},
-     {"fences": [{"corners": [], "keep_out": False, "name": ""}] * 21},
-     {"fences": [{"corners": [[1.0, 2.0]] * 200, "keep_out": False, "name": ""}] * 2}],
-    )  # fmt: skip
+    [
+        {"schema": 2},
+        {"extra": 1},
+        {"loaded": -1},
+        {"words": "x" * 121},
+        {"state": None},
+        {"route": [[91.0, 0.0]]},
+        {"route": [[0.0]]},
+        {"route": [[1.0, 2.0]] * 301},
+        {"driven_m": "far"},
+        {"fences": [{"corners": [], "keep_out": False, "name": ""}] * 21},
+        {"fences": [{"corners": [[1.0, 2.0]] * 200, "keep_out": False, "name": ""}] * 2},
+    ],
+)
 def test_a_report_that_does_not_match_its_schema_is_refused(fields) -> None:
     assert decode_mission(changed())[2] == MISSION_REPORT, "the way to make one is right"
     assert fault_of(decode_mission, changed(**fields)) is DatagramFault.VALUE
@@ -88,9 +97,13 @@ def test_one_kind_is_never_decoded_as_another() -> None:
     order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.AUTO))
     press = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
     for decoder, data in (
-        (decode, order), (decode, encoded_report()), (decode_mission_command, press),
-        (decode_mission_command, encoded_report()), (decode_mission, press), (decode_mission, order),
-    ):  # fmt: skip
+        (decode, order),
+        (decode, encoded_report()),
+        (decode_mission_command, press),
+        (decode_mission_command, encoded_report()),
+        (decode_mission, press),
+        (decode_mission, order),
+    ):
         assert fault_of(decoder, data) is DatagramFault.KIND
 
 

@@ -87,8 +87,10 @@ def test_the_layout_is_that_of_the_table() -> None:
 @settings(max_examples=50)
 @given(st.data())
 def test_one_changed_byte_is_refused(data: st.DataObject) -> None:
-    for good, decode in ((encode_command(Header(9, 1, 2, 3), COMMAND), decode_command),
-                         (encode_reply(Header(9, 1, 2, 3), FEEDBACK), decode_reply)):  # fmt: skip
+    for good, decode in (
+        (encode_command(Header(9, 1, 2, 3), COMMAND), decode_command),
+        (encode_reply(Header(9, 1, 2, 3), FEEDBACK), decode_reply),
+    ):
         at = data.draw(st.integers(0, len(good) - 1))
         flip = data.draw(st.integers(1, 255))
         bad = good[:at] + bytes((good[at] ^ flip,)) + good[at + 1 :]

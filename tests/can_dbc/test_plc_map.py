@@ -85,12 +85,22 @@ def test_a_status_survives_the_round_trip(feedback: Feedback, watchdog_ms: int, 
 def test_the_addresses_are_those_of_the_map() -> None:
     """Addresses 0-55 and 100-131 as documented, with a distinct value in each register."""
     feedback = Feedback(
-        heartbeat=11, state=State.EXECUTE, fault=1, fault_axis=3, estop=7, accepted=21, longest_cycle_us=31,
-        position=(0.065537, -0.000001, 0.0, 0.0, 0.0, 0.0, 0.0), velocity=(0.001, -0.001, 0.0, 0.0, 0.0, 0.0, 0.007),
-        pressure_bar=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), opening=0.5, load_kg=77,
-        estop_frame=bytes(range(1, 9)), sampled_us=0xABCD,
+        heartbeat=11,
+        state=State.EXECUTE,
+        fault=1,
+        fault_axis=3,
+        estop=7,
+        accepted=21,
+        longest_cycle_us=31,
+        position=(0.065537, -0.000001, 0.0, 0.0, 0.0, 0.0, 0.0),
+        velocity=(0.001, -0.001, 0.0, 0.0, 0.0, 0.0, 0.007),
+        pressure_bar=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+        opening=0.5,
+        load_kg=77,
+        estop_frame=bytes(range(1, 9)),
+        sampled_us=0xABCD,
         output=(1.0, -1.0, 0.001, 0.0, 0.0, 0.25, 0.0),
-    )  # fmt: skip
+    )
     status = status_registers(feedback, 300, WordOrder.HIGH_FIRST)
     assert status[:12] == [0x4352, 3, 0x0102, 0x0304, 11, 2, 1, 3, 7, 21, 31, 300]
     assert status[12:16] == [1, 1, 0xFFFF, 0xFFFF]
@@ -100,9 +110,15 @@ def test_the_addresses_are_those_of_the_map() -> None:
     low = status_registers(feedback, 300, WordOrder.LOW_FIRST)
     assert (low[2:4], low[12:14]) == ([0x0304, 0x0102], [1, 1])
     command = Command(
-        mode=Mode.VALVES, armed=True, reference=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.000001), rate=(0.002,) * N_AXES,
-        grapple=Grapple.HOLD, grapple_pct=20, max_speed_pct=50, reset=True,
-    )  # fmt: skip
+        mode=Mode.VALVES,
+        armed=True,
+        reference=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.000001),
+        rate=(0.002,) * N_AXES,
+        grapple=Grapple.HOLD,
+        grapple_pct=20,
+        max_speed_pct=50,
+        reset=True,
+    )
     block = command_registers(command, 5, 6, WordOrder.HIGH_FIRST)
     assert block[:6] == [5, 6, 2, 0x5AA5, 0x000F, 0x4240]
     assert block[16:] == [0xFFFF, 0xFFFF, 2, 2, 2, 2, 2, 2, 2, 3, 20, 50, 1, 0, 0, 0]

@@ -23,10 +23,21 @@ frames_in = st.lists(st.builds(Frame, u64, key, payload), max_size=5).map(tuple)
 frames_out = st.lists(st.tuples(key, payload), max_size=5).map(tuple)
 ticks = st.builds(
     TickRecord,
-    u64, st.integers(-(2**63), 2**63 - 1), u64, u64, readings, readings, frames_in, frames_in,
-    st.lists(st.binary(max_size=99), max_size=3).map(tuple), frames_out, frames_out, st.binary(max_size=300),
-    st.binary(max_size=300), st.lists(st.binary(max_size=99), max_size=3).map(tuple),
-)  # fmt: skip
+    u64,
+    st.integers(-(2**63), 2**63 - 1),
+    u64,
+    u64,
+    readings,
+    readings,
+    frames_in,
+    frames_in,
+    st.lists(st.binary(max_size=99), max_size=3).map(tuple),
+    frames_out,
+    frames_out,
+    st.binary(max_size=300),
+    st.binary(max_size=300),
+    st.lists(st.binary(max_size=99), max_size=3).map(tuple),
+)
 
 
 @given(ticks)

@@ -25,11 +25,21 @@ from tests.codes import coded
 
 def facts(ticks: int = 3, words: str = "STANDBY. All is well.") -> Facts:
     return Facts(
-        pid=os.getpid(), started_ns=1, written_ns=2, period_ns=5_000_000, ticks=ticks, missed=1, late=0,
-        mode="STANDBY", words=words, buses=(BusCounters("crane0", "ACTIVE", 9, 8, 7, 6, 5, 4),),
-        process=ProcessCounters(1, 2, 3, 4, 5, 6, 7, 8), inputs={"EncSlew": InputAge(2_500_000, 3_000_000, 17)},
-        longest_ns=tuple(range(len(STAGES))), total_ns=(ticks,) * len(STAGES),
-    )  # fmt: skip
+        pid=os.getpid(),
+        started_ns=1,
+        written_ns=2,
+        period_ns=5_000_000,
+        ticks=ticks,
+        missed=1,
+        late=0,
+        mode="STANDBY",
+        words=words,
+        buses=(BusCounters("crane0", "ACTIVE", 9, 8, 7, 6, 5, 4),),
+        process=ProcessCounters(1, 2, 3, 4, 5, 6, 7, 8),
+        inputs={"EncSlew": InputAge(2_500_000, 3_000_000, 17)},
+        longest_ns=tuple(range(len(STAGES))),
+        total_ns=(ticks,) * len(STAGES),
+    )
 
 
 def histograms(duration_ns: int = 1000, count: int = 1) -> dict[str, Durations]:

@@ -45,9 +45,10 @@ def test_pcan_rows(tmp_path: Path, version: str) -> None:
     trace = write(tmp_path / "x.trc", f";$FILEVERSION={version}\n;$STARTTIME=43474.5\n;  a comment\n{TRC[version]}")
     found = list(trace)
     assert found[:3] == [
-        Frame(10 * MS, 0x210, b"\x00\xfc"), Frame(12 * MS, 0x210 | REMOTE, b""),
+        Frame(10 * MS, 0x210, b"\x00\xfc"),
+        Frame(12 * MS, 0x210 | REMOTE, b""),
         Frame(14 * MS, 0x09F8027F | EXTENDED, b"\xff"),
-    ]  # fmt: skip
+    ]
     assert all(isinstance(r, Frame) and r.key == ERROR for r in found[3:]) and len(found) > 3
     assert len(trace.notes) == (version in ("2.0", "2.1"))
     buses = {"1.2": ["1", "1", "2", "1"], "1.3": ["1", "1", "2", "1"], "2.1": ["1"] * 4}.get(version, [""] * 4)
@@ -65,8 +66,11 @@ def test_a_cut_pcan_row_is_malformed(tmp_path: Path, version: str) -> None:
 def test_pcan_files_of_python_can(tmp_path: Path) -> None:
     with can.TRCWriter(tmp_path / "x.trc") as writer:
         for i in range(20):
-            writer.on_message_received(can.Message(timestamp=100 + i / 100, arbitration_id=0x210, is_extended_id=False,
-                                                   data=bytes(i % 9), channel=1))  # fmt: skip
+            writer.on_message_received(
+                can.Message(
+                    timestamp=100 + i / 100, arbitration_id=0x210, is_extended_id=False, data=bytes(i % 9), channel=1
+                )
+            )
     assert list(read_trace(tmp_path / "x.trc")) == [Frame(i * 10 * MS, 0x210, bytes(i % 9)) for i in range(20)]
 
 
@@ -80,8 +84,9 @@ def test_asc_with_relative_stamps(tmp_path: Path) -> None:
 def test_asc_before_the_trigger_and_in_another_language(tmp_path: Path) -> None:
     lines = "-0.250 1  210 Rx d 1 00\n 0.000 Start der Messung\n 0.500 1  9F8027Fx Rx d 1 01\n"
     assert list(write(tmp_path / "x.asc", ASC.format("absolute") + lines)) == [
-        Frame(-250 * MS, 0x210, b"\x00"), Frame(500 * MS, 0x09F8027F | EXTENDED, b"\x01"),
-    ]  # fmt: skip
+        Frame(-250 * MS, 0x210, b"\x00"),
+        Frame(500 * MS, 0x09F8027F | EXTENDED, b"\x01"),
+    ]
 
 
 def test_asc_lines_that_lack_bytes_are_malformed_and_quiet(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -118,8 +123,9 @@ def test_the_words_about_an_error_frame_belong_to_it(tmp_path: Path) -> None:
         " (1.0)  can0  20000004   [8]  00 08 00 00 00 00 60 00   ERRORFRAME\n\tcontroller-problem{tx-error-warning}\n"
     )
     assert [type(r) for r in write(tmp_path / "x.log", text + "\tstill the same\n (2.0)  can0  210   [0]\n")] == [
-        TraceFrame, TraceFrame,
-    ]  # fmt: skip
+        TraceFrame,
+        TraceFrame,
+    ]
 
 
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"]
@@ -130,8 +136,9 @@ ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"]
 def test_logs_in_every_encoding(tmp_path: Path, encoding: str, end: str) -> None:
     text = f"(1.0) can0 210#00{end}(2.0) can0 210#01{end}"
     assert list(write(tmp_path / "x.log", text, encoding)) == [
-        Frame(1000 * MS, 0x210, b"\x00"), Frame(2000 * MS, 0x210, b"\x01"),
-    ]  # fmt: skip
+        Frame(1000 * MS, 0x210, b"\x00"),
+        Frame(2000 * MS, 0x210, b"\x01"),
+    ]
 
 
 DBC = """VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: ECU\n
@@ -174,8 +181,11 @@ def test_a_message_of_j1939_is_no_fast_packet(tmp_path: Path) -> None:
     assert [(e.values, e.fault) for e in decoder.run(frames)] == [({"Spn1": 0}, "")] * 3
     summary = decoder.summary()
     assert (summary["lost_fast_packets"], summary["transported"], summary["refused"], summary["decoded"]) == (
-        0, 0, 0, 3,
-    )  # fmt: skip
+        0,
+        0,
+        0,
+        3,
+    )
 
 
 @pytest.mark.parametrize(

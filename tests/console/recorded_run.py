@@ -26,9 +26,29 @@ def report_at(stamp_ns: int) -> StateReport:
     mode, reason = (Mode.STOP, pack(Reason.JOINT_STUCK, 1)) if stopped else (Mode.ACTIVE, 0)
     since_ns, numbers = (BEGIN_NS + STOP_S * 10**9, (0.4, 0.1, 0.0)) if stopped else (0, ())
     return StateReport(
-        1, HASH, stamp_ns, mode, 1, reason, 1, 0, 0, 0, q, (0.01, 0.0, 0.0, 0.0, 0.0), reference, 60.0, 10.0, 0.0,
-        600_000, 50_000, 0, 100, since_ns, numbers,
-    )  # fmt: skip
+        1,
+        HASH,
+        stamp_ns,
+        mode,
+        1,
+        reason,
+        1,
+        0,
+        0,
+        0,
+        q,
+        (0.01, 0.0, 0.0, 0.0, 0.0),
+        reference,
+        60.0,
+        10.0,
+        0.0,
+        600_000,
+        50_000,
+        0,
+        100,
+        since_ns,
+        numbers,
+    )
 
 
 class RecordedRun:

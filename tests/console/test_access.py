@@ -78,9 +78,14 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
         clock = Clock()
         log = AuditLog(tmp_path / "audit.jsonl", clock)
         console = Console(
-            PROFILE, HASH, tmp_path / "operator", planner=planner.getsockname(), missions=tmp_path / "missions",
-            audit=log, clock=clock,
-        )  # fmt: skip
+            PROFILE,
+            HASH,
+            tmp_path / "operator",
+            planner=planner.getsockname(),
+            missions=tmp_path / "missions",
+            audit=log,
+            clock=clock,
+        )
         yield Stage(console, operator, planner, clock)
         log.close()
 
@@ -101,9 +106,14 @@ def accounts() -> Accounts:
 def guarded(stage: Stage, accounts: Accounts) -> Stage:
     """The same console for persons who sign in."""
     stage.console = Console(
-        PROFILE, HASH, stage.console.operator, planner=stage.console.planner, accounts=accounts,
-        audit=stage.console.audit, clock=stage.clock,
-    )  # fmt: skip
+        PROFILE,
+        HASH,
+        stage.console.operator,
+        planner=stage.console.planner,
+        accounts=accounts,
+        audit=stage.console.audit,
+        clock=stage.clock,
+    )
     return stage
 
 
@@ -175,8 +185,12 @@ def test_a_lease_cannot_be_stolen(stage: Stage) -> None:
         assert thief.post("/api/operator/arm", headers={TOKEN_HEADER: token}).status_code == 403
     thief.post("/api/lease/give-back")
     with thief.websocket_connect(socket_of(thief), headers=BROWSING) as ws:
-        assert ws.receive_json()["lease"] == {"page": 1, "holder": "this machine (page 1)", "mine": False,
-                                              "may_take": True}  # fmt: skip
+        assert ws.receive_json()["lease"] == {
+            "page": 1,
+            "holder": "this machine (page 1)",
+            "mine": False,
+            "may_take": True,
+        }
     assert thief.post("/api/operator/arm").status_code == 403 and stage.nothing_sent()
     assert holder.post("/api/operator/arm").status_code == 204
 
@@ -185,7 +199,11 @@ def test_a_takeover_is_explicit_and_seen_by_both(stage: Stage) -> None:
     first, second = page_client(stage.console, leads=True), page_client(stage.console)
     assert second.post("/api/lease/take", json={"over": 1}).status_code == 204
     assert first.get("/api/state").json()["lease"] | {"may_take": 1} == {
-        "page": 2, "holder": "this machine (page 2)", "mine": False, "may_take": 1}  # fmt: skip
+        "page": 2,
+        "holder": "this machine (page 2)",
+        "mine": False,
+        "may_take": 1,
+    }
     assert second.get("/api/state").json()["lease"]["mine"] is True
     assert first.post("/api/operator/arm").status_code == 403 and stage.nothing_sent()
 
@@ -312,8 +330,12 @@ def test_a_websocket_without_origin_only_shows(stage: Stage) -> None:
 
 def test_a_websocket_is_not_hijacked(stage: Stage) -> None:
     page = page_client(stage.console, leads=True)
-    for headers in ({"origin": "http://evil.example"}, {"origin": "http://127.0.0.1:9999"}, {"origin": "null"},
-                    {"host": "evil.example:8471"}):  # fmt: skip
+    for headers in (
+        {"origin": "http://evil.example"},
+        {"origin": "http://127.0.0.1:9999"},
+        {"origin": "null"},
+        {"host": "evil.example:8471"},
+    ):
         with pytest.raises(WebSocketDisconnect), page.websocket_connect(socket_of(page), headers=headers):
             pass
     for token in ("", "wrong"):
@@ -328,8 +350,18 @@ def test_a_websocket_is_not_hijacked(stage: Stage) -> None:
     assert stage.nothing_sent()
 
 
-@pytest.mark.parametrize("path", [*TRIES, "/api/lease/take", "/api/lease/give-back", "/api/plan/upload/a.geojson",
-                                  "/api/plan/missions/a.geojson", "/api/watch-end/abc", "/api/sign-out"])  # fmt: skip
+@pytest.mark.parametrize(
+    "path",
+    [
+        *TRIES,
+        "/api/lease/take",
+        "/api/lease/give-back",
+        "/api/plan/upload/a.geojson",
+        "/api/plan/missions/a.geojson",
+        "/api/watch-end/abc",
+        "/api/sign-out",
+    ],
+)
 def test_a_forged_request_is_refused(stage: Stage, path: str) -> None:
     """CSRF by a form or fetch of another site, without Origin by something older, and DNS rebinding."""
     page = page_client(stage.console, leads=True)
@@ -434,8 +466,10 @@ def test_over_tls_the_cookie_is_secure(guarded: Stage) -> None:
 def test_a_password_is_kept_as_its_hash_only(tmp_path: Path) -> None:
     path = tmp_path / "passwords"
     text = with_account("# accounts\n", account_line("anna", Role.VIEWER, PASSWORD))
-    text = with_account(with_account(text, account_line("bo", Role.TECHNICIAN, "another one ")), account_line(
-        "anna", Role.OPERATOR, PASSWORD))  # fmt: skip
+    text = with_account(
+        with_account(text, account_line("bo", Role.TECHNICIAN, "another one ")),
+        account_line("anna", Role.OPERATOR, PASSWORD),
+    )
     path.write_text(text)
     path.chmod(0o600)
     found = read_accounts(path)
@@ -447,12 +481,16 @@ def test_a_password_is_kept_as_its_hash_only(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "mode", "code"),
-    [("", 0o600, "accounts.empty"), ("anna operator\n", 0o600, "accounts.line"),
-     ("anna operator secret\n", 0o600, "accounts.line"),
-     ("anna boss $argon2id$v=19$m=8,t=1,p=1$YQ$YQ\n", 0o600, "accounts.line"),
-     ("x\n", 0o644, "accounts.open-file"), ("x\n", 0o620, "accounts.open-file"),
-     (b"\xff", 0o600, "accounts.unreadable")],
-)  # fmt: skip
+    [
+        ("", 0o600, "accounts.empty"),
+        ("anna operator\n", 0o600, "accounts.line"),
+        ("anna operator secret\n", 0o600, "accounts.line"),
+        ("anna boss $argon2id$v=19$m=8,t=1,p=1$YQ$YQ\n", 0o600, "accounts.line"),
+        ("x\n", 0o644, "accounts.open-file"),
+        ("x\n", 0o620, "accounts.open-file"),
+        (b"\xff", 0o600, "accounts.unreadable"),
+    ],
+)
 def test_a_wrong_file_of_accounts_is_refused(tmp_path: Path, text: str | bytes, mode: int, code: str) -> None:
     path = tmp_path / "passwords"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -525,8 +563,16 @@ ANY_JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=10), inner, max_size=3),
     max_leaves=8,
 )
-PATHS = ["/api/lease/take", "/api/sign-in", "/api/plan/check", "/api/plan/import", "/api/plan/export/kml",
-         "/api/plan/missions/m.geojson", "/api/plan/upload/m.geojson", "/api/session"]  # fmt: skip
+PATHS = [
+    "/api/lease/take",
+    "/api/sign-in",
+    "/api/plan/check",
+    "/api/plan/import",
+    "/api/plan/export/kml",
+    "/api/plan/missions/m.geojson",
+    "/api/plan/upload/m.geojson",
+    "/api/session",
+]
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -20,9 +20,27 @@ MEASURED = (0.5, 0.9, -2.0, 0.5, nan)
 def drawn(profile, told: float) -> dict:
     crane_state = CraneState(profile)
     report = StateReport(
-        1, profile_hash(profile), 5_000_000_000, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, MEASURED,
-        (0.0,) * 5, (*MEASURED[:4], told), nan, nan, nan, 0, 0, 0, 0,
-    )  # fmt: skip
+        1,
+        profile_hash(profile),
+        5_000_000_000,
+        Mode.ACTIVE,
+        0,
+        0,
+        1,
+        0,
+        0,
+        0,
+        MEASURED,
+        (0.0,) * 5,
+        (*MEASURED[:4], told),
+        nan,
+        nan,
+        nan,
+        0,
+        0,
+        0,
+        0,
+    )
     assert crane_state.on_report(encode(report), 0)
     state = crane_state.state(0)
     json.dumps(state, allow_nan=False)

@@ -25,10 +25,20 @@ HERE = "http://127.0.0.1:8471"
 JPEG = b"\xff\xd8\xff" + b"picture\n" * 9
 # At the base frame's origin, looking along base y: x right is base x, y down is base -z.
 FACTS = PictureFacts(
-    1, "stick", 7, "", 640, 360, 300.0, 300.0, 320.0, 180.0, (0.0, 0.0, 0.0),
+    1,
+    "stick",
+    7,
+    "",
+    640,
+    360,
+    300.0,
+    300.0,
+    320.0,
+    180.0,
+    (0.0, 0.0, 0.0),
     (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0),
     (PictureLog(3, ((10.0, 20.0), (30.0, 40.0)), 2.5, 0.2, True),),
-)  # fmt: skip
+)
 GRASP = ChosenGrasp(1, (0.0, 4.0, 1.5), 0.0, (3,), "log 3 alone")
 PLACE = {"x_m": 1.0, "y_m": 2.0, "front_rad": 0.1, "rear_rad": 0.1}
 

@@ -69,8 +69,18 @@ def test_page_and_every_file_it_names_are_served_from_here(client):
     page = client.get("/")
     assert page.status_code == 200 and 'id="stop"' in page.text
     assert "http://" not in page.text and "https://" not in page.text
-    for name in ("app.js", "scene.js", "carrier.js", "plot.js", "style.css", "icon.svg", "vendor/three.module.min.js",
-                 "vendor/three.core.min.js", "vendor/OrbitControls.js", "vendor/three.LICENSE.txt"):  # fmt: skip
+    for name in (
+        "app.js",
+        "scene.js",
+        "carrier.js",
+        "plot.js",
+        "style.css",
+        "icon.svg",
+        "vendor/three.module.min.js",
+        "vendor/three.core.min.js",
+        "vendor/OrbitControls.js",
+        "vendor/three.LICENSE.txt",
+    ):
         assert client.get(f"/static/{name}").status_code == 200, name
 
 
@@ -102,9 +112,19 @@ def test_policy_names_the_hash_of_the_import_map(client):
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example", "evil.example:8471", "127.0.0.1.evil.example", "", "evil@127.0.0.1", "evil@127.0.0.1:8471",
-     "127.0.0.1:8471:80", "127.0.0.1/x", "127.0.0.1 ", "127.0.0.1:x"],
-)  # fmt: skip
+    [
+        "evil.example",
+        "evil.example:8471",
+        "127.0.0.1.evil.example",
+        "",
+        "evil@127.0.0.1",
+        "evil@127.0.0.1:8471",
+        "127.0.0.1:8471:80",
+        "127.0.0.1/x",
+        "127.0.0.1 ",
+        "127.0.0.1:x",
+    ],
+)
 def test_foreign_host_is_refused(client, host):
     assert client.get("/api/state", headers={"host": host}).status_code == 403
     with pytest.raises(WebSocketDisconnect), client.websocket_connect("/ws", headers={"host": host}):

@@ -75,10 +75,16 @@ def test_exchanged_axes_are_named(client: TestClient) -> None:
 
 @pytest.mark.parametrize(
     ("body", "name"),
-    [({"waypoint": []}, "waypoint"), ({"waypoints": [POINT | {"altitude": 3}]}, "altitude"),
-     ({"options": {"laps": "2"}}, "laps"), ({"schema": 2}, "schema"), ([], ""), ({"fences": {}}, "fences"),
-     ({"waypoints": [{"latitude_deg": 1}]}, "longitude_deg")],
-)  # fmt: skip
+    [
+        ({"waypoint": []}, "waypoint"),
+        ({"waypoints": [POINT | {"altitude": 3}]}, "altitude"),
+        ({"options": {"laps": "2"}}, "laps"),
+        ({"schema": 2}, "schema"),
+        ([], ""),
+        ({"fences": {}}, "fences"),
+        ({"waypoints": [{"latitude_deg": 1}]}, "longitude_deg"),
+    ],
+)
 @pytest.mark.parametrize("path", ["check", "export/kml", "missions/m.geojson"])
 def test_what_is_not_the_schema_is_refused_in_one_sentence(client: TestClient, path: str, body, name: str) -> None:
     answer = client.post(f"/api/plan/{path}", json=body)
@@ -143,9 +149,20 @@ def test_missions_are_saved_in_the_folder_alone(client: TestClient, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "name", ["..%2f..%2fetc.geojson", "%2e%2e%2fa.geojson", "a%2fb.geojson", "a%5cb.geojson", ".a.geojson", "a.txt",
-             "a%00.geojson", "%2fetc%2fpasswd", "-a.geojson", "a.geojson%0a"],
-)  # fmt: skip
+    "name",
+    [
+        "..%2f..%2fetc.geojson",
+        "%2e%2e%2fa.geojson",
+        "a%2fb.geojson",
+        "a%5cb.geojson",
+        ".a.geojson",
+        "a.txt",
+        "a%00.geojson",
+        "%2fetc%2fpasswd",
+        "-a.geojson",
+        "a.geojson%0a",
+    ],
+)
 def test_no_name_leads_out_of_the_folder(client: TestClient, name: str, tmp_path: Path) -> None:
     for method in ("missions", "upload"):
         assert client.post(f"/api/plan/{method}/{name}", json=document()).status_code in (404, 409, 422)

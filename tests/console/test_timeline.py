@@ -46,8 +46,11 @@ def test_the_fault_behind_a_ramp_is_the_same_stop_and_a_second_reason_is_another
     other = replace(fault, reason=pack(Reason.ESTOP_PRESSED, 0))
     found = story(replace(REPORT, mode=Mode.ACTIVE), stop, fault, other)
     assert [(e["kind"], e["title"]) for e in found] == [
-        ("mode", "ACTIVE"), ("stop", "JOINT_STUCK"), ("mode", "FAULT"), ("stop", "ESTOP_PRESSED"),
-    ]  # fmt: skip
+        ("mode", "ACTIVE"),
+        ("stop", "JOINT_STUCK"),
+        ("mode", "FAULT"),
+        ("stop", "ESTOP_PRESSED"),
+    ]
 
 
 def test_a_machine_that_was_stopped_before_has_no_stop() -> None:
@@ -66,8 +69,9 @@ def grips(*reports: StateReport) -> list[tuple[float, list[float]]]:
 def test_a_load_is_told_once_with_its_weight_when_it_has_hung_for_a_second() -> None:
     lifted = (held(1.0, 1.4), held(2.0, 80.0), held(2.5, 190.0), held(3.0, 240.0), held(4.0, 250.0), held(9.0, 3.0))
     assert grips(REPORT, *lifted, held(9.5, 3.0, state=2), held(9.9, 0.0, state=1)) == [
-        (2.0, [240]), (9.5, []),
-    ]  # fmt: skip
+        (2.0, [240]),
+        (9.5, []),
+    ]
 
 
 def test_jaws_that_close_empty_hold_no_load() -> None:

@@ -67,10 +67,20 @@ VALUES: dict[str, dict[str, float]] = {
     "GrappleStat": {"Opening": 100.0},
 }
 MACHINE_PERIOD_MS = {
-    "VehStat": 20, "ArmHeightA": 20, "ArmHeightB": 20, "EEC1": 20, "CCVS": 100, "DM1": 1000, "PositionRapidUpdate": 100,
-    "VesselHeading": 100, "RateOfTurn": 100, "Attitude": 100, "CogSogRapidUpdate": 250, "GnssPositionData": 1000,
+    "VehStat": 20,
+    "ArmHeightA": 20,
+    "ArmHeightB": 20,
+    "EEC1": 20,
+    "CCVS": 100,
+    "DM1": 1000,
+    "PositionRapidUpdate": 100,
+    "VesselHeading": 100,
+    "RateOfTurn": 100,
+    "Attitude": 100,
+    "CogSogRapidUpdate": 250,
+    "GnssPositionData": 1000,
     "SystemTime": 1000,
-}  # fmt: skip
+}
 MACHINE_VALUES: dict[str, dict[str, float]] = {
     "VehStat": {"Gear": 3, "Brake": 1, "ParkBrake": 1},
     "EEC1": {"EngineSpeed": 1500.0},
@@ -98,10 +108,16 @@ class EncoderNode:
         self.spec = spec
         self.state = 0x7F
         self.objects = {
-            (0x1000, 0): spec.device_type, (0x1018, 1): 7, (0x6001, 0): spec.total_counts,
-            (0x6005, 1): round(spec.unit_per_count * 1e9), (0x6002, 0): spec.total_counts, (0x1A00, 0): 2,
-            (0x6000, 0): 4, (0x6003, 0): 0, (0x6509, 0): 0,
-        }  # fmt: skip
+            (0x1000, 0): spec.device_type,
+            (0x1018, 1): 7,
+            (0x6001, 0): spec.total_counts,
+            (0x6005, 1): round(spec.unit_per_count * 1e9),
+            (0x6002, 0): spec.total_counts,
+            (0x1A00, 0): 2,
+            (0x6000, 0): 4,
+            (0x6003, 0): 0,
+            (0x6509, 0): 0,
+        }
         self.silent = False
         self.refuses: set[tuple[int, int]] = set()
         self.writes: list[tuple[int, int, int]] = []
@@ -353,15 +369,24 @@ class Bench:
 
     def operator(self, action: OperatorAction, **fields: int) -> bytes:
         self.sequence += 1
-        values = {"sequence": self.sequence, "profile_hash": self.settings.profile_hash,
-                  "stamp_ns": self.now_ns, **fields}  # fmt: skip
+        values = {
+            "sequence": self.sequence,
+            "profile_hash": self.settings.profile_hash,
+            "stamp_ns": self.now_ns,
+            **fields,
+        }
         return encode(OperatorCommand(action=action, **values))
 
     def setpoint(self, knots, grapple=GrappleCommand.NEUTRAL, final=False, lease_ms=200, **fields) -> bytes:
         """``knots``: (after_ms, position, velocity)."""
         self.setpoint_sequence += 1
-        values = {"sequence": self.setpoint_sequence, "profile_hash": self.settings.profile_hash,
-                  "stamp_ns": self.now_ns, "lease_ns": lease_ms * MS, **fields}  # fmt: skip
+        values = {
+            "sequence": self.setpoint_sequence,
+            "profile_hash": self.settings.profile_hash,
+            "stamp_ns": self.now_ns,
+            "lease_ns": lease_ms * MS,
+            **fields,
+        }
         packed = tuple(Knot(round(ms * MS), tuple(p), tuple(v)) for ms, p, v in knots)
         return encode(CraneSetpoint(grapple=grapple, final=final, knots=packed, **values))
 

@@ -114,11 +114,20 @@ class DriveBench(Bench):
     def drive_setpoint(self, lease_ms: int = 200, **fields) -> bytes:
         self.drive_sequence += 1
         values = {
-            "sequence": self.drive_sequence, "profile_hash": self.settings.profile_hash, "stamp_ns": self.now_ns,
-            "lease_ns": lease_ms * MS, "steering": Steering.WAYPOINT, "latitude_deg": CARRIER.site_lat_deg,
-            "longitude_deg": CARRIER.site_lon_deg, "articulation_rad": 0.0, "articulation_rate_rad_s": 0.0,
-            "speed_m_s": 0.0, "heights_m": TRANSPORT, "float_front": False, "float_rear": False,
-        } | fields  # fmt: skip
+            "sequence": self.drive_sequence,
+            "profile_hash": self.settings.profile_hash,
+            "stamp_ns": self.now_ns,
+            "lease_ns": lease_ms * MS,
+            "steering": Steering.WAYPOINT,
+            "latitude_deg": CARRIER.site_lat_deg,
+            "longitude_deg": CARRIER.site_lon_deg,
+            "articulation_rad": 0.0,
+            "articulation_rate_rad_s": 0.0,
+            "speed_m_s": 0.0,
+            "heights_m": TRANSPORT,
+            "float_front": False,
+            "float_rear": False,
+        } | fields
         return encode(DriveSetpoint(**values))
 
     def go(self, ticks: int, *place: float, **fields) -> DriveBench:

@@ -9,10 +9,21 @@ from controller.guard.verdicts import FINE
 from tests.controller.bench import MS
 
 AXIS = Axis(
-    number=1, signal="Lift", sign=-1, deadbands_pct=(10.0, 20.0), full_speeds=(0.2, 0.4), rate_pct_s=100.0,
-    closing_ns=50 * MS, lower=-1.0, upper=1.0, speed_limit=0.2, message="EncLift", total_counts=16384,
-    zero_counts=8192, unit=-0.001,
-)  # fmt: skip
+    number=1,
+    signal="Lift",
+    sign=-1,
+    deadbands_pct=(10.0, 20.0),
+    full_speeds=(0.2, 0.4),
+    rate_pct_s=100.0,
+    closing_ns=50 * MS,
+    lower=-1.0,
+    upper=1.0,
+    speed_limit=0.2,
+    message="EncLift",
+    total_counts=16384,
+    zero_counts=8192,
+    unit=-0.001,
+)
 PERCENT = Field(0, 16, True, 0.1, -100.0, 100.0)
 POSITION = {"Position": Field(0, 16, False, 1.0, 0.0, 65535.0), "TimeStamp": Field(16, 16, False, 1.0, 0.0, 65535.0)}
 ENCODER = Layout(0x181, 4, POSITION, b"", 0)

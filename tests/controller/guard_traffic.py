@@ -170,9 +170,12 @@ BROKEN = {
     "pin into the ground": (Verdict.REACH, 15, 10, under_ground),
     "controller says it has stopped": (Verdict.DISAGREE, 15, 210, change(a=MOVING, controller={"Mode": 4})),
     "controller says nothing": (
-        Verdict.DISAGREE, 15, 310, lambda t: (t.dropped.add("CtrlStatus"), t.a.update(MOVING)),
+        Verdict.DISAGREE,
+        15,
+        310,
+        lambda t: (t.dropped.add("CtrlStatus"), t.a.update(MOVING)),
     ),
-}  # fmt: skip
+}
 DRIVE_BROKEN = {
     "drive command gone": (Verdict.NO_COMMAND, 15, 110, lambda t: t.dropped.add("VehCmd")),
     "arm command gone": (Verdict.NO_COMMAND, 15, 110, lambda t: t.dropped.add("ArmCmdB")),
@@ -182,7 +185,10 @@ DRIVE_BROKEN = {
     "arm not armed": (Verdict.NOT_ARMED, 9, 25, change(arms_a={"Arm3": 5.0}, arms_b={"ArmKey": 0xA})),
     "float valve not armed": (Verdict.NOT_ARMED, 9, 25, change(arms_b={"FloatRear": 1})),
     "both float valves": (
-        Verdict.RANGE, 9, 25, change(arms_a={"ArmKey": 0xA}, arms_b={"ArmKey": 0xA, "FloatFront": 1, "FloatRear": 1}),
+        Verdict.RANGE,
+        9,
+        25,
+        change(arms_a={"ArmKey": 0xA}, arms_b={"ArmKey": 0xA, "FloatFront": 1, "FloatRear": 1}),
     ),
     "arm not available": (Verdict.RANGE, 9, 25, change(arms_a={"ArmKey": 0xA, "Arm1": None})),
     "too fast": (Verdict.RANGE, 7, 25, change(drive=DRIVING | {"Speed": -1.1})),
@@ -191,21 +197,33 @@ DRIVE_BROKEN = {
     "steering too fast": (Verdict.RANGE, 8, 25, change(drive=DRIVING | {"ArticRate": 0.22})),
     "speed jumps": (Verdict.RATE, 7, 25, change(drive=DRIVING | {"Speed": 0.3})),
     "bent further out": (
-        Verdict.OUTSIDE, 8, 25, change(drive=DRIVING | {"ArticRate": -0.1}, vehicle={"Articulation": -0.7}),
+        Verdict.OUTSIDE,
+        8,
+        25,
+        change(drive=DRIVING | {"ArticRate": -0.1}, vehicle={"Articulation": -0.7}),
     ),
     "state gone": (Verdict.CARRIER_LOST, 7, 110, lambda t: (t.dropped.add("VehStat"), t.drive.update(DRIVING))),
     "state not available": (
-        Verdict.CARRIER_LOST, 7, 25, change(drive=DRIVING, vehicle={"Articulation": None}),
+        Verdict.CARRIER_LOST,
+        7,
+        25,
+        change(drive=DRIVING, vehicle={"Articulation": None}),
     ),
     "rolls although it brakes": (Verdict.MOVING, 7, 1530, change(vehicle={"Speed": -0.2})),
     "crane while it drives": (Verdict.BOTH, 7, 400, lambda t: drive_and_slew(t)),
     "person while it drives": (
-        Verdict.PERSON, 7, 2230, lambda t: (t.drive.update(DRIVING), t.estop.update({"Person": 1})),
+        Verdict.PERSON,
+        7,
+        2230,
+        lambda t: (t.drive.update(DRIVING), t.estop.update({"Person": 1})),
     ),
     "other guard on mach0": (
-        Verdict.OTHER_GUARD, 15, 10, lambda t: t.extra.append(Frame(t.now_ns, CODECS["GuardAlive"].key, bytes(8))),
+        Verdict.OTHER_GUARD,
+        15,
+        10,
+        lambda t: t.extra.append(Frame(t.now_ns, CODECS["GuardAlive"].key, bytes(8))),
     ),
-}  # fmt: skip
+}
 
 
 def drive_and_slew(traffic):

@@ -98,9 +98,13 @@ def test_lost_address_stops_the_machine():
 
 @pytest.mark.parametrize(
     ("state", "reason", "mode"),
-    [(3, Reason.BUS_OFF, Mode.FAULT), (4, Reason.BUS_DOWN, Mode.FAULT), (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
-     (1, Reason.NONE, Mode.ACTIVE)],
-)  # fmt: skip
+    [
+        (3, Reason.BUS_OFF, Mode.FAULT),
+        (4, Reason.BUS_DOWN, Mode.FAULT),
+        (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
+        (1, Reason.NONE, Mode.ACTIVE),
+    ],
+)
 def test_mach0_bus_state(state, reason, mode):
     bench = Bench(AORO).active()
     bench.tick(machine_bus_state=state)

@@ -248,14 +248,17 @@ KEYS = [m.key for m in (*MACHINE.messages.values(), *GNSS.messages.values())]
 hostile = st.lists(
     st.lists(
         st.tuples(
-            st.one_of(st.sampled_from(KEYS), st.integers(0, 0x1FFF_FFFF).map(lambda i: i | EXTENDED),
-                      st.sampled_from([REMOTE | KEYS[0], 0x123])),
+            st.one_of(
+                st.sampled_from(KEYS),
+                st.integers(0, 0x1FFF_FFFF).map(lambda i: i | EXTENDED),
+                st.sampled_from([REMOTE | KEYS[0], 0x123]),
+            ),
             st.binary(max_size=8),
         ),
         max_size=12,
     ),
     max_size=12,
-)  # fmt: skip
+)
 
 
 @given(hostile)

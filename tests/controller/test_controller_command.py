@@ -19,8 +19,12 @@ def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
     key.write_bytes(b"short")
     assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key)]) == 3
     assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key) + "x"]) == 3
-    for arguments in ([*good, "--bus", "x=wire:x"], [*good, "--report", "nowhere"], [*good, "--guard-not-needed"],
-                      good[:2]):  # fmt: skip
+    for arguments in (
+        [*good, "--bus", "x=wire:x"],
+        [*good, "--report", "nowhere"],
+        [*good, "--guard-not-needed"],
+        good[:2],
+    ):
         with pytest.raises(SystemExit) as stopped:
             main(["--profile", "palms_471", *arguments])
         assert stopped.value.code == 2

@@ -47,7 +47,7 @@ BAD = {
     "arm too high": (Reason.DRIVE_HEIGHT, 2, lambda b: b.to(9, 0, heights_m=high(2))),
     "arm too low": (Reason.DRIVE_HEIGHT, 1, lambda b: b.to(9, 0, heights_m=(0.1, -0.01, 0.1, 0.1))),
     "both axles float": (Reason.FLOAT_BOTH, 0, lambda b: b.to(9, 0, float_front=True, float_rear=True)),
-}  # fmt: skip
+}
 EDGES = {
     "the fastest": lambda b: b.to(9, 0, TOP),
     "the fastest backwards": lambda b: b.bend(0.0, speed_m_s=-TOP),
@@ -341,18 +341,35 @@ OWN = {"VehCmd", "ArmCmdA", "ArmCmdB", "CtrlAlive", "AddressClaim"}  # these wou
 MACHINE_KEYS = [m.key for m in (*MACHINE.messages.values(), *GNSS.messages.values()) if m.name not in OWN]
 number = st.one_of(st.floats(-2.0, 2.0), st.floats(allow_nan=True, allow_infinity=True))
 wild = st.builds(
-    DriveSetpoint, st.integers(0, 2**32 - 1), st.just(AORO.profile_hash), st.integers(0, 6_000 * MS),
-    st.integers(0, 600 * MS), st.sampled_from(Steering), number, number, number, number, number,
-    st.tuples(number, number, number, number), st.booleans(), st.booleans(), st.booleans(),
-)  # fmt: skip
+    DriveSetpoint,
+    st.integers(0, 2**32 - 1),
+    st.just(AORO.profile_hash),
+    st.integers(0, 6_000 * MS),
+    st.integers(0, 600 * MS),
+    st.sampled_from(Steering),
+    number,
+    number,
+    number,
+    number,
+    number,
+    st.tuples(number, number, number, number),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+)
 near = st.fixed_dictionaries(
     {
-        "steering": st.sampled_from(Steering), "articulation_rad": st.floats(-0.6, 0.6),
-        "articulation_rate_rad_s": st.floats(-0.2, 0.2), "speed_m_s": st.floats(-1.0, 1.0),
-        "heights_m": st.tuples(*[st.floats(0.0, 0.6)] * 4), "float_front": st.booleans(), "float_rear": st.booleans(),
-        "level": st.booleans(), "lease_ms": st.integers(1, 200),
+        "steering": st.sampled_from(Steering),
+        "articulation_rad": st.floats(-0.6, 0.6),
+        "articulation_rate_rad_s": st.floats(-0.2, 0.2),
+        "speed_m_s": st.floats(-1.0, 1.0),
+        "heights_m": st.tuples(*[st.floats(0.0, 0.6)] * 4),
+        "float_front": st.booleans(),
+        "float_rear": st.booleans(),
+        "level": st.booleans(),
+        "lease_ms": st.integers(1, 200),
     }
-)  # fmt: skip
+)
 noise = st.lists(st.tuples(st.sampled_from(MACHINE_KEYS), st.binary(max_size=8)), max_size=4)
 hostile = st.lists(st.tuples(st.one_of(wild.map(encode), near, st.none()), noise, st.integers(1, 12)), max_size=12)
 

@@ -149,9 +149,15 @@ def test_position_outside_the_range_stops():
 
 @pytest.mark.parametrize(
     ("node", "reason"),
-    [(1, Reason.SAFETY_NODE_LOST), (0x10, Reason.SAFETY_NODE_LOST), (0x7D, Reason.SAFETY_NODE_LOST),
-     (2, Reason.ENCODER_NODE_LOST), (6, Reason.ENCODER_NODE_LOST), (0x20, Reason.PRESSURE_NODE_LOST)],
-)  # fmt: skip
+    [
+        (1, Reason.SAFETY_NODE_LOST),
+        (0x10, Reason.SAFETY_NODE_LOST),
+        (0x7D, Reason.SAFETY_NODE_LOST),
+        (2, Reason.ENCODER_NODE_LOST),
+        (6, Reason.ENCODER_NODE_LOST),
+        (0x20, Reason.PRESSURE_NODE_LOST),
+    ],
+)
 def test_heartbeat_lost(node, reason):
     bench = Bench().active()
     bench.silent_nodes.add(node)
@@ -187,9 +193,14 @@ def test_restarted_encoder_is_set_up_again_before_arming():
 
 @pytest.mark.parametrize(
     ("code", "reason"),
-    [(0x5000, Reason.EMERGENCY_MESSAGE), (0x6100, Reason.EMERGENCY_MESSAGE), (0xFF01, Reason.EMERGENCY_MESSAGE),
-     (0x4200, Reason.EMERGENCY_WARNING), (0x1000, Reason.EMERGENCY_WARNING)],
-)  # fmt: skip
+    [
+        (0x5000, Reason.EMERGENCY_MESSAGE),
+        (0x6100, Reason.EMERGENCY_MESSAGE),
+        (0xFF01, Reason.EMERGENCY_MESSAGE),
+        (0x4200, Reason.EMERGENCY_WARNING),
+        (0x1000, Reason.EMERGENCY_WARNING),
+    ],
+)
 def test_emergency_messages(code, reason):
     bench = Bench().active()
     bench.extra.append(emergency_frame(Emergency(4, code, 1, b"")))
@@ -220,9 +231,13 @@ def test_foreign_controller_is_detected_in_every_mode():
 
 @pytest.mark.parametrize(
     ("state", "reason", "mode"),
-    [(3, Reason.BUS_OFF, Mode.FAULT), (4, Reason.BUS_DOWN, Mode.FAULT), (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
-     (1, Reason.NONE, Mode.ACTIVE)],
-)  # fmt: skip
+    [
+        (3, Reason.BUS_OFF, Mode.FAULT),
+        (4, Reason.BUS_DOWN, Mode.FAULT),
+        (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
+        (1, Reason.NONE, Mode.ACTIVE),
+    ],
+)
 def test_bus_state(state, reason, mode):
     bench = Bench().active()
     bench.tick(bus_state=state)

@@ -66,9 +66,13 @@ def test_pressure_kick_is_no_grip():
 
 @pytest.mark.parametrize(
     ("seconds", "opening", "state"),
-    [(2.0, 30.0, GrappleState.HOLDING), (3.4, 1.0, GrappleState.CLOSED),
-     (2.0, math.nan, GrappleState.HOLDING), (3.3, math.nan, GrappleState.CLOSED)],
-)  # fmt: skip
+    [
+        (2.0, 30.0, GrappleState.HOLDING),
+        (3.4, 1.0, GrappleState.CLOSED),
+        (2.0, math.nan, GrappleState.HOLDING),
+        (3.3, math.nan, GrappleState.CLOSED),
+    ],
+)
 def test_closed_and_holding_are_distinguished(seconds, opening, state):
     """By the opening where it is measured, else by the time until the pressure rose."""
     law = made()

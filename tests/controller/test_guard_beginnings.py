@@ -174,9 +174,15 @@ def test_the_carrier_s_speed_grows_at_its_rate_to_the_percent() -> None:
 # -- what no machine has -----------------------------------------------------------------------------------------------
 
 VALVE = {
-    "signal": "Tilt", "deadband_plus_pct": 12.0, "deadband_minus_pct": 7.0, "full_speed_plus": 0.5,
-    "full_speed_minus": 0.25, "delay_s": 0.2, "lag_s": 0.0, "sign": 1,
-}  # fmt: skip
+    "signal": "Tilt",
+    "deadband_plus_pct": 12.0,
+    "deadband_minus_pct": 7.0,
+    "full_speed_plus": 0.5,
+    "full_speed_minus": 0.25,
+    "delay_s": 0.2,
+    "lag_s": 0.0,
+    "sign": 1,
+}
 AXIS_LIMITS = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
 
 
@@ -226,11 +232,16 @@ def test_a_place_needs_all_of_its_numbers() -> None:
 @pytest.mark.parametrize(
     ("signal", "readable"),
     [
-        ("0|1@1+ (1,0) [0|1]", True), ("0|64@1+ (1,0) [0|1]", True), ("63|1@1+ (1,0) [0|1]", True),
-        ("0|0@1+ (1,0) [0|1]", False), ("0|65@1+ (1,0) [0|1]", False), ("64|1@1+ (1,0) [0|1]", False),
-        ("0|8@1+ (1,5) [0|1]", False), ("0|8@0+ (1,0) [0|1]", False),
+        ("0|1@1+ (1,0) [0|1]", True),
+        ("0|64@1+ (1,0) [0|1]", True),
+        ("63|1@1+ (1,0) [0|1]", True),
+        ("0|0@1+ (1,0) [0|1]", False),
+        ("0|65@1+ (1,0) [0|1]", False),
+        ("64|1@1+ (1,0) [0|1]", False),
+        ("0|8@1+ (1,5) [0|1]", False),
+        ("0|8@0+ (1,0) [0|1]", False),
     ],
-)  # fmt: skip
+)
 def test_a_signal_has_1_to_64_bits_of_a_frame_and_no_offset(tmp_path: Path, signal: str, readable: bool) -> None:
     path = tmp_path / "one.dbc"
     path.write_text(f'BO_ 5 One: 8 Node\n SG_ X : {signal} "" Node\n\n')

@@ -135,14 +135,15 @@ def test_both_from_the_first_step_have_the_same_time(now_ns: int, both: bool) ->
 @pytest.mark.parametrize(
     ("values", "axis"),
     [
-        ({"VehCmd": {"Brake": 100.0, "Speed": 0.01}}, DRIVE_AXIS), ({"VehCmd": {"Brake": 0.0}}, DRIVE_AXIS),
+        ({"VehCmd": {"Brake": 100.0, "Speed": 0.01}}, DRIVE_AXIS),
+        ({"VehCmd": {"Brake": 0.0}}, DRIVE_AXIS),
         ({"VehCmd": {"Brake": 100.0, "ArticRate": 0.01}}, DRIVE_AXIS),
         ({"ArmCmdA": {"ArmKey": 0xA}, "ArmCmdB": {"FloatRear": 1}}, ARMS_AXIS),
         ({"ArmCmdB": {"FloatFront": 1, "ArmKey": 0xB}}, ARMS_AXIS),
         ({"ArmCmdA": {"Arm2": 5.0}, "ArmCmdB": {"ArmKey": 0xA}}, ARMS_AXIS),
         ({"ArmCmdA": {"Arm2": 5.0, "ArmKey": 0xB}, "ArmCmdB": {"ArmKey": 0xB}}, ARMS_AXIS),
     ],
-)  # fmt: skip
+)
 def test_every_motion_needs_its_key(values: dict, axis: int) -> None:
     assert Mach0().check(**values) == (Verdict.NOT_ARMED, axis)
     armed = {name: its | {"ArmKey": 0xA} for name, its in ({"ArmCmdA": {}, "ArmCmdB": {}} | values).items()}

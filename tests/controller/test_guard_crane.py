@@ -47,10 +47,16 @@ def test_a_neutral_command_agrees_with_any_mode() -> None:
 @pytest.mark.parametrize(
     ("mode", "side", "allowed"),
     [
-        (1, 1, True), (1, -1, False), (2, -1, True), (2, 1, False), (3, -1, True), (3, 1, False), (0, 1, False),
+        (1, 1, True),
+        (1, -1, False),
+        (2, -1, True),
+        (2, 1, False),
+        (3, -1, True),
+        (3, 1, False),
+        (0, 1, False),
         (0, -1, False),
     ],
-)  # fmt: skip
+)
 def test_the_grapple_s_spool_may_be_open_on_the_side_of_its_mode(mode: int, side: int, allowed: bool) -> None:
     traffic = Traffic().good()
     traffic.b["GrappleMode"] = mode

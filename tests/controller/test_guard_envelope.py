@@ -193,12 +193,14 @@ def test_the_guard_stops_nothing_that_the_controller_lets_pass(name):
     profile = load_settings(name).profile
     kept_out = [
         [(c - h, c + h) for c, h in zip(box.center_m, box.half_m, strict=True)]
-        for box in profile.keep_out.values() if box.yaw_rad == 0.0
-    ]  # fmt: skip
+        for box in profile.keep_out.values()
+        if box.yaw_rad == 0.0
+    ]
     for low, high in read_envelope(SHIPPED / f"{name}.toml").boxes:
         if low[0] < 0.0 < high[0] and low[1] < 0.0 < high[1]:
             continue
         assert any(
             all(a - 1e-9 <= x and y <= b + 1e-9 for x, y, (a, b) in zip(low[:2], high[:2], box[:2], strict=True))
-            and high[2] <= box[2][1] + 1e-9 for box in kept_out
-        ), (low, high)  # fmt: skip
+            and high[2] <= box[2][1] + 1e-9
+            for box in kept_out
+        ), (low, high)

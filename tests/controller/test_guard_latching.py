@@ -93,8 +93,12 @@ lies = st.fixed_dictionaries(
         ),
         "b": st.fixed_dictionaries(
             {
-                "ArmKey": st.sampled_from([0, 0xA, 0xB]), "Rot": values, "Grapple": values, "Aux": values,
-                "GrappleMode": st.integers(0, 3), "MaxFlow": st.sampled_from([0.0, 100.0]),
+                "ArmKey": st.sampled_from([0, 0xA, 0xB]),
+                "Rot": values,
+                "Grapple": values,
+                "Aux": values,
+                "GrappleMode": st.integers(0, 3),
+                "MaxFlow": st.sampled_from([0.0, 100.0]),
             }
         ),
         "ticks": st.integers(1, 70),
@@ -107,9 +111,20 @@ lies = st.fixed_dictionaries(
         "person": st.sampled_from([0, 0, 0, 0, 1]),
         "lift_spool": st.sampled_from([0.0, 0.0, 0.0, 30.0]),
     }
-)  # fmt: skip
-NEUTRAL_LIE = {"a": dict(GOOD_A), "b": dict(GOOD_B), "ticks": 60, "channels": (1, 1), "reset": False,
-               "slew_counts": CENTRE, "gone": set(), "skip": 0, "mode": 3, "person": 0, "lift_spool": 0.0}  # fmt: skip
+)
+NEUTRAL_LIE = {
+    "a": dict(GOOD_A),
+    "b": dict(GOOD_B),
+    "ticks": 60,
+    "channels": (1, 1),
+    "reset": False,
+    "slew_counts": CENTRE,
+    "gone": set(),
+    "skip": 0,
+    "mode": 3,
+    "person": 0,
+    "lift_spool": 0.0,
+}
 
 
 @given(st.lists(st.one_of(lies, st.just(NEUTRAL_LIE)), max_size=12))

@@ -295,10 +295,17 @@ def test_the_depth_is_that_below_the_ground_or_in_the_deepest_box(monkeypatch) -
     at = {"pin": (0.0, 0.0, 0.0)}
     monkeypatch.setattr(Reach, "pin", lambda self, *_q: at["pin"])
     for pin, depth_m in (
-        ((0.0, 0.0, -1.25), 0.25), ((0.0, 0.0, -0.75), -0.25), ((3.0, 0.0, 0.1), 0.4), ((3.9, 0.0, 0.0), 0.1),
-        ((2.1, 0.0, 0.0), 0.1), ((3.0, 0.95, 0.0), 0.05), ((3.0, -0.95, 0.0), 0.05), ((3.0, 0.0, -0.45), 0.05),
-        ((3.0, 0.0, 0.45), 0.05), ((5.0, 0.0, 0.45), -1.0),
-    ):  # fmt: skip
+        ((0.0, 0.0, -1.25), 0.25),
+        ((0.0, 0.0, -0.75), -0.25),
+        ((3.0, 0.0, 0.1), 0.4),
+        ((3.9, 0.0, 0.0), 0.1),
+        ((2.1, 0.0, 0.0), 0.1),
+        ((3.0, 0.95, 0.0), 0.05),
+        ((3.0, -0.95, 0.0), 0.05),
+        ((3.0, 0.0, -0.45), 0.05),
+        ((3.0, 0.0, 0.45), 0.05),
+        ((5.0, 0.0, 0.45), -1.0),
+    ):
         at["pin"] = pin
         assert checked.depth_m([0.0] * 4) == pytest.approx(depth_m)
 
@@ -347,14 +354,24 @@ def test_the_axes_of_the_forwarder_are_those_of_its_files() -> None:
 @pytest.mark.parametrize("changed", [{"sign": -1, "lag_s": 0.0}, {"sign": 1, "delay_s": 0.0}])
 def test_a_valve_of_the_other_sign_swaps_its_sides(changed: dict) -> None:
     valve = {
-        "signal": "Tilt", "deadband_plus_pct": 12.0, "deadband_minus_pct": 7.0, "full_speed_plus": 0.5,
-        "full_speed_minus": 0.25, "delay_s": 0.1, "lag_s": 0.01, "sign": 1,
-    } | changed  # fmt: skip
+        "signal": "Tilt",
+        "deadband_plus_pct": 12.0,
+        "deadband_minus_pct": 7.0,
+        "full_speed_plus": 0.5,
+        "full_speed_minus": 0.25,
+        "delay_s": 0.1,
+        "lag_s": 0.01,
+        "sign": 1,
+    } | changed
     limits = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
     encoder = {
-        "kind": "rotary", "message": "EncTilt", "total_counts": 16384, "zero_counts": 5, "unit_per_count": 0.05,
+        "kind": "rotary",
+        "message": "EncTilt",
+        "total_counts": 16384,
+        "zero_counts": 5,
+        "unit_per_count": 0.05,
         "direction": -1,
-    }  # fmt: skip
+    }
     axis = _axis(2, {"valve": valve, "encoder": encoder}, limits)
     plus_first = changed["sign"] < 0
     assert axis.deadbands_pct == ((12.0, 7.0) if plus_first else (7.0, 12.0))

@@ -18,12 +18,24 @@ from tests.controller.guard_traffic import (
 
 CASES = BROKEN | DRIVE_BROKEN
 EXACT_STEPS = {
-    "command A gone": 4, "command B gone": 4, "estop gone": 7, "encoder gone": 19, "outside": 2,
-    "joint moves without a command": 3, "too fast a motion": 3, "person in the zone": 61, "pin into the ground": 2,
-    "failed detector of persons": 61, "controller says it has stopped": 41, "controller says nothing": 61,
-    "drive command gone": 16, "arm command gone": 16, "state gone": 18, "rolls although it brakes": 301,
+    "command A gone": 4,
+    "command B gone": 4,
+    "estop gone": 7,
+    "encoder gone": 19,
+    "outside": 2,
+    "joint moves without a command": 3,
+    "too fast a motion": 3,
+    "person in the zone": 61,
+    "pin into the ground": 2,
+    "failed detector of persons": 61,
+    "controller says it has stopped": 41,
+    "controller says nothing": 61,
+    "drive command gone": 16,
+    "arm command gone": 16,
+    "state gone": 18,
+    "rolls although it brakes": 301,
     "person while it drives": 441,
-}  # fmt: skip
+}
 """Steps of 5 ms until a limit of `controller.guard` is exceeded; all others count at once."""
 
 
@@ -141,10 +153,13 @@ def test_a_state_that_latches_counts_before_a_frame_that_does_not() -> None:
 
 
 ORDER = (
-    ("estop gone", Verdict.ESTOP_LOST), ("estop pressed", Verdict.ESTOP),
-    ("spool open without a command", Verdict.SPOOL), ("command B gone", Verdict.NO_COMMAND),
-    ("unknown mode", Verdict.RANGE), ("not armed", Verdict.NOT_ARMED),
-)  # fmt: skip
+    ("estop gone", Verdict.ESTOP_LOST),
+    ("estop pressed", Verdict.ESTOP),
+    ("spool open without a command", Verdict.SPOOL),
+    ("command B gone", Verdict.NO_COMMAND),
+    ("unknown mode", Verdict.RANGE),
+    ("not armed", Verdict.NOT_ARMED),
+)
 
 
 @pytest.mark.parametrize("first", range(len(ORDER) - 1))
@@ -162,7 +177,7 @@ def test_of_broken_states_the_first_of_the_order_counts(first: int) -> None:
 @pytest.mark.parametrize(
     ("values", "axis"),
     [({"Aux": 1.0, "Grapple": None}, 6), ({"Grapple": None, "Rot": 11.0, "ArmKey": 0}, 5)],
-)  # fmt: skip
+)
 def test_a_function_that_does_not_exist_counts_before_a_missing_key(values: dict, axis: int) -> None:
     traffic = Traffic().good()
     traffic.b.update(values)

@@ -246,9 +246,10 @@ def test_a_drift_is_not_judged_while_a_load_comes_and_goes(changes):
 
 
 @pytest.mark.parametrize(
-    ("load_kg_s", "share", "told"), [(-210.0, 0.012, False), (0.0, 0.012, True), (-210.0, 0.1, True)],
+    ("load_kg_s", "share", "told"),
+    [(-210.0, 0.012, False), (0.0, 0.012, True), (-210.0, 0.1, True)],
     ids=["logs come to rest", "a load hangs", "a valve is open"],
-)  # fmt: skip
+)
 def test_a_shut_lift_sinks_with_a_load_that_comes_to_rest(load_kg_s, share, told):
     """Measured on a sampled forwarder: 784 to 165 kg within 3 s sank the lift by 5 mrad."""
     bench = dithering(Bench()).armed()

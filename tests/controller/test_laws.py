@@ -59,8 +59,9 @@ def test_gain_is_the_budget_at_most(kind):
         assert once == pytest.approx(gain * small, rel=1e-3)
     assert LAWS[kind](law).step(large, 0.0, 0.0, True) <= gain * large * (1 + 1e-9)
     at_layer = LAWS[kind](law).step(law.layer, 0.0, 0.0, True)
-    assert at_layer == pytest.approx(gain * law.layer * (0.5 + 0.5 * math.tanh(1)) if kind == "sliding_mode"
-                                     else gain * law.layer)  # fmt: skip
+    assert at_layer == pytest.approx(
+        gain * law.layer * (0.5 + 0.5 * math.tanh(1)) if kind == "sliding_mode" else gain * law.layer
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

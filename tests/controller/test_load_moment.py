@@ -40,11 +40,14 @@ def test_moment_is_that_of_three_weights_about_the_edge():
     assert math.isnan(LoadMoment(AORO, of).moment_nm((0.0, math.nan, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("slew", "roll", "pitch"), [
-    (0.0, 0.0, 0.1),  # the boom looks backward: nose up is downhill
-    (math.pi / 2, 0.1, 0.0),  # base y is the machine's right: right side down
-    (-math.pi / 2, -0.1, 0.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("slew", "roll", "pitch"),
+    [
+        (0.0, 0.0, 0.1),  # the boom looks backward: nose up is downhill
+        (math.pi / 2, 0.1, 0.0),  # base y is the machine's right: right side down
+        (-math.pi / 2, -0.1, 0.0),
+    ],
+)
 def test_ground_that_falls_under_the_boom_adds_to_the_moment(slew, roll, pitch):
     q, of = (slew, *STRAIGHT[1:]), AORO.stability
     moment = LoadMoment(AORO, of)
@@ -79,9 +82,14 @@ def test_overload_ends_below_the_limit_and_does_not_flicker():
 def test_outward_and_up_raise_the_moment_and_inward_or_down_do_not():
     moment, q = LoadMoment(PROFILE, PROFILE.stability), list(HOME)
     for j, v, raised in [
-        (Joint.EXT, 0.2, True), (Joint.EXT, -0.2, False), (Joint.TILT, 0.2, True),
-        (Joint.LIFT, 0.15, True), (Joint.LIFT, -0.15, False), (Joint.SLEW, 0.3, False), (Joint.ROT, 1.0, False),
-    ]:  # fmt: skip
+        (Joint.EXT, 0.2, True),
+        (Joint.EXT, -0.2, False),
+        (Joint.TILT, 0.2, True),
+        (Joint.LIFT, 0.15, True),
+        (Joint.LIFT, -0.15, False),
+        (Joint.SLEW, 0.3, False),
+        (Joint.ROT, 1.0, False),
+    ]:
         velocity = [0.0] * 5
         velocity[j] = v
         assert moment.raised_by_motion(q, velocity) is raised, (j, v)

@@ -85,9 +85,19 @@ def build(udp, clock, bus=None, page=None, reports=None, operator=None, key=None
     controller = Controller(SETTINGS, DATABASE)
     timing = LoopTiming(controller, TimingWriter(page) if page else None, clock.time, clock.time)
     return Loop(
-        controller, [bus or MemoryBus()], setpoints, operator, [reports or receiver.getsockname()], records.ring,
-        timing, T, LEAD, clock.time, clock.sleep, key=key,
-    )  # fmt: skip
+        controller,
+        [bus or MemoryBus()],
+        setpoints,
+        operator,
+        [reports or receiver.getsockname()],
+        records.ring,
+        timing,
+        T,
+        LEAD,
+        clock.time,
+        clock.sleep,
+        key=key,
+    )
 
 
 def run(loop, ticks):
@@ -106,7 +116,7 @@ def run(loop, ticks):
 
 def test_absolute_deadlines_skip_and_never_burst(udp):
     #               tick | SYNC, tick | SYNC, tick | SYNC, tick | SYNC, tick
-    clock = Clock([0,       0, 1 * MS,   0, 12 * MS,  0, 0,         0, 0])  # fmt: skip
+    clock = Clock([0, 0, 1 * MS, 0, 12 * MS, 0, 0, 0, 0])
     loop = build(udp, clock)
     run(loop, 5)
     first = 10**9 + T

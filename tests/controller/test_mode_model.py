@@ -107,8 +107,10 @@ def test_the_properties_can_fail(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_reactions_and_latching_rules_are_those_of_the_model() -> None:
     assert [Event(Event.HOLD + r - Reaction.HOLD) for r in (Reaction.HOLD, Reaction.RAMP, Reaction.CUT)] == [
-        Event.HOLD, Event.RAMP, Event.CUT,
-    ]  # fmt: skip
+        Event.HOLD,
+        Event.RAMP,
+        Event.CUT,
+    ]
     assert FAULTS[Reason.ESTOP_PRESSED].reaction is FAULTS[Reason.GUARD_REFUSES].reaction is Reaction.CUT
     assert FAULTS[Reason.GUARD_LOST].reaction is Reaction.CUT and FAULTS[Reason.ESTOP_PRESSED].always
     assert Verdict.ESTOP in LATCHING and Verdict.RANGE in LATCHING
@@ -183,8 +185,10 @@ def test_guard_and_valve_node_follow_the_model(seed: int) -> None:
     rig, state = Rig(), after(after(State(), "time"), "time")
     names: list[str] = []
     for _ in range(14):
-        weights = [6 if n in ("time", "ARM", "reset button", "rules hold", "release", "setpoint") else 1
-                   for n in mode_model.EVENTS]  # fmt: skip
+        weights = [
+            6 if n in ("time", "ARM", "reset button", "rules hold", "release", "setpoint") else 1
+            for n in mode_model.EVENTS
+        ]
         name = rng.choices(list(mode_model.EVENTS), weights)[0]
         names.append(name)
         if name == "reset button":

@@ -242,8 +242,10 @@ NAMES = ("Slew", "Lift", "Tilt", "Ext", "Rot")
 def referring(rig: Rig, values: dict[str, float | None], ms: int, **control: Any) -> None:
     for _ in range(ms // 5):
         frames = rig.control(**control)
-        frames += [rig.frame(n, **{k: v for k, v in values.items() if k in DATABASE.message(n).index})
-                   for n in ("JointRefA", "JointRefB", "JointRefC")]  # fmt: skip
+        frames += [
+            rig.frame(n, **{k: v for k, v in values.items() if k in DATABASE.message(n).index})
+            for n in ("JointRefA", "JointRefB", "JointRefC")
+        ]
         rig.step(frames)
 
 
@@ -287,9 +289,14 @@ def test_echo_changes_only_while_the_plc_accepts_commands() -> None:
 def test_plc_values_are_on_the_bus_and_others_not_available() -> None:
     rig = Rig()
     rig.feedback = replace(
-        rig.feedback, state=State.EXECUTE, pressure_bar=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), load_kg=80,
-        longest_cycle_us=11_000, fault=Fault.ILLEGAL_VALUE, fault_axis=2,
-    )  # fmt: skip
+        rig.feedback,
+        state=State.EXECUTE,
+        pressure_bar=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0),
+        load_kg=80,
+        longest_cycle_us=11_000,
+        fault=Fault.ILLEGAL_VALUE,
+        fault_axis=2,
+    )
     rig.channel_b = 0
     rig.run(100)
     valve_a, valve_b = await_frame(rig, "ValveFbA"), await_frame(rig, "ValveFbB")

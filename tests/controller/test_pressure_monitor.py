@@ -45,14 +45,17 @@ def test_a_chamber_that_loses_its_pressure_has_burst(swapped, step_ns):
     assert found is not None and found - 10 * step_ns == LOST_NS
 
 
-@pytest.mark.parametrize("course", [
-    loaded() + [(4.0, 6.0 + RISE_BAR + 0.1)] * 20,  # the load is dropped: it no longer holds up the other chamber
-    loaded(LOADED_BAR - 0.1) + [(0.0, 0.0)] * 20,  # carries nothing
-    loaded() + [(40.0 * LOST_SHARE + 0.1, 1.5)] * 20,  # half a load gone
-    loaded() + [(4.0, 1.5)] * (LOST_NS // STEP_NS) + loaded(),  # a peak of noise, or a swing that comes back
-    loaded() + [(40.0 - 1.2 * k, 1.5) for k in range(33)] + [(0.5, 1.5)] * 20,  # 240 bar/s: the fastest of log work
-    [(4.0, 1.5)] * 30,  # never loaded
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "course",
+    [
+        loaded() + [(4.0, 6.0 + RISE_BAR + 0.1)] * 20,  # the load is dropped: it no longer holds up the other chamber
+        loaded(LOADED_BAR - 0.1) + [(0.0, 0.0)] * 20,  # carries nothing
+        loaded() + [(40.0 * LOST_SHARE + 0.1, 1.5)] * 20,  # half a load gone
+        loaded() + [(4.0, 1.5)] * (LOST_NS // STEP_NS) + loaded(),  # a peak of noise, or a swing that comes back
+        loaded() + [(40.0 - 1.2 * k, 1.5) for k in range(33)] + [(0.5, 1.5)] * 20,  # 240 bar/s: the fastest of log work
+        [(4.0, 1.5)] * 30,  # never loaded
+    ],
+)
 def test_ordinary_changes_are_none(course):
     assert burst_ns(course) is None
 
@@ -79,12 +82,15 @@ def holding_bench():
     return bench
 
 
-@pytest.mark.parametrize(("message", "signals", "j"), [
-    ("PressA", {"LiftA": 4.0, "LiftB": 1.5}, Joint.LIFT),
-    ("PressA", {"TiltA": 10.0, "TiltB": 3.0}, Joint.TILT),
-    ("PressB", {"ExtA": 3.0, "ExtB": 2.0}, Joint.EXT),
-    ("PressB", {"SlewA": 12.0, "SlewB": 1.0}, Joint.SLEW),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("message", "signals", "j"),
+    [
+        ("PressA", {"LiftA": 4.0, "LiftB": 1.5}, Joint.LIFT),
+        ("PressA", {"TiltA": 10.0, "TiltB": 3.0}, Joint.TILT),
+        ("PressB", {"ExtA": 3.0, "ExtB": 2.0}, Joint.EXT),
+        ("PressB", {"SlewA": 12.0, "SlewB": 1.0}, Joint.SLEW),
+    ],
+)
 def test_the_supply_is_cut_in_time_and_the_numbers_are_told(message, signals, j):
     bench = holding_bench()
     loaded_one = max(signals, key=bench.changed[message].__getitem__)

@@ -48,24 +48,46 @@ BAD = {
     "stamp of the future": (Reason.STAMP_FUTURE, 0, lambda b: b.hold(stamp_ns=b.now_ns + 50 * MS)),
     "too late": (Reason.STAMP_OLD, 0, lambda b: b.hold(lease_ms=1, stamp_ns=b.now_ns)),
     "lease too long": (Reason.LEASE_TOO_LONG, 0, lambda b: b.hold(lease_ms=201)),
-    "out of range": (Reason.JOINT_RANGE, 1, lambda b: b.setpoint(
-        [(0, at(b), ZERO), (9000, at(b, 1, 0.9), ZERO)])),
+    "out of range": (Reason.JOINT_RANGE, 1, lambda b: b.setpoint([(0, at(b), ZERO), (9000, at(b, 1, 0.9), ZERO)])),
     "first knot out of range": (Reason.JOINT_RANGE, 3, lambda b: b.setpoint([(0, at(b, 3, 9.0), ZERO)])),
-    "overshoot out of range": (Reason.JOINT_RANGE, 1, lambda b: b.setpoint(
-        [(0, at(b), ZERO), (8000, at(b, 1, 0.8), speed(1, 0.1)), (10000, at(b, 1, 0.8), speed(1, -0.1))])),
-    "knot too fast": (Reason.JOINT_SPEED, 0, lambda b: b.setpoint(
-        [(0, at(b), ZERO), (400, at(b), speed(0, 0.4))])),
+    "overshoot out of range": (
+        Reason.JOINT_RANGE,
+        1,
+        lambda b: b.setpoint(
+            [(0, at(b), ZERO), (8000, at(b, 1, 0.8), speed(1, 0.1)), (10000, at(b, 1, 0.8), speed(1, -0.1))]
+        ),
+    ),
+    "knot too fast": (Reason.JOINT_SPEED, 0, lambda b: b.setpoint([(0, at(b), ZERO), (400, at(b), speed(0, 0.4))])),
     "too fast between knots": (Reason.JOINT_SPEED, 2, lambda b: b.setpoint(far_knots(b, 2, 0.1))),
     "position jump": (Reason.REFERENCE_JUMP, 0, lambda b: b.setpoint([(0, at(b, 0, 0.05), ZERO)])),
-    "velocity jump": (Reason.REFERENCE_JUMP, 0, lambda b: b.setpoint(
-        [(0, at(b), speed(0, 0.3)), (400, at(b, 0, 0.12), speed(0, 0.3))])),
-    "final but moving": (Reason.FINAL_MOVING, 0, lambda b: b.setpoint(
-        [(0, at(b), ZERO), (400, at(b, 0, 0.01), speed(0, 0.05))], final=True)),
-    "drive": (Reason.CANNOT_DRIVE, 0, lambda b: encode(
-        DriveSetpoint(99, HASH, b.now_ns, 200 * MS, Steering.WAYPOINT, 63.0, 19.0, 0.0, 0.0, 0.5, (0.3,) * 4,
-                      False, False))),
-    "a report": (Reason.DATAGRAM_KIND, 0, lambda b: encode(StateReport(
-        1, HASH, b.now_ns, 2, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.0,) * 5, 0.0, 0.0, 0.0, 0, 0, 0, 0))),
+    "velocity jump": (
+        Reason.REFERENCE_JUMP,
+        0,
+        lambda b: b.setpoint([(0, at(b), speed(0, 0.3)), (400, at(b, 0, 0.12), speed(0, 0.3))]),
+    ),
+    "final but moving": (
+        Reason.FINAL_MOVING,
+        0,
+        lambda b: b.setpoint([(0, at(b), ZERO), (400, at(b, 0, 0.01), speed(0, 0.05))], final=True),
+    ),
+    "drive": (
+        Reason.CANNOT_DRIVE,
+        0,
+        lambda b: encode(
+            DriveSetpoint(
+                99, HASH, b.now_ns, 200 * MS, Steering.WAYPOINT, 63.0, 19.0, 0.0, 0.0, 0.5, (0.3,) * 4, False, False
+            )
+        ),
+    ),
+    "a report": (
+        Reason.DATAGRAM_KIND,
+        0,
+        lambda b: encode(
+            StateReport(
+                1, HASH, b.now_ns, 2, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.0,) * 5, 0.0, 0.0, 0.0, 0, 0, 0, 0
+            )
+        ),
+    ),
     "arm by a planner": (Reason.NO_AUTHORITY, 0, lambda b: b.operator(OperatorAction.ARM)),
     "truncated": (Reason.DATAGRAM_CRC, 0, lambda b: b.hold()[:-1]),
     "short": (Reason.DATAGRAM_LENGTH, 0, lambda b: b"\x54"),
@@ -75,9 +97,12 @@ BAD = {
     "bit flip": (Reason.DATAGRAM_CRC, 0, lambda b: b.hold()[:40] + b"\xff" + b.hold()[41:]),
     "not finite": (Reason.DATAGRAM_NOT_FINITE, 0, lambda b: b.setpoint([(0, [math.nan] * 5, ZERO)])),
     "infinite velocity": (Reason.DATAGRAM_NOT_FINITE, 0, lambda b: b.setpoint([(0, at(b), [math.inf] * 5)])),
-    "unknown grapple command": (Reason.DATAGRAM_VALUE, 0, lambda b: refresh_crc(
-        b.hold()[:28] + b"\x09" + b.hold()[29:])),
-}  # fmt: skip
+    "unknown grapple command": (
+        Reason.DATAGRAM_VALUE,
+        0,
+        lambda b: refresh_crc(b.hold()[:28] + b"\x09" + b.hold()[29:]),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -26,8 +26,9 @@ USUAL = USUAL_SPEED[Joint.LIFT]
 
 
 def test_the_usual_speed_is_that_of_the_slower_shipped_machine() -> None:
-    limits = [[joint(load_profile(name), Joint(j)).speed_limit for j in range(N_JOINTS)]
-              for name in ("palms_471", "aoro_fc8")]  # fmt: skip
+    limits = [
+        [joint(load_profile(name), Joint(j)).speed_limit for j in range(N_JOINTS)] for name in ("palms_471", "aoro_fc8")
+    ]
     assert list(USUAL_SPEED) == [min(pair) for pair in zip(*limits, strict=True)], "no shipped machine is judged anew"
 
 

@@ -22,9 +22,7 @@ def asked(bench: Bench, *points: tuple[float, float], joint: int = Joint.SLEW, l
     """A spool test from points (ms, %) that begins now."""
     bench.setpoint_sequence += 1
     knots = tuple(SpoolKnot(int(ms * MS), percent) for ms, percent in points)
-    test = SpoolTest(
-        bench.setpoint_sequence, bench.settings.profile_hash, bench.now_ns, lease_ms * MS, joint, knots
-    )  # fmt: skip
+    test = SpoolTest(bench.setpoint_sequence, bench.settings.profile_hash, bench.now_ns, lease_ms * MS, joint, knots)
     return encode(test)
 
 

@@ -40,11 +40,15 @@ def setpoints(draw):
     knots = tuple(Knot(1000 * draw(st.integers(0, 4_000_000)), draw(five), draw(five)) for _ in range(n))
     return encode(
         CraneSetpoint(
-            draw(st.integers(0, 2**32 - 1)), draw(st.sampled_from([0, Bench().settings.profile_hash])),
-            draw(st.integers(0, 3_000 * MS)), draw(st.integers(0, 600 * MS)),
-            draw(st.sampled_from(list(GrappleCommand))), draw(st.booleans()), knots,
+            draw(st.integers(0, 2**32 - 1)),
+            draw(st.sampled_from([0, Bench().settings.profile_hash])),
+            draw(st.integers(0, 3_000 * MS)),
+            draw(st.integers(0, 600 * MS)),
+            draw(st.sampled_from(list(GrappleCommand))),
+            draw(st.booleans()),
+            knots,
         )
-    )  # fmt: skip
+    )
 
 
 @st.composite

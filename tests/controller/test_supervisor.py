@@ -269,8 +269,11 @@ def test_every_reason_is_described():
     assert set(FAULTS) == set(Reason)
     assert all(fault.sentence and fault.advice for fault in FAULTS.values())
     on_request = (Reason.OPERATOR_STOP, Reason.OPERATOR_DISARM)
-    assert all(fault.bound_ms > 0 for reason, fault in FAULTS.items() if fault.reaction > Reaction.DEGRADE
-               and reason not in on_request)  # fmt: skip
+    assert all(
+        fault.bound_ms > 0
+        for reason, fault in FAULTS.items()
+        if fault.reaction > Reaction.DEGRADE and reason not in on_request
+    )
 
 
 def test_last_arm_command_replayed_does_not_arm_again():

@@ -122,10 +122,11 @@ def test_a_pilot_supply_that_is_off_is_a_fault_of_a_moving_machine_only() -> Non
 @pytest.mark.parametrize(
     ("mode", "event", "reason"),
     [
-        (Mode.ARMED, Event.HOLD, Reason.OPERATOR_STOP), (Mode.ACTIVE, Event.CUT, Reason.ESTOP_PRESSED),
+        (Mode.ARMED, Event.HOLD, Reason.OPERATOR_STOP),
+        (Mode.ACTIVE, Event.CUT, Reason.ESTOP_PRESSED),
         (Mode.ACTIVE, Event.DONE, Reason.NONE),
     ],
-)  # fmt: skip
+)
 def test_no_ramp_is_left_where_there_is_none(mode: Mode, event: Event, reason: Reason) -> None:
     supervisor = supervisor_in(mode)
     supervisor.ramp_ns = 5

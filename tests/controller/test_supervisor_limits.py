@@ -45,11 +45,17 @@ def test_the_limits_are_those_of_the_documentation() -> None:
 @pytest.mark.parametrize(
     ("period_ms", "late_ns", "found"),
     [
-        (1, 10 * MS, Reason.NONE), (1, 10 * MS + 1, Reason.LOOP_LATE), (5, 10 * MS, Reason.NONE),
-        (5, 10 * MS + 1, Reason.LOOP_LATE), (20, 40 * MS, Reason.NONE), (20, 40 * MS + 1, Reason.LOOP_LATE),
-        (5, 50 * MS, Reason.LOOP_LATE), (5, 50 * MS + 1, Reason.LOOP_STALLED), (5, 0, Reason.NONE),
+        (1, 10 * MS, Reason.NONE),
+        (1, 10 * MS + 1, Reason.LOOP_LATE),
+        (5, 10 * MS, Reason.NONE),
+        (5, 10 * MS + 1, Reason.LOOP_LATE),
+        (20, 40 * MS, Reason.NONE),
+        (20, 40 * MS + 1, Reason.LOOP_LATE),
+        (5, 50 * MS, Reason.LOOP_LATE),
+        (5, 50 * MS + 1, Reason.LOOP_STALLED),
+        (5, 0, Reason.NONE),
     ],
-)  # fmt: skip
+)
 def test_lateness(period_ms: int, late_ns: int, found: Reason) -> None:
     supervisor = supervisor_in(Mode.STANDBY)
     supervisor.supervise(late_ns, period_ms * MS, NOW)
@@ -57,8 +63,9 @@ def test_lateness(period_ms: int, late_ns: int, found: Reason) -> None:
     assert supervisor.late == int(found is not Reason.NONE)
 
 
-@pytest.mark.parametrize(("apart_ns", "found"), [(LATE_WINDOW_NS // 2, Reason.LOOP_LATE),
-                                                 (LATE_WINDOW_NS // 2 - 1, Reason.LOOP_STALLED)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("apart_ns", "found"), [(LATE_WINDOW_NS // 2, Reason.LOOP_LATE), (LATE_WINDOW_NS // 2 - 1, Reason.LOOP_STALLED)]
+)
 def test_three_late_ticks_within_a_second(apart_ns: int, found: Reason) -> None:
     supervisor = supervisor_in(Mode.STANDBY)
     for k in range(3):
@@ -91,12 +98,16 @@ def test_half_speed_is_no_reason_while_nothing_is_armed(mode: Mode) -> None:
 @pytest.mark.parametrize(
     ("reason", "mode", "after"),
     [
-        (Reason.ESTOP_PRESSED, Mode.STANDBY, Mode.FAULT), (Reason.GUARD_REFUSES, Mode.STANDBY, Mode.STANDBY),
-        (Reason.GUARD_REFUSES, Mode.ARMED, Mode.FAULT), (Reason.ENCODER_LOST, Mode.ARMED, Mode.FAULT),
-        (Reason.PERSON_IN_ZONE, Mode.ARMED, Mode.STOP), (Reason.PERSON_IN_ZONE, Mode.STANDBY, Mode.STANDBY),
-        (Reason.ENCODER_LOST, Mode.ACTIVE, Mode.STOP), (Reason.INPUT_MISSING, Mode.ACTIVE, Mode.ACTIVE),
+        (Reason.ESTOP_PRESSED, Mode.STANDBY, Mode.FAULT),
+        (Reason.GUARD_REFUSES, Mode.STANDBY, Mode.STANDBY),
+        (Reason.GUARD_REFUSES, Mode.ARMED, Mode.FAULT),
+        (Reason.ENCODER_LOST, Mode.ARMED, Mode.FAULT),
+        (Reason.PERSON_IN_ZONE, Mode.ARMED, Mode.STOP),
+        (Reason.PERSON_IN_ZONE, Mode.STANDBY, Mode.STANDBY),
+        (Reason.ENCODER_LOST, Mode.ACTIVE, Mode.STOP),
+        (Reason.INPUT_MISSING, Mode.ACTIVE, Mode.ACTIVE),
     ],
-)  # fmt: skip
+)
 def test_a_finding_reacts_only_while_armed_unless_it_always_does(reason: Reason, mode: Mode, after: Mode) -> None:
     supervisor = supervisor_in(mode)
     supervisor.react_to(reason, 3, NOW)
@@ -138,10 +149,17 @@ def test_a_ramp_begins_and_ends_to_the_nanosecond(event: Event, ramp_ns: int, co
 
 def _only_time(supervisor, now_ns: int) -> None:
     """One call in which nothing is found: no input is checked."""
-    inputs, supervisor.crane_inputs = supervisor.crane_inputs, SimpleNamespace(
-        foreign=False, stale_mask=0, estop=SimpleNamespace(values=None), guard=SimpleNamespace(values=None),
-        valve_a=SimpleNamespace(values=None), nodes=SimpleNamespace(worst_finding=lambda at_ns: (Reason.NONE, 0)),
-    )  # fmt: skip
+    inputs, supervisor.crane_inputs = (
+        supervisor.crane_inputs,
+        SimpleNamespace(
+            foreign=False,
+            stale_mask=0,
+            estop=SimpleNamespace(values=None),
+            guard=SimpleNamespace(values=None),
+            valve_a=SimpleNamespace(values=None),
+            nodes=SimpleNamespace(worst_finding=lambda at_ns: (Reason.NONE, 0)),
+        ),
+    )
     unknown = SimpleNamespace(value=lambda: None)
     names = ("_person", "_valve_state", "_plc_faults", "_enable")
     before = {name: getattr(supervisor, name) for name in (*names, "_alarms", "_axes", "_echo_counter")}
@@ -173,11 +191,15 @@ def test_an_echo_that_stays_is_found_after_ticks_and_time(period_ms: int, ticks:
 def test_a_harder_finding_replaces_a_milder_one_and_never_the_other_way_round() -> None:
     supervisor = supervisor_in(Mode.ACTIVE)
     for reason, detail, kept in (
-        (Reason.NONE, 9, Reason.NONE), (Reason.PRESSURE_LOST, 1, Reason.PRESSURE_LOST),
-        (Reason.BUS_PASSIVE, 2, Reason.PRESSURE_LOST), (Reason.PERSON_IN_ZONE, 3, Reason.PERSON_IN_ZONE),
-        (Reason.ENCODER_LOST, 4, Reason.ENCODER_LOST), (Reason.PLC_FAULT, 5, Reason.ENCODER_LOST),
-        (Reason.ESTOP_PRESSED, 6, Reason.ESTOP_PRESSED), (Reason.GUARD_LOST, 7, Reason.ESTOP_PRESSED),
-    ):  # fmt: skip
+        (Reason.NONE, 9, Reason.NONE),
+        (Reason.PRESSURE_LOST, 1, Reason.PRESSURE_LOST),
+        (Reason.BUS_PASSIVE, 2, Reason.PRESSURE_LOST),
+        (Reason.PERSON_IN_ZONE, 3, Reason.PERSON_IN_ZONE),
+        (Reason.ENCODER_LOST, 4, Reason.ENCODER_LOST),
+        (Reason.PLC_FAULT, 5, Reason.ENCODER_LOST),
+        (Reason.ESTOP_PRESSED, 6, Reason.ESTOP_PRESSED),
+        (Reason.GUARD_LOST, 7, Reason.ESTOP_PRESSED),
+    ):
         supervisor._collect(reason, detail)
         assert supervisor.worst is kept
     assert supervisor.worst_detail == 6

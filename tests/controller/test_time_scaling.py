@@ -39,9 +39,7 @@ def setpoint(stamp_ns, positions, velocity=ZERO, every_ms=50):
 
 def line(stamp_ns, velocity, n=9):
     """Knots on a straight line through 0 at time 0."""
-    return setpoint(
-        stamp_ns, [[v * (stamp_ns * 1e-9 + 0.05 * i) for v in velocity] for i in range(n)], velocity
-    )  # fmt: skip
+    return setpoint(stamp_ns, [[v * (stamp_ns * 1e-9 + 0.05 * i) for v in velocity] for i in range(n)], velocity)
 
 
 def test_rate_is_one_within_the_limits_of_pump_and_joints():

@@ -21,8 +21,15 @@ def test_every_reason_that_stops_has_a_text_and_no_other() -> None:
 
 def test_the_catalog_names_only_fields_that_an_entry_has() -> None:
     stop = Stop(
-        number=1, at_ns=1, utc_ns=1, mode_before="ACTIVE", mode="STOP", reason=pack(Reason.ENCODER_LOST, 1),
-        code="ENCODER_LOST", numbers=(), text="",
-    )  # fmt: skip
+        number=1,
+        at_ns=1,
+        utc_ns=1,
+        mode_before="ACTIVE",
+        mode="STOP",
+        reason=pack(Reason.ENCODER_LOST, 1),
+        code="ENCODER_LOST",
+        numbers=(),
+        text="",
+    )
     wanted = set(re.findall(r"@(\w+)@", CATALOG.read_text()))
     assert wanted and wanted <= set(stop_fields(stop, Path("file")))

@@ -82,9 +82,17 @@ def loop() -> Iterator[Loop]:
     settings = load("palms_471")
     controller = Controller(settings)
     made = Loop(
-        controller, [SilentBus()], port, None, [], None, LoopTiming(controller, clock_ns=lambda: START),
-        settings.period_ns, settings.sync_lead_ns, clock_ns=lambda: START,
-    )  # fmt: skip
+        controller,
+        [SilentBus()],
+        port,
+        None,
+        [],
+        None,
+        LoopTiming(controller, clock_ns=lambda: START),
+        settings.period_ns,
+        settings.sync_lead_ns,
+        clock_ns=lambda: START,
+    )
     yield made
     made.close()
 

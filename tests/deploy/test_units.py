@@ -16,9 +16,16 @@ CONF = dict(
     if not line.startswith("#") and line
 )
 EXPOSURE = {
-    "controller": 1.3, "guard": 1.0, "autonomy": 1.0, "recorder": 1.1, "console": 1.1, "plc": 1.4, "can@": 1.1,
-    "update": 1.2, "perception": 1.5,
-}  # fmt: skip
+    "controller": 1.3,
+    "guard": 1.0,
+    "autonomy": 1.0,
+    "recorder": 1.1,
+    "console": 1.1,
+    "plc": 1.4,
+    "can@": 1.1,
+    "update": 1.2,
+    "perception": 1.5,
+}
 """Exposure of each unit by systemd-analyze, of 10; at most 1.5."""
 EPHEMERAL = 32768
 """First ephemeral port of the kernel (ip_local_port_range)."""

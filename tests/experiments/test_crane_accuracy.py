@@ -147,10 +147,22 @@ def test_a_variant_changes_only_the_law_or_the_sag_model():
 
 def motion(goal: int = 0, load: float = 0.0, error: tuple[float, ...] = (0.003, 0.004, 0.0), **more: Any) -> dict:
     return {
-        "goal": goal, "load_kg": load, "believed_kg": load, "failed": False, "encoder_m": list(error),
-        "encoder_to_goal_m": [0.0, 0.0, 0.05], "true_m": [0.0, 0.0, 0.02], "motion_s": 6.0, "minimum_s": 5.0,
-        "planned_s": 5.5, "arrived_s": 6.0, "swing_deg": 1.0, "shut": 95, "commands": 100, **more,
-    }  # fmt: skip
+        "goal": goal,
+        "load_kg": load,
+        "believed_kg": load,
+        "failed": False,
+        "encoder_m": list(error),
+        "encoder_to_goal_m": [0.0, 0.0, 0.05],
+        "true_m": [0.0, 0.0, 0.02],
+        "motion_s": 6.0,
+        "minimum_s": 5.0,
+        "planned_s": 5.5,
+        "arrived_s": 6.0,
+        "swing_deg": 1.0,
+        "shut": 95,
+        "commands": 100,
+        **more,
+    }
 
 
 def outcomes() -> dict[str, Any]:
@@ -161,14 +173,17 @@ def outcomes() -> dict[str, Any]:
         "0/calibration": {"profile": "text", "failure": None},
         "1/calibration": {"profile": None, "failure": "aborted"},
         f"0/{OWN}": ran(
-            motion(), motion(load=200.0, error=(0.0, 0.0, 0.015), swing_deg=2.0, motion_s=None),
-            {"goal": 1, "load_kg": 0.0, "failed": True}, missing=2, stops=1,
+            motion(),
+            motion(load=200.0, error=(0.0, 0.0, 0.015), swing_deg=2.0, motion_s=None),
+            {"goal": 1, "load_kg": 0.0, "failed": True},
+            missing=2,
+            stops=1,
         ),
         "0/sliding_mode": ran(motion(error=(0.0, 0.0, 0.008))),
         f"0/{UNCOMPENSATED}": ran(motion(true_m=[0.0, 0.06, 0.08])),
         f"0/{UNCALIBRATED}": ran(motion(encoder_to_goal_m=[0.0, 0.03, 0.04])),
         f"0/{UNSHAPED}": ran(motion(swing_deg=6.0)),
-    }  # fmt: skip
+    }
 
 
 def test_metrics_are_means_over_the_points_of_their_variant():
@@ -208,9 +223,27 @@ class Echo:
             self.position = (reference[0], reference[1] + self.off_rad, *reference[2:4], math.nan)
         unknown = math.nan
         return StateReport(
-            1, profile_hash(AORO), now_ns, self.mode, 0, 0, 0, 0, 0, 0, self.position, (0.0,) * 5, reference, unknown,
-            unknown, self.load_kg, 0, 0, 0, 0,
-        )  # fmt: skip
+            1,
+            profile_hash(AORO),
+            now_ns,
+            self.mode,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            self.position,
+            (0.0,) * 5,
+            reference,
+            unknown,
+            unknown,
+            self.load_kg,
+            0,
+            0,
+            0,
+            0,
+        )
 
 
 def drive(cycles: ReachCycles, echo: Echo, seconds: float, from_ns: int = 1_000_000_000) -> int:

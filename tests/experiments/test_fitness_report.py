@@ -15,11 +15,29 @@ from host.doctor.facts import interrupt_counts
 from timberhand.cli import app
 
 GOOD = Figures(
-    seconds=60.0, period_us=5000.0, ticks=12_000, missed=0, late_p50_us=8.0, late_p99_us=20.0, late_max_us=90.0,
-    reference="cyclictest", reference_p99_us=12.0, reference_max_us=60.0, tick_p50_us=120.0, tick_p99_us=250.0,
-    frames_lost=0, page_faults=0, gc_runs=0, stops=0, fifo=True, locked_kb=50_000, refused=(), steal_ms=0.0,
-    load_before=0.05, emulated=False,
-)  # fmt: skip
+    seconds=60.0,
+    period_us=5000.0,
+    ticks=12_000,
+    missed=0,
+    late_p50_us=8.0,
+    late_p99_us=20.0,
+    late_max_us=90.0,
+    reference="cyclictest",
+    reference_p99_us=12.0,
+    reference_max_us=60.0,
+    tick_p50_us=120.0,
+    tick_p99_us=250.0,
+    frames_lost=0,
+    page_faults=0,
+    gc_runs=0,
+    stops=0,
+    fifo=True,
+    locked_kb=50_000,
+    refused=(),
+    steal_ms=0.0,
+    load_before=0.05,
+    emulated=False,
+)
 
 
 def verdict(topic: str, **changed: object) -> Verdict:
@@ -90,16 +108,17 @@ def test_the_report_holds_its_data_and_the_failure_of_a_measurement() -> None:
 
 def test_facts_of_the_computer_from_a_test_tree(tmp_path: Path) -> None:
     for place, text in {
-        "proc/cpuinfo": "processor : 0\nmodel name : Atom\nprocessor : 1\n", "proc/meminfo": "MemTotal: 2048 kB\n",
-        "proc/cmdline": "root=UUID=1234 isolcpus=1 quiet nohz_full=1", "proc/irq/4/smp_affinity_list": "0-1",
-        "proc/irq/5/smp_affinity_list": "0", "proc/irq/default_smp_affinity": "3\n",
-    }.items():  # fmt: skip
+        "proc/cpuinfo": "processor : 0\nmodel name : Atom\nprocessor : 1\n",
+        "proc/meminfo": "MemTotal: 2048 kB\n",
+        "proc/cmdline": "root=UUID=1234 isolcpus=1 quiet nohz_full=1",
+        "proc/irq/4/smp_affinity_list": "0-1",
+        "proc/irq/5/smp_affinity_list": "0",
+        "proc/irq/default_smp_affinity": "3\n",
+    }.items():
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).write_text(text)
     found = facts.read_computer(tmp_path, "#1 SMP PREEMPT_RT", 1)
-    assert found == facts.Computer(
-        "Atom", 2, 2, "#1 SMP PREEMPT_RT", ("isolcpus=1", "nohz_full=1"), (4,), 2, "3"
-    )  # fmt: skip
+    assert found == facts.Computer("Atom", 2, 2, "#1 SMP PREEMPT_RT", ("isolcpus=1", "nohz_full=1"), (4,), 2, "3")
     counts = (
         "           CPU0       CPU1\n  4:  1  20  IO-APIC 4-edge  can0\nLOC:  5  6  Local timer interrupts\nERR: 0\n"
     )

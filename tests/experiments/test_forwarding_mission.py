@@ -28,8 +28,7 @@ def grasp(log: int | None, off_m: tuple[float, float, float], logs: int = 1, sta
     """A grasp of 30 s that holds."""
     at = {"log": log, "logs": logs, "meant_m": 0.0, "off_m": list(off_m)}
     phases = [["LOOK", 0.0, 0.0], ["ABOVE", 1.0, 4.0], ["CLOSE", 10.0, 0.0]]
-    return {"begin_s": 0.0, "state": state, "phases": phases, "attempts": [at], "failure": None,
-            "end_s": 30.0}  # fmt: skip
+    return {"begin_s": 0.0, "state": state, "phases": phases, "attempts": [at], "failure": None, "end_s": 30.0}
 
 
 def outcome(logs: int = 3, off_m: tuple[float, float, float] = (0.03, 0.04, 0.0), **changes: Any) -> dict[str, Any]:
@@ -39,11 +38,21 @@ def outcome(logs: int = 3, off_m: tuple[float, float, float] = (0.03, 0.04, 0.0)
         for i in range(logs)
     ]
     return {
-        "finished": True, "failure": "", "loaded": logs, "given_up": {}, "seconds": 900.0, "driven_m": 100.0,
-        "stops": 0, "refused": 0, "states": [], "logs": lying, "places": logs,
-        "grasps": [grasp(i, off_m) for i in range(logs)], "path": [[0.0, 0.0, 0.0, 0], [1.0, 1.0, 0.0, 0]],
+        "finished": True,
+        "failure": "",
+        "loaded": logs,
+        "given_up": {},
+        "seconds": 900.0,
+        "driven_m": 100.0,
+        "stops": 0,
+        "refused": 0,
+        "states": [],
+        "logs": lying,
+        "places": logs,
+        "grasps": [grasp(i, off_m) for i in range(logs)],
+        "path": [[0.0, 0.0, 0.0, 0], [1.0, 1.0, 0.0, 0]],
         "stands": [[0.0, 0.0, 0.0]],
-    } | changes  # fmt: skip
+    } | changes
 
 
 def test_an_offset_of_five_centimetres_is_measured_as_that() -> None:

@@ -118,16 +118,30 @@ def outcome(truth: str, calibrated: bool = True, wrong: tuple[str, ...] = (), **
     }
     done |= job
     return {
-        "truth": truth, "seconds": 300.0, "said": "" if calibrated else "why", "calibrated": calibrated,
-        "jobs": [done] if calibrated else [], "wrong": list(wrong),
-    }  # fmt: skip
+        "truth": truth,
+        "seconds": 300.0,
+        "said": "" if calibrated else "why",
+        "calibrated": calibrated,
+        "jobs": [done] if calibrated else [],
+        "wrong": list(wrong),
+    }
 
 
 def mission(number: int, **told: Any) -> dict[str, Any]:
     driven: dict[str, Any] = {
-        "ground": "flat", "logs": 8, "believed": 8, "in_bunk": 8, "given_up": 0, "finished": True, "failure": "",
-        "stops": 0, "refused": 0, "seconds": 400.0, "driven_m": 40.0, "remarks": [],
-    }  # fmt: skip
+        "ground": "flat",
+        "logs": 8,
+        "believed": 8,
+        "in_bunk": 8,
+        "given_up": 0,
+        "finished": True,
+        "failure": "",
+        "stops": 0,
+        "refused": 0,
+        "seconds": 400.0,
+        "driven_m": 40.0,
+        "remarks": [],
+    }
     return outcome(f"unseen-{number}") | {"jobs": [], MISSION: driven | told}
 
 
@@ -153,9 +167,11 @@ def test_logs_of_missions_count_by_what_lies_in_the_bunk() -> None:
 
 def test_what_is_wrong_without_a_word_is_counted() -> None:
     quiet = [
-        outcome("mass-low", in_bunk=False), outcome("mass-high", in_bunk=False, says_done=False),
-        outcome("gain-low", wrong=("slew: dead time", "lift: dead time")), mission(0, in_bunk=6),
-    ]  # fmt: skip
+        outcome("mass-low", in_bunk=False),
+        outcome("mass-high", in_bunk=False, says_done=False),
+        outcome("gain-low", wrong=("slew: dead time", "lift: dead time")),
+        mission(0, in_bunk=6),
+    ]
     assert gather(quiet)["unsafe_or_silent"] == 5.0
     assert len([line for line in sentences(quiet[3]) if line.startswith("silent")]) == 2
     failure, stops = sentences(mission(1, stops=2, failure="the route is blocked"))

@@ -99,10 +99,18 @@ def test_a_missed_misplaced_or_invented_log_misleads() -> None:
 
 def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str, Any]:
     return {
-        "configuration": number, "category": word, "lifted": up, "logs": CONFIGURATIONS[number][1], "plan_ms": plan_ms,
-        "individual": number % 2 > 0, "closings": 2 if number == 4 else 1, "see_ms": 50.0, "failure": None,
-        "reason": "", "stops": 0,
-    }  # fmt: skip
+        "configuration": number,
+        "category": word,
+        "lifted": up,
+        "logs": CONFIGURATIONS[number][1],
+        "plan_ms": plan_ms,
+        "individual": number % 2 > 0,
+        "closings": 2 if number == 4 else 1,
+        "see_ms": 50.0,
+        "failure": None,
+        "reason": "",
+        "stops": 0,
+    }
 
 
 def test_a_lifted_log_after_a_stop_that_needed_a_person_is_a_failure() -> None:
@@ -111,8 +119,15 @@ def test_a_lifted_log_after_a_stop_that_needed_a_person_is_a_failure() -> None:
     metrics = gather(found, ("ours", "search"))
     assert metrics["success"] == pytest.approx(11 / 12) and metrics["config3.success"] == 0.0
     assert metrics["stopped"] == 1.0 and metrics["first_closing"] == pytest.approx(10 / 12)
-    saved = make_result("grasp-configs", METRICS, {"success": 1.0}, profile="palms_471", seed=1, trials=12,
-                        more={"judged": "ours poses, search"})  # fmt: skip
+    saved = make_result(
+        "grasp-configs",
+        METRICS,
+        {"success": 1.0},
+        profile="palms_471",
+        seed=1,
+        trials=12,
+        more={"judged": "ours poses, search"},
+    )
     again = evaluated_again(saved, found)
     assert again.metrics["success"] == pytest.approx(11 / 12) and "success" in again.missed
     assert again.commit == saved.commit and "first_closing" in again.missed
@@ -137,8 +152,10 @@ def test_the_evaluated_pair_has_plain_names_and_every_pair_has_a_prefix() -> Non
     shown = SECTIONS[0].metrics + SECTIONS[1].metrics
     assert {f.name for f in shown} <= metrics.keys()
     assert [f.name for f in METRICS if f.name in metrics and not f.holds(metrics[f.name])] == [
-        "success", "first_closing", "success_wilson_low"
-    ]  # fmt: skip
+        "success",
+        "first_closing",
+        "success_wilson_low",
+    ]
 
 
 def test_a_quick_run_keeps_the_published_ablation_and_its_commit(tmp_path: Path) -> None:
@@ -177,8 +194,12 @@ def test_after_the_papers_attempts_machines_alternate_on_their_own_scenes() -> N
 @pytest.mark.long
 def test_a_small_pile_is_lifted_completely_over_the_bus() -> None:
     options = {
-        "profile": "palms_471", "truth": "nominal", "configuration": 7, "poses": "true", "planner": "search",
-    }  # fmt: skip
+        "profile": "palms_471",
+        "truth": "nominal",
+        "configuration": 7,
+        "poses": "true",
+        "planner": "search",
+    }
     found = attempt(Job("one", "grasp", 7000, options))
     assert found["category"] == "optimal" and found["up"] == [0, 1, 2] and found["stops"] == 0
     assert set(found["expected"]) == {0, 1, 2} and math.dist(found["grip"][:2], found["asked"][:2]) < 0.06
@@ -196,8 +217,11 @@ def test_a_machine_without_the_camera_gets_true_poses_and_no_detector(tmp_path: 
 def test_the_third_machine_lifts_a_small_pile_from_data_alone(tmp_path: Path) -> None:
     loader = made(tmp_path)
     options = {
-        "profile": str(loader), "truth": str(loader.with_name(f"{NAME}.truth.toml")), "configuration": 7,
-        "poses": TRUE, "planner": "search",
-    }  # fmt: skip
+        "profile": str(loader),
+        "truth": str(loader.with_name(f"{NAME}.truth.toml")),
+        "configuration": 7,
+        "poses": TRUE,
+        "planner": "search",
+    }
     found = attempt(Job("one", "grasp", 7000, options))
     assert found["lifted"] == 3 and found["stops"] == 0 and found["closings"] == 1

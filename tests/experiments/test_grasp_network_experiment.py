@@ -48,8 +48,12 @@ def layout(folder: Path, numbers: tuple[int, ...]) -> Path:
 
 def test_the_fastest_path_is_one_that_agrees() -> None:
     times = {"torch": [10.0, 10.0], "low": [4.0, 4.0], "mixed": [2.0, 2.0], "heads": [5.0, 5.0]}
-    apart = {"torch": [(0.0, 0.0)], "low": [(1.0, 2.0), (1.0, 2.0)], "mixed": [(0.0, 3.1), (0.0, 3.1)],
-             "heads": [(0.0, 0.0)]}  # fmt: skip
+    apart = {
+        "torch": [(0.0, 0.0)],
+        "low": [(1.0, 2.0), (1.0, 2.0)],
+        "mixed": [(0.0, 3.1), (0.0, 3.1)],
+        "heads": [(0.0, 0.0)],
+    }
     found = latency.metrics(times, apart)
     assert found["latency_ratio"] == 0.4
     assert (found["argmax_px"], found["angle_deg"]) == (1.0, 2.0)
@@ -94,8 +98,12 @@ def test_a_folder_without_samples_is_refused(tmp_path: Path) -> None:
 def test_a_checkpoint_belongs_to_its_seed_schedule_and_data(tmp_path: Path) -> None:
     few = load_samples(layout(tmp_path / "a", (1, 2)))
     other = load_samples(layout(tmp_path / "b", (1, 3)))
-    names = {folds.identity(few, 1, 2), folds.identity(few, 2, 2), folds.identity(few, 1, 3),
-             folds.identity(other, 1, 2)}  # fmt: skip
+    names = {
+        folds.identity(few, 1, 2),
+        folds.identity(few, 2, 2),
+        folds.identity(few, 1, 3),
+        folds.identity(other, 1, 2),
+    }
     assert len(names) == 4
     assert folds.identity(few, 1, 2) in names
 

@@ -85,12 +85,17 @@ def test_every_law_meets_every_corner_of_twice_the_spread_and_a_quick_run_is_sho
 
 def test_metrics_are_means_counts_and_worst_values():
     outcomes = {
-        "palms/pd/shipped/wide/0": {"rest_m": [0.001, 0.003], "diverged": False, "alarms": 1, "trace": {},
-                                    "shut_share": 1.0},
+        "palms/pd/shipped/wide/0": {
+            "rest_m": [0.001, 0.003],
+            "diverged": False,
+            "alarms": 1,
+            "trace": {},
+            "shut_share": 1.0,
+        },
         "palms/pd/shipped/corner/1": {"rest_m": [0.002, 0.010], "diverged": True, "alarms": 2, "shut_share": 0.9},
         "palms/pd/shipped/corner/2": {"rest_m": [0.004, 0.004], "diverged": False, "alarms": 0, "shut_share": 0.8},
         "palms/stop/0": {"lift_empty_damped_ring_m": [0.001, 0.002], "lift_empty_plain_ring_m": [0.002, 0.004]},
-    }  # fmt: skip
+    }
     metrics = experiment.gather(outcomes)
     assert metrics["palms_pd_shipped_corner_rest_m"] == pytest.approx(0.005)
     assert metrics["palms_pd_shipped_corner_rest_m_max"] == 0.010
@@ -155,8 +160,10 @@ def test_a_law_without_margins_diverges_there(monkeypatch):
 
     def eager(*given):
         made = real(*given)
-        joints = {n: msgspec.structs.replace(s, law=msgspec.structs.replace(s.law, kp_1_s=5.0 * s.law.kp_1_s))
-                  for n, s in made.joints.items()}  # fmt: skip
+        joints = {
+            n: msgspec.structs.replace(s, law=msgspec.structs.replace(s.law, kp_1_s=5.0 * s.law.kp_1_s))
+            for n, s in made.joints.items()
+        }
         return msgspec.structs.replace(made, joints=joints)
 
     monkeypatch.setattr(individuals, "controller_profile", eager)

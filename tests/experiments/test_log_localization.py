@@ -31,8 +31,11 @@ def row(error: float, faithful: float = 0.2) -> dict:
         "faithful_length_m",
     )
     return dict.fromkeys(keys, 0.5) | {
-        "error_m": error, "faithful_error_m": faithful, "faithful_centred_m": faithful - 0.1, "parts_m": [0.0] * 3
-    }  # fmt: skip
+        "error_m": error,
+        "faithful_error_m": faithful,
+        "faithful_centred_m": faithful - 0.1,
+        "parts_m": [0.0] * 3,
+    }
 
 
 def test_medians_are_of_all_logs_and_a_missed_log_counts_as_far_off() -> None:
@@ -52,8 +55,15 @@ def test_medians_are_of_all_logs_and_a_missed_log_counts_as_far_off() -> None:
 def test_every_metric_is_computed() -> None:
     metrics = gather({f"approach/{d}/0": {"logs": [row(0.01)]} for d in (0, 45, 90)})
     for prefix in ("", "faithful."):
-        for name in ("deg0.median_m", "deg45.median_m", "deg90.median_m", "p95_m", "axis_median_deg",
-                     "diameter_median_m", "length_median_m"):  # fmt: skip
+        for name in (
+            "deg0.median_m",
+            "deg45.median_m",
+            "deg90.median_m",
+            "p95_m",
+            "axis_median_deg",
+            "diameter_median_m",
+            "length_median_m",
+        ):
             assert math.isfinite(metrics[prefix + name])
     for masks in ("true", "network"):
         assert {f.name for s in sections(masks) for f in s.metrics} <= set(metrics)

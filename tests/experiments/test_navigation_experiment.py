@@ -40,11 +40,31 @@ def ours(off_m: float = 0.0, seen_off_m: float = 0.0, points: list[tuple[float, 
         x, y, heading, _ = path.at(s)
         left = (-math.sin(heading), math.cos(heading))
         true, seen = ((x + o * left[0], y + o * left[1]) for o in (off_m, off_m + seen_off_m))
-        rows.append(row(t_s=s, x_m=true[0], y_m=true[1], yaw_rad=heading, seen_x_m=seen[0], seen_y_m=seen[1],
-                        seen_yaw_rad=heading, sigma_m=0.02, s_m=s, goal=-1))  # fmt: skip
+        rows.append(
+            row(
+                t_s=s,
+                x_m=true[0],
+                y_m=true[1],
+                yaw_rad=heading,
+                seen_x_m=seen[0],
+                seen_y_m=seen[1],
+                seen_yaw_rad=heading,
+                sigma_m=0.02,
+                s_m=s,
+                goal=-1,
+            )
+        )
     x, y, *_ = path.at(path.length_m + 0.03)
-    return {"rows": rows, "begin": list(begin), "rest_m": [x, y], "arrived": True, "reason": "", "stops": 0,
-            "rejected": 0, "seconds": 1.0}  # fmt: skip
+    return {
+        "rows": rows,
+        "begin": list(begin),
+        "rest_m": [x, y],
+        "arrived": True,
+        "reason": "",
+        "stops": 0,
+        "rejected": 0,
+        "seconds": 1.0,
+    }
 
 
 def faithful(off_m: float = 0.0, laps: int = LAPS, curve_deg_m: float = 10.0) -> dict[str, Any]:
@@ -61,12 +81,30 @@ def faithful(off_m: float = 0.0, laps: int = LAPS, curve_deg_m: float = 10.0) ->
             yaw += max(-turn, min(turn, error))
             x, y = x + SPACING_M * math.cos(yaw), y + SPACING_M * math.sin(yaw)
             shift = off_m if goal < len(points) - LAP else 0.0
-            rows.append(row(x_m=x + shift, y_m=y + shift, yaw_rad=yaw, seen_x_m=x + shift, seen_y_m=y + shift,
-                            sigma_m=0.02, goal=goal, bend_rad=bend))  # fmt: skip
+            rows.append(
+                row(
+                    x_m=x + shift,
+                    y_m=y + shift,
+                    yaw_rad=yaw,
+                    seen_x_m=x + shift,
+                    seen_y_m=y + shift,
+                    sigma_m=0.02,
+                    goal=goal,
+                    bend_rad=bend,
+                )
+            )
             if math.dist((x, y), (gx, gy)) < (6.0 if goal + 1 < len(points) else 1.0):
                 break
-    return {"rows": rows, "begin": [-12.0, -10.0, 0.0], "rest_m": [x, y], "arrived": True, "reason": "", "stops": 0,
-            "rejected": 0, "seconds": 1.0}  # fmt: skip
+    return {
+        "rows": rows,
+        "begin": [-12.0, -10.0, 0.0],
+        "rest_m": [x, y],
+        "arrived": True,
+        "reason": "",
+        "stops": 0,
+        "rejected": 0,
+        "seconds": 1.0,
+    }
 
 
 def test_the_plan_drives_every_start_on_every_ground_by_both_methods() -> None:

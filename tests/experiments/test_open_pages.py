@@ -35,17 +35,28 @@ def ticks_of(folder: Path, reads: bool) -> tuple[KeptBus, Loop, list[bytes], int
     """Ticks of a loop whose console reads every report, or none; the reports, and how many the kernel let go."""
     folder.mkdir()
     bus, controller, got, now = KeptBus(), Controller(SETTINGS, DATABASE), list[bytes](), SECOND_NS
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as setpoints, \
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as console:  # fmt: skip
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as setpoints,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as console,
+    ):
         for each in (setpoints, console):
             each.bind(("127.0.0.1", 0))
             each.setblocking(False)
         console.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         timing = LoopTiming(controller, None, lambda: now, lambda: now)
         loop = Loop(
-            controller, [bus], setpoints, None, [console.getsockname()], RecordRing(folder / "ticks"), timing, T,
-            SETTINGS.sync_lead_ns, lambda: now, lambda _: None,
-        )  # fmt: skip
+            controller,
+            [bus],
+            setpoints,
+            None,
+            [console.getsockname()],
+            RecordRing(folder / "ticks"),
+            timing,
+            T,
+            SETTINGS.sync_lead_ns,
+            lambda: now,
+            lambda _: None,
+        )
         assert not any(receiver.getblocking() for receiver in loop._reports), "a full socket cannot hold a tick"
         for k in range(TICKS):
             now = SECOND_NS + k * T

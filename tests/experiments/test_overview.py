@@ -19,8 +19,11 @@ DOCS = Path(__file__).parents[2] / "docs"
 def test_missed_and_inconclusive_limits_are_not_met_and_paper_values_are_shown() -> None:
     result = read(DOCS / "results" / "navigation.json")
     broken = {**result.metrics, "lateral_p95_m": 0.5, "stop_max_m": float("nan")}
-    text = page({"navigation": replace(result, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))}, (),
-                {"navigation": Standing.STALE})  # fmt: skip
+    text = page(
+        {"navigation": replace(result, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))},
+        (),
+        {"navigation": Standing.STALE},
+    )
     asks, papers, later, missed, _ = text.split("## ")
     (row,) = [line for line in asks.splitlines() if line.startswith("| [")]
     assert [len(result.limits) - 2, len(result.limits), 1] in [numbers_in(cell) for cell in row.split("|")]

@@ -24,8 +24,14 @@ def grasp(begin_s: float, seconds: float, logs: int = 1, state: str = "COLLECT",
     """A grasp whose ways take 8 s at least."""
     half = begin_s + seconds / 2
     phases = [["ABOVE", begin_s, 3.0], ["CLOSE", half, 1.0], ["CARRY", half + 1.0, 5.0]]
-    return {"begin_s": begin_s, "end_s": begin_s + seconds, "state": state, "phases": phases, "failure": failure,
-            "attempts": [{"log": 0, "logs": logs, "meant_m": 0.0, "off_m": [0.0, 0.0, 0.0]}]}  # fmt: skip
+    return {
+        "begin_s": begin_s,
+        "end_s": begin_s + seconds,
+        "state": state,
+        "phases": phases,
+        "failure": failure,
+        "attempts": [{"log": 0, "logs": logs, "meant_m": 0.0, "off_m": [0.0, 0.0, 0.0]}],
+    }
 
 
 def run(grasps: list[Any], logs: int = 2, seconds: float = 100.0, landed: bool = False) -> dict[str, Any]:

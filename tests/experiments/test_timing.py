@@ -308,10 +308,24 @@ def test_all_metric_names_exist():
     frames = {"rx_decode_us", "rx_decode_pythoncan_us"}  # from receive_cost
     bench = {"compiled_ratio_cold", "compiled_ratio_hot", "tick_instructions"}  # from hil.tick; only where counted
     assert set(metrics) >= {
-        "tick_cpu_p50_us", "tick_cpu_p99_us", "tick1k_cpu_p99_us", "wakeup_p50_ratio", "wakeup_p99_ratio", "missed",
-        "missed_loaded", "missed_loaded_plain", "sample_to_command_p99_us", "page_faults", "gc_runs", "host_verdict",
-        "missed_1k", "syscalls_per_tick", "voluntary_switches_per_tick", "steal_ms", "cyclictest_p99_us",
-    }  # fmt: skip
+        "tick_cpu_p50_us",
+        "tick_cpu_p99_us",
+        "tick1k_cpu_p99_us",
+        "wakeup_p50_ratio",
+        "wakeup_p99_ratio",
+        "missed",
+        "missed_loaded",
+        "missed_loaded_plain",
+        "sample_to_command_p99_us",
+        "page_faults",
+        "gc_runs",
+        "host_verdict",
+        "missed_1k",
+        "syscalls_per_tick",
+        "voluntary_switches_per_tick",
+        "steal_ms",
+        "cyclictest_p99_us",
+    }
     assert {f.name for f in METRICS} <= set(metrics) | frames | bench
     assert len({f.name for f in METRICS}) == len(METRICS)
 

@@ -181,9 +181,27 @@ def test_a_swing_begins_at_rest_and_stays_within_range_and_speed():
 def test_no_setpoint_is_sent_to_a_machine_that_is_not_armed():
     source = SetpointSource(PALMS)
     report = StateReport(
-        1, 0, START_NS, Mode.STANDBY, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.1, math.nan, 0.0, 0.5, 0.0),
-        1.0, 0.0, 0.0, 0, 0, 0, 0,
-    )  # fmt: skip
+        1,
+        0,
+        START_NS,
+        Mode.STANDBY,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        (0.0,) * 5,
+        (0.0,) * 5,
+        (0.1, math.nan, 0.0, 0.5, 0.0),
+        1.0,
+        0.0,
+        0.0,
+        0,
+        0,
+        0,
+        0,
+    )
     source.receive(report)
     assert source.setpoint(START_NS) is None
     source.receive(replace(report, mode=Mode.ARMED))

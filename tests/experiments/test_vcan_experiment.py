@@ -21,10 +21,25 @@ TOLD = f"""   1.6 s  controller ACTIVE
 
 def outcome(kind: str = "demo", seed: int = 1, clock: str = "real", **changed: Any) -> dict[str, Any]:
     return {
-        "kind": kind, "seed": seed, "exit": 0, "wall_s": 50.0, "steal_ms": 10.0, "lost_ms": 5.0, "longest_ms": 2.0,
-        "probe_real_time": True, "clock": clock, "clock_reason": "enough", "stop_reasons": [], "leases_lost": 0,
-        "done": True, "stops": 0, "refused": 0, "missed_ticks": 0, "seconds": 40.0, **changed,
-    }  # fmt: skip
+        "kind": kind,
+        "seed": seed,
+        "exit": 0,
+        "wall_s": 50.0,
+        "steal_ms": 10.0,
+        "lost_ms": 5.0,
+        "longest_ms": 2.0,
+        "probe_real_time": True,
+        "clock": clock,
+        "clock_reason": "enough",
+        "stop_reasons": [],
+        "leases_lost": 0,
+        "done": True,
+        "stops": 0,
+        "refused": 0,
+        "missed_ticks": 0,
+        "seconds": 40.0,
+        **changed,
+    }
 
 
 def test_stops_ended_leases_and_the_announced_clock_are_read_from_the_output() -> None:
@@ -62,6 +77,18 @@ def test_a_run_that_is_not_done_is_missed_on_any_host() -> None:
 
 def test_the_command_is_the_one_that_a_user_types() -> None:
     assert command("mission", 4, Path("x"))[3:] == [
-        "mission", "run", "docs/examples/paper_b.geojson", "--logs", "3", "--detector", "perfect", "--bus", "vcan",
-        "--seed", "4", "--no-console", "--out", "x",
-    ]  # fmt: skip
+        "mission",
+        "run",
+        "docs/examples/paper_b.geojson",
+        "--logs",
+        "3",
+        "--detector",
+        "perfect",
+        "--bus",
+        "vcan",
+        "--seed",
+        "4",
+        "--no-console",
+        "--out",
+        "x",
+    ]

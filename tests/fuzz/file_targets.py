@@ -178,9 +178,13 @@ def decoded(path: Path) -> Hashable:
 def bus_seeds() -> list[bytes]:
     """A DM1 by the transport protocol of J1939 and a fast packet of NMEA 2000, on two buses."""
     lines = [
-        "1CECFF00#200A0002FFCAFE00", "1CEBFF00#0104FF6E00040507", "1CEBFF00#0208090AFFFFFFFF",
-        "0DF8051C#E02B0000FF4CC0EB", "0DF8051C#E1FF000000000000", "09F8011C#0000000000000000",
-    ]  # fmt: skip
+        "1CECFF00#200A0002FFCAFE00",
+        "1CEBFF00#0104FF6E00040507",
+        "1CEBFF00#0208090AFFFFFFFF",
+        "0DF8051C#E02B0000FF4CC0EB",
+        "0DF8051C#E1FF000000000000",
+        "09F8011C#0000000000000000",
+    ]
     log = "".join(f"({i}.0{i}) can{bus} {line}\n" for bus in (0, 1) for i, line in enumerate(lines))
     return [log.encode(), *reports(".log")]
 

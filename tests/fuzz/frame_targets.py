@@ -78,7 +78,7 @@ def scripts() -> list[bytes]:
         script(*((_FRAME, 1, 0x700 + node, bytes((state,))) for node in (1, 2, 3, 16, 32) for state in (0, 4, 5, 127))),
         script(*((_FRAME, 8, 0x80 + node, bytes((0, code, 1))) for node in (2, 3, 4, 16) for code in (0x81, 0x50, 0))),
         script(*((_MACHINE_FRAME, 8, EXTENDED | 0x18EEFF27, bytes((k,) * 8)) for k in range(12)), (_TICKS, 3, 0, b"")),
-    ]  # fmt: skip
+    ]
     for kind, flags in ((_FRAME, _GOOD_CRC), (_MACHINE_FRAME, _GOOD_CRC), (_FRAME, 0), (_MACHINE_FRAME, 0)):
         for first in range(0, 48, 16):
             steps = [(kind, _KNOWN | flags | 0x18, number, bytes((number * 37 & 0xFF,) * 8)) for number in range(16)]

@@ -66,9 +66,10 @@ def datagrams() -> list[bytes]:
         DriveSetpoint(*common, *drive),
         OperatorCommand(*common, OperatorAction.ARM),
         OperatorCommand(*common, OperatorAction.STOP),
-        VehicleReport(*common, 1, 1, 0, 0, 5, 63.0, 19.0, 100.0, 4, 12, 0.02, 6, 1.0, 0.0, 7, 0.5, 0.1, 0.0, 0.0,
-                      (0.3,) * 4, 0),
-    ]  # fmt: skip
+        VehicleReport(
+            *common, 1, 1, 0, 0, 5, 63.0, 19.0, 100.0, 4, 12, 0.02, 6, 1.0, 0.0, 7, 0.5, 0.1, 0.0, 0.0, (0.3,) * 4, 0
+        ),
+    ]
     return [*map(encode, made), recordings.report(1)]
 
 

@@ -164,10 +164,14 @@ def requests() -> list[bytes]:
     write = struct.pack(">HHB", plc.COMMAND_AT, COMMAND_COUNT, len(values)) + values
     both = struct.pack(">HH", 0, STATUS_COUNT) + write
     pdus = [
-        b"\x17" + both, b"\x10" + write, b"\x03" + struct.pack(">HH", 0, STATUS_COUNT), b"\x04\x00\x00\x00\x38",
-        b"\x06" + struct.pack(">HH", plc.WATCHDOG_AT, 300), b"\x06" + struct.pack(">HH", plc.SEQUENCE_AT, 9),
+        b"\x17" + both,
+        b"\x10" + write,
+        b"\x03" + struct.pack(">HH", 0, STATUS_COUNT),
+        b"\x04\x00\x00\x00\x38",
+        b"\x06" + struct.pack(">HH", plc.WATCHDOG_AT, 300),
+        b"\x06" + struct.pack(">HH", plc.SEQUENCE_AT, 9),
         b"\x2b\x0e\x01\x00",
-    ]  # fmt: skip
+    ]
     return [bytes((modbus.UNIT,)) + pdu for pdu in pdus]
 
 

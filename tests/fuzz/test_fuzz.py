@@ -10,10 +10,20 @@ from tests.fuzz.__main__ import TARGETS
 from tests.fuzz.engine import FOREVER, REGRESSIONS, Broken, Target, fuzz, judged, packed, replay, smallest, unpacked
 
 RUNS = {
-    "controller-loader": 120, "controller-forwarder": 80, "guard": 300, "dbc": 60, "profile": 60, "guard-profile": 60,
-    "guard-envelope": 100, "guard-dbc": 300, "trace-asc": 300, "recording": 600, "mission-file": 1000,
-    "timing-page": 1500, "trace-decoded": 300,
-}  # fmt: skip
+    "controller-loader": 120,
+    "controller-forwarder": 80,
+    "guard": 300,
+    "dbc": 60,
+    "profile": 60,
+    "guard-profile": 60,
+    "guard-envelope": 100,
+    "guard-dbc": 300,
+    "trace-asc": 300,
+    "recording": 600,
+    "mission-file": 1000,
+    "timing-page": 1500,
+    "trace-decoded": 300,
+}
 SAVED = [(path.parent.name, path) for path in sorted(REGRESSIONS.glob("*/*.inputs"))]
 
 

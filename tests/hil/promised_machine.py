@@ -37,9 +37,20 @@ STOP_NS: Final = 200 * MS
 """A stop's ramp (150 ms) with the tick and the frame that carry it."""
 MARGIN_PCT: Final = 0.1
 NEEDED: Final = {
-    "EstopStat": 10, "GuardStat": 10, "EncSlew": 5, "EncLift": 5, "EncTilt": 5, "EncExt": 5, "EncRot": 5, "ValveFbA": 5,
-    "ValveFbB": 5, "PlcStatus": 20, "ValveCmdA": 5, "ValveCmdB": 5, "Sync": 5,
-}  # fmt: skip
+    "EstopStat": 10,
+    "GuardStat": 10,
+    "EncSlew": 5,
+    "EncLift": 5,
+    "EncTilt": 5,
+    "EncExt": 5,
+    "EncRot": 5,
+    "ValveFbA": 5,
+    "ValveFbB": 5,
+    "PlcStatus": 20,
+    "ValveCmdA": 5,
+    "ValveCmdB": 5,
+    "Sync": 5,
+}
 """Messages without which nothing may move, with their period [ms]."""
 SPECS: Final = [joint(SETTINGS.profile, j) for j in JOINTS]
 FUNCTIONS: Final = ("slew", "lift", "tilt", "ext", "rot")
@@ -222,9 +233,17 @@ class PromisedMachine:
         key = SYNC_ID if name == "Sync" else DATABASE.message(name).key
         end_ns = self.now_ns + round(duration_s * 1e9) if duration_s else FOREVER_NS
         self.system.core.inject(
-            Fault(kind, self.now_ns, end_ns, key, 0x7FF, probability=probability, shift_ns=shift_ns,
-                  seed=self.now_ns & 0xFFFF)
-        )  # fmt: skip
+            Fault(
+                kind,
+                self.now_ns,
+                end_ns,
+                key,
+                0x7FF,
+                probability=probability,
+                shift_ns=shift_ns,
+                seed=self.now_ns & 0xFFFF,
+            )
+        )
         if kind is Kind.DROP and probability == 1.0 and not duration_s:
             self.lost.setdefault(name, self.now_ns + NEEDED[name] * MS)
 

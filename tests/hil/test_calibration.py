@@ -79,9 +79,14 @@ def test_an_abort_leaves_the_valves_neutral_and_the_run_replays(tmp_path: Path) 
     recorder = Recorder(tmp_path / "log", profile, describe(profile, (profile.crane_bus,), 3))
     seen: list[Calibration] = []
     outcome = run_lockstep(
-        "palms_471", "sampled", 3, surveyed=False, recorder=recorder,
-        watch=seen.append, aborted=lambda: bool(seen) and _opened(seen[-1]),
-    )  # fmt: skip
+        "palms_471",
+        "sampled",
+        3,
+        surveyed=False,
+        recorder=recorder,
+        watch=seen.append,
+        aborted=lambda: bool(seen) and _opened(seen[-1]),
+    )
     recorder.close()
     assert outcome.calibration is not None and outcome.calibration.failure_code == "calibration.aborted"
     trace = outcome.calibration.trace

@@ -21,10 +21,13 @@ def verdict(**its: bool) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("its", "settled"),
     [
-        ({}, True), ({"at_rest": False}, False), ({"in_bunk": False}, True),
-        ({"in_bunk": False, "at_rest": False}, False), ({"lifted": False, "in_bunk": False}, True),
+        ({}, True),
+        ({"at_rest": False}, False),
+        ({"in_bunk": False}, True),
+        ({"in_bunk": False, "at_rest": False}, False),
+        ({"lifted": False, "in_bunk": False}, True),
     ],
-)  # fmt: skip
+)
 def test_only_a_log_that_still_moves_is_waited_for(its: dict[str, bool], settled: bool) -> None:
     assert is_settled(verdict(**its)) is settled
 
@@ -35,9 +38,21 @@ def test_the_sentence_names_all_that_is_wrong() -> None:
 
 
 SUMMARY = Summary(
-    True, outcome_sentence(verdict()), "", 26.5, 1, 5300, 0, 62160, 0, "1 log (0) of 1 at once, all draws hold it", 1,
-    "runs/paced-seed3-1", paced=True, behind_s=10.5,
-)  # fmt: skip
+    True,
+    outcome_sentence(verdict()),
+    "",
+    26.5,
+    1,
+    5300,
+    0,
+    62160,
+    0,
+    "1 log (0) of 1 at once, all draws hold it",
+    1,
+    "runs/paced-seed3-1",
+    paced=True,
+    behind_s=10.5,
+)
 
 
 def shown(summary: Summary, terminal: bool) -> list[str]:

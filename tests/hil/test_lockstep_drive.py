@@ -62,11 +62,20 @@ class Drives:
             return None
         self._sequence, self._sent_ns = self._sequence + 1, now_ns
         values = {
-            "sequence": self._sequence, "profile_hash": SETTINGS.profile_hash, "stamp_ns": now_ns,
-            "lease_ns": 200 * MS, "steering": Steering.WAYPOINT, "latitude_deg": CARRIER.site_lat_deg,
-            "longitude_deg": CARRIER.site_lon_deg, "articulation_rad": 0.0, "articulation_rate_rad_s": 0.0,
-            "speed_m_s": 0.0, "heights_m": (HIGH,) * 4, "float_front": False, "float_rear": False,
-        } | asked  # fmt: skip
+            "sequence": self._sequence,
+            "profile_hash": SETTINGS.profile_hash,
+            "stamp_ns": now_ns,
+            "lease_ns": 200 * MS,
+            "steering": Steering.WAYPOINT,
+            "latitude_deg": CARRIER.site_lat_deg,
+            "longitude_deg": CARRIER.site_lon_deg,
+            "articulation_rad": 0.0,
+            "articulation_rate_rad_s": 0.0,
+            "speed_m_s": 0.0,
+            "heights_m": (HIGH,) * 4,
+            "float_front": False,
+            "float_rear": False,
+        } | asked
         return encode(DriveSetpoint(**values))  # type: ignore[arg-type]
 
 

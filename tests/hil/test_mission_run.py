@@ -39,9 +39,13 @@ def test_a_machine_without_a_carrier_drives_no_mission(tmp_path: Path) -> None:
     ],
 )
 def test_the_machine_sees_with_its_own_camera_and_perfect_sight_is_called_a_cheat(
-    words: tuple[str, ...], detector: str, planner: tuple[str, int], cheats: bool, tmp_path: Path,
+    words: tuple[str, ...],
+    detector: str,
+    planner: tuple[str, int],
+    cheats: bool,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     given: list[object] = []
 
     def take_place(*arguments: object) -> MissionSummary:

@@ -57,10 +57,13 @@ def test_each_assortment_reaches_its_landing_although_the_planner_restarts(tmp_p
         assert plant.world.carrier.speed_m_s == pytest.approx(0.0, abs=0.01), "the machine does not drive"
         progress = read_checkpoint(book, told, system.now_ns, 10**18 + int(DEAD_S * 1e9))
         run.manager = ActivityManager(
-            profile, profile_hash(profile), told, selector=PlannerSelection(SamplingPlanner()),
+            profile,
+            profile_hash(profile),
+            told,
+            selector=PlannerSelection(SamplingPlanner()),
             unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
             progress=progress,
-        )  # fmt: skip
+        )
         run.manager.auto()
         summary = run.run(1500.0, str(tmp_path))
     assert summary.finished, summary.failure

@@ -41,10 +41,13 @@ class Crane:
         settings = load("palms_471")
         self.plant = Plant(settings.profile, 3)
         self.system = Lockstep(
-            settings, build_guard(profile_path("palms_471")), self.plant,
-            Activity(settings.profile, settings.profile_hash), Operator(settings.profile_hash, lambda *_: None, 0),
+            settings,
+            build_guard(profile_path("palms_471")),
+            self.plant,
+            Activity(settings.profile, settings.profile_hash),
+            Operator(settings.profile_hash, lambda *_: None, 0),
             Observer(),
-        )  # fmt: skip
+        )
         self.executed: list[tuple[int, int]] = []
         """When a command was accepted, and its age then [ns]."""
         self._ages_ns: dict[int, int] = {}
@@ -163,12 +166,21 @@ class Drives:
         assert carrier is not None
         return encode(
             DriveSetpoint(
-                sequence=self._sequence, profile_hash=self._settings.profile_hash, stamp_ns=now_ns, lease_ns=200 * MS,
-                steering=Steering.ARTICULATION, latitude_deg=carrier.site_lat_deg,
-                longitude_deg=carrier.site_lon_deg, articulation_rad=0.0, articulation_rate_rad_s=0.0,
-                speed_m_s=0.5, heights_m=(carrier.arm_transport_m,) * 4, float_front=False, float_rear=False,
+                sequence=self._sequence,
+                profile_hash=self._settings.profile_hash,
+                stamp_ns=now_ns,
+                lease_ns=200 * MS,
+                steering=Steering.ARTICULATION,
+                latitude_deg=carrier.site_lat_deg,
+                longitude_deg=carrier.site_lon_deg,
+                articulation_rad=0.0,
+                articulation_rate_rad_s=0.0,
+                speed_m_s=0.5,
+                heights_m=(carrier.arm_transport_m,) * 4,
+                float_front=False,
+                float_rear=False,
             )
-        )  # fmt: skip
+        )
 
 
 def test_bus_off_of_the_controller_stops_the_valves_within_100_ms_for_good(crane: Crane) -> None:

@@ -116,9 +116,12 @@ class AnyHistory(RuleBasedStateMachine):
 
 
 AnyHistory.TestCase.settings = settings(
-    max_examples=12, stateful_step_count=20, deadline=None, derandomize=True,
+    max_examples=12,
+    stateful_step_count=20,
+    deadline=None,
+    derandomize=True,
     suppress_health_check=list(HealthCheck),
-)  # fmt: skip
+)
 TestAnyHistory = AnyHistory.TestCase
 
 

@@ -39,8 +39,11 @@ def test_six_rounds_give_their_range_and_one_wild_round_of_nine_does_not_count()
 
 def test_a_limit_inside_the_interval_is_inconclusive() -> None:
     assert [verdict(interval, 2.0) for interval in ((2.0, 3.0), (1.0, 1.9), (1.9, 2.1), (0.0, math.inf))] == [
-        "reached", "missed", "inconclusive", "inconclusive"
-    ]  # fmt: skip
+        "reached",
+        "missed",
+        "inconclusive",
+        "inconclusive",
+    ]
 
 
 def test_ratios_are_those_of_the_same_round() -> None:

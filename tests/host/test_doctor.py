@@ -52,15 +52,22 @@ GOOD = {
 LINKS: list[dict[str, Any]] = [
     {"ifname": "lo", "link_type": "loopback"},
     {
-        "ifname": "crane0", "flags": ["NOARP", "UP"], "link_type": "can", "txqlen": 32,
+        "ifname": "crane0",
+        "flags": ["NOARP", "UP"],
+        "link_type": "can",
+        "txqlen": 32,
         "linkinfo": {
             "info_kind": "can",
-            "info_data": {"state": "ERROR-ACTIVE", "berr_counter": {"tx": 0, "rx": 0}, "restart_ms": 100,
-                          "bittiming": {"bitrate": 1000000}},
+            "info_data": {
+                "state": "ERROR-ACTIVE",
+                "berr_counter": {"tx": 0, "rx": 0},
+                "restart_ms": 100,
+                "bittiming": {"bitrate": 1000000},
+            },
             "info_xstats": {"restarts": 0, "bus_error": 0, "error_passive": 0, "bus_off": 0},
         },
     },
-]  # fmt: skip
+]
 Tree = Callable[..., Facts]
 
 
@@ -135,41 +142,91 @@ PINNED = "etc__systemd__system__timberhand-controller.service.d__50-processor.co
 CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
     ("priority", {"proc__self__limits": "Max realtime priority  0  0\n"}, Severity.CHANGE, "FIFO 0", "rtprio 90"),
     ("memory", {"proc__self__limits": "Max locked memory  65536  65536\n"}, Severity.CHANGE, "64 kB", "memlock"),
-    ("kernel", {"proc__version": "#1 SMP PREEMPT Debian", "sys__kernel__realtime": "0"}, Severity.CHANGE,
-     "'full'", "linux-image-rt-amd64"),
+    (
+        "kernel",
+        {"proc__version": "#1 SMP PREEMPT Debian", "sys__kernel__realtime": "0"},
+        Severity.CHANGE,
+        "'full'",
+        "linux-image-rt-amd64",
+    ),
     ("machine", {"proc__cpuinfo": "flags : fpu hypervisor"}, Severity.ADVICE, "", ""),
-    ("clock rate", {"sys__devices__system__cpu__cpu3__cpufreq__scaling_governor": "powersave"}, Severity.CHANGE,
-     "powersave", "tune.sh --apply --cpu 3"),
-    ("processor", {"sys__devices__system__cpu__isolated": ""}, Severity.CHANGE, "3",
-     "isolcpus=managed_irq,domain,3"),
-    ("processor", {"sys__devices__system__cpu__nohz_full": "", "proc__cmdline": "rcu_nocbs=3"}, Severity.ADVICE,
-     "nohz_full", "nohz_full=3"),
-    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n",
-                   "sys__devices__system__cpu__isolated": ""}, Severity.ADVICE, "",
-     "service install --cpu 3"),
-    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n"}, Severity.CHANGE,
-     "3", "service install --cpu 3"),
-    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n",
-                   PINNED: "[Service]\nCPUAffinity=2\n"}, Severity.CHANGE, "2",
-     "service install --cpu any"),
-    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "9",
-     "nano"),
-    ("sibling", {"sys__devices__system__cpu__cpu3__topology__thread_siblings_list": "1,3"}, Severity.ADVICE,
-     "1", "cpu1/online"),
+    (
+        "clock rate",
+        {"sys__devices__system__cpu__cpu3__cpufreq__scaling_governor": "powersave"},
+        Severity.CHANGE,
+        "powersave",
+        "tune.sh --apply --cpu 3",
+    ),
+    ("processor", {"sys__devices__system__cpu__isolated": ""}, Severity.CHANGE, "3", "isolcpus=managed_irq,domain,3"),
+    (
+        "processor",
+        {"sys__devices__system__cpu__nohz_full": "", "proc__cmdline": "rcu_nocbs=3"},
+        Severity.ADVICE,
+        "nohz_full",
+        "nohz_full=3",
+    ),
+    (
+        "processor",
+        {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n", "sys__devices__system__cpu__isolated": ""},
+        Severity.ADVICE,
+        "",
+        "service install --cpu 3",
+    ),
+    (
+        "processor",
+        {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n"},
+        Severity.CHANGE,
+        "3",
+        "service install --cpu 3",
+    ),
+    (
+        "processor",
+        {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n", PINNED: "[Service]\nCPUAffinity=2\n"},
+        Severity.CHANGE,
+        "2",
+        "service install --cpu any",
+    ),
+    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "9", "nano"),
+    (
+        "sibling",
+        {"sys__devices__system__cpu__cpu3__topology__thread_siblings_list": "1,3"},
+        Severity.ADVICE,
+        "1",
+        "cpu1/online",
+    ),
     ("interrupts", {"proc__irq__130__smp_affinity_list": "0-3"}, Severity.CHANGE, "130", "tune.sh"),
-    ("irqbalance", {"proc__901__stat": "901 (irqbalance) S 1", "sys__devices__system__cpu__isolated": ""},
-     Severity.CHANGE, "3", "IRQBALANCE_BANNED_CPULIST=3"),
-    ("sleep", {"sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0"}, Severity.ADVICE, "890 us",
-     "--dma-latency"),
-    ("delivery", {"proc__15__stat": GOOD["proc/15/stat"].replace(" 60 1 ", " 0 0 ")}, Severity.ADVICE, "",
-     "chrt"),
+    (
+        "irqbalance",
+        {"proc__901__stat": "901 (irqbalance) S 1", "sys__devices__system__cpu__isolated": ""},
+        Severity.CHANGE,
+        "3",
+        "IRQBALANCE_BANNED_CPULIST=3",
+    ),
+    (
+        "sleep",
+        {"sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0"},
+        Severity.ADVICE,
+        "890 us",
+        "--dma-latency",
+    ),
+    ("delivery", {"proc__15__stat": GOOD["proc/15/stat"].replace(" 60 1 ", " 0 0 ")}, Severity.ADVICE, "", "chrt"),
     ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "-1"}, Severity.ADVICE, "", "950000"),
     ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "500000"}, Severity.CHANGE, "50%", "tune.sh"),
-    ("clock", {"sys__devices__system__clocksource__clocksource0__current_clocksource": "hpet"}, Severity.CHANGE,
-     "hpet", "dmesg"),
-    ("huge pages", {"sys__kernel__mm__transparent_hugepage__enabled": "[always] madvise never"}, Severity.ADVICE,
-     "", "tune.sh"),
-]  # fmt: skip
+    (
+        "clock",
+        {"sys__devices__system__clocksource__clocksource0__current_clocksource": "hpet"},
+        Severity.CHANGE,
+        "hpet",
+        "dmesg",
+    ),
+    (
+        "huge pages",
+        {"sys__kernel__mm__transparent_hugepage__enabled": "[always] madvise never"},
+        Severity.ADVICE,
+        "",
+        "tune.sh",
+    ),
+]
 
 
 @pytest.mark.parametrize(("what", "changes", "severity", "sentence", "command"), CASES)
@@ -187,14 +244,26 @@ def test_a_suggested_change_names_its_values_and_its_command(
     ("changes", "what"),
     [
         ({"proc__self__status": "CapEff:\t000001ffffffffff", "proc__self__limits": ""}, "priority"),
-        ({"usr__lib__systemd__system__timberhand-controller.service": "LimitRTPRIO=80\nLimitMEMLOCK=infinity\n",
-          "proc__self__limits": ""}, "memory"),
-        ({"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n",
-          "sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0"}, "sleep"),
-        ({"proc__901__stat": "901 (irqbalance) S 1", "etc__default__irqbalance": "IRQBALANCE_BANNED_CPULIST=2-3"},
-         "irqbalance"),
+        (
+            {
+                "usr__lib__systemd__system__timberhand-controller.service": "LimitRTPRIO=80\nLimitMEMLOCK=infinity\n",
+                "proc__self__limits": "",
+            },
+            "memory",
+        ),
+        (
+            {
+                "etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n",
+                "sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0",
+            },
+            "sleep",
+        ),
+        (
+            {"proc__901__stat": "901 (irqbalance) S 1", "etc__default__irqbalance": "IRQBALANCE_BANNED_CPULIST=2-3"},
+            "irqbalance",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_granted_by_other_means_is_fine(tree: Tree, changes: dict[str, str | None], what: str) -> None:
     assert of(tree(**changes), what).severity is Severity.FINE
 

@@ -39,8 +39,14 @@ def test_a_bundle_is_what_was_signed(unpacked: tuple[Path, Path, Path]) -> None:
     wheel = folder / "wheels" / release.wheel
     assert release.name == f"1.0-{sums.sha256_of(wheel)[:12]}"
     program = sums.decode((folder / bundles.PROGRAM_SUMS).read_text(), "")
-    assert {"machine/palms.toml", "machine/palms.envelope.toml", "can_dbc/crane.dbc", "can_dbc/encoder.eds",
-            "autonomy/weights/logs.safetensors", "machine/__init__.py"} <= program.keys()  # fmt: skip
+    assert {
+        "machine/palms.toml",
+        "machine/palms.envelope.toml",
+        "can_dbc/crane.dbc",
+        "can_dbc/encoder.eds",
+        "autonomy/weights/logs.safetensors",
+        "machine/__init__.py",
+    } <= program.keys()
     text = (folder / bundles.REQUIREMENTS).read_text()
     assert text == f"timberhand==1.0 --hash=sha256:{sums.sha256_of(wheel)}\n"
 

@@ -53,9 +53,15 @@ def test_an_untouched_release_has_no_problem(program: tuple[Path, Path, Path]) -
 
 @pytest.mark.parametrize(
     "name",
-    [SHIPPED_PROFILE, "machine/palms.envelope.toml", "can_dbc/crane.dbc", "can_dbc/encoder.eds",
-     "autonomy/weights/logs.safetensors", "machine/__init__.py"],
-)  # fmt: skip
+    [
+        SHIPPED_PROFILE,
+        "machine/palms.envelope.toml",
+        "can_dbc/crane.dbc",
+        "can_dbc/encoder.eds",
+        "autonomy/weights/logs.safetensors",
+        "machine/__init__.py",
+    ],
+)
 def test_one_changed_byte_of_any_file_is_found(program: tuple[Path, Path, Path], name: str) -> None:
     site, _, public = program
     (site / name).write_bytes((site / name).read_bytes() + b" ")

@@ -163,9 +163,18 @@ def test_the_release_is_on_the_disk_before_it_is_whole_and_before_it_is_used(
     name = installed.state().current
     opt = installed.place.name
     assert told == [
-        "sync", "flush release.json.new", "release.json", f"flush {name}", "flush releases",
-        "trial", f"flush {opt}", "current", f"flush {opt}", "previous", f"flush {opt}",
-    ]  # fmt: skip
+        "sync",
+        "flush release.json.new",
+        "release.json",
+        f"flush {name}",
+        "flush releases",
+        "trial",
+        f"flush {opt}",
+        "current",
+        f"flush {opt}",
+        "previous",
+        f"flush {opt}",
+    ]
 
 
 def test_after_a_power_cut_the_links_say_what_is_left() -> None:

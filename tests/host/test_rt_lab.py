@@ -10,8 +10,11 @@ from host.rt_lab import guest, package
 from host.rt_lab.host import EXPECTED, POSITIVE, evaluate
 
 GOOD: dict[str, Any] = {
-    **EXPECTED, **dict.fromkeys(POSITIVE, 1), "kernel": "6.1 #1 SMP PREEMPT_RT Debian", "neutral_ms": 77.0,
-}  # fmt: skip
+    **EXPECTED,
+    **dict.fromkeys(POSITIVE, 1),
+    "kernel": "6.1 #1 SMP PREEMPT_RT Debian",
+    "neutral_ms": 77.0,
+}
 
 
 def test_a_good_result_has_no_fault() -> None:
@@ -21,12 +24,18 @@ def test_a_good_result_has_no_fault() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("kernel", "6.1 #1 SMP PREEMPT_DYNAMIC Debian"), ("realtime", None), ("controller_policy", "other 0"),
-        ("refused", ["mlockall: Cannot allocate memory"]), ("controller_locked_kb", 0), ("ticks", 0),
-        ("neutral_ms", 101.0), ("neutral_ms", None), ("opening_pct", 0.0),
+        ("kernel", "6.1 #1 SMP PREEMPT_DYNAMIC Debian"),
+        ("realtime", None),
+        ("controller_policy", "other 0"),
+        ("refused", ["mlockall: Cannot allocate memory"]),
+        ("controller_locked_kb", 0),
+        ("ticks", 0),
+        ("neutral_ms", 101.0),
+        ("neutral_ms", None),
+        ("opening_pct", 0.0),
         ("error", "OSError: no vcan"),
     ],
-)  # fmt: skip
+)
 def test_each_check_can_fail(name: str, value: object) -> None:
     faults = evaluate(GOOD | {name: value})
     assert len(faults) == 1 and str(value) in faults[0]

@@ -47,9 +47,12 @@ def test_a_host_that_takes_too_much_gets_simulated_time(
     ],
 )
 def test_the_command_enters_the_lab_with_that_clock_and_says_so(
-    choice: ClockChoice, lost: LostTime, simulated: bool, monkeypatch: pytest.MonkeyPatch,
+    choice: ClockChoice,
+    lost: LostTime,
+    simulated: bool,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     entered: list[tuple[list[str], dict[str, Any]]] = []
     monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
     monkeypatch.setattr(sys, "argv", ["timberhand", "demo", "--bus", "vcan"])

@@ -30,9 +30,18 @@ def run(folder: Path, name: str, text: str) -> str:
     path = folder / f"test_{name}.py"
     path.write_text(text)
     command = [
-        sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml"),
-        f"--rootdir={ROOT}", "-p", "tests.live.conftest", str(path),
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "no:cacheprovider",
+        "-c",
+        str(ROOT / "pyproject.toml"),
+        f"--rootdir={ROOT}",
+        "-p",
+        "tests.live.conftest",
+        str(path),
+    ]
     environment = {name: value for name, value in os.environ.items() if name != live.TAG}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, check=False)
     return f"{done.returncode}\n{done.stdout}{done.stderr}"

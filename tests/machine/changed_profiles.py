@@ -64,5 +64,10 @@ def the_problem(folder: Path, changes: dict[str, object], of: dict[str, object] 
 
 SAG = {"head_rad_m": 0.005, "pin_rad_m": 0.003, "rest_rad": 0.02}
 IMU = {
-    "node": 0x23, "message": "GrappleImu", "gain": 0.3, "pendulum_m": 0.8, "pin_speed_m_s": 0.12, "dead_zone_rad": 0.014
-}  # fmt: skip
+    "node": 0x23,
+    "message": "GrappleImu",
+    "gain": 0.3,
+    "pendulum_m": 0.8,
+    "pin_speed_m_s": 0.12,
+    "dead_zone_rad": 0.014,
+}

@@ -38,8 +38,11 @@ def test_the_frames_chain_to_the_points_of_the_kinematics(name: str, q: tuple[fl
     profile = load_profile(name)
     points, frames = chain_points(profile.kinematics, q), placed(link_frames(profile, q))
     for frame, point in (
-        ("boom", points.boom_pin), ("stick", points.stick_pin), ("pin", points.hanger_pin), ("grapple", points.grapple)
-    ):  # fmt: skip
+        ("boom", points.boom_pin),
+        ("stick", points.stick_pin),
+        ("pin", points.hanger_pin),
+        ("grapple", points.grapple),
+    ):
         assert frames[frame][0] == pytest.approx(np.array(point), abs=1e-9), frame
     boom = np.array(points.stick_pin) - points.boom_pin
     assert frames["boom"][1][:, 0] == pytest.approx(boom / np.linalg.norm(boom), abs=1e-9), "x is along the boom"

@@ -72,13 +72,25 @@ def test_a_joint_without_encoder_and_a_second_bus_are_allowed(tmp_path):
 
 # One row per mistake: what is changed, and code, key path and named words of the only problem.
 STRUCTURE = [
-    ({"joints.lift.lower_deg": -22.0, "joints.lift.lower": DELETE},
-     "profile.wrong-unit", "joints.lift.lower_deg", ('"lower"',)),
+    (
+        {"joints.lift.lower_deg": -22.0, "joints.lift.lower": DELETE},
+        "profile.wrong-unit",
+        "joints.lift.lower_deg",
+        ('"lower"',),
+    ),
     ({"kinematics.d1_mm": 1364.34, "kinematics.d1_m": DELETE}, "profile.wrong-unit", "kinematics.d1_mm", ('"d1_m"',)),
-    ({"joints.slew.speed_limit_deg_s": 20.0},
-     "profile.wrong-unit", "joints.slew.speed_limit_deg_s", ('"speed_limit"',)),
-    ({"joints.slew.valve.dedband_plus_pct": 3.0},
-     "profile.unknown-key", "joints.slew.valve.dedband_plus_pct", ('"deadband_plus_pct"',)),
+    (
+        {"joints.slew.speed_limit_deg_s": 20.0},
+        "profile.wrong-unit",
+        "joints.slew.speed_limit_deg_s",
+        ('"speed_limit"',),
+    ),
+    (
+        {"joints.slew.valve.dedband_plus_pct": 3.0},
+        "profile.unknown-key",
+        "joints.slew.valve.dedband_plus_pct",
+        ('"deadband_plus_pct"',),
+    ),
     ({"timeouts.zzz": 1}, "profile.unknown-key", "timeouts.zzz", ()),
     ({"rate": 200}, "profile.wrong-unit", "rate", ('"rate_hz"',)),
     ({"joints.boom": RAW["joints"]["lift"]}, "profile.unknown-joint", "joints.boom", ()),
@@ -93,8 +105,12 @@ STRUCTURE = [
     ({"bunk.center_m": [1.0]}, "profile.wrong-type", "bunk.center_m", ("2", "1")),
     ({"bunk.center_m": [1.0, "x"]}, "profile.wrong-type", "bunk.center_m[1]", ()),
     ({"cameras": 3}, "profile.not-a-table", "cameras", ("3",)),
-    ({"cameras.stick.fx": 530.0, "cameras.stick.fx_px": DELETE},
-     "profile.wrong-unit", "cameras.stick.fx", ('"fx_px"',)),
+    (
+        {"cameras.stick.fx": 530.0, "cameras.stick.fx_px": DELETE},
+        "profile.wrong-unit",
+        "cameras.stick.fx",
+        ('"fx_px"',),
+    ),
     ({"cameras.d435.rate_hz": DELETE}, "profile.missing-key", "cameras.d435.rate_hz", ()),
     ({"cameras.d435.rpy_rad": [0.0, 1.57]}, "profile.wrong-type", "cameras.d435.rpy_rad", ("3", "2")),
     ({"carrier": 3}, "profile.not-a-table", "carrier", ("3",)),
@@ -103,7 +119,7 @@ STRUCTURE = [
     ({"joints.slew.valve.sign": True}, "profile.not-allowed", "joints.slew.valve.sign", ("-1", "1")),
     ({"joints.slew.encoder.kind": "round"}, "profile.not-allowed", "joints.slew.encoder.kind", ()),
     ({"joints.slew.encoder.direction": [1]}, "profile.not-allowed", "joints.slew.encoder.direction", ("1", "-1")),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("changes", "code", "path", "named"), STRUCTURE, ids=lambda v: "")

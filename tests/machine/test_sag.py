@@ -32,8 +32,12 @@ KIN = PALMS.kinematics
 SOFT = Sag(0.004, 0.003, 0.012, 1.4e-6, 5200.0, 2900.0)
 LEANING = msgspec.structs.replace(PALMS, sag=SOFT)
 GIVES = st.builds(
-    Sag, st.floats(0.0, 0.008), st.floats(0.0, 0.006), st.floats(-0.02, 0.05), st.floats(0.0, 3e-6),
-)  # fmt: skip
+    Sag,
+    st.floats(0.0, 0.008),
+    st.floats(0.0, 0.006),
+    st.floats(-0.02, 0.05),
+    st.floats(0.0, 3e-6),
+)
 LOADS = st.floats(0.0, 400.0)
 INSIDE = st.tuples(*(st.floats(low + 0.05, high - 0.05) for low, high in LIMITS))
 

@@ -74,8 +74,12 @@ class Kept:
 
     def add(self, outcome: Outcome) -> None:
         """Append one result."""
-        entry = {"module": outcome.mutant.module, "number": outcome.mutant.number, "status": outcome.status,
-                 "by": outcome.by}  # fmt: skip
+        entry = {
+            "module": outcome.mutant.module,
+            "number": outcome.mutant.number,
+            "status": outcome.status,
+            "by": outcome.by,
+        }
         with self.path.open("a") as file:
             file.write(json.dumps(entry) + "\n")
 
@@ -142,8 +146,13 @@ def figures(modules: dict[str, Module], results: dict[tuple[str, int], tuple[str
     for module in modules.values():
         for mutant in module.mutants:
             status, by = results.get((mutant.module, mutant.number), ("", ""))
-            entry = {"module": mutant.module, "line": mutant.lines[0], "function": mutant.function,
-                     "operator": mutant.operator, "change": mutant.change}  # fmt: skip
+            entry = {
+                "module": mutant.module,
+                "line": mutant.lines[0],
+                "function": mutant.function,
+                "operator": mutant.operator,
+                "change": mutant.change,
+            }
             if not status:
                 unknown += 1
             elif status == SURVIVED and mutant.key in excused:
@@ -160,11 +169,17 @@ def figures(modules: dict[str, Module], results: dict[tuple[str, int], tuple[str
     return {
         "score": round(killed / judged, 4) if judged else 0.0,
         "raw": round(killed / (judged + counts["equivalent"]), 4) if judged else 0.0,
-        "mutants": sum(len(m.mutants) for m in modules.values()), "killed": counts[KILLED],
-        "timeouts": counts[TIMEOUT], "survived": counts[SURVIVED], "equivalent": counts["equivalent"],
-        "unusable": counts[UNUSABLE], "not_run": unknown, "survivors": survivors, "equivalents": explained,
+        "mutants": sum(len(m.mutants) for m in modules.values()),
+        "killed": counts[KILLED],
+        "timeouts": counts[TIMEOUT],
+        "survived": counts[SURVIVED],
+        "equivalent": counts["equivalent"],
+        "unusable": counts[UNUSABLE],
+        "not_run": unknown,
+        "survivors": survivors,
+        "equivalents": explained,
         "unusable_mutants": unusable,
-    }  # fmt: skip
+    }
 
 
 def commit() -> str:
@@ -214,9 +229,13 @@ def main(arguments: list[str] | None = None) -> int:
     if options.list:
         return 0
     for name, numbers in found.items():
-        print(f"{name}: score {numbers['score']:.4f} (raw {numbers['raw']:.4f}); " + ", ".join(
-            f"{numbers[key]} {key}" for key in ("mutants", "killed", "timeouts", "survived", "equivalent", "unusable",
-                                                "not_run")))  # fmt: skip
+        print(
+            f"{name}: score {numbers['score']:.4f} (raw {numbers['raw']:.4f}); "
+            + ", ".join(
+                f"{numbers[key]} {key}"
+                for key in ("mutants", "killed", "timeouts", "survived", "equivalent", "unusable", "not_run")
+            )
+        )
     if not options.module:
         write_result(found)
         print(f"written: {RESULT.relative_to(ROOT)}")

@@ -215,8 +215,9 @@ def code_within(code: CodeType, like: CodeType) -> CodeType:
 class FunctionMutants:
     """A pytest plugin that, in place of running the collected tests once, runs them on every mutant."""
 
-    def __init__(self, modules: Sequence[Module], wanted: Callable[[Mutant], bool], jobs: int,
-                 tell: Callable[[Outcome], None]) -> None:  # fmt: skip
+    def __init__(
+        self, modules: Sequence[Module], wanted: Callable[[Mutant], bool], jobs: int, tell: Callable[[Outcome], None]
+    ) -> None:
         self._modules, self._wanted, self._jobs, self._tell = modules, wanted, jobs, tell
         self.covered = Covered()
         self.tests: list[str] = []
@@ -374,9 +375,13 @@ class _FirstFailure:
 
 
 def run_imported(
-    scope: Scope, modules: dict[str, Module], mutants: Sequence[Mutant], baseline: Baseline, jobs: int,
+    scope: Scope,
+    modules: dict[str, Module],
+    mutants: Sequence[Mutant],
+    baseline: Baseline,
+    jobs: int,
     tell: Callable[[Outcome], None],
-) -> None:  # fmt: skip
+) -> None:
     """Run mutants that change what an import makes; call it before pytest has collected anything in this process."""
     long = [f"--deselect={name}" for name in baseline.long]
     forks = Forks(jobs)
@@ -407,9 +412,12 @@ def run_imported(
 
 
 def collect_and_run(
-    scope: Scope, modules: Sequence[Module], wanted: Callable[[Mutant], bool], jobs: int,
+    scope: Scope,
+    modules: Sequence[Module],
+    wanted: Callable[[Mutant], bool],
+    jobs: int,
     tell: Callable[[Outcome], None],
-) -> tuple[list[Mutant], Baseline]:  # fmt: skip
+) -> tuple[list[Mutant], Baseline]:
     """Run the mutants in functions; returns those that need an import, and what the unchanged tests need.
 
     Raises:

@@ -78,8 +78,13 @@ def messages_of(path: Path) -> dict[str, list[Any]]:
 def test_frames_joints_scene_and_mode_are_drawn_from_the_reports(tmp_path: Path) -> None:
     found = messages_of(recorded(tmp_path / "run", "palms_471"))
     assert {topic: len(messages) for topic, messages in found.items()} == {
-        "/tf": 34, "/joints": 34, "/reference": 34, "/machine": 1, "/mode": 2, "/camera/stick": 1,
-    }  # fmt: skip
+        "/tf": 34,
+        "/joints": 34,
+        "/reference": 34,
+        "/machine": 1,
+        "/mode": 2,
+        "/camera/stick": 1,
+    }
     frames = {t.child_frame_id: t for t in found["/tf"][0].transforms}
     grapple = frames["grapple"].translation
     expected = chain_points(load_profile("palms_471").kinematics, REPORT.position).grapple
@@ -119,8 +124,9 @@ def test_the_log_map_is_drawn_in_the_frame_in_which_the_machine_stands(tmp_path:
     plane, base = LocalPlane(VEHICLE.latitude_deg, VEHICLE.longitude_deg), bases[0]
     east, north, _ = plane.local(*MISSION_REPORT.logs[0].place)
     assert (log.pose.position.x, log.pose.position.y) == pytest.approx((east, north), abs=0.02)
-    antenna = carrier.base_from_rear(profile.carrier, carrier.rear_from_front(
-        VEHICLE.articulation_rad, profile.carrier.antenna_main_m))  # fmt: skip
+    antenna = carrier.base_from_rear(
+        profile.carrier, carrier.rear_from_front(VEHICLE.articulation_rad, profile.carrier.antenna_main_m)
+    )
     x, y, _ = turned(base.rotation, antenna)
     there = (base.translation.x + x, base.translation.y + y)
     assert there == pytest.approx((0.0, 0.0), abs=1e-6), "the antenna is where it was reported, the origin of the map"
@@ -148,8 +154,11 @@ def test_reports_have_fields_that_a_viewer_can_plot(tmp_path: Path) -> None:
     with recorded(tmp_path / "run", "aoro_fc8").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    schemas = {c.topic: json.loads(summary.schemas[c.schema_id].data) for c in summary.channels.values()
-               if c.topic in ("/controller/report", "/controller/vehicle")}  # fmt: skip
+    schemas = {
+        c.topic: json.loads(summary.schemas[c.schema_id].data)
+        for c in summary.channels.values()
+        if c.topic in ("/controller/report", "/controller/vehicle")
+    }
     report = schemas["/controller/report"]["properties"]
     assert report["position"] == {"type": "array", "items": {"type": "number"}}
     assert report["mode"] == {"type": "integer"} and "speed_m_s" in schemas["/controller/vehicle"]["properties"]

@@ -14,9 +14,16 @@ from recorder.stop import Stop
 from tests.codes import numbers_in
 
 STOP = Stop(
-    number=4, at_ns=5, utc_ns=6, mode_before="ACTIVE", mode="STOP", reason=pack(Reason.ENCODER_LOST, 1),
-    code="ENCODER_LOST", numbers=(20.0, 15.0, 0.0), text="The encoder of joint lift ... [ENCODER_LOST]",
-)  # fmt: skip
+    number=4,
+    at_ns=5,
+    utc_ns=6,
+    mode_before="ACTIVE",
+    mode="STOP",
+    reason=pack(Reason.ENCODER_LOST, 1),
+    code="ENCODER_LOST",
+    numbers=(20.0, 15.0, 0.0),
+    text="The encoder of joint lift ... [ENCODER_LOST]",
+)
 
 
 def fields_in(data: bytes) -> dict[str, str]:

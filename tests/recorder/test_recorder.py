@@ -183,7 +183,7 @@ def test_damaged_datagrams_are_counted(tmp_path):
     nan = float("nan")
     of_a_vehicle = VehicleReport(
         1, 2, 3, 4, 1, 0, 0, 0, nan, nan, nan, 0, 0, nan, 0, nan, nan, 0, nan, nan, nan, nan, (nan,) * 4, 0
-    )  # fmt: skip
+    )
     recorder.on_report(encode(of_a_vehicle))  # this machine stands still
     recorder.close()
     assert recorder.refused == 3

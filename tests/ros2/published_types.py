@@ -82,10 +82,19 @@ def _renamed(part: Any) -> Any:
 
 
 PRIMITIVES = {
-    "bool": bool, "byte": idl.uint8, "char": idl.uint8, "uint8": idl.uint8, "int8": idl.int8, "uint16": idl.uint16,
-    "int32": idl.int32, "uint32": idl.uint32, "int64": idl.int64, "uint64": idl.uint64, "float64": idl.float64,
+    "bool": bool,
+    "byte": idl.uint8,
+    "char": idl.uint8,
+    "uint8": idl.uint8,
+    "int8": idl.int8,
+    "uint16": idl.uint16,
+    "int32": idl.int32,
+    "uint32": idl.uint32,
+    "int64": idl.int64,
+    "uint64": idl.uint64,
+    "float64": idl.float64,
     "string": str,
-}  # fmt: skip
+}
 
 
 class IdlTypes:

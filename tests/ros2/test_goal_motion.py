@@ -82,7 +82,7 @@ def test_a_point_at_time_zero_is_where_the_crane_is() -> None:
         ("ros2.goal-limits", ErrorCode.INVALID_GOAL, goal((60.0, (-0.2,)), joints=("lift",))),  # into the ground
         ("ros2.goal-acceleration", ErrorCode.INVALID_GOAL, goal((1.2, (0.15,)), joints=("slew",))),
     ],
-)  # fmt: skip
+)
 def test_a_goal_that_is_not_executed_says_why(code: str, error_code: int, asked: Goal) -> None:
     refused(code, error_code, asked)
 
@@ -117,11 +117,27 @@ def test_tolerances_by_joint() -> None:
 
 def report(mode: Mode = Mode.ARMED, **changes: Any) -> StateReport:
     values: dict[str, Any] = {
-        "sequence": 1, "profile_hash": profile_hash(PROFILE), "stamp_ns": 0, "mode": mode, "grapple_state": 0,
-        "reason": 0, "setpoint_sequence": 0, "refusal": 0, "refused": 0, "stale_mask": 0, "position": START,
-        "velocity": (0.0,) * 5, "reference": START, "opening_pct": 100.0, "clamp_bar": 0.0, "load_kg": 0.0,
-        "tick_ns": 0, "late_ns": 0, "missed_ticks": 0, "frames_received": 0,
-    }  # fmt: skip
+        "sequence": 1,
+        "profile_hash": profile_hash(PROFILE),
+        "stamp_ns": 0,
+        "mode": mode,
+        "grapple_state": 0,
+        "reason": 0,
+        "setpoint_sequence": 0,
+        "refusal": 0,
+        "refused": 0,
+        "stale_mask": 0,
+        "position": START,
+        "velocity": (0.0,) * 5,
+        "reference": START,
+        "opening_pct": 100.0,
+        "clamp_bar": 0.0,
+        "load_kg": 0.0,
+        "tick_ns": 0,
+        "late_ns": 0,
+        "missed_ticks": 0,
+        "frames_received": 0,
+    }
     return StateReport(**values | changes)
 
 

@@ -64,9 +64,11 @@ def test_the_frames_are_where_the_kinematics_have_them(name: str) -> None:
     transforms = [*moving.transforms, *static.transforms]
     points = chain_points(profile.kinematics, Q)
     expected = {
-        "boom_link": points.boom_pin, "stick_link": points.stick_pin, "hanger_link": points.hanger_pin,
+        "boom_link": points.boom_pin,
+        "stick_link": points.stick_pin,
+        "hanger_link": points.hanger_pin,
         "grapple_link": points.grapple,
-    }  # fmt: skip
+    }
     for frame, point in expected.items():
         assert in_base(transforms, frame)[:3, 3] == pytest.approx(point, abs=1e-9)
     yaw = grapple_yaw(profile, Q)

@@ -42,9 +42,12 @@ def make_build(root: Path, folder: Path, key: str = "0123456789abcdef", **change
     (build / "served.py").write_text("ORIGIN = 'compiled'\n")
     source = "runtime/served_module.py"
     manifest = {
-        "platform": compiled.platform_tag(), "mypy": "1", "modules": ["runtime.served_module"],
-        "sources": {source: compiled.hash_of(root / source)}, "files": {"runtime.served_module": "served.py"},
-    }  # fmt: skip
+        "platform": compiled.platform_tag(),
+        "mypy": "1",
+        "modules": ["runtime.served_module"],
+        "sources": {source: compiled.hash_of(root / source)},
+        "files": {"runtime.served_module": "served.py"},
+    }
     (build / compiled.MANIFEST).write_text(json.dumps(manifest | changes))
     return build
 

@@ -18,9 +18,18 @@ PALMS = load_truth("nominal", 0, "palms_471")
 AORO = load_truth("nominal", 0, "aoro_fc8")
 replace = msgspec.structs.replace
 AORO_HEAVY = {
-    "slew": 8000.0, "lift": 2.5e4, "tilt": 6000.0, "ext": 400.0, "rot": 15.0, "grapple": 17.0, "steer": 8000.0,
-    "arm_fl": 2500.0, "arm_fr": 2500.0, "arm_rl": 2500.0, "arm_rr": 2500.0,
-}  # fmt: skip
+    "slew": 8000.0,
+    "lift": 2.5e4,
+    "tilt": 6000.0,
+    "ext": 400.0,
+    "rot": 15.0,
+    "grapple": 17.0,
+    "steer": 8000.0,
+    "arm_fl": 2500.0,
+    "arm_fr": 2500.0,
+    "arm_rl": 2500.0,
+    "arm_rr": 2500.0,
+}
 FRICTIONLESS = {"coulomb": 0.0, "stiction": 0.0, "viscous": 0.0}
 
 

@@ -45,9 +45,13 @@ QUIET = msgspec.structs.replace(
 
 @settings(max_examples=200, deadline=None)
 @given(
-    st.floats(-89.9, 89.9), st.floats(-180.0, 180.0), st.floats(-50.0, 3000.0),
-    st.floats(-1000.0, 1000.0), st.floats(-1000.0, 1000.0), st.floats(-20.0, 20.0),
-)  # fmt: skip
+    st.floats(-89.9, 89.9),
+    st.floats(-180.0, 180.0),
+    st.floats(-50.0, 3000.0),
+    st.floats(-1000.0, 1000.0),
+    st.floats(-1000.0, 1000.0),
+    st.floats(-20.0, 20.0),
+)
 def test_local_metres_agree_with_pymap3d(lat, lon, height, east, north, up):
     mine = LocalFrame(lat, lon, height).geodetic(east, north, up)
     back = pymap3d.geodetic2enu(*mine, lat, lon, height)

@@ -44,10 +44,14 @@ def test_it_reports_lean_and_rate_with_delay_and_error():
         for frame in heard(node, outbox):
             late_s = now_s - LATENCY_NS * 1e-9
             said.append([frame[name] for name in SIGNALS])
-            true.append([
-                0.2 * math.sin(3.5 * late_s), -0.1 * math.cos(3.5 * late_s),
-                0.7 * math.cos(3.5 * late_s), 0.35 * math.sin(3.5 * late_s),
-            ])  # fmt: skip
+            true.append(
+                [
+                    0.2 * math.sin(3.5 * late_s),
+                    -0.1 * math.cos(3.5 * late_s),
+                    0.7 * math.cos(3.5 * late_s),
+                    0.35 * math.sin(3.5 * late_s),
+                ]
+            )
     assert len(said) == 999, "nothing was felt when the first was due"
     off = [[s - t for s, t in zip(a, b, strict=True)] for a, b in zip(said[5:], true[5:], strict=True)]
     means = [sum(column) / len(off) for column in zip(*off, strict=True)]

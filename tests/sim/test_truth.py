@@ -151,8 +151,11 @@ def test_the_truth_beside_a_profile_of_ones_own_is_chosen_by_itself(tmp_path):
 
 def test_trials_on_many_machines_draw_each_unless_the_caller_named_one():
     assert [another_for_every_seed(text) for text in ("nominal", "wide_valves", "nominal:a.toml", "a.toml")] == [
-        "sampled", "wide_valves", "sampled:a.toml", "a.toml",
-    ]  # fmt: skip
+        "sampled",
+        "wide_valves",
+        "sampled:a.toml",
+        "a.toml",
+    ]
 
 
 @machines

@@ -15,9 +15,16 @@ from host.exit_codes import CommandFailed, ExitCode
 from timberhand.cli import app
 
 VALUES = {
-    "--bus": ("wire",), "--clock": ("real",), "--console": (), "--no-console": (), "--console-port": ("8000",),
-    "--foxglove": ("8765",), "--max-stops": ("3",), "--plc-link": ("modbus",), "--plc-role": ("valves",),
-}  # fmt: skip
+    "--bus": ("wire",),
+    "--clock": ("real",),
+    "--console": (),
+    "--no-console": (),
+    "--console-port": ("8000",),
+    "--foxglove": ("8765",),
+    "--max-stops": ("3",),
+    "--plc-link": ("modbus",),
+    "--plc-role": ("valves",),
+}
 """A value for each option that some mode has no use for."""
 LIVE = tuple(option for option in VALUES if not option.startswith("--plc"))
 FILE = "docs/examples/paper_b.geojson"
@@ -56,9 +63,10 @@ def test_every_option_has_a_reader(words: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "option"), [(words, option) for words, options in USELESS.items() for option in options],
+    ("words", "option"),
+    [(words, option) for words, options in USELESS.items() for option in options],
     ids=lambda part: part if isinstance(part, str) else " ".join(part),
-)  # fmt: skip
+)
 def test_an_option_without_effect_is_refused(words: tuple[str, ...], option: str) -> None:
     done = CliRunner().invoke(app, [*words, option, *VALUES[option]])
     assert isinstance(done.exception, CommandFailed), done.output

@@ -24,10 +24,18 @@ Timings = Callable[..., Timing]
 
 def unit(**found: str) -> Unit:
     usual = {
-        "Id": "timberhand-guard.service", "Type": "notify", "LoadState": "loaded", "ActiveState": "active",
-        "SubState": "running", "Result": "success", "ExecMainStatus": "0", "NRestarts": "2", "StatusText": "Well.",
-        "StateChangeTimestampMonotonic": "40000000", "ExecMainExitTimestampMonotonic": "0",
-    }  # fmt: skip
+        "Id": "timberhand-guard.service",
+        "Type": "notify",
+        "LoadState": "loaded",
+        "ActiveState": "active",
+        "SubState": "running",
+        "Result": "success",
+        "ExecMainStatus": "0",
+        "NRestarts": "2",
+        "StatusText": "Well.",
+        "StateChangeTimestampMonotonic": "40000000",
+        "ExecMainExitTimestampMonotonic": "0",
+    }
     return read_unit(usual | found, 100.0)
 
 

@@ -199,8 +199,10 @@ def test_missing_numbers_are_explained(run: Path) -> None:
     (found,) = find_stops(run, newest=True)
     told = []
     for reason, numbers in (
-        (Reason.PERSON_IN_ZONE, (None, None, None)), (Reason.GUARD_LOST, (None, None, None)), (Reason.GUARD_LOST, ()),
-    ):  # fmt: skip
+        (Reason.PERSON_IN_ZONE, (None, None, None)),
+        (Reason.GUARD_LOST, (None, None, None)),
+        (Reason.GUARD_LOST, ()),
+    ):
         stop = msgspec.structs.replace(found.stop, reason=int(reason), code=reason.name, numbers=numbers)
         text = io.StringIO()
         show(Console(file=text, width=120), replace(found, stop=stop), [])

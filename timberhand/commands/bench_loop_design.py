@@ -68,9 +68,14 @@ def loop_design(
             mark = "[green]✔[/green]" if joint.holds else "[red]✘[/red]"
             law = joint.spec.law
             table.add_row(
-                f"{mark} {joint.name}", law.kind, f"{law.kp_1_s:g}", f"{joint.phase_deg:.0f}", f"{joint.gain_db:.1f}",
-                f"{joint.bandwidth_hz:.2f}", str(joint.worst),
-            )  # fmt: skip
+                f"{mark} {joint.name}",
+                law.kind,
+                f"{law.kp_1_s:g}",
+                f"{joint.phase_deg:.0f}",
+                f"{joint.gain_db:.1f}",
+                f"{joint.bandwidth_hz:.2f}",
+                str(joint.worst),
+            )
             holds = holds and joint.holds
         screen.print(table)
         machines.append((machine, studies, work))

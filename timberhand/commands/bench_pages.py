@@ -9,8 +9,10 @@ import typer
 from timberhand.commands.options import JsonOption
 
 COUNTS: Final = {
-    "calls": "system calls of a tick", "frames": "frames sent by a tick", "instructions": "instructions of a tick",
-}  # fmt: skip
+    "calls": "system calls of a tick",
+    "frames": "frames sent by a tick",
+    "instructions": "instructions of a tick",
+}
 
 
 def pages(
@@ -68,8 +70,12 @@ def _show(found: dict[str, Any], number: int) -> None:
     cpu = found["cpu"]
     few = cpu["high"] is None
     interval = "fewer than 6 rounds give no interval" if few else f"{cpu['low']:.2f} to {cpu['high']:.2f}"
-    print(f"{'processor time of a tick, us':28}{cpu['none']:12g}{cpu['open']:12g}   "
-          f"ratio {cpu['ratio']:.2f} ({interval}), at least {cpu['at_least']}: {cpu['verdict']}")  # fmt: skip
-    print(f"{'ticks missed':28}{found['missed']['none']:12}{found['missed']['open']:12}   "
-          f"of {found['ticks']['none']} and {found['ticks']['open']}")  # fmt: skip
+    print(
+        f"{'processor time of a tick, us':28}{cpu['none']:12g}{cpu['open']:12g}   "
+        f"ratio {cpu['ratio']:.2f} ({interval}), at least {cpu['at_least']}: {cpu['verdict']}"
+    )
+    print(
+        f"{'ticks missed':28}{found['missed']['none']:12}{found['missed']['open']:12}   "
+        f"of {found['ticks']['none']} and {found['ticks']['open']}"
+    )
     print(f"the pages got {found['states']} states meanwhile")

@@ -162,9 +162,15 @@ def _confirm(profile: Profile, plan: CalibrationPlan, yes: bool) -> None:
 
 
 def _lockstep(
-    name: str, profile: Profile, truth: str, seed: int, surveyed: bool, chosen: Collection[Joint], folder: Path,
+    name: str,
+    profile: Profile,
+    truth: str,
+    seed: int,
+    surveyed: bool,
+    chosen: Collection[Joint],
+    folder: Path,
     screen: Console,
-) -> Calibration:  # fmt: skip
+) -> Calibration:
     from hil.calibration.crane import run_lockstep
     from recorder.manifest import describe
     from recorder.recorder import Recorder, RecordingRefused
@@ -177,10 +183,16 @@ def _lockstep(
         recorder = Recorder(folder / "log", profile, describe(profile, buses, seed))
         with _Progress(screen) as progress:
             outcome = run_lockstep(
-                name, truth, seed, surveyed=surveyed, chosen=chosen, recorder=recorder,
-                show=lambda plan: _confirm(profile, plan, yes=True), watch=progress.show,
+                name,
+                truth,
+                seed,
+                surveyed=surveyed,
+                chosen=chosen,
+                recorder=recorder,
+                show=lambda plan: _confirm(profile, plan, yes=True),
+                watch=progress.show,
                 aborted=lambda: bool(interrupts),
-            )  # fmt: skip
+            )
     except (ValueError, RecordingRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     finally:

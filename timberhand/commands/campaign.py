@@ -73,9 +73,16 @@ def campaign(
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     check_foreign(name.value, planner, detector)
     options = Options(
-        seed=seed, truth=truth, profile=profile, out=out or Path("runs") / "campaign" / name.value, trials=trials,
-        quick=quick, workers=Workers(workers or len(os.sched_getaffinity(0)), ray), planner=planner, detector=detector,
-    )  # fmt: skip
+        seed=seed,
+        truth=truth,
+        profile=profile,
+        out=out or Path("runs") / "campaign" / name.value,
+        trials=trials,
+        quick=quick,
+        workers=Workers(workers or len(os.sched_getaffinity(0)), ray),
+        planner=planner,
+        detector=detector,
+    )
     try:
         result, found = campaigns.run(name.value, options, recordings, Console(stderr=True))
     except KeyboardInterrupt:

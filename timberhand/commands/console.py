@@ -88,8 +88,9 @@ def console(
     if replay is not None:
         from timberhand.replay_page import show_recording
 
-        show_recording(replay, None if profile == DEFAULT_PROFILE else profile, port, bind=bind,
-                       allow_hosts=allow_host or ())  # fmt: skip
+        show_recording(
+            replay, None if profile == DEFAULT_PROFILE else profile, port, bind=bind, allow_hosts=allow_host or ()
+        )
         return
     try:
         serve(

@@ -59,9 +59,14 @@ def inject(
         return
     try:
         order = make(
-            name, word, joint or part, _seconds(at), _seconds(length) if length else FOREVER_S,
-            math.nan if size is None else size, seed,
-        )  # fmt: skip
+            name,
+            word,
+            joint or part,
+            _seconds(at),
+            _seconds(length) if length else FOREVER_S,
+            math.nan if size is None else size,
+            seed,
+        )
         if lockstep:
             _in_lockstep(profile, seed, truth_of(profile, truth), order)
             return

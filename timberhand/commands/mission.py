@@ -154,9 +154,19 @@ def run(
         from hil.missions.lockstep import run_mission
 
         summary = run_mission(
-            mission, profile, seed, truth, TABLES[manager], logs, directory, limit_s, screen, DETECTORS[detector],
-            terrain.value, chosen,
-        )  # fmt: skip
+            mission,
+            profile,
+            seed,
+            truth,
+            TABLES[manager],
+            logs,
+            directory,
+            limit_s,
+            screen,
+            DETECTORS[detector],
+            terrain.value,
+            chosen,
+        )
     else:
         from hil.harness.live import LiveOptions
         from hil.missions.live import run_live_mission

@@ -108,9 +108,10 @@ def password(
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise CommandFailed(
-            "operator.accounts-file", f"{file} cannot be changed ({reason}); choose another --file",
+            "operator.accounts-file",
+            f"{file} cannot be changed ({reason}); choose another --file",
             ExitCode.CONFIGURATION,
-        ) from None  # fmt: skip
+        ) from None
     print(f"{file}: {name} is {role.value}.")
 
 

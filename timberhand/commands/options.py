@@ -55,18 +55,20 @@ MaxStopsOption = Annotated[
 GraspPlannerOption = Annotated[
     str,
     typer.Option(
-        "--planner", metavar="NAME",
+        "--planner",
+        metavar="NAME",
         help="Planner of grasps from the ground: search (ours), cnn (paper A's network), cnn-physical (the same, "
         "trained on grasps of the plant), or one of another package.",
     ),
-]  # fmt: skip
+]
 VirtualCamerasOption = Annotated[
     int,
     typer.Option(
-        "--virtual-cameras", metavar="N",
+        "--virtual-cameras",
+        metavar="N",
         help="With a network: places of the virtual camera over which its predictions are averaged.",
     ),
-]  # fmt: skip
+]
 ForeignPlannerOption = Annotated[
     str, typer.Option("--planner", help="grasp-configs: a foreign grasp planner, by entry point, compared with ours.")
 ]

@@ -194,12 +194,18 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
 
     mission = draft.mission
     facts: dict[str, Any] = {
-        "file": str(file), "format": draft.format, "name": mission.name, "waypoints": len(mission.waypoints),
-        "laps": mission.options.laps, "fences": len(mission.fences), "landings": len(mission.landings),
-        "logs": len(mission.logs), "notes": draft.notes,
+        "file": str(file),
+        "format": draft.format,
+        "name": mission.name,
+        "waypoints": len(mission.waypoints),
+        "laps": mission.options.laps,
+        "fences": len(mission.fences),
+        "landings": len(mission.landings),
+        "logs": len(mission.logs),
+        "notes": draft.notes,
         "warnings": [str(problem) for problem in draft.warnings],
         "warning_codes": [problem.code for problem in draft.warnings],
-    }  # fmt: skip
+    }
     if review is not None:
         corners = [
             {
@@ -210,11 +216,15 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
             for corner in review.corners
         ]
         facts |= {
-            "length_m": round(review.length_m, 2), "drive_s": round(review.drive_s, 1), "logs_to_fetch": review.logs,
-            "crane_s": round(review.crane_s, 1), "total_s": round(review.total_s, 1), "corners": corners,
+            "length_m": round(review.length_m, 2),
+            "drive_s": round(review.drive_s, 1),
+            "logs_to_fetch": review.logs,
+            "crane_s": round(review.crane_s, 1),
+            "total_s": round(review.total_s, 1),
+            "corners": corners,
             "warnings": facts["warnings"] + [warning.sentence for warning in review.warnings],
             "warning_codes": facts["warning_codes"] + [warning.code for warning in review.warnings],
-        }  # fmt: skip
+        }
     return facts
 
 

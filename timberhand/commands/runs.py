@@ -69,9 +69,10 @@ def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool
 
         simulated = clock is ClockChoice.SIMULATED or (clock is ClockChoice.AUTO and _simulates())
         vcan(
-            [sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])], time_travel=simulated,
+            [sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])],
+            time_travel=simulated,
             mem=DETECTOR_MEM_MB if detects else DEFAULT_MEM_MB,
-        )  # fmt: skip
+        )
 
 
 def _simulates() -> bool:

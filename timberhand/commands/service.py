@@ -18,8 +18,10 @@ Root = Annotated[Path | None, typer.Option(help="Install into the directory tree
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the steps without executing them.")]
 
 
-@app.command(epilog="Examples:  sudo timberhand service install --wheel timberhand-0.1.0-py3-none-any.whl  ·  "
-             "timberhand service install --dry-run")  # fmt: skip
+@app.command(
+    epilog="Examples:  sudo timberhand service install --wheel timberhand-0.1.0-py3-none-any.whl  ·  "
+    "timberhand service install --dry-run"
+)
 def install(
     wheel: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Wheel to install (default: built from this checkout).")
@@ -53,10 +55,15 @@ def install(
     VERSION.whl/deploy
     """
     options = {
-        "--wheel": wheel, "--bundle": bundle, "--public-key": public_key, "--find-links": find_links,
-        "--from-environment": from_environment, "--python": python,
-        "--cpu": cpu, "--root": root,
-    }  # fmt: skip
+        "--wheel": wheel,
+        "--bundle": bundle,
+        "--public-key": public_key,
+        "--find-links": find_links,
+        "--from-environment": from_environment,
+        "--python": python,
+        "--cpu": cpu,
+        "--root": root,
+    }
     _script([word for name, value in options.items() if value is not None for word in (name, str(value))], dry_run)
 
 
@@ -116,8 +123,10 @@ def resume() -> None:
         print("an update is running, which finishes by itself")  # it has started the services, and with them this
 
 
-@app.command(epilog="Examples:  timberhand service status  ·  timberhand service status --watch  ·  "
-             "timberhand service status --json | jq .timing.durations.wake")  # fmt: skip
+@app.command(
+    epilog="Examples:  timberhand service status  ·  timberhand service status --watch  ·  "
+    "timberhand service status --json | jq .timing.durations.wake"
+)
 def status(
     watch: Annotated[bool, typer.Option("--watch", help="Refresh once per second, until Ctrl-C.")] = False,
     as_json: Annotated[
@@ -181,9 +190,12 @@ def _updater() -> Updater:
         raise CommandFailed("update.no-systemd", "systemd does not run here", ExitCode.CONFIGURATION)
     units = PLACE / "current" / "deploy" / "units"
     return Updater(
-        Trees(PLACE), SIGNER, SystemdServices(units), ReleaseProgram(),
+        Trees(PLACE),
+        SIGNER,
+        SystemdServices(units),
+        ReleaseProgram(),
         lambda line: print(f"update: {line}", file=sys.stderr, flush=True),
-    )  # fmt: skip
+    )
 
 
 def _script(options: list[str], dry_run: bool) -> Any:

@@ -93,10 +93,17 @@ def picture(
     from machine.loading.profile_file import ProfileError, load_profile
 
     request = PictureRequest(
-        logs=logs, scene=scene.value, seed=seed, terrain=terrain.value, truth=truth_of(profile, truth),
-        camera=camera, depth=depth,
-        azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, distance_m=distance_m,
-    )  # fmt: skip
+        logs=logs,
+        scene=scene.value,
+        seed=seed,
+        terrain=terrain.value,
+        truth=truth_of(profile, truth),
+        camera=camera,
+        depth=depth,
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+        distance_m=distance_m,
+    )
     try:
         machine = load_profile(profile)
         take_picture(machine, request, out)

@@ -50,9 +50,13 @@ def check(name: str) -> list[Finding]:
             return [Finding(error.code, str(source), str(error))]
         return [Finding(p.code, str(source), str(p)) for p in error.problems]
     found = [
-        *_controller(source, profile), *_places(source, profile), *_envelope(source, profile),
-        *_truth(source, profile, name), *_urdf(source, profile), *_lacking(source, profile),
-    ]  # fmt: skip
+        *_controller(source, profile),
+        *_places(source, profile),
+        *_envelope(source, profile),
+        *_truth(source, profile, name),
+        *_urdf(source, profile),
+        *_lacking(source, profile),
+    ]
     return sorted(found, key=lambda finding: finding.note)
 
 

@@ -60,10 +60,12 @@ def _texts(answers: Answers) -> dict[str, str]:
             raise CommandFailed(error.code, text, ExitCode.CONFIGURATION) from None
     truth, urdf = truth_and_urdf(answers, profile)
     return {
-        f"{answers.name}.answers.toml": answers_text(answers), f"{answers.name}.toml": drafted,
-        f"{answers.name}.envelope.toml": envelope_text(profile), f"{answers.name}.truth.toml": truth,
+        f"{answers.name}.answers.toml": answers_text(answers),
+        f"{answers.name}.toml": drafted,
+        f"{answers.name}.envelope.toml": envelope_text(profile),
+        f"{answers.name}.truth.toml": truth,
         f"{answers.name}.urdf": urdf,
-    }  # fmt: skip
+    }
 
 
 def encoder_messages() -> dict[int, str]:

@@ -15,11 +15,16 @@ def faults() -> str:
     """docs/reference/faults.md."""
     rows = (
         (
-            int(reason), f"`{reason.name}`", fault.reaction.name.lower(), fault.bound_ms or "at once",
-            fault.sentence.format("*the part*"), fault.advice, _measured(reason),
+            int(reason),
+            f"`{reason.name}`",
+            fault.reaction.name.lower(),
+            fault.bound_ms or "at once",
+            fault.sentence.format("*the part*"),
+            fault.advice,
+            _measured(reason),
         )
         for reason, fault in sorted(FAULTS.items())
-    )  # fmt: skip
+    )
     head = generated(
         "Faults and refusals",
         "`machine.status.faults.FAULTS` and `machine.status.evidence.EVIDENCE`",

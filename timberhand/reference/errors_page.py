@@ -11,9 +11,22 @@ from pathlib import Path
 from timberhand.reference.markdown import generated, table
 
 PACKAGES = (
-    "autonomy", "can_dbc", "console", "controller", "deploy", "experiments", "hil", "host", "machine", "recorder",
-    "ros2", "runtime", "sim", "timberhand", "training",
-)  # fmt: skip
+    "autonomy",
+    "can_dbc",
+    "console",
+    "controller",
+    "deploy",
+    "experiments",
+    "hil",
+    "host",
+    "machine",
+    "recorder",
+    "ros2",
+    "runtime",
+    "sim",
+    "timberhand",
+    "training",
+)
 CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*(\.[a-z0-9]+(-[a-z0-9]+)*)+")
 
 

@@ -38,11 +38,15 @@ def _message(message: MessageCodec) -> str:
     comment = f"{message.comment}\n\n" if message.comment else ""
     rows = (
         (
-            signal.name, signal.bits, f"{signal.scale:g}", f"{signal.offset:g}", signal.unit,
+            signal.name,
+            signal.bits,
+            f"{signal.scale:g}",
+            f"{signal.offset:g}",
+            signal.unit,
             "" if signal.minimum is None else f"{signal.minimum:g} to {signal.maximum:g}",
             ", ".join(f"{raw} {label}" for raw, label in signal.choices.items()) or signal.comment,
         )
         for signal in message.signals
-    )  # fmt: skip
+    )
     columns = ("signal", "bits", "scale", "offset", "unit", "range", "values or meaning")
     return f"\n### {message.name}\n\n{', '.join(filter(None, facts))}\n\n{comment}{table(columns, rows)}\n"

@@ -16,12 +16,14 @@ END: Final = "<!-- end of results -->"
 SHOWN: Final = {
     "crane-accuracy": ("Error by encoders, 3-D, mean",),
     "grasp-configs": (
-        "Success of 60 attempts as in the paper", "Success", "Lifted with the first closing of the grapple",
+        "Success of 60 attempts as in the paper",
+        "Success",
+        "Lifted with the first closing of the grapple",
         "Optimal grasps among the successful ones",
     ),
     "detector": ("Boxes, mAP@0.5",),
     "forwarding-mission": ("Logs detected", "Logs loaded", "Grapple to log, mean"),
-}  # fmt: skip
+}
 """Metrics of the README by experiment, by their titles."""
 EYES: Final = {
     "ours": "our detector and depth camera",

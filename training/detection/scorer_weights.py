@@ -205,8 +205,10 @@ def labelled_foregrounds(count: int, folder: Path, weights: Path | None, console
             found.append((foreground_of(maps, scale, sample.depth_m), ids))
             progress.advance(task)
     held_out = [i % HELD_OUT_EVERY == 0 and count > 1 for i in range(count)]
-    return LabelledForegrounds([s for s, h in zip(found, held_out, strict=True) if not h],
-                               [s for s, h in zip(found, held_out, strict=True) if h])  # fmt: skip
+    return LabelledForegrounds(
+        [s for s, h in zip(found, held_out, strict=True) if not h],
+        [s for s, h in zip(found, held_out, strict=True) if h],
+    )
 
 
 def _ship(

@@ -72,9 +72,15 @@ def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
         along, across = _tolerances(x[own], y[own], axis)
         unit = OFFSET_PX / STRIDE
         table[i] = (
-            *log[[CENTRE_U, CENTRE_V]], np.cos(2 * log[ANGLE]), np.sin(2 * log[ANGLE]), share, share * log[ELONGATION],
-            *(axis * unit / along), -axis[1] * unit / across, axis[0] * unit / across,
-        )  # fmt: skip
+            *log[[CENTRE_U, CENTRE_V]],
+            np.cos(2 * log[ANGLE]),
+            np.sin(2 * log[ANGLE]),
+            share,
+            share * log[ELONGATION],
+            *(axis * unit / along),
+            -axis[1] * unit / across,
+            axis[0] * unit / across,
+        )
         _add_peak(maps[1], log[CENTRE_U], log[CENTRE_V])
         for seen, u, v in ((START_SEEN, START_U, START_V), (END_SEEN, END_U, END_V)):
             if log[seen]:

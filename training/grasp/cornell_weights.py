@@ -28,9 +28,13 @@ def produce(samples: Sequence[Sample], seed: int, epochs: int, out: Path, consol
 
 
 def ship(
-    arrays: Mapping[str, np.ndarray], losses: Sequence[float], samples: Sequence[Sample], seed: int, epochs: int,
+    arrays: Mapping[str, np.ndarray],
+    losses: Sequence[float],
+    samples: Sequence[Sample],
+    seed: int,
+    epochs: int,
     out: Path,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write trained weights with their card; returns the card's path."""
     opening, jaw = network_training.median_size_px(network_training.plain_examples(samples))
     facts = {
@@ -76,6 +80,13 @@ def on_samples(net: GraspNet, samples: Sequence[Sample], facts: Mapping[str, str
         g = net.best(view_depth(s.depth_m, view))
         usual = Rectangle(g.u_px, g.v_px, g.theta_rad, float(facts["opening_px"]), float(facts["jaw_px"]))
         own = any(is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, r.opening_px, r.jaw_px), [r]) for r in labels)
-        found.append({"number": s.number, "right": is_correct(usual, labels), "own_size": own,
-                      "trained_on": str(s.number) in known, "q": g.q})  # fmt: skip
+        found.append(
+            {
+                "number": s.number,
+                "right": is_correct(usual, labels),
+                "own_size": own,
+                "trained_on": str(s.number) in known,
+                "q": g.q,
+            }
+        )
     return found

@@ -31,9 +31,14 @@ _HALF_PLATE, _UNDER = HALF_PLATE_M, SCOOP_SHARE
 def facts_of(jaws: Jaws) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of a grapple for ``evaluate_candidate``: facts (7,) and outline (k, 2)."""
     facts = (
-        jaws.half_gap_m, jaws.blade_m, jaws.plate_m, jaws.capacity_m2, jaws.tip_force_n, jaws.scoop_span_m,
+        jaws.half_gap_m,
+        jaws.blade_m,
+        jaws.plate_m,
+        jaws.capacity_m2,
+        jaws.tip_force_n,
+        jaws.scoop_span_m,
         jaws.room_m,
-    )  # fmt: skip
+    )
     return np.array(facts), np.array([jaws.height_m, jaws.half_width_m]).T.copy()
 
 
@@ -53,9 +58,17 @@ def _half_width(outline: np.ndarray, height: float) -> float:
 
 @njit(cache=True)
 def evaluate_candidate(
-    facts: np.ndarray, outline: np.ndarray, world: np.ndarray, upon: np.ndarray,
-    x: float, y: float, yaw: float, level: float, at: np.ndarray, captured: np.ndarray,
-) -> tuple[float, float]:  # fmt: skip
+    facts: np.ndarray,
+    outline: np.ndarray,
+    world: np.ndarray,
+    upon: np.ndarray,
+    x: float,
+    y: float,
+    yaw: float,
+    level: float,
+    at: np.ndarray,
+    captured: np.ndarray,
+) -> tuple[float, float]:
     """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 2) and ``captured`` (n,) are
     scratch."""
     n = len(world)
@@ -128,9 +141,15 @@ def evaluate_candidate(
 
 @njit(cache=True)
 def draw(
-    inverse: np.ndarray, owner: np.ndarray, world: np.ndarray, eye: np.ndarray,
-    fx: float, fy: float, cx: float, cy: float,
-) -> None:  # fmt: skip
+    inverse: np.ndarray,
+    owner: np.ndarray,
+    world: np.ndarray,
+    eye: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> None:
     """Write inverse depths of cylinders, seen straight down from ``eye``, to ``inverse`` and their numbers to
     ``owner``."""
     height, width = inverse.shape
@@ -185,10 +204,23 @@ def draw(
 
 @njit(cache=True)
 def label(
-    facts: np.ndarray, outline: np.ndarray, worlds: np.ndarray, upon: np.ndarray, moves: np.ndarray,
-    levels: np.ndarray, eye: np.ndarray, inverse: np.ndarray, fx: float, fy: float, cx: float, cy: float,
-    step: int, turned: np.ndarray, near: float, out: np.ndarray,
-) -> None:  # fmt: skip
+    facts: np.ndarray,
+    outline: np.ndarray,
+    worlds: np.ndarray,
+    upon: np.ndarray,
+    moves: np.ndarray,
+    levels: np.ndarray,
+    eye: np.ndarray,
+    inverse: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    step: int,
+    turned: np.ndarray,
+    near: float,
+    out: np.ndarray,
+) -> None:
     """Write quality and direction (3, h, w) on a grid every ``step`` pixels to ``out``: the best closing direction
     there.
 
@@ -229,9 +261,17 @@ def label(
                 for d in range(draws):
                     m = moves[d]
                     lever, _ = evaluate_candidate(
-                        facts, outline, worlds[1 + d], upon, x + m[0], y + m[1], best_yaw + m[2], best_level + m[3],
-                        at, captured,
-                    )  # fmt: skip
+                        facts,
+                        outline,
+                        worlds[1 + d],
+                        upon,
+                        x + m[0],
+                        y + m[1],
+                        best_yaw + m[2],
+                        best_level + m[3],
+                        at,
+                        captured,
+                    )
                     held += lever > 0.0
                 best *= held / draws
             out[0, row, col] = best

@@ -90,8 +90,15 @@ def upsampling() -> np.ndarray:
     return torch.nn.functional.interpolate(eye, scale_factor=POOL, mode="linear")[0].T.numpy()
 
 
-def train_network(examples: Sequence[Example], seed: int, title: str, console: Console, checkpoint: Path | None = None,
-        epochs: int = EPOCHS, batch: int = BATCH) -> tuple[TorchNet, list[float]]:  # fmt: skip
+def train_network(
+    examples: Sequence[Example],
+    seed: int,
+    title: str,
+    console: Console,
+    checkpoint: Path | None = None,
+    epochs: int = EPOCHS,
+    batch: int = BATCH,
+) -> tuple[TorchNet, list[float]]:
     """Train a net on the examples; returns it and the loss of every step."""
     low, projected = (torch.from_numpy(np.stack([getattr(e, name) for e in examples])) for name in ("low", "projected"))
     square = torch.tensor([e.square for e in examples])
@@ -151,6 +158,10 @@ def evaluate(maps: GraspMaps, grasps: Sequence[Rectangle], size_px: tuple[float,
     g = best_pixel(maps)
     own = any(is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, r.opening_px, r.jaw_px), [r]) for r in grasps)
     return {
-        "right": is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, *size_px), grasps), "own_size": own,
-        "u_px": g.u_px, "v_px": g.v_px, "theta_rad": g.theta_rad, "q": g.q,
-    }  # fmt: skip
+        "right": is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, *size_px), grasps),
+        "own_size": own,
+        "u_px": g.u_px,
+        "v_px": g.v_px,
+        "theta_rad": g.theta_rad,
+        "q": g.q,
+    }

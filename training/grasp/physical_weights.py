@@ -87,9 +87,14 @@ def frames(
 
 
 def frame(
-    world: Cylinders, ground_z_m: float, jaws: Jaws, facts: tuple[np.ndarray, np.ndarray], sigma: np.ndarray,
-    rng: np.random.Generator, seed: int,
-) -> GraspFrame:  # fmt: skip
+    world: Cylinders,
+    ground_z_m: float,
+    jaws: Jaws,
+    facts: tuple[np.ndarray, np.ndarray],
+    sigma: np.ndarray,
+    rng: np.random.Generator,
+    seed: int,
+) -> GraspFrame:
     """One frame of a world."""
     recreated = shortened_logs(world, jaws.blade_m)
     shift_m = rng.uniform(-CAMERA_SHIFT_M, CAMERA_SHIFT_M, 3)

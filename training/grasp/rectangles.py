@@ -33,8 +33,9 @@ class Rectangle:
         along = 0.5 * self.opening_px * np.array([math.cos(self.theta_rad), math.sin(self.theta_rad)])
         across = 0.5 * self.jaw_px * np.array([-math.sin(self.theta_rad), math.cos(self.theta_rad)])
         middle = np.array([self.u_px, self.v_px])
-        return np.array([middle - along - across, middle + along - across, middle + along + across,
-                         middle - along + across])  # fmt: skip
+        return np.array(
+            [middle - along - across, middle + along - across, middle + along + across, middle - along + across]
+        )
 
 
 def from_corners(corners: np.ndarray) -> Rectangle:

@@ -229,9 +229,15 @@ def _stereo_depth(machine: str, camera: str, picture: Picture, pin: Intrinsics, 
     holes, plain_holes = math.exp(rng.uniform(-1.0, 2.0)), rng.uniform(0.01, 0.25)
     reach = float(rng.choice((6, 10, 14)))
     noise = varied_stereo_noise(
-        profile_of(machine), camera, rng.getrandbits(20),
-        sigma=sigma, edges=edges, holes=holes, plain_holes=plain_holes, correlation_px=reach,
-    )  # fmt: skip
+        profile_of(machine),
+        camera,
+        rng.getrandbits(20),
+        sigma=sigma,
+        edges=edges,
+        holes=holes,
+        plain_holes=plain_holes,
+        correlation_px=reach,
+    )
     return noise.apply(picture, pin, 0)
 
 

@@ -38,10 +38,15 @@ def meshed(pile: Pile, seed: int, size_px: int) -> Sample:
     finally:
         renderer.close()
     noise = varied_stereo_noise(
-        profile_of(pile.machine), camera, rng.getrandbits(20), sigma=math.exp(rng.uniform(-1.0, 0.4)),
-        edges=(rng.uniform(0.3, 1.1), rng.uniform(0.3, 1.1)), holes=math.exp(rng.uniform(-1.0, 2.0)),
-        plain_holes=rng.uniform(0.01, 0.25), correlation_px=float(rng.choice((6, 10, 14))),
-    )  # fmt: skip
+        profile_of(pile.machine),
+        camera,
+        rng.getrandbits(20),
+        sigma=math.exp(rng.uniform(-1.0, 0.4)),
+        edges=(rng.uniform(0.3, 1.1), rng.uniform(0.3, 1.1)),
+        holes=math.exp(rng.uniform(-1.0, 2.0)),
+        plain_holes=rng.uniform(0.01, 0.25),
+        correlation_px=float(rng.choice((6, 10, 14))),
+    )
     ids, rows = drawing.labelled(exact.mask, view, keep)
     return sample(exact.rgb, exact.depth_m, ids, rows, view.intrinsics, noise.apply(exact, view.intrinsics, 0))
 

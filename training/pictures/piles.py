@@ -34,12 +34,24 @@ TERRAINS: Final = 12  # expensive to generate: so many are shared by all piles o
 MACHINES: Final = ("palms_471", "aoro_fc8")
 KIND_WEIGHTS: Final = {
     "palms_471": {
-        "single": 1.0, "separate": 2.0, "parallel": 1.5, "skewed": 1.0, "crossed": 2.0, "pile": 4.0, "bunk": 1.0,
+        "single": 1.0,
+        "separate": 2.0,
+        "parallel": 1.5,
+        "skewed": 1.0,
+        "crossed": 2.0,
+        "pile": 4.0,
+        "bunk": 1.0,
     },
     "aoro_fc8": {
-        "single": 1.5, "separate": 2.0, "parallel": 1.0, "skewed": 1.0, "crossed": 1.5, "pile": 2.0, "row": 2.0,
+        "single": 1.5,
+        "separate": 2.0,
+        "parallel": 1.0,
+        "skewed": 1.0,
+        "crossed": 1.5,
+        "pile": 2.0,
+        "row": 2.0,
     },
-}  # fmt: skip
+}
 """How often a kind of ``sim.scenes.arrangements`` is drawn for a machine."""
 MAX_LOGS: Final = {"separate": 5, "row": 10, "bunk": 12}
 ROUTE_M_PER_LOG: Final = 3.2  # of a row

@@ -35,9 +35,13 @@ class Sample:
 
 
 def sample(
-    rgb: np.ndarray, depth_m: np.ndarray, ids: np.ndarray, logs: np.ndarray, pin: Intrinsics,
+    rgb: np.ndarray,
+    depth_m: np.ndarray,
+    ids: np.ndarray,
+    logs: np.ndarray,
+    pin: Intrinsics,
     sensed_m: np.ndarray | None = None,
-) -> Sample:  # fmt: skip
+) -> Sample:
     """A sample from a picture's parts; depth NaN where unknown, everywhere in a photograph."""
     h, w = depth_m.shape
     u = ((np.arange(w) - pin.cx_px) / pin.fx_px).astype(np.float32)
@@ -46,10 +50,15 @@ def sample(
     rows = np.zeros((MAX_LOGS, ROW), np.float32)
     rows[: len(logs)] = logs
     return Sample(
-        np.ascontiguousarray(rgb), in_mm(depth_m), in_mm(depth_m if sensed_m is None else sensed_m),
-        np.array(sensed_m is not None), ids.astype(np.uint8), plane.astype(np.float32),
-        np.array([pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px], np.float32), rows,
-    )  # fmt: skip
+        np.ascontiguousarray(rgb),
+        in_mm(depth_m),
+        in_mm(depth_m if sensed_m is None else sensed_m),
+        np.array(sensed_m is not None),
+        ids.astype(np.uint8),
+        plane.astype(np.float32),
+        np.array([pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px], np.float32),
+        rows,
+    )
 
 
 def in_mm(depth_m: np.ndarray) -> np.ndarray:

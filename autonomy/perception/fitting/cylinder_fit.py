@@ -207,11 +207,17 @@ class _Problem:
         spacing = 2.0 * (long_px + area / long_px) / len(edge.u_px)
         n, m = len(edge.u_px), len(u)
         return cls(
-            pixel_rays(pin, np.concatenate([edge.u_px, u]), np.concatenate([edge.v_px, v])), edge.own, inverse, spread,
+            pixel_rays(pin, np.concatenate([edge.u_px, u]), np.concatenate([edge.v_px, v])),
+            edge.own,
+            inverse,
+            spread,
             np.repeat([min(1.0, spacing / OUTLINE_CORRELATION_PX), min(1.0, cells / m), 1.0], [n, m, 4]),
             np.repeat([OUTLINE_CAUCHY_SCALE, DEPTH_CAUCHY_SCALE, 1e6], [n, m, 4]),
-            1.0 / pin.fx_px, noise, first, float(information @ touched / information.sum()),
-        )  # fmt: skip
+            1.0 / pin.fx_px,
+            noise,
+            first,
+            float(information @ touched / information.sum()),
+        )
 
     def widened(self, first: Cylinder) -> Cylinder:
         """``first``, or where one of its sides is hidden a log of mean radius with one side at the visible strip.

@@ -70,11 +70,14 @@ def mask_network() -> Network:
     # Top-down pyramid, each level with the trunk's features of its stride.
     at = conv("top", WIDTHS[64], 1, source=taps[64])
     for level in (32, 16, 8, 4):
-        layers.extend((
-            Conv(f"down{level}", WIDTHS[level], 1, source=at), Resize(f"up{level}", 2),
-            Conv(f"side{level}", WIDTHS[level], 1, source=taps[level]),
-            Add(f"sum{level}", (f"up{level}", f"side{level}")),
-        ))  # fmt: skip
+        layers.extend(
+            (
+                Conv(f"down{level}", WIDTHS[level], 1, source=at),
+                Resize(f"up{level}", 2),
+                Conv(f"side{level}", WIDTHS[level], 1, source=taps[level]),
+                Add(f"sum{level}", (f"up{level}", f"side{level}")),
+            )
+        )
         at = conv(f"out{level}", WIDTHS[level])
         if level == KERNEL_STRIDE:
             conv("middle1", 64)

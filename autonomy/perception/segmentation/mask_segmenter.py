@@ -100,8 +100,15 @@ def kernel_logs(maps: np.ndarray, kernels: np.ndarray) -> KernelLogs:
     for k, i in enumerate(kept):
         members = np.flatnonzero(claims == k)
         if len(members) >= max(MIN_LOG_PX, MIN_OWN_SHARE * size[i]):
-            found.append(KernelLog(members, own[k, members], float(heat[rows[i], columns[i]]), float(certainty[i]),
-                                   len(members) / float(size[i])))  # fmt: skip
+            found.append(
+                KernelLog(
+                    members,
+                    own[k, members],
+                    float(heat[rows[i], columns[i]]),
+                    float(certainty[i]),
+                    len(members) / float(size[i]),
+                )
+            )
     return KernelLogs(y, x, tuple(found))
 
 
@@ -140,8 +147,16 @@ def _logits(
     u0, v0 = ((KERNEL_STRIDE * at + middle) / PLACE_PX for at in (columns, rows))
     a, b, c, d, e, one = kernels[FEATURES:]
     # The polynomial about the kernel's place, written about the origin: one product for all pixels.
-    about = np.stack([a - 2.0 * c * u0 - d * v0, b - 2.0 * e * v0 - d * u0, c, d, e,
-                      one - a * u0 - b * v0 + c * u0 * u0 + d * u0 * v0 + e * v0 * v0])  # fmt: skip
+    about = np.stack(
+        [
+            a - 2.0 * c * u0 - d * v0,
+            b - 2.0 * e * v0 - d * u0,
+            c,
+            d,
+            e,
+            one - a * u0 - b * v0 + c * u0 * u0 + d * u0 * v0 + e * v0 * v0,
+        ]
+    )
     places = np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)]).astype(np.float32)
     weights = np.concatenate([kernels[:FEATURES], about]).astype(np.float32)
     return np.asarray(weights.T @ np.concatenate([features, places]))
@@ -182,9 +197,13 @@ class MaskSegmenter:
     """
 
     def __init__(
-        self, mode: str = "rgbd", weights: Path | None = None, size_px: int = 2 * SIZE_PX, precision: str = "bf16",
+        self,
+        mode: str = "rgbd",
+        weights: Path | None = None,
+        size_px: int = 2 * SIZE_PX,
+        precision: str = "bf16",
         use_window: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.mode, self.size_px, self._precision, self._use_window = mode, size_px, precision, use_window
         self._network = mask_network()
         self._arrays, self.facts = load(weights or SHIPPED / "logs.safetensors", self._network)

@@ -53,8 +53,12 @@ class Scorer:
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray]) -> Scorer:
         """From the arrays of a ``scoring_network``."""
-        return cls(arrays["first.weight"][:, :, 0, 0], arrays["first.bias"], arrays["logit.weight"][0, :, 0, 0],
-                   float(arrays["logit.bias"][0]))  # fmt: skip
+        return cls(
+            arrays["first.weight"][:, :, 0, 0],
+            arrays["first.bias"],
+            arrays["logit.weight"][0, :, 0, 0],
+            float(arrays["logit.bias"][0]),
+        )
 
     def probability(self, features: np.ndarray) -> np.ndarray:
         """Probabilities (N,) from features (N, inputs)."""
@@ -184,10 +188,13 @@ class SegmentMerger:
         merge_probability = self.merge_probabilities(scorer).max(axis=1, initial=0.0)
         border_px, around = self._border_px.sum(axis=1), self._boundary_sum.sum(axis=1)
         around = np.divide(around, border_px, out=np.ones_like(around), where=border_px > 0.0)
-        return np.array([
-            segment_features(self.foreground, s, float(border_px[k]), float(around[k]), float(merge_probability[k]))
-            for k, s in enumerate(self.segments)
-        ], np.float32).reshape(-1, len(SEGMENT_FEATURES))  # fmt: skip
+        return np.array(
+            [
+                segment_features(self.foreground, s, float(border_px[k]), float(around[k]), float(merge_probability[k]))
+                for k, s in enumerate(self.segments)
+            ],
+            np.float32,
+        ).reshape(-1, len(SEGMENT_FEATURES))
 
 
 def _borders(foreground: Foreground, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
@@ -198,8 +205,12 @@ def _borders(foreground: Foreground, segments: list[Segment]) -> tuple[np.ndarra
         labels[foreground.y[one.members], foreground.x[one.members]] = number
     border, boundary = np.zeros((n + 1) ** 2), np.zeros((n + 1) ** 2)
     # There may be a pixel or two of boundary between segments that meet.
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]), (np.s_[:, :-2], np.s_[:, 2:]),
-                 (np.s_[:-2], np.s_[2:])):  # fmt: skip
+    for a, b in (
+        (np.s_[:, :-1], np.s_[:, 1:]),
+        (np.s_[:-1], np.s_[1:]),
+        (np.s_[:, :-2], np.s_[:, 2:]),
+        (np.s_[:-2], np.s_[2:]),
+    ):
         i, j = labels[a], labels[b]
         meet = (i != j) & (i > 0) & (j > 0)
         pair = i[meet] * (n + 1) + j[meet]

@@ -26,10 +26,26 @@ MIN_BACKGROUND_SHARE: Final = 0.6  # of a gap that separates two logs
 MIN_END_PROBABILITY: Final = 0.5
 MIN_ELONGATION: Final = 3.0  # from which on a segment's own slope of depth is used
 PAIR_FEATURES: Final = (
-    "border", "boundary", "touching", "turn", "predicted_turn", "offset", "offset_back", "votes_along", "votes_across",
-    "gap", "gap_background", "depth_difference", "depth_known", "width_ratio", "size", "elongation_big",
-    "elongation_small", "gap_widths", "offset_share",
-)  # fmt: skip
+    "border",
+    "boundary",
+    "touching",
+    "turn",
+    "predicted_turn",
+    "offset",
+    "offset_back",
+    "votes_along",
+    "votes_across",
+    "gap",
+    "gap_background",
+    "depth_difference",
+    "depth_known",
+    "width_ratio",
+    "size",
+    "elongation_big",
+    "elongation_small",
+    "gap_widths",
+    "offset_share",
+)
 """The numbers of ``pair_features``, in this order."""
 
 
@@ -92,11 +108,19 @@ class SegmentTable:
         """The table of a list of segments."""
         rows = [
             (
-                len(s.members), *s.middle, *s.axis, *s.predicted_axis, s.half_width, s.low, s.high, s.elongation,
-                *s.vote, *(s.line or UNKNOWN),
+                len(s.members),
+                *s.middle,
+                *s.axis,
+                *s.predicted_axis,
+                s.half_width,
+                s.low,
+                s.high,
+                s.elongation,
+                *s.vote,
+                *(s.line or UNKNOWN),
             )
             for s in segments
-        ]  # fmt: skip
+        ]
         return cls(np.array(rows, float).reshape(-1, 15))
 
     def put(self, row: int, segment: Segment) -> None:
@@ -125,27 +149,30 @@ def pair_features(
     background, wide = np.zeros(len(gap)), gap > MIN_GAP_PX
     hidden, inverse, line = _gap(foreground, big.take(wide), start[wide], end[wide])
     background[wide] = 1.0 - (hidden | (inverse > NEARER * line)).sum(axis=1) / GAP_SAMPLES
-    return np.stack([
-        np.minimum(border_px / (2.0 * np.minimum(small.half_width, big.half_width)), 3.0),
-        boundary,
-        border_px > 0.0,
-        np.abs(_cross(small.axis, axis)) * np.minimum(small.elongation, 4.0) / 4.0,
-        np.abs(_cross(small.predicted_axis, big.predicted_axis)),
-        np.minimum(offset / big.half_width, 4.0),
-        np.minimum(np.abs(_cross(small.axis, away)) / thin, 6.0),
-        np.minimum(np.abs(_dot(apart, axis)) / span, 1.5),
-        np.minimum(np.abs(_cross(axis, apart)) / (big.half_width + small.half_width), 3.0),
-        np.minimum(gap / span, 1.0),
-        background,
-        np.minimum(10.0 * _depth_difference(big, small, along), 5.0),
-        ~np.isnan(big.line_at + small.line_at),
-        np.abs(np.log(small.half_width / big.half_width)),
-        0.3 * np.log(small.count / foreground.grain),
-        0.2 * np.minimum(big.elongation, 20.0),
-        0.2 * np.minimum(small.elongation, 20.0),
-        0.2 * np.minimum(gap / (2.0 * np.maximum(big.half_width, 1.0)), 10.0),
-        np.minimum(offset / (big.half_width + 0.05 * np.abs(along)), 5.0),
-    ], axis=1).astype(np.float32)  # fmt: skip
+    return np.stack(
+        [
+            np.minimum(border_px / (2.0 * np.minimum(small.half_width, big.half_width)), 3.0),
+            boundary,
+            border_px > 0.0,
+            np.abs(_cross(small.axis, axis)) * np.minimum(small.elongation, 4.0) / 4.0,
+            np.abs(_cross(small.predicted_axis, big.predicted_axis)),
+            np.minimum(offset / big.half_width, 4.0),
+            np.minimum(np.abs(_cross(small.axis, away)) / thin, 6.0),
+            np.minimum(np.abs(_dot(apart, axis)) / span, 1.5),
+            np.minimum(np.abs(_cross(axis, apart)) / (big.half_width + small.half_width), 3.0),
+            np.minimum(gap / span, 1.0),
+            background,
+            np.minimum(10.0 * _depth_difference(big, small, along), 5.0),
+            ~np.isnan(big.line_at + small.line_at),
+            np.abs(np.log(small.half_width / big.half_width)),
+            0.3 * np.log(small.count / foreground.grain),
+            0.2 * np.minimum(big.elongation, 20.0),
+            0.2 * np.minimum(small.elongation, 20.0),
+            0.2 * np.minimum(gap / (2.0 * np.maximum(big.half_width, 1.0)), 10.0),
+            np.minimum(offset / (big.half_width + 0.05 * np.abs(along)), 5.0),
+        ],
+        axis=1,
+    ).astype(np.float32)
 
 
 def may_merge(foreground: Foreground, big: SegmentTable, small: SegmentTable, border_px: np.ndarray) -> np.ndarray:

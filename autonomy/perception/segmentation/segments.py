@@ -18,10 +18,21 @@ MIN_KNOWN_PX: Final = 8  # pixels with depth that determine a line
 MIN_SLOPE_PX: Final = 6.0  # of a map: shorter segments have one depth
 MIN_ELONGATION: Final = 2.0  # extent along over extent across, from which on the shape determines the axis
 SEGMENT_FEATURES: Final = (
-    "probability", "size", "half_width", "elongation", "filled", "axis_agreement", "vote_spread_along",
-    "vote_spread_across", "boundary_inside", "boundary_around", "shared_border", "merge_probability", "depth_known",
+    "probability",
+    "size",
+    "half_width",
+    "elongation",
+    "filled",
+    "axis_agreement",
+    "vote_spread_along",
+    "vote_spread_across",
+    "boundary_inside",
+    "boundary_around",
+    "shared_border",
+    "merge_probability",
+    "depth_known",
     "depth_error",
-)  # fmt: skip
+)
 """The numbers of ``segment_features``, in this order."""
 
 
@@ -171,19 +182,22 @@ def segment_features(
     to_east, to_south = one.axis.astype(np.float32)
     strays = _median(np.abs(to_east * east + to_south * south)), _median(np.abs(to_east * south - to_south * east))
     agreement = math.hypot(float(c.sum()), float(s.sum())) / (float(np.hypot(c, s).sum()) + 1e-6)
-    return np.array([
-        float(probability.sum()) / len(members),
-        0.3 * math.log(len(members) / foreground.grain),
-        0.3 * math.log(one.half_width / root),
-        0.2 * min(one.elongation, 20.0),
-        min(len(members) / (2.0 * one.half_width * length), 2.0),
-        agreement,
-        min(4.0 * strays[0] / length, 3.0),
-        min(strays[1] / one.half_width, 3.0),
-        float(foreground.boundary[foreground.y[members], foreground.x[members]].sum()) / len(members),
-        boundary_around,
-        min(border_px / (2.0 * (length + 2.0 * one.half_width)), 1.0),
-        merge_probability,
-        float(one.line is not None),
-        min(20.0 * one.line_error, 3.0),
-    ], np.float32)  # fmt: skip
+    return np.array(
+        [
+            float(probability.sum()) / len(members),
+            0.3 * math.log(len(members) / foreground.grain),
+            0.3 * math.log(one.half_width / root),
+            0.2 * min(one.elongation, 20.0),
+            min(len(members) / (2.0 * one.half_width * length), 2.0),
+            agreement,
+            min(4.0 * strays[0] / length, 3.0),
+            min(strays[1] / one.half_width, 3.0),
+            float(foreground.boundary[foreground.y[members], foreground.x[members]].sum()) / len(members),
+            boundary_around,
+            min(border_px / (2.0 * (length + 2.0 * one.half_width)), 1.0),
+            merge_probability,
+            float(one.line is not None),
+            min(20.0 * one.line_error, 3.0),
+        ],
+        np.float32,
+    )

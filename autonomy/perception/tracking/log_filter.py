@@ -89,10 +89,15 @@ class LogFilter:
         off, tilt = point - self._anchor, axis / along
         z = np.array(
             [
-                off @ self._e1, off @ self._e2, tilt @ self._e1, tilt @ self._e2,
-                (start - self._anchor) @ self._axis, (end - self._anchor) @ self._axis, body.radius_m,
+                off @ self._e1,
+                off @ self._e2,
+                tilt @ self._e1,
+                tilt @ self._e2,
+                (start - self._anchor) @ self._axis,
+                (end - self._anchor) @ self._axis,
+                body.radius_m,
             ]
-        )  # fmt: skip
+        )
         f1, f2 = (pose.rotation @ f for f in across_view(body.axis, body.point_m))
         turn = np.array([[f1 @ self._e1, f2 @ self._e1], [f1 @ self._e2, f2 @ self._e2]])
         move = float((point - center) @ axis)

@@ -43,10 +43,21 @@ class World:
             link.setblocking(False)
         ports = [link.getsockname()[1] for link in (self._control, self._scene)]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "autonomy", "--controller", f"127.0.0.1:{ports[0]}",
-             "--scene", f"127.0.0.1:{ports[1]}", "--report-port", str(self._planner[1])],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "autonomy",
+                "--controller",
+                f"127.0.0.1:{ports[0]}",
+                "--scene",
+                f"127.0.0.1:{ports[1]}",
+                "--report-port",
+                str(self._planner[1]),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
 
     def live(self, mode: Mode, enough: int = 0, **changes: object) -> None:
         """Send reports and log lists until ``enough`` setpoints are received or the process has ended."""

@@ -90,9 +90,14 @@ def test_a_mission_is_taken_at_rest_and_waits_for_auto(planner: Planner) -> None
 
 @pytest.mark.parametrize(
     ("machine", "code"),
-    [((Mode.ARMED, 0.0), "upload.armed"), ((Mode.ACTIVE, 0.0), "upload.armed"), ((Mode.STANDBY, 0.2), "upload.moving"),
-     ((Mode.STANDBY, nan), "upload.moving"), (None, "upload.no-report")],
-)  # fmt: skip
+    [
+        ((Mode.ARMED, 0.0), "upload.armed"),
+        ((Mode.ACTIVE, 0.0), "upload.armed"),
+        ((Mode.STANDBY, 0.2), "upload.moving"),
+        ((Mode.STANDBY, nan), "upload.moving"),
+        (None, "upload.no-report"),
+    ],
+)
 def test_no_mission_is_taken_unless_the_machine_rests(planner: Planner, machine, code: str) -> None:
     if machine:
         planner.machine(*machine)

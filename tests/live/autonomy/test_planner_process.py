@@ -67,8 +67,22 @@ def watcher() -> Iterator[socket.socket]:
 def process(watcher) -> Iterator[tuple[PlannerProcess, Jobless]]:
     there = "127.0.0.1:9"
     told = f"127.0.0.1:{watcher.getsockname()[1]}"
-    options = arguments(["--controller", there, "--scene", there, "--report-port", "0", "--order-port", "0",
-                         "--tell", told, "--tell", there])  # fmt: skip
+    options = arguments(
+        [
+            "--controller",
+            there,
+            "--scene",
+            there,
+            "--report-port",
+            "0",
+            "--order-port",
+            "0",
+            "--tell",
+            told,
+            "--tell",
+            there,
+        ]
+    )
     job = Jobless()
     made = PlannerProcess(job, HASH, options, KEY)  # type: ignore[arg-type]
     yield made, job

@@ -23,8 +23,23 @@ HASH = profile_hash(PROFILE)
 def planner_process(tell: int, key: bytes | None, *more: str) -> PlannerProcess:
     """The process's shell and job, reporting to a port."""
     there = "127.0.0.1:9"
-    options = arguments(["--profile", "aoro_fc8", "--controller", there, "--scene", there, "--report-port", "0",
-                         "--order-port", "0", "--tell", f"127.0.0.1:{tell}", *more])  # fmt: skip
+    options = arguments(
+        [
+            "--profile",
+            "aoro_fc8",
+            "--controller",
+            there,
+            "--scene",
+            there,
+            "--report-port",
+            "0",
+            "--order-port",
+            "0",
+            "--tell",
+            f"127.0.0.1:{tell}",
+            *more,
+        ]
+    )
     uploads = uploaded_missions(options, PROFILE, 10**8, key)
     return PlannerProcess(make_job(options, PROFILE, 10**8, key), HASH, options, key, uploads)
 

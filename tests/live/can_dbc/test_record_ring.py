@@ -19,9 +19,12 @@ def test_two_processes_at_full_speed_agree_on_every_record_that_arrives(tmp_path
         "print('ended', flush=True)\nsys.stdin.readline()\n"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", script, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-c", script, path],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    ) as writer:  # fmt: skip
+    ) as writer:
         assert "ready" in writer.stdout.readline()
         reader = RingReader(path)
         writer.stdin.write("\n")

@@ -44,10 +44,16 @@ class Browser:
         assert program is not None, MISSING
         self._said = (folder / "chromium.err").open("wb")
         options = (
-            "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-            "--enable-unsafe-swiftshader" if solid else "--disable-3d-apis", "--remote-debugging-port=0",
-            f"--user-data-dir={folder / 'chromium'}", f"--window-size={size[0]},{size[1]}",
-        )  # fmt: skip
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+            "--enable-unsafe-swiftshader" if solid else "--disable-3d-apis",
+            "--remote-debugging-port=0",
+            f"--user-data-dir={folder / 'chromium'}",
+            f"--window-size={size[0]},{size[1]}",
+        )
         self._process = subprocess.Popen(
             [program, *options, "about:blank"], stdout=subprocess.DEVNULL, stderr=self._said
         )

@@ -70,12 +70,34 @@ def perceived_run(folder: Path, logs: int = 4, **more: Any) -> Iterator[Perceive
     reports.setblocking(False)
     with ExitStack() as stack:
         stack.callback(reports.close)
-        plant = _start(stack, folder, "sim", "--seed", 3, "--logs", logs, "--bus", "crane0=virtual:perceived",
-                       "--port", sim, "--camera", pictures)  # fmt: skip
+        plant = _start(
+            stack,
+            folder,
+            "sim",
+            "--seed",
+            3,
+            "--logs",
+            logs,
+            "--bus",
+            "crane0=virtual:perceived",
+            "--port",
+            sim,
+            "--camera",
+            pictures,
+        )
         _await(plant, "ready")
         q = (*_ask(sim, "state")["joints"][:4], nan)
-        seeing = _start(stack, folder, "autonomy.perception", "--camera", CAMERA, "--frames", f"{HOST}:{pictures}",
-                        "--port", detector)  # fmt: skip
+        seeing = _start(
+            stack,
+            folder,
+            "autonomy.perception",
+            "--camera",
+            CAMERA,
+            "--frames",
+            f"{HOST}:{pictures}",
+            "--port",
+            detector,
+        )
         _await(seeing, '"ready"')
         console = Console(PROFILE, HASH, scene=(HOST, detector), reports=reports, truth=(HOST, sim), **more)
         url = stack.enter_context(served(create_app(console)))
@@ -90,16 +112,43 @@ def perceived_run(folder: Path, logs: int = 4, **more: Any) -> Iterator[Perceive
 def _play(run: PerceivedRun, page: tuple[str, int]) -> None:
     """The planner asks for logs four times a second; the controller reports, twenty times a second, a crane at rest."""
     shown = tuple(v if isfinite(v) else 0.0 for v in run.q)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner, \
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:  # fmt: skip
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
+    ):
         planner.connect(run.detector)
         planner.setblocking(False)
         n = 0
         while not run.over.wait(0.05):
             n += 1
             now = time.monotonic_ns()
-            out.sendto(encode(StateReport(n, HASH, now, Mode.ACTIVE, 1, 0, n, 0, 0, 0, shown, (0.0,) * 5, shown, 100.0,
-                                          0.0, 0.0, 700_000, 20_000, 0, 11 * n)), page)  # fmt: skip
+            out.sendto(
+                encode(
+                    StateReport(
+                        n,
+                        HASH,
+                        now,
+                        Mode.ACTIVE,
+                        1,
+                        0,
+                        n,
+                        0,
+                        0,
+                        0,
+                        shown,
+                        (0.0,) * 5,
+                        shown,
+                        100.0,
+                        0.0,
+                        0.0,
+                        700_000,
+                        20_000,
+                        0,
+                        11 * n,
+                    )
+                ),
+                page,
+            )
             if run.grasp is not None:
                 out.sendto(encode_grasp(run.grasp, n, HASH, now), page)
             try:

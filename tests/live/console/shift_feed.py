@@ -87,8 +87,9 @@ class ShiftFeed:
         state.on_report(encode(self._crane_report(t, into, stopped)), self.now_ns)
         state.on_report(encode(self._vehicle_report(drives)), self.now_ns)
         if self.steps % 3 == 0:
-            state.on_report(encode_mission(self._mission_report(int(cycle), drives), self.steps, HASH, self.now_ns),
-                            self.now_ns)  # fmt: skip
+            state.on_report(
+                encode_mission(self._mission_report(int(cycle), drives), self.steps, HASH, self.now_ns), self.now_ns
+            )
         if self.steps % 5 == 0:
             centers = [(2.0 + k, 3.0 - 0.5 * k + 0.002 * sin(t + k), -0.9) for k in range(4)]
             state.logs = tuple(
@@ -106,10 +107,27 @@ class ShiftFeed:
         holds = 12.0 < work < 20.0
         mode, reason = (Mode.STOP, pack(Reason.JOINT_STUCK, 1)) if stopped else (Mode.ACTIVE, 0)
         return StateReport(
-            self.steps, HASH, self.now_ns, mode, HOLDING if holds else 1, reason, self.steps, 0, 0, 0, q, (0.0,) * 5,
-            reference, 20.0 if holds else 100.0, 120.0 if holds else 0.0, 105.0 if holds else 0.0, 700_000, 60_000, 0,
+            self.steps,
+            HASH,
+            self.now_ns,
+            mode,
+            HOLDING if holds else 1,
+            reason,
+            self.steps,
+            0,
+            0,
+            0,
+            q,
+            (0.0,) * 5,
+            reference,
+            20.0 if holds else 100.0,
+            120.0 if holds else 0.0,
+            105.0 if holds else 0.0,
+            700_000,
+            60_000,
+            0,
             11 * self.steps,
-        )  # fmt: skip
+        )
 
     def _vehicle_report(self, drives: bool) -> VehicleReport:
         """Round and round a circle, a little beside the track of the lap before."""
@@ -119,19 +137,47 @@ class ShiftFeed:
         speed, driving = (SPEED_M_S, Driving.DRIVING) if drives else (0.0, Driving.STANDING)
         heading = radians(-((360.0 * along / LAP_M) % 360.0)) % (2 * pi)
         return VehicleReport(
-            self.steps, HASH, self.now_ns, self.steps, driving, 0, 0, self.now_ns, latitude, longitude, 102.0, 4, 18,
-            0.014, self.now_ns, heading, 0.0, self.now_ns, speed, 0.1, 0.02 * sin(angle), 0.0,
-            (0.35, 0.34, 0.33, 0.32), 0,
-        )  # fmt: skip
+            self.steps,
+            HASH,
+            self.now_ns,
+            self.steps,
+            driving,
+            0,
+            0,
+            self.now_ns,
+            latitude,
+            longitude,
+            102.0,
+            4,
+            18,
+            0.014,
+            self.now_ns,
+            heading,
+            0.0,
+            self.now_ns,
+            speed,
+            0.1,
+            0.02 * sin(angle),
+            0.0,
+            (0.35, 0.34, 0.33, 0.32),
+            0,
+        )
 
     def _mission_report(self, loaded: int, drives: bool) -> MissionReport:
         logs = tuple(_known(loaded + k) for k in range(LOGS))
         return msgspec.structs.replace(
-            self._mission, name="shift", loaded=loaded, on_board=loaded % LOAD_LOGS, missed=loaded // 9,
-            unloaded=loaded - loaded % LOAD_LOGS, on_board_m3=round(0.1 * (loaded % LOAD_LOGS), 3), logs=logs,
-            driven_m=round(self._driven_m, 1), targets=(loaded,),
+            self._mission,
+            name="shift",
+            loaded=loaded,
+            on_board=loaded % LOAD_LOGS,
+            missed=loaded // 9,
+            unloaded=loaded - loaded % LOAD_LOGS,
+            on_board_m3=round(0.1 * (loaded % LOAD_LOGS), 3),
+            logs=logs,
+            driven_m=round(self._driven_m, 1),
+            targets=(loaded,),
             words="drives up to the log" if drives else "loads a log",
-        )  # fmt: skip
+        )
 
 
 @cache

@@ -48,9 +48,13 @@ class Started:
         environment = os.environ | {"PYTHONPATH": str(ROOT), "TIMBERHAND_WIRE_DIR": str(wire)}
         with self.said.open("wb") as out:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments, option, str(port)], cwd=folder, stdout=out,
-                stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment,
-            )  # fmt: skip
+                [sys.executable, "-m", module, *arguments, option, str(port)],
+                cwd=folder,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=environment,
+            )
         self.url = f"http://127.0.0.1:{port}/"
 
     def answers(self) -> bool:

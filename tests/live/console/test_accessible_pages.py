@@ -106,9 +106,9 @@ def browser(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Browser]
 
 
 def _panels(browser: Browser) -> list[str]:
-    return list(browser.value(
-        "[...document.querySelectorAll('[role=tab]')].filter(t => t.checkVisibility()).map(t => t.id)"
-    ))  # fmt: skip
+    return list(
+        browser.value("[...document.querySelectorAll('[role=tab]')].filter(t => t.checkVisibility()).map(t => t.id)")
+    )
 
 
 def _ready(name: str, browser: Browser) -> Callable[[], Any]:

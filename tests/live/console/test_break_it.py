@@ -113,9 +113,35 @@ def test_a_button_breaks_the_run_and_the_card_says_what_happened(desk, tmp_path:
                 now = time.monotonic_ns()
                 since_ns = since_ns or (now if desk[1] else 0)
                 mode = Mode.STOP if since_ns else Mode.ACTIVE
-                out.sendto(encode(StateReport(1, HASH, now, mode, 0, reason if since_ns else 0, 1, 0, 0, 0, q,
-                                              (0.0,) * 5, q, 50.0, 12.0, 0.0, 0, 0, 0, 0, since_ns,
-                                              (0.0, 0.0, 0.0) if since_ns else ())), to)  # fmt: skip
+                out.sendto(
+                    encode(
+                        StateReport(
+                            1,
+                            HASH,
+                            now,
+                            mode,
+                            0,
+                            reason if since_ns else 0,
+                            1,
+                            0,
+                            0,
+                            0,
+                            q,
+                            (0.0,) * 5,
+                            q,
+                            50.0,
+                            12.0,
+                            0.0,
+                            0,
+                            0,
+                            0,
+                            0,
+                            since_ns,
+                            (0.0, 0.0, 0.0) if since_ns else (),
+                        )
+                    ),
+                    to,
+                )
 
     thread = threading.Thread(target=feed)
     thread.start()

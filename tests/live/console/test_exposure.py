@@ -25,10 +25,28 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with accounts, a self-signed certificate and its key, named as the service's credentials are."""
     folder = tmp_path_factory.mktemp("exposure")
     subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=timberhand",
-         "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", folder / "console-key", "-out", folder / "console-cert"],
-        check=True, capture_output=True, timeout=60,
-    )  # fmt: skip
+        [
+            "openssl",
+            "req",
+            "-x509",
+            "-newkey",
+            "rsa:2048",
+            "-nodes",
+            "-days",
+            "2",
+            "-subj",
+            "/CN=timberhand",
+            "-addext",
+            "subjectAltName=IP:127.0.0.1",
+            "-keyout",
+            folder / "console-key",
+            "-out",
+            folder / "console-cert",
+        ],
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
     (folder / "console-passwords").write_text(account_line("anna", Role.OPERATOR, PASSWORD) + "\n")
     (folder / "console-passwords").chmod(0o600)
     return folder
@@ -72,7 +90,10 @@ def test_files_that_do_not_fit_are_refused(files: Path) -> None:
 def test_the_service_s_credentials_are_used_unless_options_are_given(files: Path, tmp_path: Path) -> None:
     found = Exposure().with_credentials({"CREDENTIALS_DIRECTORY": str(files)})
     assert (found.passwords, found.tls_cert, found.tls_key) == (
-        files / "console-passwords", files / "console-cert", files / "console-key")  # fmt: skip
+        files / "console-passwords",
+        files / "console-cert",
+        files / "console-key",
+    )
     given = Exposure(passwords=tmp_path).with_credentials({"CREDENTIALS_DIRECTORY": str(files)})
     assert given.passwords == tmp_path
     assert Exposure().with_credentials({"CREDENTIALS_DIRECTORY": str(tmp_path)}) == Exposure()
@@ -92,8 +113,18 @@ def test_the_process_refuses_with_one_sentence() -> None:
 
 def test_a_person_signs_in_over_tls_from_an_address_of_the_network(files: Path, tmp_path: Path) -> None:
     e, audit = whole(files), tmp_path / "audit.jsonl"
-    arguments = ("--bind", "0.0.0.0", "--passwords", e.passwords, "--tls-cert", e.tls_cert, "--tls-key", e.tls_key,
-                 "--audit", audit)  # fmt: skip
+    arguments = (
+        "--bind",
+        "0.0.0.0",
+        "--passwords",
+        e.passwords,
+        "--tls-cert",
+        e.tls_cert,
+        "--tls-key",
+        e.tls_key,
+        "--audit",
+        audit,
+    )
     process = subprocess.Popen(console(*arguments), stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -105,8 +136,9 @@ def test_a_person_signs_in_over_tls_from_an_address_of_the_network(files: Path, 
         with urllib.request.urlopen(request, context=trusted, timeout=20) as answer:
             cookie = answer.headers["set-cookie"]
             assert answer.status == 204 and "Secure" in cookie and "HttpOnly" in cookie
-        request = urllib.request.Request(f"{url}api/session", data=b"", method="POST",
-                                         headers={"cookie": cookie.split(";")[0]})  # fmt: skip
+        request = urllib.request.Request(
+            f"{url}api/session", data=b"", method="POST", headers={"cookie": cookie.split(";")[0]}
+        )
         with urllib.request.urlopen(request, context=trusted, timeout=20) as answer:
             assert json.load(answer)["role"] == "operator"
         port = int(url.split(":")[2].strip("/"))

@@ -64,8 +64,33 @@ class Stage:
     def _work(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             while not self.over:
-                out.sendto(encode(StateReport(1, HASH, time.monotonic_ns(), Mode.STANDBY, 0, 0, 1, 0, 0, 0, Q,
-                                              (0.0,) * 5, Q, 50.0, 12.0, 0.0, 0, 0, 0, 0)), self._to)  # fmt: skip
+                out.sendto(
+                    encode(
+                        StateReport(
+                            1,
+                            HASH,
+                            time.monotonic_ns(),
+                            Mode.STANDBY,
+                            0,
+                            0,
+                            1,
+                            0,
+                            0,
+                            0,
+                            Q,
+                            (0.0,) * 5,
+                            Q,
+                            50.0,
+                            12.0,
+                            0.0,
+                            0,
+                            0,
+                            0,
+                            0,
+                        )
+                    ),
+                    self._to,
+                )
                 try:
                     command = decode(self._operator.recv(200))
                 except TimeoutError:

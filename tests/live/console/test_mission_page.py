@@ -60,9 +60,7 @@ class Stage:
         reports.bind(("127.0.0.1", 0))
         reports.setblocking(False)
         self._to = reports.getsockname()
-        console = Console(
-            profile, self.hash, ("127.0.0.1", 9), reports=reports, planner=self.orders.getsockname()
-        )  # fmt: skip
+        console = Console(profile, self.hash, ("127.0.0.1", 9), reports=reports, planner=self.orders.getsockname())
         self._serving = ExitStack()
         self.port = urlsplit(self._serving.enter_context(served(create_app(console)))).port or 0
         self._thread = threading.Thread(target=self._feed)
@@ -81,8 +79,9 @@ class Stage:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             while not self.over:
                 now = time.monotonic_ns()
-                state = StateReport(1, self.hash, now, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, q, (0.0,) * 5, q, nan, nan, nan,
-                                    0, 0, 0, 0)  # fmt: skip
+                state = StateReport(
+                    1, self.hash, now, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, q, (0.0,) * 5, q, nan, nan, nan, 0, 0, 0, 0
+                )
                 out.sendto(encode(state), self._to)
                 out.sendto(encode(VEHICLE), self._to)
                 if self.mission is not None and self.speaks:
@@ -146,10 +145,14 @@ def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Brows
 
 @pytest.mark.parametrize(
     ("button", "before", "order"),
-    [("pause", {}, MissionAction.PAUSE), ("auto", {"auto": False}, MissionAction.AUTO),
-     ("single", {}, MissionAction.SINGLE_STEP), ("single", {"single_step": True}, MissionAction.RUN_THROUGH),
-     ("next-step", {"single_step": True, "waits_for": "a log is near"}, MissionAction.NEXT_STEP)],
-)  # fmt: skip
+    [
+        ("pause", {}, MissionAction.PAUSE),
+        ("auto", {"auto": False}, MissionAction.AUTO),
+        ("single", {}, MissionAction.SINGLE_STEP),
+        ("single", {"single_step": True}, MissionAction.RUN_THROUGH),
+        ("next-step", {"single_step": True, "waits_for": "a log is near"}, MissionAction.NEXT_STEP),
+    ],
+)
 def test_a_click_sends_the_command(
     stage: Stage, browser: Browser, button: str, before: dict, order: MissionAction
 ) -> None:

@@ -50,8 +50,33 @@ def page(tmp_path: Path, timing) -> Iterator[tuple[Console, str]]:
             while not over.wait(0.05):
                 now = time.monotonic_ns()
                 mode, reason = (Mode.STOP, STOPPED) if now - began > 10**9 else (Mode.ACTIVE, 0)
-                out.sendto(encode(StateReport(1, profile_hash(PROFILE), now, mode, 0, reason, 1, 0, 0, 0, Q, (0.0,) * 5,
-                                              Q, 50.0, 12.0, 0.0, 0, 0, 0, 0)), to)  # fmt: skip
+                out.sendto(
+                    encode(
+                        StateReport(
+                            1,
+                            profile_hash(PROFILE),
+                            now,
+                            mode,
+                            0,
+                            reason,
+                            1,
+                            0,
+                            0,
+                            0,
+                            Q,
+                            (0.0,) * 5,
+                            Q,
+                            50.0,
+                            12.0,
+                            0.0,
+                            0,
+                            0,
+                            0,
+                            0,
+                        )
+                    ),
+                    to,
+                )
                 bus.send(valve.key, sender.protect(bytes(valve.length)))
                 bus.send(lift.key, bytes(lift.length))
                 written = timing(400, written_ns=now)

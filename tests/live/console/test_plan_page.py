@@ -57,9 +57,13 @@ class Stage:
         self._to = reports.getsockname()
         self.planner: PlannerProcess = planner_process(self._to[1], None, "--missions", str(self.folder))
         console = Console(
-            PROFILE, HASH, Path(self.operator.getsockname()), reports=reports, missions=self.folder,
+            PROFILE,
+            HASH,
+            Path(self.operator.getsockname()),
+            reports=reports,
+            missions=self.folder,
             planner=self.planner._commands.getsockname(),
-        )  # fmt: skip
+        )
         self._serving = ExitStack()
         self.port = urlsplit(self._serving.enter_context(served(create_app(console)))).port or 0
         self._thread = threading.Thread(target=self._work)
@@ -209,8 +213,9 @@ def test_a_plan_is_made_with_the_keyboard_alone(browser: Browser) -> None:
     def enter(selector: str) -> None:
         browser.value(f"document.querySelector({selector!r}).focus()")
         for kind, text in (("keyDown", "\r"), ("keyUp", "")):
-            browser._ask("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", text=text,
-                         windowsVirtualKeyCode=13)  # fmt: skip
+            browser._ask(
+                "Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", text=text, windowsVirtualKeyCode=13
+            )
 
     for _ in range(3):
         enter("#add")
@@ -275,8 +280,9 @@ def test_a_picture_lies_under_the_grid_where_it_is_placed(browser: Browser, tmp_
     pixel = f"[...document.querySelector('.grid').getContext('2d').getImageData({x - left}, {y - top}, 1, 1).data]"
     red, green, blue, _ = browser.value(pixel)
     assert red > 2 * green and red > blue
-    browser.value("(e => { e.value = '60'; e.dispatchEvent(new Event('change')); })"
-                  "(document.getElementById('picture-width_m'))")  # fmt: skip
+    browser.value(
+        "(e => { e.value = '60'; e.dispatchEvent(new Event('change')); })(document.getElementById('picture-width_m'))"
+    )
     browser.wait(lambda: browser.value(pixel)[3] == 0, "60 m from -50 m do not reach there")
 
 
@@ -294,9 +300,11 @@ def test_nothing_is_cut_off_at_the_usual_sizes(browser: Browser) -> None:
     wet = Fence(tuple(at(*corner) for corner in ((-6, -5), (9, -6), (12, 3), (-4, 6))), True, "wet ground")
     one, two, _, four = paper_b.waypoints
     changed = msgspec.structs.replace(
-        paper_b, waypoints=(one, two, at(29, 15), four), fences=(*paper_b.fences, wet),
+        paper_b,
+        waypoints=(one, two, at(29, 15), four),
+        fences=(*paper_b.fences, wet),
         landings=(Landing(at(-25, -21), "road side", 90.0),),
-    )  # fmt: skip
+    )
     mission = msgspec.to_builtins(changed)
     browser.value(f"plan.model.commit({json.dumps(mission)}); document.getElementById('fit').click()")
     shows(browser, "findings", "waypoint 3 is 1.0 m from the fence")
@@ -314,5 +322,8 @@ def test_nothing_is_cut_off_at_the_usual_sizes(browser: Browser) -> None:
     if os.environ.get("TIMBERHAND_PICTURES"):
         size = browser.value("`${innerWidth}x${innerHeight}`")
         light = browser.value("matchMedia('(prefers-color-scheme: light)').matches")
-        browser.picture(PICTURE if size == "1280x800" and not light else Path(f"{os.environ['TIMBERHAND_PICTURES']}/"
-                        f"plan-{size}{'-light' if light else ''}.png"))  # fmt: skip
+        browser.picture(
+            PICTURE
+            if size == "1280x800" and not light
+            else Path(f"{os.environ['TIMBERHAND_PICTURES']}/plan-{size}{'-light' if light else ''}.png")
+        )

@@ -23,7 +23,7 @@ from tests.live.console.shift_feed import CYCLE_S, HASH, PERIOD_S, PROFILE, STEP
 pytestmark = [
     pytest.mark.skipif(installed() is None, reason=MISSING),
     pytest.mark.timeout(3600),
-]  # fmt: skip
+]
 HOURS = 8.0
 DRAW_MS = 250
 """Of the computer's time; meanwhile a minute of the shift goes by."""
@@ -43,9 +43,14 @@ def shift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Fed
     with open_bus("virtual:shift") as bus:
         feed = ShiftFeed(time.monotonic_ns(), bus)
         console = FedConsole(
-            PROFILE, HASH, tmp_path / "nobody", timing_page=tmp_path / "none.timing",
-            buses={PROFILE.crane_bus: "virtual:shift"}, clock=lambda: feed.now_ns, feed=feed,
-        )  # fmt: skip
+            PROFILE,
+            HASH,
+            tmp_path / "nobody",
+            timing_page=tmp_path / "none.timing",
+            buses={PROFILE.crane_bus: "virtual:shift"},
+            clock=lambda: feed.now_ns,
+            feed=feed,
+        )
         with served(create_app(console)) as url:
             browser = Browser(tmp_path, (1280, 800), solid=True)
             try:

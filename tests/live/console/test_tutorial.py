@@ -61,9 +61,13 @@ def drive(folder: Path) -> None:
     """Drive it in virtual time; two logs end in the bunk by the plant's physics."""
     command = ["mission", "run", "missions/mission.geojson", "--lockstep", "--out", "runs/first"]
     done = subprocess.run(
-        [sys.executable, "-m", "timberhand", *command], cwd=folder, capture_output=True, text=True, timeout=LOADED_S,
+        [sys.executable, "-m", "timberhand", *command],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=LOADED_S,
         stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((folder / "runs" / "first" / "summary.json").read_text())
     assert (summary["loaded"], summary["in_bunk"], summary["finished"]) == (2, 2, True)
@@ -77,8 +81,10 @@ def replay(folder: Path, tmp_path: Path) -> None:
         opened(started, browser)
         browser.until("document.body?.dataset.recording === 'yes'")
         browser.click("tab-timeline")
-        browser.wait(lambda: "Loaded" in browser.text("panel-timeline") or "ACTIVE" in browser.text("panel-timeline"),
-                     "the modes in the timeline")  # fmt: skip
+        browser.wait(
+            lambda: "Loaded" in browser.text("panel-timeline") or "ACTIVE" in browser.text("panel-timeline"),
+            "the modes in the timeline",
+        )
         browser.value(
             "(bar => { bar.value = bar.max * 0.75; bar.dispatchEvent(new Event('change')); })"
             "(document.querySelector('.scrub'))"

@@ -27,8 +27,10 @@ def run(script: str, *arguments: object) -> str:
     """A script's answer; skips by its own sentence when a tool or the network is missing."""
     done = subprocess.run(
         ["sh", ROOT / "deploy" / "arm64" / script, *map(str, arguments)],
-        env={**os.environ, "PYTHON": sys.executable}, capture_output=True, text=True,
-    )  # fmt: skip
+        env={**os.environ, "PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+    )
     if done.returncode == TOOL_MISSING:
         pytest.skip(done.stderr.strip().splitlines()[-1])
     assert done.returncode == 0, done.stdout + done.stderr[-2000:]

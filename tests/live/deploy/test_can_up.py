@@ -18,13 +18,17 @@ case "$*" in *" show "*) [ -z "$LINK" ] && exit 1; echo "$LINK"; exit 0 ;; esac
 case " $REFUSES " in *" $5 "*) exit 2 ;; esac
 """
 REAL: dict[str, Any] = {
-    "ifname": "can0", "flags": ["NOARP"], "link_type": "can",
+    "ifname": "can0",
+    "flags": ["NOARP"],
+    "link_type": "can",
     "linkinfo": {"info_kind": "can", "info_data": {"restart_ms": 0, "bittiming": {"bitrate": 500000, "tq": 100}}},
-}  # fmt: skip
+}
 RUNNING: dict[str, Any] = {
-    "ifname": "can0", "flags": ["NOARP", "UP", "LOWER_UP"], "link_type": "can",
+    "ifname": "can0",
+    "flags": ["NOARP", "UP", "LOWER_UP"],
+    "link_type": "can",
     "linkinfo": {"info_kind": "can", "info_data": {"restart_ms": 100, "bittiming": {"bitrate": 1000000, "tq": 50}}},
-}  # fmt: skip
+}
 VIRTUAL: dict[str, Any] = {"ifname": "can0", "flags": ["NOARP"], "link_type": "can", "linkinfo": {"info_kind": "vcan"}}
 SETTINGS = {"CRANE_BUS": "socketcan:can0", "CRANE_BITRATE": "1000000", "MACHINE_BUS": "", "CAN_WAIT_S": "0"}
 
@@ -108,8 +112,16 @@ def test_every_refusal_is_one_sentence(can_up, bus, link, settings, status, name
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is missing (apt-get install shellcheck)")
 @pytest.mark.parametrize(
     "name",
-    ["install.sh", "audit.sh", "system/can-up", "system/service-ended", "deb/build.sh", "deb/postinst", "deb/prerm",
-     "../host/service_lab/init.sh"],
-)  # fmt: skip
+    [
+        "install.sh",
+        "audit.sh",
+        "system/can-up",
+        "system/service-ended",
+        "deb/build.sh",
+        "deb/postinst",
+        "deb/prerm",
+        "../host/service_lab/init.sh",
+    ],
+)
 def test_scripts_are_clean(name: str) -> None:
     subprocess.run(["shellcheck", str(SCRIPT.parents[1] / name)], check=True)

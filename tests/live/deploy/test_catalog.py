@@ -23,9 +23,7 @@ def test_systemd_reads_the_catalog(tmp_path: Path) -> None:
     shutil.copy(CATALOG, folder)
 
     def journalctl(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            ["journalctl", f"--root={tmp_path}", *words], capture_output=True, text=True, check=False
-        )  # fmt: skip
+        return subprocess.run(["journalctl", f"--root={tmp_path}", *words], capture_output=True, text=True, check=False)
 
     made = journalctl("--update-catalog")
     assert made.returncode == 0 and not made.stderr, made.stderr

@@ -83,8 +83,9 @@ def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -
     release = f"0.1.0-{hashlib.sha256(wheel.read_bytes()).hexdigest()[:12]}"
     assert os.readlink(root / "opt/timberhand/current") == f"releases/{release}"
     assert json.loads((root / "opt/timberhand/current/release.json").read_text()) == {
-        "name": release, "version": "0.1.0",
-    }  # fmt: skip
+        "name": release,
+        "version": "0.1.0",
+    }
     program = root / "opt/timberhand/current/bin/python"
     said = subprocess.run([program, "-P", "-m", "controller"], cwd="/", capture_output=True, text=True, check=True)
     assert said.stdout == "here\n"
@@ -109,8 +110,11 @@ def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -
     (units_of / units[0]).unlink()
     mended = subprocess.run(  # by the installed program itself, which keeps the packages that it was given
         [program, "-P", "-m", "deploy", *from_wheel[:2], "--python", sys.executable, "--find-links", root],
-        capture_output=True, text=True, check=False, cwd="/",
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd="/",
+    )
     assert mended.returncode == 0, mended.stderr
     assert files(root) == there
     assert install(*words, "--cpu", "0").returncode == 0

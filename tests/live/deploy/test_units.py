@@ -33,9 +33,16 @@ CONF = dict(
     if not line.startswith("#") and line
 )
 EXPOSURE = {
-    "controller": 1.3, "guard": 1.0, "autonomy": 1.0, "recorder": 1.1, "console": 1.1, "plc": 1.4, "can@": 1.1,
-    "update": 1.2, "perception": 1.5,
-}  # fmt: skip
+    "controller": 1.3,
+    "guard": 1.0,
+    "autonomy": 1.0,
+    "recorder": 1.1,
+    "console": 1.1,
+    "plc": 1.4,
+    "can@": 1.1,
+    "update": 1.2,
+    "perception": 1.5,
+}
 """Exposure of each unit by systemd-analyze, of 10; at most 1.5."""
 CREDENTIALS = "/run/credentials"
 
@@ -80,8 +87,10 @@ def words(unit: Path, **settings: str) -> list[str]:
 def test_the_security_exposure_of_every_unit_is_small(unit: Path) -> None:
     done = subprocess.run(
         ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(unit)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     level = re.search(r"Overall exposure level for .*: ([\d.]+)", done.stdout)
     assert level, done.stderr
     assert float(level[1]) <= EXPOSURE[short(unit)] <= 1.5, done.stdout
@@ -146,14 +155,18 @@ def test_the_camera_answers_where_planner_and_page_ask() -> None:
 def test_page_and_planner_share_the_folder_of_missions_as_the_settings_show() -> None:
     """The page owns it, the planner is in its group and may read what the page saves, and nobody else sees it."""
     unit, text = DEPLOY / "units", (DEPLOY / "timberhand.conf").read_text()
-    shown = {name: re.findall(rf"^#   {name}=(--(?:missions|planner) .*)$", text, re.MULTILINE)[0]
-             for name in ("AUTONOMY_OPTIONS", "CONSOLE_OPTIONS")}  # fmt: skip
+    shown = {
+        name: re.findall(rf"^#   {name}=(--(?:missions|planner) .*)$", text, re.MULTILINE)[0]
+        for name in ("AUTONOMY_OPTIONS", "CONSOLE_OPTIONS")
+    }
     planner = autonomy_arguments(words(unit / "timberhand-autonomy.service", **shown)[3:])
     page = console_command_line().parse_args(words(unit / "timberhand-console.service", **shown)[3:])
     assert page.missions == planner.missions and page.planner == f"127.0.0.1:{planner.order_port}"
     assert 24700 <= planner.order_port <= 24799 and str(planner.order_port) not in CONF.values()
-    console, users = unit / "timberhand-console.service", [setting(unit / f"timberhand-{name}.service", "User")[0]
-                                                           for name in ("console", "autonomy")]  # fmt: skip
+    console, users = (
+        unit / "timberhand-console.service",
+        [setting(unit / f"timberhand-{name}.service", "User")[0] for name in ("console", "autonomy")],
+    )
     made = f"+/usr/bin/install -d -o {users[0]} -g {users[1]} -m 2750 {page.missions}"
     assert setting(console, "ExecStartPre") == [made]
     assert setting(console, "ReadWritePaths") == [f"-{page.missions}"]

@@ -49,8 +49,11 @@ def build(tmp_path: Path, compiled: str) -> Path:
     environment = os.environ | {"TIMBERHAND_COMPILE": compiled}
     made = subprocess.run(
         [*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", wheels, source],
-        env=environment, cwd=source, capture_output=True, text=True,
-    )  # fmt: skip
+        env=environment,
+        cwd=source,
+        capture_output=True,
+        text=True,
+    )
     assert made.returncode == 0, made.stderr[-2000:]
     (wheel,) = wheels.iterdir()
     return wheel
@@ -60,8 +63,11 @@ def answer(target: Path, **environment: str) -> list[str]:
     """What a controller from the installed wheel answers; the other packages are those of this environment."""
     done = subprocess.run(
         [sys.executable, "-S", "-c", ANSWER, sysconfig.get_path("purelib")],
-        env={**os.environ, "PYTHONPATH": str(target), **environment}, cwd=target, capture_output=True, text=True,
-    )  # fmt: skip
+        env={**os.environ, "PYTHONPATH": str(target), **environment},
+        cwd=target,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout.split()
 

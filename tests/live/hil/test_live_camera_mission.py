@@ -27,12 +27,33 @@ def test_three_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path) -> Non
     path, out = mission_file(tmp_path / "mission.geojson", *LOGS), tmp_path / "run"
     done = subprocess.run(
         [
-            sys.executable, "-m", "host.vcan_lab", "--time-travel", "--mem", "3072", "--",
-            sys.executable, "-m", "timberhand", "mission", "run", path, "--bus", "wire", "--detector", "own",
-            "--no-console", "--out", out,
+            sys.executable,
+            "-m",
+            "host.vcan_lab",
+            "--time-travel",
+            "--mem",
+            "3072",
+            "--",
+            sys.executable,
+            "-m",
+            "timberhand",
+            "mission",
+            "run",
+            path,
+            "--bus",
+            "wire",
+            "--detector",
+            "own",
+            "--no-console",
+            "--out",
+            out,
         ],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])
     told = json.loads((out / "summary.json").read_text())
     assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 3

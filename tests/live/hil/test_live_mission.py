@@ -59,8 +59,12 @@ def test_a_log_is_loaded_although_the_planner_freezes_on_the_route(tmp_path: Pat
     path, out = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0)), tmp_path / "run"
     done = subprocess.run(
         [sys.executable, "-m", "host.vcan_lab", "--time-travel", "--", sys.executable, "-c", FROZEN, path, out],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])
     told = json.loads((out / "summary.json").read_text())
     assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 1

@@ -64,8 +64,16 @@ def test_what_is_not_authenticated_on_a_network_is_warned_of(tmp_path: Path) -> 
     """There is no bus here, so it ends after the warning."""
     profile = str(write_plc_profile("palms_471", "valves", tmp_path))
     for link in (["--udp", "192.0.2.1:1503", "--no-key"], ["--modbus", "192.0.2.1:502"]):
-        done = run("controller.plc", "--profile", profile, "--bus", "crane0=wire:none", *link, "--allow-network",
-                   TIMBERHAND_WIRE_DIR=str(tmp_path))  # fmt: skip
+        done = run(
+            "controller.plc",
+            "--profile",
+            profile,
+            "--bus",
+            "crane0=wire:none",
+            *link,
+            "--allow-network",
+            TIMBERHAND_WIRE_DIR=str(tmp_path),
+        )
         assert done.returncode == 4 and "warning" in done.stderr
     done = run("controller.plc", "--profile", profile, "--modbus", "127.0.0.1:502", "--key-file", str(tmp_path / "key"))
     assert done.returncode == 2 and "Modbus" in done.stderr
@@ -89,11 +97,22 @@ def test_the_bridge_reports_its_status_to_systemd_although_no_plc_answers(tmp_pa
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(20.0)
         bridge = subprocess.Popen(
-            [sys.executable, "-m", "controller.plc", "--profile", profile, "--bus", "crane0=wire:crane0",
-             "--modbus", "127.0.0.1:1", "--no-realtime"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            [
+                sys.executable,
+                "-m",
+                "controller.plc",
+                "--profile",
+                profile,
+                "--bus",
+                "crane0=wire:crane0",
+                "--modbus",
+                "127.0.0.1:1",
+                "--no-realtime",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
             env=os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify"), "TIMBERHAND_WIRE_DIR": str(tmp_path)},
-        )  # fmt: skip
+        )
         try:
             first = systemd.recv(4096).decode()
             assert first.startswith("READY=1\nWATCHDOG=1\nSTATUS=") and "PLC" in first and "ACTIVE" in first

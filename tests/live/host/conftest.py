@@ -19,6 +19,6 @@ def lab() -> Iterator[Run]:
     def run(*arguments: str, cwd: Path = ROOT, **env: str) -> subprocess.CompletedProcess[bytes]:
         return subprocess.run(
             [*LAB, *arguments], cwd=cwd, env=environment(**env), capture_output=True, timeout=100, check=False
-        )  # fmt: skip
+        )
 
     yield run

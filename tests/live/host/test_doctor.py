@@ -25,7 +25,7 @@ def test_this_installation_has_no_fault() -> None:
 def test_the_command_answers_in_json() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "timberhand", "doctor", "--rt", "--json"], cwd=ROOT, capture_output=True, text=True
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert set(told) == {"installation", "timing"}

@@ -27,8 +27,11 @@ def test_the_control_loop_runs_on_a_real_time_kernel_and_the_valves_are_neutral_
         pytest.skip(f"rt lab: {reason}")
     done = subprocess.run(
         [sys.executable, "-m", "host.rt_lab", "--timeout", "600"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.stdout, done.stderr
     result = json.loads(done.stdout)
     assert result["failed"] == [], done.stderr

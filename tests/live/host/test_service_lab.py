@@ -20,8 +20,11 @@ def test_the_valves_are_neutral_after_every_failure_of_controller_guard_and_bus(
         pytest.skip(f"service lab: {fault}")
     done = subprocess.run(
         [sys.executable, "-m", "host.service_lab", "--timeout", "2100"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.stdout, done.stderr
     result = json.loads(done.stdout)
     assert result["failed"] == [], done.stderr

@@ -76,8 +76,10 @@ def test_a_lab_leaves_nothing_behind(number: signal.Signals, tmp_path: Path) -> 
     temporary.mkdir()
     wrapper = subprocess.Popen(
         [*LAB, "--", "sh", "-c", "echo up; while :; do :; done"],
-        cwd=ROOT, env=environment(TMPDIR=str(temporary)), stdout=subprocess.PIPE,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment(TMPDIR=str(temporary)),
+        stdout=subprocess.PIPE,
+    )
     assert wrapper.stdout and wrapper.stdout.readline() == b"up\n"
     below = descendants(wrapper.pid)
     assert len(below) >= (4 if way == "uml" else 2)
@@ -92,8 +94,11 @@ def test_a_killed_user_mode_kernel_is_reported(tmp_path: Path) -> None:
         pytest.skip("this machine's kernel has CAN")
     wrapper = subprocess.Popen(
         [*LAB, "--", "sh", "-c", "echo up; while :; do :; done"],
-        cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
     assert wrapper.stdout and wrapper.stdout.readline() == b"up\n"
     below = descendants(wrapper.pid)
     kernel = eldest_child(eldest_child(wrapper.pid))  # of the keeper, which is the wrapper's
@@ -132,7 +137,7 @@ def test_a_command_that_ends_at_once_is_reported() -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=ROOT, env=environment(), capture_output=True, timeout=TIMEOUT_S, check=True
-    )  # fmt: skip
+    )
     assert b'{"exit": 7}' in done.stdout
 
 

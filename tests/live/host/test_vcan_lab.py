@@ -63,8 +63,10 @@ def test_files_written_inside_appear_on_the_host(lab: Run, tmp_path: Path) -> No
     )
     beside = subprocess.Popen(
         [*LAB, "--", "sh", "-c", "echo beside > beside.txt; ip -brief link"],
-        cwd=odd, env=environment(), stdout=subprocess.PIPE,
-    )  # fmt: skip
+        cwd=odd,
+        env=environment(),
+        stdout=subprocess.PIPE,
+    )
     done = lab("--", "sh", "-c", script, cwd=odd, TMPDIR=str(odd))
     assert b"vcan1" in beside.communicate(timeout=TIMEOUT_S)[0]
     made = Path(os.fsdecode(done.stdout.strip()))
@@ -85,8 +87,12 @@ def test_the_shim_is_harmless_where_it_is_not_needed(lab: Run, tmp_path: Path) -
     cache = tmp_path / "a cache: odd"
     done = subprocess.run(
         [sys.executable, "-c", wrapper, sys.executable, "-c", "print(sum(i * 0.5 for i in range(1000)))"],
-        cwd=ROOT, env=environment(XDG_CACHE_HOME=str(cache)), capture_output=True, timeout=60, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment(XDG_CACHE_HOME=str(cache)),
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
     assert (done.returncode, done.stdout) == (0, b"249750.0\n"), done.stderr
     assert [path.name for path in (cache / "timberhand").iterdir()] == ["xstate_shim.so"]
 
@@ -113,8 +119,12 @@ def test_without_kernel_support_and_without_the_package_the_exit_status_is_4(tmp
 def test_without_the_own_kernel_simulated_time_is_refused_in_one_sentence(tmp_path: Path) -> None:
     done = subprocess.run(
         [*LAB, "--time-travel", "--", "true"],
-        cwd=ROOT, env=environment(XDG_CACHE_HOME=str(tmp_path)), capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment(XDG_CACHE_HOME=str(tmp_path)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, done.stdout) == (4, "")
     assert done.stderr.count("\n") == 1 and "[lab.no-lab-kernel]" in done.stderr
 
@@ -126,10 +136,15 @@ def test_an_hour_of_simulated_time_is_short_and_reproducible() -> None:
     runs = [
         subprocess.run(
             [*LAB, "--time-travel", "--", sys.executable, "-B", "-c", script],
-            cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=TIMEOUT_S, check=True,
+            cwd=ROOT,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=True,
         ).stdout.split()
         for _ in range(2)
-    ]  # fmt: skip
+    ]
     assert runs[0] == runs[1]
     assert 3_600_000 <= int(runs[0][1]) - int(runs[0][0]) // 1_000_000 <= 3_600_001
 
@@ -144,11 +159,23 @@ def test_the_live_bus_tests_pass_in_the_lab(lab: Run) -> None:
     way = require_lab()
     with TemporaryDirectory(prefix="lab") as short:  # sockets' paths are limited to 107 bytes, and tmp_path is deep
         done = lab(
-            "--timeout", "80", "--root", "--",
-            sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--basetemp={short}/inside",
-            "tests/live/vcan", "tests/live/hil/test_bus_contract.py", "tests/live/hil/test_kernel_bus.py",
-            "-k", "vcan or socketcan or kernel or link",
-        )  # fmt: skip
+            "--timeout",
+            "80",
+            "--root",
+            "--",
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            f"--basetemp={short}/inside",
+            "tests/live/vcan",
+            "tests/live/hil/test_bus_contract.py",
+            "tests/live/hil/test_kernel_bus.py",
+            "-k",
+            "vcan or socketcan or kernel or link",
+        )
     report = done.stdout.decode()
     assert done.returncode == 0, report[-30_000:] + done.stderr.decode()
     if way == "uml":  # root, FIFO and every interface are there: nothing but foreign tools may be missing

@@ -53,8 +53,13 @@ kill $!
 def test_the_journal_keeps_the_fields_and_explains_the_stop(tmp_path: Path) -> None:
     done = subprocess.run(
         ["unshare", "--mount", "--propagation", "private", "sh", "-c", SCRIPT, "sh", str(tmp_path / "json")],
-        capture_output=True, text=True, check=False, timeout=60, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
     assert done.returncode == 0, done.stderr
     entry = json.loads((tmp_path / "json").read_text())
     assert entry["TIMBERHAND_CODE"] == "ENCODER_LOST" and entry["PRIORITY"] == "3"

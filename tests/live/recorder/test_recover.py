@@ -47,10 +47,23 @@ class Process:
     def __init__(self, out):
         self.out, self.ticks = out, out / "controller.ticks"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "recorder", "--out", out, "--ticks", str(self.ticks), "--report-port",
-             str(free_port()), "--bus", "crane0=virtual:recorder-test"],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "recorder",
+                "--out",
+                out,
+                "--ticks",
+                str(self.ticks),
+                "--report-port",
+                str(free_port()),
+                "--bus",
+                "crane0=virtual:recorder-test",
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         assert "ready" in self.process.stdout.readline()
         self.ring = RecordRing(self.ticks)
         self.sent = []
@@ -146,7 +159,10 @@ def test_unusable_arguments_are_reported_at_once(tmp_path, code, arguments):
     arguments = [str(tmp_path) if a == "OUT" else a for a in arguments]
     done = subprocess.run(
         [sys.executable, "-m", "recorder", "--report-port", "0", *arguments],
-        capture_output=True, text=True, timeout=30, env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=30,
+        env={**os.environ, "COLUMNS": "200"},
+    )
     assert done.returncode == code and "Traceback" not in done.stderr
     assert done.stderr.strip().splitlines()[-1].count("recorder: ") >= 1

@@ -39,8 +39,10 @@ def recorder_process(directory: Path, name: str) -> Iterator[subprocess.Popen[st
     words += ["--stops", directory / "stops"]
     with subprocess.Popen(
         [sys.executable, "-m", "recorder", *map(str, words)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
         assert process.stdout is not None and "ready" in process.stdout.readline()
         try:
             yield process

@@ -10,9 +10,17 @@ from can_dbc.messages.rgbd import REQUEST_HEADER, RgbdMessage, encode, request_n
 
 WIDTH, HEIGHT = 64, 48
 PICTURE = RgbdMessage(
-    "d435", 1, WIDTH, HEIGHT, 40.0, 40.0, 32.0, 24.0, bytes([7]) * (3 * WIDTH * HEIGHT),
+    "d435",
+    1,
+    WIDTH,
+    HEIGHT,
+    40.0,
+    40.0,
+    32.0,
+    24.0,
+    bytes([7]) * (3 * WIDTH * HEIGHT),
     (1500).to_bytes(2, "little") * (WIDTH * HEIGHT),
-)  # fmt: skip
+)
 
 
 def serve(client: Any) -> None:

@@ -30,8 +30,11 @@ def client(*arguments: str, seconds: float = 120.0) -> list[dict[str, Any]]:
     """The lines that a client prints; it may kill itself."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.live.ros2.wire_client", str(DOMAIN), *arguments],
-        capture_output=True, text=True, timeout=seconds, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=seconds,
+        check=False,
+    )
     assert done.returncode in (0, -signal.SIGKILL), done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
 
@@ -146,8 +149,9 @@ def test_a_bridge_that_is_ended_stops_the_crane_first(machine: Machine) -> None:
     before = machine.slew()
     running = subprocess.Popen(
         [sys.executable, "-m", "tests.live.ros2.wire_client", str(DOMAIN), "go", str(before - 0.6), "16"],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     goals = sum(e["event"] == "goal" for e in machine.events)
     machine.until(lambda: sum(e["event"] == "goal" for e in machine.events) > goals, 60.0)
     time.sleep(2.0)

@@ -154,9 +154,13 @@ def go(wire: Wire, slew: float, seconds: float, ending: str) -> None:
     statuses += [s.status for array in status.take(10) for s in array.status_list[-1:]]
     last = plain(heard[-1].feedback) if heard else None
     say(
-        status=done.status, code=done.result.error_code, text=done.result.error_string, feedbacks=len(heard),
-        last=last, statuses=statuses,
-    )  # fmt: skip
+        status=done.status,
+        code=done.result.error_code,
+        text=done.result.error_string,
+        feedbacks=len(heard),
+        last=last,
+        statuses=statuses,
+    )
 
 
 def main() -> None:

@@ -31,7 +31,9 @@ def test_an_envelope_without_a_seal_stops_a_run_with_one_sentence(profile: Path,
     envelope.write_text(re.sub(r"# sha256: .*", "", envelope.read_text()))
     done = subprocess.run(
         [sys.executable, "-m", "timberhand", "demo", "--lockstep", "--profile", profile, "--out", tmp_path / "run"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == ExitCode.CONFIGURATION, done.stderr
     assert "Traceback" not in done.stderr and "controller.guard.seal" in done.stderr and "[guard." in done.stderr

@@ -46,9 +46,12 @@ def heard(controller: socket.socket) -> OperatorCommand:
 def start(word: str, path: str, terminal: int | None = None, *more: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-m", "timberhand", "operator", word, "--operator", path, *more],
-        stdin=terminal, stdout=terminal, stderr=subprocess.PIPE, start_new_session=True,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # nohup hands an ignored one down
-    )  # fmt: skip
+    )
 
 
 class Terminal:

@@ -121,8 +121,10 @@ def state_becomes(bus: Bus, state: BusState) -> None:
 def test_states_of_the_can_controller_are_reported_with_their_counters(adapter: Adapter) -> None:
     with open_bus(f"socketcan:{adapter.link}") as bus:
         for state, wanted, errors in (
-            ("w", BusState.WARNING, 100), ("p", BusState.PASSIVE, 130), ("a", BusState.ACTIVE, 5),
-        ):  # fmt: skip
+            ("w", BusState.WARNING, 100),
+            ("p", BusState.PASSIVE, 130),
+            ("a", BusState.ACTIVE, 5),
+        ):
             adapter.report(state, tx_errors=errors)
             state_becomes(bus, wanted)
             assert bus.stats.tx_errors == errors

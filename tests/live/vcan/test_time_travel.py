@@ -128,7 +128,7 @@ def travel() -> Callable[..., subprocess.CompletedProcess[str]]:
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         return subprocess.run(
             [*lab, *map(str, words)], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-        )  # fmt: skip
+        )
 
     return run
 

@@ -61,10 +61,22 @@ class Run:
         key_file = write_key(directory / "key")
         self.pilot = Pilot(PROFILE, SETPOINTS, directory / "operator", REPORTS, BUS, read_key(key_file))
         self.start(
-            "controller", sys.executable, "-m", "controller", *bus, "--setpoint-port", str(SETPOINTS),
-            "--report", f"127.0.0.1:{REPORTS}", "--timing", str(directory / "timing"),
-            "--operator", str(directory / "operator"), "--key-file", str(key_file),
-        )  # fmt: skip
+            "controller",
+            sys.executable,
+            "-m",
+            "controller",
+            *bus,
+            "--setpoint-port",
+            str(SETPOINTS),
+            "--report",
+            f"127.0.0.1:{REPORTS}",
+            "--timing",
+            str(directory / "timing"),
+            "--operator",
+            str(directory / "operator"),
+            "--key-file",
+            str(key_file),
+        )
 
     def start(self, name: str, *command: str, out: str = "") -> None:
         """Start a process; what it says goes into files."""

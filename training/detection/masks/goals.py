@@ -48,8 +48,11 @@ def goals(w: Windows) -> Goals:
     loose = (blocks == WOOD).any(-1)
     ids = torch.where(blocks >= WOOD, torch.zeros_like(blocks), blocks).amax(-1).long()
     share = ((blocks > 0) & (blocks != 255)).float().mean(-1)
-    masks = F.one_hot(ids, 256)[..., 1 : MAX_LOGS + 1].permute(0, 3, 1, 2).float() if h < 64 else torch.stack(
-        [(ids == k).float() for k in range(1, MAX_LOGS + 1)], 1)  # fmt: skip
+    masks = (
+        F.one_hot(ids, 256)[..., 1 : MAX_LOGS + 1].permute(0, 3, 1, 2).float()
+        if h < 64
+        else torch.stack([(ids == k).float() for k in range(1, MAX_LOGS + 1)], 1)
+    )
     masks = masks * (~ignored)[:, None]
     counts = masks.sum((2, 3))
     line = torch.arange(h, device=device, dtype=torch.float32) * STRIDE + 0.5 * (STRIDE - 1)

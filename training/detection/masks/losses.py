@@ -24,8 +24,11 @@ def loss(
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The loss of a batch, and its parts for the record."""
     maps, kernels = out["maps"].float(), out["kernels"].float()
-    parts = {"maps": maps_loss(maps, g), "heat": heat_loss(kernels[:, 0], g),
-             "kernel": kernel_loss(maps[:, len(MAPS) :], kernels[:, 1:], g, generator)}  # fmt: skip
+    parts = {
+        "maps": maps_loss(maps, g),
+        "heat": heat_loss(kernels[:, 0], g),
+        "kernel": kernel_loss(maps[:, len(MAPS) :], kernels[:, 1:], g, generator),
+    }
     total = MAPS_SHARE * parts["maps"] + HEAT_SHARE * parts["heat"] + KERNEL_SHARE * parts["kernel"]
     return total, {name: part.detach() for name, part in parts.items()}
 

@@ -83,9 +83,15 @@ def device_of(asked: str) -> str:
 
 
 def produce(
-    folder: Path, run: Run, trunk: Path | None, photographs: Sequence[tuple[np.ndarray, np.ndarray]], device: str,
-    out: Path, command: str, console: Console,
-) -> Path:  # fmt: skip
+    folder: Path,
+    run: Run,
+    trunk: Path | None,
+    photographs: Sequence[tuple[np.ndarray, np.ndarray]],
+    device: str,
+    out: Path,
+    command: str,
+    console: Console,
+) -> Path:
     """Train on the sets of ``folder``; writes weights, card and log (JSON lines) and returns the card's path.
 
     An interrupted run continues from the checkpoint beside ``out``.
@@ -122,6 +128,9 @@ def produce(
         f"pictures (share in which they are drawn): {shares}; those with hardly any wood a third as often",
         f"{steps[0]} steps of {run.batch} windows of {run.side_px} px on {where}, AdamW with {run.learning_rate} and a "
         f"cosine, average of the weights; the trunk began {'with ' + trunk.name if trunk else 'random'}",
-        run.seed, {"loss, last record": str(last.get("loss", "none"))}, LIMITS, command,
-    )  # fmt: skip
+        run.seed,
+        {"loss, last record": str(last.get("loss", "none"))},
+        LIMITS,
+        command,
+    )
     return write(out, mask_network(), arrays, card, {}, half=True)

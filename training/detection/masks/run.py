@@ -64,10 +64,14 @@ def start_net(trunk: Mapping[str, np.ndarray] | None, seed: int) -> TorchNet:
 
 
 def train(
-    bank: Bank, run: Run, trunk: Mapping[str, np.ndarray] | None, tell: Callable[[dict[str, Any]], None],
-    keep: Callable[[dict[str, np.ndarray], int], None], more: Callable[[int], Bank | None] = lambda _: None,
+    bank: Bank,
+    run: Run,
+    trunk: Mapping[str, np.ndarray] | None,
+    tell: Callable[[dict[str, Any]], None],
+    keep: Callable[[dict[str, np.ndarray], int], None],
+    more: Callable[[int], Bank | None] = lambda _: None,
     checkpoint: Path | None = None,
-) -> dict[str, np.ndarray]:  # fmt: skip
+) -> dict[str, np.ndarray]:
     """Train; returns the averaged arrays.
 
     ``tell`` gets a record now and then, ``keep`` the averaged arrays; ``more`` may replace the pictures.
@@ -95,8 +99,15 @@ def train(
 
     def note() -> None:
         if checkpoint is not None:
-            state = {"run": identity, "step": step, "s": time.monotonic() - began, "net": net.state_dict(),
-                     "optimiser": optimiser.state_dict(), "mean": mean, "chance": generator.get_state()}  # fmt: skip
+            state = {
+                "run": identity,
+                "step": step,
+                "s": time.monotonic() - began,
+                "net": net.state_dict(),
+                "optimiser": optimiser.state_dict(),
+                "mean": mean,
+                "chance": generator.get_state(),
+            }
             draft = checkpoint.with_name(checkpoint.name + ".part")
             torch.save(state, draft)
             draft.replace(checkpoint)
@@ -142,8 +153,10 @@ def train(
             sums["n"] = sums.get("n", 0) + 1
             now = time.monotonic() - began
             if now - told > 5.0 or step == run.steps:
-                tell({"step": step, "s": round(now, 1), "rate": rate, "pictures": len(bank)} | {
-                    k: round(float(v) / sums["n"], 4) for k, v in sums.items() if k != "n"})  # fmt: skip
+                tell(
+                    {"step": step, "s": round(now, 1), "rate": rate, "pictures": len(bank)}
+                    | {k: round(float(v) / sums["n"], 4) for k, v in sums.items() if k != "n"}
+                )
                 sums, told = {}, now
             if now - kept > 60.0:
                 keep(_arrays(net, mean), step)
@@ -156,9 +169,13 @@ def train(
 
 
 def _continued(
-    checkpoint: Path | None, name: str, net: TorchNet, optimiser: torch.optim.Optimizer,
-    mean: dict[str, torch.Tensor], generator: torch.Generator,
-) -> tuple[int, float]:  # fmt: skip
+    checkpoint: Path | None,
+    name: str,
+    net: TorchNet,
+    optimiser: torch.optim.Optimizer,
+    mean: dict[str, torch.Tensor],
+    generator: torch.Generator,
+) -> tuple[int, float]:
     """Step and seconds of an interrupted run, whose state is restored; 0 without one."""
     if checkpoint is None or not checkpoint.is_file():
         return 0, 0.0

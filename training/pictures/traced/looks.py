@@ -15,8 +15,16 @@ from typing import Any, Final
 Look = dict[str, Any]
 Tones = list[list[float]]
 
-BARKS: Final = {"scaly": 2.0, "plated": 2.0, "furrowed": 2.5, "birch": 2.2, "smooth": 1.3, "peeled": 1.0, "photo": 1.5,
-    "wild": 2.5}  # fmt: skip
+BARKS: Final = {
+    "scaly": 2.0,
+    "plated": 2.0,
+    "furrowed": 2.5,
+    "birch": 2.2,
+    "smooth": 1.3,
+    "peeled": 1.0,
+    "photo": 1.5,
+    "wild": 2.5,
+}
 """Kinds of bark and how often they are drawn."""
 TONES: Final[dict[str, Sequence[Tones]]] = {
     "scaly": (
@@ -55,14 +63,14 @@ TONES: Final[dict[str, Sequence[Tones]]] = {
         [[0.3, 0.28, 0.25], [0.12, 0.1, 0.08], [0.05, 0.04, 0.035]],
         [[0.07, 0.05, 0.04], [0.09, 0.07, 0.055], [0.12, 0.095, 0.075]],
     ),
-}  # fmt: skip
+}
 ENDS: Final[Sequence[Tones]] = (
     [[0.42, 0.28, 0.15], [0.62, 0.46, 0.28], [0.5, 0.3, 0.16]],
     [[0.5, 0.38, 0.23], [0.72, 0.58, 0.4], [0.62, 0.45, 0.28]],
     [[0.3, 0.17, 0.09], [0.46, 0.29, 0.17], [0.28, 0.13, 0.07]],
     [[0.2, 0.18, 0.155], [0.34, 0.31, 0.28], [0.22, 0.19, 0.16]],
     [[0.5, 0.25, 0.1], [0.68, 0.42, 0.2], [0.45, 0.18, 0.07]],
-)  # fmt: skip
+)
 SOILS: Final[dict[str, Sequence[Tones]]] = {
     "earth": (
         [[0.02, 0.015, 0.01], [0.07, 0.05, 0.025], [0.05, 0.065, 0.02], [0.12, 0.1, 0.06]],
@@ -86,20 +94,22 @@ SOILS: Final[dict[str, Sequence[Tones]]] = {
     ),
     "photo": ([[0.04, 0.03, 0.02], [0.11, 0.09, 0.06], [0.22, 0.19, 0.14]],),
     "wild": (
-        [[0.03, 0.025, 0.02], [0.12, 0.1, 0.07], [0.3, 0.26, 0.2]], [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]],
+        [[0.03, 0.025, 0.02], [0.12, 0.1, 0.07], [0.3, 0.26, 0.2]],
+        [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]],
         [[0.02, 0.03, 0.01], [0.1, 0.07, 0.04], [0.3, 0.3, 0.15]],
     ),
-}  # fmt: skip
+}
 MOSS: Final[Sequence[Tones]] = ([[0.025, 0.05, 0.01], [0.1, 0.15, 0.03]], [[0.05, 0.07, 0.015], [0.22, 0.24, 0.06]])
 GREENS: Final[Sequence[Tones]] = (
     [[0.03, 0.06, 0.01], [0.1, 0.17, 0.03], [0.22, 0.26, 0.07]],
     [[0.05, 0.08, 0.01], [0.18, 0.2, 0.05], [0.3, 0.25, 0.1]],
     [[0.2, 0.14, 0.06], [0.4, 0.32, 0.16], [0.55, 0.46, 0.27]],
-)  # fmt: skip
+)
 WOODS: Final[Sequence[Tones]] = (
-    [[0.03, 0.022, 0.016], [0.16, 0.12, 0.09]], [[0.09, 0.08, 0.07], [0.36, 0.33, 0.3]],
+    [[0.03, 0.022, 0.016], [0.16, 0.12, 0.09]],
+    [[0.09, 0.08, 0.07], [0.36, 0.33, 0.3]],
     [[0.06, 0.03, 0.02], [0.28, 0.16, 0.1]],
-)  # fmt: skip
+)
 
 
 def varied(tones: Tones, rng: random.Random, spread: float = 0.2) -> Tones:
@@ -111,9 +121,16 @@ def varied(tones: Tones, rng: random.Random, spread: float = 0.2) -> Tones:
 
 def wild(rng: random.Random) -> list[float]:
     """Stretches, sizes and thresholds of a surface that nobody named."""
-    return [math.exp(rng.uniform(-3.0, 2.5)), rng.choice((0.0, 0.05, 0.2)), math.exp(rng.uniform(-1.2, 1.2)),
-            math.exp(rng.uniform(-2.0, 0.5)), math.exp(rng.uniform(-2.5, 2.5)), rng.choice((0.0, 0.0, 0.5, 1.0)),
-            math.exp(rng.uniform(-1.0, 0.8)), rng.uniform(0.02, 0.3)]  # fmt: skip
+    return [
+        math.exp(rng.uniform(-3.0, 2.5)),
+        rng.choice((0.0, 0.05, 0.2)),
+        math.exp(rng.uniform(-1.2, 1.2)),
+        math.exp(rng.uniform(-2.0, 0.5)),
+        math.exp(rng.uniform(-2.5, 2.5)),
+        rng.choice((0.0, 0.0, 0.5, 1.0)),
+        math.exp(rng.uniform(-1.0, 0.8)),
+        rng.uniform(0.02, 0.3),
+    ]
 
 
 def bark(rng: random.Random, kind: str, snow: float, photos: Sequence[Path]) -> Look:
@@ -121,62 +138,118 @@ def bark(rng: random.Random, kind: str, snow: float, photos: Sequence[Path]) -> 
     if kind == "photo" and not photos:
         kind = "furrowed"
     look: Look = {
-        "kind": kind, "tones": varied(rng.choice(TONES[kind]), rng), "seed": rng.uniform(0.0, 80.0),
-        "scale": math.exp(rng.gauss(0.0, 0.3)), "relief": rng.uniform(0.3, 1.0),
-        "moss": rng.uniform(0.2, 1.0) if rng.random() < 0.2 else 0.0, "moss_tones": rng.choice(MOSS),
+        "kind": kind,
+        "tones": varied(rng.choice(TONES[kind]), rng),
+        "seed": rng.uniform(0.0, 80.0),
+        "scale": math.exp(rng.gauss(0.0, 0.3)),
+        "relief": rng.uniform(0.3, 1.0),
+        "moss": rng.uniform(0.2, 1.0) if rng.random() < 0.2 else 0.0,
+        "moss_tones": rng.choice(MOSS),
         "lichen": rng.uniform(0.2, 1.0) if rng.random() < 0.35 else 0.0,
         "lichen_tone": rng.choice(([0.45, 0.48, 0.42], [0.3, 0.36, 0.25], [0.5, 0.45, 0.12])),
-        "snow": snow * rng.uniform(0.3, 1.0), "wet": rng.uniform(0.3, 1.0) if rng.random() < 0.25 else 0.0,
-        "end_tones": varied(rng.choice(ENDS), rng, 0.15), "rings": rng.uniform(12.0, 40.0),
-        "heart": rng.uniform(0.0, 0.9), "dirt": rng.uniform(0.1, 0.8), "bast": rng.uniform(0.0, 1.0), "wild": wild(rng),
-    }  # fmt: skip
+        "snow": snow * rng.uniform(0.3, 1.0),
+        "wet": rng.uniform(0.3, 1.0) if rng.random() < 0.25 else 0.0,
+        "end_tones": varied(rng.choice(ENDS), rng, 0.15),
+        "rings": rng.uniform(12.0, 40.0),
+        "heart": rng.uniform(0.0, 0.9),
+        "dirt": rng.uniform(0.1, 0.8),
+        "bast": rng.uniform(0.0, 1.0),
+        "wild": wild(rng),
+    }
     if kind == "photo":
-        look |= {"image": str(rng.choice(photos)), "repeat": rng.choice((1, 1, 2)), "hue": 0.5 + rng.gauss(0.0, 0.02),
-                 "saturation": rng.uniform(0.4, 1.2), "value": math.exp(rng.gauss(0.0, 0.35))}  # fmt: skip
+        look |= {
+            "image": str(rng.choice(photos)),
+            "repeat": rng.choice((1, 1, 2)),
+            "hue": 0.5 + rng.gauss(0.0, 0.02),
+            "saturation": rng.uniform(0.4, 1.2),
+            "value": math.exp(rng.gauss(0.0, 0.35)),
+        }
     return look
 
 
 def soil(rng: random.Random, photos: Sequence[Path]) -> Look:
     """One kind of ground."""
-    kinds = {"earth": 3.0, "grassy": 1.8, "leaves": 1.5, "stones": 1.0, "needles": 1.5, "wild": 1.5,
-             "photo": 2.5 if photos else 0.0}  # fmt: skip
+    kinds = {
+        "earth": 3.0,
+        "grassy": 1.8,
+        "leaves": 1.5,
+        "stones": 1.0,
+        "needles": 1.5,
+        "wild": 1.5,
+        "photo": 2.5 if photos else 0.0,
+    }
     kind = rng.choices(list(kinds), list(kinds.values()))[0]
-    look: Look = {"kind": kind, "tones": varied(rng.choice(SOILS[kind]), rng), "scale": math.exp(rng.gauss(0.0, 0.4)),
-                  "warp": rng.choice((0.0, 0.0, 0.5, 1.5)), "wild": wild(rng)}  # fmt: skip
+    look: Look = {
+        "kind": kind,
+        "tones": varied(rng.choice(SOILS[kind]), rng),
+        "scale": math.exp(rng.gauss(0.0, 0.4)),
+        "warp": rng.choice((0.0, 0.0, 0.5, 1.5)),
+        "wild": wild(rng),
+    }
     if kind == "photo":
-        look |= {"image": str(rng.choice(photos)), "scale": rng.uniform(0.3, 0.8), "hue": 0.5 + rng.gauss(0.0, 0.025),
-                 "saturation": rng.uniform(0.5, 1.2), "value": math.exp(rng.gauss(0.0, 0.3))}  # fmt: skip
+        look |= {
+            "image": str(rng.choice(photos)),
+            "scale": rng.uniform(0.3, 0.8),
+            "hue": 0.5 + rng.gauss(0.0, 0.025),
+            "saturation": rng.uniform(0.5, 1.2),
+            "value": math.exp(rng.gauss(0.0, 0.3)),
+        }
     return look
 
 
 def ground(rng: random.Random, snow: float, photos: Sequence[Path]) -> Look:
     """The look of the ground."""
     return {
-        "first": soil(rng, photos), "second": soil(rng, photos), "seed": rng.uniform(0.0, 60.0),
-        "patch_scale": rng.uniform(0.4, 2.5), "relief": rng.uniform(0.3, 1.0), "wet": rng.choice((0.0, 0.0, 0.5, 0.9)),
-        "snow": snow, "snow_scale": rng.uniform(0.5, 2.5), "puddles": rng.random() < 0.12,
-    }  # fmt: skip
+        "first": soil(rng, photos),
+        "second": soil(rng, photos),
+        "seed": rng.uniform(0.0, 60.0),
+        "patch_scale": rng.uniform(0.4, 2.5),
+        "relief": rng.uniform(0.3, 1.0),
+        "wet": rng.choice((0.0, 0.0, 0.5, 0.9)),
+        "snow": snow,
+        "snow_scale": rng.uniform(0.5, 2.5),
+        "puddles": rng.random() < 0.12,
+    }
 
 
 def light(rng: random.Random, eye: Sequence[float], target: Sequence[float]) -> Look:
     """Sun and sky, or dusk with work lights at the camera."""
     kind = rng.choices(("sunny", "low", "overcast", "photo", "dusk"), (3.0, 1.6, 1.6, 1.6, 0.7))[0]
-    up = {"sunny": rng.uniform(18, 62), "low": rng.uniform(3, 18), "overcast": 60.0, "photo": rng.uniform(8, 60),
-          "dusk": rng.uniform(2, 6)}[kind]  # fmt: skip
+    up = {
+        "sunny": rng.uniform(18, 62),
+        "low": rng.uniform(3, 18),
+        "overcast": 60.0,
+        "photo": rng.uniform(8, 60),
+        "dusk": rng.uniform(2, 6),
+    }[kind]
     warm = max(0.0, 1.0 - up / 30.0) * rng.uniform(0.4, 1.0)
     look: Look = {
-        "sky": "nishita", "sky_strength": rng.uniform(0.12, 0.4), "elevation_rad": math.radians(up),
-        "azimuth_rad": rng.uniform(-math.pi, math.pi), "dust": rng.uniform(0.5, 4.0), "tone": [0.8, 0.86, 0.95],
-        "sun_strength": rng.uniform(2.0, 6.0), "sun_angle_rad": math.radians(rng.choice((0.5, 0.5, 2.0))),
-        "sun_tone": [1.0, 1.0 - 0.3 * warm, 1.0 - 0.6 * warm], "lamps": [],
-    }  # fmt: skip
+        "sky": "nishita",
+        "sky_strength": rng.uniform(0.12, 0.4),
+        "elevation_rad": math.radians(up),
+        "azimuth_rad": rng.uniform(-math.pi, math.pi),
+        "dust": rng.uniform(0.5, 4.0),
+        "tone": [0.8, 0.86, 0.95],
+        "sun_strength": rng.uniform(2.0, 6.0),
+        "sun_angle_rad": math.radians(rng.choice((0.5, 0.5, 2.0))),
+        "sun_tone": [1.0, 1.0 - 0.3 * warm, 1.0 - 0.6 * warm],
+        "lamps": [],
+    }
     if kind == "overcast":
         grey = rng.uniform(0.5, 1.0)
-        look |= {"sky": "flat", "tone": [grey, 1.03 * grey, grey * rng.uniform(1.0, 1.2)], "sky_strength": 1.0,
-                 "sun_strength": rng.choice((0.0, 0.5, 1.2)), "sun_angle_rad": 0.6}  # fmt: skip
+        look |= {
+            "sky": "flat",
+            "tone": [grey, 1.03 * grey, grey * rng.uniform(1.0, 1.2)],
+            "sky_strength": 1.0,
+            "sun_strength": rng.choice((0.0, 0.5, 1.2)),
+            "sun_angle_rad": 0.6,
+        }
     elif kind == "photo":
-        look |= {"sky": rng.choice(("forest", "sunrise", "sunset", "courtyard", "city")), "sky_strength": 1.0,
-                 "sun_strength": rng.choice((0.0, 1.5, 4.0))}  # fmt: skip
+        look |= {
+            "sky": rng.choice(("forest", "sunrise", "sunset", "courtyard", "city")),
+            "sky_strength": 1.0,
+            "sun_strength": rng.choice((0.0, 1.5, 4.0)),
+        }
     elif kind == "dusk":
         look |= {"sky": "flat", "tone": [0.3, 0.4, 0.7], "sky_strength": rng.uniform(0.02, 0.25), "sun_strength": 0.0}
         for _ in range(rng.choice((1, 2, 2, 3))):
@@ -198,24 +271,48 @@ def _own_sky(rng: random.Random, kind: str, look: Look, warm: float) -> Look:
     return {
         "zenith": [bright * (1.0 - 0.65 * blue), bright * (1.0 - 0.4 * blue), bright],
         "horizon": [bright * (1.2 + 1.2 * warm), bright * (1.2 + 0.4 * warm), bright * (1.2 - 0.3 * warm)],
-        "below": [0.3 * bright, 0.27 * bright, 0.22 * bright], "sun_tone": [sun * c for c in look["sun_tone"]],
-        "sun_edge": 1.7 * look["sun_angle_rad"], "glow": rng.uniform(0.0, 0.5) * (kind in ("sunny", "low")),
-        "backdrop": float(deep), "backdrop_height": rng.uniform(0.1, 0.7), "backdrop_seed": rng.uniform(0.0, 50.0),
+        "below": [0.3 * bright, 0.27 * bright, 0.22 * bright],
+        "sun_tone": [sun * c for c in look["sun_tone"]],
+        "sun_edge": 1.7 * look["sun_angle_rad"],
+        "glow": rng.uniform(0.0, 0.5) * (kind in ("sunny", "low")),
+        "backdrop": float(deep),
+        "backdrop_height": rng.uniform(0.1, 0.7),
+        "backdrop_seed": rng.uniform(0.0, 50.0),
         "trees": [bright * c for c in rng.choice(([0.1, 0.15, 0.06], [0.06, 0.09, 0.05], [0.2, 0.16, 0.08]))],
-    }  # fmt: skip
+    }
 
 
-def crowds(rng: random.Random, middle: Sequence[float], clear: list[list[float]], near: list[list[float]], snow: float,
-           photos: Sequence[Path]) -> list[Look]:  # fmt: skip
+def crowds(
+    rng: random.Random,
+    middle: Sequence[float],
+    clear: list[list[float]],
+    near: list[list[float]],
+    snow: float,
+    photos: Sequence[Path],
+) -> list[Look]:
     """What grows and lies around: ``clear`` (x, y, radius) is kept free of big things, ``near`` of stems."""
     found: list[Look] = []
 
     def add(kind: str, count: int, size_m: float, thick_m: float, tones: Tones, **more: Any) -> None:
-        found.append({
-            "kind": kind, "count": count, "size_m": size_m, "thick_m": thick_m, "tones": varied(tones, rng),
-            "shapes": 5, "parts": 14, "lean": 0.5, "scales": [0.5, 1.4], "lifts_m": [-0.005, 0.005], "clumps": False,
-            "middle_m": list(middle[:2]), "reach_m": rng.uniform(3.5, 7.0), "keep_clear_m": [], **more,
-        })  # fmt: skip
+        found.append(
+            {
+                "kind": kind,
+                "count": count,
+                "size_m": size_m,
+                "thick_m": thick_m,
+                "tones": varied(tones, rng),
+                "shapes": 5,
+                "parts": 14,
+                "lean": 0.5,
+                "scales": [0.5, 1.4],
+                "lifts_m": [-0.005, 0.005],
+                "clumps": False,
+                "middle_m": list(middle[:2]),
+                "reach_m": rng.uniform(3.5, 7.0),
+                "keep_clear_m": [],
+                **more,
+            }
+        )
 
     green = 0.35 if snow else 1.0
     if rng.random() < 0.75 * green:
@@ -233,8 +330,15 @@ def crowds(rng: random.Random, middle: Sequence[float], clear: list[list[float]]
     if rng.random() < 0.25 * green:
         add("fern", rng.randint(5, 60), rng.uniform(0.25, 0.6), 0.0, rng.choice(GREENS), parts=9, clumps=True)
     if rng.random() < 0.35:
-        add("leaves", rng.randint(20, 90), rng.uniform(0.6, 1.2), rng.uniform(0.02, 0.05), rng.choice(SOILS["leaves"]),
-            parts=60, scales=[0.8, 1.2])  # fmt: skip
+        add(
+            "leaves",
+            rng.randint(20, 90),
+            rng.uniform(0.6, 1.2),
+            rng.uniform(0.02, 0.05),
+            rng.choice(SOILS["leaves"]),
+            parts=60,
+            scales=[0.8, 1.2],
+        )
     if rng.random() < 0.75:
         add(
             "twigs",

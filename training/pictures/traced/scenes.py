@@ -60,12 +60,16 @@ def describe(pile: Pile, seed: int, assets: Assets, form: Format) -> dict[str, A
     wide = [*([x, y, r + 0.5] for x, y, r in clear), *([*v["eye_m"][:2], 1.6] for v in views)]
     wide += [[*(0.5 * (np.array(v["eye_m"][:2]) + v["target_m"][:2])).tolist(), 1.0] for v in views]
     return {
-        "version": VERSION, "pile": f"{pile.machine} {pile.number} {pile.kind}", "seed": rng.getrandbits(30),
-        "logs": [_log(log, rng, len(barks)) for log in number], "barks": barks,
+        "version": VERSION,
+        "pile": f"{pile.machine} {pile.number} {pile.kind}",
+        "seed": rng.getrandbits(30),
+        "logs": [_log(log, rng, len(barks)) for log in number],
+        "barks": barks,
         "ground": looks.ground(rng, snow, assets.grounds) | _heights(pile, growth, middle, snow, rng),
         "crowds": looks.crowds(rng, middle.tolist(), wide, clear, snow, assets.barks),
-        "boxes": _steel(pile, growth, middle, rng), "views": views,
-    }  # fmt: skip
+        "boxes": _steel(pile, growth, middle, rng),
+        "views": views,
+    }
 
 
 def log_poses(scene: Mapping[str, Any]) -> tuple[LogPose, ...]:
@@ -90,11 +94,15 @@ def _logs(pile: Pile, growth: float, rng: random.Random) -> list[LogPose]:
     longer = rng.choice((1.0, 1.0, rng.uniform(0.75, 1.7)))
     return [
         replace(
-            log, position_m=tuple(growth * x for x in log.position_m), length_m=longer * growth * log.length_m,
-            diameter_m=growth * log.diameter_m, taper_m_m=log.taper_m_m / longer, sweep_m=growth * log.sweep_m,
+            log,
+            position_m=tuple(growth * x for x in log.position_m),
+            length_m=longer * growth * log.length_m,
+            diameter_m=growth * log.diameter_m,
+            taper_m_m=log.taper_m_m / longer,
+            sweep_m=growth * log.sweep_m,
         )
         for log in logs
-    ]  # fmt: skip
+    ]
 
 
 def _loose(middle: np.ndarray, rng: random.Random) -> list[LogPose]:
@@ -122,13 +130,22 @@ def _log(log: LogPose, rng: random.Random, barks: int) -> dict[str, Any]:
     spine = np.stack([-4.0 * log.sweep_m * s * s, np.zeros_like(s), s * log.length_m], axis=1)
     radii = np.maximum(0.025, (log.diameter_m - log.taper_m_m * s * log.length_m) / 2)
     return {
-        "number": log.instance, "quaternion": list(log.quaternion), "length_m": log.length_m,
-        "diameter_m": log.diameter_m, "taper_m_m": log.taper_m_m, "sweep_m": log.sweep_m,
-        "position_m": list(log.position_m), "turn": quaternion_matrix(log.quaternion).tolist(),
-        "spine_m": spine.tolist(), "radii_m": radii.tolist(), "bark": rng.randrange(barks),
-        "oval": rng.uniform(0.0, 0.1), "bump": rng.uniform(0.004, 0.03),
-        "flare": rng.uniform(0.1, 0.4) if rng.random() < 0.2 else 0.0, "knots": rng.choice((0, 0, 3, 8)),
-    }  # fmt: skip
+        "number": log.instance,
+        "quaternion": list(log.quaternion),
+        "length_m": log.length_m,
+        "diameter_m": log.diameter_m,
+        "taper_m_m": log.taper_m_m,
+        "sweep_m": log.sweep_m,
+        "position_m": list(log.position_m),
+        "turn": quaternion_matrix(log.quaternion).tolist(),
+        "spine_m": spine.tolist(),
+        "radii_m": radii.tolist(),
+        "bark": rng.randrange(barks),
+        "oval": rng.uniform(0.0, 0.1),
+        "bump": rng.uniform(0.004, 0.03),
+        "flare": rng.uniform(0.1, 0.4) if rng.random() < 0.2 else 0.0,
+        "knots": rng.choice((0, 0, 3, 8)),
+    }
 
 
 def _heights(pile: Pile, growth: float, middle: np.ndarray, snow: float, rng: random.Random) -> dict[str, Any]:
@@ -144,8 +161,14 @@ def _heights(pile: Pile, growth: float, middle: np.ndarray, snow: float, rng: ra
         across = (at[:, None] + x0 - middle[0]) * math.cos(turn) + (at[None] + y0 - middle[1]) * math.sin(turn)
         for side in (0.0, rng.uniform(1.6, 2.2)):
             h -= rng.uniform(0.08, 0.25) * np.exp(-(((across - offset - side) / 0.3) ** 2))
-    return {"x0_m": x0, "y0_m": y0, "cell_m": CELL_M, "heights_m": h.round(4).tolist(), "finer": FINER,
-            "rough_m": rng.uniform(0.002, 0.014)}  # fmt: skip
+    return {
+        "x0_m": x0,
+        "y0_m": y0,
+        "cell_m": CELL_M,
+        "heights_m": h.round(4).tolist(),
+        "finer": FINER,
+        "rough_m": rng.uniform(0.002, 0.014),
+    }
 
 
 def _view(logs: Sequence[LogPose], number: int, rng: random.Random, form: Format) -> dict[str, Any]:
@@ -176,11 +199,20 @@ def _view(logs: Sequence[LogPose], number: int, rng: random.Random, form: Format
     c, s = math.cos(roll), math.sin(roll)
     turn = view.rotation @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return {
-        "eye_m": eye.tolist(), "target_m": target.tolist(), "turn": turn.tolist(), "focal_px": focal,
-        "cx_px": pin.cx_px, "cy_px": pin.cy_px, "width_px": size, "height_px": size, "samples": form.samples,
-        "seed": rng.getrandbits(30), "light": looks.light(rng, eye.tolist(), target.tolist()),
-        "baseline_m": rng.choice(BASELINES_M) if rng.random() < form.stereo_share else 0.0, "number": number,
-    }  # fmt: skip
+        "eye_m": eye.tolist(),
+        "target_m": target.tolist(),
+        "turn": turn.tolist(),
+        "focal_px": focal,
+        "cx_px": pin.cx_px,
+        "cy_px": pin.cy_px,
+        "width_px": size,
+        "height_px": size,
+        "samples": form.samples,
+        "seed": rng.getrandbits(30),
+        "light": looks.light(rng, eye.tolist(), target.tolist()),
+        "baseline_m": rng.choice(BASELINES_M) if rng.random() < form.stereo_share else 0.0,
+        "number": number,
+    }
 
 
 def _steel(pile: Pile, growth: float, middle: np.ndarray, rng: random.Random) -> list[dict[str, Any]]:

@@ -37,9 +37,13 @@ SAMPLES: Final = (20, 20, 28, 48)  # of a pixel, drawn for each view
 
 
 def finished(
-    light: np.ndarray, depth_m: np.ndarray, numbers: np.ndarray, scene: Mapping[str, Any], view: Mapping[str, Any],
+    light: np.ndarray,
+    depth_m: np.ndarray,
+    numbers: np.ndarray,
+    scene: Mapping[str, Any],
+    view: Mapping[str, Any],
     matched_m: np.ndarray | None,
-) -> Sample:  # fmt: skip
+) -> Sample:
     """The sample of a rendered view, whichever renderer it came from."""
     seen = view_of(view)
     ids, logs = labelled(numbers.astype(np.int16), seen, log_poses(scene))
@@ -88,9 +92,15 @@ def drawn_file(folder: Path, number: int, piles: Sequence[Pile], size_px: int) -
 
 
 def produce(
-    folder: Path, traced: Sequence[int], drawn: Sequence[int], chunks: Mapping[str, Sequence[int]], form: Format,
-    workers: int, tell: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False,
-) -> None:  # fmt: skip
+    folder: Path,
+    traced: Sequence[int],
+    drawn: Sequence[int],
+    chunks: Mapping[str, Sequence[int]],
+    form: Format,
+    workers: int,
+    tell: Callable[[str], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
     """Draw the files of these numbers in ``workers`` processes; ``stop`` ends it early."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [("traced", n) for n in traced]
@@ -174,9 +184,13 @@ def renderer(asked: str, blender_python: Path | None = None) -> str:
 
 
 def produce_sets(
-    folder: Path, plan: SetPlan, which: str, workers: int, blender_python: Path | None = None,
+    folder: Path,
+    plan: SetPlan,
+    which: str,
+    workers: int,
+    blender_python: Path | None = None,
     tell: Callable[[str], None] = lambda _: None,
-) -> None:  # fmt: skip
+) -> None:
     """Draw what is missing of the sets in ``folder``; what is there is not drawn again.
 
     Raises:
@@ -203,9 +217,14 @@ def produce_sets(
 
 
 def blender_files(
-    folder: Path, plan: SetPlan, piles: list[Pile], form: Format, workers: int, python: Path,
+    folder: Path,
+    plan: SetPlan,
+    piles: list[Pile],
+    form: Format,
+    workers: int,
+    python: Path,
     tell: Callable[[str], None],
-) -> None:  # fmt: skip
+) -> None:
     """The traced files, drawn by Blender in processes of their own: ``bpy`` is never imported here."""
     wanted = [k for k in plan.numbers(plan.scenes) if not (folder / f"traced{k:05d}.npz").is_file()]
     work = folder / "blender"

@@ -48,8 +48,16 @@ def lying(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def stem(points: np.ndarray, radii: np.ndarray, rng: np.random.Generator, oval: float, bump: float,
-         sides: int = SIDES, flare: float = 0.0, knots: int = 0) -> Shape:  # fmt: skip
+def stem(
+    points: np.ndarray,
+    radii: np.ndarray,
+    rng: np.random.Generator,
+    oval: float,
+    bump: float,
+    sides: int = SIDES,
+    flare: float = 0.0,
+    knots: int = 0,
+) -> Shape:
     """A log in its own frame: spine (N, 3) along z, radii (N,); oval, uneven, butt flare, knots, slanted cuts.
 
     Its bark is slot 0, its sawn ends slot 1.
@@ -92,16 +100,21 @@ def stem(points: np.ndarray, radii: np.ndarray, rng: np.random.Generator, oval: 
     return Shape(whole, rows, (~bark).astype(np.int64), bark, uv)
 
 
-def field(x0: float, y0: float, cell: float, heights: np.ndarray, finer: int, rough_m: float,
-          rng: np.random.Generator) -> Shape:  # fmt: skip
+def field(
+    x0: float, y0: float, cell: float, heights: np.ndarray, finer: int, rough_m: float, rng: np.random.Generator
+) -> Shape:
     """A ground of a grid of heights, refined ``finer`` times and roughened."""
     nx, ny = heights.shape
     gx, gy = np.linspace(0, nx - 1, (nx - 1) * finer + 1), np.linspace(0, ny - 1, (ny - 1) * finer + 1)
     i, j = np.minimum(gx.astype(int), nx - 2), np.minimum(gy.astype(int), ny - 2)
     fx, fy = (gx - i)[:, None], (gy - j)[None]
     h = heights
-    z = (h[i][:, j] * (1 - fx) * (1 - fy) + h[i + 1][:, j] * fx * (1 - fy) + h[i][:, j + 1] * (1 - fx) * fy
-         + h[i + 1][:, j + 1] * fx * fy)  # fmt: skip
+    z = (
+        h[i][:, j] * (1 - fx) * (1 - fy)
+        + h[i + 1][:, j] * fx * (1 - fy)
+        + h[i][:, j + 1] * (1 - fx) * fy
+        + h[i + 1][:, j + 1] * fx * fy
+    )
     for size in (2, 5):
         small = rng.standard_normal((len(gx) // size + 3, len(gy) // size + 3))
         up = np.kron(small, np.ones((size, size)))
@@ -125,8 +138,10 @@ def tuft(rng: np.random.Generator, blades: int, height_m: float, width_m: float,
         x, y, w = away * c, away * s, width_m * rng.uniform(0.6, 1.3)
         for part, wide in ((0.0, 1.0), (0.55, 0.8)):
             reach = bend * part * part
-            vertices += [(x + reach * c - w * wide * s, y + reach * s + w * wide * c, high * part),
-                         (x + reach * c + w * wide * s, y + reach * s - w * wide * c, high * part)]  # fmt: skip
+            vertices += [
+                (x + reach * c - w * wide * s, y + reach * s + w * wide * c, high * part),
+                (x + reach * c + w * wide * s, y + reach * s - w * wide * c, high * part),
+            ]
         vertices.append((x + bend * c, y + bend * s, high * (1.0 - 0.25 * lean)))
         faces += [(o, o + 1, o + 3, o + 2), (o + 2, o + 3, o + 4)]
     return shape_of(vertices, faces)
@@ -145,9 +160,11 @@ def fern(rng: np.random.Generator, fronds: int, reach_m: float) -> Shape:
             leaf = 0.22 * long * (1.0 - t) ** 0.8 * min(1.0, 5 * t)
             for side in (-1, 1):
                 o, d = len(vertices), 0.025 * long
-                vertices += [(c * r, s * r, z), (c * (r + d), s * (r + d), z),
-                             (c * (r + 0.5 * leaf) - side * s * leaf, s * (r + 0.5 * leaf) + side * c * leaf,
-                              z - 0.25 * leaf)]  # fmt: skip
+                vertices += [
+                    (c * r, s * r, z),
+                    (c * (r + d), s * (r + d), z),
+                    (c * (r + 0.5 * leaf) - side * s * leaf, s * (r + 0.5 * leaf) + side * c * leaf, z - 0.25 * leaf),
+                ]
                 faces.append((o, o + 1, o + 2))
     return shape_of(vertices, faces)
 
@@ -161,14 +178,19 @@ def leaves(rng: np.random.Generator, count: int, reach_m: float, size_m: float) 
         turn, size, o = rng.uniform(0.0, 6.28), size_m * rng.uniform(0.5, 1.3), len(vertices)
         c, s = math.cos(turn) * size, math.sin(turn) * size
         lift = rng.uniform(0.0, 0.5, 4) * size + 0.012
-        vertices += [(x + c, y + s, lift[0]), (x - 0.5 * s, y + 0.5 * c, lift[1]), (x - c, y - s, lift[2]),
-                     (x + 0.5 * s, y - 0.5 * c, lift[3])]  # fmt: skip
+        vertices += [
+            (x + c, y + s, lift[0]),
+            (x - 0.5 * s, y + 0.5 * c, lift[1]),
+            (x - c, y - s, lift[2]),
+            (x + 0.5 * s, y - 0.5 * c, lift[3]),
+        ]
         faces.append((o, o + 1, o + 2, o + 3))
     return shape_of(vertices, faces)
 
 
-def twig(rng: np.random.Generator, length_m: float, radius_m: float, forks: int, needles: bool = False,
-         sides: int = 7) -> Shape:  # fmt: skip
+def twig(
+    rng: np.random.Generator, length_m: float, radius_m: float, forks: int, needles: bool = False, sides: int = 7
+) -> Shape:
     """A branch along x with forks (slot 0), perhaps with needles (slot 1): what is left of the crowns."""
     vertices: list[Any] = []
     faces: list[Any] = []

@@ -32,13 +32,28 @@ def packed_look(look: Mapping[str, Any]) -> np.ndarray:
     what = look["what"]
     kind = look["kind"] if what in ("bark", "end") else what
     row = [
-        _number(kind), look.get("seed", 0.0), look.get("scale", 1.0), look.get("relief", 0.0), look.get("moss", 0.0),
-        look.get("lichen", 0.0), look.get("snow", 0.0), look.get("wet", 0.0), look.get("rings", 20.0),
-        look.get("heart", 0.0), look.get("dirt", 0.0), look.get("radius_m", 0.1), look.get("bast", 0.0),
-        look.get("patch_scale", 1.0), look.get("snow_scale", 1.0), float(look.get("puddles", False)),
-        *look.get("wild", [1.0] * 8), *_tones(look.get("tones", []), 4), *_tones(look.get("end_tones", []), 3),
-        *_tones(look.get("moss_tones", []), 2), *look.get("lichen_tone", [0.4, 0.4, 0.4]),
-    ]  # fmt: skip
+        _number(kind),
+        look.get("seed", 0.0),
+        look.get("scale", 1.0),
+        look.get("relief", 0.0),
+        look.get("moss", 0.0),
+        look.get("lichen", 0.0),
+        look.get("snow", 0.0),
+        look.get("wet", 0.0),
+        look.get("rings", 20.0),
+        look.get("heart", 0.0),
+        look.get("dirt", 0.0),
+        look.get("radius_m", 0.1),
+        look.get("bast", 0.0),
+        look.get("patch_scale", 1.0),
+        look.get("snow_scale", 1.0),
+        float(look.get("puddles", False)),
+        *look.get("wild", [1.0] * 8),
+        *_tones(look.get("tones", []), 4),
+        *_tones(look.get("end_tones", []), 3),
+        *_tones(look.get("moss_tones", []), 2),
+        *look.get("lichen_tone", [0.4, 0.4, 0.4]),
+    ]
     for name in ("first", "second"):
         own = look.get(name, {"kind": "earth", "tones": []})
         row += [_number(own["kind"]), own.get("scale", 1.0), own.get("warp", 0.0), 0.0, *_tones(own["tones"], 4)]
@@ -66,15 +81,35 @@ SOURCES: Final = Path(__file__).parent / "kernel"
 FINE: Final = np.dtype([("normals", "f4", (3, 3)), ("look", "i4"), ("body", "i4"), ("end", "i4")])
 BODY: Final = np.dtype([("turn", "f4", 9), ("at", "f4", 3), ("number", "i4")])
 LAMP: Final = np.dtype([("at", "f4", 3), ("way", "f4", 3), ("tone", "f4", 3), ("edge", "f4")])
-LIGHT: Final = np.dtype([
-    ("zenith", "f4", 3), ("horizon", "f4", 3), ("below", "f4", 3), ("sun_way", "f4", 3), ("sun_tone", "f4", 3),
-    ("sun_edge", "f4"), ("glow", "f4"), ("backdrop", "f4"), ("backdrop_height", "f4"), ("backdrop_seed", "f4"),
-    ("trees", "f4", 3), ("lamps", "f4"), ("lamp", LAMP, 4),
-])  # fmt: skip
-VIEW: Final = np.dtype([
-    ("eye", "f4", 3), ("right", "f4", 3), ("down", "f4", 3), ("ahead", "f4", 3), ("lens", "f4", 4), ("size", "i4", 2),
-    ("samples", "i4"), ("seed", "u4"),
-])  # fmt: skip
+LIGHT: Final = np.dtype(
+    [
+        ("zenith", "f4", 3),
+        ("horizon", "f4", 3),
+        ("below", "f4", 3),
+        ("sun_way", "f4", 3),
+        ("sun_tone", "f4", 3),
+        ("sun_edge", "f4"),
+        ("glow", "f4"),
+        ("backdrop", "f4"),
+        ("backdrop_height", "f4"),
+        ("backdrop_seed", "f4"),
+        ("trees", "f4", 3),
+        ("lamps", "f4"),
+        ("lamp", LAMP, 4),
+    ]
+)
+VIEW: Final = np.dtype(
+    [
+        ("eye", "f4", 3),
+        ("right", "f4", 3),
+        ("down", "f4", 3),
+        ("ahead", "f4", 3),
+        ("lens", "f4", 4),
+        ("size", "i4", 2),
+        ("samples", "i4"),
+        ("seed", "u4"),
+    ]
+)
 
 
 def compiler() -> str | None:
@@ -119,8 +154,9 @@ class Tracer:
     def __init__(self, code: ctypes.CDLL, scene: Mapping[str, Any]) -> None:
         self._code = code
         tris, fine, bodies, looks = packed(scene)
-        self._scene = ctypes.c_void_p(code.scene_new(
-            _at(tris), _at(fine), len(tris), _at(bodies), len(bodies), _at(looks), len(looks)))  # fmt: skip
+        self._scene = ctypes.c_void_p(
+            code.scene_new(_at(tris), _at(fine), len(tris), _at(bodies), len(bodies), _at(looks), len(looks))
+        )
 
     def close(self) -> None:
         """Free the scene."""
@@ -174,7 +210,8 @@ def packed(scene: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray
         detail["look"] = np.array(numbers)[np.minimum(slots, len(numbers) - 1)]
         detail["body"] = len(bodies)
         detail["end"] = [look["what"] == "end" for look in piece.looks] and np.array(
-            [look["what"] == "end" for look in piece.looks])[np.minimum(slots, len(numbers) - 1)]  # fmt: skip
+            [look["what"] == "end" for look in piece.looks]
+        )[np.minimum(slots, len(numbers) - 1)]
         tris.append((piece.scale * corners @ turn.T + piece.position_m).astype(np.float32))
         fine.append(detail)
         bodies.append((turn.T.ravel(), piece.position_m, piece.number))

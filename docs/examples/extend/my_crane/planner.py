@@ -44,9 +44,14 @@ class PcaPlanner:
         along = math.atan2(axes[0, 1], axes[0, 0])
         support = min(request.logs[i].center_m[2] - 0.5 * request.logs[i].diameter_m for i in group)
         return GraspCandidate(
-            float(centre[0]), float(centre[1]), along + 0.5 * math.pi, float(support), tuple(group), 0.5,
+            float(centre[0]),
+            float(centre[1]),
+            along + 0.5 * math.pi,
+            float(support),
+            tuple(group),
+            0.5,
             f"across the principal axis of {len(group)} logs",
-        )  # fmt: skip
+        )
 
     @staticmethod
     def _reachable(request: GraspRequest, index: int) -> bool:

@@ -124,8 +124,16 @@ def _photo(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any
     return g.tinted(colour, look["hue"], look["saturation"], look["value"]), grey.outputs[0], 0.012
 
 
-_KINDS = {"scaly": _scaly, "plated": _plated, "furrowed": _furrowed, "birch": _birch, "smooth": _smooth,
-          "peeled": _peeled, "photo": _photo, "wild": _furrowed}  # fmt: skip
+_KINDS = {
+    "scaly": _scaly,
+    "plated": _plated,
+    "furrowed": _furrowed,
+    "birch": _birch,
+    "smooth": _smooth,
+    "peeled": _peeled,
+    "photo": _photo,
+    "wild": _furrowed,
+}
 
 
 def end_grain(look: Mapping[str, Any]) -> Any:
@@ -140,8 +148,9 @@ def end_grain(look: Mapping[str, Any]) -> Any:
     colour = g.ramp(wave.outputs["Fac"], [tones[0], tones[1]], 0.1, 0.9)
     flat = g.node("SeparateXYZ")
     g.link(g.coordinates("Object"), flat.inputs[0])
-    radius = g.math("POWER", g.math("ADD", g.math("POWER", flat.outputs["X"], 2.0),
-                                    g.math("POWER", flat.outputs["Y"], 2.0)), 0.5)  # fmt: skip
+    radius = g.math(
+        "POWER", g.math("ADD", g.math("POWER", flat.outputs["X"], 2.0), g.math("POWER", flat.outputs["Y"], 2.0)), 0.5
+    )
     heart = g.step(g.math("DIVIDE", radius, look["radius_m"]), 0.55, 0.35)
     colour = g.mix(g.math("MULTIPLY", heart, look["heart"]), colour, tones[2])
     rim = g.step(g.math("DIVIDE", radius, look["radius_m"]), 0.9, 0.95)

@@ -57,9 +57,13 @@ def picture(k: int, threads: int, scratch: Path, textures: Path | None) -> dict[
     camera.aim(view)
     light = camera.shoot(scratch, SAMPLES, k)
     depth, ids = camera.measure(scratch)
-    found = {"light": np.clip(light, 0.0, 6e4).astype(np.float16), "depth_m": depth.astype(np.float32), "ids": ids,
-             "lens": np.array([view["focal_px"], view["focal_px"], view["cx_px"], view["cy_px"]]),
-             "kind": np.array(kind)}  # fmt: skip
+    found = {
+        "light": np.clip(light, 0.0, 6e4).astype(np.float16),
+        "depth_m": depth.astype(np.float32),
+        "ids": ids,
+        "lens": np.array([view["focal_px"], view["focal_px"], view["cx_px"], view["cy_px"]]),
+        "kind": np.array(kind),
+    }
     if (k // len(KINDS)) % 2:
         camera.aim(view, 0.12)
         found["matched_m"] = matched_depth(light, camera.shoot(scratch, SAMPLES, k + 1), view["focal_px"], 0.12, k)
@@ -139,15 +143,36 @@ def _scene(kind: str, rng: random.Random, textures: Path | None) -> dict[str, An
         sky = {"sky": "flat", "tone": [0.8, 0.85, 0.92], "sky_strength": 1.0, "sun_strength": 0.3, "sun_angle_rad": 0.5}
     else:
         sky = {"sky": "nishita", "tone": [1, 1, 1], "sky_strength": 0.25, "sun_strength": 3.5, "sun_angle_rad": 0.009}
-    lit = {**sky, "elevation_rad": math.radians(up), "azimuth_rad": rng.uniform(-3.1, 3.1), "dust": 1.0,
-           "sun_tone": [1.0, 0.9, 0.72] if up < 15 else [1.0, 0.97, 0.9], "lamps": []}  # fmt: skip
-    return {"eye_m": eye.tolist(), "turn": turn3.tolist(), "focal_px": 0.5 * SIZE_PX / math.tan(0.5 * VIEW_RAD),
-            "cx_px": 0.5 * (SIZE_PX - 1), "cy_px": 0.5 * (SIZE_PX - 1), "width_px": SIZE_PX, "height_px": SIZE_PX,
-            "light": lit}  # fmt: skip
+    lit = {
+        **sky,
+        "elevation_rad": math.radians(up),
+        "azimuth_rad": rng.uniform(-3.1, 3.1),
+        "dust": 1.0,
+        "sun_tone": [1.0, 0.9, 0.72] if up < 15 else [1.0, 0.97, 0.9],
+        "lamps": [],
+    }
+    return {
+        "eye_m": eye.tolist(),
+        "turn": turn3.tolist(),
+        "focal_px": 0.5 * SIZE_PX / math.tan(0.5 * VIEW_RAD),
+        "cx_px": 0.5 * (SIZE_PX - 1),
+        "cy_px": 0.5 * (SIZE_PX - 1),
+        "width_px": SIZE_PX,
+        "height_px": SIZE_PX,
+        "light": lit,
+    }
 
 
-def _noisy(tones: Any, scale: float, stretch: Any, bump: float, coord: str = "Object", photo: Path | None = None,
-           snow: float = 0.0, dashes: bool = False) -> Any:  # fmt: skip
+def _noisy(
+    tones: Any,
+    scale: float,
+    stretch: Any,
+    bump: float,
+    coord: str = "Object",
+    photo: Path | None = None,
+    snow: float = 0.0,
+    dashes: bool = False,
+) -> Any:
     """A material of stretched noise, perhaps with a photograph, lying snow, or the dashes of birch."""
     m = bpy.data.materials.new("m")
     m.use_nodes = True

@@ -24,10 +24,18 @@ def matched_depth(left: np.ndarray, right: np.ndarray, focal_px: float, baseline
     # Columns to the left of the picture give the matcher room for near things.
     wide = [cv2.copyMakeBorder(e, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for e in eyes]
     matcher = cv2.StereoSGBM_create(
-        minDisparity=LEAST_DISPARITY, numDisparities=DISPARITIES, blockSize=BLOCK_PX, P1=8 * BLOCK_PX**2,
-        P2=32 * BLOCK_PX**2, disp12MaxDiff=1, uniquenessRatio=8, speckleWindowSize=80, speckleRange=2,
-        preFilterCap=31, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )  # fmt: skip
+        minDisparity=LEAST_DISPARITY,
+        numDisparities=DISPARITIES,
+        blockSize=BLOCK_PX,
+        P1=8 * BLOCK_PX**2,
+        P2=32 * BLOCK_PX**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=8,
+        speckleWindowSize=80,
+        speckleRange=2,
+        preFilterCap=31,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
     disparity = matcher.compute(*wide).astype(np.float32)[:, DISPARITIES:] / 16.0
     return np.where(disparity > LEAST_DISPARITY, focal_px * baseline_m / np.maximum(disparity, 0.1), np.nan).astype(
         np.float32
