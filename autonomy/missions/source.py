@@ -127,9 +127,11 @@ def _from_zip(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
                 raise MissionError("mission.archive", sentence, name)
             with archive.open(entry) as file:
                 inner = file.read(MAX_XML_BYTES + 1)
+    except MissionError:  # a ValueError, too: its sentence is true, and the next one would not be
+        raise
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, OSError, ValueError, EOFError, struct.error) as error:
         sentence = f"is a zip file that is damaged or cut off ({error}); copy it anew"
-        raise MissionError("mission.archive", sentence, name) from None
+        raise MissionError("mission.archive-damaged", sentence, name) from None
     inside = f"{name}/{' '.join(entry.filename.split())[:80]}"
     if len(inner) > MAX_XML_BYTES:
         raise _too_large(inside)
@@ -146,14 +148,15 @@ def _from_gzip(data: bytes, name: str) -> bytes:
             if len(found) > MAX_XML_BYTES:
                 raise _too_large(name)
             if not unpacker.eof:
-                raise MissionError("mission.archive", "is a gzip file that is cut off; copy it anew", name)
+                raise MissionError("mission.archive-damaged", "is a gzip file that is cut off; copy it anew", name)
             data = unpacker.unused_data
             if not data.startswith(_GZIP):
                 if data.strip(b"\0"):
                     break
                 return found
     except zlib.error as error:
-        raise MissionError("mission.archive", f"is a gzip file that is damaged ({error}); copy it anew", name) from None
+        sentence = f"is a gzip file that is damaged ({error}); copy it anew"
+        raise MissionError("mission.archive-damaged", sentence, name) from None
     raise MissionError("mission.archive", "is a gzip file of several pieces; unpack it and give the file inside", name)
 
 

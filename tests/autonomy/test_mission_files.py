@@ -213,7 +213,7 @@ def test_files_cut_off_and_files_of_other_kinds(tmp_path: Path) -> None:
     data = collection(line())
     assert codes(data[:-20]) == ["not-json"] and place(data[:-20]) == f"m:{1 + data[:-20].count(NEWLINE)}"
     assert codes(gpx(f"<rte>{gpx_points('rtept')}</rte>")[:-8]) == ["not-xml"]
-    assert codes(b"PK\x03\x04rest") == ["archive"]
+    assert codes(b"PK\x03\x04rest") == ["archive-damaged"]
     assert codes(b"<html><body/></html>") == ["unknown-xml"]
     assert codes(b"QGC WPL 110\n") == ["unknown-format"]
     with pytest.raises(MissionError, check=coded("mission.unreadable")):
