@@ -19,6 +19,7 @@ from typing import Final
 from autonomy.crane_job.cycle import Cycle
 from autonomy.crane_job.grapple import GrappleSequence
 from autonomy.crane_job.inbox import Inbox
+from autonomy.crane_job.load_view import LoadView, load_in_view
 from autonomy.crane_job.phase_conditions import is_motion_done, motion_rate
 from autonomy.crane_job.phases import PHASE_RULES, RESUME_PHASE, Phase, grapple_command
 from autonomy.crane_job.rotator_estimate import (
@@ -66,6 +67,7 @@ class ActivityState:
         stow_only: bool = False,
         rotator: RotatorEstimate | None = None,
         slope: tuple[float, float] = LEVEL,
+        view: LoadView | None = None,
     ) -> None:
         self.phase = Phase.WAIT
         self._paused: Problem | None = Problem("activity.no-report", "the controller has not reported")
@@ -76,7 +78,9 @@ class ActivityState:
         self.bunk_full = False
         """Whether the gripped logs have no room in the bunk."""
         self.rotator = self._count = rotator or RotatorEstimate()
+        self._counts = has_no_encoder(profile)
         self._profile = planning_profile(profile, self._count)
+        self._view, self._viewed = view, False
         self._first = Phase.STOW if stow_only else Phase.LOOK
         self._fetches_next = fetches_next
         motion_planner = motion_planner or TimeOptimalPlanner()
@@ -181,6 +185,8 @@ SETTLE_AFTER_ARRIVAL_NS: Final = 300_000_000
 """A crane at rest above logs uses a detection made this much later, ..."""
 DETECTION_TIMEOUT_NS: Final = 1_500_000_000
 """... and continues without one after this long."""
+VIEW_TIMEOUT_NS: Final = 3_000_000_000
+"""Time for a picture of a load that is shown to a camera."""
 HIDDEN_LOAD_NS: Final = 1_200_000_000
 """Time for four pictures of a load that was hidden during the motion: three make it a log of the list."""
 _TIMEOUT_FACTOR: Final = 2.0
@@ -203,6 +209,8 @@ class Activity(ActivityState):
         stow_only: fetch no log, but move over the bunk with the present load so that the machine may drive.
         rotator: the estimate of earlier jobs for a rotator without an encoder; holds the newest estimate afterwards.
         slope: how the machine stands, see `autonomy.motion.arm_kinematics`; level by default.
+        view: the camera to which a load is shown while the rotator's angle is unsure, because the log list only
+            remembers; None where pictures show the load at work.
     """
 
     # ------------------------------------------------------------------ one tick
@@ -227,6 +235,7 @@ class Activity(ActivityState):
         else:
             self._advance(dt_s)
         self._check_transition(now_ns)
+        self._follow_rotator()
         self._command_grapple(dt_s)
         if self.idle or not self._stream.due(now_ns):
             return None
@@ -256,6 +265,9 @@ class Activity(ActivityState):
         self._elapsed_s = 0.0
         self._arrived_ns = self._ready_ns = self._restart_phase = None
         closing_s = self._grapple.start_following() if phase is Phase.CLOSE else 0.0
+        self._viewed = False
+        view = self._view if phase is Phase.LIFT else None
+        self._cycle.view = view if view and view.is_needed(self.rotator, start[Joint.SLEW]) else None
         try:
             self._tracker.begin(self._cycle.plan(phase, start, closing_s))
         except (Unreachable, NoGrasp) as error:
@@ -317,7 +329,8 @@ class Activity(ActivityState):
         if self.phase in (Phase.CARRY, Phase.LOWER) and self._touches_down():
             self._restart_phase = Phase.OPEN
             return
-        if self.phase in (Phase.LIFT, Phase.CARRY) and self._direct and not lifts_bundle:
+        shows = self._cycle.view is not None
+        if self.phase in (Phase.LIFT, Phase.CARRY) and self._direct and not lifts_bundle and not shows:
             self._verify_load(now_ns)
             if self._restart_phase is not None or self._failure is not None:
                 return  # this list has been evaluated
@@ -342,6 +355,9 @@ class Activity(ActivityState):
                 return self._after_above(now_ns) if self._grapple.is_open else None
             case Phase.CLOSE:
                 return self._cycle.after_closing(self._grapple)
+            case Phase.LIFT if self._cycle.view is not None and not self._viewed:
+                assert self._arrived_ns is not None
+                return None if now_ns < self._arrived_ns + VIEW_TIMEOUT_NS else self._after_lift()
             case Phase.LIFT | Phase.CARRY:
                 if self._waits_for_load(now_ns):
                     return None
@@ -464,10 +480,39 @@ class Activity(ActivityState):
         """Whether a recent log list shows the log in the grapple."""
         return self._direct and self._ready_ns == self._inbox.logs_ns and self._inbox.is_fresh(now_ns)
 
+    @property
+    def shows_load(self) -> bool:
+        """Whether the crane stands still with its load before the camera, and a picture of it is awaited."""
+        if self._paused or self.phase is not Phase.LIFT or self._cycle.view is None or self._viewed:
+            return False
+        arrived_ns, now_ns = self._arrived_ns, self._last_ns
+        return arrived_ns is not None and now_ns is not None and now_ns >= arrived_ns + SETTLE_AFTER_ARRIVAL_NS
+
+    def view_load(self, logs: tuple[LogObservation, ...]) -> LogObservation | None:
+        """Correct the rotator by the load that a picture shows; ``logs`` are all logs of the picture in the base frame,
+        taken while `shows_load`.  Returns the load, None where the picture does not show it.
+        """
+        q = self._position()
+        load = load_in_view(self._cycle.arm, logs, self._cycle.arm.pose(q))
+        if load is None or not self.shows_load:
+            return None
+        counts = self._count.to_counts(self._tracker.setpoint)
+        stands = rotator_angle_of_hanging_log(self._profile, load, q[Joint.SLEW])
+        self.rotator = self._count = self.rotator.corrected(counts[Joint.ROT], stands)
+        self._tracker.begin(hold(self._count.to_angles(counts)))
+        self._arrived_ns, self._viewed = self._last_ns, True  # the way on needs a list that remembers the load so
+        return load
+
+    def _follow_rotator(self) -> None:
+        """Add what the rotator is told to turn to its estimates."""
+        if self._counts:
+            sent_rad = self._count.sent(self._tracker.setpoint[Joint.ROT])
+            self.rotator, self._count = self.rotator.turned(sent_rad), self._count.turned(sent_rad)
+
     def _update_rotator(self) -> None:
         """Correct the rotator estimate by the log that hangs in the jaws, for the next job."""
         seen = self._cycle.primary_log()
-        if seen is not None and has_no_encoder(self._profile):
+        if seen is not None and self._counts and self._view is None:
             q = self._position()
             stands = rotator_angle_of_hanging_log(self._profile, seen, q[Joint.SLEW])
             self.rotator = self.rotator.corrected(self._count.sent(q[Joint.ROT]), stands)

@@ -23,6 +23,7 @@ from autonomy.crane_job.grasp_verification import (
     with_load_recognized,
 )
 from autonomy.crane_job.inbox import Inbox
+from autonomy.crane_job.load_view import LoadView
 from autonomy.crane_job.phase_motions import (
     approach_motion,
     bundle_lift_motion,
@@ -48,6 +49,7 @@ from autonomy.motion.setpoint_stream import Axes
 from autonomy.motion.trajectory import Trajectory, hold, straight_line, with_quick_rotation, with_rotation
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import grapple_yaw
+from machine.geometry.kinematics import Unreachable
 from machine.geometry.sag import plausible_load_kg
 from machine.joints import Joint
 from machine.profile import Profile
@@ -111,6 +113,8 @@ class Cycle:
         """The arm with the load of the present phase."""
         self._phase_start_z_m = 0.0
         self._reselection_count, self._recovery = 0, GraspRecovery()
+        self.view: LoadView | None = None
+        """Where the next lift shows its load to a camera; None: it goes straight to its place."""
         self._turn_count = 0
         """Turns of a thin load above its place."""
         self._higher_count = 0
@@ -122,6 +126,11 @@ class Cycle:
         """The number under which the load was last seen in the jaws."""
         self._load_ids: set[int] = set()
         """All these numbers since the selection: the list remembers a load that is hidden where it was seen before."""
+
+    @property
+    def arm(self) -> Arm:
+        """The arm with the load of the present phase."""
+        return self._arm
 
     @property
     def is_bundle(self) -> bool:
@@ -246,6 +255,12 @@ class Cycle:
                     return bundle_lift_motion(arm, start, grasp)
                 if not self._motion_planner.direct:
                     return straight_line(arm, start, grasp.pose.at_height(grasp.pose.z_m + VERIFY_LIFT_M))
+                if self.view is not None:
+                    try:
+                        shown = self.view.pose(arm, start, grasp.log.diameter_m)
+                        return carry_motion(arm, self._motion_planner, start, shown, grasp, logs, hangs=False)
+                    except Unreachable:
+                        self.view = None
                 self.place = plan_place(arm, self._job, grasp, logs)
                 return carry_motion(arm, self._motion_planner, start, self.place, grasp, logs, hangs=False)
             case Phase.CARRY:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -120,6 +120,7 @@ class ActivityManager:
             key,
             progress.rotator if progress else RotatorEstimate(),
             table is PAPER_B,
+            self.log_memory,
         )
         options, carrier = mission.options, profile.carrier
         transport, loading = options.transport_height_m, options.loading_height_m
@@ -188,10 +189,17 @@ class ActivityManager:
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
         """With memory: where the camera's next picture is taken; None while it must take none, because the crane works
-        in front of it or the machine is not located."""
-        if self.log_memory is None or RULES[self.state].crane or self.state in FINAL_STATES:
+        in front of it and shows it no load, or the machine is not located."""
+        works = RULES[self.state].crane and not self.shows_load
+        if self.log_memory is None or works or self.state in FINAL_STATES:
             return None
-        return self.world.standpoint(now_ns)
+        found = self.world.standpoint(now_ns)
+        return replace(found, load=True) if found is not None and self.shows_load else found
+
+    @property
+    def shows_load(self) -> bool:
+        """With memory: whether the next picture is that of a load, which the crane holds in front of the camera."""
+        return self._crane.shows_load
 
     # ------------------------------------------------------------------ operator commands
     def auto(self) -> None:
@@ -230,9 +238,12 @@ class ActivityManager:
             self.route.update_distance(world.location)
         seen_ns = now_ns if seen_ns is None else seen_ns
         if self.log_memory is not None:
-            world.update_map(logs, seen_ns)
-            if logs and world.located:
-                self.log_memory.lose(self.load.check_fallen(now_ns))
+            if self.shows_load:
+                self._crane.view_load(logs)
+            else:
+                world.update_map(logs, seen_ns)
+                if logs and world.located:
+                    self.log_memory.lose(self.load.check_fallen(now_ns))
             logs = world.recall(self.log_memory, self.activity, now_ns)
         elif RULES[self.state].crane:  # a log in the grapple does not lie on the ground
             world.count_bunk(logs, seen_ns)

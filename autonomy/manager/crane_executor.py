@@ -13,12 +13,14 @@ from typing import Final
 from msgspec.structs import replace
 
 from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.load_view import LoadView, load_view
 from autonomy.crane_job.phases import Phase
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
 from autonomy.grasp.grasp import Grasp
 from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.planner import GraspSelector
 from autonomy.manager.load_bookkeeping import LoadBookkeeping
+from autonomy.manager.log_memory import LogMemory
 from autonomy.manager.world_model import WorldModel
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
@@ -41,8 +43,9 @@ class CraneExecutor:
     """Starts and ends crane jobs; ``job`` is the active one, None between two.
 
     ``selector`` picks grasps on the ground, ``unloading_selector`` those from the bunk.  ``rotator`` is the known state
-    of a rotator without an encoder.  ``as_paper_b`` works as paper B does: a grasp takes only its target, gives it up
-    after one failure, and ends over the bunk.
+    of a rotator without an encoder.  ``log_memory``: the camera only looks ahead; a load is shown to it while the
+    rotator is unsure, and remembered as it was seen.  ``as_paper_b`` works as paper B does: a grasp takes only its
+    target, gives it up after one failure, and ends over the bunk.
     """
 
     def __init__(
@@ -58,6 +61,7 @@ class CraneExecutor:
         key: bytes | None,
         rotator: RotatorEstimate,
         as_paper_b: bool,
+        log_memory: LogMemory | None = None,
     ) -> None:
         self.job: Activity | None = None
         self.failure: Problem | None = None
@@ -66,7 +70,7 @@ class CraneExecutor:
         self._world, self._load = world, load
         self._selector, self._unloading_selector, self._motions = selector, unloading_selector, motions
         self._lease_ns, self._key = lease_ns, key
-        self._rotator, self._as_paper_b = rotator, as_paper_b
+        self._rotator, self._as_paper_b, self._log_memory = rotator, as_paper_b, log_memory
         self._reference: tuple[float, ...] | None = None
         self._stops = self._failures = 0
 
@@ -115,7 +119,15 @@ class CraneExecutor:
             mission is None,
             self.rotator,
             self._world.slope,
+            self._view(),
         )
+
+    def _view(self) -> LoadView | None:
+        """With a camera that only looks ahead: how it sees a load; paper B leaves its rotator as it is."""
+        vehicle = self._world.vehicle
+        if self._log_memory is None or self._as_paper_b or vehicle is None:
+            return None
+        return load_view(self._profile, vehicle.articulation_rad)
 
     def _unloads_next(self, log: LogObservation) -> bool:
         """Whether the next grasp from the bunk could be of such a log."""
@@ -136,6 +148,17 @@ class CraneExecutor:
         self.job.halted = halted
         offered = tuple(log for log in logs if not self._world.is_given_up(log.id))
         return self.job.step(now_ns, report, offered)
+
+    @property
+    def shows_load(self) -> bool:
+        """Whether the crane stands still with a load in front of the camera, and a picture of it is awaited."""
+        return self.job is not None and self.job.shows_load
+
+    def view_load(self, logs: Sequence[LogObservation]) -> None:
+        """Accept the logs of a picture that was taken while `shows_load`, in the base frame."""
+        assert self.job is not None and self._log_memory is not None and self._world.report is not None
+        if (load := self.job.view_load(tuple(logs))) is not None:
+            self._log_memory.correct(load, self._world.report)
 
     def abort(self, reason: str) -> None:
         """End the job; the crane stops smoothly."""

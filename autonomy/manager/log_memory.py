@@ -81,6 +81,19 @@ class LogMemory:
         if count:
             del self._in_bunk[-count:]
 
+    def correct(self, load: LogObservation, report: StateReport) -> None:
+        """The load hangs as a camera has seen it, in the base frame: what the jaws hold turns with it about the pin."""
+        if not self._held:
+            return
+        _, yaw = self._pin(report)
+        remembered = max(self._held.values(), key=lambda log: log.length_m)
+        seen = math.atan2(load.axis[1], load.axis[0]) - yaw
+        turn = math.remainder(seen - math.atan2(remembered.axis[1], remembered.axis[0]), math.pi)
+        for held in (self._held, self._beside_held):
+            for number, log in held.items():
+                held[number] = replace(log, center_m=_turned(log.center_m, turn), axis=_turned(log.axis, turn))
+        self._due_ns = 0
+
     def log_list(
         self, now_ns: int, log_map: LogMap, base: Pose, report: StateReport | None, job: Activity | None
     ) -> tuple[LogObservation, ...] | None:

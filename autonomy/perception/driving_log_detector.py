@@ -54,6 +54,9 @@ class LogLocalizer(Protocol):
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
         """The logs of one picture."""
 
+    def localize_load(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
+        """The logs of a picture that shows a load of the crane, which must not be taken for one that lies."""
+
 
 class CylinderLocalizer:
     """``autonomy.perception.pipeline``: cylinder fits and tracks."""
@@ -70,6 +73,14 @@ class CylinderLocalizer:
             for t in fresh
             if all(t.estimate.ends_seen) or t.hits >= MIN_HITS_WITH_HIDDEN_END
         ]
+
+    def localize_load(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
+        """The cylinders of this picture alone."""
+        found = []
+        for number, fit in enumerate(self._perception.fits(frame, masks)):
+            (x, y, z), (ax, ay, az) = pose.to_base(fit.body.center_m).tolist(), (pose.rotation @ fit.body.axis).tolist()
+            found.append(LogObservation(number, (x, y, z), (ax, ay, az), fit.body.length_m, 2.0 * fit.body.radius_m))
+        return [log for log in found if log.diameter_m < log.length_m]
 
 
 class PaperBLocalizer:
@@ -102,6 +113,8 @@ class PaperBLocalizer:
             )
         return found
 
+    localize_load = localize
+
 
 _PAPER_B_SIGMAS: Final = (0.10, 0.10, 0.6, 0.6, 0.2, 0.2, 0.05)
 """Of a box [m, rad]: the position as in the paper's own errors; the axis of a log seen end-on is arbitrary."""
@@ -132,21 +145,24 @@ class DrivingLogDetector:
         self._source, self._segment, self._localizer = source, segment, localizer
         self._measured = measured
 
-    def detect(self, base: Pose, q: Sequence[float], articulation_rad: float) -> tuple[LogObservation, ...] | None:
+    def detect(
+        self, base: Pose, q: Sequence[float], articulation_rad: float, load: bool = False
+    ) -> tuple[LogObservation, ...] | None:
         """The logs of a new picture in the crane's base frame; None when there is no usable picture.
 
         ``base`` is that frame in the plane, ``q`` the joints in ``Joint`` order [rad, m], both at the time of the
-        picture.
+        picture.  ``load`` as for `detect_in_plane`.
         """
-        logs = self.detect_in_plane(lambda: (base, articulation_rad), q)
+        logs = self.detect_in_plane(lambda: (base, articulation_rad), q, load)
         return None if logs is None else tuple(in_base(o, base) for o in logs)
 
     def detect_in_plane(
-        self, standing: Callable[[], tuple[Pose, float] | None], q: Sequence[float]
+        self, standing: Callable[[], tuple[Pose, float] | None], q: Sequence[float], load: bool = False
     ) -> tuple[LogObservation, ...] | None:
         """The logs of a new picture in the plane; None when there is no usable picture.
 
         ``standing`` is called after the picture and returns base and articulation at its time, None when unknown.
+        ``load``: the picture shows a load that hangs in the crane, and its logs are measured for themselves.
         """
         self.problem = ""
         try:
@@ -163,7 +179,8 @@ class DrivingLogDetector:
             frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
             masks = [one for one in self._segment(frame) if one.score >= MIN_SCORE]
-            logs = self._localizer.localize(frame, pose, masks)
+            localize = self._localizer.localize_load if load else self._localizer.localize
+            logs = localize(frame, pose, masks)
         except (SourceError, RgbdFrameError, CameraMountError) as error:
             self.problem = str(error)
             return None

@@ -29,7 +29,7 @@ class DetectorInPlane(Protocol):
     problem: str
 
     def detect_in_plane(
-        self, standing: Callable[[], tuple[Pose, float] | None], q: tuple[float, ...]
+        self, standing: Callable[[], tuple[Pose, float] | None], q: tuple[float, ...], load: bool
     ) -> tuple[LogObservation, ...] | None:
         """The logs of a new picture in the plane."""
 
@@ -104,7 +104,7 @@ class DrivingRequests:
             taken_ns = self._taken_ns()
             return standpoint.at(begun_ns if taken_ns is None else taken_ns)
 
-        logs = self._detector.detect_in_plane(standing, request.q)
+        logs = self._detector.detect_in_plane(standing, request.q, standpoint.load)
         if logs is not None:
             self._logs, self._base = logs, standpoint.base
             self.lists += 1

@@ -19,7 +19,7 @@ from autonomy.perception.camera.frame import Pose
 MAX_AGE_NS: Final = 500_000_000
 """At 1 m/s an acceleration of 0.3 m/s^2 moves the camera by 4 cm meanwhile, which the tracks average out."""
 NUMBERS: Final = 14
-"""Of a standpoint besides its stamp: four vectors, the articulation and its rate."""
+"""Of a standpoint besides its stamp and ``load``: four vectors, the articulation and its rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,8 @@ class Standpoint:
     velocity_m_s: np.ndarray
     turn_rad_s: np.ndarray
     bending_rad_s: float
+    load: bool = False
+    """Whether the crane holds a load in front of the camera."""
 
     def at(self, now_ns: int) -> tuple[Pose, float] | None:
         """Base and articulation at another time; None when that is too far away."""
@@ -47,7 +49,7 @@ class Standpoint:
         return base, self.articulation_rad + seconds * self.bending_rad_s
 
     def numbers(self) -> tuple[float, ...]:
-        """All but the stamp, as `from_numbers` reads them."""
+        """All but the stamp and ``load``, as `from_numbers` reads them."""
         turn = Rotation.from_matrix(self.base.rotation).as_rotvec()
         vectors = (self.base.position_m, turn, self.velocity_m_s, self.turn_rad_s)
         moving = (self.articulation_rad, self.bending_rad_s)

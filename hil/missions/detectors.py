@@ -44,7 +44,7 @@ class PerfectDetector:
 
 
 class FrontCameraDetector:
-    """The front camera; it takes pictures only while the crane rests."""
+    """The front camera; it takes pictures while the crane rests, and of a load that the crane shows it."""
 
     def __init__(self, front: DrivingLogDetector, manager: ActivityManager) -> None:
         self._front, self._manager = front, manager
@@ -53,9 +53,10 @@ class FrontCameraDetector:
         """The logs in a picture taken now; None while the crane works or the machine is not localized."""
         manager = self._manager
         world = manager.world
-        if RULES[manager.state].crane or manager.state in FINAL_STATES or not world.located or world.vehicle is None:
+        works = RULES[manager.state].crane and not manager.shows_load
+        if works or manager.state in FINAL_STATES or not world.located or world.vehicle is None:
             return None
-        return self._front.detect(world.base_at(now_ns), q, world.vehicle.articulation_rad)
+        return self._front.detect(world.base_at(now_ns), q, world.vehicle.articulation_rad, manager.shows_load)
 
 
 def check_camera(profile: Profile) -> None:

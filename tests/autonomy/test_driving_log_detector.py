@@ -155,3 +155,13 @@ def test_a_failed_camera_is_reported_and_gives_no_logs() -> None:
     assert detector.detect(base(0.0, 0.0, 0.0), Q, 0.0) is None and detector.problem == "the camera fell off"
     with pytest.raises(KeyError):
         DrivingLogDetector(PROFILE, "rear view", field, field.segment, PaperBLocalizer())
+
+
+def test_a_picture_of_a_load_is_measured_alone_and_starts_no_track() -> None:
+    at, field, localizer = base(0.0, 0.0, math.pi), Scene(8.0, 0.5, 1.5), CylinderLocalizer(PROFILE)
+    detector = DrivingLogDetector(PROFILE, "front", field, field.segment, localizer)
+    field.stand(at, 0.0)
+    for _ in range(MIN_HITS_WITH_HIDDEN_END):
+        (load,) = detector.detect(at, Q, 0.0, load=True) or ()
+    assert plane_error_m(load, at, field) < 0.1 and load.covariance is None
+    assert detector.detect(at, Q, 0.0) == (), "a log of one picture is none yet"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,12 @@ def test_a_standpoint_arrives_as_it_was_sent() -> None:
     assert got is not None and request.q[:4] == Q[:4] and got.stamp_ns == sent.stamp_ns
     assert got.numbers() == pytest.approx(sent.numbers(), abs=1e-7)
     assert decode_request(encode_request(Q)).standpoint is None
+
+
+@pytest.mark.parametrize("load", [False, True])
+def test_a_request_says_whether_the_crane_holds_a_load_before_the_camera(load: bool) -> None:
+    request = decode_request(encode_request(Q, replace(driving(), load=load)))
+    assert request.standpoint is not None and request.standpoint.load is load
 
 
 @pytest.mark.parametrize("numbers", ["1 2 3", " ".join(["nan"] * 14)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from autonomy.process.jobs import STOPPING_TIMEOUT_NS, ForwardingJob
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
 from can_dbc.messages.vehicle import DriveSetpoint
+from machine.geometry.grapple import grapple_yaw
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.forwarding_jobs import begin, command, run
 from tests.autonomy.manager_missions import LOGS
@@ -127,3 +129,23 @@ def test_no_picture_is_asked_for_and_none_counts_while_the_crane_works() -> None
     job.step(forwarder.crane.now_ns, None, None, late)
     assert [log.number for log in manager.world.log_map.logs] == [log.number for log in before]
     assert manager.world.log_map.get(7) is None and manager.world.log_map.next_number == 2
+
+
+@pytest.mark.long
+def test_a_load_is_shown_to_the_camera_ahead_and_its_picture_maps_no_log() -> None:
+    forwarder, job, manager = begin(LOGS[0], uses_memory=True)
+    ahead(forwarder, job)
+    run(forwarder, job, lambda j: manager.shows_load)
+    crane, activity, base = forwarder.crane, manager.activity, forwarder.base()
+    asked = job.standpoint(crane.now_ns)
+    assert activity is not None and asked is not None and asked.load
+    (x, y, z), yaw = crane.pin(), grapple_yaw(crane.profile, crane.q) - math.pi / 2 + 0.3
+    center, axis = np.array([x, y, z - 1.2]), np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    picture = LogObservation(7, tuple(base.to_base(center)), tuple(base.rotation @ axis), 2.0, 0.2)
+    before, stood = manager.world.log_map.next_number, activity.rotator
+    job.step(crane.now_ns, None, None, (picture,))
+    assert not manager.shows_load and manager.world.log_map.next_number == before
+    turned = activity.rotator.angle(stood.sent_rad) - stood.angle_rad
+    assert 0.2 < turned < 0.31 and activity.rotator.sigma_rad < stood.sigma_rad
+    asked = job.standpoint(crane.now_ns)
+    assert asked is None, "no other picture while the crane works"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -132,3 +133,20 @@ def test_without_a_scale_the_log_is_assumed_to_hang() -> None:
     hands.to(hands.job.grasp.pose.at_height(hands.job.grasp.pose.z_m + 1.0))
     (log,) = hands.step()
     assert log.center_m[2] > hands.job.grasp.log.center_m[2] + 0.9
+
+
+def test_a_load_that_a_camera_has_seen_hangs_as_it_was_seen() -> None:
+    hands = Hands(field_of((-4.0, 3.0)))
+    hands.begin()
+    for phase in (Phase.CLOSE, Phase.LIFT):
+        hands.step(phase)
+    hands.to(hands.job.grasp.pose.at_height(hands.job.grasp.pose.z_m + 1.0))
+    (log,) = hands.step()
+    yaw = math.atan2(log.axis[1], log.axis[0]) + 0.6
+    report = SimpleNamespace(stamp_ns=hands.now_ns, position=hands.q, load_kg=math.nan)
+    # Its other end first, and without its middle: only the direction counts.
+    shown = replace(log, id=9, axis=(-math.cos(yaw), -math.sin(yaw), 0.0), length_m=1.0)
+    hands.memory.correct(shown, report)
+    (after,) = hands.step()
+    assert math.remainder(math.atan2(after.axis[1], after.axis[0]) - yaw, math.pi) == pytest.approx(0.0, abs=1e-9)
+    assert after.length_m == log.length_m and after.id == log.id

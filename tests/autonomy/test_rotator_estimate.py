@@ -12,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.load_view import load_view
 from autonomy.crane_job.rotator_estimate import SCALE_BOUNDS, RotatorEstimate, has_no_encoder, planning_profile
+from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
@@ -71,6 +73,62 @@ def test_every_log_corrects_the_count() -> None:
     learned = askew_deg(7, learns=True)
     assert max(learned[2:]) < 8.0
     assert max(askew_deg(7, learns=False)) > 20.0, "without it the count drifts"
+
+
+class Remembered(Drifting):
+    """Its only camera looks ahead: the list remembers a load as the count says, and as it was last shown."""
+
+    made = (0.75, 1.08)
+    shown_rad, views = 0.0, 0
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        if self.held is None:
+            self.shown_rad = 0.0
+            return super().seen()
+        yaw = self.planner.last_setpoint[Joint.ROT] + grapple_yaw(self.profile, (*self.q[:4], 0.0)) - pi / 2
+        axis = (cos(yaw + self.shown_rad), sin(yaw + self.shown_rad), 0.0)
+        return tuple(replace(log, axis=axis) if log.id == self.held else log for log in self.logs)
+
+    def step(self, activity: Activity) -> bytes | None:
+        self.planner = activity
+        data = super().step(activity)
+        if activity.shows_load and (load := activity.view_load(tuple(self.logs))) is not None:
+            self.views += 1
+            yaw = activity.last_setpoint[Joint.ROT] + grapple_yaw(self.profile, (*self.q[:4], 0.0)) - pi / 2
+            self.shown_rad = remainder(atan2(load.axis[1], load.axis[0]) - yaw, pi)
+        return data
+
+
+def laid_askew_deg(count: int, has_camera: bool) -> tuple[list[float], list[int]]:
+    """How far each log of a series lies askew in the bunk, and how often it was shown."""
+    crane, rests, rotator, found, views = Remembered(FORWARDER, [], q=HOME), HOME, None, [], []
+    view = load_view(FORWARDER, 0.0) if has_camera else None
+    for seed in range(count):
+        crane.logs, crane.views = [birch(seed)], 0
+        planner = Activity(FORWARDER, profile_hash(FORWARDER), last_setpoint=rests, rotator=rotator, view=view)
+        crane.run(planner)
+        assert planner.done, planner.failure
+        rests, rotator = planner.last_setpoint, planner.rotator
+        (log,) = crane.logs
+        found.append(abs(degrees(remainder(atan2(log.axis[1], log.axis[0]) - FORWARDER.bunk.yaw_rad, pi))))
+        views.append(crane.views)
+    return found, views
+
+
+@pytest.mark.long
+def test_a_load_that_nothing_shows_is_held_before_the_camera_until_the_rotator_is_known() -> None:
+    askew_deg, views = laid_askew_deg(8, has_camera=True)
+    assert max(askew_deg) < 12.0 and views[0] == 1 and set(views) == {0, 1}, "shown once, and not always"
+    assert max(laid_askew_deg(8, has_camera=False)[0]) > 30.0, "without it the count drifts"
+
+
+def test_a_turn_there_and_back_does_not_end_where_it_began() -> None:
+    rotator = RotatorEstimate(paces=(0.75, 1.08))
+    there = rotator.turned(1.0)
+    back = there.turned(0.0)
+    assert (there.angle_rad, back.angle_rad) == pytest.approx((1.08, 0.33))
+    assert rotator.sigma_rad < there.sigma_rad < back.sigma_rad
+    assert back.turned(0.0) == back and back.corrected(0.0, 0.33).sigma_rad < there.sigma_rad
 
 
 @given(ROTATORS, ANGLE)

@@ -2,8 +2,9 @@
 
 The request is ``{"op":"logs","q":"..."}``.  ``q`` holds the joint positions [rad, m] in the order of ``Joint``, "nan"
 where a joint is not measured: a detector whose camera rides on the crane needs them.  For a camera of a machine that
-drives, ``"at_ns"`` and ``"standpoint"`` say where the machine is in the plane (`autonomy.perception.standpoint`).  The
-reply is ``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame,
+drives, ``"at_ns"`` and ``"standpoint"`` say where the machine is in the plane (`autonomy.perception.standpoint`), and
+``"load":true`` that its crane holds a load in front of the camera, which lies nowhere.  The reply is
+``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame,
 ``{"plane": [...]}`` in that plane, or ``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the
 list), ``covariance`` may be missing, and ``seen`` is false when the log is remembered from an earlier picture.
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import msgspec
@@ -56,6 +57,7 @@ class _Request(msgspec.Struct, omit_defaults=True):
     q: str = ""
     at_ns: str = ""
     standpoint: str = ""
+    load: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ def encode_request(q: Sequence[float], standpoint: Standpoint | None = None) -> 
     if standpoint is None:
         return msgspec.json.encode(_Request("logs", joints))
     numbers = " ".join(f"{value:.9g}" for value in standpoint.numbers())
-    return msgspec.json.encode(_Request("logs", joints, str(standpoint.stamp_ns), numbers))
+    return msgspec.json.encode(_Request("logs", joints, str(standpoint.stamp_ns), numbers, standpoint.load))
 
 
 def decode_request(data: bytes) -> LogRequest:
@@ -104,7 +106,7 @@ def decode_request(data: bytes) -> LogRequest:
             "log-list.bad-standpoint",
             f"the request's standpoint is not {NUMBERS} finite numbers; its planner is of another release",
         )
-    return LogRequest(q, from_numbers(at_ns, numbers))
+    return LogRequest(q, replace(from_numbers(at_ns, numbers), load=request.load))
 
 
 def encode_logs(logs: Iterable[LogObservation], in_plane: bool = False) -> bytes:

@@ -44,7 +44,7 @@ class Detector:
         self.problem, self.stood, self.delay_s = "", list[tuple[Pose, float] | None](), 0.0
 
     def detect_in_plane(
-        self, standing: Callable[[], tuple[Pose, float] | None], q: tuple[float, ...]
+        self, standing: Callable[[], tuple[Pose, float] | None], q: tuple[float, ...], load: bool
     ) -> tuple[LogObservation, ...] | None:
         time.sleep(self.delay_s)
         self.stood.append(standing())
