@@ -16,12 +16,20 @@ from host.vcan_lab import lab_kernel, shim
 from tests.hil.short_missions import mission_file
 
 ROOT = Path(__file__).parents[3]
-LOGS = ((7.0, 3.6, 80.0), (9.5, -3.7, 100.0), (12.5, 3.4, 75.0))
+LOGS = (
+    (7.0, 3.6, 80.0),
+    (8.5, -3.7, 100.0),
+    (10.0, 3.7, 75.0),
+    (11.5, -3.5, 95.0),
+    (13.0, 3.5, 110.0),
+    (14.5, -3.6, 70.0),
+)
 
 
-@pytest.mark.timeout(1500)
-def test_three_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path) -> None:
-    """On the wire: a mission on vcan differs by its bus only, and takes as long again."""
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("bus", ["wire", "vcan"])
+def test_six_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path, bus: str, seed: int) -> None:
     if lab_kernel.find(shim.user_cache()) is None:
         pytest.skip(lab_kernel.MISSING)
     path, out = mission_file(tmp_path / "mission.geojson", *LOGS), tmp_path / "run"
@@ -41,7 +49,9 @@ def test_three_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path) -> Non
             "run",
             path,
             "--bus",
-            "wire",
+            bus,
+            "--seed",
+            str(seed),
             "--detector",
             "own",
             "--no-console",
@@ -56,7 +66,7 @@ def test_three_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path) -> Non
     )
     assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])
     told = json.loads((out / "summary.json").read_text())
-    assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 3
+    assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == len(LOGS)
     assert told["stops"] == told["refused"] == 0 and not told["given_up"] and not told["remarks"]
     lines = done.stdout.splitlines()
     assert any("'front'" in line for line in lines)
