@@ -25,16 +25,14 @@ import signal
 import sys
 import time
 
-from autonomy.manager.checkpoint_file import MissionFinished
 from autonomy.missions.model import MissionError
-from autonomy.networks.weights import WeightsError
 from autonomy.process.command_line import arguments
 from autonomy.process.event_output import emit
 from autonomy.process.exit_codes import BUSY, CONFIGURATION, FAILED, FINE, INTERRUPTED, SAFETY
 from autonomy.process.job_setup import make_job, uploaded_missions
 from autonomy.process.planner_process import PlannerProcess
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
-from runtime.plugins import PluginError
+from runtime.errors import ConfigError, InputRefused
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -53,11 +51,11 @@ def main(argv: list[str] | None = None) -> int:
     try:
         job = make_job(options, profile, options.lease_ms * 1_000_000, key)
         uploads = uploaded_missions(options, profile, options.lease_ms * 1_000_000, key)
-    except (MissionError, PluginError, WeightsError) as error:
+    except (MissionError, ConfigError, InputRefused) as error:
+        if error.code == "checkpoint.finished":
+            emit("done", reason=str(error))
+            return FINE
         return _complain(str(error))
-    except MissionFinished as finished:
-        emit("done", reason=str(finished))
-        return FINE
     try:
         process = PlannerProcess(job, profile_hash(profile), options, key, uploads)
     except (OSError, OverflowError) as error:

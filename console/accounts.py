@@ -17,7 +17,7 @@ from typing import Any, Final
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError, VerifyMismatchError
 
-from runtime.errors import CodedError
+from runtime.errors import ConfigError
 
 MAX_PASSWORD_CHARS: Final = 256
 """Longer ones are not hashed: hashing them would only cost time."""
@@ -42,10 +42,6 @@ class Person:
 
     name: str
     role: Role
-
-
-class AccountsRefused(CodedError, ValueError):
-    """The file of passwords cannot be used; the sentence says why and what to do."""
 
 
 class Accounts:
@@ -75,7 +71,7 @@ def read_accounts(path: Path) -> Accounts:
     """The accounts of a file.
 
     Raises:
-        AccountsRefused: it cannot be read, others may read it, or a line is wrong.
+        ConfigError: it cannot be read, others may read it, or a line is wrong.
     """
     try:
         text = path.read_text()
@@ -83,10 +79,10 @@ def read_accounts(path: Path) -> Accounts:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         sentence = f"{path} cannot be read ({reason}); make it with `timberhand operator password`"
-        raise AccountsRefused("accounts.unreadable", sentence) from None
+        raise ConfigError("accounts.unreadable", sentence) from None
     if mode & (stat.S_IROTH | stat.S_IWOTH | stat.S_IWGRP):
         sentence = f"{path} can be read or changed by others; run `chmod 600 {path}`"
-        raise AccountsRefused("accounts.open-file", sentence)
+        raise ConfigError("accounts.open-file", sentence)
     found: dict[str, tuple[Role, str]] = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
@@ -98,11 +94,11 @@ def read_accounts(path: Path) -> Accounts:
                 f"{path}, line {number} is not NAME ROLE HASH with a role of {roles}; "
                 "write it anew with `timberhand operator password`"
             )
-            raise AccountsRefused("accounts.line", sentence)
+            raise ConfigError("accounts.line", sentence)
         found[name] = Role[role.upper()], known
     if not found:
         sentence = f"{path} holds no account; add one with `timberhand operator password`"
-        raise AccountsRefused("accounts.empty", sentence)
+        raise ConfigError("accounts.empty", sentence)
     return Accounts(found)
 
 
@@ -110,14 +106,14 @@ def account_line(name: str, role: Role, password: str) -> str:
     """The line of an account.
 
     Raises:
-        AccountsRefused: the name or the password cannot be used.
+        ConfigError: the name or the password cannot be used.
     """
     if not NAME.fullmatch(name):
         sentence = f"{name!r} cannot be a name; use up to 32 letters, digits, dots, dashes and underscores"
-        raise AccountsRefused("accounts.name", sentence)
+        raise ConfigError("accounts.name", sentence)
     if not MIN_PASSWORD_CHARS <= len(password) <= MAX_PASSWORD_CHARS:
         sentence = f"the password has {len(password)} characters; use {MIN_PASSWORD_CHARS} to {MAX_PASSWORD_CHARS}"
-        raise AccountsRefused("accounts.password", sentence)
+        raise ConfigError("accounts.password", sentence)
     return f"{name} {role.name.lower()} {PasswordHasher().hash(password)}"
 
 

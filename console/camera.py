@@ -16,8 +16,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from can_dbc.messages.picture import PictureFacts, PictureRefused, decode_picture, encode_picture_request
+from can_dbc.messages.picture import PictureFacts, decode_picture, encode_picture_request
 from console.state import CraneState
+from runtime.errors import InputRefused
 
 # -- The camera's newest picture for the page: what belongs to it, and where the chosen grasp is in it.  Pure.
 #
@@ -61,7 +62,7 @@ class CameraState:
         self._answered_ns = now_ns
         try:
             facts, jpeg = decode_picture(data)
-        except PictureRefused as error:
+        except InputRefused as error:
             self._without_camera, self._problem = error.code == "picture.no-camera", str(error)
             return
         self._without_camera, self._problem = False, facts.problem

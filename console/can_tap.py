@@ -11,7 +11,7 @@ import contextlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Final
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.bitrates import BITRATES
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
@@ -19,6 +19,7 @@ from can_dbc.dbc.codec import Database, load
 from can_dbc.frame import Frame
 from console.can_table import CanTable
 from machine.profile import Profile
+from runtime.errors import LinkError
 
 PERIOD_S: Final = 0.05
 RETRY_NS: Final = 1_000_000_000
@@ -110,7 +111,7 @@ class CanTap:
         opening = asyncio.ensure_future(asyncio.to_thread(open_bus, address, participant=IDENTITY))
         try:
             bus = await asyncio.shield(opening)
-        except BusError as error:
+        except LinkError as error:
             self._refusal[name] = str(error)
             return
         except asyncio.CancelledError:  # the last page has gone meanwhile

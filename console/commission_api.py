@@ -28,7 +28,7 @@ from console.accounts import Role
 from console.commissioning import Commissioning
 from machine.joints import JOINTS, Joint
 from machine.profile import joint
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 STATIC: Final = Path(__file__).with_name("static")
 SUFFIX: Final = ".protocol.json"
@@ -122,7 +122,7 @@ class CommissionApi:
             return PlainTextResponse("Something runs already; wait, or end it.", 409)
         try:
             begin(self._work, lambda: self._access.leads(page))
-        except CodedError as error:
+        except TimberhandError as error:
             return PlainTextResponse(f"Not begun: {error}.", 422)
         return Response(status_code=204)
 
@@ -159,7 +159,7 @@ class CommissionApi:
             return PlainTextResponse(f"This is larger than {MAX_JSON_BYTES >> 10} kB.", 413)
         try:
             protocol = read_protocol(data)
-        except CodedError as error:
+        except TimberhandError as error:
             return PlainTextResponse(f"Not saved: {error}.", 422)
         facts = {
             "name": name,

@@ -23,27 +23,23 @@ from typing import Any, Final, Protocol
 from autonomy.calibration.plan import make_plan
 from autonomy.calibration.procedure import Calibration
 from autonomy.calibration.procedure_state import PATIENCE_S
-from autonomy.calibration.profile_file import Change, ProfileNotWritten, profile_changes, write_profile
+from autonomy.calibration.profile_file import Change, profile_changes, write_profile
 from autonomy.calibration.report import write_report
 from autonomy.calibration.result import identify
 from autonomy.calibration.tasks import task_name
 from autonomy.commissioning.step_test import StepResult, StepTest
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import open_bus
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import StateReport
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile
-from runtime.errors import CodedError
+from runtime.errors import InputRefused, LinkError, TimberhandError
 
 POLL_S: Final = 0.01
 LEASE_LOST: Final = "the page that began it has no control any more"
 DECIMALS: Final = 5
-
-
-class CommissioningRefused(CodedError, ValueError):
-    """Nothing is begun; the sentence says why."""
 
 
 class Procedure(Protocol):
@@ -93,7 +89,7 @@ class Commissioning:
         """Step a joint; it begins when the machine is armed, and ends when ``goes_on`` says no.
 
         Raises:
-            StepRefused: the joint cannot be stepped so.
+            InputRefused: the joint cannot be stepped so.
         """
         test = StepTest(self.profile, self.profile_hash, which, amount, load("crane"), key=self.key)
         self._begin(f"step of the {which.name.lower()}", test, test.keys, goes_on, lambda: self._keep(test.result()))
@@ -102,12 +98,12 @@ class Commissioning:
         """Calibrate the joints ``chosen``, without a survey.
 
         Raises:
-            CalibrationImpossible: a joint has no room, or nothing to be tested by.
-            CommissioningRefused: its report could not be drawn.
+            InputRefused: a joint has no room, or nothing to be tested by.
+            InputRefused: its report could not be drawn.
         """
         if importlib.util.find_spec("matplotlib") is None:
             sentence = "the report of a calibration needs matplotlib; install timberhand[tools]"
-            raise CommissioningRefused("commission.no-plots", sentence)
+            raise InputRefused("commission.no-plots", sentence)
         report = self.report()
         position = (math.nan,) * len(JOINTS) if report is None else report.position
         plan = make_plan(self.profile, position, surveyed=False, chosen=chosen)
@@ -160,7 +156,7 @@ class Commissioning:
             if run.done:
                 self._said = finish()
             self._failure = run.failure or ""
-        except (BusError, CodedError, OSError, ValueError) as error:
+        except (LinkError, TimberhandError, OSError, ValueError) as error:
             self._failure = str(error)
 
     def _drive(self, run: Procedure, bus: Bus, link: socket.socket, goes_on: Callable[[], bool]) -> None:
@@ -204,7 +200,7 @@ class Commissioning:
         self.found = {"name": name, "plots": plots, "changes": _before_and_after(self.source, changed)}
         if result.implausible:
             problems = " ".join(problem.sentence for problem in result.implausible)
-            raise ProfileNotWritten("calibration.implausible", f"No profile is written: {problems}")
+            raise InputRefused("calibration.implausible", f"No profile is written: {problems}")
         write_profile(self.source, self.folder / f"{name}.toml", changed, facts["date"])
         again = f" Tests repeated after a stop: {run.resumptions}." if run.resumptions else ""
         return f"{name}.toml is written, with {len(changed)} new values; its report is the folder beside it.{again}"

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from console.accounts import Accounts, AccountsRefused, read_accounts
+from console.accounts import Accounts, read_accounts
 from console.start_error import StartError
+from runtime.errors import ConfigError
 
 CREDENTIALS: Final = {"passwords": "console-passwords", "tls_cert": "console-cert", "tls_key": "console-key"}
 
@@ -65,7 +66,7 @@ class Exposure:
             self._check_tls(self.tls_cert, self.tls_key)
         try:
             return None if self.passwords is None else read_accounts(self.passwords)
-        except AccountsRefused as error:
+        except ConfigError as error:
             raise StartError(error.code, str(error), 3) from None
 
     @staticmethod

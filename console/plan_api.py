@@ -31,6 +31,7 @@ from console.access import Access
 from console.access_guards import page_of, person_of
 from console.accounts import Role
 from machine.profile import Carrier, Profile
+from runtime.errors import InputRefused
 
 # -- What the plan page is told about a mission: errors and warnings with the part that each is about, time and
 # wood.
@@ -41,21 +42,17 @@ from machine.profile import Carrier, Profile
 MAX_FINDINGS = 100
 
 
-class DocumentRefused(ValueError):
-    """The page's mission does not match the schema; the message is one sentence."""
-
-
 def mission_of(body: bytes) -> ForwardingMission:
     """The mission in a request.
 
     Raises:
-        DocumentRefused: it is not JSON, or a field is unknown, missing or of the wrong type.
+        InputRefused: it is not JSON, or a field is unknown, missing or of the wrong type.
     """
     try:
         return msgspec.json.decode(body, type=ForwardingMission)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         reason = str(error)[:200].rstrip(".")
-        raise DocumentRefused(f"This is not a mission of this page: {reason}.") from None
+        raise InputRefused("plan.document", f"This is not a mission of this page: {reason}.") from None
 
 
 def site_of(carrier: Carrier) -> tuple[float, float]:
@@ -255,9 +252,7 @@ def _answering(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[R
         except Refused as refused:
             status, sentence = refused.args
             return PlainTextResponse(sentence, status)
-        except DocumentRefused as error:
-            return JSONResponse({"code": "plan.document", "sentence": str(error)}, 422)
-        except MissionError as error:
+        except (InputRefused, MissionError) as error:
             return JSONResponse({"code": error.code, "sentence": str(error)}, 422)
         except ClientDisconnect:
             return Response(status_code=400)

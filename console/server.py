@@ -32,10 +32,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.missions.folder import MissionFolder
-from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from autonomy.perception.log_list.datagrams import decode_logs, encode_request
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction
 from can_dbc.messages.mission import MissionAction
-from can_dbc.timing.page import TimingRefused, read_timing
+from can_dbc.timing.page import read_timing
 from console.access import Access, Page
 from console.access_guards import AccessGuards, AuditTrail, page_of, person_of
 from console.access_routes import access_routes
@@ -49,6 +49,7 @@ from console.panel import Panel, panel_data, panels_of
 from console.plan_api import PlanApi
 from console.state import CraneState, describe_machine
 from console.true_logs import TrueLogs
+from runtime.errors import InputRefused
 
 # -- The page's buttons to try to break a live run: asks the desk of faults, and follows what becomes of each.
 #
@@ -125,7 +126,7 @@ class _Logs(asyncio.DatagramProtocol):
         self._console = console
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        with contextlib.suppress(LogListError):
+        with contextlib.suppress(InputRefused):
             self._console.crane_state.logs = decode_logs(data)
 
 
@@ -137,7 +138,7 @@ async def _request_logs(transport: asyncio.DatagramTransport) -> None:
 
 async def _read_timing(crane_state: CraneState, page: Path) -> None:
     while True:
-        with contextlib.suppress(TimingRefused):  # no page yet; the last state times out
+        with contextlib.suppress(InputRefused):  # no page yet; the last state times out
             crane_state.on_timing(await asyncio.to_thread(read_timing, page))
         await asyncio.sleep(TIMING_PERIOD_S)
 

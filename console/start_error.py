@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 
-class StartError(CodedError):
+class StartError(TimberhandError):
     """The console cannot start: an error code, one sentence and the exit code of the process."""
 
     def __init__(self, code: str, sentence: str, exit_code: int) -> None:

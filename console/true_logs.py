@@ -17,8 +17,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from autonomy.perception.log_list.datagrams import LogListError, decode_logs
+from autonomy.perception.log_list.datagrams import decode_logs
 from console.plant_link import Address, PlantLink
+from runtime.errors import InputRefused
 
 PERIOD_S: Final = 0.4
 """The plant is asked at most this often, however many pages show the logs: it has deadlines."""
@@ -61,6 +62,6 @@ class TrueLogs:
             return None
         try:
             logs = decode_logs(told)
-        except LogListError:
+        except InputRefused:
             return None
         return [asdict(log) for log in logs]

@@ -8,11 +8,7 @@ from pathlib import Path
 
 from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
 from machine.profile import Profile
-from runtime.errors import CodedError
-
-
-class ConfigError(CodedError):
-    """The controller cannot start; the sentence tells what is wrong, where, and what to do."""
+from runtime.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

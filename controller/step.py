@@ -15,13 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from can_dbc.dbc.codec import Database, DbcError, load
+from can_dbc.dbc.codec import Database, load
 from can_dbc.frame import RawFrame
 from can_dbc.messages.crane import CraneSetpoint, OperatorAction, SpoolTest
 from can_dbc.messages.vehicle import DriveSetpoint
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.carrier.vehicle import Vehicle
-from controller.config import ConfigError, Settings
+from controller.config import Settings
 from controller.crane.inputs import CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.crane.outputs import CraneWriter
@@ -42,6 +42,7 @@ from machine.joints import JOINTS
 from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import ConfigError
 
 # A constant of the module is found faster than a member of an enumeration, in every tick.
 _NONE: Final = Reason.NONE
@@ -94,7 +95,7 @@ class Controller:
         profile = settings.profile
         try:
             database = database or load("crane")
-        except DbcError as error:
+        except ConfigError as error:
             raise ConfigError(error.code, str(error)) from error
         specs = [joint(profile, j) for j in JOINTS]
         check_nodes(database, profile)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, Self
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 
 class ExitCode(IntEnum):
@@ -25,7 +25,7 @@ class ExitCode(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
-class CommandFailed(CodedError):
+class CommandFailed(TimberhandError):
     """Ends a command: an error code, one sentence for stderr, and the exit code."""
 
     def __init__(self, code: str, sentence: str, exit_code: ExitCode) -> None:
@@ -35,7 +35,7 @@ class CommandFailed(CodedError):
     @classmethod
     def from_error(cls, error: Exception, exit_code: ExitCode) -> Self:
         """The same sentence, and the same error code where ``error`` carries one."""
-        return cls(error.code if isinstance(error, CodedError) else "", str(error), exit_code)
+        return cls(error.code if isinstance(error, TimberhandError) else "", str(error), exit_code)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.code, str(self), self.exit_code)

@@ -23,20 +23,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus.base import Bus, BusError, BusState
+from can_dbc.bus.base import Bus, BusState
 from can_dbc.bus.batch import enlarge_receive_buffer
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.frame import Frame
-from can_dbc.messages.picture import PictureRefused, decode_picture, encode_picture_request
+from can_dbc.messages.picture import decode_picture, encode_picture_request
 from can_dbc.messages.record_ring import RingReader, default_path
 from can_dbc.messages.udp_address import address_argument
-from can_dbc.timing.page import Timing, TimingRefused, read_timing
+from can_dbc.timing.page import Timing, read_timing
 from machine.loading.profile_file import ProfileError, load_profile
 from recorder import journal
 from recorder.manifest import describe
-from recorder.recorder import Recorder, RecordingRefused
+from recorder.recorder import Recorder
 from recorder.stop import Stop
+from runtime.errors import InputRefused, LinkError
 
 QUEUE_ITEMS: Final = 50_000
 """About ten seconds of two busy buses."""
@@ -126,7 +127,7 @@ class InputCollector:
             if (now := time.monotonic()) < next_read_s:
                 return
             next_read_s = now + TIMING_PERIOD_S
-            with contextlib.suppress(TimingRefused):  # no controller, or one that has not started
+            with contextlib.suppress(InputRefused):  # no controller, or one that has not started
                 timing = read_timing(path)
                 if timing.facts.written_ns != written_ns:
                     written_ns = timing.facts.written_ns
@@ -142,7 +143,7 @@ class InputCollector:
 
         def receive() -> None:
             nonlocal next_ask_s, newest_ns
-            with contextlib.suppress(OSError, PictureRefused):  # no detector yet, or one without a camera
+            with contextlib.suppress(OSError, InputRefused):  # no detector yet, or one without a camera
                 while True:
                     data = sock.recv(MAX_DATAGRAM_BYTES)
                     facts, jpeg = decode_picture(data)
@@ -271,10 +272,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         manifest = describe(profile, tuple(addresses), a.seed, live=True)
         on_stop = write_to_journal if a.journal else None
         recorder = Recorder(a.out, profile, manifest, key, not a.no_sync, a.stops, on_stop)
-    except (ProfileError, RecordingRefused) as error:
+    except (ProfileError, InputRefused) as error:
         report(str(error))
         return 3
-    except BusError as error:
+    except LinkError as error:
         report(str(error))
         return 4
     except (OSError, OverflowError) as error:

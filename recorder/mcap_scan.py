@@ -21,7 +21,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -30,10 +30,6 @@ _MAX_CHUNK_BYTES = 256 << 20
 """A chunk that says it is longer is damaged; the recorder's have a few megabytes."""
 _DAMAGED = (ValueError, struct.error, McapError, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 """What the libraries raise for damaged records and chunks."""
-
-
-class NotMcap(CodedError, ValueError):
-    """The file is not an MCAP file; the sentence names it."""
 
 
 class Stored(NamedTuple):
@@ -59,12 +55,12 @@ def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema |
     """Every schema, channel and message (of ``topics``; None: all) up to the end of the valid part.
 
     Raises:
-        NotMcap: The file does not start like an MCAP file.
+        InputRefused: The file does not start like an MCAP file.
     """
     with path.open("rb") as file:
         magic = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(magic):
-            raise NotMcap("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
+            raise InputRefused("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
         wanted: set[int] = set()
         while True:
             head = file.read(_RECORD.size)
@@ -117,4 +113,4 @@ def _records(data: bytes, topics: Collection[str] | None, wanted: set[int]) -> I
         at += length
 
 
-__all__ = ["Channel", "NotMcap", "Schema", "Stored", "is_complete", "scan"]
+__all__ = ["Channel", "Schema", "Stored", "is_complete", "scan"]

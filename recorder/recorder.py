@@ -35,7 +35,7 @@ from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.grasp import decode_grasp
 from can_dbc.messages.json_schema import flat_schema
 from can_dbc.messages.mission import decode_mission
-from can_dbc.messages.picture import PictureRefused, decode_picture
+from can_dbc.messages.picture import decode_picture
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
 from machine.foxglove.topics import ENCODING, MachineTopics, Message
@@ -49,7 +49,7 @@ from recorder.stop import Stop
 from recorder.stop_files import TICK as TICK
 from recorder.stop_files import StopFiles
 from recorder.stop_recorder import StopRecorder
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 # -- Decodes the frames of a bus for a recording: message name, and values under their DBC names.
 #
@@ -111,10 +111,6 @@ _JSON: Final = msgspec.json.Encoder()
 _OBJECT: Final = b'{"type":"object"}'
 
 
-class RecordingRefused(CodedError):
-    """The recording cannot start; the sentence says what to do."""
-
-
 class Recorder:
     """One recording (module docstring: contract)."""
 
@@ -134,7 +130,7 @@ class Recorder:
         stop and the path that its file will have.
 
         Raises:
-            RecordingRefused: The directory cannot be written or contains a recording.
+            InputRefused: The directory cannot be written or contains a recording.
         """
         self.dropped = 0
         """Records lost because they could not be written."""
@@ -157,14 +153,14 @@ class Recorder:
             directory.mkdir(parents=True, exist_ok=True)
             if run_files(directory):
                 recover(directory)
-                raise RecordingRefused(
+                raise InputRefused(
                     "recording.exists", f"{directory} already contains a recording; give another directory"
                 )
             manifests.write(directory, manifest)
             self._text = {bus: CommitFile(directory / f"{bus}.log", self._durable) for bus in manifest.buses}
             self._open_segment()
         except OSError as error:
-            raise RecordingRefused(
+            raise InputRefused(
                 "recording.cannot-write",
                 f"cannot record in {directory} ({error.strerror}); free space on the disk or give another directory",
             ) from error
@@ -191,7 +187,7 @@ class Recorder:
         """Records the controller's record of one tick, unchanged."""
         try:
             tick = tick_record.decode(record)
-        except tick_record.RecordRefused:
+        except InputRefused:
             self.refused += 1
             return
         self._at(tick.now_ns)
@@ -233,7 +229,7 @@ class Recorder:
         """Records a log detector's reply to a request for its newest picture; a reply without one is not recorded."""
         try:
             facts, jpeg = decode_picture(datagram)
-        except PictureRefused:
+        except InputRefused:
             return
         if jpeg:
             self._at(facts.measured_ns)

@@ -18,10 +18,11 @@ from typing import Final
 import msgspec
 
 from recorder.manifest import Manifest
-from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
+from recorder.mcap_scan import Stored, is_complete, scan
 from recorder.recover import rewrite
 from recorder.segment import Segment
 from recorder.stop import TOPIC, Stop
+from runtime.errors import InputRefused
 
 TICK: Final = "/controller/tick"
 MAX_FILES: Final = 50
@@ -142,7 +143,7 @@ def repair(directory: Path) -> list[Path]:
 def _has_stop(part: Path) -> bool:
     try:
         return any(isinstance(record, Stored) for record in scan(part, {TOPIC}))
-    except NotMcap:
+    except InputRefused:
         return False
 
 

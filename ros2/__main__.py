@@ -23,13 +23,13 @@ from typing import Final
 from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.process.controller_link import ControllerLink
 from autonomy.process.event_output import emit
-from can_dbc.messages.key_file import KeyFileError, read_key
+from can_dbc.messages.key_file import read_key
 from can_dbc.messages.udp_address import address_argument
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from ros2.bridge import Bridge, run
 from ros2.execution.execution import TrajectoryExecution
 from ros2.process import BUSY, add_node_options, catch_signals, complain, exit_code, open_node
-from ros2.wire.node import Ros2Error
+from runtime.errors import ConfigError, LinkError
 
 NAME: Final = "timberhand"
 _FEEDBACK_INDEX: Final = {"jazzy": False, "kilted": True, "lyrical": True}
@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         profile = load_profile(options.profile)
         key = None if options.key_file is None else read_key(options.key_file)
-    except (ProfileError, KeyFileError) as error:
+    except (ProfileError, ConfigError) as error:
         return complain(str(error))
     if not 0 < options.lease_ms <= profile.timeouts.lease_max_ms:
         return complain(f"--lease-ms {options.lease_ms}: {profile.name} allows 1..{profile.timeouts.lease_max_ms}")
@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
         bridge = Bridge(profile, link, node, execution, _FEEDBACK_INDEX[options.distribution], emit)
         emit("ready", domain=options.domain, goals=execution is not None)
         run(bridge, link, signals)
-    except Ros2Error as error:
+    except LinkError as error:
         return complain(str(error), BUSY)
     finally:
         link.close()

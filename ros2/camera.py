@@ -23,8 +23,9 @@ from machine.loading.profile_file import ProfileError, load_profile
 from ros2.interfaces.sensor import CameraInfo, Image
 from ros2.process import BUSY, add_node_options, catch_signals, complain, exit_code, open_node
 from ros2.report.pictures import camera_info, colour_image, depth_image
-from ros2.wire.node import Node, Ros2Error, send
+from ros2.wire.node import Node, send
 from ros2.wire.qos import sensor_data
+from runtime.errors import LinkError
 
 FRAME_TIMEOUT_S: Final = 0.5
 POLL_S: Final = 0.1
@@ -110,7 +111,7 @@ def main(argv: list[str] | None = None) -> int:
         camera = CameraNode(open_node(f"timberhand_{options.camera}", options), options.camera, source)
         emit("ready", camera=options.camera, domain=options.domain)
         _run(camera, 1.0 / options.rate_hz, signals)
-    except Ros2Error as error:
+    except LinkError as error:
         return complain(str(error), BUSY)
     finally:
         source.close()

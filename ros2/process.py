@@ -42,7 +42,7 @@ def add_node_options(parser: argparse.ArgumentParser) -> None:
 
 
 def open_node(name: str, options: argparse.Namespace) -> Node:
-    """The node of a process; warns when others can reach it.  Raises Ros2Error."""
+    """The node of a process; warns when others can reach it.  Raises LinkError."""
     node = Node(name, options.domain, options.interface)
     if options.interface != LOOPBACK:
         sys.stderr.write(

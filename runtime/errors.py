@@ -1,11 +1,11 @@
-"""The base of all errors that reach a person: a sentence to read and a code to compare."""
+"""The errors that reach a person: a sentence to read, a code to compare, a class for what a caller can do about it."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 
-class CodedError(Exception):
+class TimberhandError(Exception):
     """An error with a sentence for people and a code for programs.
 
     ``code`` is stable; the sentence may be reworded.  A code is written ``area.what`` in lower case with hyphens, for
@@ -21,8 +21,20 @@ class CodedError(Exception):
         return type(self), (self.code, str(self))
 
 
+class InputRefused(TimberhandError, ValueError):
+    """What was given is wrong: a file, a picture, a text, a number, an option.  Give another one."""
+
+
+class ConfigError(TimberhandError, ValueError):
+    """The installation is wrong: a database, a register map, a setting, a key, an account, a plug-in.  Correct it."""
+
+
+class LinkError(TimberhandError):
+    """What is outside this process does not answer: a bus, a PLC, a camera, a network.  Check it, and try again."""
+
+
 class Problem(NamedTuple):
-    """What is wrong, where nothing is raised: the code to compare and the sentence to read, as of a `CodedError`."""
+    """What is wrong, where nothing is raised: code and sentence, as of a `TimberhandError`."""
 
     code: str
     sentence: str

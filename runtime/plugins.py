@@ -6,26 +6,22 @@ import re
 from importlib.metadata import entry_points
 from typing import Any, Final
 
-from runtime.errors import CodedError
+from runtime.errors import ConfigError
 
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]*")
-
-
-class PluginError(CodedError, ValueError):
-    """An entry point cannot be used; the sentence says why, and which there are."""
 
 
 def load_plugin(group: str, name: str, *arguments: Any) -> Any:
     """What the factory of an entry point makes of the arguments; most take none.
 
     Raises:
-        PluginError: no installed package has such an entry point, several have, or it cannot be loaded.
+        ConfigError: no installed package has such an entry point, several have, or it cannot be loaded.
     """
     known = entry_points(group=group)
     points = [point for point in known if point.name == name]
     if len(points) != 1 or not NAME.fullmatch(name):
         names = ", ".join(sorted(point.name for point in known)) or "none"
-        raise PluginError(
+        raise ConfigError(
             "plugin.unknown",
             f"{len(points)} installed packages have an entry point {name!r} in {group} (installed: {names}); exactly "
             "one must, with a name of small letters, digits, - and _",
@@ -33,6 +29,6 @@ def load_plugin(group: str, name: str, *arguments: Any) -> Any:
     try:
         return points[0].load()(*arguments)
     except Exception as error:
-        raise PluginError(
+        raise ConfigError(
             "plugin.unusable", f"the entry point {points[0].value} of {group} cannot be loaded: {error!r}"
         ) from error

@@ -24,10 +24,10 @@ from pathlib import Path
 
 import msgspec
 
-from can_dbc.bus.base import BusError
 from can_dbc.bus.factory import open_bus
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
+from runtime.errors import LinkError
 from sim.errors import PlantError
 from sim.ground.terrain import KINDS as TERRAINS
 from sim.individual import beside
@@ -112,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         sys.stderr.write(f"plant: {error}\n")
         return 3
-    except (BusError, OSError) as error:
+    except (LinkError, OSError) as error:
         sys.stderr.write(f"plant: {error}\n")
         return 4
     return 0

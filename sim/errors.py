@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 
-class PlantError(CodedError, ValueError):
+class PlantError(TimberhandError, ValueError):
     """A truth, scene, site or request that the plant cannot use.
 
     ``logs`` are the numbers of the logs in a scene that it is about; empty where it is about none.

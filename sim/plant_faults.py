@@ -15,10 +15,11 @@ from typing import Final
 
 import msgspec
 
-from can_dbc.dbc.codec import Database, DbcError, MessageCodec, load
+from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.protocols.canopen import NMT_ID, NmtCommand
 from machine.crane_nodes import CraneNode
 from machine.profile import Profile
+from runtime.errors import ConfigError
 from sim.emulation import EmulatedMachine
 from sim.errors import PlantError
 from sim.faults import frame_tap
@@ -235,7 +236,7 @@ def message(profile: Profile, name: str) -> tuple[str, MessageCodec]:
     for bus, kind in buses:
         try:
             return bus, database(kind).message(name)
-        except DbcError:
+        except ConfigError:
             continue
     raise PlantError("fault.no-message", f"{profile.name} has no message {name!r}; take a name of its DBC files")
 

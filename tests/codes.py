@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 
-def coded(code: str) -> Callable[[CodedError], bool]:
+def coded(code: str) -> Callable[[TimberhandError], bool]:
     """For ``pytest.raises(..., check=coded("profile.unknown-key"))``."""
     return lambda error: error.code == code
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 from timberhand.commands import (
     bench,
     calibrate,
@@ -169,11 +169,11 @@ def _extra_with(module: str) -> str | None:
     return None
 
 
-def _coded_errors() -> tuple[type[CodedError], type[GuardConfigError]]:
+def _coded_errors() -> tuple[type[TimberhandError], type[GuardConfigError]]:
     """Errors whose sentence is for the user; the guard, which shares no code with us, has one of its own."""
     from controller.guard.layout import GuardConfigError
 
-    return CodedError, GuardConfigError
+    return TimberhandError, GuardConfigError
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, MissionError
 from autonomy.missions.review import review
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.key_file import SERVICE_KEY, KeyFileError, read_key
+from can_dbc.messages.key_file import SERVICE_KEY, read_key
 from can_dbc.messages.mission import (
     MissionAction,
     MissionCommand,
@@ -31,6 +31,7 @@ from can_dbc.messages.mission import (
 from can_dbc.messages.mission_upload import MissionUpload, encode_mission_upload
 from host.exit_codes import CommandFailed, ExitCode
 from machine.profile import Profile
+from runtime.errors import ConfigError
 
 ANSWER_S: Final = 3.0
 """The planner answers at once, but plans a path while it does."""
@@ -66,7 +67,7 @@ def key_of(file: Path | None) -> bytes | None:
         return None
     try:
         return read_key(file or SERVICE_KEY)
-    except KeyFileError as error:
+    except ConfigError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
 
 

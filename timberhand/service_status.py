@@ -17,9 +17,10 @@ from rich.table import Table
 from rich.text import Text
 
 from can_dbc.timing.durations import Durations
-from can_dbc.timing.page import Facts, InputAge, Timing, TimingRefused, default_path, read_timing
+from can_dbc.timing.page import Facts, InputAge, Timing, default_path, read_timing
 from host.exit_codes import ExitCode
 from host.systemd import last_journal_line, show_all
+from runtime.errors import InputRefused
 
 NAMES: Final = (
     "controller",
@@ -120,7 +121,7 @@ def read_status(page: Path | None = None) -> Status:
     timing = None
     try:
         timing = read_timing(page or (SERVICE_PAGE if SERVICE_PAGE.exists() else default_path()))
-    except TimingRefused as refused:
+    except InputRefused as refused:
         notes.append(str(refused))
     return Status(units, timing, tuple(notes))
 

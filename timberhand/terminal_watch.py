@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Final
 
 from can_dbc.messages.crane import WATCH_PERIOD_NS
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 QUESTION: Final = b"\x1b[5n"
 MAX_QUESTIONS: Final = 16
@@ -29,10 +29,6 @@ FIRST_ANSWER_NS: Final = 3_000_000_000
 _ANSWER: Final = re.compile(rb"\x1b\[[0-9]n")
 _PART: Final = re.compile(rb"\x1b(\[[0-9]?)?\Z")
 """The beginning of an answer, at the end of what was read."""
-
-
-class TerminalError(CodedError, ValueError):
-    """The terminal cannot be watched; the sentence says what to do."""
 
 
 class TerminalWatch:
@@ -50,11 +46,11 @@ class TerminalWatch:
         """Whether to ask now.
 
         Raises:
-            TerminalError: it has never answered.
+            InputRefused: it has never answered.
         """
         self._begun_ns = self._begun_ns or now_ns
         if not self._answered and now_ns - self._begun_ns >= FIRST_ANSWER_NS:
-            raise TerminalError(
+            raise InputRefused(
                 "operator.silent-terminal",
                 "this terminal does not answer (DSR), so a lost link would not be seen; use another, or the page",
             )
@@ -83,7 +79,7 @@ def _read(reading: int) -> bytes:
     with contextlib.suppress(OSError):
         data = os.read(reading, 1024)
     if not data:
-        raise TerminalError("operator.terminal-gone", "the terminal is gone, so nobody watches: the machine holds")
+        raise InputRefused("operator.terminal-gone", "the terminal is gone, so nobody watches: the machine holds")
     return data
 
 
@@ -92,10 +88,10 @@ def watch(send: Callable[[int], None], limit_ns: int, reading: int = 0, writing:
     file descriptors of the terminal.
 
     Raises:
-        TerminalError: it is none, or does not answer.
+        InputRefused: it is none, or does not answer.
     """
     if not (os.isatty(reading) and os.isatty(writing)):
-        raise TerminalError(
+        raise InputRefused(
             "operator.no-terminal", "input and output are no terminal, so nobody can be there; run it in one"
         )
     before = termios.tcgetattr(reading)

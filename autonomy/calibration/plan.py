@@ -1,7 +1,7 @@
 """Plan of a calibration: the pose and the range of each joint's tests, and what they stay clear of.
 
 Every pose of every test keeps the open grapple above ground, bunk and logs, and every joint away from its stops.
-Failure: ``CalibrationImpossible`` before anything moves.
+Failure: ``InputRefused`` before anything moves.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from autonomy.calibration.survey import most_informative_poses
 from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, Profile, joint
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 RANGE_MARGIN: Final = 1.35
 """A joint may travel this many times farther than its profile says: gains differ by a fifth, levers by a tenth."""
@@ -41,10 +41,6 @@ HEIGHT_WEIGHT: Final = 0.3
 TRAVEL_WEIGHT_1_S: Final = 0.03
 _GRID_COUNT: Final = 9
 _BOOM_JOINTS: Final = (Joint.LIFT, Joint.TILT, Joint.EXT)
-
-
-class CalibrationImpossible(CodedError, ValueError):
-    """The machine cannot be calibrated here; the sentence says which joint lacks room and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +97,7 @@ def make_plan(
     With fewer joints ``chosen``, only these are tested, and not the grapple: enough after a valve was replaced.
 
     Raises:
-        CalibrationImpossible: a joint has too little room, or nothing chosen can be tested.
+        InputRefused: a joint has too little room, or nothing chosen can be tested.
     """
     here = [0.0 if np.isnan(p) else float(p) for p in position]
     clear = clear_height_m(profile)
@@ -114,7 +110,7 @@ def make_plan(
     turned = Joint.ROT if surveyed and Joint.ROT in blind and Joint.ROT in chosen else None
     if not plans and turned is None:
         names = ", ".join(j.name.lower() for j in chosen)
-        raise CalibrationImpossible(
+        raise InputRefused(
             "calibration.no-encoder", f"{names}: without an encoder only a survey can test it; choose other joints"
         )
     whole = all(j in chosen for j in JOINTS)
@@ -136,7 +132,7 @@ def _joint_plan(profile: Profile, which: Joint, before: Sequence[float], slew: f
     needed = required_range(spec)
     name = which.name.lower()
     if needed > high - low:
-        raise CalibrationImpossible(
+        raise InputRefused(
             "calibration.range-too-short",
             f"the {name} has {high - low:.2f} of free range, its tests may need {needed:.2f}; lower its speed_limit or "
             "correct full_speed in the profile",
@@ -152,7 +148,7 @@ def _joint_plan(profile: Profile, which: Joint, before: Sequence[float], slew: f
             if best is None or cost < best[0]:
                 best = (cost, tuple(_with(q, which, start + BEGIN_SHARE * needed)), start)
     if best is None:
-        raise CalibrationImpossible(
+        raise InputRefused(
             "calibration.no-clear-pose",
             f"no pose leaves the {name} {needed:.2f} of free travel with the grapple {TIP_CLEARANCE_M} m clear of "
             "ground and bunk; check [workspace], [bunk] and the joint limits in the profile",

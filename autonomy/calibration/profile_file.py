@@ -23,7 +23,7 @@ from machine.joints import Joint
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import JointSpec, Profile, joint
 from machine.sensing.weighing import lever_share
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 SPEED_LIMIT_SHARE: Final = 0.9
 """A joint that cannot reach its speed limit gets a limit at this share of what it reaches."""
@@ -32,10 +32,6 @@ SIGNIFICANT_SAG_DIGITS: Final = 5
 COMMENT_COLUMN: Final = 40
 """Column of the comments, as in the shipped profiles."""
 Change = tuple[tuple[str, ...], Any, str]
-
-
-class ProfileNotWritten(CodedError, ValueError):
-    """No profile was written; the sentence says why and what to do."""
 
 
 def profile_changes(profile: Profile, result: CalibrationResult) -> list[Change]:
@@ -147,7 +143,7 @@ def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> 
     """Write the calibrated copy of ``source``.
 
     Raises:
-        ProfileNotWritten: ``out`` exists, cannot be written, or would be no valid profile.
+        InputRefused: ``out`` exists, cannot be written, or would be no valid profile.
     """
     document = tomlkit.parse(source.read_text(encoding="utf-8"))
     for path, value, remark in changed:
@@ -165,15 +161,13 @@ def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> 
         load_profile(scratch)
         os.link(scratch, out)  # whole or not at all, and never over an existing file
     except ProfileError as error:
-        raise ProfileNotWritten(
-            "calibration.profile-invalid", f"the calibrated profile would be refused: {error}"
-        ) from None
+        raise InputRefused("calibration.profile-invalid", f"the calibrated profile would be refused: {error}") from None
     except FileExistsError:
-        raise ProfileNotWritten(
+        raise InputRefused(
             "calibration.profile-exists", f"{out} exists and is not overwritten; choose another --out"
         ) from None
     except OSError as error:
-        raise ProfileNotWritten(
+        raise InputRefused(
             "calibration.profile-unwritable",
             f"{out}: the profile cannot be written: {error.strerror}; choose another --out",
         ) from None

@@ -29,7 +29,7 @@ from machine.geometry.sag import true_pin
 from machine.joints import N_JOINTS, Joint
 from machine.profile import Kinematics, Sag
 from machine.sensing.weighing import empty_moment_nm
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 OFFSETS: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
 PIN_SIGMA_M: Final = 0.002
@@ -48,10 +48,6 @@ USUAL_COMPLIANCE_RAD_NM: Final = 1e-6
 USUAL_PARAMETERS: Final = (1.0, 0.01, 6e3, 8e3)
 """Compliance, rest, head and pin of a usual crane, for choosing the poses of a survey."""
 MIN_POSES: Final = 5
-
-
-class SurveyError(CodedError, ValueError):
-    """A survey that determines nothing; the sentence says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +117,10 @@ def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | 
     ``known``: the sag in the present profile; only ``before_m`` depends on it.
 
     Raises:
-        SurveyError: there are too few readings.
+        InputRefused: there are too few readings.
     """
     if len(readings) < MIN_POSES:
-        raise SurveyError(
+        raise InputRefused(
             "survey.too-few-poses",
             f"{len(readings)} surveyed poses are too few; survey {MIN_POSES} or more, far apart",
         )

@@ -10,14 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 COLUMNS: Final = ("u_px", "v_px", "x_m", "y_m", "z_m")
 DEPTH_COLUMN: Final = "depth_m"
-
-
-class TargetsFileError(CodedError, ValueError):
-    """The file is no list of targets; the sentence names the line and what is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +29,17 @@ def load_targets(path: Path) -> SurveyTargets:
     """The targets of a file with the columns ``COLUMNS`` and, where the camera measures depth, ``DEPTH_COLUMN``.
 
     Raises:
-        TargetsFileError: the file cannot be read, a column is missing or a value is not a finite number.
+        InputRefused: the file cannot be read, a column is missing or a value is not a finite number.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise TargetsFileError("targets.unreadable", f"{path}: cannot be read as text: {error}") from None
+        raise InputRefused("targets.unreadable", f"{path}: cannot be read as text: {error}") from None
     rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
     names = [(name or "").strip() for name in rows.fieldnames or ()]
     missing = [name for name in COLUMNS if name not in names]
     if missing:
-        raise TargetsFileError(
+        raise InputRefused(
             "targets.column-missing",
             f"{path}:1: column {missing[0]} is missing; the first line is {','.join((*COLUMNS, DEPTH_COLUMN))}",
         )
@@ -64,7 +60,7 @@ def _number(text: str | None, name: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise TargetsFileError(
+        raise InputRefused(
             "targets.not-a-number", f"{where}: {name} is {text!r}, not a number; write decimals with a point"
         )
     return value

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MAX_JSON_BYTES: Final = 65_536
 
@@ -92,23 +92,19 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     place: Line = ""
 
 
-class ProtocolRefused(CodedError, ValueError):
-    """A form cannot be taken; the sentence says why."""
-
-
 def read_protocol(data: bytes) -> Protocol:
     """The form in a document.
 
     Raises:
-        ProtocolRefused: it is none, or does not have every check once.
+        InputRefused: it is none, or does not have every check once.
     """
     try:
         found = msgspec.json.decode(data, type=Protocol)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ProtocolRefused("acceptance.document", f"this is no acceptance protocol: {error}") from None
+        raise InputRefused("acceptance.document", f"this is no acceptance protocol: {error}") from None
     if sorted(entry.id for entry in found.entries) != sorted(IDS):
         sentence = f"the protocol has not every check once; it needs {', '.join(IDS)}"
-        raise ProtocolRefused("acceptance.checks", sentence)
+        raise InputRefused("acceptance.checks", sentence)
     return found
 
 

@@ -30,7 +30,7 @@ from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
 from machine.status.explanation import describe
 from machine.status.modes import Mode
-from runtime.errors import CodedError, Problem
+from runtime.errors import InputRefused, Problem
 
 REST_S: Final = 1.5
 """At either end, so that the joint comes to rest and its error is seen."""
@@ -45,10 +45,6 @@ BEGUN_SHARE: Final = 0.1
 _PRESSURES: Final = ("PressA", "PressB")
 _MAX_TICK_S: Final = 0.1
 _NS: Final = 1e-9
-
-
-class StepRefused(CodedError, ValueError):
-    """The step cannot be made; the sentence says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,14 +129,14 @@ class StepTest:
         """Step ``which`` by ``amount`` [rad, m].
 
         Raises:
-            StepRefused: the joint cannot be seen to step, or the amount is too large.
+            InputRefused: the joint cannot be seen to step, or the amount is too large.
         """
         spec, name = joint(profile, which), which.name.lower()
         if spec.encoder is None:
-            raise StepRefused("step.no-encoder", f"the {name} has no encoder, so its step could not be seen")
+            raise InputRefused("step.no-encoder", f"the {name} has no encoder, so its step could not be seen")
         self.largest = largest_step(profile, which)
         if not 0.0 < abs(amount) <= self.largest:
-            raise StepRefused("step.amount", f"a step of the {name} is at most {self.largest:.3f}, not {amount:+.3f}")
+            raise InputRefused("step.amount", f"a step of the {name} is at most {self.largest:.3f}, not {amount:+.3f}")
         self.joint, self.amount = which, amount
         self.done = self.idle = False
         self.begun_ns: int | None = None

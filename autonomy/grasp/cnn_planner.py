@@ -18,18 +18,11 @@ import numpy as np
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, lowest_m
 from autonomy.grasp.grapple_heights import known_ground_m
 from autonomy.grasp.jaws import Jaws, jaws_of
-from autonomy.grasp.network import GraspMaps, NetworkInputError, PixelGrasp, best_pixel
+from autonomy.grasp.network import GraspMaps, PixelGrasp, best_pixel
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.quality import blade_sections, rests_upon, score_grasps
-from autonomy.grasp.virtual_scene import (
-    Camera,
-    SceneError,
-    camera_above,
-    cameras_along,
-    operational_area,
-    render,
-    shortened_logs,
-)
+from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
+from runtime.errors import InputRefused
 
 TIP_DEPTH_M: Final = 0.25
 """Depth of the tips below the surface of the pile."""
@@ -68,7 +61,7 @@ class CnnPlanner:
         """The virtual camera's image of a scene and the grasp in it.
 
         Raises:
-            SceneError: there is no log to see, or the camera is not above the ground.
+            InputRefused: there is no log to see, or the camera is not above the ground.
         """
         recreated = shortened_logs(world, jaws.blade_m)
         box = operational_area(recreated)
@@ -93,7 +86,7 @@ class CnnPlanner:
         ground = ground if math.isfinite(ground) else lowest_m(world)
         try:
             seen = self.view(world, jaws, ground)
-        except (SceneError, NetworkInputError) as error:
+        except InputRefused as error:
             raise NoGrasp("grasp.no-network-input", f"the network has nothing to plan from: {error}") from None
         found = seen.best
         depth = float(seen.depth_m[round(found.v_px), round(found.u_px)])

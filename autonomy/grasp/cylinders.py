@@ -24,15 +24,11 @@ from autonomy.perception.log_list.estimate import (
     unpack_covariance,
 )
 from autonomy.perception.log_list.observation import LogObservation
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MIN_RADIUS_M: Final = 0.02
 POINT_COUNT: Final = 15
 """Points of an axis at which its distance to other logs is computed."""
-
-
-class CovarianceError(CodedError, ValueError):
-    """A log's covariance cannot be sampled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +105,10 @@ def sample_cylinders(world: Cylinders, covariances: np.ndarray, count: int, seed
     """``count`` samples of the logs (n) from covariances (n, 7, 7); the same seed gives the same samples.
 
     Raises:
-        CovarianceError: a covariance is not finite.
+        InputRefused: a covariance is not finite.
     """
     if not np.all(np.isfinite(covariances)):
-        raise CovarianceError(
+        raise InputRefused(
             "grasp.covariance-not-finite", "the covariance of a log has an entry that is not finite; leave that log out"
         )
     value, vector = np.linalg.eigh(covariances)

@@ -18,7 +18,7 @@ import numpy as np
 from autonomy.networks.graph import AveragePool, BatchNorm, Conv, MaxPool, Network, Relu, Resize
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 SIDE_PX: Final = 300
 """Side of the depth image and of the full maps."""
@@ -95,14 +95,6 @@ class PixelGrasp:
     q: float
 
 
-class NetworkInputError(CodedError, ValueError):
-    """An image or a map that gives no grasp, or an unknown precision."""
-
-
-class NoDepth(NetworkInputError):
-    """The depth image has no known pixel."""
-
-
 def best_pixel(maps: GraspMaps) -> PixelGrasp:
     """The grasp of eq. 4.
 
@@ -110,10 +102,10 @@ def best_pixel(maps: GraspMaps) -> PixelGrasp:
     every sample and never exceeds it.
 
     Raises:
-        NetworkInputError: the quality is not finite everywhere.
+        InputRefused: the quality is not finite everywhere.
     """
     if not (np.isfinite(maps.q).all() and maps.q.size):
-        raise NetworkInputError("grasp.quality-not-finite", NOT_FINITE)
+        raise InputRefused("grasp.quality-not-finite", NOT_FINITE)
     return _at(maps, int(np.argmax(maps.q)))
 
 
@@ -133,11 +125,11 @@ def normalized_relief(depth_m: np.ndarray) -> np.ndarray:
     an image without ground behind its objects must be given one.
 
     Raises:
-        NoDepth: no pixel is known.
+        InputRefused: no pixel is known.
     """
     known = np.isfinite(depth_m) & (depth_m > 0.0)
     if not known.any():
-        raise NoDepth("grasp.no-depth", "the depth image holds no known pixel; check the camera and its view")
+        raise InputRefused("grasp.no-depth", "the depth image holds no known pixel; check the camera and its view")
     out = 1.0 - np.where(known, depth_m, 1.0).astype(np.float32) * _ground(depth_m, known)
     return np.where(
         known, np.arcsinh(np.clip(out, -MAX_RELIEF, MAX_RELIEF) / np.float32(RELIEF_SCALE)), np.float32(0.0)
@@ -199,9 +191,7 @@ class GraspNet:
 
     def __init__(self, arrays: Arrays, precision: str = "f32") -> None:
         if precision not in PRECISIONS:
-            raise NetworkInputError(
-                "grasp.unknown-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}"
-            )
+            raise InputRefused("grasp.unknown-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
         self._form = heads_first(PAPER, arrays)
         self._full: OpenVinoNet | None = None
         self._infer = pixel_grasp_inference(arrays, precision)
@@ -219,7 +209,7 @@ class GraspNet:
         """Maps of all pixels of a 300 x 300 depth image [m], f32.
 
         Raises:
-            NetworkInputError: another size, or no depth at all (``NoDepth``).
+            InputRefused: another size, or no depth at all (``InputRefused``).
         """
         self._full = self._full or OpenVinoNet(*self._form, SHAPE)
         return stack_maps(self._full(_picture(depth_m)))
@@ -228,7 +218,7 @@ class GraspNet:
         """The grasp of eq. 4 in a 300 x 300 depth image [m].
 
         Raises:
-            NetworkInputError: another size, or no depth at all (``NoDepth``).
+            InputRefused: another size, or no depth at all (``InputRefused``).
         """
         return self._infer(_picture(depth_m))
 
@@ -251,7 +241,7 @@ def pixel_grasp_inference(arrays: Arrays, precision: str = "f32") -> Callable[[n
         found = front(picture)
         quality = found["heads"][0, 0]
         if not np.isfinite(quality).all():
-            raise NetworkInputError("grasp.quality-not-finite", NOT_FINITE)
+            raise InputRefused("grasp.quality-not-finite", NOT_FINITE)
         v, u = np.divmod(np.argpartition(quality, -CANDIDATE_COUNT, axis=None)[-CANDIDATE_COUNT:], quality.shape[1])
         hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + kept["conv7.bias"], 0.0)
         again = hidden @ heads + kept["heads.bias"]
@@ -288,7 +278,7 @@ def stack_maps(found: Mapping[str, np.ndarray]) -> GraspMaps:
 
 def _picture(depth_m: np.ndarray) -> np.ndarray:
     if depth_m.shape != (SIDE_PX, SIDE_PX):
-        raise NetworkInputError(
+        raise InputRefused(
             "grasp.image-size", f"the grasp network takes {SIDE_PX} x {SIDE_PX} depth images, not {depth_m.shape}"
         )
     return normalized_relief(depth_m)[None, None]

@@ -15,10 +15,10 @@ from autonomy.grasp.grasp import Grasp
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 
-class NoGrasp(CodedError, ValueError):
+class NoGrasp(TimberhandError, ValueError):
     """No log can be picked or placed; the sentence says which and why."""
 
 

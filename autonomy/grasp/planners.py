@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from autonomy.grasp.planner import GraspPlanner
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.networks.weights import SHIPPED
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 from runtime.plugins import load_plugin
 
 if TYPE_CHECKING:
@@ -30,10 +30,6 @@ NAMES: Final = (SEARCH, *NETWORKS)
 MAX_VIRTUAL_CAMERAS: Final = 32
 
 
-class PlannerError(CodedError, ValueError):
-    """There is no such planner, or it has no virtual camera to move."""
-
-
 class PlannerChoice(NamedTuple):
     """A planner's name, and over how many places of the virtual camera a network's predictions are averaged."""
 
@@ -44,22 +40,22 @@ class PlannerChoice(NamedTuple):
         """The choice itself; nothing is loaded.
 
         Raises:
-            PlannerError: there is no such planner, or it has no virtual camera.
+            InputRefused: there is no such planner, or it has no virtual camera.
         """
         if self.name not in NAMES and not entry_points(group=GRASP_PLANNERS, name=self.name):
             foreign = sorted({point.name for point in entry_points(group=GRASP_PLANNERS)})
-            raise PlannerError(
+            raise InputRefused(
                 "planner.unknown",
                 f"there is no grasp planner {self.name!r}; there are: {', '.join((*NAMES, *foreign))}",
             )
         if not 1 <= self.virtual_cameras <= MAX_VIRTUAL_CAMERAS:
-            raise PlannerError(
+            raise InputRefused(
                 "planner.virtual-cameras",
                 f"{self.virtual_cameras} virtual cameras: the network's predictions can be averaged over 1 to "
                 f"{MAX_VIRTUAL_CAMERAS}",
             )
         if self.virtual_cameras > 1 and self.name not in NETWORKS:
-            raise PlannerError(
+            raise InputRefused(
                 "planner.no-virtual-camera",
                 f"the planner {self.name!r} has no virtual camera; those with one are: {', '.join(NETWORKS)}",
             )
@@ -69,9 +65,9 @@ class PlannerChoice(NamedTuple):
         """The planner.
 
         Raises:
-            PlannerError: as `check`.
-            PluginError: the package's planner cannot be loaded.
-            WeightsError: the network's weights are missing or damaged.
+            InputRefused: as `check`.
+            ConfigError: the package's planner cannot be loaded.
+            InputRefused: the network's weights are missing or damaged.
         """
         self.check()
         if self.name == SEARCH:
@@ -96,7 +92,7 @@ def network(weights: str) -> GraspNet:
     """Paper A's network with shipped weights.
 
     Raises:
-        WeightsError: they are missing or damaged.
+        InputRefused: they are missing or damaged.
     """
     from autonomy.grasp.network import GraspNet  # loads OpenVINO, which a search does not need
 

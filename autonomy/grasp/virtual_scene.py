@@ -15,7 +15,7 @@ import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
 from machine.geometry.optics import Intrinsics
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 SIDE_PX: Final = 300
 """Side of the image the network takes, cut from the middle of the camera's."""
@@ -25,10 +25,6 @@ TRIM_SHARE: Final = 0.10
 DOWNWARD_AXES: Final = np.diag([1.0, -1.0, -1.0])
 """Columns: the optical axes of a camera that looks straight down."""
 MIN_DEPTH_M: Final = 0.05
-
-
-class SceneError(CodedError, ValueError):
-    """The virtual scene cannot be built or seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +64,11 @@ def operational_area(world: Cylinders) -> OperationalArea:
     """The operational area, from the ends of the axes (eq. 1).
 
     Raises:
-        SceneError: there is no log, or a pose is not finite.
+        InputRefused: there is no log, or a pose is not finite.
     """
     ends = world.ends().reshape(-1, 3)
     if not len(ends) or not np.all(np.isfinite(ends)):
-        raise SceneError("grasp.scene-empty", "the virtual scene holds no log, or one whose pose is not finite")
+        raise InputRefused("grasp.scene-empty", "the virtual scene holds no log, or one whose pose is not finite")
     return OperationalArea(ends.min(axis=0), ends.max(axis=0))
 
 
@@ -95,12 +91,12 @@ def render(world: Cylinders, camera: Camera, ground_z_m: float) -> np.ndarray:
     """Depth (H, W) float32 [m], optical z, of cylinders and level ground.
 
     Raises:
-        SceneError: the camera is not above the ground, or is inside a log.
+        InputRefused: the camera is not above the ground, or is inside a log.
     """
     pin = camera.intrinsics
     below = float(camera.position_m[2]) - ground_z_m
     if not below > MIN_DEPTH_M:
-        raise SceneError(
+        raise InputRefused(
             "grasp.camera-below-ground", f"the virtual camera is {below:.2f} m above the ground; place it higher"
         )
     inverse = np.full((pin.height_px, pin.width_px), 1.0 / below, np.float32)
@@ -129,7 +125,7 @@ def _draw(
     corners = [p + a * half * w + b * across[0] + c * across[1] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
     corners_m = np.array(corners)
     if corners_m[:, 2].min() < MIN_DEPTH_M:
-        raise SceneError("grasp.camera-in-log", "the virtual camera is inside a log or beside one; raise it")
+        raise InputRefused("grasp.camera-in-log", "the virtual camera is inside a log or beside one; raise it")
     px = pin.project(corners_m)
     left, top = np.maximum(np.floor(px.min(axis=0)).astype(int), 0)
     right, bottom = np.ceil(px.max(axis=0)).astype(int) + 1

@@ -12,11 +12,7 @@ from dataclasses import dataclass
 import pymap3d
 
 from machine.geometry.carrier import Point
-from runtime.errors import CodedError
-
-
-class PlaneError(CodedError, ValueError):
-    """A local plane cannot be made."""
+from runtime.errors import InputRefused
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +26,7 @@ class LocalPlane:
     def __post_init__(self) -> None:
         good = abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0 and math.isfinite(self.altitude_m)
         if not good:
-            raise PlaneError(
+            raise InputRefused(
                 "plane.origin",
                 f"invalid origin of the local plane: latitude {self.latitude_deg} deg, longitude "
                 f"{self.longitude_deg} deg, altitude {self.altitude_m} m",

@@ -14,14 +14,10 @@ import msgspec
 
 from autonomy.manager.checkpoint import Checkpoint, copied_tally, fits_mission, mission_digest
 from autonomy.missions.model import ForwardingMission, MissionError
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 PERIOD_NS: Final = 1_000_000_000
 _MOVE: Final = "move the file away to start over"
-
-
-class MissionFinished(CodedError):
-    """The mission of a checkpoint is finished; nothing is left to do."""
 
 
 def read_checkpoint(path: Path, mission: ForwardingMission, now_ns: int, unix_ns: int) -> Checkpoint | None:
@@ -32,7 +28,7 @@ def read_checkpoint(path: Path, mission: ForwardingMission, now_ns: int, unix_ns
 
     Raises:
         MissionError: the file cannot be read, is damaged or belongs to another mission.
-        MissionFinished: the mission is finished.
+        InputRefused: the mission is finished (``checkpoint.finished``).
     """
     try:
         data = path.read_bytes()
@@ -56,7 +52,7 @@ def read_checkpoint(path: Path, mission: ForwardingMission, now_ns: int, unix_ns
         raise MissionError("checkpoint.unknown-place", sentence, str(path))
     if found.finished:
         sentence = f"{path}: this mission is finished, {found.tally.loaded} logs were loaded; {_MOVE}"
-        raise MissionFinished("checkpoint.finished", sentence)
+        raise InputRefused("checkpoint.finished", sentence)
     later_ns = (now_ns - unix_ns) - (found.clock_ns - found.unix_ns)
     return msgspec.structs.replace(found, tally=copied_tally(found.tally, later_ns), clock_ns=0, unix_ns=0)
 

@@ -20,7 +20,7 @@ from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.model import MAX_LOGS, MAX_WAYPOINTS, Point
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MAX_ELEMENTS: Final = 300_000
 MAX_KML_POSITIONS: Final = 100_000
@@ -83,22 +83,18 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|in
 _WORD: Final = re.compile(r"\S+")
 
 
-class NumberError(CodedError, ValueError):
-    """A text is not a number."""
-
-
 def decimal(text: str, what: str) -> float:
     """The number in a text.
 
     Raises:
-        NumberError: it is not a number.
+        InputRefused: it is not a number.
     """
     word = text.strip()
     if _NUMBER.fullmatch(word):
         return float(word)
     if re.fullmatch(r"[+-]?\d+,\d+", word):
-        raise NumberError("mission.decimal-comma", f'{what} "{word[:40]}" has a decimal comma; write a decimal point')
-    raise NumberError("mission.number", f'{what} "{word[:40]}" is not a number')
+        raise InputRefused("mission.decimal-comma", f'{what} "{word[:40]}" has a decimal comma; write a decimal point')
+    raise InputRefused("mission.number", f'{what} "{word[:40]}" is not a number')
 
 
 def read_gpx(data: bytes, name: str) -> Draft:
@@ -175,7 +171,7 @@ def _gpx_position(point: Element, source: Source) -> Position:
             raise source.error("gpx.missing-coordinate", point.line, f"this {point.name} has no {key}")
         try:
             values.append(decimal(point.attributes[key], key))
-        except NumberError as error:
+        except InputRefused as error:
             raise source.error(error.code, point.line, str(error)) from None
     return Position(values[0], values[1], None, point.line)
 
@@ -287,7 +283,7 @@ class _Kml:
     def position(self, parts: list[str], line: int) -> Position:
         try:
             longitude, latitude = decimal(parts[0], "longitude"), decimal(parts[1], "latitude")
-        except NumberError as error:
+        except InputRefused as error:
             raise self.source.error(error.code, line, str(error)) from None
         return Position(latitude, longitude, None, line)
 

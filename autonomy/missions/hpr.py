@@ -14,10 +14,11 @@ import math
 from typing import Final
 
 from autonomy.missions.features import Draft, Key
-from autonomy.missions.gpx_kml import NumberError, decimal
+from autonomy.missions.gpx_kml import decimal
 from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree
+from runtime.errors import InputRefused
 
 HPR: Final = "StanForD 2010 hpr"
 NAMESPACE: Final = "urn:skogforsk:stanford2010"
@@ -199,7 +200,7 @@ def _diameter_m(log: Element, measurement: Element | None, length: Element | Non
 def _number(element: Element, source: Source) -> float:
     try:
         value = decimal(element.text, element.name)
-    except NumberError as error:
+    except InputRefused as error:
         raise source.error(error.code, element.line, str(error)) from None
     if not math.isfinite(value):
         sentence = f"{element.name} is {element.text.strip()}, which is not finite"

@@ -15,7 +15,7 @@ from typing import Any, Final, Literal
 
 import msgspec
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 SCHEMA: Final = 1
 MAX_WAYPOINTS: Final = 2_000
@@ -35,7 +35,7 @@ class Problem:
         return f"{self.place}: {self.sentence}" if self.place else self.sentence
 
 
-class MissionError(CodedError, ValueError):
+class MissionError(TimberhandError, ValueError):
     """A mission cannot be used.  ``problems`` has one record per problem; ``code`` is that of the first."""
 
     def __init__(self, code: str, sentence: str, place: str = "") -> None:

@@ -73,15 +73,13 @@ class Element:
         return "" if found is None else found.text.strip()
 
 
-class TooMany(Exception):
-    """A file has more elements than allowed; args: code, line, sentence."""
-
-
 class _Builder:
     """Parser target: keeps wanted elements, counts all."""
 
-    def __init__(self, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]], inside: str = "") -> None:
-        self.wanted, self.limits, self.inside = wanted, dict(limits), inside
+    def __init__(
+        self, name: str, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]], inside: str = ""
+    ) -> None:
+        self.name, self.wanted, self.limits, self.inside = name, wanted, dict(limits), inside
         self.outside = 0
         self.more = 0
         self.counts: dict[str, int] = {}
@@ -92,14 +90,18 @@ class _Builder:
         self.root: Element | None = None
         self.line: Callable[[], int] = lambda: 0
 
+    def excess(self, code: str, sentence: str) -> MissionError:
+        """The error of a file that has more than any mission needs."""
+        return MissionError(code, f"{sentence}; thin it out, or split the mission", f"{self.name}:{self.line()}")
+
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         """Start of an element."""
         self.elements += 1
         if self.elements > MAX_ELEMENTS:
-            raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_ELEMENTS} elements")
+            raise self.excess("mission.too-many-elements", f"has more than {MAX_ELEMENTS} elements")
         self.attributes += len(attributes)
         if self.attributes > MAX_ATTRIBUTES:
-            raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_ATTRIBUTES} attributes")
+            raise self.excess("mission.too-many-elements", f"has more than {MAX_ATTRIBUTES} attributes")
         if self.skipping:
             self.skipping += 1
             return
@@ -108,20 +110,20 @@ class _Builder:
             self.outside += 1
             self.more += name == self.inside
             if self.outside > MAX_DEPTH:
-                raise TooMany("mission.nesting", self.line(), "is nested deeper than any mission")
+                raise self.excess("mission.nesting", "is nested deeper than any mission")
             return
         self._end_text()
         if self.open and name not in self.wanted:
             self.skipping = 1
             return
         if len(self.open) >= MAX_DEPTH:
-            raise TooMany("mission.nesting", self.line(), "is nested deeper than any mission")
+            raise self.excess("mission.nesting", "is nested deeper than any mission")
         for counted in (name, ANY):
             if counted in self.limits:
                 limit, what = self.limits[counted]
                 self.counts[counted] = self.counts.get(counted, 0) + 1
                 if self.counts[counted] > limit:
-                    raise TooMany("mission.too-many-elements", self.line(), f"has more than {limit} {what}")
+                    raise self.excess("mission.too-many-elements", f"has more than {limit} {what}")
         local = {key.rpartition("}")[2]: value for key, value in attributes.items()} or _NO_ATTRIBUTES
         element = Element(name, namespace.lstrip("{"), local, self.line())
         if self.open:
@@ -147,7 +149,7 @@ class _Builder:
             self.parts.append(text)
             self.characters += len(text)
             if self.characters > MAX_TEXT:
-                raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_TEXT >> 20} MB of text")
+                raise self.excess("mission.too-many-elements", f"has more than {MAX_TEXT >> 20} MB of text")
 
     def _end_text(self) -> None:
         if self.parts:
@@ -161,9 +163,9 @@ class _Builder:
 
 def root_name(data: bytes) -> str:
     """The local name of the root element, "" if there is none in the first 64 kB."""
-    builder = _Builder(frozenset(), {})
+    builder = _Builder("", frozenset(), {})
     parser = DefusedXMLParser(target=builder, forbid_dtd=True)
-    with suppress(ParseError, DefusedXmlException, TooMany, ValueError, LookupError):
+    with suppress(ParseError, DefusedXmlException, ValueError, LookupError):
         parser.feed(data[:_CHUNK])
     return builder.root.name if builder.root is not None else ""
 
@@ -180,7 +182,7 @@ def tree(
         MissionError: not well-formed XML, a document type or an entity, more than the limits allow, or no element
             ``inside`` or several.
     """
-    builder = _Builder(wanted, limits, inside)
+    builder = _Builder(name, wanted, limits, inside)
     parser = DefusedXMLParser(target=builder, forbid_dtd=True)
     builder.line = lambda: parser.parser.CurrentLineNumber
     try:
@@ -188,7 +190,7 @@ def tree(
             parser.feed(data[start : start + _CHUNK])
             if start + _CHUNK - parser.parser.CurrentByteIndex > MAX_TOKEN_BYTES + _CHUNK:
                 sentence = f"has a tag or comment of more than {MAX_TOKEN_BYTES >> 10} kB"
-                raise TooMany("mission.too-many-elements", builder.line(), sentence)
+                raise builder.excess("mission.too-many-elements", sentence)
         root = parser.close()
     except DefusedXmlException:
         raise MissionError(
@@ -197,9 +199,8 @@ def tree(
             "<!DOCTYPE ...> part",
             f"{name}:{builder.line()}",
         ) from None
-    except TooMany as error:
-        code, line, sentence = error.args
-        raise MissionError(code, f"{sentence}; thin it out, or split the mission", f"{name}:{line}") from None
+    except MissionError:
+        raise
     except ParseError as error:
         raise _refusal(data, error, parser.parser.ErrorByteIndex, name) from None
     except (ValueError, LookupError) as error:

@@ -21,7 +21,7 @@ from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, Joint
 from machine.profile import Encoder, Profile, joint
 from machine.sensing.encoder import position_from_counts
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 AXES: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
 """The joints of a demonstration (paper B: q1 to q4)."""
@@ -37,10 +37,6 @@ MIN_DURATION_S: Final = 1.5
 _CSV_HEADER: Final = ("motion", "time_s", "slew_rad", "lift_rad", "tilt_rad", "ext_m")
 
 
-class RecordingRefused(CodedError, ValueError):
-    """A recording or a file without demonstrations; the sentence says what is missing."""
-
-
 @dataclass(frozen=True, slots=True)
 class JointTrack:
     """Positions (n, 4) of `AXES` [rad, m] at times (n,) [s], on an even grid."""
@@ -53,13 +49,13 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
     """The joints over time from the encoder frames of a crane bus, unsmoothed, every `GRID_S` from first to last.
 
     Raises:
-        RecordingRefused: an encoder is missing, or the recording is too short.
+        InputRefused: an encoder is missing, or the recording is too short.
     """
     encoders: list[Encoder] = []
     for j in AXES:
         encoder = joint(profile, j).encoder
         if encoder is None:
-            raise RecordingRefused(
+            raise InputRefused(
                 "demonstration.no-encoder", f"the {j.name.lower()} of {profile.name} has no encoder to learn from"
             )
         encoders.append(encoder)
@@ -81,20 +77,20 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
         samples[i][1].append(position_from_counts(encoder, counts))
     if heard > 1 and ends_ns[0] == ends_ns[1]:
         sentence = f"the recording has no time stamps at its {heard} frames; record it with them (candump -L)"
-        raise RecordingRefused("demonstration.no-stamps", sentence)
+        raise InputRefused("demonstration.no-stamps", sentence)
     for j, e, n, (stamps, _) in zip(AXES, encoders, received, samples, strict=True):
         if n > 1 and len(stamps) < 2:
             sentence = f"the time stamps of the recording do not advance at its {n} frames {e.message}; record it anew"
-            raise RecordingRefused("demonstration.no-stamps", sentence)
+            raise InputRefused("demonstration.no-stamps", sentence)
         if n < 2:
-            raise RecordingRefused(
+            raise InputRefused(
                 "demonstration.encoder-missing",
                 f"the recording holds {n or 'no'} frame{'' if n else 's'} {e.message} of the {j.name.lower()} encoder",
             )
     begin, end = max(h[0][0] for h in samples), min(h[0][-1] for h in samples)
     if end - begin < MIN_DURATION_S * 1e9:
         seconds = max(0, end - begin) * 1e-9
-        raise RecordingRefused("demonstration.too-short", f"the recording holds only {seconds:.1f} s with all encoders")
+        raise InputRefused("demonstration.too-short", f"the recording holds only {seconds:.1f} s with all encoders")
     time_s = np.arange(int((end - begin) * 1e-9 / GRID_S) + 1) * GRID_S
     columns = [
         np.interp(time_s, (np.array(t) - begin) * 1e-9, _unwrapped(e, v))
@@ -155,14 +151,14 @@ def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
     """Name of the machine and the motions of a file.
 
     Raises:
-        RecordingRefused: the file cannot be read or is no file of demonstrations.
+        InputRefused: the file cannot be read or is no file of demonstrations.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingRefused("demonstration.unreadable", f"{path} cannot be read ({error})") from None
+        raise InputRefused("demonstration.unreadable", f"{path} cannot be read ({error})") from None
     if len(lines) < 3 or not lines[0].startswith("# demonstrations of ") or lines[1] != ",".join(_CSV_HEADER):
-        raise RecordingRefused(
+        raise InputRefused(
             "demonstration.wrong-format",
             f"{path} is no file of demonstrations; give a recording or a file written by `learn`",
         )
@@ -171,7 +167,7 @@ def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
         table = np.array([[float(x) for x in line.split(",")] for line in lines[2:] if line])
         assert table.shape[1] == len(_CSV_HEADER) and np.all(np.isfinite(table))
     except (ValueError, AssertionError, IndexError):
-        raise RecordingRefused(
+        raise InputRefused(
             "demonstration.malformed-line", f"{path} holds a line that is not {len(_CSV_HEADER)} numbers"
         ) from None
     motions = []

@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 ALPHA: Final = 25.0
 BETA: Final = ALPHA / 4.0
@@ -37,10 +37,6 @@ CORRECTION_SHARE: Final = 0.4
 """Last share of the duration, in which the residual of the phase is corrected: some percent of the goal's change."""
 _STEP_COUNT: Final = 400
 _MIN_SAMPLES: Final = 8
-
-
-class DemonstrationRefused(CodedError, ValueError):
-    """Demonstrations that teach nothing; the sentence says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +52,16 @@ class Dmp:
         """The motion from rest at ``start`` (D,) to rest at ``goal`` (D,).
 
         Raises:
-            DemonstrationRefused: a number is not finite, or the number of coordinates differs.
+            InputRefused: a number is not finite, or the number of coordinates differs.
         """
         start, goal = np.asarray(start, dtype=float), np.asarray(goal, dtype=float)
         if start.shape != (len(self.weights),) or goal.shape != start.shape:
-            raise DemonstrationRefused(
+            raise InputRefused(
                 "primitive.wrong-shape",
                 f"a primitive of {len(self.weights)} coordinates got {start.shape} and {goal.shape}",
             )
         if not (np.all(np.isfinite(start)) and np.all(np.isfinite(goal))):
-            raise DemonstrationRefused("primitive.not-finite", "start and goal of a primitive must be finite numbers")
+            raise InputRefused("primitive.not-finite", "start and goal of a primitive must be finite numbers")
         path = goal - start
         share = np.arange(_STEP_COUNT + 1) / _STEP_COUNT
         x = np.exp(-ALPHA_X * share)
@@ -113,14 +109,12 @@ def learn(
     scaled.  The duration is the mean of the demonstrations'.
 
     Raises:
-        DemonstrationRefused: there is nothing to learn from.
+        InputRefused: there is nothing to learn from.
     """
     if not demonstrations:
-        raise DemonstrationRefused("demonstration.none", "there is no demonstration to learn from")
+        raise InputRefused("demonstration.none", "there is no demonstration to learn from")
     if bases < 2:
-        raise DemonstrationRefused(
-            "demonstration.too-few-bases", f"a primitive needs at least 2 basis functions, not {bases}"
-        )
+        raise InputRefused("demonstration.too-few-bases", f"a primitive needs at least 2 basis functions, not {bases}")
     count = np.asarray(demonstrations[0][1]).shape[-1]
     flags = tuple(scaled) if scaled is not None else (False,) * count
     above, below, spans = np.zeros((count, bases)), np.zeros((count, bases)), []
@@ -141,7 +135,7 @@ def learn(
         below += np.where(use[:, None], np.sum(psi * (x**2)[:, None], axis=0), 0.0) / len(x)
     if np.any(below <= 0.0):
         j = int(np.argmax(np.any(below <= 0.0, axis=1)))
-        raise DemonstrationRefused(
+        raise InputRefused(
             "demonstration.coordinate-unmoved",
             f"no demonstration moves coordinate {j} by {least_way:g}; add one that does",
         )
@@ -168,20 +162,18 @@ def _normalized(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     t, y = np.asarray(time_s, dtype=float), np.asarray(position, dtype=float)
     if y.ndim != 2 or t.shape != y.shape[:1] or y.shape[1] != count:
-        raise DemonstrationRefused(
+        raise InputRefused(
             "demonstration.wrong-shape", f"demonstration {number} has {t.shape} times and {y.shape} positions"
         )
     if len(t) < _MIN_SAMPLES:
-        raise DemonstrationRefused(
+        raise InputRefused(
             "demonstration.too-few-samples",
             f"demonstration {number} has {len(t)} samples; at least {_MIN_SAMPLES} are needed",
         )
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
-        raise DemonstrationRefused(
-            "demonstration.not-finite", f"demonstration {number} holds a number that is not finite"
-        )
+        raise InputRefused("demonstration.not-finite", f"demonstration {number} holds a number that is not finite")
     if np.any(np.diff(t) <= 0.0):
-        raise DemonstrationRefused(
+        raise InputRefused(
             "demonstration.times-not-increasing", f"demonstration {number} has times that do not increase"
         )
     span = float(t[-1] - t[0])

@@ -18,13 +18,13 @@ import numpy as np
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.demonstration import JointTrack, joint_vectors
-from autonomy.motion.dmp import BASIS_COUNT, DemonstrationRefused, Dmp, learn
+from autonomy.motion.dmp import BASIS_COUNT, Dmp, learn
 from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import STEP_S, Trajectory, smooth_progress, within_limits
 from can_dbc.messages.crane import GrappleCommand
 from machine.geometry.kinematics import Unreachable, reachable_extensions
 from machine.profile import Bunk, Profile
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 SCHEMA: Final = 1
 BUNK_MARGIN_M: Final = 0.4
@@ -33,10 +33,6 @@ SHIPPED_FOLDER: Final = Path(__file__).parent / "demonstration_data"
 _SCALED_AXES: Final = (True, False, False, False)
 _LIMIT_RESERVE_M: Final = 0.08
 """Distance from its limits of a telescope that gives way to a height or a distance."""
-
-
-class PrimitivesRefused(CodedError, ValueError):
-    """A file of primitives that cannot be used; the sentence says why."""
 
 
 class Primitive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,12 +85,12 @@ def learn_primitives(profile: Profile, motions: Sequence[JointTrack], bases: int
     """Primitives from demonstrations of the machine.
 
     Raises:
-        DemonstrationRefused: none of them leads between the bunk and another place.
+        InputRefused: none of them leads between the bunk and another place.
     """
     arm = Arm(profile)
     out, back = split_by_direction(arm, motions)
     if not out and not back:
-        raise DemonstrationRefused(
+        raise InputRefused(
             "demonstration.not-at-bunk",
             f"none of the {len(motions)} motions leads between the bunk and another place; "
             "demonstrate some from the bunk to a log and back",
@@ -124,18 +120,18 @@ def load(profile: Profile, path: Path | None = None) -> Primitives:
     """The primitives in a file, by default those shipped for the machine.
 
     Raises:
-        PrimitivesRefused: the file cannot be read or is not for this machine.
+        InputRefused: the file cannot be read or is not for this machine.
     """
     path = path or SHIPPED_FOLDER / f"{profile.name}.json"
     hint = "learn some with `timberhand plan learn LOG --out FILE`"
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Primitives)
     except OSError as error:
-        raise PrimitivesRefused("primitives.unreadable", f"{path} cannot be read ({error.strerror}); {hint}") from None
+        raise InputRefused("primitives.unreadable", f"{path} cannot be read ({error.strerror}); {hint}") from None
     except msgspec.MsgspecError as error:
-        raise PrimitivesRefused("primitives.malformed", f"{path} is no file of primitives ({error}); {hint}") from None
+        raise InputRefused("primitives.malformed", f"{path} is no file of primitives ({error}); {hint}") from None
     if found.schema != SCHEMA or found.profile != profile.name:
-        raise PrimitivesRefused(
+        raise InputRefused(
             "primitives.other-machine",
             f"{path} is for {found.profile}, schema {found.schema}, not for {profile.name}, schema {SCHEMA}; {hint}",
         )
@@ -143,7 +139,7 @@ def load(profile: Profile, path: Path | None = None) -> Primitives:
         rows = primitive.weights
         good = len(rows) == len(_SCALED_AXES) and len({len(row) for row in rows}) == 1 and len(rows[0]) >= 2
         if not good or not 0.5 < primitive.duration_s < 120.0 or not np.all(np.isfinite(primitive.weights)):
-            raise PrimitivesRefused(
+            raise InputRefused(
                 "primitives.implausible", f"{path} holds a primitive with implausible weights or duration; {hint}"
             )
     return found

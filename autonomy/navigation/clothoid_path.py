@@ -18,7 +18,7 @@ import numpy as np
 
 from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 SPACING_M: Final = 0.05
 TOLERANCE_M: Final = 0.05
@@ -32,7 +32,7 @@ HARDEST_SHARE: Final = 0.95
 Point2 = tuple[float, float]
 
 
-class PathRefused(CodedError, ValueError):
+class PathRefused(TimberhandError, ValueError):
     """A polyline cannot be driven; the message says where and why."""
 
 

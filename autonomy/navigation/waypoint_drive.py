@@ -17,7 +17,7 @@ from autonomy.navigation.drive_request import DriveRequest
 from can_dbc.messages.vehicle import Steering, VehicleReport
 from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MIN_SWITCH_M: Final = 1.0
 """Least switching distance; with less, a machine that misses a waypoint would circle round it."""
@@ -33,10 +33,6 @@ class Waypoint:
     longitude_deg: float
 
 
-class NoWaypoints(CodedError, ValueError):
-    """A drive has no waypoints."""
-
-
 class WaypointDrive:
     """One drive along ``waypoints``; ``number`` is the index of the current one.
 
@@ -45,7 +41,7 @@ class WaypointDrive:
 
     def __init__(self, carrier: Carrier, waypoints: Sequence[Waypoint], speed_m_s: float | None = None) -> None:
         if not waypoints:
-            raise NoWaypoints("path.no-waypoints", "a drive needs at least one waypoint")
+            raise InputRefused("path.no-waypoints", "a drive needs at least one waypoint")
         self.number = 0
         self._plane = LocalPlane(waypoints[0].latitude_deg, waypoints[0].longitude_deg)
         self._waypoints = tuple(waypoints)

@@ -15,16 +15,12 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 INPUT: Final = "input"
 STATISTICS: Final = ("running_mean", "running_var")
 EPSILON: Final = 1e-5
 """Added to the variance in every batch normalisation."""
-
-
-class NetworkError(CodedError, ValueError):
-    """An invalid network description, or input that does not fit a network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +117,7 @@ class Network:
     """A named network: input channels, layers, and the names of the layers that are outputs.
 
     Raises:
-        NetworkError: two layers have one name, a source does not come before its reader, a kernel is even, channels do
+        InputRefused: two layers have one name, a source does not come before its reader, a kernel is even, channels do
             not fit, or an output is not a layer.
     """
 
@@ -134,7 +130,7 @@ class Network:
         widths = channels(self)
         for name in self.outputs:
             if name not in widths:
-                raise NetworkError("network.unknown-output", f"network {self.name}: output {name!r} is not a layer")
+                raise InputRefused("network.unknown-output", f"network {self.name}: output {name!r} is not a layer")
 
 
 def wired(network: Network) -> list[tuple[Layer, tuple[str, ...]]]:
@@ -151,21 +147,21 @@ def channels(network: Network) -> dict[str, int]:
     """Channels of the input and of every layer's output.
 
     Raises:
-        NetworkError: as ``Network``.
+        InputRefused: as ``Network``.
     """
     widths = {INPUT: network.channels}
     for layer, sources in wired(network):
         where = f"network {network.name}, layer {layer.name!r}"
         if layer.name in widths or "." in layer.name or not layer.name:
-            raise NetworkError("network.bad-name", f"{where}: its name must be unique, not empty and without a dot")
+            raise InputRefused("network.bad-name", f"{where}: its name must be unique, not empty and without a dot")
         if unknown := [s for s in sources if s not in widths]:
-            raise NetworkError("network.unknown-source", f"{where}: source {unknown[0]!r} does not come before it")
+            raise InputRefused("network.unknown-source", f"{where}: source {unknown[0]!r} does not come before it")
         width = [widths[s] for s in sources]
         if isinstance(layer, Conv):
             if layer.kernel % 2 == 0:
-                raise NetworkError("network.even-kernel", f"{where}: kernel {layer.kernel} is even; use an odd kernel")
+                raise InputRefused("network.even-kernel", f"{where}: kernel {layer.kernel} is even; use an odd kernel")
             if width[0] % layer.groups or layer.out % layer.groups:
-                raise NetworkError(
+                raise InputRefused(
                     "network.bad-groups",
                     f"{where}: {layer.groups} groups do not divide {width[0]} and {layer.out} channels",
                 )
@@ -173,7 +169,7 @@ def channels(network: Network) -> dict[str, int]:
         elif isinstance(layer, Concat):
             widths[layer.name] = sum(width)
         elif isinstance(layer, Add) and len(set(width)) != 1:
-            raise NetworkError("network.bad-sum", f"{where}: cannot add sources with {width} channels")
+            raise InputRefused("network.bad-sum", f"{where}: cannot add sources with {width} channels")
         else:
             widths[layer.name] = width[0]
     return widths

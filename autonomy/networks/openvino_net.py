@@ -24,12 +24,12 @@ from autonomy.networks.graph import (
     Conv,
     MaxPool,
     Network,
-    NetworkError,
     Relu,
     Resize,
     Sigmoid,
     wired,
 )
+from runtime.errors import InputRefused
 
 PRECISIONS: Final = ("f32", "bf16")
 Arrays = Mapping[str, np.ndarray]
@@ -45,18 +45,18 @@ class OpenVinoNet:
         precision: "f32", or "bf16" (about three digits; faster where the processor supports it).
 
     Raises:
-        NetworkError: the shape does not fit the network, or the precision is unknown.
+        InputRefused: the shape does not fit the network, or the precision is unknown.
     """
 
     def __init__(
         self, network: Network, arrays: Arrays, shape: tuple[int, int, int, int], precision: str = "f32"
     ) -> None:
         if len(shape) != 4 or shape[1] != network.channels or min(shape) < 1:
-            raise NetworkError(
+            raise InputRefused(
                 "network.bad-shape", f"network {network.name} needs images (N, {network.channels}, H, W), not {shape}"
             )
         if precision not in PRECISIONS:
-            raise NetworkError("network.bad-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
+            raise InputRefused("network.bad-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
         self.network = network
         self.shape = shape
         settings = {
@@ -71,10 +71,10 @@ class OpenVinoNet:
         """Every output by name, (N, C, H, W) float32; the caller owns the arrays.
 
         Raises:
-            NetworkError: the images have another shape than the compiled one.
+            InputRefused: the images have another shape than the compiled one.
         """
         if images.shape != self.shape:
-            raise NetworkError(
+            raise InputRefused(
                 "network.bad-images",
                 f"network {self.network.name} was compiled for images {self.shape}, not {images.shape}",
             )

@@ -16,15 +16,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialised
 
-from autonomy.networks.graph import Network, NetworkError, fingerprint, parameter_shapes
-from runtime.errors import CodedError
+from autonomy.networks.graph import Network, fingerprint, parameter_shapes
+from runtime.errors import InputRefused
 
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
 """Folder of the weights that are shipped with the package, NAME.safetensors beside its card NAME.md."""
-
-
-class WeightsError(CodedError, ValueError):
-    """A weight file that cannot be used."""
 
 
 def save(
@@ -33,11 +29,11 @@ def save(
     """Write a weight file atomically; ``half`` rounds convolutions to float16, which halves the file.
 
     Raises:
-        NetworkError: the arrays are not the network's.
+        InputRefused: the arrays are not the network's.
     """
     shapes = parameter_shapes(network)
     if {name: a.shape for name, a in arrays.items()} != shapes:
-        raise NetworkError(
+        raise InputRefused(
             "network.bad-arrays", f"names or shapes of the arrays are not those of network {network.name}"
         )
     whole = {name: np.ascontiguousarray(arrays[name], np.float32) for name in shapes}
@@ -54,20 +50,20 @@ def load(path: Path, network: Network) -> tuple[dict[str, np.ndarray], dict[str,
     """The network's arrays and the header's facts.
 
     Raises:
-        WeightsError: the file is missing, truncated, changed, or of another network.
+        InputRefused: the file is missing, truncated, changed, or of another network.
     """
     try:
         with safe_open(path, "numpy") as file:
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
-        raise WeightsError("weights.missing", f"{path}: no such weight file; `timberhand train` makes one") from None
+        raise InputRefused("weights.missing", f"{path}: no such weight file; `timberhand train` makes one") from None
     except (SafetensorError, OSError, ValueError, TypeError) as error:
-        raise WeightsError(
+        raise InputRefused(
             "weights.damaged", f"{path}: damaged or not a safetensors file ({error}); fetch or train it again"
         ) from None
     if facts.get("fingerprint") != fingerprint(network):
-        raise WeightsError(
+        raise InputRefused(
             "weights.other-network",
             f"{path}: weights of {facts.get('network', 'an unknown network')!r} do not fit this version of "
             f"{network.name!r}; train it again",
@@ -75,9 +71,9 @@ def load(path: Path, network: Network) -> tuple[dict[str, np.ndarray], dict[str,
     if {name: a.shape for name, a in arrays.items()} != parameter_shapes(network) or facts.get("digest") != _digest(
         arrays
     ):
-        raise WeightsError("weights.changed", f"{path}: its arrays were changed; fetch or train it again")
+        raise InputRefused("weights.changed", f"{path}: its arrays were changed; fetch or train it again")
     if not all(np.isfinite(a).all() for a in arrays.values()):
-        raise WeightsError("weights.not-finite", f"{path}: some values are not finite; train it again")
+        raise InputRefused("weights.not-finite", f"{path}: some values are not finite; train it again")
     return {name: a.astype(np.float32, copy=False) for name, a in arrays.items()}, facts
 
 

@@ -33,7 +33,6 @@ from typing import Final, Protocol
 import msgspec
 import numpy as np
 
-from autonomy.networks.weights import WeightsError
 from autonomy.perception.driving_log_detector import (
     CylinderLocalizer,
     DrivingLogDetector,
@@ -45,13 +44,14 @@ from autonomy.perception.log_detector import LogDetector
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter
 from autonomy.perception.shown_picture import MeasuredPicture, NewestPicture
-from autonomy.perception.sources.camera_source import CameraSource, SourceError
+from autonomy.perception.sources.camera_source import CameraSource
 from autonomy.perception.standing_requests import StandingRequests
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
 from machine.geometry.optics import Intrinsics
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
 from runtime.allocator import keep_memory
+from runtime.errors import InputRefused, LinkError
 from runtime.notifier import Notifier
 
 EXIT_OK, EXIT_CONFIGURATION, EXIT_PORT = 0, 3, 4
@@ -72,7 +72,7 @@ def open_source(address: str, camera: str, profile: Profile) -> CameraSource:
     """The source that ``--frames`` names.
 
     Raises:
-        SourceError: it cannot be opened.
+        LinkError: it cannot be opened.
     """
     if address == "zed":
         from autonomy.perception.sources.zed import ZedCamera
@@ -186,7 +186,7 @@ def main(argv: list[str] | None = None) -> int:
         else:
             segmenter = LogSegmenter(options.variant, options.weights)
         source = open_source(options.frames, options.camera, profile)
-    except (ProfileError, WeightsError, SourceError) as error:
+    except (ProfileError, InputRefused, LinkError) as error:
         return _fail(str(error), EXIT_PORT if error.code == COMES_BACK else EXIT_CONFIGURATION)
     warm_up(segmenter)
     segment = segmenter.segment

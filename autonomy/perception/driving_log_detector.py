@@ -14,17 +14,18 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame, RgbdFrameError, rescaled
-from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
+from autonomy.perception.camera.mount import optical_pose
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.papers.paper_a import log_from_mask
 from autonomy.perception.papers.paper_b import position_in_box
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
-from autonomy.perception.sources.camera_source import CameraSource, SourceError
+from autonomy.perception.sources.camera_source import CameraSource
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors
 from machine.profile import Profile
+from runtime.errors import InputRefused, LinkError
 
 MAX_RANGE_M: Final = 10.0
 """A log that is farther away is only a few pixels wide and cannot be measured."""
@@ -181,7 +182,7 @@ class DrivingLogDetector:
             masks = [one for one in self._segment(frame) if one.score >= MIN_SCORE]
             localize = self._localizer.localize_load if load else self._localizer.localize
             logs = localize(frame, pose, masks)
-        except (SourceError, RgbdFrameError, CameraMountError) as error:
+        except (LinkError, InputRefused) as error:
             self.problem = str(error)
             return None
         near = tuple(o for o in logs if np.linalg.norm(np.asarray(o.center_m) - pose.position_m) < MAX_RANGE_M)

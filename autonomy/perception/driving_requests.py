@@ -14,10 +14,11 @@ from typing import Final, Protocol
 
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.driving_log_detector import in_base
-from autonomy.perception.log_list.datagrams import LogListError, LogRequest, decode_request, encode_error, encode_logs
+from autonomy.perception.log_list.datagrams import LogRequest, decode_request, encode_error, encode_logs
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.shown_picture import NewestPicture
 from autonomy.perception.sources.camera_source import CameraSource
+from runtime.errors import InputRefused
 
 MAX_REQUEST_BYTES: Final = 2048
 Address = tuple[str, int]
@@ -85,7 +86,7 @@ class DrivingRequests:
                 continue
             try:
                 request = decode_request(data)
-            except LogListError as error:
+            except InputRefused as error:
                 self._send(encode_error(str(error)), sender)
                 continue
             if request.standpoint is not None:

@@ -11,15 +11,16 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, rescaled
-from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.camera.frame import RgbdFrame, rescaled
+from autonomy.perception.camera.mount import optical_pose
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
-from autonomy.perception.sources.camera_source import CameraSource, SourceError
+from autonomy.perception.sources.camera_source import CameraSource
 from machine.joints import N_JOINTS
 from machine.profile import Profile
+from runtime.errors import InputRefused, LinkError
 
 REST_TOLERANCE: Final = 0.004
 """The crane is at rest when no joint moves by more than this between two requests [rad, m]: 2 cm at full reach."""
@@ -83,7 +84,7 @@ class LogDetector:
             frame = rescaled(frame, self._camera.depth_scale)
             masks = self._segment(frame)
             tracks = self._perception.step(frame, pose, masks)
-        except (SourceError, RgbdFrameError, CameraMountError) as error:
+        except (LinkError, InputRefused) as error:
             self.problem = str(error)
             return None
         self.problem = ""

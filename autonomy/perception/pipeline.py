@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame, RgbdFrameError, check_frame
+from autonomy.perception.camera.frame import Pose, RgbdFrame, check_frame
 from autonomy.perception.fitting.contour import StereoSensor
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
 from autonomy.perception.fitting.measure import Masked, Rejection, measure
@@ -17,6 +17,7 @@ from autonomy.perception.tracking.displacement import is_displaced
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors, Track
 from autonomy.perception.tracking.log_tracker import LogTracker
 from machine.profile import Profile
+from runtime.errors import InputRefused
 
 MAX_SINE_TO_LEVEL: Final = 0.5
 """A steeper cylinder is not a log but a jaw of the grapple, a stump or a tree, and cannot be gripped either."""
@@ -38,7 +39,7 @@ class Perception:
         """The confirmed logs after ``frame``, taken at ``pose``, in the frame in which the poses are given.
 
         Raises:
-            RgbdFrameError: the frame is invalid, or from a camera that the profile does not have.
+            InputRefused: the frame is invalid, or from a camera that the profile does not have.
         """
         fits = [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < MAX_SINE_TO_LEVEL]
         return self._tracker.step(fits, pose, frame.stamp_ns, partial(is_displaced, frame, pose))
@@ -48,7 +49,7 @@ class Perception:
         check_frame(frame)
         if frame.camera not in self._sensors:
             known = ", ".join(self._sensors) or "none"
-            raise RgbdFrameError(
+            raise InputRefused(
                 "frame.unknown-camera",
                 f"the frame is of camera {frame.camera!r}, which the machine does not have; it has: {known}",
             )

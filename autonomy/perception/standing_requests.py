@@ -14,9 +14,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final, Protocol
 
-from autonomy.perception.log_list.datagrams import LogListError, decode_request, encode_error, encode_logs
+from autonomy.perception.log_list.datagrams import decode_request, encode_error, encode_logs
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.shown_picture import NewestPicture
+from runtime.errors import InputRefused
 
 MAX_REQUEST_BYTES: Final = 2048
 Address = tuple[str, int]
@@ -69,7 +70,7 @@ class StandingRequests:
                 continue
             try:
                 q = decode_request(data).q
-            except LogListError as error:
+            except InputRefused as error:
                 self._send(encode_error(str(error)), sender)
                 continue
             if all(map(math.isnan, q)):

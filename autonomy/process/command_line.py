@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from autonomy.grasp.planners import NAMES, SEARCH, PlannerChoice, PlannerError
+from autonomy.grasp.planners import NAMES, SEARCH, PlannerChoice
 from autonomy.manager.transition_table import TABLES
 from can_dbc.messages.udp_address import address_argument
+from runtime.errors import InputRefused
 
 Address = tuple[str, int]
 
@@ -50,7 +51,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     options = parser.parse_args(argv)
     try:
         options.planner = PlannerChoice(options.planner, options.virtual_cameras).check()
-    except PlannerError as error:
+    except InputRefused as error:
         parser.error(str(error))
     if options.progress is not None and (options.mission is None or options.order_port is None):
         parser.error("--progress needs --mission and --order-port: a resumed mission waits for the command Auto")

@@ -29,8 +29,8 @@ def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: 
 
     Raises:
         MissionError: the mission or its checkpoint cannot be used.
-        PluginError, WeightsError: the grasp planner cannot be loaded.
-        MissionFinished: the mission of the checkpoint is finished.
+        ConfigError, InputRefused: the grasp planner cannot be loaded.
+        InputRefused: the mission of the checkpoint is finished (``checkpoint.finished``).
     """
     if options.mission is None and options.missions is None:
         code, selector = profile_hash(profile), PlannerSelection(options.planner.make())

@@ -12,12 +12,12 @@ from typing import Final
 from can_dbc.messages.envelope import DatagramRefused, Kind, kind_of
 from can_dbc.messages.mission import MissionCommand, decode_mission_command
 from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 MAX_AGE_NS: Final = 1_000_000_000
 
 
-class CommandRefused(CodedError, ValueError):
+class CommandRefused(TimberhandError, ValueError):
     """An operator command is not accepted; the message says why."""
 
 

@@ -20,14 +20,14 @@ import msgspec
 
 from autonomy.manager.checkpoint_file import CheckpointFile
 from autonomy.missions.model import MissionError
-from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from autonomy.perception.log_list.datagrams import decode_logs, encode_request
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.process.command_line import Address
 from autonomy.process.event_output import emit
 from autonomy.process.jobs import Job
 from autonomy.process.mission_publisher import short_text
 from autonomy.process.operator_commands import CommandReceiver, CommandRefused
-from autonomy.process.upload import MachineAtRest, UploadedMissions, UploadRefused
+from autonomy.process.upload import MachineAtRest, UploadedMissions
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
@@ -36,6 +36,7 @@ from can_dbc.messages.mission import encode_mission
 from can_dbc.messages.mission_upload import MissionUpload
 from can_dbc.messages.vehicle import VehicleReport
 from machine.status.modes import Mode
+from runtime.errors import InputRefused
 
 STEP_S: Final = 0.01
 REQUEST_PERIOD_NS: Final = 250_000_000
@@ -170,12 +171,12 @@ class PlannerProcess:
         code = refused = ""
         try:
             if self._uploads is None:
-                raise UploadRefused("upload.not-awaited", "this planner was started with its job, not with --missions")
+                raise CommandRefused("upload.not-awaited", "this planner was started with its job, not with --missions")
             if self._job.begun:
-                raise UploadRefused("upload.begun", "a mission has begun; abort it and start the planner anew")
+                raise CommandRefused("upload.begun", "a mission has begun; abort it and start the planner anew")
             self._machine.check(now_ns)
             self._job = self._uploads.job(upload)
-        except (UploadRefused, MissionError) as error:
+        except (CommandRefused, MissionError) as error:
             code, refused = error.code, short_text(str(error).partition("\n")[0])
         self._answer = {"order": upload.sequence, "refusal": refused, "refusal_code": code}
         emit("upload", name=upload.name, refused=refused or None, code=code or None)
@@ -220,7 +221,7 @@ class PlannerProcess:
         for data in _received(self._detector):
             try:
                 logs = decode_logs(data, in_plane=self._job.drives)
-            except LogListError as error:
+            except InputRefused as error:
                 if self._changed("detector", str(error)):
                     emit("detector", reason=str(error))
         return logs

@@ -22,22 +22,18 @@ from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.standpoint import Standpoint
 from autonomy.process.event_output import emit
 from autonomy.process.jobs import Job, JobEvent
+from autonomy.process.operator_commands import CommandRefused
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.grasp import ChosenGrasp
 from can_dbc.messages.mission import MissionCommand, MissionReport
 from can_dbc.messages.mission_upload import MissionUpload
 from can_dbc.messages.vehicle import VehicleReport
 from machine.status.modes import Mode
-from runtime.errors import CodedError
 
 REPORT_AGE_NS: Final = 1_000_000_000
 STANDING_M_S: Final = 0.05
 WAITING: Final = "waits for a mission"
 NO_MISSION: Final = "there is no mission yet; upload one"
-
-
-class UploadRefused(CodedError, ValueError):
-    """An uploaded mission is not taken; nothing has changed."""
 
 
 @dataclass(slots=True)
@@ -60,14 +56,14 @@ class MachineAtRest:
         """Whether a mission may be taken now.
 
         Raises:
-            UploadRefused: it may not.
+            CommandRefused: it may not.
         """
         if now_ns - min(self.mode_ns, self.speed_ns) > REPORT_AGE_NS:
-            raise UploadRefused("upload.no-report", "the controller does not report; start it first")
+            raise CommandRefused("upload.no-report", "the controller does not report; start it first")
         if self.mode in (Mode.ARMED, Mode.ACTIVE):
-            raise UploadRefused("upload.armed", "the machine is armed; disarm it first")
+            raise CommandRefused("upload.armed", "the machine is armed; disarm it first")
         if not abs(self.speed_m_s) < STANDING_M_S:
-            raise UploadRefused("upload.moving", "the machine moves, or its speed is unknown; let it stand first")
+            raise CommandRefused("upload.moving", "the machine moves, or its speed is unknown; let it stand first")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +78,13 @@ class UploadedMissions:
         """The job of an uploaded mission.
 
         Raises:
-            UploadRefused: the file is not the one that was uploaded.
+            CommandRefused: the file is not the one that was uploaded.
             MissionError: the mission cannot be read or driven.
         """
         data = self.folder.read(upload.name)
         if hashlib.sha256(data).digest() != upload.digest:
             sentence = f"{upload.name} is not the file that was uploaded; do both use the same folder?"
-            raise UploadRefused("upload.other-file", sentence)
+            raise CommandRefused("upload.other-file", sentence)
         draft = read(data, upload.name)
         verify(draft, route_wanted=True, site=self.site)
         tell_losses(draft)

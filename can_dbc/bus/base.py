@@ -1,6 +1,6 @@
 """One small interface to any CAN bus, made for a real-time loop; `can_dbc.bus.factory` opens one.
 
-Contract of every `Bus`: only opening raises (`BusError`).  `drain`, `send` and `send_all` never block.  `drain` returns
+Contract of every `Bus`: only opening raises (`LinkError`).  `drain`, `send` and `send_all` never block.  `drain` gives
 data and remote frames in the order of the bus; error frames update `BusStats.state` and never reach a codec.  Own
 frames come back only on request, so a frame with an own identifier comes from another sender; on SocketCAN that may be
 another process on this machine.
@@ -22,7 +22,6 @@ from enum import IntEnum
 from typing import Final, Protocol, Self
 
 from can_dbc.frame import Frame
-from runtime.errors import CodedError
 
 DRAIN_LIMIT: Final = 1024
 """Most frames of one `Bus.drain` (a few more if they arrive in packets): a flooded bus must not delay the tick."""
@@ -43,10 +42,6 @@ CRTL_RX_OVERFLOW: Final = 0x01
 CRTL_WARNING: Final = 0x0C  # receive 04, transmit 08
 CRTL_PASSIVE: Final = 0x30  # receive 10, transmit 20
 CRTL_ACTIVE: Final = 0x40
-
-
-class BusError(CodedError):
-    """A bus cannot be opened; the sentence says what is wrong, where, and what to do."""
 
 
 class BusState(IntEnum):

@@ -12,8 +12,9 @@ import socket
 from collections.abc import Iterable
 from typing import Final
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.filters import FilterItem, filter_of
+from runtime.errors import LinkError
 
 PYTHON_CAN: Final = "python-can:"
 VCAN_NAMES: Final = {"crane0": "vcan0", "mach0": "vcan1"}
@@ -39,12 +40,12 @@ def open_bus(
         participant: The name of this process for faults on the wire (default: the program's name).
 
     Raises:
-        BusError: The bus cannot be opened.
+        LinkError: The bus cannot be opened.
     """
     backend, _, channel = address.removeprefix(PYTHON_CAN).partition(":")
     wanted = filter_of(filters)
     if not backend or not channel:
-        raise BusError(
+        raise LinkError(
             "bus.address",
             f"'{address}' is not a bus address; write wire:crane0, socketcan:can0 or another python-can "
             "interface and its channel, for example virtual:test.",

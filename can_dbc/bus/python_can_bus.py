@@ -15,10 +15,11 @@ from typing import Final
 
 import can
 
-from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
+from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusState
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.receive_clock import ReceiveClock
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, identifier
+from runtime.errors import LinkError
 
 _PLAUSIBLE_NS: Final = 1_000_000_000
 _FAILURES: Final = (can.CanError, OSError, ValueError, ImportError)
@@ -34,7 +35,7 @@ class PythonCanBus(BaseBus):
         try:
             self._can = self._open()
         except _FAILURES as error:
-            raise BusError(
+            raise LinkError(
                 "bus.adapter",
                 f"python-can cannot open {interface}:{channel} ({error}); check the interface name, the "
                 "channel and that the adapter's driver is installed.",

@@ -16,10 +16,11 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
+from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusState
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.frame_socket import FrameSocket
 from can_dbc.frame import Frame
+from runtime.errors import LinkError
 
 # Options that Python does not name everywhere: linux/can/raw.h, linux/sockios.h, linux/if.h.
 _CAN_RAW_ERR_FILTER: Final = 2
@@ -38,7 +39,7 @@ class SocketCanBus(BaseBus):
     def __init__(self, interface: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
         super().__init__(interface)
         if wanted is not None and len(wanted.pairs) > _MAX_FILTERS:
-            raise BusError(
+            raise LinkError(
                 "bus.too-many-filters",
                 f"{len(wanted.pairs)} filters are more than the {_MAX_FILTERS} that the kernel accepts for "
                 f"{interface}; give pairs of key and mask.",
@@ -48,12 +49,12 @@ class SocketCanBus(BaseBus):
             self._link = self._open(_IFF_UP)
         except OSError as error:
             if error.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
-                raise BusError(
+                raise LinkError(
                     "bus.no-can",
                     f"This kernel has no raw CAN sockets ({error.strerror}), so socketcan:{interface} cannot be "
                     "opened; load the modules can and can_raw, or use the wire: wire:crane0.",
                 ) from error
-            raise BusError(
+            raise LinkError(
                 "bus.interface",
                 f"CAN interface {interface} cannot be opened ({error.strerror}); see `ip link`, and bring it "
                 f"up with `ip link set {interface} up`.",

@@ -20,11 +20,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus.base import BaseBus, BusError, BusState
+from can_dbc.bus.base import BaseBus, BusState
 from can_dbc.bus.batch import Batch
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.wire_records import RECORD, RECORD_BYTES, pack, read
 from can_dbc.frame import Frame
+from runtime.errors import LinkError
 
 CONTROL: Final = 1
 DISCARD: Final = 4
@@ -168,8 +169,8 @@ class WireClient(BaseBus):
                 self._opening = _connect_and_send(self.name, self._hello, 0.0)
             if not select.select([self._opening], [], [], timeout_s)[0]:
                 return False
-            reply = _receive_answer(self._opening)
-        except (OSError, ValueError):
+            reply = _receive_answer(self.name, self._opening)
+        except (LinkError, OSError, ValueError):
             self._close_opening()
             return False
         self._sock.close()
@@ -193,29 +194,25 @@ def control(name: str, message: dict[str, Any]) -> dict[str, Any]:
     """Sends a request to the daemon of bus `name` (see `hil.wire.daemon`) without joining the bus; returns its answer.
 
     Raises:
-        BusError: There is no daemon, it does not answer, or it refuses; the sentence has its reason.
+        LinkError: There is no daemon, it does not answer, or it refuses; the sentence has its reason.
     """
     sock, reply = _connect(name, message)
     sock.close()
     return reply
 
 
-class _RefusedError(ValueError):
-    """The daemon's reason for refusing a request."""
-
-
 def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[str, Any]]:
-    """A connection to the daemon, and its answer to the first message; raises `BusError`."""
+    """A connection to the daemon, and its answer to the first message; raises `LinkError`."""
     sock = None
     try:
         sock = _connect_and_send(name, message, _OPEN_TIMEOUT_S)
-        return sock, _receive_answer(sock)
-    except (OSError, ValueError) as error:
+        return sock, _receive_answer(name, sock)
+    except (LinkError, OSError, ValueError) as error:
         if sock is not None:
             sock.close()
-        if isinstance(error, _RefusedError):
-            raise BusError("wire.refused", f"The wire daemon of {name} refuses: {error}.") from error
-        raise BusError(
+        if isinstance(error, LinkError):
+            raise
+        raise LinkError(
             "wire.no-daemon",
             f"No wire bus {name} answers at {wire_directory() / name} ({getattr(error, 'strerror', None) or error}); "
             f"start one with `python -m hil.wire.daemon --bus {name}:1000000`.",
@@ -235,11 +232,11 @@ def _connect_and_send(name: str, message: dict[str, Any], timeout_s: float) -> s
     return sock
 
 
-def _receive_answer(sock: socket.socket) -> dict[str, Any]:
-    """The daemon's answer to a control packet; raises OSError if none comes, ValueError for a refusal."""
+def _receive_answer(name: str, sock: socket.socket) -> dict[str, Any]:
+    """The daemon's answer to a control packet; raises OSError if none comes, LinkError for a refusal."""
     reply: dict[str, Any] = json.loads(sock.recv(MAX_CONTROL_BYTES)[RECORD.size :])
     if "error" in reply:
-        raise _RefusedError(reply["error"])
+        raise LinkError("wire.refused", f"The wire daemon of {name} refuses: {reply['error']}.")
     return reply
 
 

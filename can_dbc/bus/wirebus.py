@@ -15,10 +15,11 @@ from typing import Any
 
 import can
 
-from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.base import BusState
 from can_dbc.bus.python_can_bus import key_of, message_of, payload_of
 from can_dbc.bus.wire_client import WireClient
 from can_dbc.frame import Frame
+from runtime.errors import LinkError
 
 _STATES = {
     BusState.PASSIVE: can.BusState.PASSIVE,
@@ -45,7 +46,7 @@ class WireBus(can.BusABC):
         """
         try:
             self._client = WireClient(channel, None, receive_own_messages, tx_queue, error_frames=True)
-        except BusError as error:
+        except LinkError as error:
             raise can.CanInitializationError(str(error)) from error
         self.channel_info = f"timberhand wire {channel} at {self._client.bitrate} bit/s"
         self._waiting: deque[Frame] = deque()

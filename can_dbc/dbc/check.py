@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from can_dbc.dbc.codec import DbcError, FrameRefused, MessageCodec, Policy, SignalInfo, parse, resolve, usable
-from can_dbc.dbc.signals import ERROR, NOT_AVAILABLE, EncodeRefused
+from can_dbc.dbc.codec import FrameRefused, MessageCodec, Policy, SignalInfo, parse, resolve, usable
+from can_dbc.dbc.signals import ERROR, NOT_AVAILABLE
 from can_dbc.frame import describe
+from runtime.errors import ConfigError, InputRefused
 
 MAX_EXAMPLES: Final = 5
 
@@ -51,15 +52,15 @@ def check(name_or_path: str, frames: int, seed: int) -> Report:
     """Loads, lints and compares one file over ``frames`` random payloads and value sets per message."""
     try:
         path = resolve(name_or_path)
-    except DbcError as error:
+    except ConfigError as error:
         return Report(str(name_or_path), str(error), 0, 0, 0, 0, 0, (), ())
     try:
         database = parse(path)
         pairs = [(message, usable(message, path)) for message in database.messages]
-    except DbcError as error:
+    except ConfigError as error:
         try:
             found = lint(parse(path, strict=False))
-        except DbcError:
+        except ConfigError:
             found = ()
         return Report(str(path), str(error), 0, 0, 0, 0, 0, (), found)
     rng = random.Random(seed)
@@ -182,7 +183,7 @@ def compare_encode(message: Any, codec: MessageCodec, values: Sequence[Any]) -> 
         want = None
     try:
         got = codec.encode(*values)
-    except EncodeRefused:
+    except InputRefused:
         got = None
     if got == want or (got is None and stricter):
         return []

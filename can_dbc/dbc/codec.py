@@ -8,10 +8,10 @@ compiled functions:
   checks the length only.  Signals that a multiplexer leaves out are None.
 * ``receive(data)``: the same for a live system.  A frame with a value out of range is refused as a whole
   (``FrameRefused``); a raw value labelled NotAvailable or Error becomes None.
-* ``encode(*values)``: bytes from physical values in signal order.  Never wraps: raises ``EncodeRefused``, or takes
+* ``encode(*values)``: bytes from physical values in signal order.  Never wraps: raises ``InputRefused``, or takes
   the nearest valid value if the DBC says saturate.  None writes NotAvailable.  Values round half to even.
 
-A file that cannot be used raises ``DbcError`` with file, line if known, and reason.
+A file that cannot be used raises ``ConfigError`` with file, line if known, and reason.
 """
 
 from __future__ import annotations
@@ -26,16 +26,14 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from can_dbc.dbc.codegen import Decoder, Encoder, Values, compile_message
-from can_dbc.dbc.signals import EncodeRefused, FrameRefused, Policy, Refusal, SignalInfo
+from can_dbc.dbc.signals import FrameRefused, Policy, Refusal, SignalInfo
 from can_dbc.frame import EXTENDED, describe
 from can_dbc.text import decoded
-from runtime.errors import CodedError
+from runtime.errors import ConfigError
 
 __all__ = [
     "SHIPPED",
     "Database",
-    "DbcError",
-    "EncodeRefused",
     "FrameRefused",
     "MessageCodec",
     "Policy",
@@ -51,10 +49,6 @@ __all__ = [
 SHIPPED: Final = ("crane", "machine", "gnss")
 PDU2_MASK: Final = EXTENDED | 0x03FF_FF00
 PDU1_MASK: Final = EXTENDED | 0x03FF_0000
-
-
-class DbcError(CodedError):
-    """A DBC file cannot be used; the sentence is ``file[:line]: reason``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +90,10 @@ class Database:
     by_pgn: Mapping[int, MessageCodec]
 
     def message(self, name: str) -> MessageCodec:
-        """The codec of a message; raises DbcError if the file has no such message."""
+        """The codec of a message; raises ConfigError if the file has no such message."""
         codec = self.messages.get(name)
         if codec is None:
-            raise DbcError("dbc.unknown-message", f"{self.path}: there is no message {name}")
+            raise ConfigError("dbc.unknown-message", f"{self.path}: there is no message {name}")
         return codec
 
     def find(self, key: int) -> MessageCodec | None:
@@ -113,17 +107,17 @@ def pgn_key(key: int) -> int:
 
 
 def resolve(name_or_path: str | Path) -> Path:
-    """The path of a shipped database (a name without suffix) or of a file; raises DbcError if there is none."""
+    """The path of a shipped database (a name without suffix) or of a file; raises ConfigError if there is none."""
     path = Path(name_or_path)
     if str(name_or_path) in SHIPPED:
         return Path(__file__).parents[1] / f"{name_or_path}.dbc"
     if not path.is_file():
-        raise DbcError("dbc.no-file", f"{path}: no such file; shipped databases are {', '.join(SHIPPED)}")
+        raise ConfigError("dbc.no-file", f"{path}: no such file; shipped databases are {', '.join(SHIPPED)}")
     return path
 
 
 def load(name_or_path: str | Path) -> Database:
-    """Reads and compiles a database: one of ``SHIPPED`` (once in a process) or a DBC or KCD file; raises DbcError."""
+    """Read and compile a database: one of ``SHIPPED`` (once in a process) or a DBC or KCD file; raises ConfigError."""
     return _shipped(str(name_or_path)) if str(name_or_path) in SHIPPED else _read(resolve(name_or_path))
 
 
@@ -143,7 +137,7 @@ def _read(path: Path) -> Database:
     ):
         twice = [value for value, n in counts.items() if n > 1]
         if twice:
-            raise DbcError("dbc.duplicate", f"{path}: two messages share the {what} {twice[0]}")
+            raise ConfigError("dbc.duplicate", f"{path}: two messages share the {what} {twice[0]}")
     pgns = Counter(pgn_key(m.key) for m in messages if m.by_pgn)
     return Database(
         path,
@@ -169,22 +163,22 @@ def usable(message: Any, path: Path) -> MessageCodec:
     try:
         return compile_one(message, path)
     except (ArithmeticError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
-        raise DbcError("dbc.invalid", f"{path}: message {message.name} cannot be used: {error}") from error
+        raise ConfigError("dbc.invalid", f"{path}: message {message.name} cannot be used: {error}") from error
 
 
 def parse(path: Path, *, strict: bool = True) -> Any:
-    """The cantools database of a file; raises DbcError, with the line if known."""
+    """The cantools database of a file; raises ConfigError, with the line if known."""
     import cantools
     from cantools.database.errors import Error
 
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("dbc", "kcd"):
-        raise DbcError("dbc.wrong-suffix", f"{path}: not a .dbc or .kcd file")
+        raise ConfigError("dbc.wrong-suffix", f"{path}: not a .dbc or .kcd file")
     try:
         text = "\n".join(re.split("\r\n?|\n", decoded(path.read_bytes(), "cp1252" if kind == "dbc" else "utf-8")))
         return cantools.database.load_string(text, database_format=kind, strict=strict)
     except (OSError, UnicodeError) as error:
-        raise DbcError("dbc.unreadable", f"{path}: cannot be read: {error}") from error
+        raise ConfigError("dbc.unreadable", f"{path}: cannot be read: {error}") from error
     except (
         Error,
         ValueError,
@@ -198,7 +192,7 @@ def parse(path: Path, *, strict: bool = True) -> Any:
         RecursionError,
     ) as error:
         reason = re.sub(r"^(DBC|KCD): ", "", str(error)).strip('"') or type(error).__name__
-        raise DbcError("dbc.invalid", f"{path}{_line_of(reason, text)}: {reason}") from error
+        raise ConfigError("dbc.invalid", f"{path}{_line_of(reason, text)}: {reason}") from error
 
 
 def _line_of(reason: str, text: str) -> str:
@@ -219,7 +213,7 @@ def compile_one(message: Any, path: Path) -> MessageCodec:
     signals = _signals(message)
     for s in signals:
         if s.shift < 0 or s.shift + s.bits > 8 * message.length:
-            raise DbcError("dbc.invalid", f"{path}: the signal {s.name} does not fit in message {message.name}")
+            raise ConfigError("dbc.invalid", f"{path}: the signal {s.name} does not fit in message {message.name}")
     decode, receive, encode, source = compile_message(message.name, message.length, signals)
     attributes = {k: a.value for k, a in message.dbc.attributes.items()} if message.dbc else {}
     return MessageCodec(
@@ -249,7 +243,7 @@ def _data_ids(name: str, attributes: Mapping[str, Any], path: Path) -> bytes | N
     except ValueError:
         ids = b""
     if len(ids) != 16:
-        raise DbcError("dbc.data-ids", f"{path}: {name} needs 16 hexadecimal Data IDs in E2EDataIds")
+        raise ConfigError("dbc.data-ids", f"{path}: {name} needs 16 hexadecimal Data IDs in E2EDataIds")
     return ids
 
 

@@ -18,7 +18,6 @@ from typing import Any, Final
 
 from can_dbc.dbc.signals import (
     FLOAT_MAX,
-    EncodeRefused,
     FrameRefused,
     Refusal,
     Scaling,
@@ -28,6 +27,7 @@ from can_dbc.dbc.signals import (
     pack_float,
     unpack_float,
 )
+from runtime.errors import InputRefused
 
 Values = tuple[Any, ...]
 Decoder = Callable[[bytes], Values]
@@ -307,8 +307,8 @@ def _assemble(
         s = signals[i]
         try:
             bits = s.encode(values[i])
-        except EncodeRefused as error:
-            raise EncodeRefused(error.code, f"{name}.{error}") from None
+        except InputRefused as error:
+            raise InputRefused(error.code, f"{name}.{error}") from None
         if s.big_endian:
             big |= bits << s.shift
         else:
@@ -367,11 +367,11 @@ def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]
             if signals[i].is_multiplexer:
                 value = values[i]
                 if not isinstance(value, (int, float)) or not math.isfinite(value):
-                    raise EncodeRefused(
+                    raise InputRefused(
                         "codec.multiplexer", f"{name}.{signals[i].name} = {value!r} is not a multiplexer value"
                     )
                 if int(value) not in _mux_ids(signals, i):
-                    raise EncodeRefused(
+                    raise InputRefused(
                         "codec.multiplexer", f"{name}.{signals[i].name} = {value} is not a known multiplexer value"
                     )
                 found = found + active(values, i, int(value))
@@ -383,7 +383,7 @@ def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]
         used = active(values, None, None)
         surplus = [s.name for i, s in enumerate(signals) if values[i] is not None and i not in used]
         if surplus:
-            raise EncodeRefused(
+            raise InputRefused(
                 "codec.absent-signal", f"{name}: {', '.join(surplus)} is absent for this multiplexer value; give None"
             )
         return _assemble(name, length, signals, values, used)

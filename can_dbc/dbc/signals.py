@@ -2,7 +2,7 @@
 
 This is the reference for the generated code of ``codegen``.  Conversions repeat cantools' floating-point expressions
 term by term, so that results are equal bit for bit.  Encoding never wraps: a value that is not finite, or out of range
-with the policy *refuse*, raises ``EncodeRefused``; *saturate* takes the nearest valid value.  A raw value that the
+with the policy *refuse*, raises ``InputRefused``; *saturate* takes the nearest valid value.  A raw value that the
 value table labels ``NotAvailable`` or ``Error`` is not a measurement: ``valid`` turns it into None, and encoding None
 writes the raw value labelled ``NotAvailable``.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 Value = int | float | None
 FLOAT_FORMATS: Final = {16: "<e", 32: "<f", 64: "<d"}
@@ -40,10 +40,6 @@ class FrameRefused(ValueError):
         super().__init__(f"{where}: {reason.value}")
         self.reason = reason
         self.where = where
-
-
-class EncodeRefused(CodedError, ValueError):
-    """A value cannot be sent; the sentence names signal, value and limits."""
 
 
 class Policy(StrEnum):
@@ -149,27 +145,27 @@ class SignalInfo:
         raise FrameRefused(Refusal.RANGE, self.name)
 
     def encode(self, value: Value) -> int:
-        """The bits (unsigned, ``bits`` wide) of a physical value or None; raises EncodeRefused."""
+        """The bits (unsigned, ``bits`` wide) of a physical value or None; raises InputRefused."""
         if value is None:
             raw: int | float | None = self.not_available
             if raw is None:
-                raise EncodeRefused("codec.no-not-available", f"{self.name} has no raw value for 'not available'")
+                raise InputRefused("codec.no-not-available", f"{self.name} has no raw value for 'not available'")
             return self._pack(raw)
         if not isinstance(value, (int, float)) or (isinstance(value, float) and not math.isfinite(value)):
-            raise EncodeRefused("codec.not-finite", f"{self.name} = {value!r} is not a finite number")
+            raise InputRefused("codec.not-finite", f"{self.name} = {value!r} is not a finite number")
         try:
             raw = self.convert(value)
             if not self.inside(value) and (raw not in self.choices or raw in self.sentinels):
                 if self.policy is Policy.REFUSE:
-                    raise EncodeRefused("codec.out-of-range", f"{self.name} = {value} is outside {self._limits()}")
+                    raise InputRefused("codec.out-of-range", f"{self.name} = {value} is outside {self._limits()}")
                 raw = self.convert(self._clamped(value))
             if not self.is_float and not self.raw_min <= raw <= self.raw_max:
                 if self.policy is Policy.REFUSE:
-                    raise EncodeRefused("codec.does-not-fit", f"{self.name} = {value} does not fit in {self.bits} bits")
+                    raise InputRefused("codec.does-not-fit", f"{self.name} = {value} does not fit in {self.bits} bits")
                 raw = min(max(raw, self.raw_min), self.raw_max)
             return self._pack(raw)
         except OverflowError:
-            raise EncodeRefused(
+            raise InputRefused(
                 "codec.does-not-fit", f"{self.name} = {value} does not fit in {self.bits} bits"
             ) from None
 

@@ -7,27 +7,21 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import ConfigError
 
 MIN_KEY_BYTES: Final = 16
 SERVICE_KEY: Final = Path("/etc/timberhand/key")
 """The key of the installed services; root and the group timberhand-operator may read it."""
 
 
-class KeyFileError(CodedError, ValueError):
-    """The key cannot be used; the sentence tells what is wrong and what to do."""
-
-
 def read_key(path: Path) -> bytes:
-    """The key in a file, without white space around it; raises KeyFileError."""
+    """The key in a file, without white space around it; raises ConfigError."""
     try:
         key = path.read_bytes().strip()
     except OSError as error:
-        raise KeyFileError("key.unreadable", f"{path}: the key cannot be read: {error.strerror}.") from error
+        raise ConfigError("key.unreadable", f"{path}: the key cannot be read: {error.strerror}.") from error
     if len(key) < MIN_KEY_BYTES:
-        raise KeyFileError(
-            "key.short", f"{path}: a key of {len(key)} bytes is too short; use at least {MIN_KEY_BYTES}."
-        )
+        raise ConfigError("key.short", f"{path}: a key of {len(key)} bytes is too short; use at least {MIN_KEY_BYTES}.")
     return key
 
 
@@ -43,5 +37,5 @@ def service_key() -> bytes | None:
     """The key of the services that are installed here; None where there is none, or this user may not read it."""
     try:
         return read_key(SERVICE_KEY)
-    except KeyFileError:
+    except ConfigError:
         return None

@@ -11,7 +11,7 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MAX_JPEG_BYTES: Final = 48_000
 MAX_DATAGRAM_BYTES: Final = 65_000
@@ -22,10 +22,6 @@ JPEG_START: Final = b"\xff\xd8\xff"
 
 Side = Annotated[int, msgspec.Meta(ge=0, le=MAX_SIDE_PX)]
 Pixel = tuple[float, float]
-
-
-class PictureRefused(CodedError, ValueError):
-    """A datagram is not the reply of a detector with a camera."""
 
 
 class PictureLog(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,13 +90,13 @@ def decode_picture(data: bytes) -> tuple[PictureFacts, bytes]:
     """Facts and JPEG (empty without a newer picture) of a reply.
 
     Raises:
-        PictureRefused: it is not such a reply.
+        InputRefused: it is not such a reply.
     """
     head, _, jpeg = data.partition(b"\n")
     try:
         facts = _FACTS.decode(head)
     except (msgspec.DecodeError, UnicodeDecodeError):
-        raise PictureRefused("picture.no-camera", "the log detector works without pictures") from None
+        raise InputRefused("picture.no-camera", "the log detector works without pictures") from None
     if jpeg and not (jpeg.startswith(JPEG_START) and facts.measured_ns and facts.width_px and facts.height_px):
-        raise PictureRefused("picture.damaged", "the log detector's picture is damaged; restart the detector")
+        raise InputRefused("picture.damaged", "the log detector's picture is damaged; restart the detector")
     return facts, jpeg

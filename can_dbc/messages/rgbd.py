@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MAGIC: Final = 0x54485244  # "THRD"
 VERSION: Final = 1
@@ -28,10 +28,6 @@ CRC: Final = struct.Struct("<I")
 HEADER_BYTES: Final = HEADER.size + CRC.size
 PIXEL_BYTES: Final = 5
 MM_PER_M: Final = 1000.0
-
-
-class RgbdError(CodedError, ValueError):
-    """Bytes are not a frame, or a frame cannot be sent; the sentence says what is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +67,10 @@ def encode_request(camera: str) -> bytes:
 
 
 def request_name_bytes(start: bytes) -> int:
-    """Length of the name that follows a request's header; raises RgbdError if the bytes are not a request."""
+    """Length of the name that follows a request's header; raises InputRefused if the bytes are not a request."""
     magic, version, length = REQUEST_HEADER.unpack(start)
     if magic != MAGIC or version != VERSION or not 0 < length <= MAX_NAME_BYTES:
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.no-request",
             "the bytes are not a request for a frame; is the other side a camera client of this version?",
         )
@@ -82,22 +78,22 @@ def request_name_bytes(start: bytes) -> int:
 
 
 def encode(frame: RgbdMessage) -> bytes:
-    """The bytes of a frame; raises RgbdError if its sizes are inconsistent."""
+    """The bytes of a frame; raises InputRefused if its sizes are inconsistent."""
     pixels = frame.width_px * frame.height_px
     if not (0 < frame.width_px <= MAX_SIDE_PX and 0 < frame.height_px <= MAX_SIDE_PX):
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.size",
             f"a picture of {frame.width_px} x {frame.height_px} px cannot be sent; at most {MAX_SIDE_PX} px",
         )
     if len(frame.rgb) != 3 * pixels or len(frame.depth_mm) != 2 * pixels:
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.incomplete",
             f"{len(frame.rgb)} bytes of colour and {len(frame.depth_mm)} of depth are not "
             f"{frame.width_px} x {frame.height_px} px",
         )
     pinhole = (frame.fx_px, frame.fy_px, frame.cx_px, frame.cy_px)
     if not all(map(isfinite, pinhole)):
-        raise RgbdError("rgbd.not-finite", "the intrinsics are not finite; correct the camera's calibration")
+        raise InputRefused("rgbd.not-finite", "the intrinsics are not finite; correct the camera's calibration")
     name = _name(frame.camera)
     return _packed(PICTURE, name, frame.stamp_ns, frame.width_px, frame.height_px, pinhole, frame.rgb + frame.depth_mm)
 
@@ -108,43 +104,43 @@ def encode_refusal(camera: str, why: str) -> bytes:
 
 
 def decode_header(data: bytes) -> AnswerHeader:
-    """The fixed part of an answer, ``HEADER_BYTES`` long; raises RgbdError if it is invalid, before more is read."""
+    """The fixed part of an answer, ``HEADER_BYTES`` long; raises InputRefused if it is invalid, before more is read."""
     magic, version, kind, name, stamp_ns, width, height, fx, fy, cx, cy, body = HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise RgbdError("rgbd.magic", "the bytes are not a frame; is the other side a camera server?")
+        raise InputRefused("rgbd.magic", "the bytes are not a frame; is the other side a camera server?")
     if version != VERSION:
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.version",
             f"the frame has version {version}, this side reads {VERSION}; use the same release on both sides",
         )
     if kind not in (PICTURE, REFUSAL) or name > MAX_NAME_BYTES or width > MAX_SIDE_PX or height > MAX_SIDE_PX:
-        raise RgbdError("rgbd.kind", f"a frame of kind {kind} with {width} x {height} px is not valid")
+        raise InputRefused("rgbd.kind", f"a frame of kind {kind} with {width} x {height} px is not valid")
     if body != (width * height * PIXEL_BYTES if kind == PICTURE else min(body, 1000)):
-        raise RgbdError("rgbd.length", f"a frame of {width} x {height} px cannot have {body} bytes")
+        raise InputRefused("rgbd.length", f"a frame of {width} x {height} px cannot have {body} bytes")
     (crc,) = CRC.unpack_from(data, HEADER.size)
     return AnswerHeader(kind, name, stamp_ns, width, height, (fx, fy, cx, cy), name + body, crc)
 
 
 def decode(data: bytes) -> RgbdMessage:
-    """The frame of a complete answer; raises RgbdError for a refusal, with its sentence, and for a damaged answer."""
+    """The frame of a complete answer; raises InputRefused for a refusal, with its sentence, and a damaged answer."""
     if len(data) < HEADER_BYTES:
-        raise RgbdError("rgbd.length", f"{len(data)} bytes are too short for a frame")
+        raise InputRefused("rgbd.length", f"{len(data)} bytes are too short for a frame")
     head = decode_header(data)
     if len(data) != HEADER_BYTES + head.remaining_bytes:
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.length", f"{len(data)} bytes received, but the header announces {HEADER_BYTES + head.remaining_bytes}"
         )
     if zlib.crc32(memoryview(data)[HEADER_BYTES:], zlib.crc32(data[: HEADER.size])) != head.crc:
-        raise RgbdError("rgbd.checksum", "the frame has a wrong checksum")
+        raise InputRefused("rgbd.checksum", "the frame has a wrong checksum")
     body = HEADER_BYTES + head.name_bytes
     try:
         camera = data[HEADER_BYTES:body].decode()
     except UnicodeDecodeError:
-        raise RgbdError("rgbd.camera-name", "the camera's name is not UTF-8") from None
+        raise InputRefused("rgbd.camera-name", "the camera's name is not UTF-8") from None
     if head.kind == REFUSAL:
-        raise RgbdError("rgbd.refused", data[body:].decode(errors="replace"))
+        raise InputRefused("rgbd.refused", data[body:].decode(errors="replace"))
     if not head.width_px or not head.height_px or not all(map(isfinite, head.pinhole_px)):
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.intrinsics", f"a frame of {head.width_px} x {head.height_px} px with intrinsics {head.pinhole_px}"
         )
     split = body + 3 * head.width_px * head.height_px
@@ -169,7 +165,7 @@ def _packed(
 def _name(camera: str) -> bytes:
     name = camera.encode()
     if not 0 < len(name) <= MAX_NAME_BYTES:
-        raise RgbdError(
+        raise InputRefused(
             "rgbd.camera-name", f"a camera's name has 1 to {MAX_NAME_BYTES} bytes, this one has {len(name)}"
         )
     return name

@@ -23,7 +23,7 @@ from typing import Final
 from can_dbc.bus.base import BusStats
 from can_dbc.frame import Frame
 from can_dbc.messages.envelope import is_operator_command
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MAGIC: Final = 0x52544854  # "THTR"
 VERSION: Final = 3
@@ -40,10 +40,6 @@ _IN: Final = struct.Struct("<QIBB8s")
 _OUT: Final = struct.Struct("<IBB8s")
 _LENGTH: Final = struct.Struct("<H")
 _CRC: Final = struct.Struct("<I")
-
-
-class RecordRefused(CodedError, ValueError):
-    """A tick record is damaged or of another version."""
 
 
 @dataclass(slots=True)
@@ -119,7 +115,7 @@ class RecordWriter:
         """The bytes of a tick (the fields of `TickRecord`), valid until the next call.
 
         Raises:
-            RecordRefused: it is longer than `MAX_BYTES`.
+            InputRefused: it is longer than `MAX_BYTES`.
         """
         buffer, n_in, n_out = self._buffer, len(frames_in) + len(machine_frames_in), len(frames_out)
         n_out += len(machine_frames_out)
@@ -128,7 +124,7 @@ class RecordWriter:
         for datagram in (*operator, *datagrams):
             size += _LENGTH.size + len(datagram)
         if size > MAX_BYTES:
-            raise RecordRefused("tick-record.too-long", f"the tick's record of {size} bytes is too long")
+            raise InputRefused("tick-record.too-long", f"the tick's record of {size} bytes is too long")
         _HEAD.pack_into(
             buffer,
             0,
@@ -183,7 +179,7 @@ class RecordWriter:
 
 
 def encode(tick: TickRecord) -> bytes:
-    """The bytes of a tick; raises RecordRefused when they are more than `MAX_BYTES`."""
+    """The bytes of a tick; raises InputRefused when they are more than `MAX_BYTES`."""
     return bytes(
         RecordWriter().write(
             tick.now_ns,
@@ -205,16 +201,16 @@ def encode(tick: TickRecord) -> bytes:
 
 
 def decode(data: bytes) -> TickRecord:
-    """The tick in a record; raises RecordRefused."""
+    """The tick in a record; raises InputRefused."""
     if len(data) < _VERSION.size + _CRC.size:
-        raise RecordRefused("tick-record.length", f"a tick record of {len(data)} bytes is too short")
+        raise InputRefused("tick-record.length", f"a tick record of {len(data)} bytes is too short")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, len(data) - _CRC.size)[0]:
-        raise RecordRefused("tick-record.checksum", "the tick record has a wrong checksum")
+        raise InputRefused("tick-record.checksum", "the tick record has a wrong checksum")
     magic, version = _VERSION.unpack_from(data)
     if magic != MAGIC:
-        raise RecordRefused("tick-record.magic", "the bytes are not a tick record")
+        raise InputRefused("tick-record.magic", "the bytes are not a tick record")
     if version not in (VERSION, _WITHOUT_OPERATOR):
-        raise RecordRefused(
+        raise InputRefused(
             "tick-record.version", f"the tick record has version {version}, this release reads version {VERSION}"
         )
     end = len(data) - _CRC.size
@@ -241,9 +237,9 @@ def decode(data: bytes) -> TickRecord:
             frames_out[bus].append((key, payload[:length]))
             at += _OUT.size
     except (struct.error, IndexError):
-        raise RecordRefused("tick-record.contents", "the contents of the tick record do not match its counts") from None
+        raise InputRefused("tick-record.contents", "the contents of the tick record do not match its counts") from None
     if at + n_report > end:
-        raise RecordRefused("tick-record.contents", "the contents of the tick record do not match its counts")
+        raise InputRefused("tick-record.contents", "the contents of the tick record do not match its counts")
     return TickRecord(
         now_ns,
         late_ns,

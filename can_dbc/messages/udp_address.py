@@ -5,28 +5,24 @@ from __future__ import annotations
 import argparse
 import socket
 
-from runtime.errors import CodedError
-
-
-class AddressError(CodedError, ValueError):
-    """A text is not HOST:PORT, or names an unknown host; the sentence says what to write."""
+from runtime.errors import InputRefused
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """HOST:PORT as a numeric address, so that sending never waits for a name server; raises AddressError."""
+    """HOST:PORT as a numeric address, so that sending never waits for a name server; raises InputRefused."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise AddressError("address.malformed", f"{text}: write HOST:PORT, for example 127.0.0.1:5006")
+        raise InputRefused("address.malformed", f"{text}: write HOST:PORT, for example 127.0.0.1:5006")
     try:
         return socket.gethostbyname(host), int(port)
     except OSError:
         sentence = f"{text}: there is no host {host}; write an address, for example 127.0.0.1:5006"
-        raise AddressError("address.unknown-host", sentence) from None
+        raise InputRefused("address.unknown-host", sentence) from None
 
 
 def address_argument(text: str) -> tuple[str, int]:
     """`udp_address` as the ``type`` of a command-line option: raises ArgumentTypeError with the sentence."""
     try:
         return udp_address(text)
-    except AddressError as error:
+    except InputRefused as error:
         raise argparse.ArgumentTypeError(str(error)) from None

@@ -13,7 +13,7 @@ Layout (docs/reference/can-bus.md section 10)::
 ``session`` is drawn by the PLC and 0 in a request for one (hello).  ``seq`` only ever increases within a session.
 ``echo_seq`` is the sequence number of the newest valid datagram from the other side: it gives the round-trip time, and
 a datagram that echoes an old one is itself old.  The HMAC-SHA-256, cut to 16 bytes, covers all before it and is present
-exactly when both sides have a key.  Pure; decoding raises `DatagramRefused` and uses nothing, encoding raises
+exactly when both sides have a key.  Pure; decoding raises `InputRefused` and uses nothing, encoding raises
 `MapError` for values that do not fit.
 """
 
@@ -39,7 +39,7 @@ from can_dbc.plc.map import (
     Mode,
     State,
 )
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 MAGIC: Final = 0x314E5243  # "CRN1"
 VERSION: Final = 3
@@ -52,10 +52,6 @@ _REPLY: Final = struct.Struct(f"<IHHIIQIHH{2 * N_AXES}i{N_PRESSURES}h6H{ESTOP_BY
 _CRC: Final = struct.Struct("<I")
 _MICRO: Final = 1e6
 _U32: Final = 0xFFFF_FFFF
-
-
-class DatagramRefused(CodedError, ValueError):
-    """A datagram is refused as a whole; the sentence says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +110,7 @@ def decode_reply(data: bytes, key: bytes | None = None) -> tuple[Header, Feedbac
     pressures = values[2 * N_AXES : 2 * N_AXES + N_PRESSURES]
     estop, fault, axis, longest, opening, load, estop_frame, sampled_us, *outputs = values[2 * N_AXES + N_PRESSURES :]
     if state not in set(State):
-        raise DatagramRefused("plc-datagram.state", f"the PLC's state is {state}, which is not defined")
+        raise InputRefused("plc-datagram.state", f"the PLC's state is {state}, which is not defined")
     return header, Feedback(
         heartbeat=header.sequence & 0xFFFF,
         state=State(state),
@@ -164,15 +160,15 @@ def _opened(
 ) -> tuple[Header, int, int, tuple[Any, ...]]:
     expected = layout.size + _CRC.size + (0 if key is None else MAC_BYTES)
     if len(data) != expected:
-        raise DatagramRefused("plc-datagram.length", f"the datagram has {len(data)} bytes, not {expected}")
+        raise InputRefused("plc-datagram.length", f"the datagram has {len(data)} bytes, not {expected}")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, expected - _CRC.size)[0]:
-        raise DatagramRefused("plc-datagram.checksum", "the datagram has a wrong checksum")
+        raise InputRefused("plc-datagram.checksum", "the datagram has a wrong checksum")
     magic, version, got, session, sequence, time_us, echo, mode, arm, *values = layout.unpack_from(data)
     if (magic, version, got) != (MAGIC, VERSION, kind):
-        raise DatagramRefused(
+        raise InputRefused(
             "plc-datagram.header",
             f"magic 0x{magic:08X}, version {version}, type {got}: not a datagram of this protocol",
         )
     if key is not None and not hmac.compare_digest(_mac(data[: layout.size], key), data[layout.size : -_CRC.size]):
-        raise DatagramRefused("plc-datagram.authentication", "the datagram was not made with our key")
+        raise InputRefused("plc-datagram.authentication", "the datagram was not made with our key")
     return Header(session, sequence, time_us, echo), mode, arm, tuple(values)

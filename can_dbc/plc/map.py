@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 N_AXES: Final = 7
 """Slew, lift, tilt, extension, rotator, grapple, auxiliary.  The last two have no joint: their values are 0."""
@@ -112,7 +112,7 @@ RANGE_MARGIN: Final = 0.05
 """How far beyond a joint's range [rad, m] a reference may be: a machine found there must be able to hold still."""
 
 
-class MapError(CodedError, ValueError):
+class MapError(TimberhandError, ValueError):
     """A value that the map cannot carry, or undefined registers; ``axis`` is `NO_AXIS` if none is concerned."""
 
     def __init__(self, code: str, sentence: str, axis: int = NO_AXIS) -> None:

@@ -24,7 +24,7 @@ from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
 from can_dbc.plc.map import COMMAND_AT, STATUS_AT, STATUS_COUNT
-from runtime.errors import CodedError
+from runtime.errors import LinkError
 
 UNIT: Final = 1
 MAX_CONNECTIONS: Final = 8
@@ -41,10 +41,6 @@ _REFUSED: Final = (ModbusException, ValueError, OSError, TimeoutError)
 
 # Exceptions and counters report every problem; the library's own log would repeat them on stderr.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
-
-
-class LinkError(CodedError):
-    """The PLC cannot be reached or does not answer correctly; the sentence says what happened."""
 
 
 class RegisterRefused(Exception):

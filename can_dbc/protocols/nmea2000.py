@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from can_dbc.dbc.codec import Database, DbcError, EncodeRefused, MessageCodec, load
+from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.dbc.codegen import Values
 from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import ERROR, EXTENDED, REMOTE
+from runtime.errors import ConfigError, InputRefused
 
 BROADCAST: Final = 255
 MAX_FAST_PACKET_AGE_NS: Final = 750_000_000
@@ -185,17 +186,17 @@ def decode(codec: MessageCodec, payload: bytes) -> Values:
 
 
 def encode(codec: MessageCodec, **fields: Any) -> bytes:
-    """The payload of a PGN; fields not given are "not available".  Raises EncodeRefused for an invalid value."""
+    """The payload of a PGN; fields not given are "not available".  Raises InputRefused for an invalid value."""
     unknown = fields.keys() - codec.index.keys()
     if unknown:
-        raise EncodeRefused("codec.unknown-field", f"{codec.name} has no field {', '.join(sorted(unknown))}")
+        raise InputRefused("codec.unknown-field", f"{codec.name} has no field {', '.join(sorted(unknown))}")
     return codec.encode(*(fields.get(s.name) for s in codec.signals))
 
 
 def frames(codec: MessageCodec, payload: bytes, source: int, sequence: int = 0) -> list[tuple[int, bytes]]:
     """The frames that carry a payload: one, or those of a fast packet; the priority is that of the database."""
     if not codec.by_pgn:
-        raise DbcError("dbc.not-by-pgn", f"{codec.name} is not matched by PGN; its source address cannot be chosen")
+        raise ConfigError("dbc.not-by-pgn", f"{codec.name} is not matched by PGN; its source address cannot be chosen")
     key = codec.key & ~0xFF | source
     if codec.length <= 8:
         return [(key, payload)]

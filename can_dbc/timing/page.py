@@ -19,7 +19,7 @@ from typing import Any, Final
 import msgspec
 
 from can_dbc.timing.durations import BINS, Durations
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 from runtime.shared_file import SharedFile, shared_path
 
 STAGES: Final = (
@@ -54,10 +54,6 @@ _FACTS_BYTES: Final = 16 << 10
 _BLOCK: Final = 8 * BINS
 _SIZE: Final = _HEAD.size + _FACTS_BYTES + _BLOCK * len(STAGES)
 _TRIES: Final = 50
-
-
-class TimingRefused(CodedError):
-    """There is no timing page, or it cannot be read; the sentence says what to do."""
 
 
 class BusCounters(msgspec.Struct, frozen=True):
@@ -178,7 +174,7 @@ class TimingWriter:
 
 
 def read_timing(path: Path | None = None) -> Timing:
-    """A copy of the page at ``path`` (default: `default_path`); raises TimingRefused."""
+    """A copy of the page at ``path`` (default: `default_path`); raises InputRefused."""
     path = path or default_path()
     try:
         with path.open("rb", buffering=0) as file:
@@ -188,7 +184,7 @@ def read_timing(path: Path | None = None) -> Timing:
                 if len(data) == _SIZE and again == data[_SEQUENCE_AT : _SEQUENCE_AT + _SEQUENCE.size]:
                     magic, version, sequence, size = _HEAD.unpack_from(data)
                     if (magic, version) != (_MAGIC, _VERSION):
-                        raise TimingRefused(
+                        raise InputRefused(
                             "timing.other-release",
                             f"{path} is not a timing page of this release; use the same release to read it.",
                         )
@@ -197,11 +193,11 @@ def read_timing(path: Path | None = None) -> Timing:
                 time.sleep(0.002)
     except (OSError, ValueError, msgspec.MsgspecError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise TimingRefused(
+        raise InputRefused(
             "timing.no-page",
             f"No controller publishes its timing at {path} ({reason}); start it, or give the path of its page.",
         ) from (error)
-    raise TimingRefused(
+    raise InputRefused(
         "timing.not-written", f"The controller has not written its timing to {path} yet; try again in a second."
     )
 

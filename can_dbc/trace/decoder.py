@@ -75,7 +75,7 @@ class _Bus:
 
 
 class Decoder:
-    """Decodes frames with the first database that has their message; raises DbcError for an unusable file."""
+    """Decodes frames with the first database that has their message; raises ConfigError for an unusable file."""
 
     def __init__(self, files: Sequence[str]) -> None:
         self.databases: list[Database] = [load(file) for file in files]

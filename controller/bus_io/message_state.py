@@ -13,7 +13,7 @@ from typing import Any, Final
 from can_dbc.dbc.codec import FrameRefused, MessageCodec
 from can_dbc.frame import Frame
 from can_dbc.protocols.e2e import Checker
-from controller.config import ConfigError
+from runtime.errors import ConfigError
 
 NEUTRAL_WITHIN_NS: Final = 100_000_000
 """Within this time after a needed input is lost every function is at neutral (docs/reference/safety.md section 2)."""

@@ -6,15 +6,15 @@ by a command of its laws.
 
 from __future__ import annotations
 
-from can_dbc.dbc.codec import Database, DbcError, load
+from can_dbc.dbc.codec import Database, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.messages.tick_record import BusReading
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.carrier.inputs import CarrierInputs
 from controller.carrier.outputs import STANDING, CarrierWriter
-from controller.config import ConfigError
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import ConfigError
 
 
 class CarrierBus:
@@ -30,7 +30,7 @@ class CarrierBus:
         """
         try:
             machine, gnss = databases or (load("machine"), load("gnss"))
-        except DbcError as error:
+        except ConfigError as error:
             raise ConfigError(error.code, str(error)) from error
         self.inputs = CarrierInputs(machine, gnss)
         self.monitor = BusMonitor(1)

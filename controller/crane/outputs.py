@@ -16,12 +16,12 @@ from can_dbc.frame import RawFrame
 from can_dbc.messages.crane import GrappleCommand
 from can_dbc.protocols.canopen import NodeState, heartbeat_frame, next_sync, sync_frame
 from controller.bus_io.messages import ARM_KEY, PeriodicTimer, ProtectedMessage, safe_state
-from controller.config import ConfigError
 from machine.crane_nodes import CraneNode
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import ConfigError
 
 STATUS_NS: Final = 20_000_000
 HEARTBEAT_NS: Final = 100_000_000

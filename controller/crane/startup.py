@@ -23,10 +23,10 @@ from can_dbc.protocols.canopen import (
     parse_response,
     upload_request,
 )
-from controller.config import ConfigError
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Encoder, Profile, encoders
 from machine.status.reasons import Reason
+from runtime.errors import ConfigError
 
 TIMEOUT_NS: Final = 300_000_000
 MAX_TRIES: Final = 3

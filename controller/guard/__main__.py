@@ -7,6 +7,7 @@ SIGTERM, 3 configuration, 4 no bus at the start, 130 SIGINT.
 from __future__ import annotations
 
 from runtime.compiled import stay_interpreted
+from runtime.errors import LinkError
 
 if __name__ == "__main__":  # before the buses are imported: no fault of the compiler may be in guard and controller
     stay_interpreted()
@@ -20,7 +21,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import PYTHON_CAN, default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame, RawFrame
 from can_dbc.messages.operator_link import default_path as operator_path
@@ -146,7 +147,7 @@ def main(arguments: list[str] | None = None) -> int:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
             run(guard, buses, ended, Notifier(lambda: _status_text(guard, buses)), latch, operator)
-    except (GuardConfigError, BusError) as error:
+    except (GuardConfigError, LinkError) as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3 if isinstance(error, GuardConfigError) else 4
     return 130 if signal.SIGINT in ended else 0

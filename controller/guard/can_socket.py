@@ -18,8 +18,9 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Final, Self
 
-from can_dbc.bus.base import BusError, BusState, BusStats
+from can_dbc.bus.base import BusState, BusStats
 from can_dbc.frame import EXTENDED, EXTENDED_MASK, REMOTE, Frame
+from runtime.errors import LinkError
 
 MOST_FRAMES: Final = 512
 """Frames read at one look: a flooded bus must not delay the guard."""
@@ -60,7 +61,7 @@ class GuardSocket:
         try:
             self._socket: socket.socket | None = self._open(_UP)
         except OSError as error:
-            raise BusError(
+            raise LinkError(
                 "bus.interface",
                 f"CAN interface {interface} cannot be opened ({error.strerror}); see `ip link`, and bring it up with "
                 f"`ip link set {interface} up`.",

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 from typing import Final, Protocol
 
-from controller.config import ConfigError
 from machine.profile import JOINT_LAWS, Law
-from runtime.plugins import PluginError, load_plugin
+from runtime.errors import ConfigError
+from runtime.plugins import load_plugin
 
 REACHING_SHARE: Final = 0.5
 """Share of the budget in the switching term; the rest is the proportional term lambda e."""
@@ -138,7 +138,7 @@ class Foreign:
         self._kind = law.kind
         try:
             self._law: Feedback = load_plugin(JOINT_LAWS, law.kind, law)
-        except PluginError as error:
+        except ConfigError as error:
             raise ConfigError(error.code, str(error)) from error
 
     def reset(self) -> None:

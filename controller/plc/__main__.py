@@ -21,16 +21,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import default_address, open_bus
-from can_dbc.dbc.codec import DbcError, load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from can_dbc.messages.key_file import KeyFileError, read_key
+from can_dbc.messages.key_file import read_key
 from can_dbc.messages.udp_address import address_argument
 from can_dbc.plc.machine import MACHINES
 from can_dbc.plc.map import WordOrder
 from can_dbc.plc.modbus import is_loopback
-from controller.config import ConfigError
 from controller.plc.bridge import Bridge
 from controller.plc.handshake import Handshake
 from controller.plc.links import Link, MachineLink, ModbusLink, UdpLink
@@ -38,8 +37,9 @@ from controller.process.bus_link import BusLink
 from controller.process.realtime import prepare, stop_garbage_collection
 from machine.loading.profile_file import ProfileError, load_profile
 from runtime.allocator import keep_memory
+from runtime.errors import ConfigError, LinkError
 from runtime.notifier import Notifier
-from runtime.plugins import PluginError, load_plugin
+from runtime.plugins import load_plugin
 
 STEP_S: Final = 0.005
 PRIORITY: Final = 70
@@ -202,10 +202,10 @@ def main(arguments: list[str] | None = None) -> int:
             stop_garbage_collection()
             asyncio.run(_until_ended(Process(bridge, bus), link, ended))
         sys.stderr.write(f"plc: {summary(bridge)}\n")
-    except (ConfigError, DbcError, KeyFileError, PluginError, ProfileError) as error:
+    except (ConfigError, ProfileError) as error:
         sys.stderr.write(f"plc: {error}\n")
         return 3
-    except (BusError, OSError) as error:
+    except (LinkError, OSError) as error:
         sys.stderr.write(f"plc: {error}\n")
         return 4
     return 130 if signal.SIGINT in ended else 0

@@ -20,7 +20,6 @@ from can_dbc.frame import Frame, RawFrame
 from can_dbc.plc.map import ESTOP_BYTES, N_JOINTS, Command, Feedback, Grapple, Role, State
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
 from controller.bus_io.messages import PeriodicTimer, ProtectedMessage
-from controller.config import ConfigError
 from controller.crane.inputs import sample_timeout_ns
 from controller.plc.emulated_nodes import EmulatedEncoder, EmulatedNode
 from controller.plc.handshake import Handshake
@@ -28,6 +27,7 @@ from controller.plc.valve_gate import ValveGate, fault_bits, state_of
 from machine.crane_nodes import PRESSURE_NODES, CraneNode
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
+from runtime.errors import ConfigError
 
 MS: Final = 1_000_000
 EXCHANGE_NS: Final = 10 * MS

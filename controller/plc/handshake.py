@@ -18,10 +18,11 @@ from typing import Final
 
 from can_dbc.plc import datagram
 from can_dbc.plc import map as plc
-from can_dbc.plc.datagram import DatagramRefused, Header
+from can_dbc.plc.datagram import Header
 from can_dbc.plc.machine import Machine
 from can_dbc.plc.map import Command, Feedback, MapError, State, WordOrder
 from can_dbc.timing.durations import Durations
+from runtime.errors import InputRefused
 
 FRESH_NS: Final = 50_000_000
 """After this long without a good answer nothing of the PLC is passed on (docs/reference/can-bus.md section 10:
@@ -110,7 +111,7 @@ class Handshake:
         """Use a UDP reply; False when it is damaged or old."""
         try:
             header, feedback = datagram.decode_reply(data, self._key)
-        except DatagramRefused as refused:
+        except InputRefused as refused:
             self.dropped += 1
             self.problem = f"A datagram was refused: {refused}."
             return False

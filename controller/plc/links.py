@@ -14,8 +14,9 @@ from typing import Final
 
 from can_dbc.plc.machine import Machine
 from can_dbc.plc.map import MapError, check_identity
-from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
+from can_dbc.plc.modbus import ModbusClient, RegisterRefused
 from controller.plc.bridge import EXCHANGE_NS, Bridge
+from runtime.errors import LinkError
 
 TIMEOUT_S: Final = 0.1
 """A later answer does not count; the connection is closed, so that it cannot arrive at all."""

@@ -15,18 +15,17 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.filters import FilterItem
-from can_dbc.dbc.codec import DbcError
 from can_dbc.dbc.codec import load as read_dbc
-from can_dbc.messages.key_file import KeyFileError, read_key
+from can_dbc.messages.key_file import read_key
 from can_dbc.messages.operator_link import default_path as operator_path
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.record_ring import default_path as ring_path
 from can_dbc.messages.udp_address import address_argument
 from can_dbc.timing.page import METRIC_KEYS, STAGES, TimingWriter, default_path
-from controller.config import ConfigError, Settings, load
+from controller.config import Settings, load
 from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
 from controller.process.timing import LoopTiming
@@ -38,6 +37,7 @@ from machine.status.explanation import describe
 from machine.status.modes import Mode
 from runtime.allocator import keep_memory
 from runtime.compiled import running
+from runtime.errors import ConfigError, LinkError
 from runtime.huge_pages import collapse_heap
 
 PRIORITY: Final = 80
@@ -114,23 +114,23 @@ def bus_address(text: str) -> tuple[str, str]:
 
 
 def operator_socket(path: Path) -> OperatorSocket:
-    """Open the operators' socket; raises BusError."""
+    """Open the operators' socket; raises LinkError."""
     try:
         return OperatorSocket(path)
     except OSError as error:
         sentence = f"The operator's socket {path} cannot be made ({error.strerror}); choose another with --operator."
-        raise BusError("operator.socket", sentence) from error
+        raise LinkError("operator.socket", sentence) from error
 
 
 def listen(port: int) -> socket.socket:
-    """Open the setpoint socket, on loopback only; raises BusError."""
+    """Open the setpoint socket, on loopback only; raises LinkError."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         made.bind(("127.0.0.1", port))
     except (OSError, OverflowError) as error:
         made.close()
         sentence = f"UDP port {port} cannot be used ({error}); end the process that uses it or choose another port."
-        raise BusError("udp.port-in-use", sentence) from error
+        raise LinkError("udp.port-in-use", sentence) from error
     made.setblocking(False)
     return made
 
@@ -149,7 +149,7 @@ def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
 
 
 def open_buses(where: dict[str, str], controller: Controller, settings: Settings) -> list[Bus]:
-    """Open all buses or none, each with the filter of the controller's inputs; raises BusError."""
+    """Open all buses or none, each with the filter of the controller's inputs; raises LinkError."""
     wanted: list[list[FilterItem]] = [[*controller.crane_inputs.filters()]]
     if controller.carrier_bus is not None:
         wanted.append(controller.carrier_bus.inputs.filters())
@@ -158,7 +158,7 @@ def open_buses(where: dict[str, str], controller: Controller, settings: Settings
     try:
         for address, filters, queue in zip(where.values(), wanted, queues, strict=False):
             opened.append(open_bus(address, filters=filters, tx_queue=queue))
-    except BusError:
+    except LinkError:
         for bus in opened:
             bus.close()
         raise
@@ -236,10 +236,10 @@ def main(arguments: list[str] | None = None) -> int:
             sleep=make_sleep(options.spin_us * 1000),
             key=key,
         )
-    except (ConfigError, DbcError, KeyFileError) as error:
+    except ConfigError as error:
         sys.stderr.write(f"controller: {error}\n")
         return 3
-    except BusError as error:
+    except LinkError as error:
         sys.stderr.write(f"controller: {error}\n")
         return 4
     ended: list[int] = []

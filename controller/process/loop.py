@@ -18,12 +18,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.batch import Batch
 from can_dbc.messages.envelope import signed
 from can_dbc.messages.operator_link import admitted
 from can_dbc.messages.record_ring import RecordRing
-from can_dbc.messages.tick_record import RecordRefused, RecordWriter
+from can_dbc.messages.tick_record import RecordWriter
 from controller.process.bus_link import BusLink
 from controller.process.realtime import sleep_until
 from controller.process.tick_recording import write
@@ -32,6 +32,7 @@ from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from machine.status.explanation import describe
+from runtime.errors import InputRefused, LinkError
 from runtime.notifier import Notifier
 
 Address = tuple[str, int]
@@ -193,7 +194,7 @@ class Loop:
         if self._record is not None:
             try:
                 self._record.append(write(self._writer, inputs, outputs, now_ns))
-            except RecordRefused:
+            except InputRefused:
                 self.unrecorded += 1
         if now_ns >= self.timing.publish_ns:
             supervisor = self.controller.supervisor
@@ -212,7 +213,7 @@ def _connected(address: Address) -> socket.socket:
     """A socket that never blocks and sends to one address: the kernel looks for its way once and not in every tick.
 
     Raises:
-        BusError: there is no way to the address.
+        LinkError: there is no way to the address.
     """
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     made.setblocking(False)
@@ -222,7 +223,7 @@ def _connected(address: Address) -> socket.socket:
         made.close()
         where = f"{address[0]}:{address[1]}"
         sentence = f"Nothing can be sent to {where} ({error}); check --report, or the network."
-        raise BusError("udp.unreachable", sentence) from error
+        raise LinkError("udp.unreachable", sentence) from error
     return made
 
 

@@ -22,7 +22,6 @@ from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from experiments.calibration.tip import tip_errors
-from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named, trial_world
 from hil.calibration.crane import run_lockstep
@@ -32,6 +31,7 @@ from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
+from runtime.errors import InputRefused
 from sim.plant import Plant
 from sim.world import STEP_S
 
@@ -90,7 +90,7 @@ def turn_errors(job: Job, path: Path) -> list[float]:
     """Relative error of the true angle of every commanded turn in `TURNS_RAD`, with the profile in a file.
 
     Raises:
-        ExperimentError: the machine did not make all turns.
+        InputRefused: the machine did not make all turns.
     """
     profile = load_profile(path)
     plant = Plant(profile_named(job.options["profile"]), seed=job.seed, truth=job.options["truth"], logs=0)
@@ -109,7 +109,7 @@ def turn_errors(job: Job, path: Path) -> list[float]:
     finally:
         plant.close()
     if not turner.done:
-        raise ExperimentError(
+        raise InputRefused(
             "experiment.quarter-turns", f"only {len(turner.turned_rad)} of {len(TURNS_RAD)} quarter turns were made"
         )
     before = (0.0, *TURNS_RAD)

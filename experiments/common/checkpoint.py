@@ -17,8 +17,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.common.errors import ExperimentError
 from experiments.common.trial_cost import TrialCost
+from runtime.errors import InputRefused
 
 
 class Kept(NamedTuple):
@@ -35,7 +35,7 @@ class Checkpoint:
     whether the file stays on the disk after a complete run.
 
     Raises:
-        ExperimentError: another process writes the same file, or the disk refuses it.
+        InputRefused: another process writes the same file, or the disk refuses it.
     """
 
     def __init__(self, path: Path, fingerprint: str, published: Path | None = None, stays: bool = False) -> None:
@@ -47,7 +47,7 @@ class Checkpoint:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a+b")
         except OSError as error:
-            raise ExperimentError(
+            raise InputRefused(
                 "experiment.trials-unwritable",
                 f"trials cannot be kept in {path} ({error.strerror}): name another --out",
             ) from None
@@ -55,7 +55,7 @@ class Checkpoint:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._file.close()
-            raise ExperimentError(
+            raise InputRefused(
                 "experiment.in-use", f"another run writes {path}: wait for its end, or name another --out"
             ) from None
         self._file.seek(0)
@@ -123,12 +123,12 @@ def read_published(path: Path) -> dict[str, Any]:
     """The outcomes of a published file by the names of their jobs, whichever run made them.
 
     Raises:
-        ExperimentError: the file is missing or damaged.
+        InputRefused: the file is missing or damaged.
     """
     try:
         data = lzma.decompress(path.read_bytes())
     except (OSError, lzma.LZMAError) as error:
-        raise ExperimentError("experiment.published-trials", f"{path} cannot be read: {error}") from None
+        raise InputRefused("experiment.published-trials", f"{path} cannot be read: {error}") from None
     return {name: outcome for name, outcome, _ in _lines(data)}
 
 

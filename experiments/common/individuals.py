@@ -8,13 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
+from autonomy.calibration.profile_file import profile_changes, write_profile
 from autonomy.calibration.result import identify
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.calibration.crane import run_lockstep
 from machine.loading.beside import carry_envelope
+from runtime.errors import InputRefused
 
 DATE: Final = "2000-01-01"
 """Date written into the calibrated profile; the outcome of a run must not depend on the day."""
@@ -38,7 +39,7 @@ def calibrated(job: Job) -> dict[str, Any]:
         path = Path(folder) / "calibrated.toml"
         try:
             write_profile(profile_path(name), path, profile_changes(known, result), DATE)
-        except ProfileNotWritten as error:
+        except InputRefused as error:
             return {"profile": None, "failure": str(error)}
         return {"profile": path.read_text(encoding="utf-8"), "failure": None}
 

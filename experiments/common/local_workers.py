@@ -14,8 +14,8 @@ from typing import Any, Final
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 
-from experiments.common.errors import ExperimentError
 from runtime.allocator import keep_memory
+from runtime.errors import InputRefused
 
 WAITING_PER_WORKER: Final = 2
 DEATHS: Final = 3
@@ -26,7 +26,7 @@ def completed(work: Mapping[str, Callable[[], Any]], count: int) -> Iterator[tup
     """Name and result of every piece of work as it is done, by ``count`` processes.
 
     Raises:
-        ExperimentError: workers are killed again and again.
+        InputRefused: workers are killed again and again.
     """
     left, deaths = dict(work), 0
     try:
@@ -45,7 +45,7 @@ def completed(work: Mapping[str, Callable[[], Any]], count: int) -> Iterator[tup
                     except BrokenProcessPool:
                         deaths += 1
                         if deaths == DEATHS:
-                            raise ExperimentError(
+                            raise InputRefused(
                                 "experiment.worker-killed",
                                 f"worker processes were killed {DEATHS} times without a finished trial in between, "
                                 "as the kernel does when memory runs out: give fewer --workers",

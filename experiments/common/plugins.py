@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from autonomy.perception.camera.frame import RgbdFrame
-from experiments.common.errors import ExperimentError
-from runtime.plugins import PluginError, load_plugin
+from runtime.errors import ConfigError, InputRefused
+from runtime.plugins import load_plugin
 
 LOG_DETECTORS: Final = "timberhand.log_detectors"
 
@@ -53,9 +53,9 @@ def load(group: str, name: str) -> Any:
     """What the entry point's factory makes.
 
     Raises:
-        ExperimentError: no installed package has such an entry point, several have, or it cannot be loaded.
+        InputRefused: no installed package has such an entry point, several have, or it cannot be loaded.
     """
     try:
         return load_plugin(group, name)
-    except PluginError as error:
-        raise ExperimentError(error.code, str(error)) from error
+    except ConfigError as error:
+        raise InputRefused(error.code, str(error)) from error

@@ -13,7 +13,7 @@ import platform
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
-from experiments.common.errors import ExperimentError
+from runtime.errors import InputRefused
 
 RETRIES: Final = 3
 """So many times a piece of work is begun again after the death of its process or node."""
@@ -30,7 +30,7 @@ def completed(
     ``identity`` names the sources and libraries of the process that calls it: workers must name the same as we do.
 
     Raises:
-        ExperimentError: Ray is not installed, no cluster answers, a node has other sources, or workers die repeatedly.
+        InputRefused: Ray is not installed, no cluster answers, a node has other sources, or workers die repeatedly.
     """
     ray = connected(address)
     from ray.exceptions import NodeDiedError, OutOfMemoryError, RayTaskError, WorkerCrashedError
@@ -52,7 +52,7 @@ def completed(
                 except RayTaskError as error:
                     raise error.cause if isinstance(error.cause, Exception) else error from None
                 except (WorkerCrashedError, NodeDiedError, OutOfMemoryError) as error:
-                    raise ExperimentError(
+                    raise InputRefused(
                         "experiment.worker-killed",
                         f"the process of {name} was killed {RETRIES + 1} times, as Ray does when a node's memory runs "
                         f"out ({type(error).__name__}): give the nodes fewer processors (ray start --num-cpus)",
@@ -68,12 +68,12 @@ def connected(address: str) -> Any:
     """Ray, connected to the cluster.
 
     Raises:
-        ExperimentError: Ray is not installed, or no cluster answers there.
+        InputRefused: Ray is not installed, or no cluster answers there.
     """
     try:
         import ray
     except ImportError:
-        raise ExperimentError(
+        raise InputRefused(
             "experiment.ray-missing", "Ray is not installed: pip install 'timberhand[cluster]', or leave out --ray"
         ) from None
     if not ray.is_initialized():
@@ -82,7 +82,7 @@ def connected(address: str) -> Any:
             # Ray gives a task of one processor one thread (OMP_NUM_THREADS), as joblib gives it to local workers.
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            raise ExperimentError(
+            raise InputRefused(
                 "experiment.no-cluster",
                 f"no Ray cluster answers at {address!r} ({str(error).splitlines()[0]}): start one with "
                 "ray start --head, and run this command on one of its nodes",
@@ -94,7 +94,7 @@ def _on_node(do: Callable[[], Any], identity: Callable[[], str], ours: str) -> A
     begin_worker()
     theirs = _own(identity)
     if theirs != ours:
-        raise ExperimentError(
+        raise InputRefused(
             "experiment.node-differs",
             f"the node {platform.node()} has other sources or libraries ({theirs}) than this one ({ours}): give every "
             "node the same checkout and constraints.txt",

@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 from rich.console import Console
 
-from autonomy.networks.weights import WeightsError
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from experiments.common import pool
 from experiments.common.pool import Job
@@ -24,6 +23,7 @@ from experiments.detector.plots import contact_sheet, gallery, overlaid, precisi
 from experiments.detector.trial import FAITHFUL, PARTED, box_finder, example, finder, matches, perform, shipped
 from host.exit_codes import CommandFailed, ExitCode
 from machine.geometry.optics import pinhole
+from runtime.errors import InputRefused
 from training.common.average_precision import average_precision, curve, matched_truths
 from training.pictures.piles import MACHINES
 
@@ -48,7 +48,7 @@ def run(options: Options, console: Console) -> Result:
     try:
         nets = {name: box_finder() if name == FAITHFUL else finder(name) for name in networks}
         facts = {name: net.facts.get("digest", "") for name, net in nets.items()}
-    except WeightsError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     jobs = [
         Job(f"{machine}-{i}", machine, options.seed, {"number": i, "truth": options.truth, "networks": list(networks)})

@@ -15,7 +15,6 @@ from typing import Any, Final
 from rich.console import Console
 
 from experiments.common import pool
-from experiments.common.errors import ExperimentError
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
@@ -25,6 +24,7 @@ from experiments.faults import files, nominal, trial
 from experiments.faults.metrics import METRICS, gather
 from experiments.faults.pages import CONCLUSION, INTRODUCTION, sections, write_evidence
 from hil.faults.catalogue import CASES, Case, Where, Work
+from runtime.errors import InputRefused
 
 TRIALS: Final = 100
 QUICK_TRIALS: Final = 2
@@ -41,17 +41,17 @@ def run(options: Options, console: Console) -> Result:
     """Run the campaign; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        ExperimentError: the time given by ``--minutes`` is over; the same command continues.
+        InputRefused: the time given by ``--minutes`` is over; the same command continues.
     """
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     injections = plan(options.seed, trials)
     jobs = [*injections, *nominal_plan(options.seed, QUICK_NOMINAL_S if options.quick else NOMINAL_S)]
     with checkpoint(options, jobs, PROFILES, options.truth, LOCKSTEP_SOURCES) as kept:
-        over: ExperimentError | None = None
+        over: InputRefused | None = None
         try:
             with _limited(options.minutes, kept, len(jobs)):
                 pool.run(perform, jobs, kept, options.workers, "faults", console)
-        except ExperimentError as error:
+        except InputRefused as error:
             if error.code != TIME_OVER or any(job.name not in kept.done for job in injections):
                 raise
             over = error
@@ -139,14 +139,14 @@ def _limited(minutes: float | None, kept: Checkpoint, total: int) -> Iterator[No
     """End what runs inside when the time is over; finished jobs are kept.
 
     Raises:
-        ExperimentError: the time is over.
+        InputRefused: the time is over.
     """
     if minutes is None:
         yield
         return
 
     def over(number: int, frame: object) -> None:
-        raise ExperimentError(
+        raise InputRefused(
             "experiment.time-over",
             f"the time is over with {len(kept.done)} of {total} jobs done; the same command continues",
         )

@@ -30,7 +30,6 @@ from controller.config import load as load_settings
 from controller.crane.load_moment import LoadMoment
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
-from experiments.common.errors import ExperimentError
 from experiments.faults.evidence import Evidence
 from hil.faults.draws import LEASE_MS, Scene
 from hil.faults.injector import Injector
@@ -42,6 +41,7 @@ from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS
 from machine.profile import Profile
 from machine.status.modes import Mode
+from runtime.errors import InputRefused
 from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
 
@@ -244,7 +244,7 @@ class Running:
         """Run until the machine has moved for a second.
 
         Raises:
-            ExperimentError: it does not.
+            InputRefused: it does not.
         """
         system, since_ns = self.system, 0
         needed_ns = MOVING_NS if self.phase() is None else CARRIED_NS
@@ -255,7 +255,7 @@ class Running:
             since_ns = (since_ns or system.now_ns) if moving else 0
             if system.now_ns > START_NS + WARM_LIMIT_NS:
                 reason = system.report.reason if system.report else -1
-                raise ExperimentError(
+                raise InputRefused(
                     "experiment.not-moving", f"the machine of scene {self.name!r} does not move: reason {reason}"
                 )
 
@@ -263,7 +263,7 @@ class Running:
         """Run on until the reference has stood for half a second.
 
         Raises:
-            ExperimentError: it does not.
+            InputRefused: it does not.
         """
         system, since_ns, before = self.system, 0, None
         while not since_ns or system.now_ns < since_ns + HELD_NS:
@@ -275,7 +275,7 @@ class Running:
                 since_ns = system.now_ns
             before = reference
             if system.now_ns > START_NS + WARM_LIMIT_NS:
-                raise ExperimentError(
+                raise InputRefused(
                     "experiment.not-holding", f"the machine of scene {self.name!r} does not hold its pose"
                 )
 

@@ -17,7 +17,6 @@ from random import Random
 from typing import Any, Final
 
 from autonomy.crane_job.phases import Phase
-from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.faults.running import Running, build, warm
 from hil.faults.catalogue import CASES, Where
@@ -27,6 +26,7 @@ from hil.harness.lockstep import SLICE_NS, START_NS
 from machine.joints import JOINTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import InputRefused
 
 # -- Whether an injection was answered as the catalogue promises.  Pure: an outcome in, a verdict out.
 
@@ -261,7 +261,7 @@ def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """The result of a function that runs in a forked child, which leaves this process as it is.
 
     Raises:
-        ExperimentError: the child failed; its traceback is in the sentence.
+        InputRefused: the child failed; its traceback is in the sentence.
     """
     reading, writing = os.pipe()
     child = os.fork()
@@ -284,5 +284,5 @@ def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     _, status = os.waitpid(child, 0)
     answer: dict[str, Any] = json.loads(text) if text else {"failed": f"the child ended with status {status}"}
     if "failed" in answer:
-        raise ExperimentError("experiment.injection-failed", f"an injection failed: {answer['failed']}")
+        raise InputRefused("experiment.injection-failed", f"an injection failed: {answer['failed']}")
     return answer

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
+from autonomy.calibration.profile_file import profile_changes, write_profile
 from autonomy.calibration.result import CalibrationResult, identify
 from controller.guard.__main__ import profile_path
 from experiments.common import pool
@@ -45,6 +45,7 @@ from hil.calibration.crane import run_lockstep as calibrate
 from hil.demo.lockstep import run_lockstep as load_one_log
 from hil.replay.recording import PROFILE_FILE
 from machine.loading.beside import carry_envelope
+from runtime.errors import InputRefused
 
 # -- One machine with one truth: calibrated, then some logs or a mission with what the calibration has written.
 #
@@ -83,7 +84,7 @@ def tried(job: Job) -> dict[str, Any]:
         try:
             write_profile(profile_path(o["profile"]), path, profile_changes(known, result), DATE)
             carry_envelope(profile_path(o["profile"]), folder)
-        except ProfileNotWritten as error:
+        except InputRefused as error:
             return {**found, "calibrated": False, "said": str(error)}
         found |= {"calibrated": True, "wrong": wrong_values(result, content)}
         if job.kind == MISSION:

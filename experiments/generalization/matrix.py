@@ -14,7 +14,7 @@ from typing import Any, Final
 import tomlkit
 
 import sim
-from experiments.common.errors import ExperimentError
+from runtime.errors import InputRefused
 from sim.ground.terrain import KINDS
 from sim.individual import split
 
@@ -111,13 +111,13 @@ def nominal_file(profile: str, truth: str) -> Path:
     """The file to change: of the choice of ``--truth`` (`sim.individual`), or of the shipped machine ``profile``.
 
     Raises:
-        ExperimentError: neither is known.
+        InputRefused: neither is known.
     """
     own = split(truth)[1]
     if own is not None:
         return own
     if profile not in NOMINAL:
-        raise ExperimentError(
+        raise InputRefused(
             "generalization.no-truth",
             f"{profile} has no truth to vary; put NAME.truth.toml beside it, or name a file with --truth",
         )
@@ -130,7 +130,7 @@ def write_truth(nominal: Path, name: str, seed: int, folder: Path) -> tuple[Path
     ``nominal``: the file of the machine that is changed; ``seed`` is for drawn ones.
 
     Raises:
-        ExperimentError: there is no such truth.
+        InputRefused: there is no such truth.
     """
     document = tomlkit.parse(nominal.read_text())
     what, _, end = name.rpartition("-")
@@ -147,7 +147,7 @@ def write_truth(nominal: Path, name: str, seed: int, folder: Path) -> tuple[Path
         for which, value, absolute in COMBINED[name][1]:
             _change(document, PARAMETERS[which], value, absolute)
     else:
-        raise ExperimentError(
+        raise InputRefused(
             "generalization.unknown-truth", f"there is no truth {name!r}; see experiments/generalization"
         )
     path = folder / f"{document['machine']}-{name}.toml"

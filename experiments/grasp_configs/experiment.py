@@ -22,7 +22,6 @@ from rich.console import Console
 
 from autonomy.grasp.planners import GRASP_PLANNERS
 from experiments.common import overview, plugins, pool
-from experiments.common.errors import ExperimentError
 from experiments.common.individuals import calibrated
 from experiments.common.pool import Job
 from experiments.common.registry import Options
@@ -36,6 +35,7 @@ from experiments.grasp_configs.metrics import CONCLUSION, INTRODUCTION, METRICS,
 from experiments.grasp_configs.plots import draw_chain, draw_table
 from experiments.grasp_configs.pose_sources import CAMERA, POSE_SOURCES, TRUE
 from experiments.grasp_configs.trial import NETWORKS, attempt, planner_named, weights_of
+from runtime.errors import InputRefused
 from sim.scenes.arrangements import CONFIGURATIONS
 
 PAPER: Final = {"paper60_success": 59 / 60, "optimal": 48 / 59}
@@ -203,7 +203,7 @@ def run(options: Options, console: Console) -> Result:
     """Run all attempts; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        ExperimentError: a foreign planner or detector cannot be used.
+        InputRefused: a foreign planner or detector cannot be used.
     """
     if options.planner or options.detector:
         return compare(options, console)
@@ -239,17 +239,17 @@ def compare(options: Options, console: Console) -> Result:
     """A foreign planner or detector and ours on the same attempts; the limits, which are for ours, judge neither.
 
     Raises:
-        ExperimentError: there is no such planner or detector, or a page is asked for, which is that of ours.
+        InputRefused: there is no such planner or detector, or a page is asked for, which is that of ours.
     """
     if options.detector and not sees(options.profile):
-        raise ExperimentError(
+        raise InputRefused(
             "grasp-configs.no-camera",
             f"{options.profile} has no camera {CAMERA!r} for a detector; leave out --detector",
         )
     ours = pairs_of(options.profile)[0]
     foreign = (options.detector or ours[0], options.planner or ours[1])
     if options.docs is not None:
-        raise ExperimentError("plugin.no-page", "the page shows our own methods: leave out --docs")
+        raise InputRefused("plugin.no-page", "the page shows our own methods: leave out --docs")
     if options.planner:
         planner_named(options.planner)
     if options.detector and options.detector not in POSE_SOURCES:

@@ -162,7 +162,7 @@ def pose_source(name: str, plant: Plant, profile: Profile, seed: int) -> PoseSou
     """The source with this name: one of ours, or the detector of an entry point.
 
     Raises:
-        ExperimentError: there is no such detector.
+        InputRefused: there is no such detector.
     """
     if name in POSE_SOURCES:
         return POSE_SOURCES[name](plant, profile, seed)

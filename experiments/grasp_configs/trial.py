@@ -130,8 +130,8 @@ def planner_named(name: str) -> GraspPlanner:
     """The planner with this name: one of ours, or that of an entry point.
 
     Raises:
-        WeightsError: the network's weights are missing or damaged.
-        ExperimentError: there is no such planner.
+        InputRefused: the network's weights are missing or damaged.
+        InputRefused: there is no such planner.
     """
     if name == SEARCH or name in NETWORKS:
         return PlannerChoice(NETWORKS.get(name, name)).make()

@@ -15,7 +15,7 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER as NETWORK
 from autonomy.grasp.network import WEIGHTS, GraspNet, normalized_relief
 from autonomy.networks.graph import parameter_count
-from autonomy.networks.weights import WeightsError, load
+from autonomy.networks.weights import load
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
@@ -47,13 +47,13 @@ def run(options: Options, console: Console) -> Result:
             "the experiment compares with torch: pip install 'timberhand[train]'",
             ExitCode.CONFIGURATION,
         ) from None
-    from training.common.dataset_error import DatasetError
+    from runtime.errors import InputRefused
 
     metrics = {"parameters": float(parameter_count(NETWORK))}
     try:
         arrays, facts = load(WEIGHTS, NETWORK)
         skipped, pictures = _cornell(options, facts, arrays, metrics, console)
-    except (WeightsError, DatasetError) as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     scenes = [picture for _, picture in latency.log_scenes(options.seed)]
     with console.status("timing"):

@@ -18,12 +18,12 @@ from controller.crane.reference_governor import TimeScaling
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.laws.crane import LOADS, CraneLaw
-from experiments.common.errors import ExperimentError
 from machine.joints import JOINTS, N_JOINTS
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile, joint
 from machine.sensing.encoder import counts_from_position, position_from_counts
 from machine.status.reasons import Reason
+from runtime.errors import InputRefused
 from sim.world import STEP_NS, World
 
 NAMES: Final = tuple(j.name.lower() for j in JOINTS)
@@ -63,7 +63,7 @@ class JointTestbed:
     def __init__(self, profile: Profile, world: World, seed: int) -> None:
         settings = Settings(profile, profile_hash(profile), profile.rate_hz)
         if settings.period_ns != STEPS_PER_TICK * STEP_NS:
-            raise ExperimentError(
+            raise InputRefused(
                 "experiment.control-rate",
                 f"{profile.name}: this experiment needs a profile with 200 Hz, not {profile.rate_hz} Hz",
             )

@@ -16,13 +16,13 @@ import numpy as np
 
 from controller.config import Settings
 from controller.laws.feedback import LAWS
-from experiments.common.errors import ExperimentError
 from experiments.common.worlds import home_at, profile_named, trial_world
 from experiments.loop_design.loop import FREQUENCY_RAD_S, Array, LawResponse, Margins, Spool, margins, open_loop
 from experiments.loop_design.mechanics import Mechanics, mechanics
 from machine.geometry.kinematics import max_reach_m
 from machine.loading.profile_file import profile_hash
 from machine.profile import JointSpec, Profile
+from runtime.errors import InputRefused
 
 MIN_PHASE_DEG: Final = 40.0
 MIN_GAIN_DB: Final = 6.0
@@ -166,11 +166,11 @@ def study(profile: Profile, work: CaseSet) -> list[JointStudy]:
     """Study every joint with an encoder, with the gains of the profile.
 
     Raises:
-        ExperimentError: a joint has a law of another package, whose response nobody knows here.
+        InputRefused: a joint has a law of another package, whose response nobody knows here.
     """
     foreign = sorted({spec.law.kind for name, spec in profile.joints.items() if name in work.places} - LAWS.keys())
     if foreign:
-        raise ExperimentError(
+        raise InputRefused(
             "loop-design.foreign-law",
             f"the response of the law {foreign[0]!r} is not known, only those of {', '.join(LAWS)}; try it in lockstep",
         )

@@ -21,12 +21,12 @@ from rich.console import Console
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
-from experiments.common.errors import ExperimentError
 from experiments.common.result import Metric
 from experiments.common.worlds import carrier_profile, profile_named, step_neutral, trial_world
 from experiments.plant.driver import Driver
 from experiments.plant.trial import over_stakes_m, pick_logs, unload
 from machine.geometry.kinematics import Unreachable
+from runtime.errors import InputRefused
 from sim.mechanics.carrier import PARKED, Drive
 from sim.nodes.messages import ARM_KEY, ProtectedMessage
 from sim.nodes.valve import MODE_SPOOL
@@ -292,7 +292,7 @@ def _load_one(world: World, driver: Driver, quick: bool) -> None:
         if not quick:
             unload(world, driver, [world.log_bodies.states()[i]])
         return
-    raise ExperimentError(
+    raise InputRefused(
         "experiment.plant-benchmark", "the crane reaches no log of the row after the drive; change the route"
     )
 

@@ -18,12 +18,13 @@ from typing import Final
 
 from can_dbc.dbc.codec import Database, load
 from can_dbc.messages.record_ring import RingReader
-from can_dbc.messages.tick_record import RecordRefused, TickRecord, decode
+from can_dbc.messages.tick_record import TickRecord, decode
 from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.protocols.e2e import Checker, Status
 from hil.harness.processes import announce_ready
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
+from runtime.errors import InputRefused
 
 PRINT_PERIOD_NS: Final = 1_000_000_000
 POLL_PERIOD_S: Final = 0.05
@@ -79,7 +80,7 @@ class BusObserver:
         """Add one record."""
         try:
             record = decode(data)
-        except RecordRefused:
+        except InputRefused:
             self.unreadable += 1
             return
         last, self._last = self._last, record

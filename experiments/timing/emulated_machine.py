@@ -20,11 +20,12 @@ import sys
 import time
 from collections.abc import Mapping
 
-from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from experiments.timing.bus_observer import Continuity, databases
 from machine.loading.profile_file import load_profile
+from runtime.errors import LinkError
 from sim.kinematic.machine import KinematicMachine
 from sim.process.live import TX_QUEUE_FRAMES, LiveMachine
 
@@ -76,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
             gc.freeze()
             print("ready", flush=True)
             live.run()
-    except (BusError, OSError) as error:
+    except (LinkError, OSError) as error:
         sys.stderr.write(f"emulated machine: {error}\n")
         return 4
     return 0

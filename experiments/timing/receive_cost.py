@@ -32,8 +32,8 @@ from can_dbc.bus.python_can_bus import PythonCanBus
 from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.protocols.e2e import Checker, Sender
-from experiments.common.errors import ExperimentError
 from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import InputRefused
 
 DRAIN_FRAMES: Final = 14
 """Frames per drain: those that arrive on crane0 during a tick at 200 Hz."""
@@ -127,7 +127,7 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
                 samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
     for name, reader in readers.items():
         if reader.accepted < rounds * frames - 200:  # the first frame of each stream only initializes its counter
-            raise ExperimentError(
+            raise InputRefused(
                 "experiment.frames-rejected", f"path {name} accepted {reader.accepted} of {rounds * frames} frames"
             )
     metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}

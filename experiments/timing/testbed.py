@@ -22,7 +22,7 @@ from typing import Any, Final, Self
 from can_dbc.bus.factory import VCAN_NAMES
 from can_dbc.messages.key_file import write_key
 from can_dbc.messages.operator_link import guard_path
-from can_dbc.timing.page import Timing, TimingRefused, read_timing
+from can_dbc.timing.page import Timing, read_timing
 from experiments.common import host_activity
 from experiments.timing.events import Events, Stall, Stop, losses_between
 from hil.harness.processes import ProcessGroup, free_udp_ports
@@ -30,6 +30,7 @@ from hil.wire.bitrates import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason
+from runtime.errors import InputRefused
 
 HOST: Final = "127.0.0.1"
 PRIORITY: Final = {"wire": 60, "machine": 50, "setpoints": 30, "witness": 90, "witness-controller": 79}
@@ -268,7 +269,7 @@ class TimingTestbed:
         """The controller's timing page now, its losses noted; raises CommandFailed when there is none."""
         try:
             now = read_timing(self.page)
-        except TimingRefused as error:
+        except InputRefused as error:
             raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
         if self._last is not None:
             self.events.losses.extend(losses_between(self._last.facts, now.facts))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.calibration.plan import CalibrationImpossible, CalibrationPlan, make_plan
+from autonomy.calibration.plan import CalibrationPlan, make_plan
 from autonomy.calibration.procedure import Calibration
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.dbc.codec import load
@@ -28,6 +28,7 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
 from recorder.recorder import Recorder
+from runtime.errors import InputRefused
 from sim.instruments.total_station import TotalStation, grapple_yaw
 from sim.plant import Plant
 
@@ -84,7 +85,7 @@ class _Calibrator:
     def _plan(self, report: StateReport) -> None:
         try:
             self.plan = make_plan(self._profile, report.position, self._surveyed, self._chosen)
-        except CalibrationImpossible as error:
+        except InputRefused as error:
             self.refused = str(error)
             return
         self._show(self.plan)

@@ -31,7 +31,7 @@ from machine.profile import Profile
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from recorder.manifest import describe as describe_run
-from recorder.recorder import Recorder, RecordingRefused
+from recorder.recorder import Recorder
 from sim.plant import Plant
 
 SETTLE_NS: Final = 10_000_000_000
@@ -71,7 +71,7 @@ def run_lockstep(
 
     Raises:
         CommandFailed: profile, truth, camera or directory cannot be used.
-        FaultError: this machine has no such fault.
+        InputRefused: this machine has no such fault.
     """
     profile = load_profile(name)
     try:
@@ -80,7 +80,7 @@ def run_lockstep(
         detector = _camera_detector(plant, profile, camera, seed) if camera else None
         selector = PlannerSelection(planner.make())
         recorder = Recorder(directory, profile, describe_run(profile, buses, seed))
-    except (ValueError, RecordingRefused) as error:
+    except ValueError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         time = "lockstep" if companion is None else "paced"

@@ -23,7 +23,7 @@ from rich.console import Console
 
 from autonomy.crane_job.activity import Activity
 from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
-from autonomy.perception.log_list.datagrams import LogListError, decode_request, encode_error, encode_logs
+from autonomy.perception.log_list.datagrams import decode_request, encode_error, encode_logs
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.process.grasp_publisher import chosen_grasp
 from can_dbc.messages import operator_link
@@ -43,6 +43,7 @@ from hil.harness.lockstep import Lockstep, true_logs
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
+from runtime.errors import InputRefused
 
 SLACK_NS: Final = 20_000_000
 """A smaller delay is made up for unseen: the page draws every 50 ms."""
@@ -147,7 +148,7 @@ class PageLink:
             data, sender = self._scene.recvfrom(REQUEST_BYTES)
             try:
                 decode_request(data)
-            except LogListError as error:
+            except InputRefused as error:
                 self._scene.sendto(encode_error(str(error)), sender)
             else:
                 self._scene.sendto(encode_logs(logs()), sender)

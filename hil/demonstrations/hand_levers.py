@@ -27,7 +27,6 @@ from can_dbc.messages.crane import StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
-from hil.harness.errors import SetupError
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.wire.inprocess import InProcessBus
@@ -36,6 +35,7 @@ from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile, joint
 from recorder.recorder import Recorder
+from runtime.errors import InputRefused
 from sim.plant import Plant
 
 START_DELAY_S: Final = 2.0
@@ -75,7 +75,7 @@ def script(profile: Profile, seed: int, targets: int, standing: Sequence[float])
     one to the bunk.
 
     Raises:
-        SetupError: the crane cannot reach such positions.
+        InputRefused: the crane cannot reach such positions.
     """
     rng, arm, bunk, ground = random.Random(seed), Arm(profile), profile.bunk, profile.workspace.ground_z_m
     high = travel_height_m(profile)
@@ -94,7 +94,7 @@ def script(profile: Profile, seed: int, targets: int, standing: Sequence[float])
             shown.append(_motion(arm, log, over_bunk, high, rng))
             here = over_bunk
         except Unreachable as error:
-            raise SetupError("demonstration.unreachable", f"the crane cannot demonstrate there: {error}") from None
+            raise InputRefused("demonstration.unreachable", f"the crane cannot demonstrate there: {error}") from None
     return shown
 
 
@@ -208,7 +208,7 @@ def demonstrate(
     """Demonstrate the script of a machine on its plant; return the frames of the crane bus.
 
     Raises:
-        SetupError: the script cannot be made.
+        InputRefused: the script cannot be made.
         ValueError: the scene cannot be made.
     """
     profile = load_profile(name)

@@ -19,7 +19,8 @@ from typing import Any, Final
 from can_dbc.bus.factory import PYTHON_CAN, VCAN_NAMES
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import parse
-from hil.faults.table import FAULTS, Edge, FaultError
+from hil.faults.table import FAULTS, Edge
+from runtime.errors import InputRefused
 from runtime.shared_file import make_own_folder
 
 MAX_REQUEST_BYTES: Final = 4096
@@ -60,18 +61,20 @@ def answer(request: dict[str, Any], run: Path) -> dict[str, Any]:
                 order = parse(OFFERS[name].order, time.monotonic_ns() & 0xFFFF)
                 at_ns = time.monotonic_ns()
                 return {"at_ns": at_ns, "title": OFFERS[name].title, "said": inject(order, target)}
-    except FaultError as error:
+    except InputRefused as error:
         return {"error": str(error)}
     return {"error": "this fault is not offered"}
 
 
 def _emulated(run: Path) -> LiveTarget:
-    """The live run, if nothing of it can be a machine; raises FaultError."""
+    """The live run, if nothing of it can be a machine; raises InputRefused."""
     target = LiveTarget.of(run)
     virtual = {f"{ours}socketcan:{name}" for name in VCAN_NAMES.values() for ours in ("", PYTHON_CAN)}
     for bus, address in target.buses.items():
         if not address.startswith("wire:") and address not in virtual:
-            raise FaultError("fault.real-bus-page", f"{bus} is {address}, which may be a machine; nothing is injected")
+            raise InputRefused(
+                "fault.real-bus-page", f"{bus} is {address}, which may be a machine; nothing is injected"
+            )
     return target
 
 

@@ -17,11 +17,12 @@ from can_dbc.messages.datagrams import Datagram, decode, encode
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.vehicle import DriveSetpoint
 from hil.faults.order import Order
-from hil.faults.table import FAULTS, Edge, FaultError
+from hil.faults.table import FAULTS, Edge
 from hil.faults.wire_faults import wire_fault
 from hil.harness.lockstep import START_NS, Lockstep
 from hil.plc.bridged_plant import BridgedPlant
 from hil.wire.faults import FOREVER_NS
+from runtime.errors import InputRefused
 from sim.errors import PlantError
 from sim.plant_faults import PlantFault, begin
 
@@ -43,7 +44,7 @@ def effect_of(order: Order, key: bytes | None = None) -> Effect:
     """The effect of a planner fault; ``key`` authenticates datagrams that are made anew.
 
     Raises:
-        FaultError: the fault is none of datagrams.
+        InputRefused: the fault is none of datagrams.
     """
     random, size_ns = Random(order.seed), round(order.sized() * 1e6) if math.isfinite(order.sized()) else 0
     match order.fault:
@@ -69,7 +70,7 @@ def effect_of(order: Order, key: bytes | None = None) -> Effect:
             return lambda now_ns, sent: [_damaged(data, random) for data in sent]
         case "planner-arms":
             return _forged(random, key)
-    raise FaultError("fault.not-a-datagram", f"{order.fault} is no fault of a planner's datagrams")
+    raise InputRefused("fault.not-a-datagram", f"{order.fault} is no fault of a planner's datagrams")
 
 
 def _changed(change: Callable[[CraneSetpoint | DriveSetpoint], Datagram], key: bytes | None) -> Effect:
@@ -188,7 +189,7 @@ class Injector:
         """Add an order; ``start_ns`` is a time on the run's clock instead of the order's own.
 
         Raises:
-            FaultError: this machine has no such fault or part.
+            InputRefused: this machine has no such fault or part.
         """
         start_ns = START_NS + round(order.at_s * 1e9) if start_ns is None else start_ns
         end_ns = start_ns + round(order.length_s * 1e9) if math.isfinite(order.length_s) else FOREVER_NS
@@ -241,7 +242,7 @@ class Injector:
         """Open the cable between bridge and PLC."""
         plant = self._run.plant
         if not isinstance(plant, BridgedPlant):
-            raise FaultError(
+            raise InputRefused(
                 "fault.no-plc", f"{plant.profile.name} has no PLC here; add --plc, or choose another fault"
             )
         plant.cut = True
@@ -255,7 +256,7 @@ class Injector:
         """Cut the link of the operator."""
         operator = self._run.operator
         if not operator.watches:
-            raise FaultError("fault.not-watched", "no operator watches this run, so a cut link changes nothing here")
+            raise InputRefused("fault.not-watched", "no operator watches this run, so a cut link changes nothing here")
         operator.cut = True
 
         def end() -> None:
@@ -280,4 +281,4 @@ class Injector:
         try:
             return begin(self._run.plant, PlantFault(order.fault, order.part, order.sized(), order.seed), now_ns)
         except PlantError as error:
-            raise FaultError(error.code, str(error)) from None
+            raise InputRefused(error.code, str(error)) from None

@@ -17,19 +17,19 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final
 
-from can_dbc.bus.base import BusError
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.wire_client import control
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.key_file import KeyFileError, read_key
+from can_dbc.messages.key_file import read_key
 from hil.faults.order import Order
-from hil.faults.table import FAULTS, Edge, FaultError
+from hil.faults.table import FAULTS, Edge
 from hil.faults.wire_faults import wire_fault
 from hil.harness.live import ADDRESSES, HOST
 from hil.wire.faults import FOREVER_NS, Fault, Kind
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
+from runtime.errors import ConfigError, InputRefused, LinkError
 
 ANSWER_S: Final = 2.0
 FLOOD_PERIOD_S: Final = 0.01
@@ -51,7 +51,7 @@ class LiveTarget:
         """The live run that records in a directory.
 
         Raises:
-            FaultError: no live run has left its addresses there.
+            InputRefused: no live run has left its addresses there.
         """
         path = directory / ADDRESSES
         try:
@@ -59,7 +59,7 @@ class LiveTarget:
             profile, key_file = load_profile(found["profile"]), Path(found["key_file"])
             return cls(profile, found["ports"], found["buses"], found["pids"], key_file)
         except (OSError, ValueError, KeyError) as error:
-            raise FaultError(
+            raise InputRefused(
                 "fault.no-live-run", f"{path} cannot be read ({error}); give the directory of a live run with --run"
             ) from None
 
@@ -69,11 +69,11 @@ def inject(order: Order, target: LiveTarget, consent: bool = False) -> str:
     process itself does it.
 
     Raises:
-        FaultError: this fault cannot be injected into this run.
+        InputRefused: this fault cannot be injected into this run.
     """
     kind = FAULTS[order.fault]
     if kind.not_live:
-        raise FaultError("fault.not-live", f"{order.fault}: {kind.not_live}")
+        raise InputRefused("fault.not-live", f"{order.fault}: {kind.not_live}")
     time.sleep(order.at_s)
     match kind.edge:
         case Edge.PLANT:
@@ -101,9 +101,9 @@ def _ask_plant(order: Order, port: int) -> str:
         try:
             answer: Any = json.loads(client.recv(65536))
         except OSError as error:
-            raise FaultError("fault.plant-silent", f"the plant at port {port} does not answer: {error}") from None
+            raise InputRefused("fault.plant-silent", f"the plant at port {port} does not answer: {error}") from None
     if "error" in answer:
-        raise FaultError("fault.plant-refuses", f"the plant refuses {order.fault}: {answer['error']}")
+        raise InputRefused("fault.plant-refuses", f"the plant refuses {order.fault}: {answer['error']}")
     return f"{order.fault} {order.part} begun in the plant"
 
 
@@ -117,24 +117,24 @@ def _disturb_bus(order: Order, target: LiveTarget, consent: bool) -> str:
             control(address.removeprefix("wire:"), {"inject": fault.to_json()})
             return f"{order.fault} begun on {address}"
         return _send_frames(order, address, fault, consent)
-    except BusError as error:
-        raise FaultError("fault.bus", f"{address}: {error}") from None
+    except LinkError as error:
+        raise InputRefused("fault.bus", f"{address}: {error}") from None
 
 
 def _send_frames(order: Order, address: str, fault: Fault, consent: bool) -> str:
     """Frames from a participant of our own: all that can be done to a bus of the kernel."""
     if fault.kind is not Kind.BABBLE:
-        raise FaultError(
+        raise InputRefused(
             "fault.only-on-wire",
             f"{order.fault} needs the wire: frames on {address} cannot be lost or changed; use --bus wire",
         )
     if "vcan" not in address and not consent:
-        raise FaultError(
+        raise InputRefused(
             "fault.real-bus",
             f"{address} may be a machine; add --i-know to send {order.fault} there, with nobody near it",
         )
     if not math.isfinite(order.length_s):
-        raise FaultError("fault.endless", f"{order.fault} on {address} needs an end; add --for")
+        raise InputRefused("fault.endless", f"{order.fault} on {address} needs an end; add --for")
     ends_s, sent = time.monotonic() + order.length_s, 0
     with open_bus(address, participant="fault") as bus:
         while time.monotonic() < ends_s:
@@ -148,8 +148,8 @@ def _as_planner(order: Order, target: LiveTarget) -> str:
         return _signal("planner", order, target, off=False)
     try:
         key = read_key(target.key_file)
-    except KeyFileError as error:
-        raise FaultError("fault.no-live-run", f"{error} The run has ended.") from None
+    except ConfigError as error:
+        raise InputRefused("fault.no-live-run", f"{error} The run has ended.") from None
     random, sent = Random(order.seed), 0
     ends_s = time.monotonic() + (order.length_s if math.isfinite(order.length_s) else 1.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
@@ -176,7 +176,7 @@ def _signal(process: str, order: Order, target: LiveTarget, off: bool) -> str:
     name = _PROCESSES[process]
     pid = target.pids.get(name)
     if pid is None:
-        raise FaultError("fault.no-process", f"the run has no process {name}")
+        raise InputRefused("fault.no-process", f"the run has no process {name}")
     try:
         if off:
             os.kill(pid, signal.SIGKILL)
@@ -187,5 +187,5 @@ def _signal(process: str, order: Order, target: LiveTarget, off: bool) -> str:
             os.kill(pid, signal.SIGCONT)
             return f"{process} (process {pid}) stopped for {order.length_s:g} s"
     except ProcessLookupError:
-        raise FaultError("fault.no-process", f"{process} (process {pid}) has ended") from None
+        raise InputRefused("fault.no-process", f"{process} (process {pid}) has ended") from None
     return f"{process} (process {pid}) stopped; kill -CONT {pid} lets it go on"

@@ -7,8 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from hil.faults.table import FAULTS, JOINT_NAMES, PROCESSES, FaultError, Part, find
+from hil.faults.table import FAULTS, JOINT_NAMES, PROCESSES, Part, find
 from machine.crane_nodes import CraneNode
+from runtime.errors import InputRefused
 
 FOREVER_S: Final = math.inf
 _TEXT: Final = re.compile(
@@ -46,14 +47,14 @@ def make(
     """An order from a person's words; a part that is left out is the fault's default.
 
     Raises:
-        FaultError: there is no such fault, or the part does not suit it.
+        InputRefused: there is no such fault, or the part does not suit it.
     """
     fault, named = find(name, word)
     kind = FAULTS[fault]
     chosen = _JOINT_ALIASES.get(part or named, part or named) or kind.default_part
     _check_part(fault, kind.part, chosen)
     if not (math.isfinite(at_s) and at_s >= 0.0 and length_s > 0.0):
-        raise FaultError(
+        raise InputRefused(
             "fault.time", f"{fault} at {at_s:g} s for {length_s:g} s: give a time of 0 or more, and a length"
         )
     return Order(fault, chosen, at_s, length_s, size, seed)
@@ -63,11 +64,11 @@ def parse(text: str, seed: int = 0) -> Order:
     """An order from its text, as in ``encoder-lift:stuck@12.3s+500ms``.
 
     Raises:
-        FaultError: the text is not an order.
+        InputRefused: the text is not an order.
     """
     found = _TEXT.fullmatch(text)
     if found is None:
-        raise FaultError(
+        raise InputRefused(
             "fault.syntax",
             f"{text!r} is not NAME[:WORD][/PART][@START][+DURATION][=SIZE], as in encoder-lift:stuck@12.3s",
         )
@@ -76,7 +77,7 @@ def parse(text: str, seed: int = 0) -> Order:
         length_s = float(found["length"]) * (1e-3 if found["unit"] == "ms" else 1.0) if found["length"] else FOREVER_S
         size = float(found["size"]) if found["size"] else math.nan
     except ValueError:
-        raise FaultError("fault.syntax", f"{text!r}: a number in it has two decimal points") from None
+        raise InputRefused("fault.syntax", f"{text!r}: a number in it has two decimal points") from None
     return make(found["name"], found["word"] or "", found["part"] or "", at_s, length_s, size, seed)
 
 
@@ -89,6 +90,6 @@ def _check_part(fault: str, kind: Part, part: str) -> None:
         Part.BUS: ("crane0", "mach0"),
     }.get(kind)
     if kind is Part.NOTHING and part:
-        raise FaultError("fault.part", f"{fault} acts on the whole of its component; leave {part!r} out")
+        raise InputRefused("fault.part", f"{fault} acts on the whole of its component; leave {part!r} out")
     if known is not None and part not in known:
-        raise FaultError("fault.part", f"{fault}: there is no {kind} {part!r}, only {', '.join(known)}")
+        raise InputRefused("fault.part", f"{fault}: there is no {kind} {part!r}, only {', '.join(known)}")

@@ -13,13 +13,9 @@ from enum import StrEnum
 from typing import Final
 
 from machine.joints import JOINTS
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
-
-
-class FaultError(CodedError, ValueError):
-    """A fault cannot be injected; the sentence says why."""
 
 
 class Word(StrEnum):
@@ -142,12 +138,12 @@ def find(name: str, word: str = "") -> tuple[str, str]:
     """The fault and the part that a person means: ``encoder-stuck``, or ``encoder-lift`` with the word ``stuck``.
 
     Raises:
-        FaultError: there is no such fault.
+        InputRefused: there is no such fault.
     """
     if not word:
         if name in FAULTS:
             return name, ""
-        raise FaultError(
+        raise InputRefused(
             "fault.unknown", f"there is no fault {name!r}; `timberhand inject --list` shows all names and words"
         )
     component, _, part = name.partition("-")
@@ -156,4 +152,4 @@ def find(name: str, word: str = "") -> tuple[str, str]:
             return fault, part
     words = sorted({k.word.value for k in FAULTS.values() if k.component == component})
     known = f"it has {', '.join(words)}" if words else "see `timberhand inject --list`"
-    raise FaultError("fault.unknown-word", f"{component} has no fault {word!r}; {known}")
+    raise InputRefused("fault.unknown-word", f"{component} has no fault {word!r}; {known}")

@@ -7,9 +7,9 @@ from typing import Final
 from can_dbc.frame import EXTENDED, EXTENDED_MASK
 from can_dbc.protocols.e2e import protect
 from hil.faults.order import Order
-from hil.faults.table import FaultError
 from hil.wire.faults import Fault, Kind
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.errors import PlantError
 from sim.plant_faults import database, message
 
@@ -25,13 +25,13 @@ def wire_fault(order: Order, profile: Profile, start_ns: int, end_ns: int) -> tu
     """The bus and the fault that carries out an order.
 
     Raises:
-        FaultError: this machine has no such bus or message, or the fault is none of a bus.
+        InputRefused: this machine has no such bus or message, or the fault is none of a bus.
     """
     if order.fault in ("bus-drop", "bus-corrupt", "bus-repeat"):
         try:
             bus, codec = message(profile, order.part)
         except PlantError as error:
-            raise FaultError(error.code, str(error)) from None
+            raise InputRefused(error.code, str(error)) from None
         kind = {"bus-drop": Kind.DROP, "bus-corrupt": Kind.CORRUPT, "bus-repeat": Kind.REPEAT}[order.fault]
         probability = order.sized() if kind is Kind.DROP else 1.0
         shift_ns = round(order.sized() * 1e6) if kind is Kind.REPEAT else 0
@@ -40,7 +40,7 @@ def wire_fault(order: Order, profile: Profile, start_ns: int, end_ns: int) -> tu
             kind, start_ns, end_ns, codec.key, _EXACT, None, probability, shift_ns, count, seed=order.seed
         )
     if order.part not in (profile.crane_bus, profile.machine_bus):
-        raise FaultError("fault.no-bus", f"{profile.name} has no bus {order.part!r}")
+        raise InputRefused("fault.no-bus", f"{profile.name} has no bus {order.part!r}")
     return order.part, _bus_fault(order, start_ns, end_ns, order.part == profile.crane_bus)
 
 
@@ -60,4 +60,4 @@ def _bus_fault(order: Order, start_ns: int, end_ns: int, crane: bool) -> Fault:
             data = protect(bytes(codec.length), 0, codec.data_ids)
             period_ns = FOREIGN_PERIOD_NS
             return Fault(Kind.BABBLE, start_ns, end_ns, codec.key, node="foreign", shift_ns=period_ns, data=data)
-    raise FaultError("fault.not-on-bus", f"{order.fault} is no fault of a bus")
+    raise InputRefused("fault.not-on-bus", f"{order.fault} is no fault of a bus")

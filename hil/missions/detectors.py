@@ -17,10 +17,10 @@ from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
 from hil.calibration.camera_survey import surveyed_profile
-from hil.harness.errors import SetupError
 from hil.harness.lockstep import LogDetector
 from hil.plant.camera import RigCamera
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.camera.rig import CameraRig
 from sim.instruments.ideal_detector import detect_in_view
 from sim.plant import Plant
@@ -61,10 +61,10 @@ class FrontCameraDetector:
 
 def check_camera(profile: Profile) -> None:
     """Raises:
-    SetupError: the machine has no front camera.
+    InputRefused: the machine has no front camera.
     """
     if CAMERA not in profile.cameras:
-        raise SetupError(
+        raise InputRefused(
             "mission.no-front-camera", f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile"
         )
 
@@ -73,7 +73,7 @@ def make_detector(kind: str, plant: Plant, profile: Profile, manager: ActivityMa
     """The detector ``kind`` of the module docstring.
 
     Raises:
-        SetupError: the machine has no front camera.
+        InputRefused: the machine has no front camera.
         ValueError: the network's weights are missing.
     """
     if kind == PERFECT:

@@ -40,7 +40,7 @@ def _with_camera(options: LiveOptions, detector: str) -> LiveOptions:
     """The options with the camera that a detector needs.
 
     Raises:
-        SetupError: the machine has no front camera.
+        InputRefused: the machine has no front camera.
     """
     if detector == PERFECT:
         return options
@@ -73,7 +73,7 @@ class LiveMission(LiveRun[MissionSummary]):
     `hil.missions.detectors`.
 
     Raises:
-        SetupError: the machine cannot drive the mission.
+        InputRefused: the machine cannot drive the mission.
     """
 
     def __init__(

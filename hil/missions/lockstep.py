@@ -42,7 +42,7 @@ from machine.profile import Profile
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from recorder.manifest import describe as describe_run
-from recorder.recorder import Recorder, RecordingRefused
+from recorder.recorder import Recorder
 from sim.plant import Plant
 from sim.site.log_supply import LogSupplier
 from sim.site.site_file import Site
@@ -83,7 +83,7 @@ def run_mission(
         plant = site.plant(profile, truth, seed)
         buses = tuple(bus for bus in (profile.crane_bus, profile.machine_bus) if bus)
         recorder = Recorder(directory, profile, describe_run(profile, buses, seed))
-    except (ValueError, RecordingRefused) as error:
+    except ValueError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         with Display(console, f"{profile.title}: {mission.name or 'a mission'}, lockstep, seed {seed}") as display:

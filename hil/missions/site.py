@@ -8,8 +8,8 @@ from __future__ import annotations
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import ForwardingMission
-from hil.harness.errors import SetupError
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.site.log_supply import LogPlace, along_route, place_logs
 from sim.site.site_file import Site
 
@@ -22,16 +22,16 @@ def site_of(
     ``terrain`` is the kind of its ground, one of `sim.ground.terrain.KINDS`.
 
     Raises:
-        SetupError: the machine does not drive, or the mission has no route.
+        InputRefused: the machine does not drive, or the mission has no route.
     """
     carrier = profile.carrier
     if carrier is None:
-        raise SetupError(
+        raise InputRefused(
             "mission.stationary-machine",
             f"{profile.name} does not drive; a mission needs a machine with a carrier, such as aoro_fc8",
         )
     if not mission.waypoints:
-        raise SetupError("mission.no-route", "the mission has no route; add waypoints")
+        raise InputRefused("mission.no-route", "the mission has no route; add waypoints")
     first = mission.waypoints[0]
     # The front axle starts at the first waypoint, so the origin of the rear frame lies behind it.
     lat, lon, _ = LocalPlane(first.latitude_deg, first.longitude_deg).geodetic(-carrier.front_axle_m, 0.0)

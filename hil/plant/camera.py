@@ -7,8 +7,8 @@ from autonomy.perception.log_detector import LogDetector
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.sources.stream import frame_from_message
 from can_dbc.messages.rgbd import decode, encode
-from hil.harness.errors import SetupError
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.camera.rig import CameraRig
 from sim.camera.server import rgbd_message
 from sim.plant import Plant
@@ -34,12 +34,12 @@ def camera_detector(plant: Plant, profile: Profile, camera: str, seed: int) -> L
     """A log detector behind a camera of the plant.
 
     Raises:
-        SetupError: the machine has no such camera.
+        InputRefused: the machine has no such camera.
         ValueError: the network's weights are missing.
     """
     if camera not in profile.cameras:
         names = ", ".join(profile.cameras) or "none"
-        raise SetupError("plant-camera.unknown", f"{profile.name} has no camera {camera!r}; it has: {names}")
+        raise InputRefused("plant-camera.unknown", f"{profile.name} has no camera {camera!r}; it has: {names}")
     world = plant.world
     return LogDetector(
         profile, camera, RigCamera(CameraRig(world, profile, world.truth, seed), camera), LogSegmenter().segment

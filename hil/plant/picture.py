@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
-from hil.harness.errors import SetupError
 from machine.geometry.optics import pinhole
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.camera.geometry import orbit
 from sim.camera.render import ImagingConditions, render
 from sim.camera.rig import CameraRig
@@ -46,13 +46,13 @@ def take_picture(profile: Profile, request: PictureRequest, path: Path) -> None:
     """Write the picture to ``path``.
 
     Raises:
-        SetupError: unknown camera.
+        InputRefused: unknown camera.
         ValueError: the scene cannot be made.
         OSError: the file cannot be written.
     """
     if request.camera is not None and request.camera not in profile.cameras:
         known = ", ".join(profile.cameras) or "none"
-        raise SetupError("plant-camera.unknown", f"{profile.name} has no camera {request.camera!r}; it has: {known}")
+        raise InputRefused("plant-camera.unknown", f"{profile.name} has no camera {request.camera!r}; it has: {known}")
     plant = Plant(profile, request.seed, request.truth, request.logs, scene=request.scene, terrain=request.terrain)
     world = plant.world
     try:

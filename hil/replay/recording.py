@@ -12,8 +12,9 @@ import msgspec
 
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
-from recorder.mcap_scan import Channel, NotMcap, Stored, is_complete, scan
+from recorder.mcap_scan import Channel, Stored, is_complete, scan
 from recorder.recover import recover, run_files
+from runtime.errors import InputRefused
 
 PROFILE_FILE: Final = "profile.toml"
 """The profile of the run, where it lies with the recording."""
@@ -51,7 +52,7 @@ def messages(files: list[Path], topic: str) -> Iterator[bytes]:
             for record in scan(path, {topic}):
                 if isinstance(record, Stored):
                     yield record.data
-    except NotMcap as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
 
 
@@ -70,7 +71,7 @@ def contents(files: list[Path]) -> dict[str, int]:
                     topics[record.id] = record.topic
                 elif isinstance(record, Stored):
                     counts[topics[record.channel_id]] += 1
-    except NotMcap as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     return dict(sorted(counts.items()))
 

@@ -19,8 +19,8 @@ from can_dbc.dbc.codec import Database, load, resolve
 from can_dbc.frame import RawFrame, describe
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.tick_record import RecordRefused, TickRecord
-from controller.config import ConfigError, Settings
+from can_dbc.messages.tick_record import TickRecord
+from controller.config import Settings
 from controller.config import load as load_settings
 from controller.process.tick_recording import restore_inputs, transmitted
 from controller.step import Controller, step
@@ -29,6 +29,7 @@ from hil.replay.recording import PROFILE_FILE, manifest_of, messages
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
 from recorder.recorder import TICK
+from runtime.errors import ConfigError, InputRefused
 
 # -- Describes how the recorded and the replayed outputs of a tick differ.
 
@@ -185,7 +186,7 @@ def recorded_ticks(files: list[Path]) -> Iterator[TickRecord]:
     try:
         for data in messages(files, TICK):
             yield tick_record.decode(data)
-    except RecordRefused as error:
+    except InputRefused as error:
         raise CommandFailed(
             "recording.other-version",
             f"{files[0].parent}: {error}; replay it with the release that recorded it",

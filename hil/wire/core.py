@@ -25,10 +25,10 @@ from typing import Final
 from can_dbc.bus.base import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
 from can_dbc.bus.filters import FilterItem, filter_of
 from can_dbc.frame import ERROR, Frame
-from hil.wire.errors import WireError
 from hil.wire.faults import Damage, Fault, Kind
 from hil.wire.node import Flight, Node, Pending, Segment
 from hil.wire.stuffing import frame_bits, priority
+from runtime.errors import InputRefused
 
 END_BITS: Final = 10  # CRC delimiter, acknowledge slot and delimiter, end of frame
 SPACE_BITS: Final = 3
@@ -42,7 +42,7 @@ class WireCore:
 
     def __init__(self, bitrate: int, name: str = "wire", restart_ns: int = 100_000_000) -> None:
         if bitrate <= 0 or 1_000_000_000 % bitrate:
-            raise WireError(
+            raise InputRefused(
                 "wire.bitrate", f"A bit of wire {name} at {bitrate} bit/s is not a whole number of ns long."
             )
         self.name = name
@@ -140,10 +140,10 @@ class WireCore:
         Frames may start before `to_ns`, not at it.
 
         Raises:
-            WireError: `to_ns` lies in the past.
+            InputRefused: `to_ns` lies in the past.
         """
         if to_ns < self.now_ns:
-            raise WireError(
+            raise InputRefused(
                 "wire.time-reversed", f"Wire {self.name} is at {self.now_ns} ns and cannot go back to {to_ns} ns."
             )
         while True:

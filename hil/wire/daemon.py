@@ -20,9 +20,9 @@ import socket
 import sys
 from pathlib import Path
 
-from can_dbc.bus.base import BusError
 from can_dbc.bus.wire_client import wire_directory
 from hil.wire.server import Server, serve
+from runtime.errors import LinkError
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
             os.write(options.ready_fd, b"ready\n")
             os.close(options.ready_fd)
         serve(servers, stop)
-    except BusError as error:
+    except LinkError as error:
         print(f"{error} [{error.code}]", file=sys.stderr)
         return 4
     finally:
@@ -80,10 +80,10 @@ def _prepare(directory: Path) -> None:
         owner = directory.stat().st_uid
     except OSError as error:
         sentence = f"The wire directory {directory} cannot be created ({error.strerror})."
-        raise BusError("wire.directory", sentence) from error
+        raise LinkError("wire.directory", sentence) from error
     if owner not in (os.getuid(), 0):
         sentence = f"The wire directory {directory} belongs to another user; choose another with --dir."
-        raise BusError("wire.directory-owner", sentence)
+        raise LinkError("wire.directory-owner", sentence)
 
 
 def _bus(text: str) -> tuple[str, int]:

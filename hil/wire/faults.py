@@ -22,7 +22,7 @@ from enum import StrEnum
 from random import Random
 from typing import Any, NamedTuple, Self
 
-from hil.wire.errors import WireError
+from runtime.errors import InputRefused
 
 FOREVER_NS = 1 << 62
 
@@ -61,7 +61,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.end_ns <= self.start_ns or self.shift_ns < 0 or self.count < 1 or len(self.data) > 8:
-            raise WireError(
+            raise InputRefused(
                 "wire.fault-fields",
                 f"The wire fault {self.kind} needs end_ns after start_ns, shift_ns of 0 or more, count of 1 "
                 "or more and at most 8 data bytes.",

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus.base import BusError
+from runtime.errors import LinkError
 
 _START_TIMEOUT_S: Final = 20.0
 _STOP_TIMEOUT_S: Final = 5.0
@@ -26,7 +26,7 @@ def wire_daemon(
     `joined` maps SocketCAN interfaces to the bus that they join.
 
     Raises:
-        BusError: the daemon does not start; the sentence is the daemon's own.
+        LinkError: the daemon does not start; the sentence is the daemon's own.
     """
     ready, child_end = os.pipe()
     command = [sys.executable, "-m", "hil.wire.daemon", "--ready-fd", str(child_end)]
@@ -44,7 +44,7 @@ def wire_daemon(
         if not select.select([ready], [], [], _START_TIMEOUT_S)[0] or not os.read(ready, 16):
             process.kill()
             sentence = process.communicate()[1].strip() or "The wire daemon did not start."
-            raise BusError("wire.not-started", sentence)
+            raise LinkError("wire.not-started", sentence)
         yield process
     finally:
         os.close(ready)

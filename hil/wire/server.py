@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.base import BusState
 from can_dbc.bus.socketcan import SocketCanBus
 from can_dbc.bus.wire_client import CONTROL, DISCARD, MAX_BATCH_RECORDS, MAX_CONTROL_BYTES
 from can_dbc.bus.wire_records import RECORD, STATUS
@@ -24,6 +24,7 @@ from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault
 from hil.wire.node import Node
+from runtime.errors import LinkError
 
 GRAIN_NS: Final = 250_000
 _SEND_BUFFER_BYTES: Final = 1 << 16
@@ -196,7 +197,7 @@ class Server:
                 continue
             try:
                 self.join(interface)
-            except BusError:
+            except LinkError:
                 self.unplugged[interface] = now_ns + _RETRY_NS
             else:
                 del self.unplugged[interface]
@@ -241,7 +242,7 @@ def serve(servers: list[Server], stop: socket.socket) -> None:
 def _listen(path: Path) -> socket.socket:
     """A listening socket at `path`; the file of a dead daemon is replaced, a running daemon is an error."""
     if (length := len(os.fsencode(path))) > _SOCKET_PATH_BYTES:
-        raise BusError(
+        raise LinkError(
             "wire.path-too-long",
             f"The wire bus {path.name} cannot listen at {path}: a socket path has at most {_SOCKET_PATH_BYTES} "
             f"bytes, this one has {length}; choose a shorter directory with --dir or TIMBERHAND_WIRE_DIR.",
@@ -259,7 +260,7 @@ def _listen(path: Path) -> socket.socket:
         sock.listen(32)
     except OSError as error:
         sock.close()
-        raise BusError(
+        raise LinkError(
             "wire.cannot-listen",
             f"The wire bus {path.name} cannot listen at {path} ({error.strerror or error}); is another wire "
             "daemon running? Stop it, or choose another directory with --dir.",

@@ -15,7 +15,7 @@ from host.release import machine_files, sums
 from host.release.bundle import PROGRAM_SUMS, SUMS
 from host.release.signature import verify
 from host.release.trees import RELEASES, marker_of
-from runtime.errors import CodedError, Problem
+from runtime.errors import Problem, TimberhandError
 
 PROGRAM: Final = Path(__file__).resolve().parents[2]
 """The folder of this program's packages: site-packages of a release, or a checkout."""
@@ -40,7 +40,7 @@ def problems(signer: Path, profile: Path, program: Path = PROGRAM) -> Iterator[P
     if not profile.resolve().is_relative_to(program):
         try:
             machine_files.check(profile.parent, signer)
-        except CodedError as error:
+        except TimberhandError as error:
             yield Problem(error.code, str(error))
 
 
@@ -58,7 +58,7 @@ def _program(tree: Path, program: Path, signer: Path) -> Iterator[Problem]:
             changed = [PROGRAM_SUMS]
         else:
             changed = sums.differing(program, sums.decode((tree / PROGRAM_SUMS).read_text(), str(tree / PROGRAM_SUMS)))
-    except CodedError as error:
+    except TimberhandError as error:
         yield Problem(error.code, str(error))
         return
     if changed:

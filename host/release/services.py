@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, Protocol
 
-from can_dbc.timing.page import TimingRefused, read_timing
+from can_dbc.timing.page import read_timing
 from host.exit_codes import CommandFailed, ExitCode
 from host.release.gate import ServiceReading
 from host.systemd import show, systemctl
 from machine.status.modes import Mode
+from runtime.errors import InputRefused
 
 PAGE: Final = Path("/run/timberhand/controller.timing")
 STALE_NS: Final = 3_000_000_000
@@ -30,7 +31,7 @@ def service_mode() -> str | None:
     """The mode of the controller that runs as a service; None when none runs."""
     try:
         timing = read_timing(PAGE)
-    except TimingRefused:
+    except InputRefused:
         return None
     return timing.facts.mode if timing.age_ns < STALE_NS else None
 

@@ -12,13 +12,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 _LINE: Final = re.compile(r"([0-9a-f]{64}) [ *](\S.*)")
-
-
-class SumsError(CodedError, ValueError):
-    """A list that cannot be read, or files that are not those of the list."""
 
 
 def sha256_of(path: Path) -> str:
@@ -36,14 +32,14 @@ def decode(text: str, where: str) -> dict[str, str]:
     """Name -> hash; ``where`` names the list in the error.
 
     Raises:
-        SumsError: a line is no entry, a name stands twice or leaves the folder.
+        InputRefused: a line is no entry, a name stands twice or leaves the folder.
     """
     found: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         match = _LINE.fullmatch(line)
         name = match[2] if match else ""
         if match is None or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or name in found:
-            raise SumsError("sums.broken", f"{where}, line {number}, is no hash of a file; get the list again")
+            raise InputRefused("sums.broken", f"{where}, line {number}, is no hash of a file; get the list again")
         found[name] = match[1]
     return found
 

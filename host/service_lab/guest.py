@@ -23,6 +23,7 @@ from can_dbc.messages.key_file import SERVICE_KEY, read_key
 from host.service_lab import authority, lost_bus, perception, trial, updates
 from host.service_lab.pilot import Pilot
 from host.systemd import journal, main_pid, process_facts, show, systemctl
+from host.vcan_lab.spec import LabError
 from recorder.mcap_scan import Stored, scan
 from recorder.recorder import TIMING
 
@@ -368,7 +369,7 @@ def main() -> None:
     check = Check(sys.stdout)
     try:
         run(check, json.loads(Path(sys.argv[1]).read_text()))
-    except (OSError, ValueError, KeyError, subprocess.SubprocessError, trial.MachineStuck) as error:
+    except (OSError, ValueError, KeyError, subprocess.SubprocessError, LabError) as error:
         check.expect(False, f"the test was aborted: {type(error).__name__}: {error}")
     check.end()
     systemctl("poweroff", "--force", "--force")

@@ -43,7 +43,7 @@ def lose(loss: Loss, pilot: Pilot, plant_port: int) -> dict[str, Any]:
     """Run one trial and return its figures.
 
     Raises:
-        MachineStuck: the crane does not move before or after the loss.
+        LabError: the crane does not move before or after the loss.
     """
     processes = _processes()
     losing = prepare(*loss.lose)

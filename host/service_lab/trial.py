@@ -14,8 +14,8 @@ from typing import Any, Final
 from can_dbc.messages.crane import OperatorAction
 from host.service_lab.pilot import Pilot, Valve
 from host.systemd import show
+from host.vcan_lab.spec import LabError
 from machine.status.modes import Mode
-from runtime.errors import CodedError
 
 CONTROLLER: Final = "timberhand-controller.service"
 GUARD: Final = "timberhand-guard.service"
@@ -55,15 +55,11 @@ ENDINGS: Final = (
 )
 
 
-class MachineStuck(CodedError):
-    """The machine does not move as a trial requires."""
-
-
 def slew_until_fast(pilot: Pilot) -> None:
     """Arm the machine and slew it, again after every stop.
 
     Raises:
-        MachineStuck: the crane does not move.
+        LabError: the crane does not move.
     """
     limit_s = time.monotonic() + REARM_S
     while time.monotonic() < limit_s:
@@ -82,7 +78,7 @@ def slew_until_fast(pilot: Pilot) -> None:
                 return
         else:
             pilot.until(lambda: False, 0.6)
-    raise MachineStuck("service-lab.machine-stuck", f"the crane does not move: {pilot.report}")
+    raise LabError("service-lab.machine-stuck", f"the crane does not move: {pilot.report}")
 
 
 def _fast(pilot: Pilot) -> bool:

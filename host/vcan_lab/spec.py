@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 DEFAULT_LINKS: Final = ("vcan0", "vcan1")
 DEFAULT_MEM_MB: Final = 1024
@@ -28,7 +28,7 @@ _CON_OUT, _CON_ERR, _CON_CONTROL = 1, 2, 3
 _IFNAMSIZ = 15
 
 
-class LabError(CodedError):
+class LabError(TimberhandError):
     """The lab cannot be provided; the sentence tells why and what to do."""
 
 

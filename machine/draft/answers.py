@@ -16,13 +16,9 @@ import msgspec
 from machine.loading.problem import Problem
 from machine.loading.structure import build
 from machine.profile import KeepOut
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 STRAIGHT_RAD: Final = 1.5707963267948966
-
-
-class AnswersError(CodedError, ValueError):
-    """The answers cannot be used; the text has one line per problem."""
 
 
 def _q(description: str, **limits: Any) -> Any:
@@ -190,26 +186,26 @@ def answers_of(raw: dict[str, Any], where: str) -> Answers:
     """The checked answers of parsed TOML; ``where`` begins every line of an error.
 
     Raises:
-        AnswersError: a key is missing or unknown, or a value has the wrong type or is impossible.
+        InputRefused: a key is missing or unknown, or a value has the wrong type or is impossible.
     """
     problems: list[Problem] = []
     built = build(Answers, raw, "", problems)
     if not problems:
         problems = list(_contradictions(built))
     if problems:
-        raise AnswersError("answers.wrong", "\n".join(f"{where}: {problem}" for problem in problems))
+        raise InputRefused("answers.wrong", "\n".join(f"{where}: {problem}" for problem in problems))
     found: Answers = built
     return found
 
 
 def read_answers(path: Path) -> dict[str, Any]:
-    """The parsed TOML of a file of answers; raises AnswersError."""
+    """The parsed TOML of a file of answers; raises InputRefused."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise AnswersError("answers.unreadable", f"{path}: the answers cannot be read: {error.strerror}") from None
+        raise InputRefused("answers.unreadable", f"{path}: the answers cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise AnswersError("answers.broken-toml", f"{path}: not a TOML file: {error}") from None
+        raise InputRefused("answers.broken-toml", f"{path}: not a TOML file: {error}") from None
 
 
 def _contradictions(answers: Answers) -> Iterator[Problem]:

@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element, ParseError
 import defusedxml.ElementTree
 from defusedxml import DefusedXmlException
 
-from machine.draft.answers import AnswersError
+from runtime.errors import InputRefused
 
 CHAIN: Final = ("slew", "lift", "tilt", "ext", "hanger")
 """Joints that a crane has; ``hanger`` is the first passive hinge above the grapple."""
@@ -46,7 +46,7 @@ def answers_from_urdf(path: Path, names: Mapping[str, str]) -> dict[str, Any]:
     """``kinematics`` and the ranges in ``joints``, as parsed answers; ``names``: the file's joint of each of ours.
 
     Raises:
-        AnswersError: the file cannot be read, a joint is missing, or its joints are no such crane.
+        InputRefused: the file cannot be read, a joint is missing, or its joints are no such crane.
     """
     placed = _placed(path)
 
@@ -54,7 +54,7 @@ def answers_from_urdf(path: Path, names: Mapping[str, str]) -> dict[str, Any]:
         name = names.get(joint, joint)
         if name not in placed:
             text = f"{path}: there is no joint {name!r}; name the file's joint, as in --urdf-joints {joint}=NAME"
-            raise AnswersError("answers.urdf-joint", f"{text}; it has {', '.join(placed)}")
+            raise InputRefused("answers.urdf-joint", f"{text}; it has {', '.join(placed)}")
         return placed[name]
 
     kinematics = _kinematics(path, {joint: one(joint) for joint in CHAIN})
@@ -114,8 +114,8 @@ def _below_pin(known: Mapping[str, _Placed]) -> dict[str, float]:
     }
 
 
-def _unfit(path: Path, what: str) -> AnswersError:
-    return AnswersError("answers.urdf-chain", f"{path}: {what}; this project drives cranes that work in one plane")
+def _unfit(path: Path, what: str) -> InputRefused:
+    return InputRefused("answers.urdf-chain", f"{path}: {what}; this project drives cranes that work in one plane")
 
 
 def _placed(path: Path) -> dict[str, _Placed]:
@@ -126,9 +126,9 @@ def _placed(path: Path) -> dict[str, _Placed]:
         below = {_link(j, "child"): j for j in joints.values()}
         return {name: _place(joint, below) for name, joint in joints.items()}
     except OSError as error:
-        raise AnswersError("answers.urdf-unreadable", f"{path}: cannot be read: {error.strerror}") from None
+        raise InputRefused("answers.urdf-unreadable", f"{path}: cannot be read: {error.strerror}") from None
     except (ParseError, DefusedXmlException, KeyError, ValueError, RecursionError) as error:
-        raise AnswersError("answers.urdf-broken", f"{path}: not a URDF file: {error}") from None
+        raise InputRefused("answers.urdf-broken", f"{path}: not a URDF file: {error}") from None
 
 
 def _link(joint: Element, end: str) -> str:

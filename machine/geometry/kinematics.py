@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 
 from machine.joints import Joint
 from machine.profile import Kinematics, Profile, joint, joint_limits
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 Point = tuple[float, float, float]
 Limits = Sequence[tuple[float, float]]
@@ -35,7 +35,7 @@ _BOOM_LINKS: Final = (Joint.LIFT, Joint.TILT, Joint.EXT)
 _GOLDEN: Final = (sqrt(5.0) - 1.0) / 2.0
 
 
-class Unreachable(CodedError, ValueError):
+class Unreachable(TimberhandError, ValueError):
     """No joint position inside the limits reaches the point; the sentence says which limit and by how much."""
 
     def __init__(self, sentence: str, code: str = "reach.unreachable") -> None:

@@ -18,7 +18,7 @@ from machine.loading.checks import problems_of
 from machine.loading.problem import Problem
 from machine.loading.structure import build, did_you_mean
 from machine.profile import Profile
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 
 SHIPPED_FOLDER: Final = Path(__file__).resolve().parents[1]
 """Profiles and envelopes that come with the package."""
@@ -28,7 +28,7 @@ _DEFAULT: Final = b',"operator_link_ms":1000'
 """A value that came later, as it is encoded where a machine has the default."""
 
 
-class ProfileError(CodedError, ValueError):
+class ProfileError(TimberhandError, ValueError):
     """A profile cannot be used.
 
     The text has one line per problem.  ``problems`` holds them where the file could be read: with code

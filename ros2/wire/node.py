@@ -18,7 +18,7 @@ from cyclonedds.topic import Topic
 
 from ros2.interfaces.graph import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
 from ros2.wire.qos import endpoint_qos, latched
-from runtime.errors import CodedError
+from runtime.errors import LinkError
 
 LOOPBACK: Final = "127.0.0.1"
 MAX_DOMAIN: Final = 232
@@ -28,10 +28,6 @@ _LOCAL_DISCOVERY: Final = '<Peers><Peer address="localhost"/></Peers>'
 Message = TypeVar("Message", bound=IdlStruct)
 
 
-class Ros2Error(CodedError, RuntimeError):
-    """The node cannot be opened, or cannot send; the sentence says why and what to do."""
-
-
 class Node:
     """A node ``name`` in the root namespace of a domain (``ROS_DOMAIN_ID``)."""
 
@@ -39,14 +35,14 @@ class Node:
         """``interface`` is the address of the network interface to use.
 
         Raises:
-            Ros2Error: the domain cannot be opened there.
+            LinkError: the domain cannot be opened there.
         """
         self._name = name
         try:
             self._domain = Domain(domain_id, _configuration(interface))
             self.participant = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
-            raise Ros2Error(
+            raise LinkError(
                 "ros2.no-domain",
                 f"ROS 2 domain {domain_id} cannot be opened on {interface}: {error.msg}; "
                 "give the address of an interface that is up",

@@ -14,15 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
-from can_dbc.messages.rgbd import (
-    MM_PER_M,
-    REQUEST_HEADER,
-    RgbdError,
-    RgbdMessage,
-    encode,
-    encode_refusal,
-    request_name_bytes,
-)
+from can_dbc.messages.rgbd import MM_PER_M, REQUEST_HEADER, RgbdMessage, encode, encode_refusal, request_name_bytes
+from runtime.errors import InputRefused
 from sim.camera.rig import RgbdFrame
 from sim.camera.scene import Scene
 
@@ -94,7 +87,7 @@ class CameraServer:
                         errors="replace"
                     )
                     client.sendall(self._answer(name))
-        except (OSError, RgbdError):
+        except (OSError, InputRefused):
             return  # a malformed request ends the connection
         finally:
             self._clients.discard(client)

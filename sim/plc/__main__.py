@@ -23,8 +23,9 @@ import msgspec
 from can_dbc.messages.key_file import read_key
 from can_dbc.messages.udp_address import address_argument, udp_address
 from can_dbc.plc.map import Role, WordOrder
-from can_dbc.plc.modbus import LinkError, ModbusServer, is_loopback
+from can_dbc.plc.modbus import ModbusServer, is_loopback
 from machine.loading.profile_file import load_profile
+from runtime.errors import LinkError
 from sim.errors import PlantError
 from sim.plc.plant import PlcPlant
 from sim.plc.server import Address, Datagrams, listen, serve

@@ -13,9 +13,10 @@ from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 
 from can_dbc.plc import map as plc
-from can_dbc.plc.datagram import DatagramRefused, Header, decode_command
+from can_dbc.plc.datagram import Header, decode_command
 from can_dbc.plc.map import Bounds, Command, Fault, MapError, Mode, WordOrder
 from can_dbc.plc.modbus import RegisterRefused
+from runtime.errors import InputRefused
 
 # -- The PLC's half of the handshake over UDP: sessions, numbers that only increase, and proof that a datagram is
 # new.
@@ -219,7 +220,7 @@ class CommandArbiter:
                 self._accept(client, header.sequence, command, now_ns)
             else:
                 self.replayed += 1
-        except DatagramRefused:
+        except InputRefused:
             self.dropped += 1
         except MapError as error:
             if self._may_command(client, now_ns):

@@ -14,7 +14,8 @@ from typing import cast
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import Header, encode_reply
 from can_dbc.plc.map import Feedback
-from can_dbc.plc.modbus import LinkError, ModbusServer, RegisterRefused
+from can_dbc.plc.modbus import ModbusServer, RegisterRefused
+from runtime.errors import LinkError
 from sim.plc.program import Program
 
 Address = tuple[str, int]

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from autonomy.commissioning.acceptance import IDS, ProtocolRefused, Verdict, document, judge, read_protocol
+from autonomy.commissioning.acceptance import IDS, Verdict, document, judge, read_protocol
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 
@@ -48,12 +49,12 @@ def test_only_a_whole_passed_and_signed_protocol_is_accepted() -> None:
     ],
 )
 def test_what_is_no_protocol_is_refused(data: bytes) -> None:
-    with pytest.raises(ProtocolRefused):
+    with pytest.raises(InputRefused):
         read_protocol(data)
 
 
 def test_missing_checks_have_a_code_and_facts_are_kept() -> None:
-    with pytest.raises(ProtocolRefused, check=coded("acceptance.checks")):
+    with pytest.raises(InputRefused, check=coded("acceptance.checks")):
         judged(form(entries=[]))
     kept = document(read_protocol(json.dumps(form()).encode()), {"profile": "palms_471"})
     assert kept["profile"] == "palms_471" and kept["verdict"] == "accepted" and kept["inspector"] == "Anna"

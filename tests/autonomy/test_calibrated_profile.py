@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import machine
-from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
+from autonomy.calibration.profile_file import profile_changes, write_profile
 from autonomy.calibration.result import CalibrationResult, JointResult
 from autonomy.calibration.survey import SurveyFit
 from autonomy.calibration.turn_fit import SideFit, TurnFit
@@ -15,6 +15,7 @@ from autonomy.calibration.valve_fit import ValveFit
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash, shipped_profiles
 from machine.profile import Sag
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 SHIPPED = Path(machine.__file__).parent
@@ -113,13 +114,13 @@ def test_surveyed_turns_are_written_and_a_rotator_that_is_slower_gets_a_lower_li
 def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     out.write_text("mine")
-    with pytest.raises(ProfileNotWritten, check=coded("calibration.profile-exists")):
+    with pytest.raises(InputRefused, check=coded("calibration.profile-exists")):
         write_profile(SHIPPED / "palms_471.toml", out, CHANGES, "2026-11-21")
     assert out.read_text() == "mine"
 
 
 def test_a_profile_that_would_be_refused_is_not_left_behind(tmp_path: Path) -> None:
     bad = [(("joints", "slew", "valve", "full_speed_plus"), 0.01, "too slow for its limit")]
-    with pytest.raises(ProfileNotWritten, check=coded("calibration.profile-invalid")):
+    with pytest.raises(InputRefused, check=coded("calibration.profile-invalid")):
         write_profile(SHIPPED / "palms_471.toml", tmp_path / "mine.toml", bad, "2026-11-21")
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,7 @@ import pytest
 from autonomy.calibration.delay_fit import fit_delay, response_s
 from autonomy.calibration.result import identify
 from autonomy.calibration.spool_program import reversed_sweep, staircase, sweep, wiggle
-from autonomy.calibration.survey import SurveyError, SurveyReading, fit_survey, most_informative_poses
+from autonomy.calibration.survey import SurveyReading, fit_survey, most_informative_poses
 from autonomy.calibration.tasks import Findings
 from autonomy.calibration.trace import SpoolTestRecord
 from autonomy.calibration.valve_fit import deadband_difference, fit_valve
@@ -20,6 +20,7 @@ from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag
 from machine.sensing.weighing import empty_moment_nm
+from runtime.errors import InputRefused
 from tests.autonomy.valve_stand_in import StandIn
 from tests.codes import coded
 
@@ -162,7 +163,7 @@ def test_a_crane_with_a_known_sag_is_compared_with_that() -> None:
 
 
 def test_too_few_surveyed_poses_are_refused() -> None:
-    with pytest.raises(SurveyError, check=coded("survey.too-few-poses")):
+    with pytest.raises(InputRefused, check=coded("survey.too-few-poses")):
         fit_survey(PALMS.kinematics, surveyed(0.0)[:4])
 
 

@@ -7,7 +7,7 @@ from math import nan
 import msgspec
 import pytest
 
-from autonomy.calibration.plan import CalibrationImpossible, make_plan, plan_summary
+from autonomy.calibration.plan import make_plan, plan_summary
 from autonomy.calibration.profile_file import profile_changes
 from autonomy.calibration.report import result_document
 from autonomy.calibration.result import CalibrationResult, identify
@@ -28,6 +28,7 @@ from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import InputRefused
 from tests.autonomy.commissioned_crane import HOME, SAG, Crane
 from tests.codes import coded, numbers_in
 
@@ -247,7 +248,7 @@ def test_a_rotator_without_encoder_does_not_go_on_after_a_stop() -> None:
 
 def test_a_joint_without_encoder_cannot_be_chosen_alone() -> None:
     profile = load_profile("aoro_fc8")
-    with pytest.raises(CalibrationImpossible, check=coded("calibration.no-encoder")):
+    with pytest.raises(InputRefused, check=coded("calibration.no-encoder")):
         make_plan(profile, HOME["aoro_fc8"], surveyed=False, chosen=(Joint.ROT,))
     plan = make_plan(profile, HOME["aoro_fc8"], surveyed=False, chosen=(Joint.ROT, Joint.LIFT))
     assert [p.joint for p in plan.joints] == [Joint.LIFT] and not plan.grapple
@@ -295,7 +296,7 @@ def test_a_plan_stays_clear_of_ground_bunk_and_stops(name: str) -> None:
 
 def test_a_machine_without_room_is_refused_before_anything_moves() -> None:
     bunk = msgspec.structs.replace(PALMS.bunk, stake_height_m=9.0)
-    with pytest.raises(CalibrationImpossible, check=coded("calibration.no-clear-pose")):
+    with pytest.raises(InputRefused, check=coded("calibration.no-clear-pose")):
         make_plan(msgspec.structs.replace(PALMS, bunk=bunk), (0.0, 0.7, -1.5, 0.3, nan), surveyed=False)
 
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame, RgbdFrameError, check_frame, rescaled
+from autonomy.perception.camera.frame import Pose, RgbdFrame, check_frame, rescaled
 from autonomy.perception.log_list.estimate import LogEstimate, across
 from machine.geometry.optics import Intrinsics, rpy_matrix
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 PIN = Intrinsics(64, 48, 40.0, 40.0, 31.5, 23.5)
@@ -39,7 +40,7 @@ def test_a_good_frame_passes_and_its_depth_can_be_rescaled() -> None:
     ],
 )
 def test_an_invalid_frame_is_refused(change: dict, code: str) -> None:
-    with pytest.raises(RgbdFrameError, check=coded(f"frame.{code}")):
+    with pytest.raises(InputRefused, check=coded(f"frame.{code}")):
         check_frame(replace(GOOD, **change))
 
 

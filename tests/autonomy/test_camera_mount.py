@@ -7,10 +7,11 @@ import pytest
 from msgspec.structs import replace
 
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.camera.mount import optical_pose
 from autonomy.perception.camera.survey import surveyed
 from machine.geometry.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
 from machine.loading.profile_file import load_profile
+from runtime.errors import InputRefused
 from sim.camera.geometry import mount_view, quaternion_matrix
 from sim.world import open_world
 from tests.codes import coded
@@ -52,7 +53,7 @@ def test_articulation_turns_the_front_camera() -> None:
 
 def test_a_camera_on_a_swinging_link_is_refused() -> None:
     profile = load_profile("palms_471")
-    with pytest.raises(CameraMountError, check=coded("camera-mount.unknown-link")):
+    with pytest.raises(InputRefused, check=coded("camera-mount.unknown-link")):
         optical_pose(profile, replace(profile.cameras["stick"], link="rotator"), [0.0, 0.5, -1.0, 0.0])
 
 
@@ -84,9 +85,9 @@ def test_a_survey_estimates_mount_and_scale() -> None:
 def test_an_impossible_survey_is_refused() -> None:
     link = Pose(np.zeros(3), np.eye(3))
     camera, pixels, depths, places, _, _ = targets(2)
-    with pytest.raises(CameraMountError, check=coded("camera-mount.too-few-targets")):
+    with pytest.raises(InputRefused, check=coded("camera-mount.too-few-targets")):
         surveyed(camera, link, pixels[:5], depths[:5], places[:5])
-    with pytest.raises(CameraMountError, check=coded("camera-mount.bad-targets")):
+    with pytest.raises(InputRefused, check=coded("camera-mount.bad-targets")):
         surveyed(camera, link, pixels[::-1], depths, places)
-    with pytest.raises(CameraMountError, check=coded("camera-mount.bad-depth-scale")):
+    with pytest.raises(InputRefused, check=coded("camera-mount.bad-depth-scale")):
         surveyed(camera, link, pixels, 1.3 * depths, places)

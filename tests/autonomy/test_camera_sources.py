@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.sources.camera_source import SourceError
 from autonomy.perception.sources.frame_folder import INDEX, FrameFolder, FrameFolderWriter
 from autonomy.perception.sources.stream import StreamCamera
 from autonomy.perception.sources.zed import ZedCamera
 from machine.geometry.optics import Intrinsics
+from runtime.errors import LinkError
 from tests.codes import coded
 
 PIN = Intrinsics(8, 6, 10.0, 10.0, 3.5, 2.5)
@@ -44,10 +44,10 @@ def test_a_frame_folder_returns_the_frames_that_were_written(tmp_path: Path, dep
 
 
 def test_a_folder_without_valid_index_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, check=coded("camera-source.no-frame-folder")):
+    with pytest.raises(LinkError, check=coded("camera-source.no-frame-folder")):
         FrameFolder(tmp_path)
     (tmp_path / INDEX).write_text("{}")
-    with pytest.raises(SourceError, check=coded("camera-source.bad-index")):
+    with pytest.raises(LinkError, check=coded("camera-source.bad-index")):
         FrameFolder(tmp_path)
 
 
@@ -55,18 +55,18 @@ def test_missing_or_wrong_pictures_are_refused(tmp_path: Path) -> None:
     writer = FrameFolderWriter(tmp_path)
     writer.add(picture(5))
     writer.close()
-    with pytest.raises(SourceError, check=coded("camera-source.folder-in-use")):
+    with pytest.raises(LinkError, check=coded("camera-source.folder-in-use")):
         FrameFolderWriter(tmp_path)
     index = json.loads((tmp_path / INDEX).read_text())
     (tmp_path / INDEX).write_text(json.dumps({**index, "width_px": 80}))
-    with pytest.raises(SourceError, check=coded("camera-source.bad-frame-size")):
+    with pytest.raises(LinkError, check=coded("camera-source.bad-frame-size")):
         FrameFolder(tmp_path).frame()
     (tmp_path / INDEX).write_text(json.dumps(index))
     Image.fromarray(np.zeros((3, 3, 3), np.uint8)).save(tmp_path / "000000.png")
-    with pytest.raises(SourceError, check=coded("camera-source.bad-frame-size")):
+    with pytest.raises(LinkError, check=coded("camera-source.bad-frame-size")):
         FrameFolder(tmp_path).frame()
     (tmp_path / "000000.depth.png").write_bytes(b"no picture")
-    with pytest.raises(SourceError, check=coded("camera-source.bad-frame")):
+    with pytest.raises(LinkError, check=coded("camera-source.bad-frame")):
         FrameFolder(tmp_path).frame()
 
 
@@ -139,22 +139,22 @@ def test_a_zed_delivers_its_intrinsics_rgb_and_nan_for_unknown_depth() -> None:
 
 
 def test_a_zed_that_cannot_be_opened_is_late_or_disconnected() -> None:
-    with pytest.raises(SourceError, check=coded("camera-source.not-opened")):
+    with pytest.raises(LinkError, check=coded("camera-source.not-opened")):
         ZedCamera("front", sdk=fake_sdk(state="CAMERA NOT DETECTED"))
-    with pytest.raises(SourceError, check=coded("camera-source.no-resolution")):
+    with pytest.raises(LinkError, check=coded("camera-source.no-resolution")):
         ZedCamera("front", "HD9", sdk=fake_sdk())
     assert ZedCamera("front", sdk=fake_sdk(grabbed="TIMEOUT")).frame() is None
-    with pytest.raises(SourceError, check=coded("camera-source.disconnected")):
+    with pytest.raises(LinkError, check=coded("camera-source.disconnected")):
         ZedCamera("front", sdk=fake_sdk(grabbed="UNPLUGGED", opened=False)).frame()
 
 
 def test_a_zed_that_was_pulled_is_opened_again_when_it_is_back() -> None:
     sdk = fake_sdk(grabbed="UNPLUGGED", opened=False)
     camera = ZedCamera("front", sdk=sdk)
-    with pytest.raises(SourceError, check=coded("camera-source.disconnected")):
+    with pytest.raises(LinkError, check=coded("camera-source.disconnected")):
         camera.frame()
     sdk.Camera.open = lambda _self, _settings: "CAMERA NOT DETECTED"
-    with pytest.raises(SourceError, check=coded("camera-source.not-opened")):
+    with pytest.raises(LinkError, check=coded("camera-source.not-opened")):
         camera.frame()
     sdk.Camera.open, sdk.Camera.grab = (lambda _self, _settings: "SUCCESS"), (lambda _self: "SUCCESS")
     frame = camera.frame()
@@ -163,7 +163,7 @@ def test_a_zed_that_was_pulled_is_opened_again_when_it_is_back() -> None:
 
 def test_a_zed_without_its_sdk_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyzed", None)
-    with pytest.raises(SourceError, check=coded("camera-source.no-sdk")) as told:
+    with pytest.raises(LinkError, check=coded("camera-source.no-sdk")) as told:
         ZedCamera("front")
     assert "\n" not in str(told.value)
 

@@ -20,11 +20,12 @@ from autonomy.manager.checkpoint import (
     copied_tally,
     mission_digest,
 )
-from autonomy.manager.checkpoint_file import PERIOD_NS, CheckpointFile, MissionFinished, read_checkpoint
+from autonomy.manager.checkpoint_file import PERIOD_NS, CheckpointFile, read_checkpoint
 from autonomy.manager.tally import Load, LoadedLog, Tally
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, MissionError, Point
 from autonomy.process.exit_codes import CONFIGURATION, FINE
+from runtime.errors import InputRefused
 from tests.autonomy.manager_missions import (
     listed_mission,
 )
@@ -115,7 +116,7 @@ def test_other_missions_and_unreadable_files_are_refused(tmp_path: Path) -> None
 
 def test_a_finished_mission_is_reported(tmp_path: Path) -> None:
     path = kept(tmp_path / "p", some(listed_mission(), finished=True))
-    with pytest.raises(MissionFinished, check=coded("checkpoint.finished")):
+    with pytest.raises(InputRefused, check=coded("checkpoint.finished")):
         read_checkpoint(path, listed_mission(), 0, 0)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from autonomy.perception.camera.frame import Pose, RgbdFrameError
+from autonomy.perception.camera.frame import Pose
 from autonomy.perception.fitting.contour import StereoSensor, log_contour
 from autonomy.perception.fitting.cylinder import (
     Cylinder,
@@ -21,6 +21,7 @@ from autonomy.perception.fitting.cylinder_fit import fit_cylinder
 from autonomy.perception.fitting.measure import implausibility, initial_cylinder
 from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
+from runtime.errors import InputRefused
 from sim.camera.scene import BUNK, SceneBuilder
 from tests.autonomy.log_views import (
     CAMERA,
@@ -224,13 +225,13 @@ def test_no_mask_no_depth_and_an_invalid_frame_give_no_log() -> None:
     blind = replace(frame, depth_m=np.where(picture.mask == 1, np.nan, frame.depth_m))
     assert perception.fits(blind, masks_of(picture)) == []
     assert perception.rejections[0].code == "too-little-depth"
-    with pytest.raises(RgbdFrameError, check=coded("frame.depth-unknown")):
+    with pytest.raises(InputRefused, check=coded("frame.depth-unknown")):
         perception.fits(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), [])
-    with pytest.raises(RgbdFrameError, check=coded("frame.unknown-camera")):
+    with pytest.raises(InputRefused, check=coded("frame.unknown-camera")):
         perception.fits(replace(frame, camera="rear"), [])
-    with pytest.raises(RgbdFrameError, check=coded("frame.bad-mask")):
+    with pytest.raises(InputRefused, check=coded("frame.bad-mask")):
         perception.fits(frame, [TrueMask(np.zeros((3, 3), bool))])
-    with pytest.raises(RgbdFrameError, check=coded("frame.bad-size")):
+    with pytest.raises(InputRefused, check=coded("frame.bad-size")):
         perception.fits(replace(frame, intrinsics=PIN.scaled(0.5)), [])
 
 

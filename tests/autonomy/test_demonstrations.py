@@ -14,15 +14,13 @@ from autonomy.motion.demonstration import (
     AXES,
     GRID_S,
     JointTrack,
-    RecordingRefused,
     format_demonstrations,
     joint_track,
     read_demonstrations,
     segment_motions,
     smoothed,
 )
-from autonomy.motion.dmp import DemonstrationRefused
-from autonomy.motion.movement_primitives import PrimitiveMotions, PrimitivesRefused, algorithm_1, learn_primitives
+from autonomy.motion.movement_primitives import PrimitiveMotions, algorithm_1, learn_primitives
 from autonomy.motion.pose import Pose
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
@@ -32,6 +30,7 @@ from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
 from machine.sensing.encoder import counts_from_position
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 PROFILE = load_profile("aoro_fc8")
@@ -84,13 +83,13 @@ def test_encoder_frames_become_joint_positions_over_time() -> None:
 
 
 def test_an_encoder_without_frames_is_named() -> None:
-    with pytest.raises(RecordingRefused, check=coded("demonstration.encoder-missing")):
+    with pytest.raises(InputRefused, check=coded("demonstration.encoder-missing")):
         joint_track(PROFILE, CRANE, frames(shown(), without=Joint.TILT))
 
 
 def test_a_log_without_time_stamps_is_named_so() -> None:
     bare = [Frame(0, frame.key, frame.data) for frame in frames(shown(), without=Joint.SLEW)]
-    with pytest.raises(RecordingRefused, check=coded("demonstration.no-stamps")):
+    with pytest.raises(InputRefused, check=coded("demonstration.no-stamps")):
         joint_track(PROFILE, CRANE, bare)
 
 
@@ -148,9 +147,9 @@ def test_a_file_of_demonstrations_reads_back(tmp_path: Path) -> None:
 )
 def test_another_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "other.csv").write_text(text)
-    with pytest.raises(RecordingRefused, check=lambda e: e.code in FILE_CODES and "other.csv" in str(e)):
+    with pytest.raises(InputRefused, check=lambda e: e.code in FILE_CODES and "other.csv" in str(e)):
         read_demonstrations(tmp_path / "other.csv")
-    with pytest.raises(RecordingRefused, check=coded("demonstration.unreadable")):
+    with pytest.raises(InputRefused, check=coded("demonstration.unreadable")):
         read_demonstrations(tmp_path / "missing.csv")
 
 
@@ -222,7 +221,7 @@ def test_one_direction_alone_teaches_the_other_in_reverse() -> None:
 def test_motions_beside_the_bunk_teach_nothing() -> None:
     beside = shown()
     beside = JointTrack(beside.time_s, beside.position + np.array([1.2, 0.0, 0.0, 0.0]))
-    with pytest.raises(DemonstrationRefused, check=coded("demonstration.not-at-bunk")):
+    with pytest.raises(InputRefused, check=coded("demonstration.not-at-bunk")):
         learn_primitives(PROFILE, segment_motions(PROFILE, beside))
 
 
@@ -239,7 +238,7 @@ def test_a_file_of_primitives_is_accepted_whole_or_refused(tmp_path: Path) -> No
     }
     for code, data in cases.items():
         file.write_bytes(data)
-        with pytest.raises(PrimitivesRefused, check=coded(code)):
+        with pytest.raises(InputRefused, check=coded(code)):
             movement_primitives.load(PROFILE, file)
-    with pytest.raises(PrimitivesRefused, check=coded("primitives.unreadable")):
+    with pytest.raises(InputRefused, check=coded("primitives.unreadable")):
         movement_primitives.load(load_profile("palms_471"))

@@ -18,9 +18,9 @@ from autonomy.perception.driving_log_detector import (
     PaperBLocalizer,
 )
 from autonomy.perception.log_list.observation import LogObservation
-from autonomy.perception.sources.camera_source import SourceError
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
+from runtime.errors import LinkError
 
 PROFILE = load_profile("aoro_fc8")
 PIN = intrinsics(PROFILE.cameras["front"]).scaled(0.5)
@@ -58,7 +58,7 @@ class Scene:
 
     def frame(self) -> RgbdFrame | None:
         if self.failure:
-            raise SourceError("camera-source.disconnected", self.failure)
+            raise LinkError("camera-source.disconnected", self.failure)
         assert self.pose is not None
         self.count += 1
         u, v = np.meshgrid(np.arange(PIN.width_px), np.arange(PIN.height_px))

@@ -9,15 +9,10 @@ import numpy as np
 import pytest
 
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.datagrams import (
-    LogListError,
-    decode_logs,
-    decode_request,
-    encode_logs,
-    encode_request,
-)
+from autonomy.perception.log_list.datagrams import decode_logs, decode_request, encode_logs, encode_request
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 Q = (0.0, 1.2, -2.4, 0.1, math.nan)
@@ -64,12 +59,12 @@ def test_a_request_says_whether_the_crane_holds_a_load_before_the_camera(load: b
 
 @pytest.mark.parametrize("numbers", ["1 2 3", " ".join(["nan"] * 14)])
 def test_a_standpoint_that_is_none_is_refused(numbers: str) -> None:
-    with pytest.raises(LogListError, check=coded("log-list.bad-standpoint")):
+    with pytest.raises(InputRefused, check=coded("log-list.bad-standpoint")):
         decode_request(b'{"op":"logs","at_ns":"5","standpoint":"%s"}' % numbers.encode())
 
 
 def test_a_list_in_the_other_frame_is_refused() -> None:
     assert decode_logs(encode_logs([LOG], in_plane=True), in_plane=True) == (LOG,)
     for written, read in ((False, True), (True, False)):
-        with pytest.raises(LogListError, check=coded("log-list.other-frame")):
+        with pytest.raises(InputRefused, check=coded("log-list.other-frame")):
             decode_logs(encode_logs([LOG], in_plane=written), in_plane=read)

@@ -15,8 +15,6 @@ from autonomy.grasp.network import (
     RELIEF_SCALE,
     GraspMaps,
     GraspNet,
-    NetworkInputError,
-    NoDepth,
     PixelGrasp,
     _patches,
     best_pixel,
@@ -29,6 +27,7 @@ from autonomy.grasp.network import (
 from autonomy.networks.graph import parameter_count, parameter_shapes
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.torch_net import random_net
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 TABLE_1 = {
@@ -141,7 +140,7 @@ def test_the_grasp_is_where_quality_is_greatest() -> None:
 
 def test_a_map_that_is_no_number_gives_no_grasp() -> None:
     q = np.zeros((10, 10), np.float32)
-    with pytest.raises(NetworkInputError, check=coded("grasp.quality-not-finite")):
+    with pytest.raises(InputRefused, check=coded("grasp.quality-not-finite")):
         best_pixel(GraspMaps(np.where(np.arange(10) == 3, np.nan, q), q, q))
 
 
@@ -174,7 +173,7 @@ def test_unknown_depth_is_ground() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0, np.inf])
 def test_a_picture_without_depth_is_refused(value: float, arrays) -> None:
-    with pytest.raises(NoDepth, check=coded("grasp.no-depth")):
+    with pytest.raises(InputRefused, check=coded("grasp.no-depth")):
         normalized_relief(np.full((300, 300), value, np.float32))
 
 
@@ -195,5 +194,5 @@ def test_maps_and_grasp_of_the_running_net_agree(arrays) -> None:
 
 
 def test_another_size_is_refused(arrays) -> None:
-    with pytest.raises(NetworkInputError, check=coded("grasp.image-size")):
+    with pytest.raises(InputRefused, check=coded("grasp.image-size")):
         GraspNet(arrays).best(np.ones((480, 640), np.float32))

@@ -10,9 +10,9 @@ import pytest
 
 from autonomy.perception.camera.frame import RgbdFrame
 from autonomy.perception.log_detector import MAX_REQUEST_GAP_NS, LogDetector
-from autonomy.perception.sources.camera_source import SourceError
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
+from runtime.errors import LinkError
 
 PROFILE = load_profile("palms_471")
 CAMERA = "stick"
@@ -30,7 +30,7 @@ class Source:
 
     def frame(self) -> RgbdFrame | None:
         if self.failure:
-            raise SourceError("camera-source.disconnected", self.failure)
+            raise LinkError("camera-source.disconnected", self.failure)
         if self.problem:
             return None
         self.count += 1

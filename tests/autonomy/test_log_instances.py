@@ -8,14 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsError, save
-from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, content_window
+from autonomy.networks.weights import save
+from autonomy.perception.camera.frame import RgbdFrame, content_window
 from autonomy.perception.segmentation.instances import decode_instances
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter, fuse_scales
 from autonomy.perception.segmentation.network import OFFSET_PX, STRIDE, unet
 from autonomy.perception.segmentation.resize import doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture
 from training.detection.segmentation import targets
@@ -220,14 +221,14 @@ def test_invalid_frames_are_refused(untrained):
     segmenter = LogSegmenter("rgbd", untrained, size_px=96)
     pin = Intrinsics(64, 64, 60.0, 60.0, 31.5, 31.5)
     blind = RgbdFrame("stick", 0, np.zeros((64, 64, 3), np.uint8), np.full((64, 64), np.nan, np.float32), pin)
-    with pytest.raises(RgbdFrameError, check=coded("frame.depth-unknown")):
+    with pytest.raises(InputRefused, check=coded("frame.depth-unknown")):
         segmenter.segment(blind)
 
 
 def test_corrupt_or_foreign_weights_are_refused(untrained, tmp_path):
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(untrained.read_bytes()[:5000])
-    with pytest.raises(WeightsError):
+    with pytest.raises(InputRefused):
         LogSegmenter("rgbd", cut)
-    with pytest.raises(WeightsError, check=coded("weights.other-network")):
+    with pytest.raises(InputRefused, check=coded("weights.other-network")):
         LogSegmenter("depth", untrained)

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.perception.log_list.datagrams import (
-    LogListError,
     decode_logs,
     decode_request,
     encode_error,
@@ -21,6 +20,7 @@ from autonomy.perception.log_list.datagrams import (
 )
 from autonomy.perception.log_list.estimate import LogEstimate, unpack_covariance
 from autonomy.perception.log_list.observation import LogObservation
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 LOG: dict[str, Any] = {
@@ -45,7 +45,7 @@ def test_logs_without_ids_are_numbered_by_index_and_axes_are_normalised() -> Non
 def test_ids_of_a_detector_are_kept_and_must_differ() -> None:
     seen = [LogObservation(n, (1.0, 2.0, -1.0), (0.0, 1.0, 0.0), 3.0, 0.2) for n in (7, 3)]
     assert decode_logs(encode_logs(seen)) == tuple(seen)
-    with pytest.raises(LogListError, check=coded("log-list.duplicate-id")):
+    with pytest.raises(InputRefused, check=coded("log-list.duplicate-id")):
         decode_logs(encode_logs([seen[0], seen[0]]))
 
 
@@ -63,7 +63,7 @@ def test_a_reply_carries_the_covariance() -> None:
 
 
 def test_an_error_reply_is_raised() -> None:
-    with pytest.raises(LogListError, check=coded("log-list.detector-error")):
+    with pytest.raises(InputRefused, check=coded("log-list.detector-error")):
         decode_logs(encode_error("the camera is dark"))
 
 
@@ -74,7 +74,7 @@ def test_a_request_carries_the_joints_which_are_nan_when_missing() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"[]", b'{"op":"state"}', b'{"op":"logs","q":"1 2"}', b'{"op":"logs","q":"a"}'])
 def test_a_datagram_that_is_not_a_request_is_refused(data: bytes) -> None:
-    with pytest.raises(LogListError, check=coded("log-list.not-a-request")):
+    with pytest.raises(InputRefused, check=coded("log-list.not-a-request")):
         decode_request(data)
 
 
@@ -97,7 +97,7 @@ def test_an_empty_list_is_valid() -> None:
     ],
 )
 def test_an_impossible_log_refuses_the_whole_list(changes: dict[str, object], code: str) -> None:
-    with pytest.raises(LogListError, check=coded(f"log-list.{code}")):
+    with pytest.raises(InputRefused, check=coded(f"log-list.{code}")):
         decode_logs(reply(**changes))
 
 
@@ -114,6 +114,6 @@ def test_an_impossible_log_refuses_the_whole_list(changes: dict[str, object], co
 def test_any_other_data_raises_only_log_list_error(data: bytes) -> None:
     try:
         logs = decode_logs(data)
-    except LogListError:
+    except InputRefused:
         return
     assert all(math.isfinite(v) for log in logs for v in (*log.center_m, *log.axis))

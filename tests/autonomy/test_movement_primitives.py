@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.motion.dmp import DemonstrationRefused, Dmp, learn
+from autonomy.motion.dmp import Dmp, learn
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 TIME_S = np.linspace(0.0, 6.0, 301)
@@ -139,7 +140,7 @@ def test_demonstrations_that_teach_nothing_are_refused() -> None:
         "demonstration.coordinate-unmoved": [(TIME_S, flat)],
     }
     for code, shown in cases.items():
-        with pytest.raises(DemonstrationRefused, check=coded(code)):
+        with pytest.raises(InputRefused, check=coded(code)):
             learn(shown, (True, False))
-    with pytest.raises(DemonstrationRefused, check=coded("primitive.not-finite")):
+    with pytest.raises(InputRefused, check=coded("primitive.not-finite")):
         SCALED.rollout(np.array([0.0, np.nan]), np.array([1.0, 1.0]))

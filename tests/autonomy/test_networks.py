@@ -18,7 +18,6 @@ from autonomy.networks.graph import (
     Conv,
     MaxPool,
     Network,
-    NetworkError,
     Relu,
     Resize,
     Sigmoid,
@@ -27,7 +26,8 @@ from autonomy.networks.graph import (
 )
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsError, load, save
+from autonomy.networks.weights import load, save
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 LAYERS = {
@@ -106,11 +106,11 @@ def test_bf16_is_close_to_f32() -> None:
 
 
 def test_another_shape_or_precision_is_refused() -> None:
-    with pytest.raises(NetworkError, check=coded("network.bad-images")):
+    with pytest.raises(InputRefused, check=coded("network.bad-images")):
         OpenVinoNet(TINY, drawn(TINY), (1, 1, 6, 6))(np.zeros((1, 1, 6, 7), np.float32))
-    with pytest.raises(NetworkError, check=coded("network.bad-shape")):
+    with pytest.raises(InputRefused, check=coded("network.bad-shape")):
         OpenVinoNet(TINY, drawn(TINY), (1, 3, 6, 6))
-    with pytest.raises(NetworkError, check=coded("network.bad-precision")):
+    with pytest.raises(InputRefused, check=coded("network.bad-precision")):
         OpenVinoNet(TINY, drawn(TINY), (1, 1, 6, 6), "int4")
 
 
@@ -126,7 +126,7 @@ def test_another_shape_or_precision_is_refused() -> None:
     ],
 )
 def test_an_invalid_description_is_refused(layers: tuple, outputs: tuple[str, ...], code: str) -> None:
-    with pytest.raises(NetworkError, check=coded(f"network.{code}")):
+    with pytest.raises(InputRefused, check=coded(f"network.{code}")):
         Network("wrong", 1, layers, outputs)
 
 
@@ -164,7 +164,7 @@ def test_a_damaged_weight_file_is_refused(tmp_path, damage: str) -> None:
         path.write_bytes(
             {"cut": whole[:-9], "header": whole[:20], "flipped": flipped, "empty": b"", "text": b"x" * 99}[damage]
         )
-    with pytest.raises(WeightsError) as refused:
+    with pytest.raises(InputRefused) as refused:
         load(path, TINY)
     assert refused.value.code == {"missing": "weights.missing", "flipped": "weights.changed"}.get(
         damage, "weights.damaged"
@@ -176,9 +176,9 @@ def test_weights_of_another_network_are_refused(tmp_path) -> None:
     other = Network("other", 1, (Conv("a", 2, 3), Relu("r"), Conv("y", 1, 1)), ("y",))
     path = tmp_path / "w.safetensors"
     save(path, other, drawn(other), {})
-    with pytest.raises(WeightsError, check=coded("weights.other-network")):
+    with pytest.raises(InputRefused, check=coded("weights.other-network")):
         load(path, TINY)
-    with pytest.raises(NetworkError, check=coded("network.bad-arrays")):
+    with pytest.raises(InputRefused, check=coded("network.bad-arrays")):
         save(path, TINY, drawn(other), {})
 
 
@@ -186,7 +186,7 @@ def test_values_that_are_not_finite_are_refused(tmp_path) -> None:
     path, arrays = tmp_path / "w.safetensors", drawn(TINY)
     arrays["a.bias"][0] = np.nan
     save(path, TINY, arrays, {})
-    with pytest.raises(WeightsError, check=coded("weights.not-finite")):
+    with pytest.raises(InputRefused, check=coded("weights.not-finite")):
         load(path, TINY)
 
 
@@ -194,5 +194,5 @@ def test_a_file_without_facts_is_refused(tmp_path) -> None:
     path = tmp_path / "w.safetensors"
     save(path, TINY, drawn(TINY), {})
     save_file(load_file(path), path)
-    with pytest.raises(WeightsError, check=coded("weights.other-network")):
+    with pytest.raises(InputRefused, check=coded("weights.other-network")):
         load(path, TINY)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from autonomy.perception import __main__ as process
-from autonomy.perception.sources.camera_source import SourceError
+from runtime.errors import LinkError
 from runtime.notifier import Notifier
 from tests.codes import numbers_in
 
@@ -62,7 +62,7 @@ def test_a_camera_that_is_not_there_now_is_tried_again_by_the_service(
     monkeypatch: pytest.MonkeyPatch, code: str, exit_code: int
 ) -> None:
     def refuse(*_: object) -> None:
-        raise SourceError(code, "no")
+        raise LinkError(code, "no")
 
     monkeypatch.setattr(process, "LogSegmenter", lambda *_: None)
     monkeypatch.setattr(process, "open_source", refuse)

@@ -6,9 +6,10 @@ import pytest
 
 from autonomy.grasp import planners
 from autonomy.grasp.cnn_planner import CnnPlanner
-from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice, PlannerError
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.process.command_line import arguments
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 WORDS = ["--controller", "127.0.0.1:1", "--report-port", "2", "--scene", "127.0.0.1:3"]
@@ -37,9 +38,9 @@ def test_a_name_makes_its_planner_and_reaches_the_planning_process(choice, kind)
     ],
 )
 def test_what_no_planner_can_do_is_refused_before_anything_is_loaded(choice, code, capsys):
-    with pytest.raises(PlannerError, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         choice.check()
-    with pytest.raises(PlannerError, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         choice.make()
     with pytest.raises(SystemExit, match="2"):
         arguments([*WORDS, "--planner", choice.name, "--virtual-cameras", str(choice.virtual_cameras)])
@@ -53,5 +54,5 @@ def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch):
     monkeypatch.setattr("autonomy.grasp.planners.entry_points", entry_points)
     monkeypatch.setattr("runtime.plugins.entry_points", entry_points)
     assert isinstance(PlannerChoice("pca").make(), SamplingPlanner)
-    with pytest.raises(PlannerError, check=coded("planner.no-virtual-camera")):
+    with pytest.raises(InputRefused, check=coded("planner.no-virtual-camera")):
         PlannerChoice("pca", 2).check()

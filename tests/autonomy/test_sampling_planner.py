@@ -8,7 +8,7 @@ from math import atan2, pi, remainder
 import numpy as np
 import pytest
 
-from autonomy.grasp.cylinders import CovarianceError, as_cylinders, default_covariance, sample_cylinders
+from autonomy.grasp.cylinders import as_cylinders, default_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import hover_height_m
 from autonomy.grasp.grasp import restricted_to
 from autonomy.grasp.jaws import jaws_of
@@ -22,6 +22,7 @@ from autonomy.perception.log_list.estimate import LogEstimate
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile
+from runtime.errors import InputRefused
 from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 from tests.codes import coded
 
@@ -165,7 +166,7 @@ def test_samples_have_the_requested_spread() -> None:
     assert np.std(drawn.length) == pytest.approx(np.hypot(sigma[4], sigma[5]), rel=0.05)
     again = sample_cylinders(world, np.diag(sigma**2)[None], 4000, 3)
     assert np.array_equal(again.center, drawn.center)
-    with pytest.raises(CovarianceError, check=coded("grasp.covariance-not-finite")):
+    with pytest.raises(InputRefused, check=coded("grasp.covariance-not-finite")):
         sample_cylinders(world, np.full((1, 7, 7), np.nan), 2, 0)
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from autonomy.networks.weights import WeightsError
 from autonomy.perception.segmentation.instances import foreground_of
 from autonomy.perception.segmentation.network import STRIDE
 from autonomy.perception.segmentation.segment_merging import (
@@ -16,6 +15,7 @@ from autonomy.perception.segmentation.segment_merging import (
 from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES, SegmentTable, pair_features
 from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, make_segment
 from autonomy.perception.segmentation.watershed import boundary_map, watershed
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture
 from training.detection import scorer_weights
@@ -159,5 +159,5 @@ def test_a_picture_without_logs_has_no_segments():
 
 
 def test_missing_scorers_are_refused(tmp_path):
-    with pytest.raises(WeightsError, check=coded("weights.missing")):
+    with pytest.raises(InputRefused, check=coded("weights.missing")):
         load_scorers(tmp_path)

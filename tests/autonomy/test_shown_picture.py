@@ -16,13 +16,13 @@ from autonomy.perception.shown_picture import OUTLINE, MeasuredPicture, NewestPi
 from can_dbc.messages.picture import (
     MAX_DATAGRAM_BYTES,
     MAX_JPEG_BYTES,
-    PictureRefused,
     decode_picture,
     encode_picture_request,
     picture_request,
 )
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
@@ -137,7 +137,7 @@ def test_other_datagrams_are_not_requests_for_a_picture(data: bytes) -> None:
     ],
 )
 def test_what_is_no_picture_is_refused(data: bytes, code: str) -> None:
-    with pytest.raises(PictureRefused, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         decode_picture(data)
 
 

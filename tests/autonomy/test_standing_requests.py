@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
-from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from autonomy.perception.log_list.datagrams import decode_logs, encode_request
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.shown_picture import NewestPicture
 from autonomy.perception.standing_requests import StandingRequests
 from can_dbc.messages.picture import decode_picture, encode_picture_request
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 LOG = LogObservation(3, (-1.0, 4.0, 0.1), (0.0, 1.0, 0.0), 2.0, 0.2)
@@ -87,5 +88,5 @@ def test_a_problem_is_reported_once_and_a_bad_request_is_answered(served: Served
         served.asker.send(encode_request(Q[0]))
         served.requests.answer_waiting()
     assert served.troubles == ["no picture"] and served.requests.lists == 0
-    with pytest.raises(LogListError, check=coded("log-list.detector-error")):
+    with pytest.raises(InputRefused, check=coded("log-list.detector-error")):
         decode_logs(served.asker.recv(4096))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from autonomy.commissioning.step_test import StepRefused, StepTest, largest_step, profile_margins
+from autonomy.commissioning.step_test import StepTest, largest_step, profile_margins
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import StateReport
@@ -21,6 +21,7 @@ from hil.wire.inprocess import InProcessBus
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
+from runtime.errors import InputRefused
 from sim.plant import Plant
 from tests.codes import coded
 
@@ -121,13 +122,13 @@ def test_a_test_waits_for_armed_and_ends_with_the_controller() -> None:
 
 @pytest.mark.parametrize("amount", [0.0, math.nan, math.inf, 10.0, -10.0])
 def test_an_amount_that_is_none_or_too_large_is_refused(amount: float) -> None:
-    with pytest.raises(StepRefused, check=coded("step.amount")):
+    with pytest.raises(InputRefused, check=coded("step.amount")):
         StepTest(PROFILE, HASH, Joint.LIFT, amount, load("crane"))
 
 
 def test_a_joint_without_an_encoder_is_refused() -> None:
     forwarder = load_profile("aoro_fc8")
-    with pytest.raises(StepRefused, check=coded("step.no-encoder")):
+    with pytest.raises(InputRefused, check=coded("step.no-encoder")):
         StepTest(forwarder, 1, Joint.ROT, 0.1, load("crane"))
 
 

@@ -14,18 +14,11 @@ from autonomy.grasp.cylinders import as_cylinders
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet, PixelGrasp
 from autonomy.grasp.planner import GraspRequest, NoGrasp
-from autonomy.grasp.virtual_scene import (
-    Camera,
-    SceneError,
-    camera_above,
-    cameras_along,
-    operational_area,
-    render,
-    shortened_logs,
-)
+from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from machine.loading.profile_file import load_profile
+from runtime.errors import InputRefused
 from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 from tests.codes import coded
 
@@ -61,7 +54,7 @@ def test_the_cuboid_holds_the_ends_and_the_camera_hangs_three_metres_over_its_mi
     assert box.low_m == pytest.approx(np.array(turned.center_m) - half)
     assert box.high_m == pytest.approx(np.array(turned.center_m) + half)
     assert camera_above(box).position_m == pytest.approx((*turned.center_m[:2], turned.center_m[2] + 3.0))
-    with pytest.raises(SceneError, check=coded("grasp.scene-empty")):
+    with pytest.raises(InputRefused, check=coded("grasp.scene-empty")):
         operational_area(as_cylinders([]))
 
 
@@ -102,9 +95,9 @@ def test_a_log_fills_the_pixels_it_should() -> None:
 
 
 def test_a_camera_that_cannot_see_is_refused() -> None:
-    with pytest.raises(SceneError, check=coded("grasp.camera-below-ground")):
+    with pytest.raises(InputRefused, check=coded("grasp.camera-below-ground")):
         render(as_cylinders(pair()), Camera(np.array([X, Y, GROUND])), GROUND)
-    with pytest.raises(SceneError, check=coded("grasp.camera-in-log")):
+    with pytest.raises(InputRefused, check=coded("grasp.camera-in-log")):
         render(as_cylinders(pair()), Camera(np.array([X, Y, GROUND + 0.2])), GROUND)
 
 

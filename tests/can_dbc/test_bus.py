@@ -21,41 +21,41 @@ from can_dbc.bus.base import (
     ERR_RESTARTED,
     ERR_TX_TIMEOUT,
     BaseBus,
-    BusError,
     BusState,
     BusStats,
 )
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.socketcan import SocketCanBus
 from can_dbc.frame import ERROR, Frame
+from runtime.errors import LinkError
 from tests.codes import coded
 
 
 @pytest.mark.parametrize("address", ["", "crane0", "wire:", ":crane0"])
 def test_an_address_names_backend_and_channel(address: str) -> None:
-    with pytest.raises(BusError, check=coded("bus.address")):
+    with pytest.raises(LinkError, check=coded("bus.address")):
         open_bus(address)
 
 
 def test_a_missing_daemon_is_reported(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
-    with pytest.raises(BusError, check=coded("wire.no-daemon")):
+    with pytest.raises(LinkError, check=coded("wire.no-daemon")):
         open_bus("wire:crane0")
 
 
 def test_a_missing_interface_is_reported() -> None:
     expected = "bus.interface" if factory.kernel_has_can() else "bus.no-can"
-    with pytest.raises(BusError, check=coded(expected)):
+    with pytest.raises(LinkError, check=coded(expected)):
         open_bus("socketcan:nocan9")
 
 
 def test_too_many_filters_for_the_kernel_are_reported() -> None:
-    with pytest.raises(BusError, check=coded("bus.too-many-filters")):
+    with pytest.raises(LinkError, check=coded("bus.too-many-filters")):
         open_bus("socketcan:can0", filters=range(513))
 
 
 def test_an_unknown_python_can_interface_is_reported() -> None:
-    with pytest.raises(BusError, check=coded("bus.adapter")):
+    with pytest.raises(LinkError, check=coded("bus.adapter")):
         open_bus("nosuch:1")
 
 
@@ -191,5 +191,5 @@ def test_an_address_chooses_our_socket_or_python_cans(
 
 @pytest.mark.parametrize("address", ["python-can:", "python-can:socketcan", "python-can:socketcan:"])
 def test_python_can_without_an_interface_is_no_address(address: str) -> None:
-    with pytest.raises(BusError, check=coded("bus.address")):
+    with pytest.raises(LinkError, check=coded("bus.address")):
         open_bus(address)

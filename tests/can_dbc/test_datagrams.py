@@ -28,8 +28,9 @@ from can_dbc.messages.crane import (
 )
 from can_dbc.messages.datagrams import Datagram, decode, encode
 from can_dbc.messages.envelope import DatagramFault, DatagramRefused
-from can_dbc.messages.udp_address import AddressError, address_argument, udp_address
+from can_dbc.messages.udp_address import address_argument, udp_address
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 KEY = b"a key of the two sides"
@@ -344,7 +345,7 @@ def test_a_refusal_has_its_reason() -> None:
 )
 def test_an_invalid_address_is_refused(text):
     code = "address.unknown-host" if text.startswith("nosuch") else "address.malformed"
-    with pytest.raises(AddressError, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         udp_address(text)
     with pytest.raises(argparse.ArgumentTypeError):
         address_argument(text)

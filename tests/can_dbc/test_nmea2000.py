@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from nmea2000.decoder import NMEA2000Decoder
 
 from can_dbc.dbc import codec
-from can_dbc.dbc.signals import EncodeRefused, FrameRefused
+from can_dbc.dbc.signals import FrameRefused
 from can_dbc.frame import ERROR, EXTENDED, Frame
 from can_dbc.protocols import nmea2000 as n2k
 from can_dbc.trace.candump import read_trace
+from runtime.errors import InputRefused
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
 PGNS = sorted(CANBOAT.glob("pgns/*.yaml"))
@@ -159,7 +160,7 @@ def test_encode_refuses() -> None:
     position = gnss().messages["PositionRapidUpdate"]
     assert n2k.encode(position) == bytes.fromhex("ffffff7fffffff7f")
     for bad in ({"Latitude": 90.1}, {"Latitude": float("nan")}, {"Lattitude": 1.0}):
-        with pytest.raises(EncodeRefused):
+        with pytest.raises(InputRefused):
             n2k.encode(position, **bad)
 
 

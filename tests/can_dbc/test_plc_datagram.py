@@ -13,7 +13,6 @@ from can_dbc.plc.datagram import (
     COMMAND_BYTES,
     MAC_BYTES,
     REPLY_BYTES,
-    DatagramRefused,
     Header,
     decode_command,
     decode_reply,
@@ -21,6 +20,7 @@ from can_dbc.plc.datagram import (
     encode_reply,
 )
 from can_dbc.plc.map import Command, Feedback, Grapple, MapError, Mode, State
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 U32 = st.integers(0, 0xFFFF_FFFF)
@@ -94,7 +94,7 @@ def test_one_changed_byte_is_refused(data: st.DataObject) -> None:
         at = data.draw(st.integers(0, len(good) - 1))
         flip = data.draw(st.integers(1, 255))
         bad = good[:at] + bytes((good[at] ^ flip,)) + good[at + 1 :]
-        with pytest.raises(DatagramRefused):
+        with pytest.raises(InputRefused):
             decode(bad)
 
 
@@ -102,7 +102,7 @@ def test_one_changed_byte_is_refused(data: st.DataObject) -> None:
 @given(st.binary(max_size=200))
 def test_noise_is_refused(data: bytes) -> None:
     for decode in (decode_command, decode_reply):
-        with pytest.raises(DatagramRefused):
+        with pytest.raises(InputRefused):
             decode(data)
 
 
@@ -137,7 +137,7 @@ def test_a_datagram_with_a_key_is_refused_when_its_contents_were_changed(at: int
     bad = bytearray(good)
     bad[at] ^= flip
     struct.pack_into("<I", bad, len(bad) - 4, zlib.crc32(bad[:-4]))
-    with pytest.raises(DatagramRefused):
+    with pytest.raises(InputRefused):
         decode_command(bytes(bad), KEY)
 
 
@@ -145,7 +145,7 @@ def test_a_key_must_be_the_same_on_both_sides() -> None:
     keyed, plain = (encode_reply(Header(9, 1, 2, 3), FEEDBACK, key) for key in (KEY, None))
     assert decode_reply(keyed, KEY) == decode_reply(plain)
     for data, key in ((keyed, None), (plain, KEY)):
-        with pytest.raises(DatagramRefused, check=coded("plc-datagram.length")):
+        with pytest.raises(InputRefused, check=coded("plc-datagram.length")):
             decode_reply(data, key)
-    with pytest.raises(DatagramRefused, check=coded("plc-datagram.authentication")):
+    with pytest.raises(InputRefused, check=coded("plc-datagram.authentication")):
         decode_reply(keyed, b"another key of 16")

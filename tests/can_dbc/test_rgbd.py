@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from can_dbc.messages.rgbd import (
     HEADER_BYTES,
     REQUEST_HEADER,
-    RgbdError,
     RgbdMessage,
     decode,
     decode_header,
@@ -18,6 +17,7 @@ from can_dbc.messages.rgbd import (
     encode_request,
     request_name_bytes,
 )
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 
@@ -41,7 +41,7 @@ def test_any_flipped_bit_refuses_the_frame(data: st.DataObject) -> None:
     whole = bytearray(encode(frame()))
     at = data.draw(st.integers(0, len(whole) - 1))
     whole[at] ^= 1 << data.draw(st.integers(0, 7))
-    with pytest.raises(RgbdError):
+    with pytest.raises(InputRefused):
         decode(bytes(whole))
 
 
@@ -49,25 +49,25 @@ def test_any_flipped_bit_refuses_the_frame(data: st.DataObject) -> None:
 def test_a_cut_or_lengthened_frame_is_refused(kept: int, more: int) -> None:
     whole = encode(frame())
     for broken in (whole[: min(kept, len(whole) - 1)], whole + bytes(more)):
-        with pytest.raises(RgbdError):
+        with pytest.raises(InputRefused):
             decode(broken)
 
 
 @given(st.binary(min_size=HEADER_BYTES, max_size=HEADER_BYTES + 40))
 def test_noise_is_not_a_frame(noise: bytes) -> None:
-    with pytest.raises(RgbdError):
+    with pytest.raises(InputRefused):
         decode(noise)
 
 
 def test_a_refusal_has_its_reason() -> None:
-    with pytest.raises(RgbdError, match=r"^the lens is covered$", check=coded("rgbd.refused")):
+    with pytest.raises(InputRefused, match=r"^the lens is covered$", check=coded("rgbd.refused")):
         decode(encode_refusal("front", "the lens is covered"))
 
 
 def test_a_request_carries_the_cameras_name() -> None:
     asked = encode_request("front")
     assert asked[REQUEST_HEADER.size :] == b"front" and request_name_bytes(asked[: REQUEST_HEADER.size]) == 5
-    with pytest.raises(RgbdError, check=coded("rgbd.no-request")):
+    with pytest.raises(InputRefused, check=coded("rgbd.no-request")):
         request_name_bytes(bytes(REQUEST_HEADER.size))
 
 
@@ -81,7 +81,7 @@ def test_a_request_carries_the_cameras_name() -> None:
     ],
 )
 def test_an_inconsistent_frame_is_not_sent(broken, code: str) -> None:
-    with pytest.raises(RgbdError, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         encode(broken(frame()))
 
 

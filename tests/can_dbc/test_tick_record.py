@@ -12,7 +12,8 @@ from can_dbc.bus.base import DRAIN_LIMIT, BusState, BusStats
 from can_dbc.frame import Frame
 from can_dbc.messages import datagrams
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
-from can_dbc.messages.tick_record import BusReading, RecordRefused, TickRecord, decode, encode
+from can_dbc.messages.tick_record import BusReading, TickRecord, decode, encode
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 u64 = st.integers(0, 2**64 - 1)
@@ -60,13 +61,13 @@ def test_without_a_vehicle_the_record_has_the_former_bytes(tick):
 def test_a_damaged_record_is_refused(tick, place, flip):
     data = bytearray(encode(tick))
     data[place % len(data)] ^= flip
-    with pytest.raises(RecordRefused):
+    with pytest.raises(InputRefused):
         decode(bytes(data))
 
 
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_are_refused(data):
-    with pytest.raises(RecordRefused):
+    with pytest.raises(InputRefused):
         decode(data)
 
 
@@ -98,7 +99,7 @@ def test_in_a_record_of_version_2_the_kind_tells_whose_a_datagram_was():
 def test_a_record_of_version_1_is_refused_by_its_number():
     # An empty tick as version 1 wrote it: one bus, its state and counters in the head.
     old = sealed(struct.pack("<I6HQqQQQQQ", 0x52544854, 1, 0, 0, 0, 0, 0, 10**9, 0, 0, 0, 0, 0, 0))
-    with pytest.raises(RecordRefused, check=coded("tick-record.version")):
+    with pytest.raises(InputRefused, check=coded("tick-record.version")):
         decode(old)
 
 
@@ -108,7 +109,7 @@ def test_a_frame_of_an_unknown_bus_is_refused(bus):
     body = bytearray(encode(tick)[:-4])
     at = body.index(struct.pack("<QIB", 1, 2, 0)) + 12
     body[at] = bus
-    with pytest.raises(RecordRefused, check=coded("tick-record.contents")):
+    with pytest.raises(InputRefused, check=coded("tick-record.contents")):
         decode(sealed(bytes(body)))
 
 

@@ -15,11 +15,11 @@ from can_dbc.timing.page import (
     Facts,
     InputAge,
     ProcessCounters,
-    TimingRefused,
     TimingWriter,
     default_path,
     read_timing,
 )
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 
@@ -59,7 +59,7 @@ def _at_once(monkeypatch):
 def test_a_written_page_is_read(tmp_path):
     path = tmp_path / "sub" / "controller.timing"
     writer = TimingWriter(path)
-    with pytest.raises(TimingRefused, check=coded("timing.not-written")):
+    with pytest.raises(InputRefused, check=coded("timing.not-written")):
         read_timing(path)
     writer.publish(facts(), histograms())
     found = read_timing(path)
@@ -68,7 +68,7 @@ def test_a_written_page_is_read(tmp_path):
     assert found.durations["sync"].bins == histograms()["sync"].bins
     writer.close()
     writer.close()
-    with pytest.raises(TimingRefused, check=coded("timing.no-page")):
+    with pytest.raises(InputRefused, check=coded("timing.no-page")):
         read_timing(path)
 
 
@@ -89,14 +89,14 @@ def test_a_page_during_a_write_or_of_another_release_is_refused(tmp_path):
     with path.open("r+b") as file:
         file.seek(8)
         file.write(struct.pack("<Q", 3))
-    with pytest.raises(TimingRefused, check=coded("timing.not-written")):
+    with pytest.raises(InputRefused, check=coded("timing.not-written")):
         read_timing(path)
     with path.open("r+b") as file:
         file.write(struct.pack("<II", 0x504D4854, 99))
-    with pytest.raises(TimingRefused, check=coded("timing.other-release")):
+    with pytest.raises(InputRefused, check=coded("timing.other-release")):
         read_timing(path)
     path.write_bytes(b"short")
-    with pytest.raises(TimingRefused):
+    with pytest.raises(InputRefused):
         read_timing(path)
 
 
@@ -157,6 +157,6 @@ def test_a_page_with_missing_stages_is_refused(tmp_path):
     path = tmp_path / "timing"
     writer = TimingWriter(path)
     writer.publish(msgspec.structs.replace(facts(), longest_ns=(1, 2)), histograms())
-    with pytest.raises(TimingRefused):
+    with pytest.raises(InputRefused):
         read_timing(path)
     writer.close()

@@ -20,11 +20,12 @@ from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
 from console.access import FAILURES_NS, LEASE_NS, MAX_FAILURES, MAX_PAGES, SESSION_NS, ControlLease
 from console.access_guards import TOKEN_HEADER
-from console.accounts import Accounts, AccountsRefused, Role, account_line, read_accounts, with_account
+from console.accounts import Accounts, Role, account_line, read_accounts, with_account
 from console.audit import MAX_REFUSED, AuditLog
 from console.console import Console
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
+from runtime.errors import ConfigError
 from tests.codes import coded
 from tests.console.page_client import BROWSING, HERE, WS, page_client, socket_of, visitor
 from tests.operator_end import OperatorEnd
@@ -495,7 +496,7 @@ def test_a_wrong_file_of_accounts_is_refused(tmp_path: Path, text: str | bytes, 
     path = tmp_path / "passwords"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     path.chmod(mode)
-    with pytest.raises(AccountsRefused, check=coded(code)):
+    with pytest.raises(ConfigError, check=coded(code)):
         read_accounts(path)
 
 
@@ -503,7 +504,7 @@ def test_a_wrong_file_of_accounts_is_refused(tmp_path: Path, text: str | bytes, 
     ("name", "password"), [("a b", PASSWORD), ("", PASSWORD), ("anna", "short"), ("anna", "x" * 300)]
 )
 def test_a_bad_name_or_password_is_refused(name: str, password: str) -> None:
-    with pytest.raises(AccountsRefused):
+    with pytest.raises(ConfigError):
         account_line(name, Role.VIEWER, password)
 
 

@@ -12,12 +12,12 @@ from can_dbc.protocols.e2e import Checker, Status
 from can_dbc.protocols.nmea2000 import encode, frames, join_id
 from controller.carrier.bus import CarrierBus
 from controller.carrier.outputs import STANDING, CarrierCommand
-from controller.config import ConfigError
 from controller.step import Controller
 from machine.joints import ARTICULATION
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import ConfigError
 from tests.codes import coded
 from tests.controller.bench import AORO, CODECS, DATABASE, GNSS, MACHINE, MS, Bench, T
 

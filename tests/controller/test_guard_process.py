@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import pytest
 
-from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.base import BusState
 from can_dbc.frame import EXTENDED
 from controller.guard import __main__ as process
 from controller.guard.__main__ import build, main, profile_path
@@ -17,6 +17,7 @@ from controller.guard.latch_file import LatchFile, default_path
 from controller.guard.verdicts import Verdict
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
+from runtime.errors import LinkError
 from tests.controller.bench import DATABASE, MS
 
 T = process.PERIOD_NS
@@ -132,7 +133,7 @@ def test_its_status_text_names_verdict_and_bus(monkeypatch):
 @pytest.mark.usefixtures("handlers")
 def test_a_bus_that_cannot_be_opened_ends_it(monkeypatch, capsys):
     def refuses(address, **_options):
-        raise BusError("bus.no-such", f"no {address}")
+        raise LinkError("bus.no-such", f"no {address}")
 
     world = World(1)
     monkeypatch.setattr(world, "open_bus", refuses)

@@ -15,11 +15,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.base import BusState
 from can_dbc.frame import EXTENDED, REMOTE, Frame
 from controller.guard import __main__ as process
 from controller.guard import can_socket
 from controller.guard.can_socket import MOST_FRAMES, GuardSocket
+from runtime.errors import LinkError
 from tests.codes import coded
 
 FRAME = struct.Struct("=IB3x8s")
@@ -329,10 +330,10 @@ def test_a_full_queue_refuses_and_keeps_the_link(kernel: Kernel) -> None:
 
 def test_an_interface_that_is_down_or_missing_is_told(kernel: Kernel) -> None:
     kernel.flags = 0
-    with pytest.raises(BusError, match="can0", check=coded("bus.interface")):
+    with pytest.raises(LinkError, match="can0", check=coded("bus.interface")):
         GuardSocket("can0", KEYS)
     kernel.refuses = errno.ENODEV
-    with pytest.raises(BusError, match=os.strerror(errno.ENODEV), check=coded("bus.interface")):
+    with pytest.raises(LinkError, match=os.strerror(errno.ENODEV), check=coded("bus.interface")):
         GuardSocket("can0", KEYS)
     kernel.refuses, kernel.flags = 0, UP
     GuardSocket("can0", KEYS).close()

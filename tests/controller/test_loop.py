@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.base import BusState
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from can_dbc.frame import Frame
@@ -25,6 +25,7 @@ from controller.process.warm_up import NullBus, warm_up
 from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
 from machine.status.reasons import Reason
+from runtime.errors import LinkError
 from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, SETTINGS, Bench, T
 
@@ -344,7 +345,7 @@ def test_reports_that_nobody_receives_are_counted(udp):
 
 
 def test_an_address_without_a_way_to_it_is_named(udp):
-    with pytest.raises(BusError, match=r"255.255.255.255:5006", check=coded("udp.unreachable")):
+    with pytest.raises(LinkError, match=r"255.255.255.255:5006", check=coded("udp.unreachable")):
         build(udp, Clock(), reports=("255.255.255.255", 5006))
 
 

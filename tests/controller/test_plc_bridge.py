@@ -18,7 +18,6 @@ from can_dbc.plc.datagram import Header, encode_reply
 from can_dbc.plc.map import Command, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
 from can_dbc.protocols.canopen import parse_heartbeat
 from can_dbc.protocols.e2e import Checker, Sender, Status
-from controller.config import ConfigError
 from controller.crane.startup import Startup
 from controller.plc import __main__ as process
 from controller.plc import links
@@ -29,6 +28,7 @@ from hil.plc.profile import write_plc_profile
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
 from machine.status.modes import Mode as ControllerMode
+from runtime.errors import ConfigError
 from tests.codes import coded
 
 MS = 1_000_000

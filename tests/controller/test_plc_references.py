@@ -10,10 +10,10 @@ import pytest
 
 from can_dbc.dbc.codec import load
 from can_dbc.frame import RawFrame
-from controller.config import ConfigError
 from controller.crane.outputs import CraneWriter
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
+from runtime.errors import ConfigError
 from tests.codes import coded
 
 DATABASE = load("crane")

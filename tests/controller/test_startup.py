@@ -6,11 +6,11 @@ import msgspec
 import pytest
 
 from can_dbc.protocols.canopen import SDO_TO_SERVER, Sdo, SdoKind
-from controller.config import ConfigError
 from controller.crane.startup import EncoderSetup, Phase
 from controller.step import Controller
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import ConfigError
 from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, PROFILE, SETTINGS, Bench, T
 

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from can_dbc.messages.crane import OperatorAction
-from controller.config import ConfigError, Settings
+from controller.config import Settings
 from controller.laws.joint import JointLaw
 from controller.laws.sway import (
     FADE_S,
@@ -28,6 +28,7 @@ from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import profile_hash
 from machine.profile import Imu, joint
 from machine.status.modes import Mode
+from runtime.errors import ConfigError
 from tests.codes import coded
 from tests.controller.bench import AORO, DATABASE, MS, SETTINGS, Bench, T, count_until
 

@@ -25,12 +25,11 @@ from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.plc.machine import MACHINES
 from can_dbc.plc.map import Feedback
-from controller.config import ConfigError, Settings, load
+from controller.config import Settings, load
 from controller.guard.__main__ import build as build_guard
 from controller.laws.feedback import Foreign, law_of
 from controller.plc.bridge import EXCHANGE_NS, Bridge
 from controller.step import Controller
-from experiments.common.errors import ExperimentError
 from experiments.common.plugins import LOG_DETECTORS
 from experiments.loop_design.study import CaseSet, study
 from hil.harness.lockstep import START_NS, Lockstep, Observer
@@ -39,6 +38,7 @@ from hil.plc.profile import write_plc_profile
 from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
+from runtime.errors import ConfigError, InputRefused
 from runtime.plugins import load_plugin
 from sim.camera.rig import CameraRig
 from sim.plant import Plant
@@ -165,7 +165,7 @@ def test_a_law_that_cannot_be_loaded_stops_the_start_and_one_without_a_number_th
 
 
 def test_the_margins_of_a_law_that_nobody_knows_are_not_invented() -> None:
-    with pytest.raises(ExperimentError, check=coded("loop-design.foreign-law")):
+    with pytest.raises(InputRefused, check=coded("loop-design.foreign-law")):
         study(with_law(PALMS, "leaky_pi"), CaseSet({"slew": []}, {}, (), ()))
 
 

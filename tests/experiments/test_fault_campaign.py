@@ -21,11 +21,11 @@ from experiments.faults.separation import Separation, merged
 from experiments.faults.trial import in_child, inject, judge
 from hil.faults.catalogue import BY_NAME, CASES
 from hil.faults.order import parse
-from hil.faults.table import FaultError
 from hil.harness.lockstep import START_NS
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from runtime.errors import InputRefused
 from tests.codes import coded, numbers_in
 
 
@@ -248,7 +248,7 @@ def test_a_fault_at_every_edge_is_answered_and_named() -> None:
         found = in_child(lambda scene=scene, text=text: _injected(scene, text))  # type: ignore[misc]
         assert reaction in found["reached"], (scene, text, found)
         assert found["reason"] == reason, (scene, text, found)
-    with pytest.raises(FaultError, check=coded("fault.no-plc")):
+    with pytest.raises(InputRefused, check=coded("fault.no-plc")):
         _injected("crane palms_471", "plc-off")
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from experiments.common.errors import ExperimentError
 from experiments.common.registry import Options
 from experiments.generalization.experiment import MISSIONS, jobs_of, page_of, scenes_of, wrong_values
 from experiments.generalization.matrix import (
@@ -28,6 +27,7 @@ from hil.missions.site import site_of
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import Carrier
+from runtime.errors import InputRefused
 from sim.ground.terrain import KINDS
 from sim.truth.load import load_truth
 from tests.codes import coded, numbers_in
@@ -62,12 +62,12 @@ def test_a_machine_of_ones_own_varies_its_own_truth(tmp_path: Path) -> None:
     own.write_text(PALMS.read_text().replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))
     _, truth = write_truth(nominal_file("mine.toml", f"sampled:{own}"), "mass-low", 1, tmp_path)
     assert truth["supply"]["relief_pa"] == 18.0e6
-    with pytest.raises(ExperimentError, check=coded("generalization.no-truth")):
+    with pytest.raises(InputRefused, check=coded("generalization.no-truth")):
         nominal_file("mine.toml", "nominal")
 
 
 def test_a_truth_that_does_not_exist_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, check=coded("generalization.unknown-truth")):
+    with pytest.raises(InputRefused, check=coded("generalization.unknown-truth")):
         write_truth(PALMS, "nonsense-low", 1, tmp_path)
 
 

@@ -11,7 +11,6 @@ import pytest
 from rich.console import Console
 
 from autonomy.perception.log_list.observation import LogObservation
-from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import make_result
@@ -31,6 +30,7 @@ from experiments.grasp_configs.grasp_categories import Grip, category, lies_on, 
 from experiments.grasp_configs.metrics import METRICS, SECTIONS, sections
 from experiments.grasp_configs.pose_sources import TRUE, misled
 from experiments.grasp_configs.trial import attempt
+from runtime.errors import InputRefused
 from sim.scenes.arrangements import CONFIGURATIONS
 from sim.wood.logs import LogState
 from tests.codes import coded
@@ -209,7 +209,7 @@ def test_a_machine_without_the_camera_gets_true_poses_and_no_detector(tmp_path: 
     loader = str(made(tmp_path))
     assert {poses for poses, _ in pairs_of(loader)} == {TRUE} and pairs_of(loader)[0] == (TRUE, "search")
     assert pairs_of("palms_471")[0] == BEST
-    with pytest.raises(ExperimentError, check=coded("grasp-configs.no-camera")):
+    with pytest.raises(InputRefused, check=coded("grasp-configs.no-camera")):
         compare(replace(OPTIONS, profile=loader, detector="ours"), Console())
 
 

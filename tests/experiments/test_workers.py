@@ -14,11 +14,11 @@ from rich.console import Console
 from experiments.common import pool, ray_workers
 from experiments.common.campaign import line_of
 from experiments.common.checkpoint import Checkpoint
-from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.trial_cost import TrialCost, overhead_s
 from experiments.common.workers import Workers
 from experiments.plant.experiment import perform
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.experiments.mortal_trials import (
     mortal,
@@ -66,11 +66,11 @@ def test_a_run_with_more_trials_or_sources_changed_back_loses_none(tmp_path: Pat
 def test_two_runs_do_not_write_the_same_trials(tmp_path: Path) -> None:
     with (
         Checkpoint(tmp_path / "trials.jsonl", "one"),
-        pytest.raises(ExperimentError, check=coded("experiment.in-use")),
+        pytest.raises(InputRefused, check=coded("experiment.in-use")),
     ):
         Checkpoint(tmp_path / "trials.jsonl", "one")
     (tmp_path / "file").touch()
-    with pytest.raises(ExperimentError, check=coded("experiment.trials-unwritable")):
+    with pytest.raises(InputRefused, check=coded("experiment.trials-unwritable")):
         Checkpoint(tmp_path / "file" / "trials.jsonl", "one")
 
 
@@ -151,10 +151,10 @@ def test_a_trial_that_fails_on_a_cluster_raises_its_own_error_and_the_others_are
         list(ray_workers.completed(work, "auto", lambda: "ours"))
     assert len(made.cancelled) == 3
     on_stand_in(monkeypatch, {work["square/3"]: Died()})
-    with pytest.raises(ExperimentError, match="square/3", check=coded("experiment.worker-killed")):
+    with pytest.raises(InputRefused, match="square/3", check=coded("experiment.worker-killed")):
         list(ray_workers.completed(work, "auto", lambda: "ours"))
 
 
 def test_a_worker_with_other_sources_refuses_its_trial() -> None:
-    with pytest.raises(ExperimentError, match="theirs", check=coded("experiment.node-differs")):
+    with pytest.raises(InputRefused, match="theirs", check=coded("experiment.node-differs")):
         ray_workers._on_node(lambda: 1, lambda: "theirs", "ours")

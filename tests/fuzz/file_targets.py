@@ -21,21 +21,21 @@ from autonomy.missions.mission_file import verify
 from autonomy.missions.model import MissionError
 from autonomy.networks import weights
 from autonomy.networks.graph import parameter_shapes
-from autonomy.networks.weights import WeightsError
 from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
-from can_dbc.dbc.codec import Database, DbcError, EncodeRefused, FrameRefused
+from can_dbc.dbc.codec import Database, FrameRefused
 from can_dbc.dbc.codec import load as load_dbc
 from can_dbc.trace.candump import read_trace
 from can_dbc.trace.decoder import Decoder
 from can_dbc.trace.records import MalformedRecord
-from controller.config import ConfigError, Settings
+from controller.config import Settings
 from controller.config import load as load_settings
 from controller.guard.__main__ import build
 from controller.guard.envelope import SEAL, digest
 from controller.guard.guard import Guard
 from controller.guard.layout import GuardConfigError, read_layouts
-from recorder.mcap_scan import NotMcap, is_complete, scan
+from recorder.mcap_scan import is_complete, scan
 from recorder.recover import recover
+from runtime.errors import ConfigError, InputRefused
 from tests.controller.guard_traffic import MOVING, Traffic
 from tests.fuzz.engine import Run, Target, coded, in_file, of_file, outcome
 from tests.recorder import recordings
@@ -113,8 +113,8 @@ def read_recording(path: Path) -> tuple[Path, int]:
     """The file and the number of its messages before a damage."""
     try:
         return path, sum(1 for _ in scan(path))
-    except NotMcap:
-        with contextlib.suppress(NotMcap):
+    except InputRefused:
+        with contextlib.suppress(InputRefused):
             recover(path.parent)
         raise
 
@@ -221,7 +221,7 @@ def used(database: Database) -> Hashable:
         for payload in (bytes(codec.length), b"\xff" * codec.length, b""):
             with contextlib.suppress(FrameRefused):
                 codec.receive(payload)
-        with contextlib.suppress(EncodeRefused):
+        with contextlib.suppress(InputRefused):
             codec.encode(*(0 for _ in codec.signals))
     return "good"
 
@@ -322,15 +322,15 @@ _PROFILE = of_file("fuzz.toml", ConfigError, load_settings, has_carrier)
 _GUARD_PROFILE = of_file("fuzz.toml", GuardConfigError, build, guards)
 FILES = (
     _files("mission-file", lambda: mission, mission_seeds, _JSON + _XML, rb"[:,>\"] *([-0-9.]+|\"[^\"]*\")"),
-    _files("recording", of_file("run.mcap", NotMcap, read_recording, repaired), recording_seeds),
+    _files("recording", of_file("run.mcap", InputRefused, read_recording, repaired), recording_seeds),
     _files("trace-text", of_file("trace.log", (), read_trace, counted), lambda: [*TRACES, *reports(".trc")]),
     _files("trace-asc", of_file("trace.asc", (), read_trace, counted), lambda: [ASC, *reports(".asc")], max_bytes=4096),
     _files("trace-blf", of_file("trace.blf", (), read_trace, counted), lambda: [blf_seed(), *reports(".blf")]),
     _files("trace-decoded", of_file("trace.log", (), decoded, tuple), bus_seeds),
-    _files("dbc", of_file("fuzz.dbc", DbcError, load_dbc, used), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
+    _files("dbc", of_file("fuzz.dbc", ConfigError, load_dbc, used), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
     _files("profile", _PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     _files("guard-dbc", of_file("guard.dbc", (), guard_dbc, tuple), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
     _files("guard-profile", _GUARD_PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     Target("guard-envelope", "files", start_envelope, envelope_seeds, _TOML, sealed),
-    _files("weights", of_file("fuzz.safetensors", WeightsError, load_weights, finite), weight_seeds, _JSON),
+    _files("weights", of_file("fuzz.safetensors", InputRefused, load_weights, finite), weight_seeds, _JSON),
 )

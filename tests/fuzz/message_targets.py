@@ -31,13 +31,12 @@ from can_dbc.messages.mission import (
 from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload, encode_mission_upload
 from can_dbc.messages.record_ring import MAGIC as RING_MAGIC
 from can_dbc.messages.record_ring import RecordRing, RingReader
-from can_dbc.messages.rgbd import RgbdError
-from can_dbc.messages.tick_record import RecordRefused
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
-from can_dbc.timing.page import TimingRefused, TimingWriter, read_timing
+from can_dbc.timing.page import TimingWriter, read_timing
 from controller.config import load
 from controller.requests.gate import RequestGate
 from controller.requests.setpoint_gate import RequestRefused
+from runtime.errors import InputRefused
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.conftest import a_timing
 from tests.fuzz.engine import Run, Target, in_file, outcome
@@ -136,16 +135,14 @@ def keyed(data: bytes) -> Hashable:
 
 
 def recorded(data: bytes) -> Hashable:
-    return outcome(
-        RecordRefused, tick_record.decode, data, then=lambda tick: (len(tick.frames_in), len(tick.datagrams))
-    )
+    return outcome(InputRefused, tick_record.decode, data, then=lambda tick: (len(tick.frames_in), len(tick.datagrams)))
 
 
 def pictured(data: bytes) -> Hashable:
     """Both sides read the fixed part first, with its exact length."""
-    found = [outcome(RgbdError, rgbd.decode, data)]
+    found = [outcome(InputRefused, rgbd.decode, data)]
     parts = ((rgbd.decode_header, rgbd.HEADER_BYTES), (rgbd.request_name_bytes, rgbd.REQUEST_HEADER.size))
-    found += [outcome(RgbdError, what, data[:size]) for what, size in parts if len(data) >= size]
+    found += [outcome(InputRefused, what, data[:size]) for what, size in parts if len(data) >= size]
     return tuple(found)
 
 
@@ -219,7 +216,7 @@ def start_timing() -> Run:
         if data[8:16] == bytes(8) or data[8] & 1:
             return "not written"  # the reader waits for the writer, 0.1 s each time
         path.write_bytes(data)
-        return outcome(TimingRefused, read_timing, path, then=lambda timing: timing.facts.mode)
+        return outcome(InputRefused, read_timing, path, then=lambda timing: timing.facts.mode)
 
     return run
 

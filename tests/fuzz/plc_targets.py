@@ -11,10 +11,11 @@ from pymodbus.client import AsyncModbusTcpClient
 
 from can_dbc.plc import map as plc
 from can_dbc.plc import modbus
-from can_dbc.plc.datagram import DatagramRefused, Header, decode_command, decode_reply, encode_command, encode_reply
+from can_dbc.plc.datagram import Header, decode_command, decode_reply, encode_command, encode_reply
 from can_dbc.plc.map import COMMAND_COUNT, STATUS_COUNT, Bounds, Command, Feedback, MapError, Mode, State, WordOrder
-from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
+from can_dbc.plc.modbus import ModbusClient, RegisterRefused
 from controller.plc.handshake import Handshake
+from runtime.errors import InputRefused, LinkError
 from sim.plc.command_arbiter import CommandArbiter
 from tests.fuzz.engine import Run, Target, coded, outcome
 from tests.fuzz.message_targets import with_crc
@@ -41,7 +42,7 @@ def start_datagrams() -> Run:
     def run(data: bytes) -> Hashable:
         nonlocal now_ns
         now_ns += 10 * MS
-        refusals = (DatagramRefused, MapError)
+        refusals = (InputRefused, MapError)
         found = [outcome(refusals, what, data) for what in (decode_reply, decode_command)]
         shake.datagram(COMMAND, now_ns)
         found.append(shake.accept_datagram(data, now_ns))

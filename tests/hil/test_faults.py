@@ -15,11 +15,12 @@ from hil.faults.catalogue import BY_NAME, CASES, Where
 from hil.faults.draws import Scene
 from hil.faults.injector import Injector, effect_of
 from hil.faults.order import Order, make, parse
-from hil.faults.table import FAULTS, Edge, FaultError, Word, find
+from hil.faults.table import FAULTS, Edge, Word, find
 from hil.faults.wire_faults import wire_fault
 from hil.harness.operator import Operator
 from hil.wire.faults import Kind
 from machine.loading.profile_file import load_profile
+from runtime.errors import InputRefused
 from sim.plant_faults import BEGINNERS
 from tests.codes import coded
 
@@ -76,7 +77,7 @@ def test_an_order_is_read_from_its_text() -> None:
     ],
 )
 def test_a_wrong_order_is_refused_in_words(text: str, code: str) -> None:
-    with pytest.raises(FaultError, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         parse(text)
 
 
@@ -89,9 +90,9 @@ def test_bus_faults_name_the_bus_of_their_message() -> None:
     bus, fault = wire_fault(make("bus-drop", part="VehStat"), AORO, 5, 9)
     assert (bus, fault.kind, fault.start_ns, fault.end_ns) == ("mach0", Kind.DROP, 5, 9)
     assert wire_fault(make("bus-stub", part="crane0"), AORO, 0, 1)[1].node == "controller"
-    with pytest.raises(FaultError, check=coded("fault.no-bus")):
+    with pytest.raises(InputRefused, check=coded("fault.no-bus")):
         wire_fault(make("bus-babble", part="mach0"), PALMS, 0, 1)
-    with pytest.raises(FaultError, check=coded("fault.no-message")):
+    with pytest.raises(InputRefused, check=coded("fault.no-message")):
         wire_fault(make("bus-drop", part="VehStat"), PALMS, 0, 1)
 
 
@@ -137,5 +138,5 @@ def test_the_link_of_an_operator_who_watches_is_cut_for_a_while() -> None:
 def test_the_link_of_an_operator_who_does_not_watch_cannot_be_cut() -> None:
     injector = Injector(SimpleNamespace(operator=Operator(7, lambda *_: None)))  # type: ignore[arg-type]
     injector.order(make("operator-off"), 1000)
-    with pytest.raises(FaultError, check=coded("fault.not-watched")):
+    with pytest.raises(InputRefused, check=coded("fault.not-watched")):
         injector.begin(1000)

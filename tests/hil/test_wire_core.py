@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from can_dbc.bus.base import ERR_ACK, ERR_BUSOFF, ERR_CRTL, ERR_RESTARTED, BusState
 from can_dbc.frame import ERROR, EXTENDED, Frame
 from hil.wire.core import Node, WireCore
-from hil.wire.errors import WireError
 from hil.wire.faults import Fault, Kind
 from hil.wire.inprocess import InProcessBus
 from hil.wire.stuffing import frame_bits, priority
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 BIT_NS = 1000
@@ -99,13 +99,13 @@ def test_a_frame_arrives_at_its_last_bit() -> None:
 def test_time_cannot_go_back() -> None:
     core, _ = core_with(1)
     core.advance(10)
-    with pytest.raises(WireError, check=coded("wire.time-reversed")):
+    with pytest.raises(InputRefused, check=coded("wire.time-reversed")):
         core.advance(9)
 
 
 @pytest.mark.parametrize("bitrate", [0, -1, 3])
 def test_a_bit_is_a_whole_number_of_ns(bitrate: int) -> None:
-    with pytest.raises(WireError, check=coded("wire.bitrate")):
+    with pytest.raises(InputRefused, check=coded("wire.bitrate")):
         WireCore(bitrate)
 
 

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from machine.draft.answers import AnswersError, answers_of
+from machine.draft.answers import answers_of
 from machine.draft.from_urdf import answers_from_urdf
 from machine.draft.profile_text import profile_text
 from machine.draft.questions import Question, answers_text, example, merged, put, questions
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.draft.truth import crane_urdf, least_inertia
 from sim.truth.load import load_truth
 from tests.codes import coded
@@ -84,7 +85,7 @@ def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path
     path = tmp_path / "crane.urdf"
     text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
     path.write_text(text.replace('joint name="lift"', 'joint name="q2"'))
-    with pytest.raises(AnswersError, match="--urdf-joints lift", check=coded("answers.urdf-joint")):
+    with pytest.raises(InputRefused, match="--urdf-joints lift", check=coded("answers.urdf-joint")):
         answers_from_urdf(path, {})
     given = answers(("kinematics", None), ("joints.lift.lower", None))
     both = answers_of(merged(given, answers_from_urdf(path, {"lift": "q2"})), "answers")
@@ -104,7 +105,7 @@ def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str,
     text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
     assert old in text
     path.write_text(text.replace(old, new))
-    with pytest.raises(AnswersError, check=coded(code)):
+    with pytest.raises(InputRefused, check=coded(code)):
         answers_from_urdf(path, {})
 
 
@@ -124,7 +125,7 @@ def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str,
     ],
 )
 def test_answers_that_make_no_machine_are_refused_in_a_sentence(change: tuple[str, object], named: str) -> None:
-    with pytest.raises(AnswersError, match=r"^here: ", check=coded("answers.wrong")) as refused:
+    with pytest.raises(InputRefused, match=r"^here: ", check=coded("answers.wrong")) as refused:
         answers_of(answers(change), "here")
     assert named in str(refused.value)
 

@@ -19,8 +19,9 @@ from recorder import files
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module
 from recorder.mcap_scan import Channel, Stored, is_complete, scan
-from recorder.recorder import CHUNK_NS, Recorder, RecordingRefused
+from recorder.recorder import CHUNK_NS, Recorder
 from recorder.recover import run_files
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.recorder.recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
 
@@ -191,14 +192,14 @@ def test_damaged_datagrams_are_counted(tmp_path):
 
 def test_a_directory_with_a_recording_is_refused_and_unchanged(run):
     before = (run / "run.mcap").read_bytes()
-    with pytest.raises(RecordingRefused, check=coded("recording.exists")):
+    with pytest.raises(InputRefused, check=coded("recording.exists")):
         Recorder(run, PROFILE, manifest())
     assert (run / "run.mcap").read_bytes() == before
 
 
 def test_directory_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingRefused, check=coded("recording.cannot-write")):
+    with pytest.raises(InputRefused, check=coded("recording.cannot-write")):
         Recorder(tmp_path / "file", PROFILE, manifest())
 
 
@@ -230,7 +231,7 @@ class FullDisk:
 
 def test_full_disk_at_start_is_refused(tmp_path, monkeypatch):
     FullDisk(monkeypatch).full = True
-    with pytest.raises(RecordingRefused, match=os.strerror(errno.ENOSPC), check=coded("recording.cannot-write")):
+    with pytest.raises(InputRefused, match=os.strerror(errno.ENOSPC), check=coded("recording.cannot-write")):
         Recorder(tmp_path, PROFILE, manifest())
 
 

@@ -16,9 +16,10 @@ from can_dbc.messages.record_ring import RingReader
 from can_dbc.timing.page import TimingWriter
 from recorder import manifest as manifests
 from recorder.__main__ import InputCollector, udp_socket, write_all
-from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
+from recorder.mcap_scan import Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, Recorder
 from recorder.recover import recover
+from runtime.errors import InputRefused
 from tests.codes import coded, numbers_in
 from tests.recorder.recordings import PROFILE, T_NS, feed, manifest, record, tick
 
@@ -116,7 +117,7 @@ def test_an_unfinished_line_of_the_candump_file_is_removed(whole, tmp_path):
 
 def test_a_file_of_another_kind_is_refused_with_its_name(tmp_path):
     (tmp_path / "run.mcap").write_text("this is no recording")
-    with pytest.raises(NotMcap, check=coded("recording.not-mcap")):
+    with pytest.raises(InputRefused, check=coded("recording.not-mcap")):
         list(scan(tmp_path / "run.mcap"))
 
 

@@ -7,8 +7,9 @@ import threading
 import numpy as np
 import pytest
 
-from can_dbc.messages.rgbd import HEADER_BYTES, RgbdError, RgbdMessage, decode, decode_header, encode_request
+from can_dbc.messages.rgbd import HEADER_BYTES, RgbdMessage, decode, decode_header, encode_request
 from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
 from sim.camera.rig import Mount, RgbdFrame
 from sim.camera.server import CameraServer, rgbd_message
 from tests.codes import coded
@@ -50,7 +51,7 @@ def answer(client: socket.socket) -> RgbdMessage:
 
 def test_an_unknown_camera_is_refused() -> None:
     server = CameraServer(Rig(), 0)
-    with asked(server, "rear") as client, pytest.raises(RgbdError, check=coded("rgbd.refused")):
+    with asked(server, "rear") as client, pytest.raises(InputRefused, check=coded("rgbd.refused")):
         answer(client)
     server.close()
 

@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import make
-from hil.faults.table import FAULTS, FaultError
+from hil.faults.table import FAULTS
 from hil.harness.live import ADDRESSES
 from host.exit_codes import CommandFailed
 from machine.loading.profile_file import load_profile
+from runtime.errors import InputRefused
 from tests.codes import coded
 from timberhand.cli import app
 
@@ -62,7 +63,7 @@ def test_a_real_bus_is_left_alone() -> None:
         (make("planner-nan"), "fault.not-live"),
         (make("process-off"), "fault.no-process"),
     ):
-        with pytest.raises(FaultError, check=coded(code)):
+        with pytest.raises(InputRefused, check=coded(code)):
             inject(order, target())
 
 
@@ -85,7 +86,7 @@ def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None
         (tmp_path / ADDRESSES).write_text(json.dumps(document))
         there = LiveTarget.of(tmp_path)
         assert "encoder-stuck" in inject(make("encoder-lift", "stuck", length_s=0.5), there)
-        with pytest.raises(FaultError, check=coded("fault.plant-refuses")):
+        with pytest.raises(InputRefused, check=coded("fault.plant-refuses")):
             inject(make("encoder-stuck"), there)
         thread.join()
     assert asked[0] == {

@@ -6,8 +6,9 @@ import os
 
 import pytest
 
+from runtime.errors import InputRefused
 from tests.codes import coded
-from timberhand.terminal_watch import FIRST_ANSWER_NS, MAX_QUESTIONS, TerminalError, TerminalWatch, watch
+from timberhand.terminal_watch import FIRST_ANSWER_NS, MAX_QUESTIONS, TerminalWatch, watch
 
 MS = 1_000_000
 LIMIT_NS = 1000 * MS
@@ -52,13 +53,13 @@ def test_a_terminal_that_never_answers_is_refused() -> None:
     terminal = TerminalWatch(LIMIT_NS)
     terminal.ask(1000 * MS)
     assert terminal.ask(1000 * MS + FIRST_ANSWER_NS - 1)
-    with pytest.raises(TerminalError, check=coded("operator.silent-terminal")):
+    with pytest.raises(InputRefused, check=coded("operator.silent-terminal")):
         terminal.ask(1000 * MS + FIRST_ANSWER_NS)
 
 
 def test_a_pipe_is_no_terminal() -> None:
     reading, writing = os.pipe()
-    with pytest.raises(TerminalError, check=coded("operator.no-terminal")):
+    with pytest.raises(InputRefused, check=coded("operator.no-terminal")):
         watch(lambda stamp_ns: None, LIMIT_NS, reading, writing)
     os.close(reading)
     os.close(writing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from runtime.errors import CodedError
+from runtime.errors import TimberhandError
 from timberhand.reference import errors_page
 from timberhand.reference.__main__ import REPOSITORY
 
@@ -17,5 +17,5 @@ def test_a_code_belongs_to_one_area_of_the_program() -> None:
 def test_an_error_keeps_its_code_across_processes() -> None:
     import pickle
 
-    error = pickle.loads(pickle.dumps(CodedError("test.code", "A sentence.")))
+    error = pickle.loads(pickle.dumps(TimberhandError("test.code", "A sentence.")))
     assert (error.code, str(error)) == ("test.code", "A sentence.")

@@ -5,10 +5,11 @@ import pytest
 import torch
 from rich.console import Console
 
-from autonomy.networks.graph import NetworkError, parameter_count
+from autonomy.networks.graph import parameter_count
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsError, save
+from autonomy.networks.weights import save
 from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector, box_net, decode_boxes
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import picture
 from training.common.loop import Schedule
@@ -55,11 +56,11 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
     path = tmp_path / "boxes.safetensors"
     save(path, box_net(), random_net(box_net(), 1).arrays(), {})
     detector = BoxDetector(path)
-    with pytest.raises(NetworkError, check=coded("network.bad-picture")):
+    with pytest.raises(InputRefused, check=coded("network.bad-picture")):
         detector.detect(np.zeros((304, 304, 3), np.uint8))
     found, _ = detector.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
     assert found.shape[1] == 4
-    with pytest.raises(WeightsError):
+    with pytest.raises(InputRefused):
         BoxDetector(tmp_path / "none.safetensors")
     assert parameter_count(box_net()) < 500_000
 

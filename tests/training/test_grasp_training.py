@@ -18,8 +18,8 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER, GraspMaps, heads_first
 from autonomy.networks.graph import parameter_shapes
 from autonomy.networks.torch_net import random_net
+from runtime.errors import InputRefused
 from tests.codes import coded
-from training.common.dataset_error import DatasetError
 from training.grasp import network_training
 from training.grasp.cornell import Sample, grouped_folds, load, paper_folds, rectangles
 from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, is_correct, wrapped
@@ -109,17 +109,17 @@ def test_a_folder_in_the_layout_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("labels", ["1 2\n3 4\n5 6\n", "one two\n" * 4, "1 2 3\n" * 4])
 def test_malformed_labels_are_refused(tmp_path: Path, labels: str) -> None:
     written(tmp_path, 1, labels)
-    with pytest.raises(DatasetError, check=coded("dataset.bad-rectangles")):
+    with pytest.raises(InputRefused, check=coded("dataset.bad-rectangles")):
         rectangles(tmp_path / "pcd0001cpos.txt")
 
 
 def test_a_folder_without_samples_and_a_broken_tiff_are_refused(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(DatasetError, check=coded("dataset.no-samples")):
+        with pytest.raises(InputRefused, check=coded("dataset.no-samples")):
             load(folder)
     written(tmp_path, 1, SQUARE)
     (tmp_path / "pcd0001d.tiff").write_bytes(b"II*\0 no picture")
-    with pytest.raises(DatasetError, check=coded("dataset.bad-depth")):
+    with pytest.raises(InputRefused, check=coded("dataset.bad-depth")):
         load(tmp_path)
 
 

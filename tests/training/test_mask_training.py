@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from autonomy.networks.weights import load
 from autonomy.perception.segmentation.mask_network import mask_network
 from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
 from tests.codes import coded, numbers_in
 from timberhand.commands.train import app
-from training.common.dataset_error import DatasetError
 from training.pictures import piles
 from training.pictures.samples import sample, write
 from training.pictures.traced import sets
@@ -54,7 +54,7 @@ def test_sets_are_drawn_in_the_shares_of_the_card(folder):
 def test_no_traced_pictures_are_a_coded_error(tmp_path):
     from training.detection.masks.mixture import mixed
 
-    with pytest.raises(DatasetError, check=coded("dataset.no-traced")):
+    with pytest.raises(InputRefused, check=coded("dataset.no-traced")):
         mixed(tmp_path)
 
 
@@ -62,7 +62,7 @@ def test_without_compiler_and_blender_the_error_says_what_to_install(monkeypatch
     monkeypatch.setattr(sets, "compiler", lambda: None)
     monkeypatch.setattr(sets, "find_spec", lambda name: None)
     for asked in sets.RENDERERS:
-        with pytest.raises(DatasetError, check=coded("dataset.no-renderer")):
+        with pytest.raises(InputRefused, check=coded("dataset.no-renderer")):
             sets.renderer(asked)
 
 

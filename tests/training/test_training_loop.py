@@ -13,8 +13,9 @@ from rich.console import Console
 
 from autonomy.networks.graph import BatchNorm, Conv, Network, Relu
 from autonomy.networks.torch_net import TorchNet, random_net
+from runtime.errors import InputRefused
 from tests.codes import coded
-from training.common.loop import Schedule, TrainingError, train
+from training.common.loop import Schedule, train
 
 SMALL = Network("small", 1, (Conv("a", 4, 3), BatchNorm("n"), Relu("r"), Conv("y", 1, 1)), ("y",))
 
@@ -114,5 +115,5 @@ def test_a_checkpoint_is_written_at_intervals(tmp_path: Path) -> None:
 
 
 def test_a_loss_that_is_not_finite_stops_the_run() -> None:
-    with pytest.raises(TrainingError, check=coded("training.diverged")):
+    with pytest.raises(InputRefused, check=coded("training.diverged")):
         run(None, give=lambda i: (batch(i)[0] * (float("nan") if i == 2 else 1.0), batch(i)[1]))

@@ -8,17 +8,17 @@ import pytest
 from rich.console import Console
 
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsError, load, save
+from autonomy.networks.weights import load, save
 from autonomy.perception.papers.box_detector import BoxDetector
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import unet
 from autonomy.perception.segmentation.segment_merging import load_scorers
 from machine.geometry.optics import pinhole
+from runtime.errors import InputRefused
 from sim.camera.geometry import look_at
 from sim.camera.scene import LogPose
 from tests.codes import coded
-from training.common.dataset_error import DatasetError
 from training.detection import detector_weights, scorer_weights
 from training.pictures import drawing, piles, shards
 from training.pictures.drawing import MAX_LOGS, draw, labelled
@@ -55,7 +55,7 @@ def test_piles_are_stored_completely(few):
     assert chunk("palms_471", 0) == first and len(first) == 2
     assert [p.number for p in chunk("palms_471", 3)] == [6, 7]
     file.write_bytes(file.read_bytes()[:300])
-    with pytest.raises(DatasetError, check=coded("dataset.bad-piles")):
+    with pytest.raises(InputRefused, check=coded("dataset.bad-piles")):
         chunk("palms_471", 0)
 
 
@@ -151,7 +151,7 @@ def test_a_damaged_shard_is_refused(few):
     shard(few, 0, 96)
     (folder,) = few.glob("logs-*")
     (folder / "ids.npy").write_bytes(b"")
-    with pytest.raises(DatasetError, check=coded("dataset.bad-shard")):
+    with pytest.raises(InputRefused, check=coded("dataset.bad-shard")):
         shard(few, 0, 96)
 
 
@@ -185,7 +185,7 @@ def test_the_depth_variant_can_start_from_weights_of_the_rgbd_variant(tmp_path):
     assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
     save(alone, unet("depth"), taken, {})
     assert np.array_equal(detector_weights.initial_arrays(alone, "depth")["in2.weight"], taken["in2.weight"])
-    with pytest.raises(WeightsError, check=coded("weights.other-network")):
+    with pytest.raises(InputRefused, check=coded("weights.other-network")):
         detector_weights.initial_arrays(alone, "rgbd")
 
 

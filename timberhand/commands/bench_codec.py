@@ -45,7 +45,8 @@ def measure(repetitions: int) -> dict[str, Any]:
     from importlib.metadata import version
 
     from can_dbc.dbc.check import random_values
-    from can_dbc.dbc.codec import EncodeRefused, FrameRefused, load, parse
+    from can_dbc.dbc.codec import FrameRefused, load, parse
+    from runtime.errors import InputRefused
 
     database = load("crane")
     reference = {m.name: m for m in parse(database.path).messages}
@@ -64,7 +65,7 @@ def measure(repetitions: int) -> dict[str, Any]:
                     values = list(ours.decode(payload))
                     if None not in values:
                         break
-                except (EncodeRefused, FrameRefused):
+                except (InputRefused, FrameRefused):
                     continue
             named = dict(zip(ours.index, values or (), strict=True))
             rows.append({"message": name} | _timed(ours, theirs, payload, values or [], named, repetitions))

@@ -65,11 +65,12 @@ def calibrate(
     """
     from rich.console import Console
 
-    from autonomy.calibration.profile_file import ProfileNotWritten, lowered_gains, profile_changes, write_profile
+    from autonomy.calibration.profile_file import lowered_gains, profile_changes, write_profile
     from autonomy.calibration.report import result_document, write_report
     from autonomy.calibration.result import identify
     from machine.loading.beside import carry_envelope
     from machine.loading.profile_file import ProfileError, load_profile
+    from runtime.errors import InputRefused
 
     try:
         known = load_profile(profile)
@@ -113,7 +114,7 @@ def calibrate(
     try:
         write_profile(_source(profile), out, changed, facts["date"])
         carry_envelope(_source(profile), out.parent)
-    except ProfileNotWritten as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
     if calibration.resumptions:
@@ -173,7 +174,7 @@ def _lockstep(
 ) -> Calibration:
     from hil.calibration.crane import run_lockstep
     from recorder.manifest import describe
-    from recorder.recorder import Recorder, RecordingRefused
+    from recorder.recorder import Recorder
 
     interrupts: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
@@ -193,7 +194,7 @@ def _lockstep(
                 watch=progress.show,
                 aborted=lambda: bool(interrupts),
             )
-    except (ValueError, RecordingRefused) as error:
+    except ValueError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     finally:
         signal.signal(signal.SIGINT, before)
@@ -221,16 +222,16 @@ def _live(
     screen: Console,
 ) -> Calibration:
     from autonomy.calibration import live
-    from autonomy.calibration.plan import CalibrationImpossible, make_plan
+    from autonomy.calibration.plan import make_plan
     from autonomy.calibration.procedure import Calibration
     from autonomy.calibration.procedure_state import PATIENCE_S, READING_COUNT
     from autonomy.process.controller_link import ControllerLink
-    from can_dbc.bus.base import BusError
     from can_dbc.bus.factory import open_bus
     from can_dbc.dbc.codec import load
     from can_dbc.messages.udp_address import udp_address
     from machine.loading.profile_file import profile_hash
     from machine.status.modes import Mode
+    from runtime.errors import InputRefused, LinkError
 
     controller, report_port, address, key_file, lease_ms = link_options
     if not 0 < lease_ms <= profile.timeouts.lease_max_ms:
@@ -288,9 +289,9 @@ def _live(
                 live.run(run, link, bus_frames, reader, watch)
         finally:
             signal.signal(signal.SIGINT, before)
-    except CalibrationImpossible as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
-    except BusError as error:
+    except LinkError as error:
         raise CommandFailed.from_error(error, ExitCode.BUS) from None
     finally:
         link.close()

@@ -101,12 +101,12 @@ def diff(
     """
     import tomllib
 
+    from runtime.errors import ConfigError
     from timberhand.configuration.inventory import differences
-    from timberhand.configuration.settings_file import SettingsError
 
     try:
         found = differences(first, second)
-    except SettingsError as error:
+    except ConfigError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except tomllib.TOMLDecodeError as error:
         raise CommandFailed("config.broken-toml", f"broken TOML: {error}", ExitCode.CONFIGURATION) from None
@@ -224,9 +224,10 @@ def _file(file: Path | None) -> Path:
 
 
 def _text(path: Path) -> str:
-    from timberhand.configuration.settings_file import SettingsError, read
+    from runtime.errors import ConfigError
+    from timberhand.configuration.settings_file import read
 
     try:
         return read(path)
-    except SettingsError as error:
+    except ConfigError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None

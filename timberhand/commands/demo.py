@@ -187,12 +187,12 @@ def demo(
     if lockstep:
         from hil.demo.lockstep import run_lockstep
         from hil.faults.order import parse
-        from hil.faults.table import FaultError
+        from runtime.errors import InputRefused
 
         try:
             orders = [parse(text, seed) for text in faults or ()]
             summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera, orders, planner=chosen)
-        except FaultError as error:
+        except InputRefused as error:
             raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     elif paced:
         from hil.demo.paced import run_paced

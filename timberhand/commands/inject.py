@@ -52,7 +52,7 @@ def inject(
     from rich.console import Console
 
     from hil.faults.order import FOREVER_S, make
-    from hil.faults.table import FaultError
+    from runtime.errors import InputRefused
 
     if list_all or not name:
         _show(Console())
@@ -74,7 +74,7 @@ def inject(
         from hil.faults.live import inject as inject_live
 
         print(inject_live(order, LiveTarget.of(run or _newest_run()), i_know))
-    except FaultError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.USAGE) from None
 
 
@@ -110,23 +110,23 @@ def _show(console: object) -> None:
 
 
 def _seconds(text: str) -> float:
-    from hil.faults.table import FaultError
+    from runtime.errors import InputRefused
 
     number, factor = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
     try:
         return float(number) * factor
     except ValueError:
-        raise FaultError("fault.time-syntax", f"{text!r} is no time; write 12.3s or 500ms") from None
+        raise InputRefused("fault.time-syntax", f"{text!r} is no time; write 12.3s or 500ms") from None
 
 
 def _newest_run() -> Path:
     """The directory below runs/ with the newest live run."""
-    from hil.faults.table import FaultError
     from hil.harness.live import ADDRESSES
+    from runtime.errors import InputRefused
 
     found = sorted(Path("runs").glob(f"*/{ADDRESSES}"), key=lambda path: path.stat().st_mtime)
     if not found:
-        raise FaultError(
+        raise InputRefused(
             "fault.no-live-run", "there is no live run below runs/; start `timberhand demo`, or add --lockstep"
         )
     return found[-1].parent

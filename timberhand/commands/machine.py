@@ -61,9 +61,10 @@ def new(
 
       timberhand machine new my_loader           asks on the terminal
     """
-    from machine.draft.answers import AnswersError, read_answers
+    from machine.draft.answers import read_answers
     from machine.draft.from_urdf import answers_from_urdf
     from machine.draft.questions import merged
+    from runtime.errors import InputRefused
     from timberhand.machine_files.check import check as check_files
     from timberhand.machine_files.make import make
 
@@ -79,7 +80,7 @@ def new(
                 "there is no terminal to ask on; give --answers FILE, from `timberhand machine questions`",
                 ExitCode.USAGE,
             )
-    except AnswersError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     path = make(merged(given, described), str(answers or folder), folder)
     found = [finding for finding in check_files(str(path)) if finding.code != "guard.envelope-damaged"]

@@ -92,8 +92,9 @@ def password(
     """
     import sys
 
-    from console.accounts import AccountsRefused, Role, account_line, with_account
+    from console.accounts import Role, account_line, with_account
     from host.exit_codes import CommandFailed, ExitCode
+    from runtime.errors import ConfigError
 
     if sys.stdin.isatty():
         secret = typer.prompt("password", hide_input=True, confirmation_prompt=True, err=True)
@@ -101,7 +102,7 @@ def password(
         secret = sys.stdin.readline().rstrip("\n")
     try:
         line = account_line(name, Role[role.value.upper()], secret)
-    except AccountsRefused as error:
+    except ConfigError as error:
         raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     try:
         _replace(file, with_account(file.read_text() if file.exists() else "", line))

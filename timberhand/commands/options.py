@@ -89,11 +89,12 @@ def planner_of(name: str, virtual_cameras: int) -> PlannerChoice:
     Raises:
         CommandFailed: there is no such planner, or it has no virtual camera.
     """
-    from autonomy.grasp.planners import PlannerChoice, PlannerError
+    from autonomy.grasp.planners import PlannerChoice
+    from runtime.errors import InputRefused
 
     try:
         return PlannerChoice(name, virtual_cameras).check()
-    except PlannerError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.USAGE) from None
 
 

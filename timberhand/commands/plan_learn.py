@@ -39,14 +39,14 @@ def learn(
     """
     import json
 
-    from autonomy.motion.dmp import DemonstrationRefused
     from autonomy.motion.movement_primitives import encode, learn_primitives
+    from runtime.errors import InputRefused
     from training.motion.demonstration_recordings import motions_in
 
     machine, motions = motions_in(recording, profile)
     try:
         primitives = learn_primitives(machine, motions)
-    except DemonstrationRefused as error:
+    except InputRefused as error:
         raise CommandFailed("plan.demonstrations", f"{recording}: {error}", ExitCode.CONFIGURATION) from None
     _write(out, encode(primitives))
     if csv is not None:
@@ -100,7 +100,8 @@ def demonstrate(
     from hil.demonstrations.hand_levers import demonstrate as demonstrate_motions
     from machine.loading.profile_file import ProfileError, load_profile
     from recorder.manifest import describe
-    from recorder.recorder import Recorder, RecordingRefused
+    from recorder.recorder import Recorder
+    from runtime.errors import InputRefused
 
     error_console = Console(stderr=True)
     try:
@@ -119,7 +120,7 @@ def demonstrate(
             )
         if recorder is not None:
             recorder.close()
-    except (ProfileError, ValueError, RecordingRefused) as error:
+    except (ProfileError, ValueError, InputRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     motions = segment_motions(machine, joint_track(machine, load("crane"), frames))
     _write(out, format_demonstrations(machine.name, motions).encode())

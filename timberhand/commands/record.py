@@ -33,11 +33,11 @@ def record(
 
       timberhand record --out runs/field-1 --bus crane0=socketcan:can0
     """
-    from can_dbc.bus.base import BusError
     from can_dbc.bus.factory import default_address
     from host.exit_codes import CommandFailed, ExitCode
     from machine.loading.profile_file import ProfileError, load_profile
     from recorder.__main__ import main
+    from runtime.errors import LinkError
 
     try:
         machine = load_profile(profile)
@@ -45,7 +45,7 @@ def record(
         buses = bus or [f"{name}={default_address(name)}" for name in names]
     except ProfileError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
-    except BusError as error:
+    except LinkError as error:
         raise CommandFailed.from_error(error, ExitCode.BUS) from error
     arguments = ["--out", str(out), "--report-port", str(report_port), *(("--ticks", str(ticks)) if ticks else ())]
     arguments += ["--timing", str(timing)] if timing else []

@@ -45,15 +45,16 @@ def decode(
     """
     import json
 
-    from can_dbc.dbc.codec import SHIPPED, DbcError
+    from can_dbc.dbc.codec import SHIPPED
     from can_dbc.trace.candump import read_trace
     from can_dbc.trace.decoder import Decoder
     from host.exit_codes import CommandFailed, ExitCode
+    from runtime.errors import ConfigError
 
     try:
         decoder = Decoder(dbc or list(SHIPPED))
         records = read_trace(recording)
-    except DbcError as error:
+    except ConfigError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     except OSError as error:
         raise CommandFailed(

@@ -46,17 +46,18 @@ def survey_camera(
 
     from rich.console import Console
 
-    from autonomy.calibration.profile_file import ProfileNotWritten, write_profile
-    from autonomy.calibration.targets_file import TargetsFileError, load_targets
-    from autonomy.perception.camera.mount import CameraMountError, link_pose
+    from autonomy.calibration.profile_file import write_profile
+    from autonomy.calibration.targets_file import load_targets
+    from autonomy.perception.camera.mount import link_pose
     from autonomy.perception.camera.survey import surveyed
     from controller.guard.__main__ import profile_path
     from machine.loading.profile_file import ProfileError, load_profile
+    from runtime.errors import InputRefused
 
     try:
         known = load_profile(profile)
         seen = load_targets(targets)
-    except (ProfileError, TargetsFileError) as error:
+    except (ProfileError, InputRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if camera not in known.cameras:
         names = ", ".join(known.cameras) or "none"
@@ -68,7 +69,7 @@ def survey_camera(
     try:
         link = link_pose(known, before.link, q, math.radians(articulation_deg))
         found = surveyed(before, link, seen.pixels_px, seen.depths_m, seen.places_m)
-    except CameraMountError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     remark = f"by {len(seen.places_m)} surveyed targets"
     values: dict[str, Any] = {
@@ -81,7 +82,7 @@ def survey_camera(
     ]
     try:
         write_profile(Path(profile_path(profile)), out, changed, datetime.date.today().isoformat())
-    except ProfileNotWritten as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     if as_json:
         print(json.dumps({"camera": camera, "targets": len(seen.places_m), **values}, indent=2))

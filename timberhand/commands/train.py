@@ -94,7 +94,7 @@ def _grasp_physical(weights: Path, seed: int, epochs: int | None) -> None:
 def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None:
     from rich.console import Console
 
-    from training.common.dataset_error import DatasetError
+    from runtime.errors import InputRefused
     from training.grasp import network_training as training
     from training.grasp.cornell import load
     from training.grasp.cornell_weights import produce
@@ -102,7 +102,7 @@ def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None
     screen = Console(stderr=True)
     try:
         samples = load(data)
-    except DatasetError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         weights, card = produce(samples, seed, epochs or training.EPOCHS, out, screen)
@@ -260,7 +260,7 @@ def traced_pictures(
     """
     from rich.console import Console
 
-    from training.common.dataset_error import DatasetError
+    from runtime.errors import InputRefused
     from training.pictures.traced.sets import SetPlan, produce_sets
 
     screen = Console(stderr=True)
@@ -271,7 +271,7 @@ def traced_pictures(
         raise CommandFailed(
             "train.interrupted", "interrupted; the same command continues", ExitCode.INTERRUPTED
         ) from None
-    except DatasetError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     screen.print(f"\n{folder}", highlight=False)
 

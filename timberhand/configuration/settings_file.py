@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
 
-from runtime.errors import CodedError
+from runtime.errors import ConfigError
 
 INSTALLED: Final = Path("/etc/timberhand/timberhand.conf")
 SHIPPED: Final = Path(__file__).parents[2] / "deploy" / "timberhand.conf"
@@ -39,18 +39,14 @@ class Problem:
     note: bool = False
 
 
-class SettingsError(CodedError, ValueError):
-    """The file cannot be read at all."""
-
-
 def read(path: Path) -> str:
-    """The text of a settings file; raises SettingsError."""
+    """The text of a settings file; raises ConfigError."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise SettingsError("settings.unreadable", f"{path} cannot be read: {error.strerror}; name a file") from None
+        raise ConfigError("settings.unreadable", f"{path} cannot be read: {error.strerror}; name a file") from None
     except UnicodeDecodeError as error:
-        raise SettingsError("settings.not-utf8", f"{path} is not UTF-8 text at byte {error.start}") from None
+        raise ConfigError("settings.not-utf8", f"{path} is not UTF-8 text at byte {error.start}") from None
 
 
 def parse(text: str, problems: list[Problem]) -> dict[str, Setting]:

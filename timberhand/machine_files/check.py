@@ -11,18 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from controller.config import ConfigError, Settings
+from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from controller.guard.envelope import SHIPPED, read_envelope
 from controller.guard.layout import GuardConfigError
 from controller.step import Controller
-from machine.draft.answers import AnswersError
 from machine.draft.envelope_text import envelope_kinematics
 from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.geometry.kinematics import Unreachable, solve
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from machine.profile import Profile
+from runtime.errors import ConfigError, InputRefused
 from sim.draft.consistency import truth_problems
 from sim.individual import beside, split
 
@@ -128,7 +128,7 @@ def _urdf(source: Path, profile: Profile) -> Iterator[Finding]:
 
     try:
         described = answers_from_urdf(path, {})["kinematics"]
-    except AnswersError as error:
+    except InputRefused as error:
         yield Finding(error.code, str(path), str(error))
         return
     for key, value in described.items():

@@ -9,11 +9,12 @@ from typing import Any, Final
 from can_dbc.dbc.codec import load
 from controller.crane.startup import TPDO1
 from host.exit_codes import CommandFailed, ExitCode
-from machine.draft.answers import Answers, AnswersError, answers_of
+from machine.draft.answers import Answers, answers_of
 from machine.draft.envelope_text import envelope_text
 from machine.draft.profile_text import profile_text
 from machine.draft.questions import answers_text
 from machine.loading.profile_file import ProfileError, load_profile
+from runtime.errors import InputRefused
 from sim.draft.truth import truth_and_urdf
 
 ENCODER_SENDER: Final = "ENC"
@@ -30,7 +31,7 @@ def make(raw: dict[str, Any], where: str, folder: Path) -> Path:
     """
     try:
         answers = answers_of(raw, where)
-    except AnswersError as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     texts = _texts(answers)
     present = [folder / name for name in texts if (folder / name).exists()]

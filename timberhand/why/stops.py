@@ -18,7 +18,7 @@ import msgspec
 from can_dbc.messages import tick_record
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.tick_record import RecordRefused, TickRecord
+from can_dbc.messages.tick_record import TickRecord
 from hil.replay.recording import files_of, manifest_of, messages
 from hil.replay.replay import recorded_ticks
 from host.exit_codes import CommandFailed, ExitCode
@@ -28,6 +28,7 @@ from recorder.recorder import STOPS_NAME, TICK
 from recorder.stop import TOPIC, Stop, report_of, stop_from
 from recorder.stop_files import files_in, parts_in
 from recorder.stop_recorder import AFTER_NS, BEFORE_NS
+from runtime.errors import InputRefused
 
 SERVICE_RECORDINGS: Final = Path("/var/lib/timberhand")
 SERVICE_STOPS: Final = SERVICE_RECORDINGS / STOPS_NAME
@@ -97,7 +98,7 @@ def stops_in_recording(files: list[Path]) -> Iterator[FoundStop]:
 def _decoded(data: bytes, file: Path) -> TickRecord:
     try:
         return tick_record.decode(data)
-    except RecordRefused as error:
+    except InputRefused as error:
         raise CommandFailed(
             "recording.other-version",
             f"{file.parent}: {error}; read it with the release that recorded it",

@@ -25,17 +25,13 @@ from rich.progress import TextColumn
 
 from autonomy.networks.graph import Network
 from autonomy.networks.torch_net import TorchNet, random_net
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 from training.common.progress import progress_bar
 
 Batch = tuple[torch.Tensor, ...]
 WARM_UP_SHARE: Final = 0.05
 """Share of the steps in which the learning rate rises."""
 LOSS_SMOOTHING: Final = 0.98
-
-
-class TrainingError(CodedError, ValueError):
-    """A training that cannot continue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +75,7 @@ def train(
         console: of the progress bar.
 
     Raises:
-        TrainingError: the loss is not finite.
+        InputRefused: the loss is not finite.
         KeyboardInterrupt: after Ctrl-C.
     """
     optimiser = torch.optim.AdamW(net.parameters(), schedule.learning_rate, weight_decay=schedule.weight_decay)
@@ -94,7 +90,7 @@ def train(
             for step in range(len(losses), schedule.steps):
                 value = _step(net, optimiser, batch(step), loss, schedule, step)
                 if not math.isfinite(value):
-                    raise TrainingError(
+                    raise InputRefused(
                         "training.diverged", f"{title}: the loss of step {step} is {value}; lower the learning rate"
                     )
                 losses.append(value)

@@ -10,10 +10,11 @@ from typing import Final
 import numpy as np
 from rich.console import Console
 
-from autonomy.networks.weights import WeightsError, load
+from autonomy.networks.weights import load
 from autonomy.perception.papers.box_detector import box_net
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import CHANNELS, unet
+from runtime.errors import InputRefused
 from training.common.average_precision import Matches, average_precision, box_overlaps, curve, mask_overlaps
 from training.common.loop import Schedule
 from training.common.model_card import Card, write
@@ -71,7 +72,7 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     Missing pictures are drawn first.  Returns the path of the card.
 
     Raises:
-        WeightsError: the initial weights are missing, damaged or of another network.
+        InputRefused: the initial weights are missing, damaged or of another network.
     """
     start = initial_arrays(plan.start, variant) if plan.start else None
     source = small_pictures(folder, plan.count, console)
@@ -89,11 +90,11 @@ def initial_arrays(weights: Path, variant: str) -> dict[str, np.ndarray]:
     colour channels.
 
     Raises:
-        WeightsError: as ``load``.
+        InputRefused: as ``load``.
     """
     try:
         return load(weights, unet(variant))[0]
-    except WeightsError:
+    except InputRefused:
         if variant != "depth":
             raise
     arrays = load(weights, unet("rgbd"))[0]
@@ -105,7 +106,7 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
     """Train the box detector in the role of paper B's in the same way.  Returns the path of the card.
 
     Raises:
-        WeightsError: as ``produce``.
+        InputRefused: as ``produce``.
     """
     start = load(plan.start, box_net())[0] if plan.start else None
     source = small_pictures(folder, plan.count, console)

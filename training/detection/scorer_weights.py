@@ -172,7 +172,7 @@ def produce(count: int, seed: int, folder: Path, out: Path, weights: Path | None
     shipped ones.  Returns the path of the last card.
 
     Raises:
-        WeightsError: the network's weights are missing or damaged.
+        InputRefused: the network's weights are missing or damaged.
     """
     seen = labelled_foregrounds(count, folder, weights, console)
     rng = np.random.default_rng(seed)

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from training.common.dataset_error import DatasetError
+from runtime.errors import InputRefused
 from training.grasp.rectangles import Rectangle, from_corners
 
 GUARD_COUNT: Final = 4
@@ -36,12 +36,12 @@ def load(folder: Path) -> tuple[Sample, ...]:
     """All samples in the order of their numbers.
 
     Raises:
-        DatasetError: there is no sample, or a file cannot be read.
+        InputRefused: there is no sample, or a file cannot be read.
     """
     files = sorted(folder.rglob("pcd*d.tiff")) if folder.is_dir() else []
     found = [s for path in files if (s := _sample(path)) is not None]
     if not found:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.no-samples",
             f"{folder}: no Cornell samples; the folder must hold pcdNNNNd.tiff and pcdNNNNcpos.txt",
         )
@@ -67,11 +67,11 @@ def depth(path: Path) -> np.ndarray:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             found = np.asarray(image, np.float32)
     except (OSError, UnidentifiedImageError, ValueError) as error:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.bad-depth", f"{path}: cannot be read as a TIFF of float32 metres ({error})"
         ) from None
     if found.ndim != 2:
-        raise DatasetError("dataset.bad-depth", f"{path}: not a depth picture but of shape {found.shape}")
+        raise InputRefused("dataset.bad-depth", f"{path}: not a depth picture but of shape {found.shape}")
     return np.where(np.isfinite(found) & (found > 0.0), found, np.float32(np.nan))
 
 
@@ -79,13 +79,13 @@ def rectangles(path: Path) -> tuple[Rectangle, ...]:
     """The rectangles of a label file, without those with a corner that is not a number.
 
     Raises:
-        DatasetError: a line is not two numbers, or the number of lines is not a multiple of four.
+        InputRefused: a line is not two numbers, or the number of lines is not a multiple of four.
     """
     try:
         lines = [[float(x) for x in line.split()] for line in path.read_text().splitlines() if line.strip()]
         corners = np.array(lines, float).reshape(-1, 4, 2)
     except (ValueError, OSError) as error:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.bad-rectangles", f"{path}: must hold four lines 'x y' for every rectangle ({error})"
         ) from None
     made = (from_corners(c) for c in corners if np.isfinite(c).all())

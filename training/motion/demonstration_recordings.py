@@ -7,13 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from autonomy.motion.demonstration import (
-    JointTrack,
-    RecordingRefused,
-    joint_track,
-    read_demonstrations,
-    segment_motions,
-)
+from autonomy.motion.demonstration import JointTrack, joint_track, read_demonstrations, segment_motions
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.trace.candump import read_trace
@@ -22,7 +16,8 @@ from hil.replay.recording import files_of, manifest_of
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile, encoders
-from recorder.mcap_scan import NotMcap, Stored, scan
+from recorder.mcap_scan import Stored, scan
+from runtime.errors import InputRefused
 
 _RAW: Final = struct.Struct("<IB3x8s")
 DEFAULT_PROFILE: Final = "aoro_fc8"
@@ -48,7 +43,7 @@ def motions_in(log: Path, profile: str | None = None) -> tuple[Profile, tuple[Jo
         else:
             machine, frames = _frames(log, profile)
             motions = segment_motions(machine, joint_track(machine, load_database("crane"), frames))
-    except (RecordingRefused, ProfileError) as error:
+    except (InputRefused, ProfileError) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if not motions:
         raise CommandFailed(
@@ -97,5 +92,5 @@ def _raw(files: Sequence[Path], topic: str) -> Iterator[Frame]:
                 if isinstance(record, Stored) and len(record.data) >= _RAW.size:
                     key, length, data = _RAW.unpack_from(record.data)
                     yield Frame(record.publish_ns, key, data[:length])
-    except NotMcap as error:
+    except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error

@@ -20,12 +20,12 @@ import numpy as np
 
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
+from runtime.errors import InputRefused
 from sim.camera.scene import Ground, LogPose
 from sim.geometry.shape import Vector
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import KINDS
 from sim.scenes.settled_logs import settle_logs
-from training.common.dataset_error import DatasetError
 
 FORMAT_VERSION: Final = 1  # incremented when the same seed would give other piles
 CHUNK: Final = 64
@@ -108,7 +108,7 @@ def settle(machine: str, number: int) -> Pile:
     """One pile by its number; a draw without room or rest is repeated.
 
     Raises:
-        DatasetError: MAX_DRAWS draws in a row failed.
+        InputRefused: MAX_DRAWS draws in a row failed.
     """
     profile = profile_of(machine)
     rng = random.Random(f"pile {machine} {number}")
@@ -130,7 +130,7 @@ def settle(machine: str, number: int) -> Pile:
             last = error
             continue
         return Pile(machine, number, kind, ground, terrain_seed if ground == "rough" else 0, datum, poses)
-    raise DatasetError(
+    raise InputRefused(
         "dataset.no-rest", f"pile {number} of {machine} did not come to rest in {MAX_DRAWS} draws; last reason: {last}"
     )
 
@@ -141,7 +141,7 @@ def chunk(machine: str, index: int, folder: Path | None = None, tick: Callable[[
     ``tick`` is called after each pile that is settled.
 
     Raises:
-        DatasetError: the file does not hold such piles, or a pile does not come to rest.
+        InputRefused: the file does not hold such piles, or a pile does not come to rest.
     """
     path = (folder or cache_folder()) / f"{machine}-{index:07d}-e{FORMAT_VERSION}.npz"
     if path.exists():
@@ -197,6 +197,6 @@ def _read(path: Path, machine: str, index: int) -> list[Pile]:
             out.append(Pile(machine, index * CHUNK + i, str(data["kinds"][i]), *ground, logs))
         return out
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.bad-piles", f"{path} does not hold settled piles ({error}); delete it to have them settled again"
         ) from None

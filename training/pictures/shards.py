@@ -20,7 +20,7 @@ import numpy as np
 
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from machine.geometry.optics import Intrinsics
-from training.common.dataset_error import DatasetError
+from runtime.errors import InputRefused
 from training.pictures.drawing import MAX_LOGS, draw
 from training.pictures.labels import ID, ROW, Labelled
 from training.pictures.piles import HELD_OUT, MACHINES, Pile, chunk
@@ -51,7 +51,7 @@ def shard(folder: Path, number: int, size_px: int = 304, tick: Callable[[], None
     Shards from HELD_OUT on use piles that no training shard uses.
 
     Raises:
-        DatasetError: the shard is damaged.
+        InputRefused: the shard is damaged.
     """
     path = folder / f"logs-{size_px}-{number:07d}-e{FORMAT_VERSION}"
     if not path.is_dir():
@@ -59,11 +59,11 @@ def shard(folder: Path, number: int, size_px: int = 304, tick: Callable[[], None
     try:
         arrays = [np.load(path / f"{name}.npy", mmap_mode="r") for name in Shard.__dataclass_fields__]
     except (OSError, EOFError, ValueError) as error:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.bad-shard", f"{path} is not a shard of pictures ({error}); delete it to have it drawn again"
         ) from None
     if arrays[0].shape != (SHARD, size_px, size_px, 3):
-        raise DatasetError(
+        raise InputRefused(
             "dataset.bad-shard",
             f"{path} holds pictures of shape {arrays[0].shape}; delete it to have it drawn again",
         )

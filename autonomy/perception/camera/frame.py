@@ -11,11 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from machine.geometry.optics import Intrinsics
-from runtime.errors import CodedError
-
-
-class RgbdFrameError(CodedError, ValueError):
-    """A frame that was refused as a whole."""
+from runtime.errors import InputRefused
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,54 +64,52 @@ def check_frame(frame: RgbdFrame) -> None:
     """Check that sizes agree, that the intrinsics are a camera's, and that some depth is known.
 
     Raises:
-        RgbdFrameError: one of these does not hold.
+        InputRefused: one of these does not hold.
     """
     name, pin = f"frame of camera {frame.camera!r}", frame.intrinsics
     rgb, depth = np.asarray(frame.rgb), np.asarray(frame.depth_m)
     if depth.ndim != 2 or not depth.size:
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.no-depth-array",
             f"{name}: depth has shape {depth.shape} instead of (height, width); check the source of the frame",
         )
     if rgb.shape != (*depth.shape, 3) or rgb.dtype != np.uint8:
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.bad-colour",
             f"{name}: colour is {rgb.dtype} of shape {rgb.shape}, but depth of shape {depth.shape} "
             f"needs uint8 of shape {(*depth.shape, 3)}; register depth to the colour picture",
         )
     if depth.dtype.kind != "f":
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.bad-depth-type",
             f"{name}: depth is {depth.dtype} instead of floating-point metres with NaN for unknown; convert it",
         )
     if (pin.height_px, pin.width_px) != depth.shape:
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.bad-size",
             f"{name} is {depth.shape[1]} x {depth.shape[0]} px, but its intrinsics are for {pin.width_px} x "
             f"{pin.height_px} px; take the intrinsics from the source of the frame",
         )
     if not all(map(math.isfinite, (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px))) or min(pin.fx_px, pin.fy_px) <= 0.0:
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.bad-intrinsics",
             f"{name}: focal lengths {pin.fx_px:g}, {pin.fy_px:g} px and principal point are not a pinhole camera's",
         )
     if not (0.5 < pin.fx_px / pin.fy_px < 2.0 and 0.1 < pin.fx_px / pin.width_px < 20.0):
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.bad-intrinsics",
             f"{name}: focal lengths {pin.fx_px:g}, {pin.fy_px:g} px do not fit the size of the picture",
         )
     if not (-0.5 <= pin.cx_px <= pin.width_px - 0.5 and -0.5 <= pin.cy_px <= pin.height_px - 0.5):
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.bad-intrinsics",
             f"{name}: principal point ({pin.cx_px:g}, {pin.cy_px:g}) px is outside the picture",
         )
     nearest = float(np.fmin.reduce(depth, axis=None))
     if math.isnan(nearest) or nearest == math.inf:
-        raise RgbdFrameError(
+        raise InputRefused(
             "frame.depth-unknown",
             f"{name} has no known depth; check that the lens is not covered and the scene not nearer than the range",
         )
     if nearest <= 0.0:
-        raise RgbdFrameError(
-            "frame.depth-not-positive", f"{name} has depth of 0 m or less; mark unknown depth with NaN"
-        )
+        raise InputRefused("frame.depth-not-positive", f"{name} has depth of 0 m or less; mark unknown depth with NaN")

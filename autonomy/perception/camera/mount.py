@@ -20,20 +20,16 @@ from machine.geometry.kinematics import chain_points
 from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix
 from machine.joints import Joint
 from machine.profile import Camera, Profile
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 UNIT_VECTORS: Final = np.eye(3)
-
-
-class CameraMountError(CodedError, ValueError):
-    """A camera whose pose is unknown, or a survey that does not determine it."""
 
 
 def optical_pose(profile: Profile, camera: Camera, q: Sequence[float], articulation_rad: float = 0.0) -> Pose:
     """The optical frame in the crane's base frame; ``q`` are joint positions in ``Joint`` order [rad, m].
 
     Raises:
-        CameraMountError: the camera's link is none of those above.
+        InputRefused: the camera's link is none of those above.
     """
     link = link_pose(profile, camera.link, q, articulation_rad)
     turn = link.rotation @ rpy_matrix(camera.rpy_rad) @ BODY_FROM_OPTICAL
@@ -44,7 +40,7 @@ def link_pose(profile: Profile, name: str, q: Sequence[float], articulation_rad:
     """The frame of a link that may carry a camera, in the crane's base frame.
 
     Raises:
-        CameraMountError: the link is none of those above.
+        InputRefused: the link is none of those above.
     """
     kin, carrier = profile.kinematics, profile.carrier
     if name == "base":
@@ -63,7 +59,7 @@ def link_pose(profile: Profile, name: str, q: Sequence[float], articulation_rad:
         case "stick":
             turn = slew @ rpy_matrix((q[Joint.LIFT] + q[Joint.TILT], 0.0, 0.0))
             return Pose(np.array(points.stick_pin), turn)
-    raise CameraMountError(
+    raise InputRefused(
         "camera-mount.unknown-link",
         f"the pose of link {name!r} is unknown; mount the camera on base, boom or stick"
         + (", rear or front" if carrier is not None else ""),

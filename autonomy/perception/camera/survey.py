@@ -10,10 +10,10 @@ from msgspec.structs import replace
 from scipy.optimize import least_squares
 
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.camera.mount import CameraMountError
 from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics, intrinsics, rpy_matrix
 from machine.loading.ranges import DEPTH_SCALE_RANGE
 from machine.profile import Camera
+from runtime.errors import InputRefused
 
 MIN_TARGETS: Final = 6
 MOUNT_PRIOR_SIGMA: Final = (0.03, 0.03, 0.03, 0.035, 0.035, 0.035)
@@ -45,10 +45,10 @@ def surveyed(
         pixel_sigma_px: standard deviation of ``pixels_px``.
 
     Raises:
-        CameraMountError: too few targets, or no mount near the profile's explains the pixels or depths.
+        InputRefused: too few targets, or no mount near the profile's explains the pixels or depths.
     """
     if len(targets_m) < MIN_TARGETS:
-        raise CameraMountError(
+        raise InputRefused(
             "camera-mount.too-few-targets",
             f"{len(targets_m)} targets do not determine a mount; survey at least {MIN_TARGETS}",
         )
@@ -72,7 +72,7 @@ def surveyed(
     rest = solution.fun[: 2 * len(targets_m)]
     off_px = math.sqrt(float(np.mean(rest * rest))) * pixel_sigma_px
     if not off_px < MAX_RESIDUAL_SIGMAS * pixel_sigma_px:
-        raise CameraMountError(
+        raise InputRefused(
             "camera-mount.bad-targets",
             f"the targets are {off_px:.1f} px from where any mount near the profile's puts them; "
             "check the order of the targets and their surveyed positions",
@@ -94,7 +94,7 @@ def _depth_scale(true_m: np.ndarray, depths_m: np.ndarray) -> float:
     scale = float(np.sum(weights * depths_m[known] / true_m[known]) / np.sum(weights))
     low, high, _ = DEPTH_SCALE_RANGE
     if not low < scale < high:
-        raise CameraMountError(
+        raise InputRefused(
             "camera-mount.bad-depth-scale",
             f"measured depth is {scale:.2f} times the surveyed depth; correct the camera's baseline or focal length",
         )

@@ -10,11 +10,12 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.ndimage import label
 
-from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, content_window
+from autonomy.perception.camera.frame import RgbdFrame, content_window
 from autonomy.perception.fitting.contour import Contour, StereoSensor, log_contour
 from autonomy.perception.fitting.cylinder import MIN_PIXELS, Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit, fit_cylinder
 from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
 
 # -- Plausibility of fits, and fits that are fragments of one log.
 #
@@ -208,7 +209,7 @@ def measure(
     """Fits of all masks, with fragments of one log merged, and the rejected masks.
 
     Raises:
-        RgbdFrameError: a mask is not bool or not of the frame's size.
+        InputRefused: a mask is not bool or not of the frame's size.
     """
     scene = _MaskedFrame.of(frame, masks, sensor)
     initial = {i: scene.initial(i) for i in range(len(masks))}
@@ -267,7 +268,7 @@ class _MaskedFrame:
         top, bottom, left, right = content_window(frame.rgb)
         for i, mask in enumerate(masks):
             if mask.shape != labels.shape or mask.dtype != bool:
-                raise RgbdFrameError(
+                raise InputRefused(
                     "frame.bad-mask",
                     f"mask {i} is {mask.dtype} of shape {mask.shape} instead of bool of the frame's {labels.shape}",
                 )

@@ -24,15 +24,11 @@ import msgspec
 from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
 from autonomy.perception.standpoint import NUMBERS, Standpoint, from_numbers
 from machine.joints import N_JOINTS
-from runtime.errors import CodedError
+from runtime.errors import InputRefused
 
 _ROWS: Final = 7
 _DIAGONAL: Final = tuple(TRIANGLE - k * (k + 1) // 2 for k in range(_ROWS, 0, -1))
 _MIN_AXIS_NORM: Final = 1e-6
-
-
-class LogListError(CodedError, ValueError):
-    """A request or a log list that was refused as a whole."""
 
 
 class _Log(msgspec.Struct):
@@ -85,7 +81,7 @@ def decode_request(data: bytes) -> LogRequest:
     """The request of a datagram; all joints are NaN when it holds none.
 
     Raises:
-        LogListError: the datagram is not a request for logs.
+        InputRefused: the datagram is not a request for logs.
     """
     try:
         request = _REQUESTS.decode(data)
@@ -93,16 +89,16 @@ def decode_request(data: bytes) -> LogRequest:
         numbers = tuple(float(word) for word in request.standpoint.split())
         at_ns = int(request.at_ns or "0")
     except (msgspec.DecodeError, ValueError) as error:
-        raise LogListError("log-list.not-a-request", f"the datagram is not a request for logs: {error}") from None
+        raise InputRefused("log-list.not-a-request", f"the datagram is not a request for logs: {error}") from None
     if request.op != "logs" or len(q) != N_JOINTS:
-        raise LogListError(
+        raise InputRefused(
             "log-list.not-a-request",
             f"the datagram is not a request for logs: op {request.op!r} with {len(q)} joints instead of {N_JOINTS}",
         )
     if not numbers:
         return LogRequest(q)
     if len(numbers) != NUMBERS or not all(map(math.isfinite, numbers)):
-        raise LogListError(
+        raise InputRefused(
             "log-list.bad-standpoint",
             f"the request's standpoint is not {NUMBERS} finite numbers; its planner is of another release",
         )
@@ -124,41 +120,41 @@ def decode_logs(data: bytes, in_plane: bool = False) -> tuple[LogObservation, ..
     """The log list of a reply, axes normalised; in the crane's base frame or ``in_plane``.
 
     Raises:
-        LogListError: the reply is not a log list, is in the other frame, a log in it is impossible, or it is an error.
+        InputRefused: the reply is not a log list, is in the other frame, a log in it is impossible, or it is an error.
     """
     try:
         reply = _REPLIES.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise LogListError("log-list.not-a-list", f"the detector's reply is not a log list: {error}") from None
+        raise InputRefused("log-list.not-a-list", f"the detector's reply is not a log list: {error}") from None
     rows = reply
     if isinstance(reply, _Answer):
         if reply.error is not None or reply.plane is None:
-            raise LogListError("log-list.detector-error", reply.error or "the detector's reply is empty")
+            raise InputRefused("log-list.detector-error", reply.error or "the detector's reply is empty")
         rows = reply.plane
     if isinstance(reply, _Answer) != in_plane:
         wanted, camera = ("plane", "looks ahead of") if in_plane else ("crane's base frame", "stands still with")
-        raise LogListError(
+        raise InputRefused(
             "log-list.other-frame",
             f"the detector's list is not in the {wanted}; start a detector whose camera {camera} the machine",
         )
     assert isinstance(rows, list)
     logs = tuple(_checked(index if log.id is None else log.id, log) for index, log in enumerate(rows))
     if len({log.id for log in logs}) < len(logs):
-        raise LogListError("log-list.duplicate-id", "two logs of the detector's reply have the same number")
+        raise InputRefused("log-list.duplicate-id", "two logs of the detector's reply have the same number")
     return logs
 
 
 def _checked(number: int, log: _Log) -> LogObservation:
     norm = math.hypot(*log.axis)
     if not all(map(math.isfinite, (*log.position_m, norm, log.length_m, log.diameter_m))) or norm < _MIN_AXIS_NORM:
-        raise LogListError("log-list.bad-value", f"log {number} has a value that is not finite or an axis of length 0")
+        raise InputRefused("log-list.bad-value", f"log {number} has a value that is not finite or an axis of length 0")
     if not 0.0 < log.diameter_m < log.length_m:
-        raise LogListError(
+        raise InputRefused(
             "log-list.bad-size", f"log {number} is {log.length_m:g} m long and {log.diameter_m:g} m wide: not a log"
         )
     c = log.covariance
     if c is not None and (len(c) != TRIANGLE or not all(map(math.isfinite, c)) or min(c[i] for i in _DIAGONAL) < 0.0):
-        raise LogListError(
+        raise InputRefused(
             "log-list.bad-covariance",
             f"log {number} has an invalid covariance; it must be {TRIANGLE} finite numbers without a negative variance",
         )

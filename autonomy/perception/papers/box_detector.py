@@ -12,9 +12,10 @@ from typing import Final
 import numpy as np
 from scipy import ndimage
 
-from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, NetworkError, Relu, Resize
+from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
+from runtime.errors import InputRefused
 
 SIZE_PX: Final = 608
 STRIDE: Final = 8
@@ -54,7 +55,7 @@ class BoxDetector:
     """The detector with its weights (default: the shipped ones), on one thread.
 
     Raises:
-        WeightsError: the weights are missing, damaged or of another network.
+        InputRefused: the weights are missing, damaged or of another network.
     """
 
     def __init__(self, weights: Path | None = None, precision: str = "f32") -> None:
@@ -67,10 +68,10 @@ class BoxDetector:
         descending.
 
         Raises:
-            NetworkError: the picture has another size or type.
+            InputRefused: the picture has another size or type.
         """
         if rgb.shape != (SIZE_PX, SIZE_PX, 3) or rgb.dtype != np.uint8:
-            raise NetworkError(
+            raise InputRefused(
                 "network.bad-picture",
                 f"the box detector needs letterboxed pictures of {SIZE_PX} x {SIZE_PX} px, uint8, not {rgb.dtype} of "
                 f"shape {rgb.shape}",

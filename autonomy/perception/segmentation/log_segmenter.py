@@ -66,7 +66,7 @@ class LogSegmenter:
         use_window: whether a window around the wood is segmented at a finer scale.
 
     Raises:
-        WeightsError: the weights are missing, damaged or of another network.
+        InputRefused: the weights are missing, damaged or of another network.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class LogSegmenter:
         """The logs of a frame in descending order of score; empty when there is none.
 
         Raises:
-            RgbdFrameError: the frame is invalid.
+            InputRefused: the frame is invalid.
         """
         check_frame(frame)
         return self.segment_picture(frame.rgb, frame.depth_m, frame.intrinsics)

@@ -11,9 +11,10 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, NetworkError, Relu, Resize
+from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
 
 MAPS: Final = ("mask", "centre", "offset_u", "offset_v", "cos2", "sin2", "ends", "edge")
 """Mask, centre, ends and edge are logits; the offset to the log's centre is in units of OFFSET_PX of the input; the
@@ -33,10 +34,10 @@ def unet(variant: str) -> Network:
     """The network of a variant in CHANNELS; its only output ``maps`` has a channel for each of MAPS.
 
     Raises:
-        NetworkError: the variant is unknown.
+        InputRefused: the variant is unknown.
     """
     if variant not in CHANNELS:
-        raise NetworkError(
+        raise InputRefused(
             "network.unknown-variant", f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}"
         )
     layers: list[Layer] = []

@@ -77,7 +77,7 @@ def load_scorers(folder: Path = SHIPPED) -> SegmentScorers:
     """From ``segment_merging.safetensors`` and ``segment_quality.safetensors`` of a folder.
 
     Raises:
-        WeightsError: the files are missing, damaged or of other networks.
+        InputRefused: the files are missing, damaged or of other networks.
     """
     networks = (MERGE_NETWORK, QUALITY_NETWORK)
     merge, quality = (Scorer.of(load(folder / f"{network.name}.safetensors", network)[0]) for network in networks)

@@ -5,11 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 from autonomy.perception.camera.frame import RgbdFrame
-from runtime.errors import CodedError
-
-
-class SourceError(CodedError, ValueError):
-    """A source that cannot be opened or read."""
 
 
 class CameraSource(Protocol):
@@ -19,7 +14,7 @@ class CameraSource(Protocol):
         """The newest frame; None when there is none yet, none in time, or none left.
 
         Raises:
-            SourceError: the source cannot deliver frames.
+            LinkError: the source cannot deliver frames.
         """
         ...
 

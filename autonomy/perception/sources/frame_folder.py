@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image
 
 from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.sources.camera_source import SourceError
 from machine.geometry.optics import Intrinsics
+from runtime.errors import LinkError
 
 INDEX: Final = "camera.json"
 MM_PER_M: Final = 1000.0
@@ -39,7 +39,7 @@ class FrameFolder:
     """A folder of frames as a source: every call returns the next frame, None after the last.
 
     Raises:
-        SourceError: the folder has no valid index.
+        LinkError: the folder has no valid index.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,12 +48,12 @@ class FrameFolder:
         try:
             self.index = msgspec.json.decode(path.read_bytes(), type=Index)
         except OSError as error:
-            raise SourceError(
+            raise LinkError(
                 "camera-source.no-frame-folder",
                 f"{folder} is not a folder of frames: {INDEX} cannot be read ({error.strerror or error})",
             ) from None
         except msgspec.DecodeError as error:
-            raise SourceError(
+            raise LinkError(
                 "camera-source.bad-index", f"{path}: {error}; correct the file or write the folder again"
             ) from None
 
@@ -64,7 +64,7 @@ class FrameFolder:
         """The next frame.
 
         Raises:
-            SourceError: its pictures are missing, unreadable or of another size.
+            LinkError: its pictures are missing, unreadable or of another size.
         """
         if self._next == len(self):
             return None
@@ -80,11 +80,11 @@ class FrameFolder:
                 rgb = np.asarray(picture.convert("RGB"))
             depth_m = self._depth(stem)
         except (OSError, ValueError) as error:
-            raise SourceError(
+            raise LinkError(
                 "camera-source.bad-frame", f"frame {number} of {self._folder} cannot be read: {error}"
             ) from None
         if rgb.shape[:2] != (i.height_px, i.width_px) or depth_m.shape != rgb.shape[:2]:
-            raise SourceError(
+            raise LinkError(
                 "camera-source.bad-frame-size",
                 f"frame {number} of {self._folder} is {rgb.shape[1]} x {rgb.shape[0]} px with depth of shape "
                 f"{depth_m.shape}, but {INDEX} states {i.width_px} x {i.height_px} px",
@@ -108,13 +108,13 @@ class FrameFolderWriter:
     """Writes a folder of frames; ``close`` writes its index.
 
     Raises:
-        SourceError: the folder already holds frames, or a frame is of another camera than the first.
+        LinkError: the folder already holds frames, or a frame is of another camera than the first.
     """
 
     def __init__(self, folder: Path, depth: Literal["png", "npy"] = "png") -> None:
         self._folder, self._depth = Path(folder), depth
         if (self._folder / INDEX).exists():
-            raise SourceError("camera-source.folder-in-use", f"{folder} already holds frames; choose another folder")
+            raise LinkError("camera-source.folder-in-use", f"{folder} already holds frames; choose another folder")
         self._folder.mkdir(parents=True, exist_ok=True)
         self._first: RgbdFrame | None = None
         self._stamps_ns: list[int] = []
@@ -123,7 +123,7 @@ class FrameFolderWriter:
         """Write one frame."""
         first = self._first or frame
         if (frame.camera, frame.intrinsics) != (first.camera, first.intrinsics):
-            raise SourceError(
+            raise LinkError(
                 "camera-source.other-camera",
                 f"a frame of camera {frame.camera!r} does not belong in a folder of camera {first.camera!r} or has "
                 "other intrinsics; write it to another folder",

@@ -14,8 +14,9 @@ from typing import Final
 import numpy as np
 
 from autonomy.perception.camera.frame import RgbdFrame
-from can_dbc.messages.rgbd import HEADER_BYTES, MM_PER_M, RgbdError, RgbdMessage, decode, decode_header, encode_request
+from can_dbc.messages.rgbd import HEADER_BYTES, MM_PER_M, RgbdMessage, decode, decode_header, encode_request
 from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
 
 MAX_RECEIVE_BYTES: Final = 1 << 20
 
@@ -40,10 +41,10 @@ class StreamCamera:
         end_s = time.monotonic() + self._timeout_s
         try:
             frame = self._receive(end_s)
-        except (OSError, RgbdError) as error:
+        except (OSError, InputRefused) as error:
             self.close()
             self.problem = f"no frame of camera {self._camera} from {self._address}: {error or type(error).__name__}"
-            self.problem_code = error.code if isinstance(error, RgbdError) else "camera-source.connection"
+            self.problem_code = error.code if isinstance(error, InputRefused) else "camera-source.connection"
             return None
         self.problem = self.problem_code = ""
         if frame is None:
@@ -95,7 +96,7 @@ class StreamCamera:
         else:
             host, _, port = self._address.rpartition(":")
             if not host or not port.isdigit():
-                raise RgbdError("rgbd.address", f"'{self._address}' is neither HOST:PORT nor unix:PATH")
+                raise InputRefused("rgbd.address", f"'{self._address}' is neither HOST:PORT nor unix:PATH")
             sock, target = socket.socket(socket.AF_INET, socket.SOCK_STREAM), (host, int(port))
         sock.settimeout(_left(end_s))
         try:

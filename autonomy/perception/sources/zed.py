@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.sources.camera_source import SourceError
 from machine.geometry.optics import Intrinsics
+from runtime.errors import LinkError
 
 
 class ZedCamera:
@@ -19,7 +19,7 @@ class ZedCamera:
     disconnected is opened again by the next call of `frame` at which it is there.
 
     Raises:
-        SourceError: the SDK is missing, or the camera cannot be opened.
+        LinkError: the SDK is missing, or the camera cannot be opened.
     """
 
     def __init__(self, name: str, resolution: str = "HD720", rate_hz: int = 15, sdk: Any = None) -> None:
@@ -29,7 +29,7 @@ class ZedCamera:
         try:
             settings.camera_resolution = getattr(sl.RESOLUTION, resolution)
         except AttributeError:
-            raise SourceError(
+            raise LinkError(
                 "camera-source.no-resolution", f"camera {name}: the ZED SDK has no resolution {resolution!r}; use HD720"
             ) from None
         settings.camera_fps = rate_hz
@@ -42,7 +42,7 @@ class ZedCamera:
     def _open(self) -> None:
         state = self._camera.open(self._settings)
         if state != self._sl.ERROR_CODE.SUCCESS:
-            raise SourceError(
+            raise LinkError(
                 "camera-source.not-opened",
                 f"camera {self._name} cannot be opened: {state}; check its cable and that no other process uses it",
             )
@@ -55,7 +55,7 @@ class ZedCamera:
         """The next frame; None when the camera delivered none in time.
 
         Raises:
-            SourceError: the camera is disconnected, or not back yet.
+            LinkError: the camera is disconnected, or not back yet.
         """
         sl, camera = self._sl, self._camera
         if self._lost:
@@ -66,7 +66,7 @@ class ZedCamera:
                 return None
             self._lost = True
             camera.close()
-            raise SourceError(
+            raise LinkError(
                 "camera-source.disconnected", f"camera {self._name} is disconnected: {state}; check its cable"
             )
         camera.retrieve_image(self._picture, sl.VIEW.LEFT)
@@ -87,6 +87,6 @@ def _sdk() -> Any:
     try:
         return import_module("pyzed.sl")
     except ImportError:
-        raise SourceError(
+        raise LinkError(
             "camera-source.no-sdk", "a ZED camera needs the ZED SDK with its Python API (pyzed); install both"
         ) from None

@@ -12,15 +12,12 @@ import pytest
 
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.driving_requests import DrivingRequests
-from autonomy.perception.log_list.datagrams import (
-    LogListError,
-    decode_logs,
-    encode_request,
-)
+from autonomy.perception.log_list.datagrams import decode_logs, encode_request
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.shown_picture import NewestPicture
 from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
 from can_dbc.messages.picture import decode_picture, encode_picture_request
+from runtime.errors import InputRefused
 from tests.codes import coded
 
 Q = (0.0, 1.2, -2.4, 0.1, math.nan)
@@ -114,7 +111,7 @@ def test_a_standpoint_that_is_too_old_is_told_once(served: Served) -> None:
 def test_a_nonsense_request_is_answered_with_an_error(served: Served) -> None:
     served.planner.send(b"{}")
     served.requests.answer_waiting()
-    with pytest.raises(LogListError, check=coded("log-list.detector-error")):
+    with pytest.raises(InputRefused, check=coded("log-list.detector-error")):
         decode_logs(served.planner.recv(4096))
 
 

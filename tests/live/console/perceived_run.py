@@ -18,7 +18,7 @@ from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
-from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from autonomy.perception.log_list.datagrams import decode_logs, encode_request
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
@@ -29,6 +29,7 @@ from hil.harness.processes import free_udp_ports
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
+from runtime.errors import InputRefused
 from tests.live.console.served_page import served
 
 PROFILE = load_profile("palms_471")
@@ -155,7 +156,7 @@ def _play(run: PerceivedRun, page: tuple[str, int]) -> None:
                 if n % 5 == 0:
                     planner.send(encode_request(run.q))
                 run.logs = decode_logs(planner.recv(65536)) or run.logs
-            except (BlockingIOError, ConnectionRefusedError, LogListError):
+            except (BlockingIOError, ConnectionRefusedError, InputRefused):
                 continue
 
 

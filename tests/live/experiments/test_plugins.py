@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 from autonomy.grasp.planners import GRASP_PLANNERS
 from autonomy.perception.camera.frame import RgbdFrame
 from experiments.common import plugins
-from experiments.common.errors import ExperimentError
 from experiments.common.plugins import SeenLog
 from experiments.common.registry import Options
 from experiments.grasp_configs import pose_sources
 from experiments.grasp_configs.experiment import compare, jobs_of
 from host.exit_codes import ExitCode
+from runtime.errors import InputRefused
 from tests.codes import coded
 from timberhand.cli import app
 
@@ -50,17 +50,17 @@ def installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_or_broken_method_is_refused_with_what_is_installed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ExperimentError, match="pca", check=coded("plugin.unknown")):
+    with pytest.raises(InputRefused, match="pca", check=coded("plugin.unknown")):
         plugins.load(GRASP_PLANNERS, "pac")
     broken = tmp_path / "broken-1.dist-info"
     broken.mkdir()
     (broken / "METADATA").write_text("Name: broken\nVersion: 1\n")
     (broken / "entry_points.txt").write_text(f"[{GRASP_PLANNERS}]\nbroken = not_there:Planner\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(ExperimentError, check=coded("plugin.unusable")):
+    with pytest.raises(InputRefused, check=coded("plugin.unusable")):
         plugins.load(GRASP_PLANNERS, "broken")
     options = Options(1, "nominal", "palms_471", tmp_path / "out", planner="pca", docs=tmp_path)
-    with pytest.raises(ExperimentError, check=coded("plugin.no-page")):
+    with pytest.raises(InputRefused, check=coded("plugin.no-page")):
         compare(options, Console(quiet=True))
     refused = CliRunner().invoke(app, ["experiment", "navigation", "--quick", "--planner", "pca"])
     assert refused.exit_code == ExitCode.USAGE

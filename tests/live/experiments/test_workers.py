@@ -20,10 +20,10 @@ from rich.console import Console
 from experiments.common import pool, ray_workers
 from experiments.common.campaign import line_of
 from experiments.common.checkpoint import Checkpoint
-from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.workers import Trial, Workers
 from experiments.plant.experiment import perform
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.experiments.mortal_trials import (
     always_killed,
@@ -63,7 +63,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def test_workers_that_are_killed_again_and_again_end_the_run_with_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, check=coded("experiment.worker-killed")):
+    with pytest.raises(InputRefused, check=coded("experiment.worker-killed")):
         table(tmp_path / "trials.jsonl", always_killed, Workers(2), square_jobs(3))
 
 
@@ -105,7 +105,7 @@ def test_every_trial_comes_with_its_cost_and_a_kept_one_with_that_of_then(tmp_pa
 
 def test_without_ray_the_sentence_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ExperimentError, check=coded("experiment.ray-missing")):
+    with pytest.raises(InputRefused, check=coded("experiment.ray-missing")):
         table(tmp_path / "trials.jsonl", slow_square, Workers(ray="auto"), square_jobs(1))
 
 
@@ -171,5 +171,5 @@ def test_a_cluster_of_two_nodes_gives_the_same_bytes_with_a_worker_killed_on_the
     assert (tmp_path / "marker").exists() and there == alone
     met = ray_workers.completed({name: partial(meet, tmp_path, name) for name in "ab"}, cluster.address, lambda: "ours")
     assert len({node for _, node in met}) == 2, "each node works, at the same time"
-    with pytest.raises(ExperimentError, check=coded("experiment.node-differs")):
+    with pytest.raises(InputRefused, check=coded("experiment.node-differs")):
         list(ray_workers.completed({"a": partial(slow_square, square_jobs(1)[0])}, cluster.address, process_id))

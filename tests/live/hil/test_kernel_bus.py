@@ -11,9 +11,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from can_dbc.bus.base import DRAIN_LIMIT, ERR_BUSOFF, ERR_RESTARTED, BusError, BusState
+from can_dbc.bus.base import DRAIN_LIMIT, ERR_BUSOFF, ERR_RESTARTED, BusState
 from can_dbc.bus.factory import open_bus
 from can_dbc.frame import ERROR, Frame
+from runtime.errors import LinkError
 from tests.codes import coded
 from tests.live.hil.bus_backends import Backend, counted_receives, kernel_interface
 
@@ -76,7 +77,7 @@ def test_a_link_that_was_down_for_a_moment_is_detected(link: str) -> None:
 
 def test_a_link_that_is_down_is_not_opened(link: str) -> None:
     ip("link", "set", link, "down")
-    with pytest.raises(BusError, check=coded("bus.interface")):
+    with pytest.raises(LinkError, check=coded("bus.interface")):
         open_bus(f"socketcan:{link}")
 
 

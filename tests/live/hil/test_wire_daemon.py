@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.base import BusState
 from can_dbc.bus.factory import kernel_has_can, open_bus
 from can_dbc.bus.wire_client import CONTROL, control, wire_directory
 from can_dbc.bus.wire_records import RECORD
@@ -24,6 +24,7 @@ from can_dbc.frame import ERROR, EXTENDED, Frame
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
 from hil.wire.stuffing import frame_bits
+from runtime.errors import LinkError
 from tests.codes import coded
 
 TIMEOUT_S = 5.0
@@ -111,13 +112,13 @@ def test_malformed_arguments_are_a_usage_error(arguments: list[str], tmp_path: P
 
 
 def test_a_launch_that_fails_reports_the_reason(daemon: subprocess.Popen[str]) -> None:
-    with pytest.raises(BusError, match=r"\[wire.cannot-listen\]"), wire_daemon({"crane0": 1_000_000}):
+    with pytest.raises(LinkError, match=r"\[wire.cannot-listen\]"), wire_daemon({"crane0": 1_000_000}):
         pass
 
 
 def test_a_directory_with_a_path_too_long_for_a_socket_is_refused(tmp_path: Path) -> None:
     deep = tmp_path / ("d" * 110)
-    with pytest.raises(BusError, match=r"\[wire.path-too-long\]"), wire_daemon({"a": 1_000_000}, deep):
+    with pytest.raises(LinkError, match=r"\[wire.path-too-long\]"), wire_daemon({"a": 1_000_000}, deep):
         pass
 
 
@@ -157,7 +158,7 @@ def test_faults_act_and_heal_by_control_messages(daemon: subprocess.Popen[str]) 
 def test_a_malformed_request_is_refused_without_side_effects(
     request_: dict[str, object], daemon: subprocess.Popen[str]
 ) -> None:
-    with pytest.raises(BusError, check=coded("wire.refused")):
+    with pytest.raises(LinkError, check=coded("wire.refused")):
         control("crane0", request_)
     assert control("crane0", {"stats": True})["nodes"] == []
 

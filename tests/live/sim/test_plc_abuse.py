@@ -18,7 +18,8 @@ import pytest
 from can_dbc.plc import modbus
 from can_dbc.plc.datagram import Header, decode_reply, encode_command
 from can_dbc.plc.map import Command, Fault, State
-from can_dbc.plc.modbus import MAX_CONNECTIONS, LinkError, ModbusClient, RegisterRefused
+from can_dbc.plc.modbus import MAX_CONNECTIONS, ModbusClient, RegisterRefused
+from runtime.errors import LinkError
 from sim.plc.command_arbiter import MAX_DRAFT_COUNT
 from tests.live.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
 

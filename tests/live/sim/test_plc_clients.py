@@ -21,7 +21,8 @@ from pyModbusTCP.client import ModbusClient as OtherClient
 from pyModbusTCP.server import ModbusServer as OtherServer
 
 from can_dbc.plc.map import MAGIC, MAP_VERSION, STATUS_COUNT, Feedback, State, WordOrder, read_status, status_registers
-from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
+from can_dbc.plc.modbus import ModbusClient, RegisterRefused
+from runtime.errors import LinkError
 from tests.codes import coded
 from tests.live.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
 

@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
+from runtime.errors import InputRefused
 from tests.codes import coded
-from training.common.dataset_error import DatasetError
 from training.pictures import piles
 from training.pictures.samples import read
 from training.pictures.traced import sets
@@ -39,5 +39,5 @@ def test_what_blender_drew_becomes_samples(tmp_path):
     back = read(out / "traced00000.npz")
     assert back["rgb"].shape == (2, 48, 48, 3) and (back["depth_mm"] == 2000).all()
     worker.write_text("#!/bin/sh\nexit 3\n")
-    with pytest.raises(DatasetError, check=coded("dataset.blender-failed")):
+    with pytest.raises(InputRefused, check=coded("dataset.blender-failed")):
         sets.blender_files(tmp_path, plan, settled, form, 1, worker, lambda _: None)

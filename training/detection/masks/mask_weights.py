@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 
 from autonomy.perception.segmentation.mask_network import CHANNELS, TRUNK, mask_network
-from training.common.dataset_error import DatasetError
+from runtime.errors import InputRefused
 from training.common.model_card import Card, write
 from training.detection.masks.mixture import SHARES, mixed
 from training.detection.masks.run import Run, train
@@ -72,13 +72,13 @@ def device_of(asked: str) -> str:
     """The device by its name; "auto" is cuda where there is one.
 
     Raises:
-        DatasetError: there is no such device.
+        InputRefused: there is no such device.
     """
     there = torch.cuda.is_available()
     if asked == "auto":
         return "cuda" if there else "cpu"
     if asked == "cuda" and not there:
-        raise DatasetError("train.no-cuda", "torch finds no CUDA device; use --device cpu")
+        raise InputRefused("train.no-cuda", "torch finds no CUDA device; use --device cpu")
     return asked
 
 
@@ -97,11 +97,11 @@ def produce(
     An interrupted run continues from the checkpoint beside ``out``.
 
     Raises:
-        DatasetError: the pictures, the trunk or the device are missing.
+        InputRefused: the pictures, the trunk or the device are missing.
     """
     where = device_of(device)
     if trunk is not None and not trunk.is_file():
-        raise DatasetError(
+        raise InputRefused(
             "dataset.no-trunk", f"{trunk}: no such file; torchvision's mobilenet_v2-b0353104.pth is meant"
         )
     bank, counts = mixed(folder, photographs)

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from machine.geometry.optics import Intrinsics, pinhole
-from training.common.dataset_error import DatasetError
+from runtime.errors import InputRefused
 from training.detection.masks.bank import WOOD, Bank, bank_of, joined
 from training.pictures.labels import ROW
 from training.pictures.samples import Sample, read, sample
@@ -29,17 +29,17 @@ def mixed(
     """The pictures of ``folder`` with photographs (rgb, wood), and how many there are of each set.
 
     Raises:
-        DatasetError: there are no traced pictures, or sizes differ.
+        InputRefused: there are no traced pictures, or sizes differ.
     """
     banks: dict[str, Bank] = {}
     for name in ("traced", "drawn", "meshed"):
         rows = [read(file) for file in sorted(folder.glob(f"{name}*.npz"))]
         if rows:
             if len({one["ids"].shape[1:] for one in rows}) > 1:
-                raise DatasetError("dataset.sizes-differ", f"{folder}: pictures of {name}*.npz differ in size")
+                raise InputRefused("dataset.sizes-differ", f"{folder}: pictures of {name}*.npz differ in size")
             banks[name] = bank_of({key: np.concatenate([one[key] for one in rows]) for key in rows[0]})
     if "traced" not in banks:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.no-traced", f"{folder} holds no traced*.npz; make them: timberhand train traced-pictures {folder}"
         )
     side = banks["traced"].ids.shape[-1]
@@ -49,7 +49,7 @@ def mixed(
             {key: np.stack([getattr(s, key) for s in shots]) for key in Sample.__dataclass_fields__}
         )
     if any(one.ids.shape[-1] != side for one in banks.values()):
-        raise DatasetError("dataset.sizes-differ", f"{folder}: the sets have pictures of different sizes")
+        raise InputRefused("dataset.sizes-differ", f"{folder}: the sets have pictures of different sizes")
     for name, one in banks.items():
         weight = torch.where(wood_share(one) < BARE_WOOD_SHARE, BARE_WEIGHT, 1.0)
         one.share.copy_(shares[name] * weight / weight.sum())

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from training.common.dataset_error import DatasetError
+from runtime.errors import InputRefused
 from training.pictures import meshed
 from training.pictures.drawing import draw, labelled
 from training.pictures.piles import MACHINES, Pile, chunk
@@ -165,7 +165,7 @@ def renderer(asked: str, blender_python: Path | None = None) -> str:
     """The path tracer to use: the one that is asked for, otherwise the first that is installed.
 
     Raises:
-        DatasetError: it is not installed.
+        InputRefused: it is not installed.
     """
     own = compiler() is not None
     blender = blender_python is not None or find_spec("bpy") is not None
@@ -180,7 +180,7 @@ def renderer(asked: str, blender_python: Path | None = None) -> str:
         ANY: "no path tracer is installed: install g++ (or CUDA's nvcc beside a GPU), or Blender's Python package "
         "bpy==4.2.0 in an environment of its own, then --blender-python ITS/bin/python",
     }
-    raise DatasetError("dataset.no-renderer", needs[asked])
+    raise InputRefused("dataset.no-renderer", needs[asked])
 
 
 def produce_sets(
@@ -194,7 +194,7 @@ def produce_sets(
     """Draw what is missing of the sets in ``folder``; what is there is not drawn again.
 
     Raises:
-        DatasetError: the renderer is not installed or failed, or the piles cannot be read.
+        InputRefused: the renderer is not installed or failed, or the piles cannot be read.
     """
     chosen = renderer(which, blender_python)
     folder.mkdir(parents=True, exist_ok=True)
@@ -205,7 +205,7 @@ def produce_sets(
         try:
             library(folder / "compiled")  # here, so that an error is told once and not by each process
         except (OSError, subprocess.CalledProcessError) as error:
-            raise DatasetError("dataset.tracer-not-compiled", f"the path tracer was not compiled: {error}") from None
+            raise InputRefused("dataset.tracer-not-compiled", f"the path tracer was not compiled: {error}") from None
     form = Format(plan.size_px, 0 if own else BLENDER_SAMPLES, plan.views, STEREO_SHARE)
     drawn = plan.numbers(plan.drawn, DRAWN_OF_A_FILE)
     chunks = dict.fromkeys(MACHINES, numbers)
@@ -245,7 +245,7 @@ def blender_files(
         for one in running:
             one.terminate()
     if failed:
-        raise DatasetError(
+        raise InputRefused(
             "dataset.blender-failed", f"{len(failed)} of {workers} Blender processes failed; what they said is above"
         )
     for k in wanted:
