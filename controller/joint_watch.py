@@ -151,7 +151,7 @@ class JointWatch:
                 continue  # what an encoder did that jumped or was lost is no motion
             neutral = crane.spools_pct[j] == 0.0 and not (loops and loops[j].value())
             velocity = estimator.velocity
-            yields = (pressed and j == _ROT) or (pushed and j == _SLEW)
+            yields = pushed if j == _SLEW else j == _ROT and (pressed or crane.grapple.at_work)
             reason = monitor.step(crane.commands[j], velocity, yields)
             tested = crane.spool_run.tested(j, now_ns)
             if tested:

@@ -162,6 +162,8 @@ def usable(message: Any, path: Path) -> MessageCodec:
     """`compile_one`, also for numbers that cantools accepts and no codec can use, such as an infinite scale."""
     try:
         return compile_one(message, path)
+    except ConfigError:
+        raise
     except (ArithmeticError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
         raise ConfigError("dbc.invalid", f"{path}: message {message.name} cannot be used: {error}") from error
 

@@ -191,12 +191,14 @@ def read_timing(path: Path | None = None) -> Timing:
                     if sequence and not sequence & 1:
                         return _timing(data, size)
                 time.sleep(0.002)
+    except InputRefused:
+        raise
     except (OSError, ValueError, msgspec.MsgspecError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputRefused(
             "timing.no-page",
             f"No controller publishes its timing at {path} ({reason}); start it, or give the path of its page.",
-        ) from (error)
+        ) from error
     raise InputRefused(
         "timing.not-written", f"The controller has not written its timing to {path} yet; try again in a second."
     )

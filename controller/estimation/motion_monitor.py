@@ -36,7 +36,8 @@ asks for a steady speed (0.03 s in one of fifty log jobs on sampled machines).""
 _RUNAWAY_S: Final = 0.06
 _YIELDING_S: Final = 0.4
 """The same of a joint that yields to what it carries: a log that caught at a stake wound a rotator up by 0.22 rad and
-turned it back as far when it came free, at 1.4 rad/s.  Its spool is watched besides."""
+turned it back as far when it came free, at 1.4 rad/s; behind a PLC it then rang three times by 7 degrees.  Its spool
+is watched besides."""
 _OVERSPEED_SHARE: Final = 0.25
 """Share of the speed limit by which a joint may be faster than its command: pendulum, ringing, ..."""
 _OVERSPEED_GAIN: Final = 0.3

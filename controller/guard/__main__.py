@@ -7,7 +7,6 @@ SIGTERM, 3 configuration, 4 no bus at the start, 130 SIGINT.
 from __future__ import annotations
 
 from runtime.compiled import stay_interpreted
-from runtime.errors import LinkError
 
 if __name__ == "__main__":  # before the buses are imported: no fault of the compiler may be in guard and controller
     stay_interpreted()
@@ -37,6 +36,7 @@ from controller.guard.operator import OperatorActions
 from controller.process.bus_link import BusLink
 from controller.process.realtime import prepare, sleep_until, stop_garbage_collection
 from runtime.allocator import keep_memory
+from runtime.errors import LinkError
 from runtime.notifier import Notifier
 
 PERIOD_NS: Final = 5_000_000
@@ -120,9 +120,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
     parser.add_argument("--bus", action="append", default=[], metavar="NAME=ADDRESS", help="address of crane0 or mach0")
     parser.add_argument("--rate", type=int, default=0, metavar="HZ", help="the controller's, if not the profile's")
-    parser.add_argument(
-        "--operator", type=Path, metavar="FILE", help="the controller's; the guard's own lies beside it"
-    )
+    parser.add_argument("--operator", type=Path, metavar="FILE", help="the controller's; the guard's is beside it")
     parser.add_argument("--state", type=Path, metavar="FILE", help="there while it is latched, also over a restart")
     parser.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     options = parser.parse_args(arguments)

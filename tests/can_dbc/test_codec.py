@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from can_dbc.dbc import check, codec
 from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import EXTENDED
-from runtime.errors import InputRefused
+from runtime.errors import ConfigError, InputRefused
 from tests.codes import coded
 
 DATA = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can"
@@ -341,20 +341,20 @@ BROKEN = [
 def test_broken_files_name_line_and_reason(tmp_path: Path, text: str, code: str, named: tuple[str, ...]) -> None:
     path = tmp_path / "f.dbc"
     path.write_text(HEAD + text)
-    with pytest.raises(codec.DbcError, check=coded(code)) as refused:
+    with pytest.raises(ConfigError, check=coded(code)) as refused:
         codec.load(path)
     assert all(word in str(refused.value) for word in named)
 
 
 @pytest.mark.parametrize("name", ["nowhere.dbc", "wheel"])
 def test_missing_files(name: str) -> None:
-    with pytest.raises(codec.DbcError, check=coded("dbc.no-file")):
+    with pytest.raises(ConfigError, check=coded("dbc.no-file")):
         codec.load(name)
 
 
 @pytest.mark.parametrize("path", [p for p in FOREIGN if p.name in REFUSED_BY_CANTOOLS], ids=id_of)
 def test_files_cantools_refuses(path: Path) -> None:
-    with pytest.raises(codec.DbcError, match=rf"{path.name}:\d+: ", check=coded("dbc.invalid")):
+    with pytest.raises(ConfigError, match=rf"{path.name}:\d+: ", check=coded("dbc.invalid")):
         codec.load(path)
     report = check.check(str(path), 1, 1)
     assert report.error
@@ -363,7 +363,7 @@ def test_files_cantools_refuses(path: Path) -> None:
 
 
 def test_unknown_message_is_a_clear_error(crane: codec.Database) -> None:
-    with pytest.raises(codec.DbcError, check=coded("dbc.unknown-message")):
+    with pytest.raises(ConfigError, check=coded("dbc.unknown-message")):
         crane.message("ValveCmdC")
 
 

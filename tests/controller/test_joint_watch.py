@@ -299,6 +299,19 @@ def test_a_rotator_that_logs_between_the_tongs_turn_back_is_not_reversed(grapple
     assert bench.mode is (Mode.FAULT if told else Mode.ACTIVE)
 
 
+@pytest.mark.parametrize("grapple", [GrappleCommand.NEUTRAL, GrappleCommand.HOLD])
+def test_a_rotator_that_its_load_swings_runs_away_by_more(grapple):
+    """Behind a PLC a log that came free of a stake let the rotator ring by 7 degrees, at most at 77 deg/s."""
+    bench = dithering(Bench()).armed()
+    bench.tick([bench.hold(grapple=grapple)])
+    bench.moves_alone[4] = 0.5
+    for k in range(100):
+        at_work = bench.mode in (Mode.ARMED, Mode.ACTIVE)
+        bench.tick([bench.hold(grapple=grapple)] if k % 10 == 0 and at_work else ())
+    runs_away = (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, Joint.ROT)
+    assert runs_away is (grapple is GrappleCommand.NEUTRAL)
+
+
 def hold(bench: Bench, ticks: int) -> int:
     """The planner keeps the crane where it is; ticks until the machine stops."""
     start = list(bench.controller.reference_position)

@@ -17,6 +17,7 @@ from host.exit_codes import CommandFailed, ExitCode
 from host.release import bundle as bundles
 from host.release import sums
 from host.release.signature import make_keys, sign, verify
+from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.host.small_releases import keys, small_bundle
 from timberhand.cli import app
@@ -84,7 +85,7 @@ def test_another_signer_and_a_changed_list_are_refused(unpacked: tuple[Path, Pat
         bundles.check(folder, public)
     listed.write_text("nonsense\n")
     sign(listed, private)
-    with pytest.raises(sums.SumsError, check=coded("sums.broken")):
+    with pytest.raises(InputRefused, check=coded("sums.broken")):
         bundles.check(folder, public)
     for name in (bundles.SUMS + ".sig", bundles.SUMS):
         (folder / name).unlink()
@@ -134,7 +135,7 @@ def test_a_tar_file_writes_nothing_outside_its_folder(tmp_path: Path) -> None:
 def test_a_list_of_hashes_never_names_a_file_outside() -> None:
     digest = "0" * 64
     for line in (f"{digest}  ../x", f"{digest}  /etc/passwd", "x  y", f"{digest}  a\n{digest}  a"):
-        with pytest.raises(sums.SumsError, check=coded("sums.broken")):
+        with pytest.raises(InputRefused, check=coded("sums.broken")):
             sums.decode(line, "list")
     assert sums.decode(sums.encode({"b": digest, "a/c": digest}), "list") == {"a/c": digest, "b": digest}
 
