@@ -49,7 +49,14 @@ class RotatorEstimate:
     @property
     def sigma_rad(self) -> float:
         """1-sigma of the angle at the count ``sent_rad``."""
-        return sqrt(self.covariance[0])
+        return sqrt(max(0.0, self.covariance[0]))
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether the paces are within their bounds and the covariance is one; a file may hold any numbers."""
+        (least, most), (aa, an, ap, nn, _, pp) = SCALE_BOUNDS, self.covariance
+        correlates = an * an <= aa * nn and ap * ap <= aa * pp
+        return min(aa, nn, pp) >= 0.0 and correlates and all(least <= pace <= most for pace in self.paces)
 
     def angle(self, sent_rad: float) -> float:
         """The angle at a count, rad."""

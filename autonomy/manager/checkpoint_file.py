@@ -44,6 +44,9 @@ def read_checkpoint(path: Path, mission: ForwardingMission, now_ns: int, unix_ns
         raise MissionError(
             "checkpoint.damaged", f"is damaged or not a checkpoint ({error}); {_MOVE}", str(path)
         ) from None
+    if not found.rotator.is_possible:
+        sentence = f"is damaged: its rotator cannot stand as it says; {_MOVE}"
+        raise MissionError("checkpoint.damaged", sentence, str(path))
     if found.mission != mission_digest(mission):
         sentence = f"is the checkpoint of another mission; start the planner with that one, or {_MOVE}"
         raise MissionError("checkpoint.other-mission", sentence, str(path))

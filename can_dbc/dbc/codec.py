@@ -212,6 +212,9 @@ def _line_of(reason: str, text: str) -> str:
 
 def compile_one(message: Any, path: Path) -> MessageCodec:
     """The codec of one cantools message; ``path`` is named in errors."""
+    if not message.name or not all(signal.name for signal in message.signals):  # possible in KCD
+        what = f"message {message.name} has a signal" if message.name else f"message {message.frame_id:#x} is"
+        raise ConfigError("dbc.invalid", f"{path}: {what} without a name")
     signals = _signals(message)
     for s in signals:
         if s.shift < 0 or s.shift + s.bits > 8 * message.length:

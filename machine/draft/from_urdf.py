@@ -160,15 +160,22 @@ def _place(joint: Element, below: Mapping[str, Element]) -> _Placed:
         raise ValueError(f"joint {joint.attrib['name']} has an axis of no length")
     unit = (own[0] / length, own[1] / length, own[2] / length)
     given = {} if limit is None else limit.attrib
-    ends = [float(given[key]) if key in given else None for key in ("lower", "upper")]
+    ends = [_number(given[key]) if key in given else None for key in ("lower", "upper")]
     return _Placed(at, _turned(turn, unit), *ends)
 
 
 def _vector(text: str | None, otherwise: Vector) -> Vector:
     if text is None:
         return otherwise
-    x, y, z = map(float, text.split())
+    x, y, z = map(_number, text.split())
     return x, y, z
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text!r} is not a number")
+    return value
 
 
 def _rotation(rpy: Vector) -> Matrix:

@@ -415,3 +415,19 @@ def test_a_database_of_j1939_as_a_whole_is_matched_by_pgn(tmp_path: Path, attrib
     assert database.find(0x18F00421 | EXTENDED) == (database.message("A") if by_pgn else None)
     assert database.find(0x0CF004FE | EXTENDED) == database.message("A")
     assert not database.message("B").by_pgn
+
+
+@pytest.mark.parametrize("what", ["Message", "Signal"])
+def test_a_kcd_message_or_signal_without_a_name_is_refused(tmp_path: Path, what: str) -> None:
+    """The fuzzer found it: cantools gives it the name None."""
+    text = (
+        '<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/1.0"><Document/><Bus name="b">'
+        '<Message id="0x1" length="8" name="M"><Signal name="X" offset="0" length="8"/></Message></Bus>'
+        "</NetworkDefinition>"
+    )
+    path = tmp_path / "f.kcd"
+    path.write_text(text)
+    assert "M" in codec.load(path).messages
+    path.write_text(text.replace(' name="M"' if what == "Message" else ' name="X"', ""))
+    with pytest.raises(ConfigError, check=coded("dbc.invalid")):
+        codec.load(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
+import math
 import os
 import random
 import re
@@ -16,9 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from autonomy.manager.checkpoint import Checkpoint, mission_digest
+from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
+from autonomy.manager.tally import Load, LoadedLog, Tally
 from autonomy.missions.mission_file import read as read_mission
 from autonomy.missions.mission_file import verify
-from autonomy.missions.model import MissionError
+from autonomy.missions.model import ForwardingMission, KnownLog, MissionError, Point
 from autonomy.networks import weights
 from autonomy.networks.graph import parameter_shapes
 from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
@@ -33,9 +37,13 @@ from controller.guard.__main__ import build
 from controller.guard.envelope import SEAL, digest
 from controller.guard.guard import Guard
 from controller.guard.layout import GuardConfigError, read_layouts
+from machine.draft.from_urdf import answers_from_urdf
+from machine.loading.profile_file import load_profile
 from recorder.mcap_scan import is_complete, scan
 from recorder.recover import recover
 from runtime.errors import ConfigError, InputRefused
+from sim.draft.truth import crane_urdf
+from sim.truth.load import load_truth
 from tests.controller.guard_traffic import MOVING, Traffic
 from tests.fuzz.engine import Run, Target, coded, in_file, of_file, outcome
 from tests.recorder import recordings
@@ -236,6 +244,50 @@ def guard_dbc(path: Path) -> Hashable:
     return tuple(outcome(GuardConfigError, use, name) for name in ("ValveCmdA", "EstopStat", "EncSlew"))
 
 
+def kcd_seeds() -> list[bytes]:
+    """The databases of the DBC seeds as KCD."""
+    import cantools
+
+    texts = (seed.decode("cp1252") for seed in dbc_seeds())
+    return [cantools.database.load_string(text, "dbc").as_kcd_string().encode() for text in texts]
+
+
+_RESUMED = ForwardingMission("fuzz", (Point(63.0, 19.0), Point(63.0, 19.001)), logs=(KnownLog(Point(63.0, 19.0)),))
+
+
+def urdf_seeds() -> list[bytes]:
+    """The plant's crane."""
+    return [crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471")).encode()]
+
+
+def urdf_answers(path: Path) -> dict[str, Any]:
+    """The crane of a URDF, every joint with the name that we give it."""
+    return answers_from_urdf(path, {})
+
+
+def all_finite(answers: dict[str, Any]) -> Hashable:
+    """What a machine is made of are numbers."""
+    ranges = [bound for joint in answers["joints"].values() for bound in joint.values()]
+    assert all(map(math.isfinite, (*answers["kinematics"].values(), *ranges)))
+    return len(ranges), len(answers["kinematics"])
+
+
+def checkpoint_seeds() -> list[bytes]:
+    """The progress of one mission: at its start, and with logs aboard, given up and missed."""
+    digest_, log = mission_digest(_RESUMED), LoadedLog(Point(63.0, 19.0), 5, 0.1)
+    path, seeds = in_file("seed.json"), []
+    for tally in (Tally(), Tally(board=[log], loads=[Load((log,), 7, 5.0)], given_up={3: "too far"})):
+        CheckpointFile(path).write(Checkpoint(mission=digest_, tally=tally), 5, 10**18)
+        seeds.append(path.read_bytes())
+    return seeds
+
+
+def resumed(progress: Checkpoint | None) -> Hashable:
+    """What a mission resumes with can be used."""
+    assert progress is not None and progress.rotator.turned(1.0).turned(-1.0).corrected(0.5, 0.2).sigma_rad >= 0.0
+    return min(progress.tally.loaded, 2), bool(progress.tally.board)
+
+
 def profile_seeds() -> list[bytes]:
     return [path.read_bytes() for path in sorted((ROOT / "machine").glob("*.toml")) if "envelope" not in path.name]
 
@@ -302,6 +354,7 @@ _TOML = (
     *(b"[1, 2]", b"{a = 1}"),
 )
 _DBC = (*_NUMBERS.split(), *b'64 7x @1+ @0- | m0 M " ; (0,0) [0|0]'.split(), b"BO_ ", b" SG_ ", b"BA_ ", b"VAL_ ")
+_XML_NUMBERS = (*_XML, *_NUMBERS.split())
 _DBC_VALUE = rb"(-?[0-9.]+|[+-] )"
 _TOML_VALUE = rb"= *([^\n#]+)"
 
@@ -319,6 +372,9 @@ def _files(
 
 
 _PROFILE = of_file("fuzz.toml", ConfigError, load_settings, has_carrier)
+_CHECKPOINT = of_file(
+    "fuzz.json", (MissionError, InputRefused), lambda path: read_checkpoint(path, _RESUMED, 7, 10**18), resumed
+)
 _GUARD_PROFILE = of_file("fuzz.toml", GuardConfigError, build, guards)
 FILES = (
     _files("mission-file", lambda: mission, mission_seeds, _JSON + _XML, rb"[:,>\"] *([-0-9.]+|\"[^\"]*\")"),
@@ -328,6 +384,22 @@ FILES = (
     _files("trace-blf", of_file("trace.blf", (), read_trace, counted), lambda: [blf_seed(), *reports(".blf")]),
     _files("trace-decoded", of_file("trace.log", (), decoded, tuple), bus_seeds),
     _files("dbc", of_file("fuzz.dbc", ConfigError, load_dbc, used), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
+    _files(
+        "kcd",
+        of_file("fuzz.kcd", ConfigError, load_dbc, used),
+        kcd_seeds,
+        _XML_NUMBERS,
+        rb'="([^"]*)"',
+        1 << 14,
+    ),
+    _files(
+        "urdf",
+        of_file("fuzz.urdf", InputRefused, urdf_answers, all_finite),
+        urdf_seeds,
+        _XML_NUMBERS,
+        rb'="([^"]*)"',
+    ),
+    _files("checkpoint", _CHECKPOINT, checkpoint_seeds, _JSON, rb"[:,\[] *([-0-9.e+]+|\"[^\"]*\")"),
     _files("profile", _PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     _files("guard-dbc", of_file("guard.dbc", (), guard_dbc, tuple), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
     _files("guard-profile", _GUARD_PROFILE, profile_seeds, _TOML, _TOML_VALUE),

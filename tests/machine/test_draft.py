@@ -98,6 +98,8 @@ def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path
     [
         ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -1"/>', "answers.urdf-chain"),
         ("</robot>", "", "answers.urdf-broken"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 nan"/>', "answers.urdf-broken"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><limit lower="1e400"/>', "answers.urdf-broken"),
     ],
 )
 def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str, code: str) -> None:
