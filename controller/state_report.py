@@ -10,7 +10,7 @@ from typing import Final
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
-from controller.bus_io.message_state import or_nan
+from controller.bus_io.message_state import Signal, or_nan
 from controller.bus_io.messages import PeriodicTimer
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs
@@ -34,6 +34,7 @@ class StateReporter:
         "_evidence",
         "_gate",
         "_inputs",
+        "_mode_switch",
         "_sequence",
         "_settings",
         "_supervisor",
@@ -53,6 +54,7 @@ class StateReporter:
     ) -> None:
         self._settings, self._supervisor, self._gate = settings, supervisor, gate
         self._inputs, self._crane, self._estimators, self._evidence = inputs, crane, estimators, evidence
+        self._mode_switch = Signal(inputs.estop, "ModeSwitch")
         self._due, self._sequence = PeriodicTimer(REPORT_NS), 0
         self.late_ns = self.tick_ns = 0
 
@@ -67,7 +69,7 @@ class StateReporter:
             return None
         supervisor, gate, crane, estimators = self._supervisor, self._gate, self._crane, self._estimators
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
-        # Five by place, and tuples from lists: CPython 3.11 never takes a tuple of 20 (the names of all fields) or one
+        # Six by place, and tuples from lists: CPython 3.11 never takes a tuple of 20 (the names of all fields) or one
         # made from a generator from its free list again, and the heap would grow for half an hour.
         report = StateReport(
             self._sequence,
@@ -75,7 +77,7 @@ class StateReporter:
             now_ns,
             supervisor.mode,
             crane.grapple.state,
-            reason=pack(supervisor.reason, supervisor.detail),
+            pack(supervisor.reason, supervisor.detail),
             setpoint_sequence=gate.sequence,
             refusal=pack(gate.refusal, gate.detail),
             refused=gate.refused,
@@ -93,6 +95,7 @@ class StateReporter:
             since_ns=self._evidence.since_ns,
             numbers=self._evidence.numbers,
             operator_link=supervisor.operator_link.state(now_ns),
+            mode_switch=self._mode_switch.value() or 0,
         )
         self.late_ns = self.tick_ns = 0
         return encode(report)

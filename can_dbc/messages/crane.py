@@ -26,6 +26,8 @@ _EVIDENCE: Final = struct.Struct("<Q3d")
 """Behind a report whose reason slowed or stopped the machine."""
 _LINK: Final = struct.Struct("<B")
 """Behind everything else, once an operator watches."""
+_LINK_AND_SWITCH: Final = struct.Struct("<BB")
+"""In its place on a machine with a mode switch."""
 
 
 class GrappleCommand(IntEnum):
@@ -66,6 +68,16 @@ class LinkWatch(IntEnum):
     """Nobody watches."""
     WATCHED = 1
     LOST = 2
+
+
+class ModeSwitch(IntEnum):
+    """The operator's mode switch; the numbers are those of ``EstopStat.ModeSwitch``."""
+
+    NOT_FITTED = 0
+    """The machine has none, or it is not known yet."""
+    IDLE = 1
+    AUTO = 2
+    FAULTY = 3
 
 
 class Knot(NamedTuple):
@@ -139,7 +151,7 @@ class StateReport:
 
     While the reason is one that slows or stops the machine, ``since_ns`` is when it began, else 0, and ``numbers`` is
     its evidence: measured value, limit and one more (`machine.status.evidence`), NaN where there is none.
-    ``operator_link`` is a `LinkWatch`.
+    ``operator_link`` is a `LinkWatch`, ``mode_switch`` a `ModeSwitch`.
     """
 
     sequence: int
@@ -165,6 +177,7 @@ class StateReport:
     since_ns: int = 0
     numbers: tuple[float, ...] = ()
     operator_link: int = LinkWatch.OFF
+    mode_switch: int = ModeSwitch.NOT_FITTED
 
 
 def crane_body(m: CraneSetpoint) -> bytes:
@@ -207,6 +220,8 @@ def report_body(m: StateReport) -> bytes:
     )
     if m.since_ns:
         body += _EVIDENCE.pack(m.since_ns, *m.numbers)
+    if m.mode_switch:
+        return body + _LINK_AND_SWITCH.pack(m.operator_link, m.mode_switch)
     return body + _LINK.pack(m.operator_link) if m.operator_link else body
 
 
@@ -254,14 +269,18 @@ def operator_from(common: Common, body: bytes) -> OperatorCommand:
 
 
 def report_from(common: Common, body: bytes) -> StateReport:
-    """The report in a body, with or without evidence and link; raises struct.error for a wrong length."""
+    """The report in a body, with or without evidence, link and switch; raises struct.error for a wrong length."""
     values = _REPORT.unpack(body[: _REPORT.size])
     more = body[_REPORT.size :]
-    since_ns, link = 0, 0
+    since_ns, link, switch = 0, 0, 0
     numbers: tuple[Any, ...] = ()
     if len(more) % _EVIDENCE.size == _LINK.size:
         more, link = more[: -_LINK.size], more[-1]
         if link not in (LinkWatch.WATCHED, LinkWatch.LOST):
+            raise DatagramRefused(DatagramFault.LENGTH)
+    elif len(more) % _EVIDENCE.size == _LINK_AND_SWITCH.size:
+        more, link, switch = more[: -_LINK_AND_SWITCH.size], more[-2], more[-1]
+        if link > LinkWatch.LOST or not ModeSwitch.IDLE <= switch <= ModeSwitch.FAULTY:
             raise DatagramRefused(DatagramFault.LENGTH)
     if more:
         since_ns, *measured = _EVIDENCE.unpack(more)
@@ -269,5 +288,5 @@ def report_from(common: Common, body: bytes) -> StateReport:
     joints = values[7 : 7 + 3 * N_AXES]
     fields: list[Any] = [*common, *values[:7]]
     fields += [joints[:N_AXES], joints[N_AXES : 2 * N_AXES], joints[2 * N_AXES :]]
-    fields += [*values[7 + 3 * N_AXES :], since_ns, numbers, link]
+    fields += [*values[7 + 3 * N_AXES :], since_ns, numbers, link, switch]
     return StateReport(*fields)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from can_dbc.dbc.codec import Database
+from can_dbc.messages.crane import ModeSwitch
 from can_dbc.protocols.canopen import HEARTBEAT_BASE, Emergency, NodeState, emergency_frame
 from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave
 from machine.crane_nodes import CraneNode
@@ -60,8 +61,9 @@ class Device(CanopenSlave):
 class EstopBox(Device):
     """Safety module: two channels, reset button, and the pilot supply: hard-wired relay and guard in series.
 
-    ``press``, ``release`` and ``reset`` are its buttons, `move_lever` is what it sees of the hand levers.  `receive`
-    takes GuardPilot; a machine whose guard does not switch the supply (behind a PLC) never calls `decide`.
+    ``press``, ``release`` and ``reset`` are its buttons, `move_lever` is what it sees of the hand levers, and
+    ``mode_switch`` is the operator's, which `turn` turns.  `receive` takes GuardPilot; a machine whose guard does not
+    switch the supply (behind a PLC) never calls `decide`.
     """
 
     RESET_PULSE_NS = 200 * MS
@@ -73,6 +75,7 @@ class EstopBox(Device):
         self._period = PeriodicTimer(10 * MS)
         self._channels = (1, 1)
         self._source = self._events = self._lever = 0
+        self.mode_switch = ModeSwitch.NOT_FITTED
         self._reset_until_ns: int | None = None
         self._wants_reset = self._changed = False
         self.relay_on = self.guard_on = True
@@ -124,6 +127,11 @@ class EstopBox(Device):
         self._lever = int(moved)
         self._event()
 
+    def turn(self, mode_switch: ModeSwitch) -> None:
+        """Turn the operator's mode switch."""
+        self.mode_switch = mode_switch
+        self._event()
+
     def _event(self) -> None:
         self._events = (self._events + 1) & 0xFF
         self._changed = True
@@ -139,8 +147,8 @@ class EstopBox(Device):
             self._changed = False
             reset = int(self._reset_until_ns is not None)
             pressure = self.PILOT_BAR if self.pilot_on else 0.0
-            state = (*self._channels, self._source, reset, int(self.pilot_on), 0, self._lever, pressure, self._events)
-            self.outbox.append(self._message.frame(*state))
+            inputs = (*self._channels, self._source, reset, int(self.pilot_on), 0, self._lever)
+            self.outbox.append(self._message.frame(*inputs, pressure, self._events, self.mode_switch))
 
 
 class PressureModule(Device):

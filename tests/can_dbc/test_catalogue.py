@@ -35,6 +35,7 @@ CATALOGUE = [
             "Lever": 30,
             "PilotPress": 32,
             "EventSeq": 44,
+            "ModeSwitch": 52,
         },
     ),
     ("EncSlew", 0x182, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from can_dbc.dbc.codec import load
 from can_dbc.messages.crane import (
     MAX_KNOTS,
     N_AXES,
@@ -20,6 +21,7 @@ from can_dbc.messages.crane import (
     GrappleCommand,
     Knot,
     LinkWatch,
+    ModeSwitch,
     OperatorAction,
     OperatorCommand,
     SpoolKnot,
@@ -105,6 +107,7 @@ reports = st.builds(
     u32,
     u32,
     operator_link=st.integers(0, len(LinkWatch) - 1),
+    mode_switch=st.integers(0, len(ModeSwitch) - 1),
 )
 maybe = st.floats(allow_infinity=False)
 vehicle_reports = st.builds(
@@ -405,3 +408,25 @@ def test_a_report_tells_of_the_operators_link_only_while_it_is_watched(
         with pytest.raises(DatagramRefused) as refused:
             decode(data + struct.pack("<I", zlib.crc32(data)))
         assert refused.value.fault is DatagramFault.LENGTH
+
+
+@pytest.mark.parametrize("link", list(LinkWatch))
+@pytest.mark.parametrize("evidence", [{}, {"since_ns": 77, "numbers": (20.0, 15.0, 4.0)}])
+def test_a_report_tells_of_the_mode_switch_only_where_there_is_one(link: LinkWatch, evidence: dict[str, Any]) -> None:
+    known = (1.0,) * 5
+    plain = StateReport(1, 2, 3, 2, 0, 0, 0, 0, 0, 0, known, known, known, 0.0, 0.0, 0.0, 1, 2, 3, 4, **evidence)
+    for switch in (ModeSwitch.IDLE, ModeSwitch.AUTO, ModeSwitch.FAULTY):
+        told = dataclasses.replace(plain, operator_link=link, mode_switch=switch)
+        assert decode(encode(told)) == told and len(encode(told)) == len(encode(plain)) + 2
+    for unknown in ((link, 0), (link, 4), (3, 1), (255, 255)):
+        data = encode(told)[:-6] + bytes(unknown)
+        with pytest.raises(DatagramRefused) as refused:
+            decode(data + struct.pack("<I", zlib.crc32(data)))
+        assert refused.value.fault is DatagramFault.LENGTH
+
+
+def test_the_numbers_of_the_mode_switch_are_those_of_its_signal() -> None:
+    (signal,) = (s for s in load("crane").message("EstopStat").signals if s.name == "ModeSwitch")
+    assert {n: label.upper() for n, label in signal.choices.items()} == {
+        int(switch): switch.name.replace("_", "") for switch in ModeSwitch
+    }

@@ -2,7 +2,7 @@
 
 import pytest
 
-from can_dbc.messages.crane import OperatorAction
+from can_dbc.messages.crane import ModeSwitch, OperatorAction
 from controller.transitions import TRANSITIONS, Event
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
@@ -218,6 +218,19 @@ def test_a_machine_that_does_not_tell_about_its_levers_works_as_before(value):
     bench.active()
     bench.run(10)
     assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
+
+
+def test_the_mode_switch_is_reported_and_stops_nothing():
+    bench = Bench().active()
+    assert bench.reports[-1].mode_switch == ModeSwitch.NOT_FITTED
+    for position in (ModeSwitch.AUTO, ModeSwitch.IDLE, ModeSwitch.FAULTY):
+        bench.changed["EstopStat"] = {"ModeSwitch": position}
+        bench.drive(0, 0.08, 10)
+        assert bench.reports[-1].mode_switch == position
+        assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE and not bench.neutral
+    bench.dropped.add("EstopStat")
+    bench.run(20)
+    assert bench.reports[-1].mode_switch == ModeSwitch.NOT_FITTED, "it is not known"
 
 
 def test_arming_with_the_emergency_stop_in_error_is_refused():

@@ -168,7 +168,7 @@ def test_an_operator_and_a_pressed_stop_are_events(tmp_path: Path) -> None:
     recorder = recorder_in(tmp_path)
     bench = RecordedBench([recorder])
     bench.active(ticks=100)
-    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0, "ModeSwitch": 1}
     bench.changed["GuardStat"] = {"Enable": 0, "Verdict": 7}
     bench.run(20, bus_errors=12)
     bench.tick([bench.operator(OperatorAction.RESET)], bus_errors=12)
@@ -176,7 +176,8 @@ def test_an_operator_and_a_pressed_stop_are_events(tmp_path: Path) -> None:
     recorder.close()
     (found,) = find_stops(tmp_path)
     texts = [event.text for event in events_of(found.ticks, found.stop.at_ns)]
-    assert "EstopStat: ChannelA Released → Pressed, ChannelB Released → Pressed" in texts
+    pressed = "ChannelA Released → Pressed, ChannelB Released → Pressed"
+    assert f"EstopStat: {pressed}, ModeSwitch NotFitted → Idle" in texts
     assert "GuardStat: Enable Enabled → Disabled, Verdict GOOD → ESTOP" in texts
     assert "operator: RESET" in texts and "crane0: ACTIVE → PASSIVE" in texts
     assert any("crane0" in text and 12 in numbers_in(text) for text in texts)

@@ -39,7 +39,7 @@ BEFORE_S: Final = 2.0
 SETPOINT_SILENCE_NS: Final = 150_000_000
 BEAT_SILENCE_NS: Final = 5 * WATCH_PERIOD_NS // 2
 WATCHED: Final = {
-    "EstopStat": ("ChannelA", "ChannelB", "Person", "Lever", "ResetReq"),
+    "EstopStat": ("ChannelA", "ChannelB", "Person", "Lever", "ModeSwitch", "ResetReq"),
     "GuardStat": ("Enable", "Verdict"),
     "ValveFbA": ("State",),
     "ValveFbB": ("ExitCode",),
