@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 
 from can_dbc.dbc.codec import Database, MessageCodec, load
+from can_dbc.messages.crane import ModeSwitch
 from can_dbc.protocols.canopen import NMT_ID, NmtCommand
 from machine.crane_nodes import CraneNode
 from machine.profile import Profile
@@ -40,8 +41,8 @@ ENCODER_MESSAGES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class PlantFault:
-    """One fault: its name, the part it acts on (joint, message or node, "" where there is only one), its size in the
-    unit of its name in `BEGINNERS`, and the seed of what it draws.
+    """One fault: its name, the part it acts on (joint, message, node or position of the mode switch, "" where there is
+    only one), its size in the unit of its name in `BEGINNERS`, and the seed of what it draws.
     """
 
     name: str
@@ -165,6 +166,18 @@ def _person(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 def _lever(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
     plant.estop.move_lever(True)
     return lambda: plant.estop.move_lever(False)
+
+
+def _turn(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
+    """The operator turns the mode switch to a position, and back at the end."""
+    before = plant.estop.mode_switch
+    try:
+        plant.estop.turn(ModeSwitch[fault.part.upper().replace("-", "_")])
+    except KeyError:
+        known = ", ".join(switch.name.lower().replace("_", "-") for switch in ModeSwitch)
+        text = f"the mode switch has no position {fault.part!r}; use one of {known}"
+        raise PlantError("fault.no-position", text) from None
+    return lambda: plant.estop.turn(before)
 
 
 def _gnss(change: Callable[[GnssNode, PlantFault], End]) -> Callable[[EmulatedMachine, PlantFault, int], End]:
@@ -305,6 +318,7 @@ BEGINNERS: Final[dict[str, Callable[[EmulatedMachine, PlantFault, int], End]]] =
     "estop-wire": _estop_wire,
     "person-in-zone": _person,
     "lever-moved": _lever,
+    "mode-switch": _turn,
     "gnss-off": _gnss(_silence),
     "gnss-jump": _gnss(_jump),
     "gnss-single": _gnss(_fix),

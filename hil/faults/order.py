@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from hil.faults.table import FAULTS, JOINT_NAMES, PROCESSES, Part, find
+from hil.faults.table import FAULTS, JOINT_NAMES, POSITIONS, PROCESSES, Part, find
 from machine.crane_nodes import CraneNode
 from runtime.errors import InputRefused
 
@@ -88,6 +88,7 @@ def _check_part(fault: str, kind: Part, part: str) -> None:
         Part.NODE: nodes,
         Part.PROCESS: PROCESSES,
         Part.BUS: ("crane0", "mach0"),
+        Part.POSITION: POSITIONS,
     }.get(kind)
     if kind is Part.NOTHING and part:
         raise InputRefused("fault.part", f"{fault} acts on the whole of its component; leave {part!r} out")

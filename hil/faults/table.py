@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from can_dbc.messages.crane import ModeSwitch
 from machine.joints import JOINTS
 from runtime.errors import InputRefused
 
@@ -52,6 +53,7 @@ class Part(StrEnum):
     NODE = "node"
     BUS = "bus"
     PROCESS = "process"
+    POSITION = "position"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,7 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "estop-wire": FaultKind("estop", Word.WRONG, _P, "the wire of one contact breaks"),
     "person-in-zone": FaultKind("person", Word.WRONG, _P, "the safety module sees a person"),
     "lever-moved": FaultKind("lever", Word.WRONG, _P, "a person moves a hand lever"),
+    "mode-switch": FaultKind("mode", Word.WRONG, _P, "the operator turns it", Part.POSITION, "idle"),
     "gnss-off": FaultKind("gnss", Word.OFF, _P, "sends nothing"),
     "gnss-jump": FaultKind("gnss", Word.WRONG, _P, "the position jumps", Part.NOTHING, "", "m", 3.0),
     "gnss-single": FaultKind("gnss", Word.GARBAGE, _P, "from RTK to a single fix"),
@@ -132,6 +135,8 @@ FAULTS: Final[dict[str, FaultKind]] = {
     "process-stuck": FaultKind("process", Word.STUCK, _S, "does not run for a while", Part.PROCESS, "controller"),
 }
 PROCESSES: Final = ("controller", "guard", "planner")
+POSITIONS: Final = tuple(switch.name.lower().replace("_", "-") for switch in ModeSwitch)
+"""Of the operator's mode switch."""
 
 
 def find(name: str, word: str = "") -> tuple[str, str]:

@@ -61,6 +61,7 @@ def test_an_order_is_read_from_its_text() -> None:
     assert (order.part, order.length_s, order.size, order.seed) == ("EncTilt", 1.0, 30.0, 4)
     assert parse("estop:off").fault == "estop-pressed" and math.isinf(parse("estop:off").length_s)
     assert parse("valve-gain").sized() == 0.5
+    assert [parse(text).part for text in ("mode-switch@3+2s", "mode-switch/auto")] == ["idle", "auto"]
 
 
 @pytest.mark.parametrize(
@@ -74,6 +75,7 @@ def test_an_order_is_read_from_its_text() -> None:
         ("encoder-stuck@1.2.3", "fault.syntax"),
         ("encoder-stuck+0s", "fault.time"),
         ("process-stuck/console", "fault.part"),
+        ("mode-switch/manual", "fault.part"),
     ],
 )
 def test_a_wrong_order_is_refused_in_words(text: str, code: str) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from autonomy.crane_job.activity import Activity
 from can_dbc.frame import Frame, RawFrame
+from can_dbc.messages.crane import ModeSwitch
 from can_dbc.plc.map import Fault, Feedback, State
 from controller.config import load
 from controller.guard.__main__ import build as build_guard
@@ -144,6 +145,9 @@ def test_the_emergency_stop_behind_the_plc_stops_and_latches(tmp_path: Path) -> 
     run.until(Mode.ACTIVE)
     while not run.moving():
         run.system.advance()
+    run.plant.estop.turn(ModeSwitch.AUTO)
+    run.wait(60)
+    assert run.moving() and run.system.report is not None and run.system.report.mode_switch == ModeSwitch.AUTO
     run.plant.estop.press()
     pressed_ns = run.system.now_ns
     while run.moving():

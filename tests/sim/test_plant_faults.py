@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from can_dbc.messages.crane import ModeSwitch
 from can_dbc.protocols.e2e import Checker, Status
 from machine.loading.profile_file import load_profile
 from sim.errors import PlantError
@@ -74,6 +75,22 @@ def test_a_broken_wire_and_a_person_are_protected_correctly() -> None:
         assert checker.check(data) is not Status.ERROR
         values = ESTOP.named(ESTOP.receive(data))
     assert (values["ChannelA"], values["ChannelB"], values["Person"]) == (0, 1, 1)
+
+
+def test_the_mode_switch_is_turned_at_once_and_back_at_the_end() -> None:
+    plant = machine()
+
+    def sent(start_ms: int) -> list[float]:
+        return [ESTOP.named(ESTOP.receive(d))["ModeSwitch"] for d in sent_of(plant, ESTOP.key, 20, start_ms)]
+
+    assert set(sent(0)) == {0}
+    plant.estop.turn(ModeSwitch.AUTO)
+    end = begin(plant, PlantFault("mode-switch", "faulty"), 0)
+    assert set(sent(20)) == {3}
+    end()
+    assert set(sent(40)) == {2}
+    begin(plant, PlantFault("mode-switch", "not-fitted"), 0)
+    assert set(sent(60)) == {0}
 
 
 def test_a_delayed_message_keeps_its_payload() -> None:
@@ -149,6 +166,7 @@ def test_what_a_machine_does_not_have_is_refused_in_words() -> None:
         (PlantFault("gnss-off"), "fault.no-gnss"),
         (PlantFault("hose-burst", "lift"), "fault.no-physics"),
         (PlantFault("message-off", "VehStat"), "fault.no-message"),
+        (PlantFault("mode-switch", "manual"), "fault.no-position"),
         (PlantFault("message-masquerade", "EncLift"), "fault.no-data-id"),
     ):
         with pytest.raises(PlantError, check=coded(code)):
@@ -158,7 +176,7 @@ def test_what_a_machine_does_not_have_is_refused_in_words() -> None:
 def test_every_fault_begins_and_ends_on_a_machine_that_drives() -> None:
     plant = KinematicMachine(load_profile("aoro_fc8"), 0, step_ns=2_500_000)
     plant.step(1_000_000_000, [])
-    parts = {"encoder": "lift", "message": "VehStat", "valve": "lift", "node": "valves"}
+    parts = {"encoder": "lift", "message": "VehStat", "valve": "lift", "node": "valves", "mode": "idle"}
     for name in BEGINNERS:
         if name in ("hose-burst", "load-overload"):
             continue  # need physics

@@ -20,7 +20,7 @@ def inject(
     at: Annotated[str, typer.Option(help="When: 12.3s after the start (lockstep), or from now (live).")] = "0s",
     length: Annotated[str, typer.Option("--for", help="How long, as in 500ms or 2s (default: for ever).")] = "",
     joint: Annotated[str, typer.Option(help="Joint: q1 to q5, or slew, lift, tilt, ext, rot.")] = "",
-    part: Annotated[str, typer.Option(help="Message, node, bus or process that the fault acts on.")] = "",
+    part: Annotated[str, typer.Option(help="Message, node, bus, process or position that the fault acts on.")] = "",
     size: Annotated[float | None, typer.Option(help="Size in the unit of --list (default: that of --list).")] = None,
     seed: Annotated[int, typer.Option(help="For what the fault draws, and for the job in lockstep.")] = 1,
     run: Annotated[
