@@ -8,6 +8,7 @@ loads one log into the bunk; with ``--mission FILE`` and a machine that drives, 
 operator commands from this computer only (`can_dbc.messages.mission` and `can_dbc.messages.grasp` define them).
 ``--progress FILE`` stores a checkpoint of the mission; if the file exists already, the mission is resumed from it after
 the operator has commanded Auto.
+The mode switch of a machine that has one holds, starts and resumes either job (`autonomy.manager.operator_switch`).
 ``--missions DIR`` waits for a mission to be uploaded instead: the console names a file of that folder, and the planner
 takes it while the machine is not armed and stands (`autonomy.process.upload`).
 

@@ -24,6 +24,7 @@ from autonomy.manager.crane_executor import CraneExecutor
 from autonomy.manager.event_conditions import EventConditions
 from autonomy.manager.load_bookkeeping import LoadBookkeeping
 from autonomy.manager.log_memory import LogMemory
+from autonomy.manager.operator_switch import OperatorSwitch
 from autonomy.manager.route_driver import RouteDriver
 from autonomy.manager.tally import Tally
 from autonomy.manager.target_log import TargetLog
@@ -55,6 +56,7 @@ from runtime.errors import Problem
 
 MAX_OUTSIDE_M: Final = 0.5
 """Farther outside a fence than any error of receiver or path follower: the mission fails."""
+PAUSED: Final = "an operator has paused the mission"
 HISTORY_LENGTH: Final = 64
 """Transitions kept for the operator."""
 
@@ -103,7 +105,10 @@ class ActivityManager:
         self.load = LoadBookkeeping(profile, mission, self.world, progress)
         self._digest = mission_digest(mission)
         self.log_memory = LogMemory(profile) if uses_memory else None
+        self.switch = OperatorSwitch()
         self._auto = self._step_released = False
+        self._idle_reason = ""
+        """Why the mission was set to Idle; empty while it never was."""
         self.pending_event: Event | None = None
         """In single-step mode: the event that waits for `next_step`."""
         self._table, self._key = table, key
@@ -202,13 +207,18 @@ class ActivityManager:
         return self._crane.shows_load
 
     # ------------------------------------------------------------------ operator commands
+    @property
+    def is_auto(self) -> bool:
+        """Whether the mission is at Auto."""
+        return self._auto
+
     def auto(self) -> None:
-        """Set the mode switch to Auto."""
+        """Set the mission to Auto; without effect while the operator's mode switch holds."""
         self._auto = True
 
-    def idle(self) -> None:
-        """Set the mode switch to Idle: everything stops smoothly; the next Auto resumes the mission."""
-        self._auto = False
+    def idle(self, reason: str = PAUSED) -> None:
+        """Set the mission to Idle for a reason: everything stops smoothly; the next Auto resumes the mission."""
+        self._auto, self._idle_reason = False, reason
 
     def next_step(self) -> None:
         """In single-step mode: release the next transition."""
@@ -234,6 +244,7 @@ class ActivityManager:
         """
         world = self.world
         world.update(now_ns, report, vehicle)
+        self._obey_switch(report)
         if vehicle is not None and world.location is not None and world.location.usable:
             self.route.update_distance(world.location)
         seen_ns = now_ns if seen_ns is None else seen_ns
@@ -266,8 +277,16 @@ class ActivityManager:
             self._proceed(now_ns)
         return self._send(now_ns, report, vehicle, logs)
 
+    def _obey_switch(self, report: StateReport | None) -> None:
+        self.switch.take(report)
+        if self.switch.started:
+            self.auto()
+        elif (hold := self.switch.hold) is not None:
+            self.idle(hold.sentence)
+
     def _off(self) -> str:
-        return "the mode switch is at Idle" if not self._auto and self.state not in FINAL_STATES | {State.IDLE} else ""
+        """Why the mission is at Idle after it has been set so; empty while it is not, and once it has ended."""
+        return "" if self._auto or self.state in FINAL_STATES else self._idle_reason
 
     def _danger(self) -> Problem | None:
         """Why a driving machine must stop; None while it may drive."""

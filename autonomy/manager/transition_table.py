@@ -63,8 +63,8 @@ class Event(IntEnum):
 
 
 EVENT_DESCRIPTIONS: Final[Mapping[Event, str]] = {
-    Event.RESUMED: "the mode switch is at Auto, and the mission was begun before the planner restarted",
-    Event.AUTO: "the mode switch is at Auto",
+    Event.RESUMED: "the mission is at Auto, and was begun before the planner restarted",
+    Event.AUTO: "the mission is at Auto",
     Event.AT_HEIGHT: "all four swing arms are at the requested height",
     Event.LOG_NEAR: "a log is near enough to stop for",
     Event.STANDING: "the machine is at standstill",
@@ -110,7 +110,7 @@ class Rule:
 
 
 RULES: Final[Mapping[State, Rule]] = {
-    State.IDLE: Rule("waits for the mode switch to be set to Auto", float("inf"), ""),
+    State.IDLE: Rule("waits to be set to Auto", float("inf"), ""),
     State.RAISE: Rule(
         "moves the frame to transport height",
         30.0,

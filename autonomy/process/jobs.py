@@ -13,9 +13,11 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.grasp import Grasp
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.checkpoint import Checkpoint
+from autonomy.manager.operator_switch import OperatorSwitch
 from autonomy.manager.transition_table import FINAL_STATES, State
 from autonomy.missions.model import ForwardingMission
 from autonomy.perception.driving_log_detector import in_base
@@ -27,6 +29,7 @@ from can_dbc.messages.crane import StateReport
 from can_dbc.messages.grasp import ChosenGrasp
 from can_dbc.messages.mission import MissionAction, MissionCommand, MissionReport
 from can_dbc.messages.vehicle import VehicleReport
+from runtime.errors import Problem
 
 JobEvent = tuple[str, Mapping[str, Any]]
 MAX_TOLD: Final = 3
@@ -102,6 +105,7 @@ class SingleLogJob:
 
     def __init__(self, activity: Activity) -> None:
         self._activity = activity
+        self._switch, self._held = OperatorSwitch(), ""
 
     @property
     def idle(self) -> bool:
@@ -121,7 +125,15 @@ class SingleLogJob:
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
-        """One step of the activity; the carrier stands."""
+        """One step of the activity, which the operator's mode switch may hold; the carrier stands."""
+        self._switch.take(report)
+        if self._switch.started:
+            self._held = ""
+        elif (hold := self._switch.hold) is not None:
+            self._held = hold.sentence
+        self._activity.halted = bool(self._held)
+        if self._held and self._activity.phase is Phase.WAIT:
+            return []
         data = self._activity.step(now_ns, report, logs)
         return [] if data is None else [data]
 
@@ -141,7 +153,7 @@ class SingleLogJob:
     def events(self) -> Iterator[JobEvent]:
         """Grasp, phase and pause reason."""
         yield from _crane_events(self._activity.grasp, self._activity.phase.name)
-        yield _pause_event(self._activity.paused)
+        yield _pause_event(self._held or self._activity.paused)
 
     def outcome(self) -> dict[str, Any]:
         """No fields."""
@@ -168,17 +180,17 @@ class SingleLogJob:
 
 
 class ForwardingJob:
-    """A mission as a job.  Its mode switch starts at Auto, but at Idle for a resumed mission, because the machine may
-    have been changed in the meantime, and without ``begin``.  ``begun`` says whether it was ever at Auto.
+    """A mission as a job.  It begins at Auto, but at Idle if it is a resumed mission, because the machine may have been
+    changed in the meantime, and without ``begin``.  ``begun`` says whether it was ever at Auto.
     """
 
     def __init__(self, manager: ActivityManager, mission: ForwardingMission, begin: bool = True) -> None:
         self._manager = manager
         self._ended_ns = self._now_ns = 0
         self._publisher = MissionPublisher(manager, mission)
-        self._auto = self.begun = begin and not manager.resumed
-        self._command, self._refusal = 0, ""
-        if self._auto:
+        self.begun = begin and not manager.resumed
+        self._command, self._refusal, self._refusal_code = 0, "", ""
+        if self.begun:
             manager.auto()
 
     @property
@@ -208,6 +220,7 @@ class ForwardingJob:
         if self.drives and logs:
             logs = self._in_base(now_ns, logs)
         sent = self._manager.step(now_ns, report, vehicle, logs)
+        self.begun |= self._manager.is_auto
         if self._manager.state not in FINAL_STATES:
             self._ended_ns = now_ns
         return sent
@@ -257,20 +270,23 @@ class ForwardingJob:
         }
 
     def execute(self, command: MissionCommand) -> str:
-        """Execute an operator command; an ended mission accepts none."""
-        self._command, self._refusal = command.sequence, self._executed(command.action)
-        return self._refusal
+        """Execute an operator command; an ended mission accepts none, and the mode switch may forbid Auto."""
+        refused = self._executed(command.action)
+        code, sentence = refused if isinstance(refused, Problem) else ("", refused)
+        self._command, self._refusal, self._refusal_code = command.sequence, sentence, code
+        return sentence
 
-    def _executed(self, action: MissionAction) -> str:
+    def _executed(self, action: MissionAction) -> str | Problem:
         manager = self._manager
         if manager.state in FINAL_STATES:
             return MISSION_ENDED
         match action:
             case MissionAction.AUTO:
-                self._auto = self.begun = True
+                if (hold := manager.switch.hold) is not None:
+                    return hold
+                self.begun = True
                 manager.auto()
             case MissionAction.PAUSE:
-                self._auto = False
                 manager.idle()
             case MissionAction.SINGLE_STEP:
                 manager.single_step = True
@@ -286,7 +302,8 @@ class ForwardingJob:
 
     def report(self, now_ns: int) -> MissionReport:
         """The mission report."""
-        return self._publisher.report(now_ns, self._auto, self._command, self._refusal)
+        manager = self._manager
+        return self._publisher.report(now_ns, manager.is_auto, self._command, self._refusal, self._refusal_code)
 
     def chosen_grasp(self) -> ChosenGrasp | None:
         """The grasp of the present crane job."""

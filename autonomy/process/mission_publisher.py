@@ -73,8 +73,10 @@ class MissionPublisher:
         )
         self._landings = tuple(Landing(_place(x.position), short_text(x.name)) for x in mission.landings[:MAX_LANDINGS])
 
-    def report(self, now_ns: int, auto: bool, order: int = 0, refusal: str = "") -> MissionReport:
-        """The report; ``auto`` is the mode switch, ``order`` and ``refusal`` are those of the last command."""
+    def report(
+        self, now_ns: int, auto: bool, order: int = 0, refusal: str = "", refusal_code: str = ""
+    ) -> MissionReport:
+        """The report; ``order``, ``refusal`` and ``refusal_code`` are those of the last command."""
         manager, tally = self._manager, self._manager.tally
         given_up = list(tally.given_up.items())[-MAX_GIVEN_UP:]
         activity = manager.activity
@@ -91,6 +93,7 @@ class MissionPublisher:
             failure=short_text(manager.failure),
             order=order,
             refusal=short_text(refusal),
+            refusal_code=refusal_code,
             loaded=tally.loaded,
             on_board=tally.on_board,
             on_board_m3=round(tally.board_m3, 3),

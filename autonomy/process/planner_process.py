@@ -176,6 +176,7 @@ class PlannerProcess:
                 raise CommandRefused("upload.begun", "a mission has begun; abort it and start the planner anew")
             self._machine.check(now_ns)
             self._job = self._uploads.job(upload)
+            self._job.step(now_ns, self._machine.report, None, ())  # it knows the mode switch before the next command
         except (CommandRefused, MissionError) as error:
             code, refused = error.code, short_text(str(error).partition("\n")[0])
         self._answer = {"order": upload.sequence, "refusal": refused, "refusal_code": code}

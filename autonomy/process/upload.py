@@ -38,9 +38,9 @@ NO_MISSION: Final = "there is no mission yet; upload one"
 
 @dataclass(slots=True)
 class MachineAtRest:
-    """What is known of the machine: its mode and speed, and when they were reported."""
+    """What is known of the machine: its newest state report, its speed, and when they were reported."""
 
-    mode: int = -1
+    report: StateReport | None = None
     speed_m_s: float = math.nan
     mode_ns: int = -REPORT_AGE_NS
     speed_ns: int = -REPORT_AGE_NS
@@ -48,9 +48,14 @@ class MachineAtRest:
     def on_reports(self, report: StateReport | None, vehicle: VehicleReport | None, now_ns: int) -> None:
         """Take the newest reports."""
         if report is not None:
-            self.mode, self.mode_ns = report.mode, now_ns
+            self.report, self.mode_ns = report, now_ns
         if vehicle is not None:
             self.speed_m_s, self.speed_ns = vehicle.speed_m_s, now_ns
+
+    @property
+    def mode(self) -> int:
+        """The mode of the newest report, -1 before the first."""
+        return -1 if self.report is None else self.report.mode
 
     def check(self, now_ns: int) -> None:
         """Whether a mission may be taken now.

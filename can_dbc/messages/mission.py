@@ -110,8 +110,8 @@ class MissionReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``state`` is the short name of its state and ``words`` describes it; ``paused`` says why nothing moves,
     ``waits_for`` which transition waits for the next single step, ``failure`` why the mission ended early.  ``targets``
     are the numbers of the logs to grasp, ``crane`` describes what the crane does.  ``route`` is driven repeatedly if
-    ``closed``.  ``order`` is the sequence number of the last command or upload and ``refusal`` why it was refused; a
-    refused upload has a ``refusal_code``, too.
+    ``closed``.  ``order`` is the sequence number of the last command or upload and ``refusal`` why it was refused; an
+    upload, and a command that the operator's mode switch forbids, has a ``refusal_code``, too.
     """
 
     schema: Literal[1]

@@ -13,6 +13,8 @@ from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.grasp.selection import PlannerSelection
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.process.jobs import SingleLogJob
 from can_dbc.messages.crane import OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
@@ -101,7 +103,7 @@ def _camera_detector(plant: Plant, profile: Profile, camera: str, seed: int) -> 
 
 
 class _Job:
-    """Lockstep run with a display: shows every change, ends with the planner."""
+    """Lockstep run with a display: shows every change, ends with the planner.  `step` makes it the run's planner."""
 
     def __init__(
         self,
@@ -121,15 +123,20 @@ class _Job:
         self._phase = self._grasp = ""
         self._closings = 0
         self.activity = Activity(profile, profile_hash(profile), grasp_selector=selector)
+        self._job = SingleLogJob(self.activity)
         self.system = Lockstep(
             settings,
             build_guard(profile_path(name)),
             plant,
-            self.activity,
+            self,
             Operator(profile_hash(profile), self._on_press, max_stops),
             Observer(recorder, [self._on_report], on_outputs=[] if companion is None else [companion.on_outputs]),
             detector,
         )
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> list[bytes]:
+        """Pass the inputs of the tick to the job, which obeys the mode switch; its datagrams to the controller."""
+        return self._job.step(now_ns, report, None, logs)
 
     def run(self, limit_s: float, directory: str) -> Summary:
         system, activity = self.system, self.activity

@@ -15,7 +15,7 @@ import numpy as np
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, ModeSwitch, StateReport
 from can_dbc.messages.datagrams import decode
 from machine.geometry.grapple import grapple_yaw, half_gap_m, opening_pct_from_jaw_angle, tip_below_pin_m
 from machine.geometry.sag import true_pin
@@ -59,6 +59,7 @@ class StandIn:
     held: int | None = None
     setpoint: CraneSetpoint | None = None
     trace: list[Moment] = field(default_factory=list)
+    mode_switch: ModeSwitch = ModeSwitch.NOT_FITTED
 
     @cached_property
     def profile_hash(self) -> int:
@@ -91,6 +92,7 @@ class StandIn:
             0,
             0,
             0,
+            mode_switch=self.mode_switch,
         )
 
     @property

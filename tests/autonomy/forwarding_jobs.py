@@ -15,12 +15,14 @@ from tests.autonomy.manager_missions import PLANE, PROFILE
 from tests.autonomy.mapped_logs import lying
 
 
-def begin(*logs, end_m: float = 26.0, **told: Any) -> tuple[Forwarder, ForwardingJob, ActivityManager]:
+def begin(
+    *logs, end_m: float = 26.0, waits: bool = False, **told: Any
+) -> tuple[Forwarder, ForwardingJob, ActivityManager]:
     way = tuple(Point(*PLANE.geodetic(x, 0.0)[:2]) for x in (10.0, end_m))
     mission = ForwardingMission("test", way)
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE, **told)
     forwarder = Forwarder(PROFILE, PLANE, [lying(*log) for log in logs], (0.0, 0.1, 0.05))
-    return forwarder, ForwardingJob(manager, mission), manager
+    return forwarder, ForwardingJob(manager, mission, begin=not waits), manager
 
 
 def run(forwarder: Forwarder, job: ForwardingJob, enough, limit: int = 20_000) -> list[tuple[str, dict[str, Any]]]:

@@ -8,16 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
 from autonomy.manager.transition_table import State
 from autonomy.perception.log_list.observation import LogObservation
-from autonomy.process.jobs import STOPPING_TIMEOUT_NS, ForwardingJob
+from autonomy.process.jobs import STOPPING_TIMEOUT_NS, ForwardingJob, SingleLogJob
+from can_dbc.messages.crane import ModeSwitch, StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
 from can_dbc.messages.vehicle import DriveSetpoint
 from machine.geometry.grapple import grapple_yaw
+from machine.loading.profile_file import load_profile, profile_hash
+from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.forwarding_jobs import begin, command, run
 from tests.autonomy.manager_missions import LOGS
+
+PALMS = load_profile("palms_471")
 
 
 @pytest.mark.long
@@ -86,6 +93,133 @@ def test_pause_stops_the_crane_smoothly_and_auto_resumes_with_the_log(phase: str
     assert job.execute(command(2, MissionAction.AUTO)) == ""
     run(forwarder, job, lambda j: j.idle)
     assert job.done and manager.tally.loaded == 1 and forwarder.in_bunk == 1
+
+
+def standing(forwarder: Forwarder, job: ForwardingJob) -> bool:
+    """Whether the machine has come to rest and stays there for ten seconds."""
+    for _ in range(60):
+        forwarder.step(job)  # type: ignore[arg-type]
+    before = forwarder.driven_m
+    for _ in range(200):
+        forwarder.step(job)  # type: ignore[arg-type]
+    return forwarder.speed_m_s == 0.0 and forwarder.driven_m == before
+
+
+@pytest.mark.parametrize(("position", "code"), [(ModeSwitch.IDLE, "switch.idle"), (ModeSwitch.FAULTY, "switch.faulty")])
+def test_the_operators_switch_holds_a_mission_whatever_is_commanded(position: ModeSwitch, code: str) -> None:
+    forwarder, job, _ = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder.crane.mode_switch = position
+    assert standing(forwarder, job)
+    told = job.report(forwarder.crane.now_ns)
+    assert not told.auto and told.paused == job.execute(command(1, MissionAction.AUTO))
+    told = job.report(forwarder.crane.now_ns)
+    assert (told.order, told.refusal_code) == (1, code) and standing(forwarder, job)
+    assert job.execute(command(2, MissionAction.PAUSE)) == "" and job.report(0).refusal_code == ""
+
+
+def test_turning_the_switch_from_idle_to_auto_resumes_and_auto_alone_does_not() -> None:
+    forwarder, job, manager = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder.crane.mode_switch = ModeSwitch.AUTO
+    for _ in range(20):
+        forwarder.step(job)  # type: ignore[arg-type]
+    assert forwarder.speed_m_s > 0.3, "Auto changes nothing by itself"
+    job.execute(command(1, MissionAction.PAUSE))
+    assert standing(forwarder, job)
+    forwarder.crane.mode_switch = ModeSwitch.FAULTY
+    forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.crane.mode_switch = ModeSwitch.AUTO
+    assert standing(forwarder, job), "it was not at Idle"
+    forwarder.crane.mode_switch = ModeSwitch.IDLE
+    assert standing(forwarder, job)
+    forwarder.crane.mode_switch = ModeSwitch.AUTO
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    assert job.report(0).auto and manager.state is State.SEARCH and manager.paused == ""
+
+
+def test_a_repaired_switch_lets_a_command_resume() -> None:
+    forwarder, job, _ = begin()
+    forwarder.crane.mode_switch = ModeSwitch.FAULTY
+    assert standing(forwarder, job) and forwarder.drive is None
+    forwarder.crane.mode_switch = ModeSwitch.AUTO
+    assert standing(forwarder, job) and forwarder.drive is None
+    assert job.execute(command(1, MissionAction.AUTO)) == ""
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+
+
+@pytest.mark.parametrize("position", [ModeSwitch.NOT_FITTED, ModeSwitch.AUTO])
+def test_a_mission_that_waits_starts_by_the_turn_of_the_switch_or_by_command(position: ModeSwitch) -> None:
+    forwarder, job, manager = begin(waits=True)
+    forwarder.crane.mode_switch = position
+    assert standing(forwarder, job) and manager.state is State.IDLE
+    assert not job.begun and not job.report(0).auto and job.report(0).paused == ""
+    if position is ModeSwitch.AUTO:
+        forwarder.crane.mode_switch = ModeSwitch.IDLE
+        assert standing(forwarder, job) and job.report(0).paused and not job.begun
+        forwarder.crane.mode_switch = ModeSwitch.AUTO
+    else:
+        assert job.execute(command(1, MissionAction.AUTO)) == ""
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    assert job.begun
+
+
+class Lone:
+    """A single-log job, as the stand-in of the crane steps one."""
+
+    def __init__(self) -> None:
+        self.activity = Activity(PALMS, profile_hash(PALMS))
+        self.job = SingleLogJob(self.activity)
+
+    @property
+    def phase(self) -> Phase:
+        return self.activity.phase
+
+    @property
+    def idle(self) -> bool:
+        return self.job.idle
+
+    @property
+    def failure(self) -> str | None:
+        return self.job.failure
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        sent = self.job.step(now_ns, report, None, logs)
+        return sent[0] if sent else None
+
+    def paused(self) -> object:
+        return dict(self.job.events())["paused"]["reason"]
+
+
+@pytest.mark.parametrize("position", [ModeSwitch.IDLE, ModeSwitch.FAULTY])
+def test_the_operators_switch_holds_a_single_log_job_and_its_turn_resumes_it(position: ModeSwitch) -> None:
+    crane, lone = StandIn(PALMS, [GROUND_LOG]), Lone()
+    crane.until(lone, Phase.ABOVE)  # type: ignore[arg-type]
+    for _ in range(20):
+        crane.step(lone)  # type: ignore[arg-type]
+    crane.mode_switch = position
+    for _ in range(60):
+        crane.step(lone)  # type: ignore[arg-type]
+    stands = crane.q
+    assert lone.paused()
+    crane.mode_switch = ModeSwitch.AUTO if position is ModeSwitch.FAULTY else ModeSwitch.NOT_FITTED
+    for _ in range(600):
+        crane.step(lone)  # type: ignore[arg-type]
+    assert crane.q == stands and crane.setpoint is not None, "it is held, not abandoned"
+    for crane.mode_switch in (ModeSwitch.IDLE, ModeSwitch.AUTO):
+        crane.step(lone)  # type: ignore[arg-type]
+    crane.until(lone, Phase.DESCEND)  # type: ignore[arg-type]
+    assert lone.paused() is None
+
+
+def test_a_single_log_job_that_finds_the_switch_at_idle_sends_nothing_before_its_turn() -> None:
+    crane, lone = StandIn(PALMS, [GROUND_LOG], mode_switch=ModeSwitch.IDLE), Lone()
+    for _ in range(40):
+        assert crane.step(lone) is None and lone.phase is Phase.WAIT  # type: ignore[arg-type]
+    assert lone.paused()
+    crane.mode_switch = ModeSwitch.AUTO
+    crane.step(lone)  # type: ignore[arg-type]
+    assert crane.setpoint is not None and lone.paused() is None
 
 
 def ahead(forwarder: Forwarder, job: ForwardingJob) -> None:

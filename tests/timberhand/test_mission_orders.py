@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from autonomy.process.planner_process import PlannerProcess
+from can_dbc.messages.crane import ModeSwitch
 from host.exit_codes import CommandFailed, ExitCode
 from machine.status.modes import Mode
 from tests.autonomy.mission_checks import EXAMPLES
@@ -47,8 +48,8 @@ class Machine:
         assert report is not None
         return report.auto
 
-    def stands(self, mode: Mode = Mode.STANDBY) -> None:
-        report_machine(self.process._link.getsockname(), KEY, mode)
+    def stands(self, mode: Mode = Mode.STANDBY, switch: ModeSwitch = ModeSwitch.NOT_FITTED) -> None:
+        report_machine(self.process._link.getsockname(), KEY, mode, switch=switch)
         self.process.step(self.clock_ns())
 
     def exchange(self, port: int, order: bytes) -> Iterator[bytes]:
@@ -88,6 +89,36 @@ def test_a_mission_is_started_paused_resumed_and_aborted(machine: Machine) -> No
     assert machine.run("resume") == ExitCode.OK and machine.auto()
     assert machine.start() == ExitCode.SAFETY_STOP, "it has begun"
     assert machine.run("abort") == ExitCode.OK and machine.process.job.failure
+
+
+@pytest.mark.parametrize(("switch", "code"), [(ModeSwitch.IDLE, "switch.idle"), (ModeSwitch.FAULTY, "switch.faulty")])
+def test_the_operators_switch_forbids_a_start(machine: Machine, switch: ModeSwitch, code: str) -> None:
+    machine.stands(switch=switch)
+    orders = mission_orders.PlannerOrders(1, machine.process._hash, KEY)
+    mission = mission_orders.checked(FILE, PROFILE)
+    with pytest.raises(CommandFailed, check=coded(code)):
+        orders.start(mission, "m.geojson", machine.folder)
+    assert not machine.auto() and not machine.process.job.begun
+    assert machine.run("resume") == ExitCode.SAFETY_STOP
+
+
+def test_turning_the_switch_to_auto_starts_the_mission_that_waits(machine: Machine) -> None:
+    machine.stands(switch=ModeSwitch.IDLE)
+    assert machine.start() == ExitCode.SAFETY_STOP, "it is uploaded, and waits"
+    machine.stands(switch=ModeSwitch.AUTO)
+    assert machine.auto() and machine.process.job.begun
+
+
+def test_a_switch_that_was_turned_before_the_upload_starts_nothing(machine: Machine) -> None:
+    machine.stands(switch=ModeSwitch.IDLE)
+    machine.stands(switch=ModeSwitch.AUTO)
+    orders = mission_orders.PlannerOrders(1, machine.process._hash, KEY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(orders.__class__, "order", lambda *_: None)
+        orders.start(mission_orders.checked(FILE, PROFILE), "m.geojson", machine.folder)
+    machine.stands(switch=ModeSwitch.AUTO)
+    assert not machine.auto() and not machine.process.job.begun
+    assert machine.run("resume") == ExitCode.OK and machine.auto()
 
 
 @pytest.mark.parametrize(("mode", "code"), [(None, "upload.no-report"), (Mode.ARMED, "upload.armed")])
