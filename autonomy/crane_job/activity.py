@@ -241,7 +241,7 @@ class Activity(ActivityState):
             return None
         tracker = self._tracker
         return self._stream.datagram(
-            now_ns, self._count.motion(tracker.motion), tracker.clock_s, self._grapple.command, tracker.rate
+            now_ns, self._count.motion(tracker.motion), tracker.clock_s, self._grapple.command, tracker.announce()
         )
 
     def _position(self) -> tuple[float, ...]:

@@ -19,17 +19,27 @@ Axes = tuple[float, ...]
 
 
 class TrajectoryTracker:
-    """The tracked ``motion``, the time on it ``clock_s``, and its ``rate`` in seconds per second."""
+    """The tracked ``motion``, the time on it ``clock_s``, and its next ``rate`` in seconds per second.
+
+    The clock goes at the rate that was announced last: that is the one the controller follows, whatever the planner has
+    decided since.
+    """
 
     def __init__(self, profile: Profile, last_setpoint: Axes) -> None:
         self.motion: Trajectory = hold(last_setpoint)
         self.clock_s = 0.0
         self.rate = 1.0
+        self._announced = 0.0
         self._profile = profile
 
     def begin(self, motion: Trajectory) -> None:
         """Track another motion from its start."""
-        self.motion, self.clock_s, self.rate = motion, 0.0, 1.0
+        self.motion, self.clock_s, self.rate, self._announced = motion, 0.0, 1.0, 0.0
+
+    def announce(self) -> float:
+        """The rate that goes into a datagram now."""
+        self._announced = self.rate
+        return self.rate
 
     @property
     def setpoint(self) -> Axes:
@@ -44,7 +54,7 @@ class TrajectoryTracker:
     @property
     def is_stopped(self) -> bool:
         """Whether the clock stands still."""
-        return self.rate == 0.0
+        return self.rate == self._announced == 0.0
 
     def hold_here(self) -> None:
         """Replace the rest of the motion by a hold at the present setpoint."""
@@ -53,7 +63,7 @@ class TrajectoryTracker:
     def advance(self, dt_s: float, wanted: float, measured: Sequence[float]) -> None:
         """Advance by ``dt_s`` and approach the ``wanted`` rate, or a lower one while a joint falls behind."""
         wanted = min(wanted, self._following_rate(measured))
-        self.clock_s += self.rate * dt_s  # at the rate that the last datagram announced
+        self.clock_s += self._announced * dt_s
         most = dt_s / BRAKE_S
         self.rate += min(max(wanted - self.rate, -most), most)
 

@@ -211,7 +211,7 @@ class TrajectoryExecution:
             return None, None
         grips = self._inbox.report.grapple_state in _GRIPS
         command = GrappleCommand.HOLD if grips else GrappleCommand.NEUTRAL
-        return self._stream.datagram(now_ns, tracker.motion, tracker.clock_s, command, tracker.rate), None
+        return self._stream.datagram(now_ns, tracker.motion, tracker.clock_s, command, tracker.announce()), None
 
     def progress(self) -> Progress | None:
         """Where the goal is; None without one."""
