@@ -81,6 +81,8 @@ class ActivityState:
         self._counts = has_no_encoder(profile)
         self._profile = planning_profile(profile, self._count)
         self._view, self._viewed = view, False
+        self.load_unseen = False
+        """Whether a load was held before the camera and no picture showed it."""
         self._first = Phase.STOW if stow_only else Phase.LOOK
         self._fetches_next = fetches_next
         motion_planner = motion_planner or TimeOptimalPlanner()
@@ -357,7 +359,8 @@ class Activity(ActivityState):
                 return self._cycle.after_closing(self._grapple)
             case Phase.LIFT if self._cycle.view is not None and not self._viewed:
                 assert self._arrived_ns is not None
-                return None if now_ns < self._arrived_ns + VIEW_TIMEOUT_NS else self._after_lift()
+                self.load_unseen = now_ns >= self._arrived_ns + VIEW_TIMEOUT_NS
+                return self._after_lift() if self.load_unseen else None
             case Phase.LIFT | Phase.CARRY:
                 if self._waits_for_load(now_ns):
                     return None

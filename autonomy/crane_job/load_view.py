@@ -34,14 +34,13 @@ UNSURE_AHEAD_RAD: Final = 0.08
 AHEAD_RAD: Final = 1.9
 """Slew to either side beyond which a log lies ahead of the machine."""
 AHEAD_M: Final = 3.0
-"""Distance of a shown load in front of the camera: all of a log of 4 m is in the picture."""
+"""Distance of a shown load in front of the camera: half of the picture is 3.6 m wide there."""
 BELOW_CAMERA_M: Final = 0.45
 """A shown load hangs so far below the camera, clear of the ground and of the upper edge of the picture."""
 ASIDE_M: Final = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Places beside the middle of the picture, for a slew that does not turn all round."""
 VIEW_MARGIN_M: Final = 0.5
 """A load is measured this near to the jaws: the machine leans, and the load swings."""
-MAX_SINE_TO_LEVEL: Final = 0.5
 VEHICLE_LINKS: Final = ("front", "rear")
 
 
@@ -85,7 +84,7 @@ class LoadView:
 
 def load_in_view(arm: Arm, logs: Iterable[LogObservation], pin: Pose) -> LogObservation | None:
     """What hangs in the jaws at a pin, of the logs of one picture; None where the picture shows no such log."""
-    hanging = [o for o in logs if abs(o.axis[2]) < MAX_SINE_TO_LEVEL and is_between_jaws(arm, o, pin, VIEW_MARGIN_M)]
+    hanging = (log for log in logs if is_between_jaws(arm, log, pin, VIEW_MARGIN_M))
     return max(hanging, key=lambda o: o.length_m, default=None)
 
 

@@ -1,10 +1,10 @@
 """Angle estimate of a rotator without an encoder: the commanded count, corrected by how logs hang below it.
 
 The count drifts because the valve gives more or less than the profile says: by 15 % of every turn in the nominal
-machine, and by 8 % too much to one side and 25 % too little to the other in an individual one, which adds up to a
-right angle within four logs. A log that hangs in closed jaws lies across their opening, so a view of the log is a view
-of the rotator. The planner works with the estimated angle; the controller receives the count that should bring the
-rotator there.
+machine, and by 8 % too much to one side and 25 % too little to the other in an individual one, which added up to 47
+degrees within four logs. A log that hangs in closed jaws lies across their opening, so a view of the log is a view of
+the rotator. The planner works with the estimated angle; the controller receives the count that should bring the rotator
+there.
 """
 
 from __future__ import annotations

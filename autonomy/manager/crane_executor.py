@@ -7,7 +7,7 @@ picked are given with the list from which a grasp is chosen.  Results are passed
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import degrees, isfinite
 from typing import Final
 
 from msgspec.structs import replace
@@ -184,6 +184,12 @@ class CraneExecutor:
         if job is None or not job.idle or not job.done or job.grasp is None:
             return False
         self._load.book_loaded(job, now_ns)
+        if job.load_unseen:
+            self._load.tally.remark(
+                now_ns,
+                "no picture showed a load that was held before the camera; the rotator's angle is known to "
+                f"{degrees(job.rotator.sigma_rad):.0f} degrees only",
+            )
         self._end(job)
         return True
 

@@ -78,7 +78,7 @@ class CylinderLocalizer:
     def localize_load(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
         """The cylinders of this picture alone."""
         found = []
-        for number, fit in enumerate(self._perception.fits(frame, masks)):
+        for number, fit in enumerate(self._perception.level_fits(frame, pose, masks)):
             (x, y, z), (ax, ay, az) = pose.to_base(fit.body.center_m).tolist(), (pose.rotation @ fit.body.axis).tolist()
             found.append(LogObservation(number, (x, y, z), (ax, ay, az), fit.body.length_m, 2.0 * fit.body.radius_m))
         return [log for log in found if log.diameter_m < log.length_m]

@@ -41,8 +41,12 @@ class Perception:
         Raises:
             InputRefused: the frame is invalid, or from a camera that the profile does not have.
         """
-        fits = [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < MAX_SINE_TO_LEVEL]
+        fits = self.level_fits(frame, pose, instances)
         return self._tracker.step(fits, pose, frame.stamp_ns, partial(is_displaced, frame, pose))
+
+    def level_fits(self, frame: RgbdFrame, pose: Pose, instances: Sequence[Masked]) -> list[CylinderFit]:
+        """`fits` without what stands too steep at ``pose`` to be a log."""
+        return [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < MAX_SINE_TO_LEVEL]
 
     def fits(self, frame: RgbdFrame, instances: Sequence[Masked]) -> list[CylinderFit]:
         """The logs of one frame alone, in its optical frame; ``rejections`` holds the masks that gave none."""

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Final
 
 from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.transition_table import FINAL_STATES, RULES
 from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingLogDetector, PaperBLocalizer
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
@@ -50,13 +49,11 @@ class FrontCameraDetector:
         self._front, self._manager = front, manager
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs in a picture taken now; None while the crane works or the machine is not localized."""
-        manager = self._manager
-        world = manager.world
-        works = RULES[manager.state].crane and not manager.shows_load
-        if works or manager.state in FINAL_STATES or not world.located or world.vehicle is None:
+        """The logs in a picture taken now; None while the manager wants none."""
+        world, standpoint = self._manager.world, self._manager.standpoint(now_ns)
+        if standpoint is None:
             return None
-        return self._front.detect(world.base_at(now_ns), q, world.vehicle.articulation_rad, manager.shows_load)
+        return self._front.detect(world.base_at(now_ns), q, standpoint.articulation_rad, standpoint.load)
 
 
 def check_camera(profile: Profile) -> None:

@@ -122,6 +122,14 @@ def test_a_load_that_nothing_shows_is_held_before_the_camera_until_the_rotator_i
     assert max(laid_askew_deg(8, has_camera=False)[0]) > 30.0, "without it the count drifts"
 
 
+@pytest.mark.long
+def test_a_load_that_no_picture_shows_is_laid_down_all_the_same_and_said() -> None:
+    crane = Blind(FORWARDER, [birch(0)], q=HOME)
+    planner = Activity(FORWARDER, profile_hash(FORWARDER), view=load_view(FORWARDER, 0.0))
+    crane.run(planner)
+    assert planner.done and planner.load_unseen, planner.failure
+
+
 def test_a_turn_there_and_back_does_not_end_where_it_began() -> None:
     rotator = RotatorEstimate(paces=(0.75, 1.08))
     there = rotator.turned(1.0)
