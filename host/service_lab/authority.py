@@ -29,9 +29,7 @@ def probe(expect: Expect, page: str) -> None:
     _, session = post(origin, "session")
     told = json.loads(session)
     expect(told["token"] == "", f"who has not opened the printed address got the page {told['page']}")
-    _ENTERED.open(printed_address(), timeout=10.0).close()
-    _, session = post(origin, "session")
-    token = json.loads(session)["token"]
+    token = open_page(origin)
     unnamed, _ = post(origin, "operator/reset")
     expect(unnamed == 403, f"a reset that no page sends was answered {unnamed}")
     for action, mode in (("stop", "STOP. "), ("reset", "STANDBY. ")):
@@ -49,6 +47,14 @@ def probe(expect: Expect, page: str) -> None:
     command = ("setpriv", "--reuid", "timberhand-planner", "--regid", "timberhand-planner", "--init-groups")
     done = subprocess.run([*command, sys.executable, "-c", send], capture_output=True, text=True)
     expect("PermissionError" in done.stderr, f"the planner's user sent a command: {done.stderr[-300:]}")
+
+
+def open_page(origin: str) -> str:
+    """Open the address that the console printed, as a person does; returns the page's token."""
+    _ENTERED.open(printed_address(), timeout=10.0).close()
+    _, session = post(origin, "session")
+    token: str = json.loads(session)["token"]
+    return token
 
 
 def printed_address() -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, TextIO
 
 from can_dbc.messages.key_file import SERVICE_KEY, read_key
-from host.service_lab import authority, lost_bus, perception, trial, updates
+from host.service_lab import authority, loading, lost_bus, perception, trial, updates
 from host.service_lab.pilot import Pilot
 from host.systemd import journal, main_pid, process_facts, show, systemctl
 from host.vcan_lab.spec import LabError
@@ -33,13 +33,10 @@ SERVICES: Final = ("controller", "guard", "perception", "recorder", "autonomy", 
 PLANT_PORT: Final = 24720
 CAMERA_PORT: Final = 24721
 FIFO: Final = {"controller": 80, "guard": 85}
-READY_S: Final = 2.0
-SLOW_PYTHON_S: Final = 0.3
-"""If Python alone takes longer than this to start and end, the host is too busy to evaluate a start."""
+READY_S: Final = 0.1
+"""Computing costs no simulated time: what is left is what a start waits for."""
 NEUTRAL_MS: Final = 100.0
-TRIES: Final = 4
-WORK_S: Final = 150.0
-"""Imports are slow in user-mode Linux: the page needs 54 s on an idle computer."""
+WORK_S: Final = 30.0
 STILL_MRAD: Final = 10.0
 """Greatest motion of a crane with closed valves; a slewing crane exceeds it within a tenth of a second."""
 IFF_UP: Final = 1
@@ -47,10 +44,10 @@ PILOT_PRIORITY, PLANT_PRIORITY, SYSTEMD_PRIORITY, SOFT_INTERRUPT_PRIORITY = 70, 
 
 
 class Check:
-    """The findings; ``failed`` and ``inconclusive`` hold sentences."""
+    """The findings; ``failed`` holds sentences."""
 
     def __init__(self, out: TextIO) -> None:
-        self.result: dict[str, Any] = {"failed": [], "inconclusive": [], "figures": {}, "trials": []}
+        self.result: dict[str, Any] = {"failed": [], "figures": {}, "trials": []}
         self._out = out
         self._begin_s = time.monotonic()
 
@@ -64,14 +61,11 @@ class Check:
             self.result["failed"].append(sentence)
             self.step(f"FAILED: {sentence}")
 
-    def figure(self, name: str, value: float, limit: float, disturbed: bool = False) -> None:
+    def figure(self, name: str, value: float, limit: float) -> None:
         """Record a figure and compare it with its limit."""
         self.result["figures"][name] = value
         self.step(f"{name} = {value:.1f} (at most {limit:g})")
-        if value > limit and disturbed:
-            self.result["inconclusive"].append(f"{name}: the host was too busy during the measurement")
-        else:
-            self.expect(value <= limit, f"{name} is {value:.1f}, more than {limit:g}")
+        self.expect(value <= limit, f"{name} is {value:.1f}, more than {limit:g}")
 
     def end(self) -> None:
         """Print the result."""
@@ -124,12 +118,7 @@ def change_settings(check: Check) -> dict[str, str]:
 
 
 def prioritize() -> None:
-    """Real-time priorities as in the vcan lab: frames and systemd must not wait for ordinary processes.
-
-    This kernel accounts processor time in steps of 10 ms, charged to the process that runs at their end, often a FIFO
-    loop that has just woken up.  It would take such loops for endless ones and throttle them, so throttling is off.
-    """
-    Path("/proc/sys/kernel/sched_rt_runtime_us").write_text("-1")
+    """Real-time priorities as in the vcan lab: frames and systemd must not wait for ordinary processes."""
     os.sched_setscheduler(1, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(SYSTEMD_PRIORITY))
     for comm in Path("/proc").glob("[0-9]*/comm"):
         if comm.read_text().startswith("ksoftirqd"):
@@ -156,9 +145,10 @@ def plug_in(check: Check) -> None:
     check.expect(up, f"an interface that appeared is not set up: {journal('timberhand-can@crane0.service')}")
 
 
-def start_plant(check: Check, port: str) -> subprocess.Popen[str]:
+def start_plant(check: Check, *options: str) -> subprocess.Popen[str]:
     """Start the emulated machine with real-time priority."""
-    command = [sys.executable, "-m", "sim", "--bus", "crane0=socketcan:crane0", "--port", port]
+    bus = ("--bus", "crane0=socketcan:crane0", "--port", str(PLANT_PORT))
+    command = [sys.executable, "-m", "sim", *bus, *options]
     environment = os.environ | {"PYTHONPATH": ":".join(sys.path[1:])}
     plant = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     assert plant.stdout
@@ -168,14 +158,10 @@ def start_plant(check: Check, port: str) -> subprocess.Popen[str]:
 
 
 def cold_start(check: Check) -> None:
-    """Measure the time from the first start of the controller to READY, and that of Python alone."""
-    begin_s = time.monotonic()
-    subprocess.run(["/opt/timberhand/current/bin/python", "-P", "-c", "pass"], check=False, cwd="/")
-    python_s = time.monotonic() - begin_s
+    """Measure the time from the first start of the controller to READY."""
     started = systemctl("start", trial.CONTROLLER)
     check.expect(started.returncode == 0, f"the controller does not start: {journal(trial.CONTROLLER)[-5:]}")
-    check.result["figures"]["python_start_s"] = python_s
-    check.figure("cold_start_s", ready_s(), READY_S, python_s > SLOW_PYTHON_S)
+    check.figure("cold_start_s", ready_s(), READY_S)
 
 
 def ready_s() -> float:
@@ -191,8 +177,13 @@ def _state(page: str) -> Any:
 
 def wait_for_work(check: Check, page: str) -> None:
     """Start the target; wait until page, recorder, planner and perception work."""
+    begin_s = time.monotonic()
     started = systemctl("start", "timberhand.target")
     check.expect(started.returncode == 0, f"the target does not start: {started.stderr}")
+    waits_for = show("timberhand.target", "After")["After"].split()
+    check.expect(perception.UNIT not in waits_for, "the target, and with it the boot, waits for the camera")
+    state = show(perception.UNIT, "ActiveState")["ActiveState"]
+    check.step(f"the target has started after {time.monotonic() - begin_s:.1f} s; perception is {state}")
     checks: dict[str, Callable[[], object]] = {
         # Page and recorder read the controller's timing page as different users.
         "console": lambda: _state(page)["timing"],
@@ -252,22 +243,12 @@ def inspect(check: Check, page: str) -> None:
 
 
 def end_services(check: Check, pilot: Pilot) -> None:
-    """End controller and guard in every way; repeat trials that a standstill of the guest disturbed."""
+    """End controller and guard in every way."""
     for ending in trial.ENDINGS:
-        for _ in range(TRIES):
-            try:
-                figures = trial.run_trial(ending, pilot)
-            except ProcessLookupError:
-                check.step(f"{ending.name}: a busy host ended the service before we did")
-                continue
-            if ending.unit == trial.CONTROLLER:
-                figures["ready_s"] = ready_s()
-            check.result["trials"].append(figures)
-            check.step(f"{ending.name}: { ({name: value for name, value in figures.items() if name != 'feedback'}) }")
-            late = figures["neutral_ms"] > NEUTRAL_MS and trial.was_disturbed(figures)
-            if trial.was_moving(figures) and not late:
-                break
-        evaluate_trial(check, ending, check.result["trials"][-1])
+        figures = trial.run_trial(ending, pilot)
+        check.result["trials"].append(figures)
+        check.step(f"{ending.name}: { ({name: value for name, value in figures.items() if name != 'feedback'}) }")
+        evaluate_trial(check, ending, figures)
     for unit in (trial.CONTROLLER, trial.GUARD):
         watchdog = [line for line in journal(unit) if "Watchdog timeout" in line]
         check.expect(watchdog, f"systemd says nothing of a watchdog of {unit}")
@@ -276,7 +257,7 @@ def end_services(check: Check, pilot: Pilot) -> None:
 def evaluate_trial(check: Check, ending: trial.Ending, figures: dict[str, Any]) -> None:
     """Check the figures of a trial."""
     name = ending.name
-    check.figure(f"{name}_neutral_ms", figures["neutral_ms"], NEUTRAL_MS, trial.was_disturbed(figures))
+    check.figure(f"{name}_neutral_ms", figures["neutral_ms"], NEUTRAL_MS)
     check.result["figures"] |= {f"{name}_{what}": figures[what] for what in ("no_flow_ms", "shut_ms", "ended_ms")}
     check.expect(trial.was_moving(figures), f"{name}: the crane did not move when the service ended")
     if not ending.signal:
@@ -328,8 +309,22 @@ def check_removal(check: Check) -> None:
     check.expect(not Path("/etc/timberhand/timberhand.conf").exists(), "unchanged settings are still there")
 
 
+def run_loading(check: Check, order: dict[str, str]) -> None:
+    """One log into the bunk, for a guest whose time is simulated."""
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    install(check, order)
+    conf = change_settings(check)
+    plug_in(check)
+    plant = start_plant(check, "--camera", str(CAMERA_PORT))
+    page = f"http://127.0.0.1:{conf['CONSOLE_PORT']}/"
+    wait_for_work(check, page)
+    for name, value in loading.load_a_log(page, PLANT_PORT, check.expect, check.step).items():
+        check.result["figures"][f"loading_{name}"] = value
+    plant.terminate()
+
+
 def run(check: Check, order: dict[str, str]) -> None:
-    """Run all steps."""
+    """End services and buses in every way."""
     facts = {"kernel": platform.release(), "systemd": systemctl("--version").stdout.splitlines()[0]}
     check.result["environment"] = facts | {"python": platform.python_version()}
     prioritize()
@@ -342,7 +337,7 @@ def run(check: Check, order: dict[str, str]) -> None:
     conf = change_settings(check)
     bus_without_interface(check)
     plug_in(check)
-    plant = start_plant(check, str(PLANT_PORT))
+    plant = start_plant(check)
     cold_start(check)
     inspect(check, f"http://127.0.0.1:{conf['CONSOLE_PORT']}/")
     check_status_command(check)
@@ -368,7 +363,8 @@ def main() -> None:
     os.environ.pop("PYTHONPATH", None)  # for this process only; the installed program must not need it
     check = Check(sys.stdout)
     try:
-        run(check, json.loads(Path(sys.argv[1]).read_text()))
+        order = json.loads(Path(sys.argv[1]).read_text())
+        (run_loading if order["steps"] == "loading" else run)(check, order)
     except (OSError, ValueError, KeyError, subprocess.SubprocessError, LabError) as error:
         check.expect(False, f"the test was aborted: {type(error).__name__}: {error}")
     check.end()

@@ -18,20 +18,21 @@ import sysconfig
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from host.release import bundle
 from host.release.signature import make_keys
-from host.vcan_lab import keeper, shim
-from host.vcan_lab.spec import LabError
-from host.vcan_lab.uml import KERNEL
+from host.vcan_lab import keeper, lab_kernel, shim
+from host.vcan_lab.spec import VIRTUAL_START_NS, LabError
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CHECKOUT: Final = ROOT / "pyproject.toml"
-MEM_MB: Final = 1536
+MEM_MB: Final = 4096
 """Memory for the plant, the installed program on the overlay, and systemd; the host provides only touched pages."""
+PARTS: Final = ("services", "loading")
+"""What each guest does: services and buses end in every way; a log is loaded, in simulated time."""
 END_S: Final = 10.0
 WARM_UP_S: Final = 300.0
 LEFT_OUT: Final = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycache__", "*.egg-info")
@@ -44,7 +45,7 @@ plant = Plant(load_profile("palms_471"))
 for now_ms in range(1000, 1100, 5):
     plant.step(now_ms * 1_000_000, [])
 """
-"""Compiles the code for the guest; inside it would take long, while services are timed."""
+"""Compiles the code for the guest; inside it would take long."""
 
 CHECK_SERVICE: Final = """\
 [Unit]
@@ -69,8 +70,8 @@ def missing() -> str | None:
     """Why this computer cannot run the lab; None when it can."""
     if platform.machine() != "x86_64":
         return f"user-mode Linux runs on x86_64 only, this is {platform.machine()}"
-    if shutil.which(KERNEL) is None:
-        return f"{KERNEL} is missing: apt-get install user-mode-linux"
+    if lab_kernel.find(shim.user_cache()) is None:
+        return lab_kernel.MISSING
     if not Path("/lib/systemd/systemd").exists():
         return "systemd is missing: apt-get install systemd"
     if not Path("/lib/systemd/systemd-udevd").exists():
@@ -113,8 +114,10 @@ def _build_options() -> list[str]:
     return ["--no-build-isolation"] if int(version.split(".")[0]) >= 77 else []
 
 
-def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
-    """Run the guest and return its result; ``show_step`` gets a line for every step.
+def run(
+    wheel: Path | None, timeout_s: float, show_step: Callable[[str], None], parts: Sequence[str] = PARTS
+) -> dict[str, Any]:
+    """Run a guest for each part and return their result; ``show_step`` gets a line for every step.
 
     Everything in the guest runs from the wheel, including the test itself and the emulated machine; the checkout is
     hidden from it.
@@ -132,18 +135,22 @@ def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) 
         packages, python = f"/opt/environment/{_packages().relative_to(sys.prefix)}", python_for_services()
         _warm_up(python, f"{program}:{_packages()}")
         order = {"wheel": str(wheel), "python": python, "environment": "/opt/environment", **_bundles(wheel, folder)}
-        (folder / "order.json").write_text(json.dumps(order))
         check = CHECK_SERVICE.format(program=program, packages=packages, python=python, order=folder / "order.json")
         (folder / "check.service").write_text(check)
         settings = [
             f"LAB={folder}",
             f"ENVIRONMENT={Path(sys.prefix).resolve()}",
-            f"PYTHON={python}",
             *([f"CHECKOUT={ROOT}"] if CHECKOUT.is_file() else []),
         ]
         init = program / "host" / "service_lab" / "init.sh"
         init.chmod(0o755)
-        return _boot(init, settings, timeout_s, show_step)
+        result: dict[str, Any] = {"failed": [], "figures": {}, "trials": []}
+        for part in parts:
+            (folder / "order.json").write_text(json.dumps(order | {"steps": part}))
+            told = _boot([f"init={init}", *settings], timeout_s, show_step)
+            joined = {name: result[name] + told[name] for name in ("failed", "trials")}
+            result |= told | joined | {"figures": result["figures"] | told["figures"]}
+        return result
 
 
 def _bundles(wheel: Path, folder: Path) -> dict[str, str]:
@@ -184,7 +191,9 @@ def _warm_up(python: str, path: str) -> None:
         raise LabError("service-lab.wheel-broken", f"the program in the wheel does not run: {reason}") from error
 
 
-def _boot(init: Path, settings: list[str], timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
+def _boot(settings: list[str], timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
+    kernel = lab_kernel.find(shim.user_cache())
+    assert kernel
     messages, far = os.pipe()
     log = os.memfd_create("kernel log")
     arguments = [
@@ -201,21 +210,16 @@ def _boot(init: Path, settings: list[str], timeout_s: float, show_step: Callable
         "quiet",
         "panic=1",
         "noreboot",
-        "initcall_blacklist=raid6_select_algo,calibrate_xor_blocks",
-        f"init={init}",
+        "time-travel=inf-cpu",
+        f"time-travel-start={VIRTUAL_START_NS}",
         *settings,
     ]
-    env = {"PATH": os.defpath}
-    if shim.needed(Path("/proc/cpuinfo").read_text()):
-        env["LD_PRELOAD"] = str(shim.library(shim.user_cache()))
-    kernel = shutil.which(KERNEL)
-    assert kernel
     guest = subprocess.Popen(
         [sys.executable, "-ISB", keeper.__file__, kernel, *arguments],
         stdin=subprocess.PIPE,
         stdout=log,
         stderr=log,
-        env=env,
+        env={"PATH": os.defpath},
         cwd="/",
         start_new_session=True,
         pass_fds=[far],

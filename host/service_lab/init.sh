@@ -1,15 +1,9 @@
 #!/bin/sh
 # First process of the guest: a throw-away overlay over the host's root, then systemd with nothing of the host enabled.
 # From the kernel's command line: LAB, a directory with check.service; ENVIRONMENT, the virtual environment whose packages
-# are used, which is shown at /opt/environment, outside every home directory; PYTHON, an interpreter; CHECKOUT, if any, a
-# folder that is hidden.
+# are used, which is shown at /opt/environment, outside every home directory; CHECKOUT, if any, a folder that is hidden.
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin
 mount -t proc proc /proc
-modules=/usr/lib/uml/modules/$(uname -r)
-overlay=$modules/kernel/fs/overlayfs/overlay.ko
-# finit_module(2) by number, for a machine without kmod
-load='import ctypes, os, sys; ctypes.CDLL(None).syscall(313, os.open(sys.argv[1], os.O_RDONLY), b"", 0)'
-[ ! -e "$overlay" ] || "$PYTHON" -ISB -c "$load" "$overlay"
 mount -t tmpfs -o mode=755 tmpfs /mnt
 mkdir /mnt/upper /mnt/work /mnt/root
 mount -t overlay overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work /mnt/root || exit 1
@@ -28,9 +22,6 @@ ln -s ../check.service "$units/multi-user.target.wants/"
 ln -sf /lib/systemd/system/multi-user.target "$units/default.target"
 : >"$root/etc/machine-id"
 : >"$root/etc/fstab"
-mkdir -p "$root/lib/modules"
-ln -sfn "$modules" "$root/lib/modules/$(uname -r)"
-echo vcan >"$root/etc/modules-load.d/vcan.conf"
 mount --bind "$root$ENVIRONMENT" "$root/opt/environment"
 [ ! "${CHECKOUT-}" ] || mount -t tmpfs -o mode=755 tmpfs "$root$CHECKOUT"
 umount /proc

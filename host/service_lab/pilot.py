@@ -1,7 +1,6 @@
 """Operator, planner and bus observer in one: arms the machine, slews the crane slowly, and records the bus.
 
-Runs at real-time priority between controller and plant, polls every 2 ms, and records gaps between polls: the guest, or
-this process, stood still meanwhile, so that trials with gaps prove nothing.
+Runs at real-time priority between controller and plant, and polls every 2 ms.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class Valve(NamedTuple):
 
 
 class Pilot:
-    """`until` runs the loop; ``valves``, ``modes`` and ``gaps`` hold the observations since `clear`."""
+    """`until` runs the loop; ``valves`` and ``modes`` hold the observations since `clear`."""
 
     def __init__(
         self,
@@ -86,8 +85,6 @@ class Pilot:
         self.commands = 0
         self.armed_after_ns = self.disarmed_ns = self.guarded_ns = 0
         self.mode_when_disarmed = Mode.BOOT
-        self.gaps: list[tuple[int, int]] = []
-        self._polled_ns = time.monotonic_ns()
 
     def press(self, action: OperatorAction) -> None:
         """Press a button of the operator."""
@@ -120,15 +117,8 @@ class Pilot:
         """The largest opening now [%]."""
         return self.valves[-1].opening_pct if self.valves else 0.0
 
-    def stood_still_ms(self, begin_ns: int, end_ns: int) -> float:
-        """The longest gap between polls that overlaps the window [ms]."""
-        return max((b - a for a, b in self.gaps if b >= begin_ns and a <= end_ns), default=0) * 1e-6
-
     def _poll(self) -> None:
         now_ns = time.monotonic_ns()
-        if now_ns - self._polled_ns > 10_000_000:
-            self.gaps.append((self._polled_ns, now_ns))
-        self._polled_ns = now_ns
         frames: list[Frame] = []
         self._bus.drain(frames)
         for frame in frames:

@@ -28,8 +28,6 @@ COMMAND_PRIORITY: Final = 40
 TICK_NS: Final = 5_000_000
 QUIET_S: Final = 1.5
 """Observation time after a service has returned."""
-STILL_MS: Final = 10.0
-"""A longer standstill of the guest near the end of the service invalidates the trial."""
 GUARD_BACK_NS: Final = 400_000_000
 """Messages of the guard later than this after its end come from the restarted guard (RestartSec is longer)."""
 REARM_S: Final = 120.0
@@ -99,6 +97,7 @@ def run_trial(ending: Ending, pilot: Pilot) -> dict[str, Any]:
     slew_until_fast(pilot)
     opening_pct = pilot.opening_pct()
     pilot.clear()
+    pilot.until(lambda: pilot.valves, 0.1)
     began_ns = time.monotonic_ns()
     if stop:
         release(stop)
@@ -121,7 +120,6 @@ def run_trial(ending: Ending, pilot: Pilot) -> dict[str, Any]:
         "neutral_ms": time_after(pilot, began_ns, lambda v: v.state in MOVING),
         "no_flow_ms": time_after(pilot, began_ns, lambda v: v.opening_pct > pilot.deadband_pct),
         "shut_ms": time_after(pilot, began_ns, lambda v: v.opening_pct > SHUT_PCT),
-        "stood_still_ms": pilot.stood_still_ms(began_ns - 10_000_000, began_ns + 200_000_000),
         "feedback": [
             (round((v.stamp_ns - began_ns) * 1e-6, 1), v.state, round(v.opening_pct, 1))
             for v in pilot.valves
@@ -157,11 +155,6 @@ def release(command: subprocess.Popen[bytes]) -> None:
 def was_moving(figures: dict[str, Any]) -> bool:
     """Whether the crane moved until the end of the service, so that the trial is valid."""
     return bool(figures["moving_until_then"] and figures["opening_pct"] > OPEN_PCT)
-
-
-def was_disturbed(figures: dict[str, Any]) -> bool:
-    """Whether the guest stood still in the relevant window."""
-    return bool(figures["stood_still_ms"] > STILL_MS)
 
 
 def time_after(pilot: Pilot, began_ns: int, moving: Callable[[Valve], bool]) -> float:

@@ -38,6 +38,7 @@ INTENDED = {
     "CapabilityBoundingSet",
     "MemoryDenyWriteExecute",
     "PrivateDevices",
+    "ProcSubset",
 }
 """Hardening settings that may differ between units: FIFO, CAN, network, interface configuration, compiled
 networks, and cameras."""
@@ -92,9 +93,10 @@ def test_only_the_control_processes_are_real_time_and_the_guard_has_the_highest_
         assert setting(unit, "LimitMEMLOCK") == ["infinity"]
 
 
-def test_only_what_runs_networks_may_make_machine_code_and_only_the_camera_sees_devices() -> None:
+def test_only_what_runs_networks_makes_machine_code_and_sees_the_processor_and_only_the_camera_sees_devices() -> None:
     loose = {short(unit) for unit in UNITS if setting(unit, "MemoryDenyWriteExecute") == ["no"]}
-    assert loose == {"perception", "autonomy"}
+    sees_cpuinfo = {short(unit) for unit in UNITS if setting(unit, "ProcSubset") != ["pid"]}
+    assert loose == sees_cpuinfo == {"perception", "autonomy"}
     assert {short(unit) for unit in UNITS if setting(unit, "PrivateDevices") == ["no"]} == {"perception"}
     unit = DEPLOY / "units/timberhand-perception.service"
     assert setting(unit, "Type") == ["notify"] and int(setting(unit, "WatchdogSec")[0]) <= 10

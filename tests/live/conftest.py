@@ -2,7 +2,8 @@
 
 A witness on every processor tells when it stood still (`experiments.common.stall_witness`).  A test that fails while
 the host stood still for longer than the test bears (15 ms, or its mark ``bears``) has found nothing; it is reported as
-inconclusive, with the stall.  Any other failure is a failure.
+inconclusive, with the stall.  Any other failure is a failure.  A test in simulated time bears any standstill:
+nothing in it depends on the host's clock.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ operator has armed it again.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -53,6 +54,7 @@ sys.exit(summary.exit_code)
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.bears(math.inf)
 def test_a_log_is_loaded_although_the_planner_freezes_on_the_route(tmp_path: Path) -> None:
     if lab_kernel.find(shim.user_cache()) is None:
         pytest.skip(lab_kernel.MISSING)
