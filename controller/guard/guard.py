@@ -19,9 +19,8 @@ from typing import Final
 from can_dbc.frame import EXTENDED, Frame, RawFrame
 from controller.guard import carrier as mach0
 from controller.guard.envelope import Envelope
-from controller.guard.joints import CommandedAxis, MeasuredJoint
+from controller.guard.joints import CommandedAxis, MeasuredJoint, MotionWatch
 from controller.guard.layout import GuardConfigError, Layout
-from controller.guard.motion import MotionWatch
 from controller.guard.reach import Reach
 from controller.guard.stream import FrameEffect, Punctuality, SentMessage, WatchedMessage
 from controller.guard.verdicts import AUX_AXIS, DRIVE_AXIS, FINE, GRAPPLE_AXIS, LATCHING, NO_AXIS, Finding, Verdict

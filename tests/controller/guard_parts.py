@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from controller.guard.envelope import Axis
+from controller.guard.joints import MotionWatch
 from controller.guard.layout import Field, Layout
-from controller.guard.motion import MotionWatch
 from controller.guard.verdicts import FINE
 from tests.controller.bench import MS
 

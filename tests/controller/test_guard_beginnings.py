@@ -10,9 +10,8 @@ from can_dbc.frame import Frame
 from controller.guard import stream
 from controller.guard.__main__ import profile_path
 from controller.guard.envelope import Envelope, Kinematics, _axis, read_envelope
-from controller.guard.joints import CommandedAxis, MeasuredJoint, RateCredit
+from controller.guard.joints import CommandedAxis, MeasuredJoint, MotionWatch, RateCredit
 from controller.guard.layout import Field, GuardConfigError, Layout, read_layouts
-from controller.guard.motion import MotionWatch
 from controller.guard.reach import Reach
 from controller.guard.stream import Punctuality, SentMessage, WatchedMessage
 from controller.guard.verdicts import DRIVE_AXIS, FINE, Verdict

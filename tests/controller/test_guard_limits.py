@@ -10,9 +10,8 @@ import pytest
 from can_dbc.frame import Frame
 from controller.guard.__main__ import DATABASES, profile_path
 from controller.guard.envelope import CarrierLimits, Envelope, Kinematics, _axis, read_envelope
-from controller.guard.joints import CommandedAxis, MeasuredJoint, RateCredit
+from controller.guard.joints import CommandedAxis, MeasuredJoint, MotionWatch, RateCredit
 from controller.guard.layout import Field, Layout, read_layouts
-from controller.guard.motion import MotionWatch
 from controller.guard.reach import Reach
 from controller.guard.verdicts import FINE, Verdict
 from tests.controller.bench import MS
