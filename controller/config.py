@@ -5,10 +5,22 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
 from machine.profile import Profile
 from runtime.errors import ConfigError
+
+TX_QUEUE_NS: Final = 20_000_000
+"""Own frames wait at most about this long for a bus."""
+CRANE_FRAMES_PER_TICK: Final = 3
+"""Both valve commands and SYNC."""
+REFERENCE_FRAMES_PER_TICK: Final = 3
+"""The joint references for a PLC that closes the joint loops."""
+OCCASIONAL_FRAMES: Final = 4
+"""Status, heartbeat, and requests of the start-up."""
+MIN_QUEUE_FRAMES: Final = 8
+"""More than a single tick sends; on mach0 two periods of its commands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +46,19 @@ class Settings:
         the rest is for a slow adapter.
         """
         return self.period_ns * 3 // 5
+
+    @property
+    def tx_queue_frames(self) -> tuple[int, int]:
+        """How many own frames may wait for crane0 and for mach0: those of `TX_QUEUE_NS`.
+
+        A full queue tells that they are old, and `controller.process.bus_link` cancels them.  The bound is a time,
+        because at 1 kHz a number that is safe at 200 Hz is full after a few ticks.
+        """
+        plc = self.profile.plc
+        referring = plc is not None and plc.role == "references"
+        frames_per_tick = CRANE_FRAMES_PER_TICK + (REFERENCE_FRAMES_PER_TICK if referring else 0)
+        ticks = -(-TX_QUEUE_NS // self.period_ns)
+        return max(MIN_QUEUE_FRAMES, ticks * frames_per_tick + OCCASIONAL_FRAMES), MIN_QUEUE_FRAMES
 
 
 def load(name_or_path: str | Path, rate_hz: int = 0) -> Settings:

@@ -4,9 +4,9 @@ Nothing here ends the process, because a running controller can report the fault
 of both directions are discarded: they are from a time in which the machine was not under control.
 
 Old commands are never left in the transmit queue.  One that is full holds commands that have waited too long
-(`controller.process.tx_queue`): they are cancelled, and until the queue has been empty every tick that sends cancels
-those of the one before.  A kernel's queue cannot be emptied from outside: there its own length is the bound
-(`txqueuelen`), and guard and nodes refuse what comes late.
+(`controller.config.Settings.tx_queue_frames`): they are cancelled, and until the queue has been empty every tick that
+sends cancels those of the one before.  A kernel's queue cannot be emptied from outside: there its own length is the
+bound (`txqueuelen`), and guard and nodes refuse what comes late.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ from controller.config import Settings, load
 from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
 from controller.process.timing import LoopTiming
-from controller.process.tx_queue import MIN_QUEUE_FRAMES, crane_queue_frames
 from controller.process.warm_up import warm_up
 from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
@@ -153,7 +152,7 @@ def open_buses(where: dict[str, str], controller: Controller, settings: Settings
     wanted: list[list[FilterItem]] = [[*controller.crane_inputs.filters()]]
     if controller.carrier_bus is not None:
         wanted.append(controller.carrier_bus.inputs.filters())
-    queues = (crane_queue_frames(settings), MIN_QUEUE_FRAMES)
+    queues = settings.tx_queue_frames
     opened: list[Bus] = []
     try:
         for address, filters, queue in zip(where.values(), wanted, queues, strict=False):

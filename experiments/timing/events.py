@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from can_dbc.timing.page import Facts
-from controller.process.tx_queue import TX_QUEUE_NS
+from controller.config import TX_QUEUE_NS
 from machine.status.reasons import Reason
 
 STALL_NS: Final = 10_000_000

@@ -23,7 +23,6 @@ from controller.guard.guard import Guard
 from controller.guard.operator import action_of
 from controller.process.bus_link import BusLink
 from controller.process.tick_recording import record
-from controller.process.tx_queue import MIN_QUEUE_FRAMES, crane_queue_frames
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from hil.harness.operator import Operator
@@ -125,10 +124,9 @@ class Lockstep:
         """The operator's commands on their way, as ``_datagrams`` are the planner's."""
         self._datagrams: list[bytes] = []
         self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self.cores}
-        queues = (crane_queue_frames(settings), MIN_QUEUE_FRAMES)
         self._crane, *more = (
             BusLink(InProcessBus(core, "controller", tx_queue=queue))
-            for core, queue in zip(self.cores, queues, strict=False)
+            for core, queue in zip(self.cores, settings.tx_queue_frames, strict=False)
         )
         self._machine = more[0] if self._controller.carrier_bus and more else None
         keys = guard.keys_of_buses

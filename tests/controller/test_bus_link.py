@@ -8,9 +8,8 @@ import pytest
 from can_dbc.frame import Frame
 from can_dbc.messages.tick_record import BusReading
 from controller.bus_io.bus_monitor import BusMonitor
-from controller.config import load
+from controller.config import MIN_QUEUE_FRAMES, TX_QUEUE_NS, load
 from controller.process.bus_link import BusLink
-from controller.process.tx_queue import MIN_QUEUE_FRAMES, TX_QUEUE_NS, crane_queue_frames
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault, Kind
 from hil.wire.inprocess import InProcessBus
@@ -30,7 +29,7 @@ class Rig:
         self.period_ns = 1_000_000_000 // rate_hz
         self.core = WireCore(1_000_000)
         self.core.inject(Fault(Kind.BABBLE, 100 * MS, end_ns, key=0x000))
-        self.bus = InProcessBus(self.core, "controller", tx_queue=crane_queue_frames(load("palms_471", rate_hz)))
+        self.bus = InProcessBus(self.core, "controller", tx_queue=load("palms_471", rate_hz).tx_queue_frames[0])
         self.listener = InProcessBus(self.core, "listener")
         self.link, self.reading, self.monitor = BusLink(self.bus), BusReading(), BusMonitor(0)
         self.reasons: list[tuple[int, Reason]] = []
@@ -104,6 +103,6 @@ def test_commands_that_are_not_due_in_every_tick_are_neither_cancelled_early_nor
 
 def test_joint_references_have_room_in_the_queue() -> None:
     settings = load("palms_471")
-    plain = crane_queue_frames(settings)
+    plain = settings.tx_queue_frames[0]
     profile = msgspec.structs.replace(load_profile("palms_471"), plc=Plc("references"))
-    assert crane_queue_frames(type(settings)(profile, 0, settings.rate_hz)) > plain
+    assert type(settings)(profile, 0, settings.rate_hz).tx_queue_frames[0] > plain
