@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from controller.bus_io.message_state import MessageState, Signal, or_nan
+from controller.bus_io import MessageState, Signal, or_nan
 from controller.carrier.monitors import BEND_MARGIN_RAD, DISAGREE_RAD
 from controller.carrier.vehicle import Vehicle
 from controller.config import Settings

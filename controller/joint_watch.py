@@ -18,7 +18,7 @@ from array import array
 from collections.abc import Sequence
 from typing import Final
 
-from controller.bus_io.message_state import Signal
+from controller.bus_io import Signal
 from controller.crane.motion import Crane
 from controller.estimation.direction_monitor import DirectionMonitor
 from controller.estimation.drift_monitor import DriftMonitor

@@ -10,8 +10,7 @@ from typing import Final
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
-from controller.bus_io.message_state import Signal, or_nan
-from controller.bus_io.messages import PeriodicTimer
+from controller.bus_io import PeriodicTimer, Signal, or_nan
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs
 from controller.crane.motion import Crane

@@ -19,7 +19,7 @@ from can_dbc.dbc.codec import Database, load
 from can_dbc.frame import RawFrame
 from can_dbc.messages.crane import CraneSetpoint, OperatorAction, SpoolTest
 from can_dbc.messages.vehicle import DriveSetpoint
-from controller.bus_io.bus_monitor import BusMonitor
+from controller.bus_io import BusMonitor
 from controller.carrier.vehicle import Vehicle
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs, spool_signals

@@ -13,8 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from controller.bus_io.bus_monitor import BusMonitor
-from controller.bus_io.message_state import MessageState, Signal
+from controller.bus_io import BusMonitor, MessageState, Signal
 from controller.carrier.bus import CarrierBus
 from controller.carrier.dead_reckoning import TRUE_REFERENCE
 from controller.carrier.inputs import CarrierInputs

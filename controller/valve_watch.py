@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from controller.bus_io.message_state import Signal
+from controller.bus_io import Signal
 from controller.crane.inputs import CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.estimation.joint_estimator import JointEstimator

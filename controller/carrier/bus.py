@@ -9,7 +9,7 @@ from __future__ import annotations
 from can_dbc.dbc.codec import Database, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.messages.tick_record import BusReading
-from controller.bus_io.bus_monitor import BusMonitor
+from controller.bus_io import BusMonitor
 from controller.carrier.inputs import CarrierInputs
 from controller.carrier.outputs import STANDING, CarrierWriter
 from machine.status.modes import Mode

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from controller.bus_io.message_state import Signal, or_nan
+from controller.bus_io import Signal, or_nan
 from controller.carrier.inputs import CarrierInputs
 from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.heading import east_north_m

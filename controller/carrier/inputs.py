@@ -12,7 +12,7 @@ from typing import Final
 from can_dbc.dbc.codec import PDU2_MASK, Database, FrameRefused, pgn_key
 from can_dbc.frame import EXTENDED, Frame
 from can_dbc.protocols.nmea2000 import Reassembler
-from controller.bus_io.message_state import MessageState, age_out
+from controller.bus_io import MessageState, age_out
 from controller.carrier.address_claim import FORMATS, AddressClaim
 from machine.status.stale_inputs import CARRIER_BIT
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from controller.bus_io.message_state import Signal
+from controller.bus_io import Signal
 from controller.carrier.dead_reckoning import (
     MAX_REPEATED_JUMP_M,
     MAX_REPEATED_JUMP_RAD,

@@ -11,7 +11,7 @@ from typing import Final
 
 from can_dbc.dbc.codec import Database
 from can_dbc.frame import RawFrame
-from controller.bus_io.messages import ARM_KEY, PeriodicTimer, ProtectedMessage, safe_state
+from controller.bus_io import ARM_KEY, PeriodicTimer, ProtectedMessage, safe_state
 from controller.carrier.address_claim import AddressClaim
 from machine.geometry.carrier import ARMS
 from machine.status.modes import Mode

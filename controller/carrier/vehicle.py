@@ -16,8 +16,7 @@ from typing import Final
 from can_dbc.dbc.codec import Database
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VEHICLE_INPUTS, DriveSetpoint, Driving, Steering, VehicleReport
-from controller.bus_io.message_state import MessageState, or_nan
-from controller.bus_io.messages import PeriodicTimer
+from controller.bus_io import MessageState, PeriodicTimer, or_nan
 from controller.carrier.bus import CarrierBus
 from controller.carrier.dead_reckoning import DeadReckoning
 from controller.carrier.monitors import VehicleMonitor

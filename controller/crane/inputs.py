@@ -21,7 +21,7 @@ from can_dbc.protocols.canopen import (
     Presence,
     parse_emergency,
 )
-from controller.bus_io.message_state import MessageState, Signal, age_out
+from controller.bus_io import MessageState, Signal, age_out
 from machine.crane_nodes import PRESSURE_NODES, CraneNode
 from machine.joints import ARTICULATION, JOINTS
 from machine.profile import Profile, encoders

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest
-from controller.bus_io.message_state import Signal, or_nan
-from controller.bus_io.messages import PeriodicTimer
+from controller.bus_io import PeriodicTimer, Signal, or_nan
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs
 from controller.crane.load_moment import LoadMoment

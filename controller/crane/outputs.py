@@ -15,7 +15,7 @@ from can_dbc.dbc.codec import Database, MessageCodec
 from can_dbc.frame import RawFrame
 from can_dbc.messages.crane import GrappleCommand
 from can_dbc.protocols.canopen import NodeState, heartbeat_frame, next_sync, sync_frame
-from controller.bus_io.messages import ARM_KEY, PeriodicTimer, ProtectedMessage, safe_state
+from controller.bus_io import ARM_KEY, PeriodicTimer, ProtectedMessage, safe_state
 from machine.crane_nodes import CraneNode
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from controller.bus_io.message_state import MessageState, Signal
+from controller.bus_io import MessageState, Signal
 
 LOADED_BAR: Final = 15.0
 LOST_SHARE: Final = 0.4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from controller.bus_io.message_state import MessageState, Signal
+from controller.bus_io import MessageState, Signal
 from controller.estimation.joint_estimator import JointEstimator
 from machine.profile import Encoder
 from machine.sensing.encoder import EncoderScale

@@ -19,7 +19,7 @@ from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.plc.map import ESTOP_BYTES, N_JOINTS, Command, Feedback, Grapple, Role, State
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
-from controller.bus_io.messages import PeriodicTimer, ProtectedMessage
+from controller.bus_io import PeriodicTimer, ProtectedMessage
 from controller.crane.inputs import sample_timeout_ns
 from controller.plc.emulated_nodes import EmulatedEncoder, EmulatedNode
 from controller.plc.handshake import Handshake

@@ -13,7 +13,7 @@ from can_dbc.dbc.codec import MessageCodec
 from can_dbc.frame import RawFrame
 from can_dbc.protocols.canopen import NodeState, heartbeat_frame
 from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave, Objects
-from controller.bus_io.messages import PeriodicTimer
+from controller.bus_io import PeriodicTimer
 from controller.crane.startup import TPDO1, TPDO1_MAPPINGS
 from machine.profile import Encoder
 from machine.sensing.encoder import counts_from_position

@@ -15,8 +15,7 @@ from can_dbc.frame import Frame
 from can_dbc.plc import map as plc
 from can_dbc.plc.map import N_AXES, N_JOINTS, Bounds, Command, Feedback, Grapple, MapError, Mode, Role, State
 from can_dbc.protocols.punctuality import Punctuality
-from controller.bus_io.message_state import MessageState, age_out
-from controller.bus_io.messages import ARM_KEY
+from controller.bus_io import ARM_KEY, MessageState, age_out
 from machine.joints import JOINTS
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import Profile, joint

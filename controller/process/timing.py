@@ -17,7 +17,7 @@ from typing import Final
 from can_dbc.bus.base import Bus
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, TimingWriter
-from controller.bus_io.message_state import MessageState
+from controller.bus_io import MessageState
 from controller.step import Controller
 from runtime.compiled import running
 

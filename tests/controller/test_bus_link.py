@@ -7,7 +7,7 @@ import pytest
 
 from can_dbc.frame import Frame
 from can_dbc.messages.tick_record import BusReading
-from controller.bus_io.bus_monitor import BusMonitor
+from controller.bus_io import BusMonitor
 from controller.config import MIN_QUEUE_FRAMES, TX_QUEUE_NS, load
 from controller.process.bus_link import BusLink
 from hil.wire.core import WireCore

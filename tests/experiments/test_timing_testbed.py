@@ -15,7 +15,7 @@ from can_dbc.messages.crane import CraneSetpoint, StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.tick_record import BusReading
 from can_dbc.timing.page import Facts, ProcessCounters
-from controller.bus_io.bus_monitor import BusMonitor
+from controller.bus_io import BusMonitor
 from controller.config import load as settings_of
 from controller.guard.__main__ import build, profile_path, split
 from controller.guard.operator import action_of
