@@ -17,7 +17,7 @@ from controller.config import Settings
 from controller.crane.inputs import HEARTBEAT_TIMEOUT_NS, CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.estimation.joint_estimator import JointEstimator
-from controller.requests.gate import RequestGate
+from controller.requests import RequestGate
 from controller.supervisor import (
     LATE_NS,
     LATE_PERIODS,

@@ -16,7 +16,7 @@ from controller.crane.inputs import CraneInputs
 from controller.crane.motion import Crane
 from controller.estimation.joint_estimator import JointEstimator
 from controller.evidence import Evidence
-from controller.requests.setpoint_gate import SetpointGate
+from controller.requests import SetpointGate
 from controller.supervisor import Supervisor
 from machine.status.reasons import pack
 

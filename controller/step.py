@@ -31,8 +31,7 @@ from controller.estimation.pressure_monitor import NO_FUNCTION
 from controller.estimation.sensed_joint import SensedJoint
 from controller.evidence import Evidence
 from controller.joint_watch import JointWatch
-from controller.requests.gate import RequestGate
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestGate, RequestRefused
 from controller.state_report import StateReporter
 from controller.supervisor import Supervisor
 from controller.tick import Inputs, Outputs

@@ -24,7 +24,7 @@ class Inputs:
     bus: BusReading = field(default_factory=BusReading)
     machine_bus: BusReading = field(default_factory=BusReading)
     operator: list[bytes] = field(default_factory=list)
-    """Datagrams of persons who may arm (`controller.requests.operator_socket`); they are heard before the others."""
+    """Datagrams of persons who may arm (`controller.process.operator_socket`); they are heard before the others."""
     datagrams: list[bytes] = field(default_factory=list)
     """Datagrams of anyone else: setpoints, and STOP."""
     late_ns: int = 0

@@ -3,7 +3,7 @@
 ARM, DISARM, RESET and the heartbeats are heard only there, and only with an authenticator made with the credential of
 the listener's present start: random bytes in a file beside the socket, which its owner and its group may read (as
 X11's cookie).  So what was sent before a restart is worth nothing after it.  STOP needs none, and is heard there before
-anything else, whatever waits on the setpoint port.  The controller's side is `controller.requests.operator_socket`, the
+anything else, whatever waits on the setpoint port.  The controller's side is `controller.process.operator_socket`, the
 guard's `controller.guard.operator`: it hears the person itself, and nothing moves without the ARM that it heard.
 """
 

@@ -27,7 +27,7 @@ from controller.estimation.sensed_joint import SensedJoint
 from controller.laws.drive import DriveLaw
 from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw
 from controller.laws.suspension import Suspension
-from controller.requests.setpoint_gate import RequestRefused, SetpointGate
+from controller.requests import RequestRefused, SetpointGate
 from machine.profile import Carrier, CarrierValve, Encoder
 from machine.status.reasons import Reason, pack
 

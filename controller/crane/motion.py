@@ -28,8 +28,7 @@ from controller.laws.crane import LOADS, CraneLaw
 from controller.laws.grapple import GrappleLaw
 from controller.laws.joint import STANDING_UNIT_S
 from controller.laws.sway import STATUS_USABLE, SWING, SwayDamping
-from controller.requests.gate import RequestGate
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestGate, RequestRefused
 from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.status.reasons import Reason
 

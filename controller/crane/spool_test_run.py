@@ -20,7 +20,7 @@ from typing import Final
 
 from can_dbc.messages.crane import MAX_KNOTS, SpoolTest
 from controller.laws.joint import ACCELERATION_FACTOR
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestRefused
 from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import JointSpec, Profile, joint

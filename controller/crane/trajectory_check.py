@@ -10,7 +10,7 @@ from typing import Final
 
 from can_dbc.messages.crane import CraneSetpoint
 from controller.crane.reference_governor import Trajectory, extremes, peak_speed
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestRefused
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint
 from machine.status.reasons import Reason

@@ -15,7 +15,7 @@ from math import cos, sin
 from typing import Final
 
 from can_dbc.messages.crane import Knot
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestRefused
 from machine.geometry.bunk import stake_walls
 from machine.geometry.kinematics import pin_position
 from machine.profile import Profile

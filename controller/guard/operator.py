@@ -1,6 +1,6 @@
 """What a person asks for, heard by the guard itself: an operator's socket of its own, apart from the controller's.
 
-Who is heard there: `controller.requests.operator_socket`.  STOP counts whatever key, age or order it carries.
+Who is heard there: `controller.process.operator_socket`.  STOP counts whatever key, age or order it carries.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
 from controller.guard.layout import GuardConfigError
-from controller.requests.operator_socket import OperatorSocket
+from controller.process.operator_socket import OperatorSocket
 
 AGE_NS: Final = 1_000_000_000
 

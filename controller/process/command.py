@@ -27,10 +27,10 @@ from can_dbc.messages.udp_address import address_argument
 from can_dbc.timing.page import METRIC_KEYS, STAGES, TimingWriter, default_path
 from controller.config import Settings, load
 from controller.process.loop import Loop
+from controller.process.operator_socket import OperatorSocket
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
 from controller.process.timing import LoopTiming
 from controller.process.warm_up import warm_up
-from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
 from machine.status.explanation import describe
 from machine.status.modes import Mode

@@ -25,10 +25,10 @@ from can_dbc.messages.operator_link import admitted
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.tick_record import RecordWriter
 from controller.process.bus_link import BusLink
+from controller.process.operator_socket import OperatorSocket
 from controller.process.realtime import sleep_until
 from controller.process.tick_recording import write
 from controller.process.timing import LoopTiming
-from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from machine.status.explanation import describe

@@ -27,8 +27,8 @@ from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import fast_packet
 from controller.config import Settings
 from controller.process.loop import Loop
+from controller.process.operator_socket import OperatorSocket
 from controller.process.timing import LoopTiming
-from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
 from machine.joints import JOINTS
 from machine.profile import joint

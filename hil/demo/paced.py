@@ -32,8 +32,8 @@ from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.grasp import encode_grasp
 from can_dbc.messages.vehicle import VehicleReport
+from controller.process.operator_socket import OperatorSocket
 from controller.process.realtime import sleep_until
-from controller.requests.operator_socket import OperatorSocket
 from controller.tick import Outputs
 from hil.demo.lockstep import run_lockstep
 from hil.demo.summary import Summary

@@ -22,7 +22,7 @@ from controller.crane.reference_governor import Trajectory
 from controller.crane.trajectory_check import TrajectoryCheck
 from controller.crane.workspace_check import MAX_KNOTS_CHECKED, WorkspaceCheck
 from controller.laws.grapple import GrappleState
-from controller.requests.setpoint_gate import REFUSED_LIMIT_COUNT, RequestRefused
+from controller.requests import REFUSED_LIMIT_COUNT, RequestRefused
 from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.profile import Profile, joint
 from machine.status.explanation import describe, sentence_of

@@ -13,7 +13,7 @@ from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import signed
 from can_dbc.messages.operator_link import CREDENTIAL_BYTES
-from controller.requests.operator_socket import COMMAND_BYTES, OperatorSocket
+from controller.process.operator_socket import COMMAND_BYTES, OperatorSocket
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.controller.bench import Bench

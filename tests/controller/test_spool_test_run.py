@@ -9,7 +9,7 @@ import pytest
 
 from can_dbc.messages.crane import SpoolKnot, SpoolTest
 from controller.crane.spool_test_run import MAX_OPEN_NS, SpoolTestRun
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestRefused
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason

@@ -8,7 +8,7 @@ import pytest
 from can_dbc.messages.crane import Knot
 from controller.config import Settings
 from controller.crane.workspace_check import GROUND_MARGIN_M, MAX_KNOTS_CHECKED, WorkspaceCheck
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestRefused
 from machine.geometry.bunk import stake_walls
 from machine.geometry.kinematics import Unreachable, pin_position, solve
 from machine.loading.profile_file import load_profile, profile_hash

@@ -34,8 +34,7 @@ from can_dbc.messages.record_ring import RecordRing, RingReader
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from can_dbc.timing.page import TimingWriter, read_timing
 from controller.config import load
-from controller.requests.gate import RequestGate
-from controller.requests.setpoint_gate import RequestRefused
+from controller.requests import RequestGate, RequestRefused
 from runtime.errors import InputRefused
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.conftest import a_timing

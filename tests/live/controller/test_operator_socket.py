@@ -12,7 +12,7 @@ from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import signed
 from can_dbc.messages.operator_link import credential_path
-from controller.requests.operator_socket import OperatorSocket
+from controller.process.operator_socket import OperatorSocket
 
 NOBODY = 65534
 BECOME_NOBODY = "import os, socket, sys\nos.setgroups([])\nos.setgid(65534)\nos.setuid(65534)\n"

@@ -1,1 +1,0 @@
-"""Requests that arrive as datagrams: their checks, their order and the memory of refusals."""
