@@ -20,14 +20,19 @@ from typing import Final
 
 from controller.bus_io import Signal
 from controller.crane.motion import Crane
-from controller.estimation.direction_monitor import DirectionMonitor
-from controller.estimation.drift_monitor import DriftMonitor
 from controller.estimation.joint_estimator import JointEstimator
-from controller.estimation.motion_monitor import AGAINST_ELSEWHERE_S, AGAINST_S, LATE_DELAY_S, MotionMonitor
+from controller.estimation.joint_monitors import (
+    AGAINST_ELSEWHERE_S,
+    AGAINST_S,
+    LATE_DELAY_S,
+    USUAL_SPEED,
+    DriftMonitor,
+    MotionMonitor,
+    SlopeYield,
+    StandstillMonitor,
+)
 from controller.estimation.sensed_joint import SensedJoint
-from controller.estimation.slope_yield import SlopeYield
-from controller.estimation.standstill_monitor import StandstillMonitor
-from controller.estimation.usual_speed import USUAL_SPEED
+from controller.estimation.valve_monitors import DirectionMonitor
 from controller.supervisor import NO_JOINT, Supervisor
 from controller.transitions import OPERATING
 from machine.joints import N_JOINTS, Joint

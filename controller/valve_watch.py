@@ -17,9 +17,14 @@ from controller.bus_io import Signal
 from controller.crane.inputs import CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.estimation.joint_estimator import JointEstimator
-from controller.estimation.speed_monitor import WINDOW_S, SpeedMonitor, command_window_s
-from controller.estimation.spool_monitor import LONGEST_DELAY_S, SpoolMonitor
-from controller.estimation.usual_speed import USUAL_SPEED
+from controller.estimation.joint_monitors import USUAL_SPEED
+from controller.estimation.valve_monitors import (
+    LONGEST_DELAY_S,
+    SPEED_WINDOW_S,
+    SpeedMonitor,
+    SpoolMonitor,
+    command_window_s,
+)
 from controller.supervisor import Supervisor
 from controller.transitions import OPERATING
 from machine.joints import N_JOINTS, Joint
@@ -75,7 +80,7 @@ class ValveWatch:
         ]
         self._speeds = [
             SpeedMonitor(
-                s.valve, s.speed_limit, period_s, WINDOW_S if plc is None else command_window_s(s.valve), least
+                s.valve, s.speed_limit, period_s, SPEED_WINDOW_S if plc is None else command_window_s(s.valve), least
             )
             for s, least in zip(specs, USUAL_SPEED, strict=True)
         ]

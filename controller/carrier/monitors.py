@@ -18,7 +18,7 @@ from controller.carrier.dead_reckoning import (
 )
 from controller.carrier.inputs import CarrierInputs
 from controller.estimation.joint_estimator import TrackedJoint
-from controller.estimation.motion_monitor import LATE_LAG_S, MotionMonitor
+from controller.estimation.joint_monitors import LATE_LAG_S, MotionMonitor
 from controller.laws.suspension import N_ARMS, Suspension
 from machine.joints import ARTICULATION
 from machine.profile import Carrier

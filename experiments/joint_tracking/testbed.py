@@ -16,7 +16,7 @@ from typing import Any, Final
 from controller.config import Settings
 from controller.crane.reference_governor import TimeScaling
 from controller.estimation.joint_estimator import JointEstimator
-from controller.estimation.motion_monitor import MotionMonitor
+from controller.estimation.joint_monitors import MotionMonitor
 from controller.laws.crane import LOADS, CraneLaw
 from machine.joints import JOINTS, N_JOINTS
 from machine.loading.profile_file import profile_hash

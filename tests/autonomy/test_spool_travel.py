@@ -12,7 +12,7 @@ from autonomy.calibration.spool_run import MonitoredSpoolRun
 from autonomy.calibration.spool_travel import MAX_LEGS, TOLERANCES, Leg, SpoolTravel
 from autonomy.calibration.tasks import SpoolTask
 from controller.crane.spool_test_run import MAX_OPEN_NS
-from controller.estimation.standstill_monitor import SHAKEN_S_AT_LIMIT
+from controller.estimation.joint_monitors import SHAKEN_S_AT_LIMIT
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from tests.autonomy.valve_stand_in import LEAD_S, StandIn

@@ -6,12 +6,9 @@ from itertools import count
 import pytest
 
 from can_dbc.messages.crane import GrappleCommand
-from controller.estimation.drift_monitor import DriftMonitor
 from controller.estimation.joint_estimator import NoiseMonitor
-from controller.estimation.motion_monitor import MotionMonitor
-from controller.estimation.speed_monitor import WINDOW_S, SpeedMonitor
-from controller.estimation.spool_monitor import SpoolMonitor
-from controller.estimation.standstill_monitor import StandstillMonitor
+from controller.estimation.joint_monitors import DriftMonitor, MotionMonitor, StandstillMonitor
+from controller.estimation.valve_monitors import SPEED_WINDOW_S, SpeedMonitor, SpoolMonitor
 from machine.status.reasons import Reason
 from tests.controller.bench import AORO, SPECS, Bench, T
 
@@ -48,7 +45,7 @@ def drift(rng):
 
 
 def speed(rng):
-    monitor, expected, factor = SpeedMonitor(SPEC.valve, LIMIT, T_S, WINDOW_S), 0.0, 1.0
+    monitor, expected, factor = SpeedMonitor(SPEC.valve, LIMIT, T_S, SPEED_WINDOW_S), 0.0, 1.0
     for k in count():
         if k % 150 == 0:
             expected, factor = rng.choice((0.0, 0.4, 0.9)) * LIMIT, rng.choice((-1.0, 0.0, 0.5, 1.0, 1.0, 1.9))

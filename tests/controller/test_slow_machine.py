@@ -5,11 +5,8 @@ import math
 import msgspec
 import pytest
 
-from controller.estimation.drift_monitor import DriftMonitor
-from controller.estimation.motion_monitor import MotionMonitor
-from controller.estimation.speed_monitor import WINDOW_S, SpeedMonitor
-from controller.estimation.standstill_monitor import StandstillMonitor
-from controller.estimation.usual_speed import USUAL_SPEED
+from controller.estimation.joint_monitors import USUAL_SPEED, DriftMonitor, MotionMonitor, StandstillMonitor
+from controller.estimation.valve_monitors import SPEED_WINDOW_S, SpeedMonitor
 from machine.joints import N_JOINTS, Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
@@ -69,7 +66,7 @@ def test_oil_that_is_pressed_first_is_no_stuck_joint_and_one_that_never_moves_is
 
 @pytest.mark.parametrize(("least_speed", "reason"), [(USUAL, Reason.NONE), (0.0, Reason.JOINT_STUCK)])
 def test_the_spool_of_a_slow_joint_is_open_before_it_moves(least_speed: float, reason: Reason) -> None:
-    monitor = SpeedMonitor(SLOW_VALVE, SLOW.speed_limit, PERIOD_S, WINDOW_S, least_speed)
+    monitor = SpeedMonitor(SLOW_VALVE, SLOW.speed_limit, PERIOD_S, SPEED_WINDOW_S, least_speed)
     found = (monitor.step(0.018, 0.001) for _ in range(round(0.6 / PERIOD_S)))
     assert next((r for r in found if r is not Reason.NONE), Reason.NONE) is reason
     stuck = (monitor.step(SLOW.speed_limit, 0.0) for _ in range(round(0.6 / PERIOD_S)))

@@ -8,7 +8,7 @@ import pytest
 
 from can_dbc.messages.crane import GrappleCommand
 from controller.config import Settings
-from controller.estimation.spool_monitor import SPOOL_S, SpoolMonitor
+from controller.estimation.valve_monitors import SPOOL_S, SpoolMonitor
 from controller.valve_watch import allowed_delay_s
 from machine.loading.profile_file import profile_hash
 from machine.profile import Plc
