@@ -20,7 +20,7 @@ from typing import Final
 
 from controller.bus_io import Signal
 from controller.crane.motion import Crane
-from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.joint_estimator import JointEstimator, SensedJoint
 from controller.estimation.joint_monitors import (
     AGAINST_ELSEWHERE_S,
     AGAINST_S,
@@ -31,7 +31,6 @@ from controller.estimation.joint_monitors import (
     SlopeYield,
     StandstillMonitor,
 )
-from controller.estimation.sensed_joint import SensedJoint
 from controller.estimation.valve_monitors import DirectionMonitor
 from controller.supervisor import NO_JOINT, Supervisor
 from controller.transitions import OPERATING

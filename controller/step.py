@@ -26,9 +26,8 @@ from controller.crane.inputs import CraneInputs, spool_signals
 from controller.crane.motion import Crane
 from controller.crane.outputs import CraneWriter
 from controller.crane.startup import Startup, check_nodes
-from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.joint_estimator import JointEstimator, SensedJoint
 from controller.estimation.pressure_monitor import NO_FUNCTION
-from controller.estimation.sensed_joint import SensedJoint
 from controller.evidence import Evidence
 from controller.joint_watch import JointWatch
 from controller.requests import RequestGate, RequestRefused

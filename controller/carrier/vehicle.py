@@ -22,8 +22,7 @@ from controller.carrier.dead_reckoning import DeadReckoning
 from controller.carrier.monitors import VehicleMonitor
 from controller.carrier.outputs import STANDING, CarrierCommand
 from controller.config import Settings
-from controller.estimation.joint_estimator import JointEstimator
-from controller.estimation.sensed_joint import SensedJoint
+from controller.estimation.joint_estimator import JointEstimator, SensedJoint
 from controller.laws.drive import DriveLaw
 from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw
 from controller.laws.suspension import Suspension

@@ -51,7 +51,6 @@ MODULES: Final = (
     "controller.estimation.joint_estimator",
     "controller.estimation.load_estimator",
     "controller.estimation.pressure_monitor",
-    "controller.estimation.sensed_joint",
     "controller.evidence",
     "controller.joint_watch",
     "controller.laws.joint",
