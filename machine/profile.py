@@ -199,7 +199,7 @@ class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Stability(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the machine bears (`controller.crane.load_moment`).
+    """What the machine bears (`controller.crane.load`).
 
     The empty crane weighs like ``head_kg`` at the stick pin and ``pin_kg`` at the hanger pin.  It tips over a line
     ``edge_m`` from the slew axis when the moment about it exceeds ``stabilising_nm`` on level ground; every radian by

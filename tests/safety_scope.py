@@ -49,7 +49,7 @@ SCOPES = (
             "tests/controller/test_stalls.py",
             "tests/controller/test_joint_watch.py",
             "tests/controller/test_pressure_monitor.py",
-            "tests/controller/test_load_moment.py",
+            "tests/controller/test_load.py",
             "tests/controller/test_faults.py",
             "tests/controller/test_vehicle_faults.py",
             "tests/controller/test_bus_faults.py",
@@ -92,7 +92,7 @@ MEASURED = {
         "test_motion_in_a_stop_that_no_lever_explains_is_cut",
         "test_ten_times_the_noise_halves_the_speed_in_time",
     ),
-    "test_load_moment.py": (),
+    "test_load.py": (),
     "test_pressure_monitor.py": (),
     "test_supervisor_link.py": (
         "test_arming_is_refused_while_the_link_is_lost_and_says_what_to_do",

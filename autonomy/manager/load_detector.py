@@ -31,7 +31,7 @@ MIN_LOAD_SHARE: Final = 0.3
 GREEN_KG_M3: Final = 900.0
 """... with the density of green wood (birch 850 to 950, `docs/reference/machines.md`)."""
 SCALE_SIGMA_KG: Final = 15.0
-"""1-sigma of a mean reading (`controller.estimation.load_estimator`: friction of some 20 kg at 5 m)."""
+"""1-sigma of a mean reading (`controller.crane.load.LoadEstimator`: friction of some 20 kg at 5 m)."""
 UNKNOWN_WOOD_SIGMA, KNOWN_WOOD_SIGMA = 0.20, 0.12
 """Relative 1-sigma of a log's expected weight, by size and density: before and after this wood has been weighed."""
 MIN_WEIGHED: Final = 3

@@ -15,14 +15,12 @@ from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest
 from controller.bus_io import PeriodicTimer, Signal, or_nan
 from controller.config import Settings
 from controller.crane.inputs import CraneInputs
-from controller.crane.load_moment import LoadMoment
+from controller.crane.load import LoadChange, LoadEstimator, LoadMoment
 from controller.crane.reference_governor import ReferenceGovernor
 from controller.crane.spool_test_run import SpoolTestRun
 from controller.crane.trajectory_check import TrajectoryCheck
 from controller.crane.workspace_check import WorkspaceCheck
 from controller.estimation.joint_estimator import JointEstimator
-from controller.estimation.load_change import LoadChange
-from controller.estimation.load_estimator import LoadEstimator
 from controller.estimation.pressure_monitor import PressureMonitor
 from controller.laws.crane import LOADS, CraneLaw
 from controller.laws.grapple import GrappleLaw

@@ -27,7 +27,7 @@ from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from controller.config import Settings
 from controller.config import load as load_settings
-from controller.crane.load_moment import LoadMoment
+from controller.crane.load import LoadMoment
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from experiments.faults.evidence import Evidence

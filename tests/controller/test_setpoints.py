@@ -130,7 +130,7 @@ def test_every_refusal_reason_is_tried():
         Reason.BELOW_GROUND,
         Reason.KEEP_OUT,
         Reason.RAISES_MOMENT,
-    }  # in test_workspace and test_load_moment
+    }  # in test_workspace and test_load
     tried = {reason for reason, _, _ in BAD.values()} | unreachable
     assert tried == {r for r in Reason if r > 100}
     assert {100 + f for f in DatagramFault} <= set(Reason)

@@ -1,22 +1,37 @@
-"""Load, reach and slope against what the machine bears: outward and up is refused, down and inward is not."""
+"""The load in the grapple: how heavy it is, whether it comes or goes, and whether the machine bears it."""
 
+import dataclasses
 import math
 
 import msgspec
 import pytest
 
 from controller.config import Settings
-from controller.crane.load_moment import CONFIRMATIONS, LoadMoment
+from controller.crane.load import (
+    CHANGE_KG,
+    CHANGE_MEAN_S,
+    CHANGE_REST_NS,
+    CONFIRMATIONS,
+    LoadChange,
+    LoadEstimator,
+    LoadMoment,
+)
+from controller.crane.motion import LOAD_PERIOD_NS
 from machine.geometry.kinematics import max_reach_m
 from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.profile import Stability
-from machine.sensing.weighing import MIN_LEVER_ARM_M, lever_share
+from machine.profile import Sag, Stability
+from machine.sensing.weighing import MIN_LEVER_ARM_M, empty_moment_nm, lever_share
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import HOME, MS, PROFILE, Bench, T, count_until
+from tests.controller.bench import HOME, MS, PROFILE, SETTINGS, Bench, T, count_until
+
+PERIOD_S = LOAD_PERIOD_NS * 1e-9
+
+
+# -- Load moment
 
 AORO = load_profile("aoro_fc8")
 STRAIGHT = (0.0, 0.0, -0.1, 2.4, 0.0)
@@ -266,3 +281,132 @@ def test_by_the_pressures_inward_motion_goes_on_at_half_speed():
         bench.changed["PressA"] = {"LiftA": bar, "LiftB": 2.0}
         drive(bench, Joint.EXT, -0.01, 150)
     assert bench.mode is Mode.ACTIVE and not supervisor.half_speed and bench.reason == Reason.NONE
+
+
+# -- Load by pressures: by the load cell, else by the pressures of a lift at rest or steady speed
+
+WEIGHED = msgspec.structs.replace(SETTINGS.profile, sag=Sag(0.002, 0.0015, 0.01, 1e-6, 5200.0, 2900.0))
+BACK_BAR = 4.0
+
+
+def pressures(kg: float, q=HOME) -> tuple[float, float]:
+    """Both sides of the lift cylinder under the empty crane and a load."""
+    lift, kin = WEIGHED.joints["lift"].valve, WEIGHED.kinematics
+    moment_nm = empty_moment_nm(WEIGHED.sag, kin, q) + kg * GRAVITY_M_S2 * (distances(kin, q)[1] - kin.a1_m)
+    load_bar = moment_nm / (1e5 * lift.flow_plus * lever_share(lift, q[1]))
+    return load_bar + BACK_BAR * lift.flow_minus / lift.flow_plus, BACK_BAR
+
+
+def run(estimate: LoadEstimator, kg: float, seconds: float, velocity=lambda time_s: 0.0) -> float:
+    for i in range(round(seconds / PERIOD_S)):
+        found = estimate.step(HOME, velocity(i * PERIOD_S), *pressures(kg), PERIOD_S)
+    return found
+
+
+def test_load_at_rest_is_the_moment_beyond_the_empty_crane():
+    estimate = LoadEstimator(WEIGHED)
+    assert run(estimate, 0.0, PERIOD_S) == pytest.approx(0.0, abs=1e-6)
+    after = run(estimate, 200.0, 0.8)
+    assert 100.0 < after < 150.0, "filtered"
+    assert run(estimate, 200.0, 6.0) == pytest.approx(200.0, abs=1.0)
+
+
+def test_pressures_count_only_at_steady_speed():
+    estimate = LoadEstimator(WEIGHED)
+    run(estimate, 100.0, 1.0)
+    assert run(estimate, 300.0, 0.4, lambda t: 0.4 * t) == pytest.approx(100.0, abs=15.0), "kept"
+    assert run(estimate, 300.0, 8.0, lambda t: 0.16) == pytest.approx(300.0, abs=1.0)
+
+
+def test_load_is_never_negative():
+    assert run(LoadEstimator(WEIGHED), -40.0, 1.0) == 0.0
+
+
+@pytest.mark.parametrize("gone", ["pressure", "position", "sag"])
+def test_unknown_input_gives_nan_and_restarts_the_filter(gone):
+    profile = msgspec.structs.replace(WEIGHED, sag=None) if gone == "sag" else WEIGHED
+    estimate = LoadEstimator(profile)
+    run(estimate, 250.0, 2.0)
+    a, b = pressures(0.0)
+    q = (HOME[0], math.nan, *HOME[2:]) if gone == "position" else HOME
+    assert math.isnan(estimate.step(q, 0.0, None if gone == "pressure" else a, b, PERIOD_S))
+    again = estimate.step(HOME, 0.0, a, b, PERIOD_S)
+    assert math.isnan(again) if gone == "sag" else again == pytest.approx(0.0, abs=1e-6)
+
+
+def test_rotator_position_is_not_needed():
+    a, b = pressures(150.0)
+    assert LoadEstimator(WEIGHED).step((*HOME[:4], math.nan), 0.0, a, b, PERIOD_S) == pytest.approx(150.0)
+
+
+def report(profile, **grapple) -> float:
+    bench = Bench(dataclasses.replace(SETTINGS, profile=profile))
+    a, b = pressures(180.0)
+    bench.changed["PressA"] = {"LiftA": a, "LiftB": b}
+    bench.changed["GrappleStat"] = grapple
+    bench.boot().run(120)
+    return bench.reports[-1].load_kg
+
+
+def test_load_cell_has_priority_over_pressures():
+    assert report(WEIGHED, Load=77.0) == 77.0
+    assert report(WEIGHED, Load=None) == pytest.approx(180.0, abs=3.0)
+    assert math.isnan(report(SETTINGS.profile, Load=None))
+
+
+# -- Load change: when a load comes or goes
+
+PERIOD_S = LOAD_PERIOD_NS * 1e-9
+
+
+class Scale:
+    """A load that is estimated again and again."""
+
+    def __init__(self) -> None:
+        self.change = LoadChange(PERIOD_S)
+        self.now_ns = 0
+
+    def weighs(self, seconds, load_kg):
+        """Whether the load changed while it was ``load_kg(t)``, the time from the start of this."""
+        seen = False
+        for k in range(round(seconds / PERIOD_S)):
+            self.now_ns += LOAD_PERIOD_NS
+            self.change.step(load_kg(k * PERIOD_S), self.now_ns)
+            seen |= self.change.recent(self.now_ns)
+        return seen
+
+
+def settled(load_kg):
+    scale = Scale()
+    scale.weighs(8.0 * CHANGE_MEAN_S + CHANGE_REST_NS * 1e-9, lambda t: load_kg)
+    assert not scale.change.recent(scale.now_ns)
+    return scale
+
+
+def test_a_load_that_hangs_is_none_and_one_that_swings_is_none():
+    assert not settled(0.0).weighs(5.0, lambda t: 0.9 * CHANGE_KG)
+    assert not settled(93.0).weighs(5.0, lambda t: 93.0 + 20.0 * math.sin(6.0 * t))
+    assert not settled(600.0).weighs(5.0, lambda t: 600.0 + 90.0 * math.sin(6.0 * t))
+
+
+@pytest.mark.parametrize(
+    ("before_kg", "after_kg"),
+    [
+        pytest.param(0.0, lambda t: 60.0, id="a log is lifted"),
+        pytest.param(93.0, lambda t: 0.0, id="a log touches the ground"),
+        pytest.param(93.0, lambda t: 93.0 + 1500.0 * t, id="a log is caught"),
+        pytest.param(780.0, lambda t: 780.0 - 210.0 * t, id="logs come to rest"),
+    ],
+)
+def test_a_load_that_comes_or_goes_is_a_change_until_the_boom_has_come_to_rest(before_kg, after_kg):
+    scale = settled(before_kg)
+    assert scale.weighs(1.5, after_kg)
+    rests_kg = max(0.0, after_kg(1.5))
+    assert scale.weighs(CHANGE_REST_NS * 1e-9, lambda t: rests_kg)
+    scale.weighs(8.0 * CHANGE_MEAN_S, lambda t: rests_kg)
+    assert not scale.change.recent(scale.now_ns)
+
+
+def test_a_load_that_nobody_knows_is_no_change():
+    scale = settled(500.0)
+    assert not scale.weighs(2.0, lambda t: math.nan)

@@ -1,23 +1,7 @@
-"""Does the machine bear load, reach and slope together?  (docs/reference/safety.md cases 21 and 43)
+"""The load in the grapple: how heavy it is, whether it comes or goes, and whether the machine bears it.
 
-The moment about the tipping line, at `Stability.edge_m` from the slew axis in the direction of the boom [Nm]::
-
-    g (load (r_pin - edge) + pin (r_pin - edge) + head (r_head - edge)) + slope_nm_rad * slope
-
-against ``share`` of the stabilising moment.  ``pin`` and ``head`` are the weights of the empty crane as they act at
-hanger pin and stick pin, ``slope`` is how much the ground falls in the direction of the boom [rad].  One edge serves
-all directions: it is the nearest one, so along the machine the judgement is on the safe side.
-
-Two judgements make an overload.  The slow one, 50 times a second, takes the load of the load cell or of
-`controller.estimation.load_estimator`; an unknown load (NaN) counts as none, and then only crane and slope are judged.
-The fast one takes every pressure frame of the lift: the moment that its oil holds, less that of the empty crane, is
-the load's, and it is judged where it will be after `LEAD_S` at its present rise.  A load that appears at once falls
-with the crane at first and presses on the machine only as fast as it compresses the oil.  In the plant with physics
-1500 to 3000 kg exceed 36 kNm at 4 m after 220 to 240 ms, and are seen after 180 to 200 ms.  Earlier there is nothing
-to see: after 50 ms 3000 kg have raised the lift's pressure by 7 bar, 200 kg by 3.4 bar and 500 kg by 5 bar, and the
-moment rises by 40 kNm/s, as it does when a log is lifted or the lift starts (40 kNm/s, and 52 kNm/s on the larger
-crane).  Ordinary work and calibrations come to 0.55 of the limit with their rise counted; `PRESSURE_SHARE` is twice
-that.
+`LoadEstimator` weighs it by the lift's pressures where no load cell does, `LoadChange` tells monitors of joints when it
+pushes or springs the boom, and `LoadMoment` judges load, reach and slope together.
 """
 
 from __future__ import annotations
@@ -30,7 +14,123 @@ from typing import Final
 from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import N_JOINTS, Joint
 from machine.profile import Profile, Stability, joint
-from machine.sensing.weighing import MIN_LEVER_ARM_M, PA_PER_BAR, empty_moment_nm, lever_share
+from machine.sensing.weighing import (
+    MIN_LEVER_ARM_M,
+    PA_PER_BAR,
+    empty_moment_nm,
+    hanging_load_kg,
+    lever_share,
+    lift_moment_nm,
+)
+
+FILTER_S: Final = 0.8
+STEADY_S: Final = 0.3
+STEADY_SHARE: Final = 0.04
+"""A lift is steady while its speed differs by less than this share of its speed limit from its mean over `STEADY_S`."""
+
+
+class LoadEstimator:
+    """Filtered load [kg] by the pressures of the lift cylinder, on a machine without a load cell; NaN while unknown.
+
+    The moment held by the cylinder less that of the empty crane (`machine.sensing.weighing`, both from calibration),
+    divided by the pin's distance.  Only pressures of a lift that rests or moves steadily count; between them the last
+    value is kept.  The cylinder's friction is an error of some 20 kg at 5 m, and more nearer by.  A swinging load is
+    averaged over `FILTER_S`.  The estimate is updated 50 times a second, not in every tick.
+    """
+
+    __slots__ = ("_kg", "_profile", "_slow", "_steady")
+
+    def __init__(self, profile: Profile) -> None:
+        self._profile = profile
+        self._steady = STEADY_SHARE * joint(profile, Joint.LIFT).speed_limit
+        self._slow = 0.0
+        self._kg = math.nan
+
+    def step(
+        self, position: Sequence[float], velocity: float, a_bar: float | None, b_bar: float | None, elapsed_s: float
+    ) -> float:
+        """Load [kg] from joint positions, the lift's velocity [rad/s] and its pressures [bar] (None: unknown)."""
+        profile = self._profile
+        if profile.sag is None or a_bar is None or b_bar is None or not _carrying_joints_known(position):
+            self._slow, self._kg = 0.0, math.nan
+            return math.nan
+        unsteady = velocity - self._slow
+        self._slow += unsteady * min(1.0, elapsed_s / STEADY_S)
+        if abs(unsteady) > self._steady:
+            return self._kg
+        moment_nm = lift_moment_nm(profile, position[Joint.LIFT], a_bar, b_bar)
+        kg = hanging_load_kg(profile.sag, profile.kinematics, position, moment_nm)
+        if kg == kg:
+            before = kg if self._kg != self._kg else self._kg
+            self._kg = max(0.0, before + (kg - before) * min(1.0, elapsed_s / FILTER_S))
+        return self._kg
+
+
+def _carrying_joints_known(position: Sequence[float]) -> bool:
+    """Whether the joints that carry the load are known; the rotator does not matter."""
+    return not any(math.isnan(position[j]) for j in range(N_JOINTS - 1))
+
+
+# -- Load change: does something take up or let go a weight, so that every joint moves on its oil and steel?
+#
+# A log that touches the ground, hangs in a heap, catches at a stake or comes to rest in the bunk pushes the boom, and
+# springs it when it comes free.  The load cell shows it: the load leaves its mean of the last second.  Measured on a
+# sampled forwarder: a carried log of 93 kg caught (0 to 837 kg within half a second), held the slew at an eighth of its
+# speed and threw it on at twice the speed of its valve; logs that came to rest took 620 kg off the lift within 3 s and
+# sank it by 5 mrad with shut valves.  Monitors that compare a joint with its valve allow for it
+# (`controller.joint_watch`, `controller.valve_watch`).
+
+CHANGE_KG: Final = 40.0
+"""Least difference from the load's mean that is a change: twice what friction of the lift falsifies, ..."""
+CHANGE_SHARE: Final = 0.2
+"""... and at least this share of the mean: a log that swings pulls by more than its weight and by less."""
+CHANGE_MEAN_S: Final = 1.0
+CHANGE_REST_NS: Final = 1_200_000_000
+"""A joint comes to rest on its oil within half of its slowest period (2.5 s)."""
+
+
+class LoadChange:
+    """`step` with every estimate of the load, ``period_s`` apart; `recent` tells whether it changed lately."""
+
+    __slots__ = ("_gain", "_mean_kg", "_until_ns")
+
+    def __init__(self, period_s: float) -> None:
+        self._gain = period_s / CHANGE_MEAN_S
+        self._mean_kg = 0.0
+        self._until_ns = 0
+
+    def step(self, load_kg: float, now_ns: int) -> None:
+        """The estimated load (NaN: not known, which is no change)."""
+        if load_kg == load_kg:
+            off_kg = load_kg - self._mean_kg
+            if abs(off_kg) > max(CHANGE_KG, CHANGE_SHARE * self._mean_kg):
+                self._until_ns = now_ns + CHANGE_REST_NS
+            self._mean_kg += self._gain * off_kg
+
+    def recent(self, now_ns: int) -> bool:
+        """Whether the load changed up to `CHANGE_REST_NS` ago."""
+        return now_ns < self._until_ns
+
+
+# -- Load moment: does the machine bear load, reach and slope together?  (docs/reference/safety.md cases 21 and 43)
+#
+# The moment about the tipping line, at `Stability.edge_m` from the slew axis in the direction of the boom [Nm]::
+#
+#     g (load (r_pin - edge) + pin (r_pin - edge) + head (r_head - edge)) + slope_nm_rad * slope
+#
+# against ``share`` of the stabilising moment.  ``pin`` and ``head`` are the weights of the empty crane as they act at
+# hanger pin and stick pin, ``slope`` is how much the ground falls in the direction of the boom [rad].  One edge serves
+# all directions: it is the nearest one, so along the machine the judgement is on the safe side.
+#
+# Two judgements make an overload.  The slow one, 50 times a second, takes the load of the load cell or of
+# `LoadEstimator`; an unknown load (NaN) counts as none, and then only crane and slope are judged.  The fast one takes
+# every pressure frame of the lift: the moment that its oil holds, less that of the empty crane, is the load's, and it
+# is judged where it will be after `LEAD_S` at its present rise.  A load that appears at once falls with the crane at
+# first and presses on the machine only as fast as it compresses the oil.  In the plant with physics 1500 to 3000 kg
+# exceed 36 kNm at 4 m after 220 to 240 ms, and are seen after 180 to 200 ms.  Earlier there is nothing to see: after 50
+# ms 3000 kg have raised the lift's pressure by 7 bar, 200 kg by 3.4 bar and 500 kg by 5 bar, and the moment rises by 40
+# kNm/s, as it does when a log is lifted or the lift starts (40 kNm/s, and 52 kNm/s on the larger crane).  Ordinary work
+# and calibrations come to 0.55 of the limit with their rise counted; `PRESSURE_SHARE` is twice that.
 
 CONFIRMATIONS: Final = 2
 """Judgements in a row that make an overload: a peak of a swinging load lasts less than one period of them, 20 ms."""
