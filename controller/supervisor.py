@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from controller.bus_io import BusMonitor, MessageState, Signal
-from controller.carrier.bus import CarrierBus
+from controller.carrier.bus import CarrierBus, CarrierInputs
 from controller.carrier.dead_reckoning import TRUE_REFERENCE
-from controller.carrier.inputs import CarrierInputs
 from controller.crane.inputs import CraneInputs
 from controller.crane.startup import Startup
 from controller.estimation.joint_estimator import JointEstimator

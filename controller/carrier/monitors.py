@@ -10,13 +10,13 @@ from __future__ import annotations
 from typing import Final
 
 from controller.bus_io import Signal
+from controller.carrier.bus import CarrierInputs
 from controller.carrier.dead_reckoning import (
     MAX_REPEATED_JUMP_M,
     MAX_REPEATED_JUMP_RAD,
     RTK_METHODS,
     DeadReckoning,
 )
-from controller.carrier.inputs import CarrierInputs
 from controller.estimation.joint_estimator import TrackedJoint
 from controller.estimation.joint_monitors import LATE_LAG_S, MotionMonitor
 from controller.laws.suspension import N_ARMS, Suspension

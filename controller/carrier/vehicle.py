@@ -17,10 +17,9 @@ from can_dbc.dbc.codec import Database
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VEHICLE_INPUTS, DriveSetpoint, Driving, Steering, VehicleReport
 from controller.bus_io import MessageState, PeriodicTimer, or_nan
-from controller.carrier.bus import CarrierBus
+from controller.carrier.bus import STANDING, CarrierBus, CarrierCommand
 from controller.carrier.dead_reckoning import DeadReckoning
 from controller.carrier.monitors import VehicleMonitor
-from controller.carrier.outputs import STANDING, CarrierCommand
 from controller.config import Settings
 from controller.estimation.joint_estimator import JointEstimator, SensedJoint
 from controller.laws.drive import DriveLaw

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from can_dbc.frame import EXTENDED, REMOTE
 from can_dbc.protocols.e2e import Checker, Status
 from can_dbc.protocols.nmea2000 import encode, frames, join_id
-from controller.carrier.bus import CarrierBus
-from controller.carrier.outputs import STANDING, CarrierCommand
+from controller.carrier.bus import STANDING, CarrierBus, CarrierCommand
 from controller.step import Controller
 from machine.joints import ARTICULATION
 from machine.status.explanation import describe
