@@ -17,7 +17,7 @@ from typing import Final
 from controller.bus_io import Signal, or_nan
 from controller.carrier.bus import CarrierInputs
 from controller.estimation.joint_estimator import JointEstimator
-from controller.laws.heading import east_north_m
+from controller.laws.drive import east_north_m
 from machine.geometry.carrier import ARMS, heading_rate_rad_s
 from machine.profile import Carrier
 from machine.status.reasons import Reason

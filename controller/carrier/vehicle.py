@@ -22,8 +22,7 @@ from controller.carrier.dead_reckoning import DeadReckoning
 from controller.carrier.monitors import VehicleMonitor
 from controller.config import Settings
 from controller.estimation.joint_estimator import JointEstimator, SensedJoint
-from controller.laws.drive import DriveLaw
-from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw
+from controller.laws.drive import AngleLaw, DriveLaw, SteeringLimits, WaypointLaw
 from controller.laws.suspension import Suspension
 from controller.requests import RequestRefused, SetpointGate
 from machine.profile import Carrier, CarrierValve, Encoder
@@ -241,8 +240,8 @@ class Vehicle:
         if m.steering is Steering.WAYPOINT:
             east, north = self.reckoning.offset_m(m.latitude_deg, m.longitude_deg)
             # While the machine stands, turning the front half would only scrub the tyres.
-            wanted = self._waypoint.step(east, north, self.reckoning.yaw_rad) if rolls else 0.0
-            self.steering.step(wanted, angle, elapsed_s)
+            rate_rad_s = self._waypoint.step(east, north, self.reckoning.yaw_rad) if rolls else 0.0
+            self.steering.step(rate_rad_s, angle, elapsed_s)
             return
         rate = m.articulation_rate_rad_s
         limit = self._carrier.articulation_limit_rad

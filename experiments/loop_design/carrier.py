@@ -18,7 +18,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from controller.laws.heading import ANGLE_GAIN
+from controller.laws.drive import ANGLE_GAIN
 from experiments.loop_design.loop import (
     FREQUENCY_RAD_S,
     TRANSPORT_S,

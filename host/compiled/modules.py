@@ -54,7 +54,6 @@ MODULES: Final = (
     "controller.laws.drive",
     "controller.laws.feedback",
     "controller.laws.grapple",
-    "controller.laws.heading",
     "controller.laws.suspension",
     "controller.laws.sway",
     "controller.laws.valve_map",

@@ -15,8 +15,7 @@ from typing import Final
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.motion_model import antenna_reach, front_attitude
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
-from controller.laws.drive import DriveLaw
-from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw, east_north_m
+from controller.laws.drive import AngleLaw, DriveLaw, SteeringLimits, WaypointLaw, east_north_m
 from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
 

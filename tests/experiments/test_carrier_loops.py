@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from controller.estimation.joint_estimator import JointEstimator
-from controller.laws.heading import AngleLaw, WaypointLaw
+from controller.laws.drive import AngleLaw, WaypointLaw
 from experiments.loop_design import carrier as loops
 from experiments.loop_design.carrier import CarrierCase, angle_spec, arm_loop, heading_loop, natural
 from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins

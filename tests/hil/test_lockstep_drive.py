@@ -16,7 +16,7 @@ from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleRe
 from controller.config import load as load_settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
-from controller.laws.heading import east_north_m
+from controller.laws.drive import east_north_m
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.replay.recording import files_of

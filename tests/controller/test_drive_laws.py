@@ -6,12 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.laws.drive import SETTLE_S, STANDING_M_S, STOP_M_S2, DriveLaw
-from controller.laws.heading import (
+from controller.laws.drive import (
     ANGLE_BAND_RAD,
     MIN_BEARING_M,
     RATE_RISE_S,
+    SETTLE_S,
+    STANDING_M_S,
+    STOP_M_S2,
     AngleLaw,
+    DriveLaw,
     SteeringLimits,
     WaypointLaw,
     east_north_m,
