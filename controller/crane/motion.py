@@ -18,8 +18,7 @@ from controller.crane.inputs import CraneInputs
 from controller.crane.load import LoadChange, LoadEstimator, LoadMoment
 from controller.crane.reference_governor import ReferenceGovernor
 from controller.crane.spool_test_run import SpoolTestRun
-from controller.crane.trajectory_check import TrajectoryCheck
-from controller.crane.workspace_check import WorkspaceCheck
+from controller.crane.trajectory_check import TrajectoryCheck, WorkspaceCheck
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.pressure_monitor import PressureMonitor
 from controller.laws.crane import LOADS, CraneLaw

@@ -42,7 +42,6 @@ MODULES: Final = (
     "controller.crane.spool_test_run",
     "controller.crane.startup",
     "controller.crane.trajectory_check",
-    "controller.crane.workspace_check",
     "controller.estimation.valve_monitors",
     "controller.estimation.joint_monitors",
     "controller.estimation.joint_estimator",

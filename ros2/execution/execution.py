@@ -19,8 +19,7 @@ from autonomy.crane_job.trajectory_tracker import TrajectoryTracker
 from autonomy.motion.setpoint_stream import HORIZON_KNOT_COUNT, PERIOD_NS, Motion, SetpointStream
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from controller.crane.reference_governor import Trajectory
-from controller.crane.trajectory_check import TrajectoryCheck
-from controller.crane.workspace_check import MAX_KNOTS_CHECKED, WorkspaceCheck
+from controller.crane.trajectory_check import MAX_KNOTS_CHECKED, TrajectoryCheck, WorkspaceCheck
 from controller.laws.grapple import GrappleState
 from controller.requests import REFUSED_LIMIT_COUNT, RequestRefused
 from machine.joints import JOINTS, N_JOINTS, Joint

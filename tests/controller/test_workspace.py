@@ -7,7 +7,7 @@ import pytest
 
 from can_dbc.messages.crane import Knot
 from controller.config import Settings
-from controller.crane.workspace_check import GROUND_MARGIN_M, MAX_KNOTS_CHECKED, WorkspaceCheck
+from controller.crane.trajectory_check import GROUND_MARGIN_M, MAX_KNOTS_CHECKED, WorkspaceCheck
 from controller.requests import RequestRefused
 from machine.geometry.bunk import stake_walls
 from machine.geometry.kinematics import Unreachable, pin_position, solve
@@ -72,7 +72,7 @@ def test_no_more_knots_than_promised_are_checked_and_the_last_always(monkeypatch
     asked = []
     check = WorkspaceCheck(PROFILE)
     monkeypatch.setattr(
-        "controller.crane.workspace_check.pin_position", lambda kin, q: asked.append(q) or pin_position(kin, q)
+        "controller.crane.trajectory_check.pin_position", lambda kin, q: asked.append(q) or pin_position(kin, q)
     )
     for n in range(1, 17):
         asked.clear()
