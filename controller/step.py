@@ -28,10 +28,9 @@ from controller.crane.outputs import CraneWriter
 from controller.crane.startup import Startup, check_nodes
 from controller.estimation.joint_estimator import JointEstimator, SensedJoint
 from controller.estimation.pressure_monitor import NO_FUNCTION
-from controller.evidence import Evidence
 from controller.joint_watch import JointWatch
 from controller.requests import RequestGate, RequestRefused
-from controller.state_report import StateReporter
+from controller.state_report import Evidence, StateReporter
 from controller.supervisor import Supervisor
 from controller.tick import Inputs, Outputs
 from controller.transitions import OPERATING, Event

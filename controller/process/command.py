@@ -137,26 +137,25 @@ def listen(port: int) -> socket.socket:
 def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
     """Name -> address of the machine's buses in the loop's order; raises ConfigError."""
     profile = settings.profile
-    wanted = [name for name in (profile.crane_bus, profile.machine_bus) if name]
+    buses = [name for name in (profile.crane_bus, profile.machine_bus) if name]
     for name in given:
-        if name not in wanted:
+        if name not in buses:
             raise ConfigError(
                 "config.no-such-bus",
-                f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; leave --bus {name} out.",
+                f"{profile.name} has no bus {name}, only {' and '.join(buses)}; leave --bus {name} out.",
             )
-    return {name: given.get(name) or default_address(name) for name in wanted}
+    return {name: given.get(name) or default_address(name) for name in buses}
 
 
 def open_buses(where: dict[str, str], controller: Controller, settings: Settings) -> list[Bus]:
     """Open all buses or none, each with the filter of the controller's inputs; raises LinkError."""
-    wanted: list[list[FilterItem]] = [[*controller.crane_inputs.filters()]]
+    filters: list[list[FilterItem]] = [[*controller.crane_inputs.filters()]]
     if controller.carrier_bus is not None:
-        wanted.append(controller.carrier_bus.inputs.filters())
-    queues = settings.tx_queue_frames
+        filters.append(controller.carrier_bus.inputs.filters())
     opened: list[Bus] = []
     try:
-        for address, filters, queue in zip(where.values(), wanted, queues, strict=False):
-            opened.append(open_bus(address, filters=filters, tx_queue=queue))
+        for address, keys, queue in zip(where.values(), filters, settings.tx_queue_frames, strict=False):
+            opened.append(open_bus(address, filters=keys, tx_queue=queue))
     except LinkError:
         for bus in opened:
             bus.close()

@@ -1,8 +1,8 @@
 """The evidence of a reason: which signal was judged, what was measured, and the limit, as numbers with their units.
 
 The controller keeps up to three numbers with the reason that slowed or stopped the machine: the measured value, the
-limit and one more (`controller.evidence`).  ``StateReport.numbers`` carries them, NaN where there is none.  What they
-mean, and their text, is in this table alone; no text is made in a tick.
+limit and one more (`controller.state_report`).  ``StateReport.numbers`` carries them, NaN where there is none.  What
+they mean, and their text, is in this table alone; no text is made in a tick.
 """
 
 from __future__ import annotations
