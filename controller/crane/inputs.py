@@ -266,9 +266,9 @@ class CraneInputs:
         by_key, own = self._by_key, self._own
         for frame in frames:
             key = frame[1]
-            found = by_key.get(key)
-            if found is not None:
-                found.receive(frame, now_ns)
+            message = by_key.get(key)
+            if message is not None:
+                message.receive(frame, now_ns)
             elif key in own:
                 self.foreign = True
             elif not (nodes.receive(frame, now_ns) or sdo(key, frame[2])):

@@ -32,7 +32,7 @@ _MAX_FLOW_PCT: Final = 100.0
 
 def _ranges(profile: Profile, codec: MessageCodec) -> list[tuple[int, float, float, float]]:
     """(joint, lowest and highest position, greatest speed) that a reference frame can carry; raises ConfigError."""
-    found = []
+    ranges = []
     signals = {s.name: s for s in codec.signals}
     for j in JOINTS:
         name = j.name.capitalize()
@@ -45,8 +45,8 @@ def _ranges(profile: Profile, codec: MessageCodec) -> list[tuple[int, float, flo
                     f"joints.{name.lower()}: {codec.name} carries only {low:g} to {high:g} at {fastest:g} per s; "
                     "reduce the joint's range or speed limit.",
                 )
-            found.append((int(j), low, high, fastest))
-    return found
+            ranges.append((int(j), low, high, fastest))
+    return ranges
 
 
 class CraneWriter:
@@ -59,8 +59,8 @@ class CraneWriter:
         "_grapple",
         "_heartbeat",
         "_mode_at",
-        "_places",
         "_references",
+        "_spools",
         "_status",
         "_status_at",
         "_status_due",
@@ -71,7 +71,7 @@ class CraneWriter:
         codecs = [database.message(name) for name in ("ValveCmdA", "ValveCmdB", "CtrlStatus")]
         self._a, self._b, self._status = (ProtectedMessage(codec) for codec in codecs)
         index_a, index_b = codecs[0].index, codecs[1].index
-        self._places: list[tuple[ProtectedMessage, int]] = []
+        self._spools: list[tuple[ProtectedMessage, int]] = []
         for j in JOINTS:
             signal = joint(profile, j).valve.signal
             if signal not in index_a and signal not in index_b:
@@ -80,9 +80,9 @@ class CraneWriter:
                     f"joints.{j.name.lower()}.valve.signal: no ValveCmd signal is called {signal}; "
                     "use a name of the DBC.",
                 )
-            self._places.append((self._a, index_a[signal]) if signal in index_a else (self._b, index_b[signal]))
-        wanted = profile.plc is not None and profile.plc.role == "references"
-        names = ("JointRefA", "JointRefB", "JointRefC") if wanted else ()
+            self._spools.append((self._a, index_a[signal]) if signal in index_a else (self._b, index_b[signal]))
+        referring = profile.plc is not None and profile.plc.role == "references"
+        names = ("JointRefA", "JointRefB", "JointRefC") if referring else ()
         self._references = [(ProtectedMessage(c), _ranges(profile, c)) for c in map(database.message, names)]
         self._mode_at = index_a["Mode"]
         self._grapple = tuple(index_b[s] for s in ("ArmKey", "Grapple", "GrappleMode", "PumpReq", "MaxFlow"))
@@ -106,15 +106,15 @@ class CraneWriter:
         HOLD.
         """
         for j in range(N_JOINTS):
-            message, place = self._places[j]
-            message.values[place] = spools_pct[j] if moving else 0.0
+            message, index = self._spools[j]
+            message.values[index] = spools_pct[j] if moving else 0.0
         self._a.values[self._mode_at] = _SPOOL if moving else _NEUTRAL
         key, grapple, mode, pump, flow = self._grapple
         values = self._b.values
         values[key] = ARM_KEY if armed else 0
         values[grapple] = grapple_pct if moving else 0.0
-        kept = moving or grapple_mode is GrappleCommand.HOLD
-        values[mode] = grapple_mode if kept else GrappleCommand.NEUTRAL
+        passed_on = moving or grapple_mode is GrappleCommand.HOLD
+        values[mode] = grapple_mode if passed_on else GrappleCommand.NEUTRAL
         values[pump] = 1 if armed else 0
         values[flow] = _MAX_FLOW_PCT
         frames.append(self._a.frame())
@@ -144,8 +144,8 @@ class CraneWriter:
         state = safe_state(mode, reason, half_speed)
         values = self._status.values
         contents = (mode, state, reason, stale_mask, max(late_ns, 0) * 1e-6, min(bus_errors, 255))
-        for place, value in zip(self._status_at, contents, strict=True):
-            values[place] = value
+        for index, value in zip(self._status_at, contents, strict=True):
+            values[index] = value
         return self._status.frame()
 
     def heartbeat_and_sync(self, now_ns: int, frames: list[RawFrame]) -> RawFrame:
