@@ -22,3 +22,7 @@ def test_a_tick_is_walked_from_step_on() -> None:
     assert walk.jumps["controller/step.py", "controller/supervisor.py"] > 0
     assert not any(count for (a, b), count in walk.jumps.items() if a == b or not a)
     assert walk.calls.total() > walk.jumps.total() > len(files) - 2
+
+
+def test_a_tick_of_a_fixed_crane_is_followed_in_at_most_thirty_files() -> None:
+    assert len(walked(Bench().active(), []).calls) <= 30
