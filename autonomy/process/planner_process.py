@@ -36,6 +36,7 @@ from can_dbc.messages.mission import encode_mission
 from can_dbc.messages.mission_upload import MissionUpload
 from can_dbc.messages.vehicle import VehicleReport
 from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from runtime.errors import InputRefused
 
 STEP_S: Final = 0.01
@@ -238,8 +239,11 @@ class PlannerProcess:
         for event, fields in self._job.events():
             if self._changed(event, fields):
                 emit("running" if fields == NOT_PAUSED else event, **fields)
-        if report is not None and self._changed("refused", report.refused) and report.refused:
-            emit("refused", number=report.refusal, count=report.refused)
+        if report is not None and report.refused:
+            # A flood of strangers is told once: every process can be one.
+            strangers = report.refusal == Reason.DATAGRAM_AUTHENTICATION
+            if self._changed("refused", None if strangers else report.refused):
+                emit("refused", number=report.refusal, count=report.refused)
 
     def _changed(self, name: str, value: object) -> bool:
         before = self._emitted.get(name)

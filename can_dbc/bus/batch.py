@@ -22,43 +22,47 @@ _HEADER: Final = struct.Struct("@PI4xPNPNi4xI4x")  # struct mmsghdr: name, its l
 _HEADER_WORDS: Final = _HEADER.size // 4
 _LENGTH_WORD: Final = 14
 """Place of the datagram's length in the header as 32-bit words."""
+_NAME: Final = struct.Struct("!2xH4s8x")  # struct sockaddr_in
 
 
 class _Buffers:
-    """``count`` message headers that point at ``size`` bytes of data and ``ancillary`` bytes of control data each."""
+    """``count`` message headers that point at ``size`` bytes of data and ``ancillary`` bytes of control data each, and
+    at an IPv4 address if ``named``."""
 
-    __slots__ = ("_address", "_headers", "_keep", "_words", "ancillary", "control", "count", "data", "size")
+    __slots__ = ("_address", "_headers", "_keep", "_names", "_words", "ancillary", "control", "count", "data", "size")
 
-    def __init__(self, size: int, ancillary: int, count: int) -> None:
+    def __init__(self, size: int, ancillary: int, count: int, named: bool = False) -> None:
         self.size, self.ancillary, self.count = size, ancillary, count
         self.data = memoryview(bytearray(size * count))
         self.control = memoryview(bytearray(max(ancillary * count, 1)))
+        self._names = bytearray(_NAME.size * count)
         iovecs, self._headers = bytearray(_IOVEC.size * count), memoryview(bytearray(_HEADER.size * count))
         self._words = self._headers.cast("I")
-        buffers = (self.data, self.control, iovecs, self._headers)
+        buffers = (self.data, self.control, self._names, iovecs, self._headers)
         views = [ctypes.c_char.from_buffer(buffer) for buffer in buffers]
         self._keep = views, iovecs
-        data_at, control_at, iovecs_at, headers_at = (ctypes.addressof(view) for view in views)
+        data_at, control_at, names_at, iovecs_at, headers_at = (ctypes.addressof(view) for view in views)
+        name_bytes = _NAME.size if named else 0
         self._address = ctypes.c_void_p(headers_at)
         for i in range(count):
             _IOVEC.pack_into(iovecs, i * _IOVEC.size, data_at + i * size, size)
             where = control_at + i * ancillary if ancillary else 0
-            _HEADER.pack_into(
-                self._headers, i * _HEADER.size, 0, 0, iovecs_at + i * _IOVEC.size, 1, where, ancillary, 0, 0
-            )
+            name_at = names_at + i * name_bytes if named else 0
+            iovec_at = iovecs_at + i * _IOVEC.size
+            _HEADER.pack_into(self._headers, i * _HEADER.size, name_at, name_bytes, iovec_at, 1, where, ancillary, 0, 0)
 
 
 class Batch(_Buffers):
     """Room for ``count`` datagrams of at most ``size`` bytes with ``ancillary`` bytes of control data each.
 
     After `receive` datagram i is at ``data[i * size]``, its control messages at ``control[i * ancillary]``; missing
-    control data reads as zeros.
+    control data reads as zeros.  ``named``: the socket is one of IPv4, and `sender` tells who sent.
     """
 
     __slots__ = ("_fresh", "_used", "_zeros")
 
-    def __init__(self, size: int, ancillary: int = 0, count: int = 64) -> None:
-        super().__init__(size, ancillary, count)
+    def __init__(self, size: int, ancillary: int = 0, count: int = 64, named: bool = False) -> None:
+        super().__init__(size, ancillary, count, named)
         self._fresh, self._zeros = bytes(self._headers), bytes(ancillary * count)
         self._used = 0
 
@@ -82,6 +86,11 @@ class Batch(_Buffers):
         """Size in bytes of datagram i of the last `receive`."""
         found: int = self._words[i * _HEADER_WORDS + _LENGTH_WORD]
         return found
+
+    def sender(self, i: int) -> tuple[str, int]:
+        """Address and port that datagram i of the last `receive` came from."""
+        port, host = _NAME.unpack_from(self._names, i * _NAME.size)
+        return socket.inet_ntoa(host), port
 
     def lengths(self) -> list[int]:
         """Size in bytes of each datagram of the last `receive`."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import signal
-import socket
 import sys
 from pathlib import Path
 from typing import Final
@@ -29,6 +28,7 @@ from controller.config import Settings, load
 from controller.process.loop import Loop
 from controller.process.operator_socket import OperatorSocket
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
+from controller.process.setpoint_port import listen
 from controller.process.timing import LoopTiming
 from controller.process.warm_up import warm_up
 from controller.step import Controller
@@ -119,19 +119,6 @@ def operator_socket(path: Path) -> OperatorSocket:
     except OSError as error:
         sentence = f"The operator's socket {path} cannot be made ({error.strerror}); choose another with --operator."
         raise LinkError("operator.socket", sentence) from error
-
-
-def listen(port: int) -> socket.socket:
-    """Open the setpoint socket, on loopback only; raises LinkError."""
-    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        made.bind(("127.0.0.1", port))
-    except (OSError, OverflowError) as error:
-        made.close()
-        sentence = f"UDP port {port} cannot be used ({error}); end the process that uses it or choose another port."
-        raise LinkError("udp.port-in-use", sentence) from error
-    made.setblocking(False)
-    return made
 
 
 def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:

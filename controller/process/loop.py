@@ -16,17 +16,15 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import Final
 
 from can_dbc.bus.base import Bus
-from can_dbc.bus.batch import Batch
 from can_dbc.messages.envelope import signed
-from can_dbc.messages.operator_link import admitted
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.tick_record import RecordWriter
 from controller.process.bus_link import BusLink
 from controller.process.operator_socket import OperatorSocket
 from controller.process.realtime import sleep_until
+from controller.process.setpoint_port import Address, SetpointPort
 from controller.process.tick_recording import write
 from controller.process.timing import LoopTiming
 from controller.step import Controller, step
@@ -34,11 +32,6 @@ from controller.tick import Inputs, Outputs
 from machine.status.explanation import describe
 from runtime.errors import InputRefused, LinkError
 from runtime.notifier import Notifier
-
-Address = tuple[str, int]
-MAX_DATAGRAMS: Final = 16
-"""At most this many datagrams are received in one tick; in a flood the rest waits."""
-DATAGRAM_BYTES: Final = 2048
 
 
 class Loop:
@@ -65,7 +58,7 @@ class Loop:
     ) -> None:
         self.controller = controller
         self.buses = tuple(buses)
-        self.setpoints, self.operator = setpoints, operator
+        self._setpoints, self.operator = SetpointPort(setpoints, key), operator
         self.timing = timing
         self.ticks = self.missed = self.unsent = self.unrecorded = 0
         self.stopping = False
@@ -77,7 +70,6 @@ class Loop:
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
         self._writer = RecordWriter()
-        self._waiting = Batch(DATAGRAM_BYTES, count=MAX_DATAGRAMS)
         self._notifier = Notifier(self.status_text, notify)
 
     def stop(self) -> None:
@@ -146,7 +138,8 @@ class Loop:
         supervisor = self.controller.supervisor
         reason = describe(supervisor.reason, supervisor.detail, self.controller.evidence.numbers)
         buses = "".join(f"{bus.name} is {bus.stats.state.name}. " for bus in self.buses if bus.stats.state)
-        return f"{supervisor.mode.name}. {reason} {buses}Missed ticks: {self.missed} of {self.ticks + self.missed}."
+        missed = f"Missed ticks: {self.missed} of {self.ticks + self.missed}."
+        return f"{supervisor.mode.name}. {reason} {buses}{self._setpoints.strangers_text()}{missed}"
 
     def shut_down(self) -> None:
         """Send neutral commands and a last status, so that no node has to wait for a time-out."""
@@ -161,7 +154,7 @@ class Loop:
             receiver.close()
         if self._record is not None:
             self._record.close()
-        self.setpoints.close()
+        self._setpoints.close()
         if self.operator is not None:
             self.operator.close()
         for bus in self.buses:
@@ -175,14 +168,7 @@ class Loop:
         datagrams.clear()
         if self.operator is not None:
             self.operator.receive(inputs.operator, datagrams)
-        batch = self._waiting
-        try:
-            count = batch.receive(self.setpoints.fileno())
-        except OSError:
-            return
-        for i in range(count):
-            at = i * DATAGRAM_BYTES
-            datagrams.append(admitted(batch.data[at : at + batch.length(i)].tobytes(), self._key))
+        self._setpoints.receive(datagrams)
 
     def _report_and_record(self, inputs: Inputs, outputs: Outputs, now_ns: int) -> None:
         """Send reports and the tick's record, and publish the timing page once a second."""

@@ -59,6 +59,7 @@ MODULES: Final = (
     "controller.process.bus_link",
     "controller.process.loop",
     "controller.process.operator_socket",
+    "controller.process.setpoint_port",
     "controller.process.tick_recording",
     "controller.process.timing",
     "controller.requests",

@@ -286,7 +286,7 @@ ADVICE: Final = {
     Reason.DATAGRAM_VERSION: "Run the same release on both sides.",
     Reason.DATAGRAM_KIND: _PLANNER,
     Reason.DATAGRAM_CRC: _PLANNER,
-    Reason.DATAGRAM_AUTHENTICATION: "Give both sides the same key.",
+    Reason.DATAGRAM_AUTHENTICATION: "Give both sides the same key; the controller's status names the sender's port.",
     Reason.DATAGRAM_NOT_FINITE: _PLANNER,
     Reason.DATAGRAM_VALUE: _PLANNER,
     Reason.WRONG_PROFILE: "Start both sides with the same profile.",

@@ -250,7 +250,8 @@ class TrajectoryExecution:
                 f"{problem.sentence}: {describe(report.reason, numbers=report.numbers)}" if reason else problem.sentence
             )
             return Outcome(Status.ABORTED, reason or Reason.NOT_ARMED, text)
-        if (report.refused - run.refused_before) & 0xFFFF >= REFUSED_LIMIT_COUNT:
+        strangers = report.refusal == Reason.DATAGRAM_AUTHENTICATION  # whom every process can be
+        if (report.refused - run.refused_before) & 0xFFFF >= REFUSED_LIMIT_COUNT and not strangers:
             return Outcome(Status.ABORTED, report.refusal & 0xFF, describe(report.refusal))
         return None
 

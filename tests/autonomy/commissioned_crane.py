@@ -48,6 +48,7 @@ class Crane:
     no_compass: bool = False
     only_turns: bool = False
     refuses: int = 0
+    refusal: Reason = Reason.FINAL_MOVING
     reason: Reason = Reason.NONE
     chosen: tuple[Joint, ...] = tuple(JOINTS)
     patience_s: float = 0.0
@@ -150,7 +151,7 @@ class Crane:
             0,
             self.reason,
             0,
-            119,
+            self.refusal,
             self.refuses,
             0,
             sensed,

@@ -262,6 +262,14 @@ def test_a_refused_setpoint_ends_the_run() -> None:
     assert run.failure_code == "calibration.setpoint-refused"
 
 
+def test_a_strangers_datagram_ends_no_run() -> None:
+    crane = Crane()
+    crane.run(3.0)
+    crane.refuses, crane.refusal = 1, Reason.DATAGRAM_AUTHENTICATION
+    crane.run(1.0)
+    assert crane.calibration.failure_code is None and not crane.calibration.idle
+
+
 def test_it_waits_until_a_person_arms() -> None:
     crane = Crane(mode=Mode.STANDBY)
     run = crane.run(5.0)

@@ -21,6 +21,7 @@ from hil.wire.inprocess import InProcessBus
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from runtime.errors import InputRefused
 from sim.plant import Plant
 from tests.codes import coded
@@ -103,8 +104,8 @@ def test_a_test_waits_for_armed_and_ends_with_the_controller() -> None:
     test = StepTest(PROFILE, HASH, Joint.SLEW, 0.2, load("crane"))
     q = (0.0, 0.5, -1.5, 0.5, 0.0)
 
-    def report(mode: Mode, refused: int = 0) -> StateReport:
-        return StateReport(1, HASH, 1, mode, 0, 0, 1, 110, refused, 0, q, (0.0,) * 5, q, 0.0, 0.0, 0.0, 0, 0, 0, 0)
+    def report(mode: Mode, refused: int = 0, refusal: Reason = Reason.WRONG_PROFILE) -> StateReport:
+        return StateReport(1, HASH, 1, mode, 0, 0, 1, refusal, refused, 0, q, (0.0,) * 5, q, 0.0, 0.0, 0.0, 0, 0, 0, 0)
 
     assert test.step(10**9, report(Mode.STANDBY)) is None and "STANDBY" in str(test.waiting)
     assert test.step(2 * 10**9, report(Mode.ACTIVE)) is None and "ACTIVE" in str(test.waiting), "a planner drives"
@@ -113,6 +114,8 @@ def test_a_test_waits_for_armed_and_ends_with_the_controller() -> None:
     assert test.idle and test._failure is not None and test._failure.code == "step.controller-silent"
     again = StepTest(PROFILE, HASH, Joint.SLEW, 0.2, load("crane"))
     again.step(10**9, report(Mode.ARMED))
+    again.step(10**9 + 5 * 10**7, report(Mode.ACTIVE, 1, Reason.DATAGRAM_AUTHENTICATION))
+    assert not again.idle, "a stranger's datagram"
     assert again.step(10**9 + 10**8, report(Mode.ACTIVE, refused=1)) is None and again.idle and again.failure
     last = StepTest(PROFILE, HASH, Joint.SLEW, -0.2, load("crane"))
     q = (-1.65, *q[1:])

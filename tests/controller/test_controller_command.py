@@ -5,7 +5,8 @@ import pytest
 from can_dbc.messages.key_file import write_key
 from can_dbc.messages.udp_address import address_argument
 from controller.config import load
-from controller.process.command import bus_address, listen, main, parser
+from controller.process.command import bus_address, main, parser
+from controller.process.setpoint_port import listen
 from runtime.errors import ConfigError
 from tests.codes import coded, numbers_in
 from tests.controller.bench import MS

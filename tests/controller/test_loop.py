@@ -19,8 +19,9 @@ from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
 from controller.carrier.vehicle import Vehicle
 from controller.config import load
-from controller.process.loop import DATAGRAM_BYTES, MAX_DATAGRAMS, Loop
+from controller.process.loop import Loop
 from controller.process.operator_socket import OperatorSocket
+from controller.process.setpoint_port import DATAGRAM_BYTES, MAX_DATAGRAMS
 from controller.process.timing import LoopTiming, ProcessReader
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller

@@ -207,6 +207,12 @@ def test_refused_setpoints_end_the_goal_with_the_gates_reason() -> None:
     assert not made.busy
 
 
+def test_strangers_who_send_without_the_key_end_no_goal() -> None:
+    made = execution(report(refused=7))
+    made.begin(SLEW, 0, 0)
+    assert made.step(20_000_000, report(refused=900, refusal=Reason.DATAGRAM_AUTHENTICATION))[1] is None
+
+
 def test_a_silent_controller_ends_the_goal() -> None:
     made = execution(report())
     made.begin(SLEW, 0, 0)

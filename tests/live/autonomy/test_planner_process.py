@@ -6,6 +6,7 @@ import json
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -20,7 +21,9 @@ from can_dbc.messages.mission import (
     decode_mission,
     encode_mission_command,
 )
+from machine.status.reasons import Reason
 from tests.can_dbc.example_mission_report import MISSION_REPORT
+from tests.console.state_reports import REPORT
 
 HASH, KEY = 77, b"key"
 
@@ -132,6 +135,15 @@ def test_reports_are_sent_twice_a_second_and_after_a_command(process, watcher) -
     assert [report for *_, report in reports] == [MISSION_REPORT] * 4 and reports[0][:2] == (HASH, begin_ns)
     give(process[0], MissionAction.AUTO)
     assert watcher.recv(65536)
+
+
+def test_refused_setpoints_are_told_each_time_and_a_flood_of_strangers_once(process, capsys) -> None:
+    told = [(1, Reason.JOINT_SPEED), (2, Reason.JOINT_SPEED)]
+    told += [(k, Reason.DATAGRAM_AUTHENTICATION) for k in range(60, 600, 60)] + [(601, Reason.JOINT_SPEED)]
+    for refused, refusal in told:
+        process[0]._emit_changes(replace(REPORT, refused=refused, refusal=refusal))
+    events = map(json.loads, capsys.readouterr().out.splitlines())
+    assert [m["count"] for m in events if m["event"] == "refused"] == [1, 2, 60, 601]
 
 
 def test_the_command_port_is_bound_to_loopback(process) -> None:

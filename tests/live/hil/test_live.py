@@ -20,8 +20,14 @@ import can
 import pytest
 
 from can_dbc.dbc import codec
+from can_dbc.timing.page import default_path, read_timing
+from hil.harness.live import ADDRESSES
+from hil.replay.recording import files_of
+from hil.replay.replay import recorded_ticks
 from host.exit_codes import ExitCode
 from host.vcan_lab.clock import clock_here
+from machine.status.reasons import Reason
+from timberhand.why.timeline import reports_of
 
 pytestmark = pytest.mark.timeout(700)
 
@@ -145,6 +151,42 @@ def test_a_killed_process_ends_the_run_with_one_sentence(tmp_path: Path, demo: D
     assert "Traceback" not in err
     assert "[live.process-ended]" in err
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["complete"]
+
+
+FLOOD = """
+import os, socket, sys
+if os.getuid() == 0:  # as another user
+    os.setgroups([]), os.setgid(65534), os.setuid(65534)
+link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+print(link.bind(("127.0.0.1", 0)) or link.getsockname()[1], flush=True)
+while True:  # small ones leave no gap in the queue for others
+    link.sendto(b"x", ("127.0.0.1", int(sys.argv[1])))
+"""
+
+
+def test_a_flood_of_the_setpoint_port_stops_nothing_and_is_named(tmp_path: Path, demo: Demo) -> None:
+    """A process of another user sends as fast as it can; the planner goes on, and the controller says who it is."""
+    process = demo("--bus", "wire", "--live", "--seed", "103", *PATIENT.split())
+    await_line(process, "→ ABOVE")
+    found = json.loads((tmp_path / "run" / ADDRESSES).read_text())
+    command = [sys.executable, "-c", FLOOD, str(found["ports"]["control"])]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as flood:
+        try:
+            assert flood.stdout is not None
+            port = flood.stdout.readline().strip()
+            page = default_path().with_name(f"live-{process.pid}.timing")
+            await_line(process, "→ CARRY")
+            words = read_timing(page).facts.words
+            out, err = process.communicate(timeout=600)
+            assert flood.poll() is None, "it floods until the end"
+        finally:
+            flood.kill()
+    assert process.returncode == ExitCode.OK, out + err
+    assert f"the last from UDP port {port}." in words
+    files = files_of(tmp_path / "run")
+    ticks = list(recorded_ticks(files))
+    assert sum(tick.datagrams.count(b"") for tick in ticks) > 1000, "the flood came through to the controller"
+    assert not {Reason(r.reason & 0xFF) for r in reports_of(ticks)} & {Reason.LEASE_LOST, Reason.SETPOINTS_REFUSED}
 
 
 def pid_of(parent: int, module: str) -> int:
