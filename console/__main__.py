@@ -23,7 +23,7 @@ from console.access_guards import ENTRY
 from console.audit import AuditLog
 from console.exposure import Exposure, check_local
 from console.start_error import StartError
-from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
+from machine.loading.profile_file import ProfileError, load_profile, profile_check, profile_file, profile_hash
 from machine.profile import Profile
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def serve(
     from console.server import create_app
 
     try:
-        machine = load_profile(profile)
+        machine, check = load_profile(profile), profile_check(profile)
         key = key_file.read_bytes().strip() if key_file else None
     except ProfileError as error:
         raise StartError(error.code, str(error), 3) from error
@@ -90,6 +90,7 @@ def serve(
     console = Console(
         profile=machine,
         profile_hash=profile_hash(machine),
+        profile_check=check,
         operator=operator,
         planner=_address(planner, "--planner"),
         scene=_address(scene, "--scene"),

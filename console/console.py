@@ -145,6 +145,8 @@ class Console:
     audit: AuditLog | None = None
     tls: bool = False
     """Whether the page is served over TLS."""
+    profile_check: int = 0
+    """Of the profile's file, which an ARM is meant for (`OperatorCommand`); a guard hears no other."""
     clock: Callable[[], int] = time.monotonic_ns
     access: Access = field(init=False)
     crane_state: CraneState = field(init=False)
@@ -169,7 +171,11 @@ class Console:
         """
         assert self.operator is not None
         message = OperatorCommand(
-            self._next(), self.profile_hash, self.clock() if stamp_ns is None else stamp_ns, action
+            self._next(),
+            self.profile_hash,
+            self.clock() if stamp_ns is None else stamp_ns,
+            action,
+            self.profile_check,
         )
         operator_link.send(encode(message), self.operator)
 

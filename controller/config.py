@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
+from machine.loading.profile_file import ProfileError, load_profile, profile_check, profile_hash
 from machine.profile import Profile
 from runtime.errors import ConfigError
 
@@ -74,5 +73,4 @@ def load(name_or_path: str | Path, rate_hz: int = 0) -> Settings:
     rate_hz = rate_hz or profile.rate_hz
     if not 50 <= rate_hz <= 1000:
         raise ConfigError("config.rate", f"A control rate of {rate_hz} Hz is not possible; choose 50 to 1000 Hz.")
-    file_check = zlib.crc32(profile_file(name_or_path).read_bytes()) & 0xFFFFFF
-    return Settings(profile, profile_hash(profile), rate_hz, file_check)
+    return Settings(profile, profile_hash(profile), rate_hz, profile_check(name_or_path))

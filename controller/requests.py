@@ -126,11 +126,13 @@ class SetpointGate:
 class RequestGate(SetpointGate):
     """The gate of all datagrams; as a `SetpointGate` it keeps the order of crane setpoints and spool tests."""
 
-    __slots__ = ("_drives", "_operator_sequence", "_operator_stamp_ns", "watch_stamp_ns")
+    __slots__ = ("_drives", "_operator_sequence", "_operator_stamp_ns", "_profile_check", "watch_stamp_ns")
 
-    def __init__(self, profile: Profile, profile_hash: int) -> None:
+    def __init__(self, profile: Profile, profile_hash: int, profile_check: int = 0) -> None:
+        """``profile_check``: of the profile's file, which an ARM that names one must be meant for; 0: not compared."""
         super().__init__(profile, profile_hash)
         self._drives = profile.carrier is not None
+        self._profile_check = profile_check
         self._operator_stamp_ns = self._operator_sequence = -1
         self.watch_stamp_ns = 0
         """Stamp of the last WATCH or WATCH_END."""
@@ -171,6 +173,9 @@ class RequestGate(SetpointGate):
 
     def _check_operator(self, message: OperatorCommand, latest_ns: int) -> None:
         if message.profile_hash != self._profile_hash:
+            raise RequestRefused(Reason.WRONG_PROFILE)
+        compared = self._profile_check and message.action is OperatorAction.ARM
+        if compared and message.profile_check not in (0, self._profile_check):
             raise RequestRefused(Reason.WRONG_PROFILE)
         order, watches = (message.stamp_ns, message.sequence), message.action in WATCH_ACTIONS
         if not watches and order <= (self._operator_stamp_ns, self._operator_sequence):

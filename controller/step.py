@@ -122,7 +122,7 @@ class Controller:
             self.startup,
             settings.file_check,
         )
-        self.gate = RequestGate(profile, settings.profile_hash)
+        self.gate = RequestGate(profile, settings.profile_hash, settings.file_check)
         self.crane = Crane(settings, self.crane_inputs, self.estimators, self.gate)
         # A PLC passes on positions that its own cycle has smoothed: the same count again says nothing of the encoder.
         counted = sensed if profile.plc is None else [None] * len(sensed)

@@ -132,12 +132,17 @@ class SpoolTest:
 
 @dataclass(frozen=True, slots=True)
 class OperatorCommand:
-    """One request of an operator."""
+    """One request of an operator.
+
+    ``profile_check``: the check of the profile's file that an ARM is meant for, 24 bits, as in ``GuardStat``; 0: not
+    said.
+    """
 
     sequence: int
     profile_hash: int
     stamp_ns: int
     action: OperatorAction
+    profile_check: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +199,7 @@ def spool_body(m: SpoolTest) -> bytes:
 
 def operator_body(m: OperatorCommand) -> bytes:
     """The body of an operator command."""
-    return _OPERATOR.pack(m.action)
+    return _OPERATOR.pack(m.action | m.profile_check << 8)
 
 
 def report_body(m: StateReport) -> bytes:
@@ -265,7 +270,8 @@ def spool_from(common: Common, body: bytes) -> SpoolTest:
 
 def operator_from(common: Common, body: bytes) -> OperatorCommand:
     """The operator command in a body; raises struct.error for a wrong length and ValueError for an unknown action."""
-    return OperatorCommand(*common, OperatorAction(*_OPERATOR.unpack(body)))
+    (word,) = _OPERATOR.unpack(body)
+    return OperatorCommand(*common, OperatorAction(word & 0xFF), word >> 8)
 
 
 def report_from(common: Common, body: bytes) -> StateReport:

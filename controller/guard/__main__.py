@@ -137,7 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
         latch = LatchFile(options.state or default_path())
         guard = build(profile_path(options.profile), rate_hz=options.rate, latched=latch.latched)
         with ExitStack() as opened:
-            operator = opened.enter_context(closing(OperatorActions(guard_path(options.operator or operator_path()))))
+            path = guard_path(options.operator or operator_path())
+            operator = opened.enter_context(closing(OperatorActions(path, guard.profile_check)))
             needed = [(name, keys) for name, keys in zip(BUSES, guard.keys_of_buses, strict=True) if keys]
             links = [open_link(addresses.get(name) or default_address(name), keys) for name, keys in needed]
             buses = [opened.enter_context(link) for link in links]

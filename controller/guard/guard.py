@@ -76,8 +76,9 @@ class Guard:
     __slots__ = (
         "_a", "_agreed_ns", "_apart_ns", "_armed", "_b", "_beyond", "_calm_ns", "_carrier", "_clear_ns", "_commands",
         "_commands_of", "_estop", "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_jaws_ns", "_now_ns",
-        "_open_pct", "_operated_ns", "_own_keys", "_profile_check", "_punctuality", "_reach", "_reset_seen", "_sent",
-        "_status", "_stopped_ns", "_supply", "_watches", "axis", "events", "joints", "latched", "motion", "verdict",
+        "_open_pct", "_operated_ns", "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status",
+        "_stopped_ns", "_supply", "_watches", "axis", "events", "joints", "latched", "motion", "profile_check",
+        "verdict",
     )  # fmt: skip
 
     def __init__(self, envelope: Envelope, layouts: dict[str, Layout], latched: bool = False) -> None:
@@ -112,14 +113,13 @@ class Guard:
             feedback = next(m for m in self._feedback if f"Spool{signal}" in m.layout.fields)
             field = feedback.layout.fields[f"Spool{signal}"]
             self.motion.append((feedback, MotionWatch(number, field, deadband_pct, closing_ns, sensed.get(number))))
-        self._reach, self._profile_check = Reach(envelope), envelope.profile_check
+        self._reach, self.profile_check = Reach(envelope), envelope.profile_check
         self._grapple_field = fields_b["Grapple"]
         self.verdict, self.axis = Verdict.NO_COMMAND, NO_AXIS
         self.events = 0
         self._supply, self._beyond = False, 0
-        self._now_ns = self._calm_ns = self._heartbeat_ns = 0
+        self._now_ns = self._calm_ns = self._heartbeat_ns = self._clear_ns = self._agreed_ns = 0
         self._heard_ns, self._jaws_ns = -SILENCE_NS - 1, -PRESSED_NS - 1
-        self._clear_ns = self._agreed_ns = 0
         self._apart_ns = APART_PERIODS * envelope.period_ns
         self._armed, self._operated_ns, self._open_pct, self._stopped_ns = False, 0, 0.0, -PERSON_CARRIER_NS
         self.latched, self._reset_seen = latched, True  # a button that is down already is no edge
@@ -140,7 +140,7 @@ class Guard:
         values = {
             "Enable": ENABLE if self.enabled else 0, "Supply": SUPPLY if self._supply else 0, "Verdict": self.verdict,
             "FaultAxis": self.axis, "SeenCounter": max(self._a.counter, 0), "EventCount": self.events,
-            "ProfileCheck": self._profile_check,
+            "ProfileCheck": self.profile_check,
         }  # fmt: skip
         out = [message.frame(values) for message in self._sent if message.due(now_ns, changed)]
         if now_ns >= self._heartbeat_ns:

@@ -28,7 +28,7 @@ from can_dbc.messages.udp_address import address_argument
 from hil.harness.operator import Operator
 from hil.harness.processes import announce_ready
 from machine.joints import JOINTS
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import load_profile, profile_check, profile_hash
 from machine.profile import Profile
 from machine.status.explanation import describe
 from machine.status.modes import Mode
@@ -65,11 +65,11 @@ class Swing:
 class SetpointSource:
     """Reports in, datagrams out; pure."""
 
-    def __init__(self, profile: Profile, key: bytes | None = None) -> None:
+    def __init__(self, profile: Profile, key: bytes | None = None, check: int = 0) -> None:
         self._key = key
         self._specs = [profile.joints[j.name.lower()] for j in JOINTS]
         self._hash = profile_hash(profile)
-        self.operator = Operator(self._hash, lambda _action, _report: None)
+        self.operator = Operator(self._hash, lambda _action, _report: None, profile_check=check)
         self._swings: list[Swing] = []
         self._begin_ns = 0
         self._sequence = 0
@@ -124,7 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--key-file", required=True, type=Path)
     options = parser.parse_args(arguments)
     key = read_key(options.key_file)
-    source = SetpointSource(load_profile(options.profile), key)
+    source = SetpointSource(load_profile(options.profile), key, profile_check(options.profile))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", options.report_port))
         link.settimeout(0.02)

@@ -29,7 +29,7 @@ from hil.harness.operator import Operator
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.wire.bitrates import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
-from machine.loading.profile_file import profile_hash
+from machine.loading.profile_file import profile_check, profile_hash
 from machine.profile import Profile
 from machine.status.explanation import describe
 from machine.status.modes import Mode
@@ -144,7 +144,8 @@ class LiveRun(ABC, Generic[Outcome]):
         self._done = False
         self._outcome: dict[str, Any] = {}
         """The planner's final message."""
-        self._operator = Operator(profile_hash(options.profile), self._on_press, options.max_stops)
+        check = profile_check(options.profile_name)
+        self._operator = Operator(profile_hash(options.profile), self._on_press, options.max_stops, False, check)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, 0))
         self._socket.settimeout(0.02)

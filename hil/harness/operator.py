@@ -27,7 +27,8 @@ _BUTTONS: Final = {Mode.STANDBY: OperatorAction.ARM, Mode.STOP: OperatorAction.A
 class Operator:
     """Presses ARM and RESET; ``stops`` counts the stops, ``complaint`` says why nothing is pressed any more.
 
-    While ``cut`` nothing that it sends arrives: its link is lost.
+    While ``cut`` nothing that it sends arrives: its link is lost.  ``profile_check`` as in `OperatorCommand`: a guard
+    that is a process of its own wants it.
     """
 
     def __init__(
@@ -36,12 +37,13 @@ class Operator:
         on_press: Callable[[OperatorAction, StateReport], None],
         max_stops: int = MAX_STOPS,
         watches: bool = False,
+        profile_check: int = 0,
     ) -> None:
         self.stops = 0
         self.watches = watches
         self.cut = False
         self._max_stops = max_stops
-        self._profile_hash = profile_hash
+        self._profile_hash, self._profile_check = profile_hash, profile_check
         self._on_press = on_press
         self._sequence = 0
         self._mode: int = Mode.BOOT
@@ -91,4 +93,5 @@ class Operator:
 
     def _command(self, action: OperatorAction, report: StateReport) -> bytes:
         self._sequence += 1
-        return encode(OperatorCommand(self._sequence, self._profile_hash, report.stamp_ns, action))
+        stamp = (self._sequence, self._profile_hash, report.stamp_ns)
+        return encode(OperatorCommand(*stamp, action, self._profile_check))

@@ -22,7 +22,7 @@ from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, Operator
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
 from machine.joints import JOINTS
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import load_profile, profile_check, profile_hash
 from machine.profile import joint
 from machine.status.modes import Mode
 
@@ -59,7 +59,7 @@ class Pilot:
             min(joint(profile, j).valve.deadband_plus_pct, joint(profile, j).valve.deadband_minus_pct)
             for j in JOINTS[: len(SPOOLS)]
         )
-        self._hash, self._key = profile_hash(profile), key
+        self._hash, self._check, self._key = profile_hash(profile), profile_check(profile_name), key
         self._feedback, self._command, self._arm, self._guard = messages = [
             codec.load("crane").message(name) for name in ("ValveFbA", "ValveCmdA", "ValveCmdB", "GuardStat")
         ]
@@ -90,7 +90,7 @@ class Pilot:
         """Press a button of the operator."""
         now_ns = time.monotonic_ns()
         with contextlib.suppress(OSError):  # no controller now
-            command = OperatorCommand(next(self._numbers), self._hash, now_ns, action)
+            command = OperatorCommand(next(self._numbers), self._hash, now_ns, action, self._check)
             operator_link.send(encode(command), self._operator)
 
     def swing(self) -> None:

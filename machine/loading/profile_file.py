@@ -95,6 +95,14 @@ def profile_hash(profile: Profile) -> int:
     return zlib.crc32(content.replace(_DEFAULT, b"") + b"}")
 
 
+def profile_check(name_or_path: str | Path) -> int:
+    """CRC-32 of a profile's file, its lower 24 bits, by which the guard knows it; OSError, ``ProfileError``.
+
+    The guard does not read a profile as others do, so it knows the bytes alone: comments count.
+    """
+    return zlib.crc32(profile_file(name_or_path).read_bytes()) & 0xFFFFFF
+
+
 def profile_file(name_or_path: str | Path) -> Path:
     """The file of a shipped name or of a path; raises ``ProfileError`` for an unknown name."""
     text = str(name_or_path)

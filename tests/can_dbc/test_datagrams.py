@@ -83,7 +83,9 @@ def spool_tests(draw: st.DrawFn) -> SpoolTest:
     return SpoolTest(draw(u32), draw(u32), draw(stamps), draw(microseconds), draw(st.integers(0, N_AXES - 1)), knots)
 
 
-operator_commands = st.builds(OperatorCommand, u32, u32, stamps, st.sampled_from(OperatorAction))
+operator_commands = st.builds(
+    OperatorCommand, u32, u32, stamps, st.sampled_from(OperatorAction), st.integers(0, 0xFFFFFF)
+)
 reports = st.builds(
     StateReport,
     u32,

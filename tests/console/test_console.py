@@ -32,6 +32,7 @@ from tests.console.state_reports import REPORT
 from tests.operator_end import OperatorEnd
 
 PROFILE = load_profile("palms_471")
+CHECK = 0x123456
 
 
 @pytest.fixture
@@ -52,7 +53,8 @@ def operator_socket(tmp_path):
 
 @pytest.fixture
 def console(operator_socket):
-    return Console(PROFILE, profile_hash(PROFILE), Path(operator_socket.getsockname()), clock=lambda: 10**10)
+    path = Path(operator_socket.getsockname())
+    return Console(PROFILE, profile_hash(PROFILE), path, clock=lambda: 10**10, profile_check=CHECK)
 
 
 def client_of(console, peer="127.0.0.1", **options):
@@ -160,7 +162,7 @@ def test_command_sends_its_datagram(client, operator_socket, action):
     assert answer.status_code == 204
     message = decode(operator_socket.recv(100))
     assert isinstance(message, OperatorCommand)
-    assert (message.action, message.profile_hash) == (action, profile_hash(PROFILE))
+    assert (message.action, message.profile_hash, message.profile_check) == (action, profile_hash(PROFILE), CHECK)
 
 
 def test_command_sequence_grows(client, operator_socket):

@@ -19,7 +19,7 @@ from tests.controller.bench import MS, Bench, T, count_until
 from tests.controller.guard_traffic import DRIVING, MOVING, Traffic
 
 ARM, DISARM, STOP, RESET = OperatorAction.ARM, OperatorAction.DISARM, OperatorAction.STOP, OperatorAction.RESET
-NOW, KEY = 10**10, b"k" * 16
+NOW, KEY, CHECK = 10**10, b"k" * 16, 0x123456
 
 
 def opened(traffic: Traffic, percent: float = 60.0) -> Traffic:
@@ -113,8 +113,8 @@ def test_reset_while_it_works_changes_nothing() -> None:
 # -- datagrams ---------------------------------------------------------------------------------------------------------
 
 
-def command(action: OperatorAction, stamp_ns: int = NOW, key: bytes | None = None) -> bytes:
-    return encode(OperatorCommand(1, 0, stamp_ns, action), key)
+def command(action: OperatorAction, stamp_ns: int = NOW, key: bytes | None = None, check: int = 0) -> bytes:
+    return encode(OperatorCommand(1, 0, stamp_ns, action, check), key)
 
 
 def test_a_command_counts_once_and_in_its_time() -> None:
@@ -126,6 +126,28 @@ def test_a_command_counts_once_and_in_its_time() -> None:
     assert action_of(command(STOP, 1000), NOW, NOW) == (STOP, NOW), "STOP at any age"
 
 
+@pytest.mark.parametrize("check", [0, 1, CHECK ^ 1, 0xFFFFFF])
+def test_an_arm_that_was_meant_for_another_profile_enables_nothing(tmp_path: Path, check: int) -> None:
+    """A controller that arms itself waits for it; the guard knows what its own profile's file is."""
+    path = tmp_path / "operators" / "controller"
+    traffic = Traffic()
+    assert traffic.tick(60) is Verdict.GOOD
+    with closing(OperatorActions(operator_link.guard_path(path), CHECK)) as operator:
+        for sent in (command(ARM, check=check), command(ARM, NOW + 1000, check=CHECK)):
+            with pytest.raises(FileNotFoundError):  # no controller listens
+                operator_link.send(sent, path)
+        heard = operator.receive(NOW + 1000)
+    assert heard == [0, ARM]
+    traffic.guard.hear(heard[0], traffic.now_ns)
+    traffic.a, traffic.b["ArmKey"], traffic.controller["Mode"] = dict(MOVING), 0xA, 3
+    assert traffic.tick() is Verdict.NOT_ARMED
+
+
+@pytest.mark.parametrize("action", [DISARM, STOP, RESET])
+def test_what_enables_nothing_is_heard_for_any_profile(action: OperatorAction) -> None:
+    assert action_of(command(action, check=CHECK ^ 1), 0, NOW, CHECK)[0] == action
+
+
 @pytest.mark.parametrize("data", [b"nothing", Bench().armed().hold()])
 def test_what_is_no_command_of_a_person_is_worth_nothing(data: bytes) -> None:
     assert action_of(data, 7, NOW) == (0, 7)
@@ -134,7 +156,7 @@ def test_what_is_no_command_of_a_person_is_worth_nothing(data: bytes) -> None:
 def test_both_sockets_hear_what_is_sent_to_one_and_only_who_holds_the_credential_but_for_stop(tmp_path: Path) -> None:
     path = tmp_path / "operators" / "controller"
     guard = operator_link.guard_path(path)
-    with closing(OperatorActions(guard)) as operator, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
+    with closing(OperatorActions(guard, 0)) as operator, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
         assert operator.receive(NOW) == []
         for _ in range(2):
             with pytest.raises(FileNotFoundError):  # no controller listens
@@ -149,4 +171,4 @@ def test_both_sockets_hear_what_is_sent_to_one_and_only_who_holds_the_credential
 def test_a_socket_that_cannot_be_made_stops_the_start(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(GuardConfigError, check=coded("guard.operator")):
-        OperatorActions(tmp_path / "file" / "socket")
+        OperatorActions(tmp_path / "file" / "socket", 0)

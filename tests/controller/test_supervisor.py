@@ -3,6 +3,7 @@
 import pytest
 
 from can_dbc.messages.crane import ModeSwitch, OperatorAction
+from controller.requests import RequestGate
 from controller.transitions import TRANSITIONS, Event
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
@@ -257,6 +258,7 @@ def test_operator_commands_are_refused_replayed_old_or_for_another_profile():
     for data, reason in (
         (arm, Reason.OUT_OF_ORDER),
         (bench.operator(OperatorAction.ARM, profile_hash=3), Reason.WRONG_PROFILE),
+        (bench.operator(OperatorAction.ARM, profile_check=OTHER_CHECK), Reason.WRONG_PROFILE),
         (bench.operator(OperatorAction.ARM, stamp_ns=bench.now_ns + 100 * MS), Reason.STAMP_FUTURE),
     ):
         bench.tick([data])
@@ -265,6 +267,17 @@ def test_operator_commands_are_refused_replayed_old_or_for_another_profile():
     bench.run(202)
     bench.tick([late])
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.STAMP_OLD
+
+
+def test_an_arm_for_the_file_of_the_controllers_profile_arms_and_what_enables_nothing_is_heard_for_any():
+    bench = Bench().boot()
+    bench.tick([bench.operator(OperatorAction.ARM, profile_check=SETTINGS.file_check)])
+    assert bench.mode is Mode.ARMED
+    bench.tick([bench.operator(OperatorAction.DISARM, profile_check=OTHER_CHECK)])
+    assert bench.mode is Mode.STANDBY
+    without_a_file = RequestGate(SETTINGS.profile, SETTINGS.profile_hash)
+    arm = bench.operator(OperatorAction.ARM, profile_check=OTHER_CHECK)
+    assert without_a_file.accept(arm, bench.now_ns, 0, operator=True) is OperatorAction.ARM
 
 
 def test_neutral_in_every_mode_but_active_and_the_ramp():

@@ -237,7 +237,7 @@ def test_the_guard_lives_with_a_bus_and_without_one(systemd: Systemd, state: Bus
     ended: list[int] = []
     bus.at_send = lambda: ended.append(15) if len(bus.sent) >= 10 else None
     notifier = Notifier(lambda: f"{guard.verdict.name} {bus.stats.state.name}")
-    with closing(OperatorActions(tmp_path / "guard" / "operator")) as operator:
+    with closing(OperatorActions(tmp_path / "guard" / "operator", 0)) as operator:
         run_guard(guard, [bus], ended, notifier, LatchFile(tmp_path / "latched"), operator)
     *others, last = systemd.heard()
     assert last == {"STOPPING": "1", "STATUS": "Ending."}

@@ -39,6 +39,14 @@ def test_the_operator_waits_before_arming_and_between_presses() -> None:
     assert seen == [OperatorAction.ARM, OperatorAction.ARM]
 
 
+def test_its_arm_is_meant_for_the_file_of_its_profile() -> None:
+    operator = Operator(7, lambda *_: None, profile_check=0xABCDEF)
+    operator.step(report(Mode.STANDBY, 10 * REACTION_NS))
+    command = decode(operator.step(report(Mode.STANDBY, 11 * REACTION_NS)) or b"")
+    assert isinstance(command, OperatorCommand)
+    assert (command.action, command.profile_check) == (OperatorAction.ARM, 0xABCDEF)
+
+
 def test_the_operator_does_nothing_while_the_machine_works() -> None:
     operator = Operator(7, lambda *_: None)
     for mode in (Mode.BOOT, Mode.ARMED, Mode.ACTIVE):
