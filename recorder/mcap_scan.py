@@ -8,7 +8,7 @@ every chunk its CRC, so that all but the unfinished chunk can be read in order (
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -51,8 +51,11 @@ def is_complete(path: Path) -> bool:
         return file.read(1)[0] == Opcode.FOOTER and file.read()[-len(MCAP0_MAGIC) :] == MCAP0_MAGIC
 
 
-def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema | Channel | Stored]:
-    """Every schema, channel and message (of ``topics``; None: all) up to the end of the valid part.
+def scan(
+    path: Path, topics: Collection[str] | None = None, ended: Callable[[int], None] = lambda at_byte: None
+) -> Iterator[Schema | Channel | Stored]:
+    """Every schema, channel and message (of ``topics``; None: all) up to the end of the valid part; ``ended`` is told
+    the byte of that end if it is not that of the recording.
 
     Raises:
         InputRefused: The file does not start like an MCAP file.
@@ -63,20 +66,21 @@ def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema |
             raise InputRefused("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
         wanted: set[int] = set()
         while True:
+            at_byte = file.tell()
             head = file.read(_RECORD.size)
             if len(head) < _RECORD.size:
-                return
+                return ended(at_byte)
             opcode, length = _RECORD.unpack(head)
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 return
             if length > path.stat().st_size - file.tell():
-                return
+                return ended(at_byte)
             body = file.read(length)
             try:
                 records = _chunk(body) if opcode == Opcode.CHUNK else head + body
                 found = list(_records(records, topics, wanted))
             except _DAMAGED:
-                return
+                return ended(at_byte)
             yield from found
 
 

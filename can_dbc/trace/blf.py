@@ -1,8 +1,9 @@
 """Reads BLF: walks containers and objects with bounds, and leaves the contents of whole CAN objects to python-can.
 
 Time, memory and output are bounded by the size of the file: every step moves forward, at most `MAX_OBJECT_BYTES` wait
-for the rest of an object, and a file may unpack to `MAX_EXPANSION` times its size.  What was written without containers
-is read too.  The file's header holds its size and the count of its objects, so a cut file is told from a whole one.
+for the rest of an object, and what is unpacked is at most `MAX_EXPANSION` times the packed bytes read so far.  What was
+written without containers is read too.  The file's header holds its size and the count of its objects, so a cut file is
+told from a whole one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from can_dbc.trace.records import MalformedRecord, TraceFrame
 
 MAX_EXPANSION: Final = 64
 """Unpacked bytes per byte of the file; equal frames at equal steps, the most regular real traffic, reach 10."""
-FREE_EXPANSION_BYTES: Final = 1 << 20
+FREE_EXPANSION_BYTES: Final = 1 << 18
+"""Two containers of the usual size."""
 MAX_OBJECT_BYTES: Final = 16 << 20
 STEP_BYTES: Final = 1 << 16
 BATCH: Final = 500
@@ -54,7 +56,7 @@ class _Reader:
         self.content = content
         self.notes = notes
         self.start_ns = 0
-        self.budget = FREE_EXPANSION_BYTES + MAX_EXPANSION * len(content)
+        self.budget = FREE_EXPANSION_BYTES
         self.objects = 0
         self.containers = 0
         self.waiting = bytearray()
@@ -144,11 +146,11 @@ class _Reader:
             packed = self.content[start : min(end, start + STEP_BYTES)]
             while packed:
                 data = unpacker.decompress(packed, STEP_BYTES)
-                self.budget -= len(data)
+                self.budget += MAX_EXPANSION * (len(packed) - len(unpacker.unconsumed_tail)) - len(data)
                 if self.budget < 0:
                     raise _Damaged(
                         f"damaged inside the container at byte {at}: "
-                        f"the file unpacks to more than {MAX_EXPANSION} times its size"
+                        f"it unpacks to more than {MAX_EXPANSION} times its size"
                     )
                 packed = unpacker.unconsumed_tail
                 yield data

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from datetime import date
 from functools import partial
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,9 @@ CANDUMP_SCREEN: Final = re.compile(
 PCAN_VIEW: Final = re.compile(
     r"\d+\)\s+(\d+(?:\.\d+)?)\s+(?:Rx|Tx)\s+([0-9A-Fa-f]{4}|[0-9A-Fa-f]{8})\s+(\d+)\s+((?:[0-9A-Fa-f]{2}\s*)*)$"
 )
+ZERO_BASED: Final = re.compile(r"\s*\((\d{3,4}\.\d{6})\)\s+[A-Za-z]\S*\s")
+"""Stamps of ``candump -tz``, from the first frame, and of ``-td``, from the frame before."""
+MAX_STAMPS_COMPARED: Final = 1000
 YACHT_DEVICES: Final = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) [RT] ([0-9A-Fa-f]{8})((?: [0-9A-Fa-f]{2}){0,8})\s*$")
 PAYLOAD: Final = re.compile(r"(?:#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)(?:_[0-9A-Fa-f])?$")
 MAX_DATA: Final = 64
@@ -54,8 +58,11 @@ PCAN_ERRORS: Final = frozenset(("Warng", "Error", "ST", "ER"))
 PCAN_OTHERS: Final = frozenset(("EC", "EV"))
 FD_BYTES: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 ASC_BASE: Final = re.compile(r"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE)
+ASC_HEADER_LINES: Final = 5
 ASC_TIMED: Final = re.compile(r"(-?\d{1,19}\.\d+)\s+(.+)")
-ASC_OTHER: Final = re.compile(r"(?!CANFD\b)[^\W\d]|\d+\s+(?:Statistic|SV:|J1939TP)|.*(?:\bStatus:|Trigger|log )")
+ASC_OTHER: Final = re.compile(
+    r"(?!CANFD\b)(?:[^\W\d]|[^\x00-\x7f])|\d+\s+(?:Statistic|SV:|J1939TP)|.*(?:\bStatus:|Trigger|log )"
+)
 
 
 def read_trace(path: Path) -> Trace:
@@ -68,7 +75,8 @@ def read_trace(path: Path) -> Trace:
     if (packed := next((kind for mark, kind in PACKED.items() if content.startswith(mark)), None)) is not None:
         return Trace(lambda _: iter([MalformedRecord(0, f"a {packed} file; unpack it and give the log inside")]))
     lines = decoded(content, "utf-8").splitlines()
-    return Trace(partial(_asc if path.suffix.lower() == ".asc" else _text, lines))
+    asc = path.suffix.lower() == ".asc" or any(ASC_BASE.match(line) for line in lines[:ASC_HEADER_LINES])
+    return Trace(partial(_asc if asc else _text, lines))
 
 
 # -- text ----------------------------------------------------------------------------------------------------
@@ -77,6 +85,7 @@ def read_trace(path: Path) -> Trace:
 def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
     pcan = Pcan()
     error_frame, found = False, False
+    added_ns = 0 if _are_differences(lines) else None
     for number, raw in enumerate(lines, 1):
         line = raw.strip()
         if not line or line[0] == "#":
@@ -92,12 +101,24 @@ def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | Malformed
             yield MalformedRecord(number, line[:MAX_LINE])
         elif (frame := parse_line(line) or pcan.frame(line)) is not None:
             error_frame, found = bool(frame.key & ERROR), True
+            if added_ns is not None:
+                added_ns += frame.stamp_ns
+                frame = TraceFrame(added_ns, frame.key, frame.data, frame.interface)
             yield frame
         elif not pcan.other(line):
             yield MalformedRecord(number, line)
+    if added_ns is not None:
+        notes.append("the stamps are those of candump -td, from one frame to the next, and are added up")
     if pcan.others:
         kinds = ", ".join(sorted(pcan.others))
         notes.append(f"{pcan.others.total()} rows of PCAN hold no frames ({kinds})")
+
+
+def _are_differences(lines: list[str]) -> bool:
+    """Whether stamps are those of ``candump -td``: the first is 0, and of the others more than a fifth do not rise."""
+    found = (ZERO_BASED.match(line) for line in islice(lines, MAX_STAMPS_COMPARED))
+    stamps = [float(match[1]) for match in found if match is not None]
+    return stamps[:1] == [0.0] and sum(b <= a for a, b in pairwise(stamps[1:])) * 5 > len(stamps)
 
 
 def parse_line(line: str) -> TraceFrame | None:

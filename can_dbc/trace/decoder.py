@@ -90,8 +90,7 @@ class Decoder:
             if isinstance(record, MalformedRecord):
                 self.counts["broken"] += 1
                 if len(self.broken_examples) < MAX_EXAMPLES:
-                    where = f"line {record.line}: " if record.line else ""
-                    self.broken_examples.append(where + record.text[: 80 if record.line else None])
+                    self.broken_examples.append(record.shown)
                 continue
             self.counts["frames"] += 1
             bus = self._bus(record)
@@ -113,6 +112,7 @@ class Decoder:
             "refused",
             "bad_crc",
             "error_frames",
+            "remote_frames",
             "broken",
             "transported",
             "unknown_transported",
@@ -154,7 +154,7 @@ class Decoder:
 
     def _frame(self, frame: Frame, bus: _Bus) -> DecodedMessage | None:
         if frame.key & (ERROR | REMOTE):
-            self.counts["error_frames" if frame.key & ERROR else "unknown"] += 1
+            self.counts["error_frames" if frame.key & ERROR else "remote_frames"] += 1
             return None
         codec = self._find(frame.key)
         if codec is None:

@@ -26,6 +26,14 @@ class MalformedRecord(NamedTuple):
     line: int
     text: str
 
+    @property
+    def shown(self) -> str:
+        """For people: the line's number and what of its beginning can be printed; a sentence on a binary file whole."""
+        if not self.line:
+            return self.text
+        text = "".join(c if c.isprintable() else "�" for c in self.text[:80])
+        return f"line {self.line}: {text}"
+
 
 class Trace(Iterator[TraceFrame | MalformedRecord]):
     """The records of a trace in file order; ``notes`` is complete behind the last one and says what is not read."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -41,6 +43,23 @@ def files_of(log: Path) -> list[Path]:
     return files
 
 
+def no_frames(log: Path, reasons: Sequence[str]) -> CommandFailed:
+    """The error of a CAN log in which no frame can be read; ``reasons`` may be empty or hold empty ones."""
+    why = "; ".join(filter(None, reasons))
+    return CommandFailed(
+        "recording.no-frames",
+        f"{log}: holds no CAN frame that can be read{f' ({why})' if why else ''}; give a log of a CAN bus",
+        ExitCode.CONFIGURATION,
+    )
+
+
+@cache
+def tell_end(path: Path, at_byte: int) -> None:
+    """Say once, on stderr, that a recording is not read to its end."""
+    sentence = f"{path} is read up to byte {at_byte}: there it was cut off, is damaged, or is still being recorded"
+    print(sentence, file=sys.stderr)
+
+
 def messages(files: list[Path], topic: str) -> Iterator[bytes]:
     """The payloads of a topic, in recorded order.
 
@@ -49,7 +68,7 @@ def messages(files: list[Path], topic: str) -> Iterator[bytes]:
     """
     try:
         for path in files:
-            for record in scan(path, {topic}):
+            for record in scan(path, {topic}, partial(tell_end, path)):
                 if isinstance(record, Stored):
                     yield record.data
     except InputRefused as error:
@@ -66,7 +85,7 @@ def contents(files: list[Path]) -> dict[str, int]:
     try:
         for path in files:
             topics: dict[int, str] = {}
-            for record in scan(path):
+            for record in scan(path, None, partial(tell_end, path)):
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Stored):

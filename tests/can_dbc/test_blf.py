@@ -128,6 +128,14 @@ def test_a_file_unpacks_to_a_bounded_size() -> None:
     assert len(bad) == 1 and str(reader.MAX_EXPANSION) in bad[0].text
 
 
+def test_the_rest_of_a_file_does_not_pay_for_what_one_container_unpacks_to() -> None:
+    """Otherwise 7 MB, of which most is never reached, cost minutes of equal frames."""
+    bomb = container(can_object(MS, 1) * 50_000, packed=True)
+    values, bad, _ = records(file(bomb + container(random.Random(1).randbytes(1 << 20)), 50_000))
+    assert 0 < len(values) * 48 < 2 * reader.FREE_EXPANSION_BYTES
+    assert len(bad) == 1 and "144" in bad[0].text
+
+
 def test_an_unknown_compression_and_a_foreign_file_are_said() -> None:
     values, bad, _ = records(file(container(three(), method=5) + container(three())))
     assert (values, len(bad)) == ([1, 2, 3], 1)

@@ -161,10 +161,11 @@ def test_decoder_counts_everything() -> None:
     assert {k: v for k, v in summary.items() if isinstance(v, int)} == {
         "frames": 7,
         "decoded": 1,
-        "unknown": 2,
+        "unknown": 1,
         "refused": 2,
         "bad_crc": 1,
         "error_frames": 1,
+        "remote_frames": 1,
         "broken": 1,
         "lost_fast_packets": 0,
         "transported": 0,

@@ -89,6 +89,29 @@ def test_asc_before_the_trigger_and_in_another_language(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("steps_ms", "stamps_ms"),
+    [
+        ([0, 100, 100, 100], [0, 100, 200, 300]),
+        ([0, 100, 99, 1, 1500, 7], [0, 100, 199, 200, 1700, 1707]),
+        ([0, 100, 200, 200, 300, 1500], [0, 100, 200, 200, 300, 1500]),  # -tz, and two buses in the same moment
+        ([5, 3, 2, 1], [5, 3, 2, 1]),
+    ],
+)
+def test_differences_of_candump_are_added_up(tmp_path: Path, steps_ms: list[int], stamps_ms: list[int]) -> None:
+    lines = "".join(f" ({ms // 1000:03d}.{ms % 1000:03d}000)  can0  210   [1]  00\n" for ms in steps_ms)
+    trace = write(tmp_path / "x.log", lines)
+    assert [r.stamp_ns for r in trace if isinstance(r, Frame)] == [ms * MS for ms in stamps_ms]
+    assert len(trace.notes) == (steps_ms != stamps_ms)
+
+
+def test_asc_by_its_header_and_in_any_code_page(tmp_path: Path) -> None:
+    (tmp_path / "x.txt").write_bytes(
+        (ASC.format("absolute") + " 0.0 測定開始\n 0.1 1 210 Rx d 1 00\n").encode("shift-jis")
+    )
+    assert list(read_trace(tmp_path / "x.txt")) == [Frame(100 * MS, 0x210, b"\x00")]
+
+
 def test_asc_lines_that_lack_bytes_are_malformed_and_quiet(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """python-can takes the bytes that are there, and logs a line for each."""
     lines = " 0.1 1  210 Rx d 8 00 11\n" + " 0.2 CANFD 1 Rx 210 x 1 0 d 8 01 02 03 04 05 06 07 08\n" * 50

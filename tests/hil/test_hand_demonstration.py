@@ -68,6 +68,9 @@ def test_learn_reads_the_shipped_demonstrations(tmp_path: Path) -> None:
     [
         ("log.csv", "x", None),
         ("log.txt", "(0.1) crane0 182#0011223344556677\n", None),
+        ("bare.log", "  crane0  702   [1]  00\n" * 3, "demonstration.no-stamps"),
+        ("photo.log", "\x01\x1b[2J\n", "recording.no-frames"),
+        ("packed.log", "PK\x03\x04", "recording.no-frames"),
         ("missing", None, "recording.none"),
         ("run.mcap", "x", "recording.not-mcap"),
     ],
@@ -80,6 +83,13 @@ def test_a_file_without_motions_is_refused(tmp_path: Path, name: str, text: str 
     assert stopped.value.exit_code == ExitCode.CONFIGURATION and code in (None, stopped.value.code)
     with pytest.raises(CommandFailed, check=coded("demonstration.other-machine")):
         motions_in(SHOWN, "palms_471")
+
+
+def test_records_that_cannot_be_read_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "cut.log").write_text("(0.1) can0 7FF#00\n(0.2) can0 7FF#0")
+    with pytest.raises(CommandFailed, check=coded("demonstration.encoder-missing")):
+        motions_in(tmp_path / "cut.log")
+    assert "line 2" in capsys.readouterr().err
 
 
 def test_encoder_frames_of_two_interfaces_are_refused(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
@@ -19,7 +20,7 @@ from controller.config import load as load_settings
 from controller.process.tick_recording import record
 from controller.step import Controller, step
 from controller.tick import Inputs
-from hil.replay.recording import contents, files_of, manifest_of
+from hil.replay.recording import contents, files_of, manifest_of, messages
 from hil.replay.replay import replay
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
@@ -256,3 +257,19 @@ def test_a_recording_that_is_cut_before_its_manifest_is_named_so(tmp_path: Path,
     path.write_bytes((b"\x89MCAP0\r\n" + bytes((1,)) + (1000).to_bytes(8, "little") + bytes(100))[:size])
     with pytest.raises(CommandFailed, check=coded("recording.cut-off")):
         manifest_of([path])
+
+
+@pytest.mark.parametrize("damage", ["cut", "in a chunk"])
+def test_a_recording_that_is_not_read_to_its_end_is_said_to_be_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str
+) -> None:
+    path = keep(tmp_path, RECORDS) / "run.mcap"
+    content = path.read_bytes()
+    list(messages([path], "/manifest"))
+    assert capsys.readouterr().err == ""
+    half = content.rindex(bytes((Opcode.DATA_END,)) + (4).to_bytes(8, "little")) // 2
+    path.write_bytes(content[:half] if damage == "cut" else content[:half] + bytes(64) + content[half + 64 :])
+    again = path.rename(path.with_name("run-0002.mcap"))
+    list(messages([again], "/manifest"))
+    contents([again])
+    assert capsys.readouterr().err.count(str(again)) == 1

@@ -66,25 +66,19 @@ def decode(
             if not quiet:
                 typer.echo(separator + json.dumps(entry.as_dict(), allow_nan=False))
                 separator = ","
-        _refuse_nothing(recording, decoder)
+        _refuse_nothing(recording, decoder, records)
         head = separator if separator != "," else ""
         typer.echo(f'{head}], "summary": {json.dumps(decoder.summary() | {"notes": records.notes})}}}')
         return
     _print(recording, decoder, records, quiet)
 
 
-def _refuse_nothing(recording: Path, decoder: Decoder) -> None:
+def _refuse_nothing(recording: Path, decoder: Decoder, records: Trace) -> None:
     """Raises CommandFailed for a file in which no frame could be read."""
-    from host.exit_codes import CommandFailed, ExitCode
+    from hil.replay.recording import no_frames
 
-    if decoder.counts["frames"]:
-        return
-    why = "; ".join(decoder.broken_examples[:1])
-    raise CommandFailed(
-        "recording.no-frames",
-        f"{recording}: holds no CAN frame that can be read{f' ({why})' if why else ''}; give a log of a CAN bus",
-        ExitCode.CONFIGURATION,
-    )
+    if not decoder.counts["frames"]:
+        raise no_frames(recording, [*decoder.broken_examples[:1], *records.notes])
 
 
 def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> None:
@@ -102,7 +96,7 @@ def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> No
             console.print(
                 f"[dim]{stamp}{interface} {entry.identifier:>8}[/dim] [cyan]{name}[/cyan] {escape(entry.text())}{mark}"
             )
-    _refuse_nothing(recording, decoder)
+    _refuse_nothing(recording, decoder, records)
     summary = decoder.summary()
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("message")
@@ -113,7 +107,7 @@ def _print(recording: Path, decoder: Decoder, records: Trace, quiet: bool) -> No
     console.print(
         f"{summary['frames']} frames, {summary['decoded']} messages decoded, {summary['unknown']} frames unknown, "
         f"{summary['refused']} refused, {summary['bad_crc']} with a bad CRC, "
-        f"{summary['error_frames']} error frames, "
+        f"{summary['error_frames']} error frames, {summary['remote_frames']} remote frames, "
         f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} malformed records"
     )
     if any(

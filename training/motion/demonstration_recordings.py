@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -11,8 +13,8 @@ from autonomy.motion.demonstration import JointTrack, joint_track, read_demonstr
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.trace.candump import read_trace
-from can_dbc.trace.records import TraceFrame
-from hil.replay.recording import files_of, manifest_of
+from can_dbc.trace.records import Trace, TraceFrame
+from hil.replay.recording import files_of, manifest_of, no_frames, tell_end
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile, encoders
@@ -58,7 +60,7 @@ def _frames(log: Path, profile: str | None) -> tuple[Profile, Iterator[Frame]]:
     if log.is_file() and log.suffix.lower() != ".mcap":
         machine = load_profile(profile or DEFAULT_PROFILE)
         try:
-            return machine, _of_one_interface(log, machine)
+            return machine, _of_one_interface(log, read_trace(log), machine)
         except OSError as error:
             raise CommandFailed(
                 "demonstration.unreadable", f"{log} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
@@ -68,27 +70,39 @@ def _frames(log: Path, profile: str | None) -> tuple[Profile, Iterator[Frame]]:
     return machine, _raw(files, f"/{machine.crane_bus}/raw")
 
 
-def _of_one_interface(log: Path, machine: Profile) -> Iterator[Frame]:
-    """The encoder frames of a log; refused when they come on several interfaces, which may be two machines."""
+def _of_one_interface(log: Path, trace: Trace, machine: Profile) -> Iterator[Frame]:
+    """The frames of a log; refused when those of encoders come on several interfaces, which may be two machines."""
     database = load_database("crane")
     keys = {database.message(e.message).key for e in encoders(machine).values() if e.message in database.messages}
-    frames = [entry for entry in read_trace(log) if isinstance(entry, TraceFrame) and entry.key in keys]
-    interfaces = sorted({frame.interface for frame in frames})
-    if len(interfaces) > 1:
-        raise CommandFailed(
-            "demonstration.several-buses",
-            f"{log} holds encoder frames of {len(interfaces)} interfaces ({', '.join(interfaces)}); keep the lines of "
-            "one of them",
-            ExitCode.CONFIGURATION,
-        )
-    return iter(frames)
+    interfaces: set[str] = set()
+    frames = lost = 0
+    first = ""
+    for record in trace:
+        if not isinstance(record, TraceFrame):
+            lost, first = lost + 1, first or record.shown
+            continue
+        frames += 1
+        if record.key in keys:
+            interfaces.add(record.interface)
+        if len(interfaces) > 1:
+            raise CommandFailed(
+                "demonstration.several-buses",
+                f"{log} holds encoder frames of several interfaces ({', '.join(sorted(interfaces))}); keep the lines "
+                "of one of them",
+                ExitCode.CONFIGURATION,
+            )
+        yield record
+    if not frames:
+        raise no_frames(log, [first, *trace.notes])
+    if lost:
+        print(f"{log}: {lost} record{'' if lost == 1 else 's'} cannot be read ({first})", file=sys.stderr)
 
 
 def _raw(files: Sequence[Path], topic: str) -> Iterator[Frame]:
     """The frames of a bus with their monotonic stamps."""
     try:
         for path in files:
-            for record in scan(path, {topic}):
+            for record in scan(path, {topic}, partial(tell_end, path)):
                 if isinstance(record, Stored) and len(record.data) >= _RAW.size:
                     key, length, data = _RAW.unpack_from(record.data)
                     yield Frame(record.publish_ns, key, data[:length])
