@@ -142,12 +142,14 @@ class MotionMonitor:
         dt, decay, usual = self._period_s, self._decay, self._usual
         expected, moved = abs(late), abs(velocity)
         self._recent_command = recent = max(abs(early), expected, self._recent_command - self._command_decay)
-        self._expected = decay * self._expected + dt * expected
-        self._behind = decay * self._behind + dt * (late - velocity) * math.copysign(1.0, late)
         commanded = _REVERSAL_SHARE * self._limit
         opposed = (velocity < 0.0 and min(early, late) > commanded) or (
             velocity > 0.0 and max(early, late) < -commanded
         )
+        self._expected, self._behind = decay * self._expected, decay * self._behind
+        if not (yields and opposed):  # what its load turns back is not stuck
+            self._expected += dt * expected
+            self._behind += dt * (late - velocity) * math.copysign(1.0, late)
         self._against = decay * self._against + (dt * moved if opposed else 0.0)
         faster = 0.0 if opposed else moved - (1.0 + _OVERSPEED_GAIN) * recent - _OVERSPEED_SHARE * usual
         self._overspeed = max(0.0, decay * self._overspeed + dt * faster)

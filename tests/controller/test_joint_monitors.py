@@ -135,6 +135,18 @@ def test_a_rotator_that_a_log_turns_runs_away_by_more(yields, limit_rad):
     assert beyond_rad == pytest.approx(limit_rad * spec.speed_limit, abs=2.0 * PERIOD_S * spec.speed_limit)
 
 
+@pytest.mark.parametrize(("yields", "stuck"), [(False, True), (True, False)])
+def test_a_rotator_that_a_log_turns_back_is_not_stuck(yields: bool, stuck: bool) -> None:
+    """As measured: a log that catches turns it back for 0.4 s at 25 deg/s, and it turns on at half of its command."""
+    monitor, command = MotionMonitor(SPECS[4], PERIOD_S, against_s=1.0), 0.21
+    for _ in range(400):
+        assert monitor.step(command, command, yields) is Reason.NONE
+    reasons = [monitor.step(command, -0.43, yields) for _ in range(80)]
+    reasons += [monitor.step(command, 0.5 * command, yields) for _ in range(80)]
+    assert (Reason.JOINT_STUCK in reasons) is stuck
+    assert Reason.JOINT_STUCK in [monitor.step(command, 0.0, yields) for _ in range(400)]
+
+
 # -- Standstill monitor: slow motion without a command is found, and a joint that only shakes is not
 
 SENSED = [
