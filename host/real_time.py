@@ -44,15 +44,18 @@ STANDS_STILL: Final = Finding(int(_TIMEOUT_S * 1e9), 0.0, 0.0)
 """A probe that does not come to its end."""
 
 
-def obstacle(finding: Finding) -> str:
-    """What stands in the way of a live run on this computer, as the beginning of a sentence; empty: nothing."""
+def obstacle(finding: Finding, more: float = 0.0) -> str:
+    """What stands in the way of a live run on this computer, as the beginning of a sentence; empty: nothing.
+
+    ``more``: processors that the run needs besides, as its detector does.
+    """
     if finding.longest_ns > BEARABLE_NS:
         return (
             f"This computer stood still for up to {finding.longest_ns / 1e6:.1f} ms in a look of {LOOK_S:.0f} s, "
             f"and a live run bears {BEARABLE_NS / 1e6:.1f} ms"
         )
-    if finding.free < lateness.NEED:
-        return f"A live run needs {lateness.NEED} processors, and this computer has {finding.free:.1f} free"
+    if finding.free < (need := lateness.NEED + more):
+        return f"A live run needs {need} processors, and this computer has {finding.free:.1f} free"
     if finding.stolen > BEARABLE_STOLEN:
         return (
             "This computer is a virtual machine whose host took its processors away for "

@@ -31,7 +31,7 @@ _MODE: Final = re.compile(r"^ *[0-9.]+ s +(STOP|FAULT): (.*)$", re.MULTILINE)
 def command(kind: str, seed: int, out: Path) -> list[str]:
     """The user's command line for one run."""
     mission = ["mission", "run", MISSION, "--logs", str(MISSION_LOGS), "--detector", "perfect"]
-    job = mission if kind == "mission" else ["demo"]
+    job = mission if kind == "mission" else ["demo", "--detector", "perfect"]
     return [
         sys.executable,
         "-m",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 from typer.testing import CliRunner
 
@@ -98,12 +99,39 @@ def test_inside_the_lab_no_look_is_taken(ran: list[str], monkeypatch: pytest.Mon
     assert ran == ["live"]
 
 
+@pytest.mark.parametrize(
+    ("free", "detector", "kind"), [(2.0, "perfect", "live"), (2.0, "own", "paced"), (2.6, "own", "live")]
+)
 def test_a_computer_that_holds_the_period_runs_live(
-    ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    free: float, detector: str, kind: str, ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("host.real_time.look", lambda: QUIET)
-    CliRunner().invoke(app, ["demo", "--bus", "wire", "--out", str(tmp_path)])
-    assert ran == ["live"]
+    monkeypatch.setattr("host.real_time.look", lambda: msgspec.structs.replace(QUIET, free=free))
+    CliRunner().invoke(app, ["demo", "--bus", "wire", "--detector", detector, "--out", str(tmp_path)])
+    assert ran == [kind]
+
+
+@pytest.mark.parametrize(
+    ("words", "camera"),
+    [
+        ("--lockstep", "stick"),
+        ("--lockstep --camera d435", "d435"),
+        ("--lockstep --detector perfect", ""),
+        ("--lockstep --profile aoro_fc8", ""),
+    ],
+)
+def test_a_camera_that_sees_the_cranes_work_finds_the_log(
+    words: str, camera: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[object] = []
+
+    def take_place(*given: object, **_: object) -> Summary:
+        seen.append(given[6])
+        return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
+
+    monkeypatch.setattr("hil.demo.lockstep.run_lockstep", take_place)
+    done = CliRunner().invoke(app, ["demo", *words.split(), "--out", str(tmp_path)])
+    assert seen == [camera]
+    assert ("the planner is told" in done.output) is (camera == "")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from timberhand.cli import app
 
 VALUES = {
     "--bus": ("wire",),
+    "--camera": ("stick",),
     "--clock": ("real",),
     "--console": (),
     "--no-console": (),
@@ -26,13 +27,14 @@ VALUES = {
     "--plc-role": ("valves",),
 }
 """A value for each option that some mode has no use for."""
-LIVE = tuple(option for option in VALUES if not option.startswith("--plc"))
+LIVE = tuple(option for option in VALUES if not option.startswith(("--plc", "--camera")))
 FILE = "docs/examples/paper_b.geojson"
 USELESS = {
     ("demo", "--lockstep"): (*LIVE, "--plc-link"),
     ("demo", "--lockstep", "--plc"): (*LIVE, "--plc-link"),
     ("demo",): ("--plc-role", "--plc-link", "--clock"),
     ("demo", "--no-console"): ("--console-port",),
+    ("demo", "--detector", "perfect"): ("--camera",),
     ("demo", "--bus", "wire"): ("--clock",),
     ("mission", "run", FILE, "--lockstep"): LIVE,
     ("mission", "run", FILE): ("--clock",),

@@ -42,6 +42,13 @@ class PlcRole(StrEnum):
     VALVES = "valves"
 
 
+class Detector(StrEnum):
+    """What finds the logs."""
+
+    OWN = "own"
+    PERFECT = "perfect"
+
+
 class PlcLink(StrEnum):
     """Protocol between bridge and PLC."""
 
@@ -80,8 +87,12 @@ def demo(
         typer.Option(help="references: the PLC closes the joint loops; valves: it passes valve commands on."),
     ] = PlcRole.REFERENCES,
     plc_link: Annotated[PlcLink, typer.Option(help="Modbus/TCP or cyclic UDP datagrams (live).")] = PlcLink.MODBUS,
+    detector: Annotated[
+        Detector,
+        typer.Option(help="What finds the logs: a camera of the machine; perfect cheats with the plant's truth."),
+    ] = Detector.OWN,
     camera: Annotated[
-        str, typer.Option(help="Detect the logs with this camera of the profile (default: true log poses).")
+        str, typer.Option(help="Which camera of the profile (default: the first one that sees the crane's work).")
     ] = "",
     planner: GraspPlannerOption = "search",
     virtual_cameras: VirtualCamerasOption = 1,
@@ -119,7 +130,7 @@ def demo(
 
       timberhand demo --plc                  a PLC closes the joint loops
 
-      timberhand demo --camera stick         a camera detects the log
+      timberhand demo --detector perfect     without the camera: less work for this computer
 
       timberhand demo --planner cnn          paper A's network plans the grasp
 
@@ -127,12 +138,15 @@ def demo(
     """
     from rich.console import Console
 
+    from autonomy.crane_job.load_view import VEHICLE_LINKS
     from machine.loading.profile_file import ProfileError, load_profile
 
     if lockstep:
         refuse_without_effect(context, (*LIVE_ONLY, "plc_link"), "with --lockstep")
     if not (plc or paper_a):
         refuse_without_effect(context, ("plc_role", "plc_link"), "without --plc")
+    if detector is Detector.PERFECT:
+        refuse_without_effect(context, ("camera",), "with --detector perfect")
     if not console:
         refuse_without_effect(context, ("console_port",), "with --no-console")
     if bus not in (Backend.VCAN, Backend.PYTHON_CAN):
@@ -140,22 +154,33 @@ def demo(
     if refused := refusal(live, lockstep, bus, plc and plc_link is PlcLink.UDP):
         raise refused
     if paper_a:
-        if profile != "palms_471" or planner != "search" or camera or plc_role is not PlcRole.REFERENCES:
+        chosen_already = profile != "palms_471" or planner != "search" or camera or detector is Detector.PERFECT
+        if chosen_already or plc_role is not PlcRole.REFERENCES:
             raise CommandFailed(
                 "demo.paper-a",
-                "--paper-a chooses machine, camera, planner and the PLC's role; leave out --profile, --camera, "
-                "--planner and --plc-role",
+                "--paper-a chooses machine, camera, planner and the PLC's role; leave out --profile, --detector, "
+                "--camera, --planner and --plc-role",
                 ExitCode.USAGE,
             )
         camera, planner, plc = "stick", "cnn", True
     chosen = planner_of(planner, virtual_cameras)
-    if not lockstep:
-        enter_lab(bus, clock, detects=bool(camera))
     try:
         machine = load_profile(profile)
         cameras = machine.cameras
     except ProfileError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    cheats = ""
+    if detector is Detector.PERFECT:
+        cheats = "--detector perfect cheats: the planner is told where the logs truly lie"
+    elif not camera:
+        camera = next((name for name, each in cameras.items() if each.link not in VEHICLE_LINKS), "")
+        cheats = (
+            ""
+            if camera
+            else (f"{profile} has no camera that sees the crane's work: the planner is told where the logs truly lie")
+        )
+    if not lockstep:
+        enter_lab(bus, clock, detects=bool(camera))
     if camera and camera not in cameras:
         raise CommandFailed(
             "demo.no-camera",
@@ -170,13 +195,15 @@ def demo(
         )
     truth = truth_of(profile, truth)
     screen = Console(stderr=as_json)
+    if cheats:
+        screen.print(cheats, style="yellow", markup=False, soft_wrap=True)
     if lockstep or live is not None:
         paced = live is False
     else:
         from hil.harness.live import uses_wire
 
         on_wire = "TIMBERHAND_LAB" not in os.environ and uses_wire(machine, bus.value)
-        paced = on_wire and _paces(screen, plc and plc_link is PlcLink.UDP)
+        paced = on_wire and _paces(screen, plc and plc_link is PlcLink.UDP, 1.0 if camera else 0.0)
     kind = "lockstep" if lockstep else "paced" if paced else bus.value
     directory = out or new_directory(f"{kind}{'-plc' if plc else ''}-seed{seed}")
     if plc:
@@ -261,14 +288,14 @@ def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> Comma
     return None
 
 
-def paced_or_live(finding: Finding, live_only: bool) -> tuple[bool, str]:
+def paced_or_live(finding: Finding, live_only: bool, more: float = 0.0) -> tuple[bool, str]:
     """Whether the demo is paced on a computer of which a look found ``finding``, and what to say.
 
-    ``live_only``: what was asked for exists in a live run alone.
+    ``live_only``: what was asked for exists in a live run alone; ``more``: processors that it needs besides.
     """
     from host.real_time import obstacle
 
-    found = obstacle(finding)
+    found = obstacle(finding, more)
     if not found:
         return False, ""
     if live_only:
@@ -276,14 +303,14 @@ def paced_or_live(finding: Finding, live_only: bool) -> tuple[bool, str]:
     return True, f"{found}: the demo runs in paced virtual time instead; --live insists."
 
 
-def _paces(screen: RichConsole, live_only: bool) -> bool:
+def _paces(screen: RichConsole, live_only: bool, more: float) -> bool:
     """Look at this computer, and tell the user what that means where it cannot hold a live run."""
     from hil.harness.display import say
     from host.real_time import look
 
     with screen.status("Does this computer hold the period of a live run?"):
         finding = look()
-    paced, sentence = paced_or_live(finding, live_only)
+    paced, sentence = paced_or_live(finding, live_only, more)
     if sentence:
         say(screen, "", sentence, "yellow")
     return paced

@@ -50,6 +50,8 @@ def demo(tmp_path: Path) -> Iterator[Demo]:
             "-m",
             "timberhand",
             "demo",
+            "--detector",
+            "perfect",
             "--no-console",
             "--out",
             str(tmp_path / "run"),

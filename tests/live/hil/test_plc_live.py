@@ -31,7 +31,7 @@ def run(*arguments: str, timeout: float = 60.0, **environment: str) -> subproces
 @pytest.mark.timeout(400)
 def test_a_log_lands_in_the_bunk_over_modbus(tmp_path: Path) -> None:
     """What is asserted is the outcome; a host that is short of processor time stops the machine, rightly."""
-    arguments = ["demo", "--plc", "--bus", "wire", "--live", "--no-console", "--json"]
+    arguments = ["demo", "--detector", "perfect", "--plc", "--bus", "wire", "--live", "--no-console", "--json"]
     arguments += ["--max-stops", "60", "--limit-s", "300"]
     done = run("timberhand", *arguments, "--out", str(tmp_path / "run"), timeout=380, TIMBERHAND_WIRE_DIR=str(tmp_path))
     assert done.returncode == 0, done.stderr

@@ -267,7 +267,9 @@ def test_the_demo_in_simulated_time_misses_no_tick_and_no_setpoint(
     travel: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     """Every process of it: on a host of any speed the machine is never stopped, for none of them is ever late."""
-    done = travel("-m", "timberhand", "demo", "--bus", "vcan", "--no-console", "--out", tmp_path / "run")
+    done = travel(
+        "-m", "timberhand", "demo", "--detector", "perfect", "--bus", "vcan", "--no-console", "--out", tmp_path / "run"
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr
     told = json.loads((tmp_path / "run/summary.json").read_text())
     assert told["in_bunk"]
