@@ -14,6 +14,7 @@ from can_dbc.messages.crane import CraneSetpoint, Knot
 from controller.crane.reference_governor import Trajectory, extremes, peak_speed
 from controller.requests import RequestRefused
 from machine.geometry.bunk import stake_walls
+from machine.geometry.grapple import lowest_pin_m
 from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint
@@ -111,20 +112,18 @@ class TrajectoryCheck:
 
 
 MAX_KNOTS_CHECKED: Final = 4
-GROUND_MARGIN_M: Final = 0.1
-"""Ground that lies lower than the profile says, and sag: the rotator may be commanded this far below the ground."""
 _ALLOWED_M: Final = 1e-3
 
 
 class WorkspaceCheck:
     """Checks the tip against one profile.
 
-    Checked is what hangs stiff under the boom tip, from the hanger pin down to the rotator; the jaws below it must
-    touch logs and ground to work.  At most `MAX_KNOTS_CHECKED` knots of a datagram are checked, spread evenly and with
-    the last one among them: a setpoint reaches 0.4 s ahead and comes every 50 ms, so the tip moves by a few centimetres
-    between two checks.  A crane that is inside already, moved there by hand, may leave: only a knot that is inside
-    where the first one is not, or deeper in the ground than it, is refused.  The carrier's frame can be higher than its
-    lowest position, and then the ground lies deeper below the crane; the ground's limit counts for the highest frame.
+    Against boxes what hangs stiff under the boom tip is checked, from the hanger pin down to the rotator; the jaws
+    below it must touch logs to work.  Against the ground the grapple is (`machine.geometry.grapple.lowest_pin_m`).  At
+    most `MAX_KNOTS_CHECKED` knots of a datagram are checked, spread evenly and with the last one among them: a setpoint
+    reaches 0.4 s ahead and comes every 50 ms, so the tip moves by a few centimetres between two checks.  A crane that
+    is inside already, moved there by hand, may leave: only a knot that is inside where the first one is not, or deeper
+    in the ground than it, is refused.
     """
 
     __slots__ = ("_boxes", "_hang_m", "_kinematics", "_lowest_z_m")
@@ -132,8 +131,7 @@ class WorkspaceCheck:
     def __init__(self, profile: Profile) -> None:
         kin = self._kinematics = profile.kinematics
         self._hang_m = kin.hanger_to_fork_m + kin.fork_to_rotator_m
-        lift_m = 0.0 if profile.carrier is None else profile.carrier.arm_travel_m
-        self._lowest_z_m = profile.workspace.ground_z_m - lift_m - GROUND_MARGIN_M + self._hang_m
+        self._lowest_z_m = lowest_pin_m(profile)
         self._boxes = tuple(
             (
                 box.center_m[0],

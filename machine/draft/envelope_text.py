@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from machine.draft.toml_text import value_text
+from machine.geometry.grapple import lowest_pin_m
 from machine.joints import JOINTS
 from machine.profile import KeepOut, Profile, joint
 
@@ -13,6 +14,8 @@ LIMITS: Final = ("lower", "upper", "speed_limit", "acceleration_limit")
 COLUMN_HALF_M: Final = 0.45
 """Half the edge of the box around the column with its foot."""
 UNDER_BOOM_PIN_M: Final = 0.15
+BELOW_CONTROLLER_M: Final = 0.05
+"""The guard stops a pin this much lower than where the controller refuses it."""
 
 
 def envelope_kinematics(profile: Profile) -> dict[str, float]:
@@ -32,10 +35,11 @@ def envelope_kinematics(profile: Profile) -> dict[str, float]:
 
 def envelope_text(profile: Profile) -> str:
     """The envelope without its last line."""
-    ground = profile.workspace.ground_z_m
-    high = profile.kinematics.d1_m - UNDER_BOOM_PIN_M
-    boxes = [("The column with its foot: the pin would hit it.", _column(ground, high))]
-    boxes += [(f"keep_out.{name} of the profile.", _corners(box)) for name, box in profile.keep_out.items()]
+    ground, kin = profile.workspace.ground_z_m, profile.kinematics
+    hang_m = kin.hanger_to_fork_m + kin.fork_to_rotator_m - BELOW_CONTROLLER_M
+    high = round(kin.d1_m - UNDER_BOOM_PIN_M + hang_m, 4)
+    boxes = [("The column with its foot: what hangs stiff below the pin would hit it.", _column(ground, high))]
+    boxes += [(f"keep_out.{name} of the profile.", _corners(box, hang_m)) for name, box in profile.keep_out.items()]
     out = [
         f"# Envelope of {profile.title},",
         "# for the guard: what this machine may do at most, whatever its profile says.",
@@ -43,7 +47,8 @@ def envelope_text(profile: Profile) -> str:
         "# A draft from its profile.  Check every limit against the machine; then seal the file with",
         "# `python -m controller.guard.seal FILE`.  Without the seal the guard does not start.",
         "",
-        f"ground_m = {value_text(ground)}",
+        "# The hanger pin stays above this height; a grapple hangs below it.",
+        f"ground_m = {value_text(round(lowest_pin_m(profile) - BELOW_CONTROLLER_M, 3))}",
         "",
         "[kinematics]",
         *(f"{key} = {value_text(value)}" for key, value in envelope_kinematics(profile).items()),
@@ -60,10 +65,10 @@ def _column(ground: float, high: float) -> tuple[list[float], list[float]]:
     return [-COLUMN_HALF_M, -COLUMN_HALF_M, ground], [COLUMN_HALF_M, COLUMN_HALF_M, high]
 
 
-def _corners(box: KeepOut) -> tuple[list[float], list[float]]:
-    """The axis-parallel box around a box that is turned about the vertical."""
+def _corners(box: KeepOut, hang_m: float) -> tuple[list[float], list[float]]:
+    """The axis-parallel box around a box that is turned about the vertical, and ``hang_m`` higher."""
     (x, y, z), (a, b, c) = box.center_m, box.half_m
     cos, sin = abs(math.cos(box.yaw_rad)), abs(math.sin(box.yaw_rad))
     dx, dy = cos * a + sin * b, sin * a + cos * b
-    low, high = (x - dx, y - dy, z - c), (x + dx, y + dy, z + c)
+    low, high = (x - dx, y - dy, z - c), (x + dx, y + dy, z + c + hang_m)
     return [round(v, 4) for v in low], [round(v, 4) for v in high]

@@ -12,10 +12,16 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from math import ceil, degrees, floor, pi
+from typing import Final
 
 from machine.geometry.kinematics import Unreachable
 from machine.joints import Joint
 from machine.profile import JawTable, Kinematics, Profile, joint
+
+FIXED_GROUND_M: Final = 0.2
+"""The ground around a fixed base may lie this much lower than the profile says, ..."""
+RAISED_GROUND_M: Final = 0.1
+"""... and that of a carrier this much lower than with its frame at its highest."""
 
 
 def grapple_yaw(profile: Profile, q: Sequence[float]) -> float:
@@ -65,6 +71,18 @@ def half_gap_m(jaws: JawTable, jaw_rad: float) -> float:
 def lowest_tip_below_pin_m(jaws: JawTable) -> float:
     """The greatest depth of the tips while closing [m]: the clearance that a closing grapple needs."""
     return max(jaws.tip_below_pin_m)
+
+
+def lowest_pin_m(profile: Profile) -> float:
+    """Height of the hanger pin [m] below which no work brings it: its grapple would be in the ground.
+
+    On a fixed base that of the open grapple, which stands on the ground to grasp what lies there.  Under a carrier the
+    ground is deeper by what its frame is raised; there it is that of the shortest grapple, closed and empty.
+    """
+    tips, ground_m, carrier = profile.grapple.jaws.tip_below_pin_m, profile.workspace.ground_z_m, profile.carrier
+    if carrier is None:
+        return ground_m - FIXED_GROUND_M + tips[0]
+    return ground_m - carrier.arm_travel_m - RAISED_GROUND_M + min(tips)
 
 
 def jaw_angle_from_opening_pct(jaws: JawTable, opening_pct: float) -> float:

@@ -165,7 +165,7 @@ _FAULTS: Final = {
     Reason.FLOAT_BOTH: Fault(REFUSE, 10, NOTHING, "A drive setpoint was refused: both axles would float"),
     Reason.CRANE_MOVES: Fault(REFUSE, 10, NOTHING, "A drive setpoint was refused: the crane is moving"),
     Reason.CARRIER_MOVES: Fault(REFUSE, 10, NOTHING, "A crane setpoint was refused: the machine is driving"),
-    Reason.BELOW_GROUND: Fault(REFUSE, 10, NOTHING, "A setpoint was refused: the rotator would touch the ground"),
+    Reason.BELOW_GROUND: Fault(REFUSE, 10, NOTHING, "A setpoint was refused: the grapple would enter the ground"),
     Reason.KEEP_OUT: Fault(
         REFUSE, 10, NOTHING, "A setpoint was refused: the boom tip would enter a box that it must keep out of"
     ),

@@ -1,15 +1,19 @@
 """The guard's envelope file: sealed, apart from the profile, and never exceeded by it."""
 
+import itertools
 import re
 
 import pytest
 
 from can_dbc.dbc.codec import load as load_database
 from controller.config import load as load_settings
+from controller.crane.trajectory_check import WorkspaceCheck
 from controller.guard import seal
 from controller.guard.__main__ import DATABASES, build
 from controller.guard.envelope import SHIPPED, read_envelope
 from controller.guard.layout import GuardConfigError, read_layouts
+from machine.geometry.bunk import stake_walls
+from machine.geometry.grapple import lowest_pin_m
 from machine.loading.profile_file import shipped_profiles
 from tests.codes import coded
 from tests.controller.guard_traffic import PROFILE
@@ -33,7 +37,7 @@ def test_every_shipped_profile_has_a_sealed_envelope(name):
 
 def test_the_envelope_beside_the_profile_counts(files):
     profile, envelope = files
-    text = envelope.read_text().replace("ground_m = -1.39", "ground_m = -0.5")
+    text = envelope.read_text().replace("ground_m = -0.565", "ground_m = -0.5")
     envelope.write_text(text)
     with pytest.raises(GuardConfigError, check=coded("guard.envelope-damaged")):
         build(profile)
@@ -137,7 +141,7 @@ def test_a_database_with_numbers_or_bytes_that_cannot_be_read_stops_the_start(tm
 @pytest.mark.parametrize("value", ["nan", "inf", '"a text"', "[1.0]"])
 def test_a_sealed_limit_that_is_no_finite_number_stops_the_start(files, value):
     profile, envelope = files
-    envelope.write_text(envelope.read_text().replace("ground_m = -1.39", f"ground_m = {value}"))
+    envelope.write_text(envelope.read_text().replace("ground_m = -0.565", f"ground_m = {value}"))
     assert seal.main([str(envelope)]) == 0
     with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
         build(profile)
@@ -149,8 +153,8 @@ def test_a_sealed_limit_that_is_no_finite_number_stops_the_start(files, value):
         ("lower = -1.74533\nupper = 1.74533", "lower = 1.74533\nupper = -1.74533"),
         ("speed_limit = 0.35", "speed_limit = -0.35"),
         ("acceleration_limit = 0.4", "acceleration_limit = 0.0"),
-        ("high_m = [0.4, 0.4, 1.2]", "high_m = [0.4, -0.5, 1.2]"),
-        ("ground_m = -1.39", "ground_m = " + 5000 * "[" + 5000 * "]"),
+        ("high_m = [0.4, 0.4, 1.5]", "high_m = [0.4, -0.5, 1.5]"),
+        ("ground_m = -0.565", "ground_m = " + 5000 * "[" + 5000 * "]"),
     ],
 )
 def test_a_sealed_envelope_that_no_machine_has_stops_the_start(files, old, new):
@@ -191,16 +195,11 @@ def test_guard_and_controller_have_one_check_of_one_file(files):
 def test_the_guard_stops_nothing_that_the_controller_lets_pass(name):
     """A box around the crane's own column is out of its reach; every other one is a keep-out of the profile."""
     profile = load_settings(name).profile
-    kept_out = [
-        [(c - h, c + h) for c, h in zip(box.center_m, box.half_m, strict=True)]
-        for box in profile.keep_out.values()
-        if box.yaw_rad == 0.0
-    ]
+    check = WorkspaceCheck(profile)
     for low, high in read_envelope(SHIPPED / f"{name}.toml").boxes:
         if low[0] < 0.0 < high[0] and low[1] < 0.0 < high[1]:
             continue
-        assert any(
-            all(a - 1e-9 <= x and y <= b + 1e-9 for x, y, (a, b) in zip(low[:2], high[:2], box[:2], strict=True))
-            and high[2] <= box[2][1] + 1e-9
-            for box in kept_out
-        ), (low, high)
+        heights = (max(low[2], min(b.center_m[2] - b.half_m[2] for b in profile.keep_out.values())), 0.0, high[2])
+        for x, y, z in itertools.product((low[0], -2.0, high[0]), (low[1], 0.0, high[1]), heights):
+            assert check._box_at(x, y, z) >= len(stake_walls(profile.bunk)), (x, y, z)
+    assert lowest_pin_m(profile) >= read_envelope(SHIPPED / f"{name}.toml").ground_m + 0.04

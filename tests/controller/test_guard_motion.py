@@ -183,9 +183,36 @@ def test_the_pin_may_not_enter_a_box():
     for lift_rad_s in (-0.15, 0.15):
         x, y, z = reach.pin(q[0], q[1] + lift_rad_s * 0.1, *q[2:])
         verdicts[lift_rad_s] = reach.deeper(q, [0.0, lift_rad_s, 0.0, 0.0])
-        assert verdicts[lift_rad_s] == (abs(x) < 0.4 and abs(y) < 0.4 and -1.39 < z < 1.2)
+        assert verdicts[lift_rad_s] == (abs(x) < 0.4 and abs(y) < 0.4 and -1.39 < z < 1.5)
     assert sorted(verdicts.values()) == [False, True]
     assert not reach.deeper(q, [0.0] * 4)
+
+
+def lowers(machine: str, x_m: float, y_m: float, z_m: float) -> bool:
+    """Whether the guard stops a pin there that goes down at 0.3 m/s, by lift and telescope."""
+    profile, reach = load_profile(machine), Reach(read_envelope(PROFILE.with_name(f"{machine}.toml")))
+    here, there = (solve(profile, x_m, y_m, z) for z in (z_m, z_m - 0.003))
+    return reach.deeper(list(here), [100.0 * (b - a) for a, b in zip(here, there, strict=True)])
+
+
+@pytest.mark.parametrize(("machine", "x_m", "y_m"), [("palms_471", -1.8, 4.4), ("aoro_fc8", 4.0, 3.4)])
+def test_a_grapple_may_be_lowered_to_logs_on_the_ground_and_not_into_it(machine: str, x_m: float, y_m: float) -> None:
+    """Of a carrier's ground the guard knows no more than that it is not deeper than with the frame at its highest."""
+    profile = load_profile(machine)
+    tips, ground_m = profile.grapple.jaws.tip_below_pin_m, profile.workspace.ground_z_m
+    touches_m = ground_m + min(tips) if profile.carrier is None else ground_m - profile.carrier.arm_travel_m + min(tips)
+    assert not lowers(machine, x_m, y_m, touches_m + tips[0] - min(tips) - 0.05), "an open one on ground that is lower"
+    assert lowers(machine, x_m, y_m, touches_m + (0.13 if profile.carrier is None else -0.13))
+
+
+@pytest.mark.parametrize(("x_m", "y_m"), [(-2.9, 0.6), (-2.6, -0.6)])
+def test_what_hangs_stiff_under_the_pin_does_not_enter_the_machine(x_m: float, y_m: float) -> None:
+    """The front half of the carrier, which the controller keeps it out of from 0.1 m higher."""
+    profile = load_profile("aoro_fc8")
+    kin, box = profile.kinematics, profile.keep_out["front_half"]
+    over_m = box.center_m[2] + box.half_m[2] + kin.hanger_to_fork_m + kin.fork_to_rotator_m
+    assert lowers("aoro_fc8", x_m, y_m, over_m - 0.1)
+    assert not lowers("aoro_fc8", x_m, y_m, over_m)
 
 
 @pytest.mark.parametrize("grapple_mode", [1, 2, 3])

@@ -7,9 +7,10 @@ import pytest
 
 from can_dbc.messages.crane import Knot
 from controller.config import Settings
-from controller.crane.trajectory_check import GROUND_MARGIN_M, MAX_KNOTS_CHECKED, WorkspaceCheck
+from controller.crane.trajectory_check import MAX_KNOTS_CHECKED, WorkspaceCheck
 from controller.requests import RequestRefused
 from machine.geometry.bunk import stake_walls
+from machine.geometry.grapple import FIXED_GROUND_M
 from machine.geometry.kinematics import Unreachable, pin_position, solve
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import KeepOut
@@ -36,8 +37,9 @@ def refusal(check, *points):
 
 
 def test_ground_is_refused_from_above_and_a_way_out_is_not():
+    """The open grapple may stand a little lower than the ground should be; a closed one never comes there."""
     check = WorkspaceCheck(PROFILE)
-    lowest = PROFILE.workspace.ground_z_m - GROUND_MARGIN_M + HANG_M
+    lowest = PROFILE.workspace.ground_z_m - FIXED_GROUND_M + PROFILE.grapple.jaws.tip_below_pin_m[0]
     x, y, _ = ABOVE
     assert refusal(check, ABOVE, (x, y, lowest + 0.01)) is Reason.NONE
     assert refusal(check, ABOVE, (x, y, lowest - 0.01)) is Reason.BELOW_GROUND

@@ -52,6 +52,8 @@ class Hostile:
     begin_ns: int = 1 << 62
     told: dict[str, Any] = field(default_factory=lambda: {"Mode": RUN, "SafeState": 0, "Reason": 0})
     """What it says of itself in CtrlStatus."""
+    jaws: dict[str, float] = field(default_factory=dict)
+    """What it commands of the jaws in ValveCmdB, in place of the controller's."""
 
     def on_outputs(self, outputs: Outputs, now_ns: int) -> None:
         """Forge the frames of this tick."""
@@ -59,7 +61,8 @@ class Hostile:
             return
         grown = self.rate_pct_s * (now_ns - self.begin_ns) * 1e-9
         percent = math.copysign(min(abs(self.most_pct), 10.0 + grown), self.most_pct)
-        values = {"ValveCmdA": {"Mode": SPOOL}, "ValveCmdB": {"ArmKey": ARM_KEY, "PumpReq": 1}, "CtrlStatus": self.told}
+        valve_b = {"ArmKey": ARM_KEY, "PumpReq": 1} | self.jaws
+        values = {"ValveCmdA": {"Mode": SPOOL}, "ValveCmdB": valve_b, "CtrlStatus": self.told}
         functions = ("Slew", "Lift", "Tilt", "Ext", "Rot")
         for i, (key, data) in enumerate(outputs.frames):
             codec = FORGED.get(key)
@@ -86,6 +89,7 @@ class Attack:
     beyond: float = 0.0
     """How far it came past its range."""
     lowest_m: float = math.inf
+    """Of the pin, in the crane's base frame."""
     tip_m: float = 0.0
     enabled_ns: int = 0
     """Time with the valves enabled, from the beginning of the attack."""

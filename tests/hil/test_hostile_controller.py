@@ -39,6 +39,15 @@ def test_a_joint_that_is_driven_out_is_cut_before_its_end_stop() -> None:
     assert found.beyond < END_STOP
 
 
+@pytest.mark.parametrize("percent", [-35.0, -60.0])
+def test_a_closed_grapple_is_not_driven_into_the_ground(percent: float) -> None:
+    """At a speed that breaks no rule; its tips meet 0.8 m below the pin."""
+    jaws = {"GrappleMode": 2, "Grapple": 100.0}
+    found = attack("palms_471", Hostile("Lift", percent, 25.0, jaws=jaws), Joint.LIFT, 14.0)
+    assert found.verdict is Verdict.REACH and found.fastest < 1.0
+    assert found.lowest_m > load_profile("palms_471").workspace.ground_z_m + 0.7
+
+
 def stop_at(now_ns: int, profile_hash: int) -> bytes:
     """The datagram of a person's STOP."""
     return encode(OperatorCommand(1, profile_hash, now_ns, OperatorAction.STOP))

@@ -18,7 +18,7 @@ from controller.guard.envelope import SHIPPED, read_envelope
 from controller.guard.layout import GuardConfigError
 from controller.step import Controller
 from machine.draft.envelope_text import envelope_kinematics
-from machine.geometry.grapple import lowest_tip_below_pin_m
+from machine.geometry.grapple import lowest_pin_m, lowest_tip_below_pin_m
 from machine.geometry.kinematics import Unreachable, solve
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from machine.profile import Profile
@@ -100,10 +100,11 @@ def _envelope(source: Path, profile: Profile) -> Iterator[Finding]:
                 "judge another crane: measure, and correct one of the two"
             )
             yield Finding("machine.other-geometry", file, text)
-    if envelope.ground_m > profile.workspace.ground_z_m + SAME_M:
+    lowest_m = lowest_pin_m(profile)
+    if envelope.ground_m > lowest_m + SAME_M:
         text = (
-            f"ground_m is {envelope.ground_m:g}, above the profile's ground at {profile.workspace.ground_z_m:g}; the "
-            "guard would stop the crane over it"
+            f"ground_m is {envelope.ground_m:g}, and by the profile's ground and grapple the hanger pin works down to "
+            f"{lowest_m:g}; the guard would stop the crane over it"
         )
         yield Finding("machine.other-ground", file, text)
 
