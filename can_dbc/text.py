@@ -9,7 +9,7 @@ HEAD_BYTES: Final = 256
 
 
 def decoded(content: bytes, fallback: str) -> str:
-    """UTF-8 or UTF-16, with or without a byte order mark, else ``fallback``; what that cannot read is replaced."""
+    """UTF-8 or UTF-16, with or without a byte order mark; bytes that are not UTF-8 are ``fallback``'s or replaced."""
     if content.startswith(BOM_UTF8):
         return content[len(BOM_UTF8) :].decode("utf-8", "replace")
     if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
@@ -18,7 +18,5 @@ def decoded(content: bytes, fallback: str) -> str:
     for encoding, zeros, letters in (("utf-16-le", head[1::2], head[::2]), ("utf-16-be", head[::2], head[1::2])):
         if zeros.count(0) > len(zeros) // 2 and not letters.count(0):
             return content.decode(encoding, "replace")
-    try:
-        return content.decode("utf-8")
-    except UnicodeDecodeError:
-        return content.decode(fallback, "replace")
+    others = {0xDC00 + byte: bytes((byte,)).decode(fallback, "replace") for byte in range(0x80, 0x100)}
+    return content.decode("utf-8", "surrogateescape").translate(others)

@@ -30,6 +30,9 @@ _GPX: Final = frozenset(
         "name",
         "rte",
         "rtept",
+        "extensions",
+        "RoutePointExtension",
+        "rpt",
         "trk",
         "trkseg",
         "trkpt",
@@ -50,6 +53,7 @@ _KML_UNUSED: Final = {
     "Model": "model",
     "Tour": "tour",
 }
+_LINK: Final = "a link to another file, which is not followed; save what it shows as a file of its own"
 MAX_GAP_M: Final = 5.0
 """Segments of a track that begin no farther than this from the end of the one before are one drive [est]."""
 _KML: Final = frozenset(
@@ -108,7 +112,11 @@ def read_gpx(data: bytes, name: str) -> Draft:
     routes, tracks = ([line for line in lines if any(line[0])] for lines in (routes, tracks))
     lines = routes or tracks
     if routes and tracks:
-        notes.append("a track beside the route ignored")
+        one_point = sum(map(len, routes[0][0])) == 1 < sum(map(len, tracks[0][0]))
+        lines = tracks if len(routes) == 1 and one_point else routes
+        notes.append(
+            f"a {'route of one point beside the track' if lines is tracks else 'track beside the route'} ignored"
+        )
     shapes, gaps = [], Gaps()
     for segments, owner in lines:
         read = [tuple(_gpx_position(point, source) for point in points) for points in segments]
@@ -123,6 +131,10 @@ def read_gpx(data: bytes, name: str) -> Draft:
     draft = assemble(shapes, source, "GPX", title)
     draft.notes += notes
     gaps.tell(draft)
+    between = [e for _, owner in lines for e in _inside(owner) if e.name == "rpt"]
+    if between:
+        sentence = f"{len(between)} points between those of the route are not used; the machine drives straight"
+        draft.warn("gpx.points-between", between[0].line, sentence)
     return draft
 
 
@@ -186,13 +198,14 @@ def read_kml(data: bytes, name: str) -> Draft:
     for element in _inside(root):
         if element.name in _KML_UNUSED:
             reader.left_out[_KML_UNUSED[element.name]] += 1
+    link = next((element for element in _inside(root) if element.name == "NetworkLink"), None)
+    if link is not None and not reader.shapes:
+        raise reader.source.error("kml.network-link", link.line, f"holds no place, only {_LINK}")
     draft = assemble(reader.shapes, reader.source, "KML", title)
     draft.notes += [*reader.notes, *(f"{count} × {what} ignored" for what, count in reader.left_out.items())]
     reader.gaps.tell(draft)
-    for link in (element for element in _inside(root) if element.name == "NetworkLink"):
-        sentence = "a link to another file is not followed; save what it shows as a file of its own"
-        draft.warn("kml.network-link", link.line, sentence)
-        break
+    if link is not None:
+        draft.warn("kml.network-link", link.line, _LINK)
     return draft
 
 

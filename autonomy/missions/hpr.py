@@ -101,6 +101,8 @@ def read_hpr(data: bytes, name: str) -> Draft:
     if lost:
         sentence = f"{lost} logs of stems without coordinates are left out; the machine is not told of them"
         draft.warn("hpr.no-coordinates", None, sentence)
+    if not logs:
+        draft.warn("hpr.no-logs", root.line, "no log is read from this file")
     if several:
         draft.notes.append(
             f"{several} logs were measured more than once; one measurement is read, the harvester's if it is marked"
@@ -125,17 +127,23 @@ def _position(owners: tuple[Element, ...], source: Source) -> tuple[Point, float
         latitude, longitude = given.first("Latitude"), given.first("Longitude")
         if latitude is None or longitude is None:
             continue
-        at = Point(_angle(latitude, "South", source), _angle(longitude, "West", source))
+        at = Point(_angle(latitude, "north", "south", source), _angle(longitude, "east", "west", source))
+        if not at.latitude_deg and not at.longitude_deg:
+            continue  # the receiver had no fix
         tip = given.attributes.get("receiverPosition", "").startswith("Crane tip")
         if tip or best is None:
             best = at, TIP_SIGMA_M if tip else MACHINE_SIGMA_M
     return best
 
 
-def _angle(element: Element, negative: str, source: Source) -> float:
+def _angle(element: Element, positive: str, negative: str, source: Source) -> float:
     value = _number(element, source)
-    category = element.attributes.get(f"{element.name.lower()}Category", "")
-    return -value if category == negative else value
+    name = f"{element.name.lower()}Category"
+    category = element.attributes.get(name, positive)
+    if category.lower() not in (positive, positive[0], negative, negative[0]):
+        sentence = f'{name} is "{category[:40]}"; it is {positive.title()} or {negative.title()}'
+        raise source.error("hpr.category", element.line, sentence)
+    return value if category.lower().startswith(positive[0]) else -value
 
 
 def _log(

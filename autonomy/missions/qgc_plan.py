@@ -25,6 +25,7 @@ CONDITIONS: Final = range(112, 160)
 """MAV_CMD: commands that go to a place, and commands that wait for something."""
 DRIVES: Final = {
     **dict.fromkeys((32, 33, 34, 192), "moves to another place"),
+    **dict.fromkeys(range(5000, 5005), "fence"),
     177: "jump",
     191: "go-around",
     193: "pause",
@@ -40,6 +41,7 @@ NO_CHANGE, DEFAULT_SPEED = -1, -2
 GLOBAL_FRAMES: Final = frozenset({0, 3, 5, 6, 10, 11})
 """MAV_FRAME: latitude and longitude in degrees; the others are metres, or no place at all."""
 ARDUPILOT: Final = 3
+FENCE_PARTS: Final = ("polygon", "polygons", "circles", "breachReturn")
 CIRCLE_CORNERS: Final = 48
 Path = tuple[str | int, ...]
 
@@ -72,6 +74,9 @@ def read(document: dict[str, Any], source: Source) -> Draft:
     rally = document.get("rallyPoints")
     if isinstance(rally, dict) and rally.get("points"):
         draft.notes.append("rally points ignored")
+    for part in fence:
+        if part not in FENCE_PARTS and isinstance(fence[part], list | dict) and fence[part]:
+            draft.warn("plan.geofence-part", ("geoFence", part), f"{part[:40]} of the fence is not read")
     if fence.get("breachReturn"):
         draft.notes.append("the point to return to from outside the fence ignored")
     return draft
@@ -101,7 +106,7 @@ class _Reader:
             )
             draft.warn("plan.several-speeds", ("mission", "items"), sentence)
         if self.other_speed is not None:
-            sentence = "this speed is no ground speed (type 1) and is not used; set the ground speed"
+            sentence = "this speed is no ground speed (type 1) in m/s and is not used; set the ground speed"
             draft.warn("plan.speed-type", self.other_speed, sentence)
         for what, paths in self.not_driven.items():
             sentence = f"{len(paths)} × {what}: a mission does not have it, and the machine drives on without it"
@@ -134,12 +139,12 @@ class _Reader:
                 if (_number(given[0]) and given[0] > 0) or item.get("autoContinue") is False:
                     self.not_driven.setdefault("wait at a waypoint", []).append(path)
                 self.speeds_m_s.append(speed)
-            elif command == DO_CHANGE_SPEED and isinstance(given, list) and len(given) > 1 and _number(given[1]):
-                if given[1] == NO_CHANGE:
-                    continue
-                if given[0] == GROUND_SPEED:
-                    speed = None if given[1] == DEFAULT_SPEED else float(given[1])
-                else:
+            elif command == DO_CHANGE_SPEED:
+                kind, value, _, relative = (*given, None, None, 0, 0)[:4] if isinstance(given, list) else (None,) * 4
+                if kind == GROUND_SPEED and _number(value) and not relative:
+                    if value != NO_CHANGE:
+                        speed = None if value == DEFAULT_SPEED else float(value)
+                elif value != NO_CHANGE:
                     self.other_speed = path
             elif _number(command) and (command in PLACES or command in CONDITIONS or command in DRIVES):
                 does = DRIVES.get(command, "wait" if command in CONDITIONS else "movement")
@@ -165,10 +170,13 @@ class _Reader:
             for i, entry in enumerate(listed):
                 path: Path = ("geoFence", kind, i)
                 shape = entry.get(inner) if isinstance(entry, dict) else None
+                inclusion = entry.get("inclusion", True) if isinstance(entry, dict) else True
+                if inclusion not in (True, False):
+                    raise self.source.error("plan.geofence", path, "inclusion of this fence is neither true nor false")
                 if kind == "polygons" and isinstance(shape, list):
-                    self.polygon(shape, bool(entry.get("inclusion", True)), (*path, inner))
+                    self.polygon(shape, bool(inclusion), (*path, inner))
                 elif kind == "circles" and isinstance(shape, dict):
-                    self.circle(shape, bool(entry.get("inclusion", True)), (*path, inner))
+                    self.circle(shape, bool(inclusion), (*path, inner))
                 else:
                     raise self.source.error("plan.geofence", path, f"this fence has no {inner}")
 

@@ -236,6 +236,9 @@ def _no_json(source: Source, complaint: str) -> MissionError:
     if found is None:
         cut = "truncated" in complaint
         last = source.text.count("\n") + 1 if cut else None
+        if "out of range" in complaint:
+            sentence = "a number is larger than a computer's; write the value that it stands for"
+            return source.error("mission.json-number", last, sentence)
         reason = "it ends too early; was the file cut off?" if cut else f"{complaint[0].lower()}{complaint[1:]}"
         return source.error("mission.not-json", last, f"this is not JSON: {reason}")
     before = source.text.encode()[: int(found[2])]

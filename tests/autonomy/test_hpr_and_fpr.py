@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
@@ -48,8 +49,9 @@ def test_the_crane_tips_position_is_better_than_the_harvesters() -> None:
     assert places[-1, :2] == pytest.approx((0.0, -12.0), abs=0.02) and logs[-1].sigma_m == MACHINE_SIGMA_M
 
 
-def test_south_and_west() -> None:
-    turned = TEXT.replace('"North"', '"South"').replace('"East"', '"West"')
+@pytest.mark.parametrize(("south", "west"), [("South", "West"), ("south", "WEST"), ("S", "W")])
+def test_south_and_west(south: str, west: str) -> None:
+    turned = TEXT.replace('"North"', f'"{south}"').replace('"East"', f'"{west}"')
     at_first = read(turned.encode(), "h").mission.logs[0].position
     assert (at_first.latitude_deg, at_first.longitude_deg) == (
         pytest.approx(-63.65777, abs=1e-3),
@@ -71,6 +73,17 @@ def test_stems_without_coordinates_are_counted() -> None:
     draft = read((TEXT[:start] + TEXT[end:]).encode(), "h")
     assert len(draft.mission.logs) == 5 and draft.notes == []
     assert [(p.code, numbers_in(p.sentence)) for p in draft.warnings] == [("hpr.no-coordinates", [2])]
+
+
+def test_no_fix_is_no_position() -> None:
+    zeros = re.sub(r"(<L(?:at|ong)itude[^>]*>)[\d.]+", r"\g<1>0.0", TEXT)
+    draft = read(zeros.encode(), "h")
+    assert draft.mission.logs == () and [p.code for p in draft.warnings] == ["hpr.no-coordinates", "hpr.no-logs"]
+
+
+def test_a_file_without_logs_is_said_to_have_none() -> None:
+    draft = read(TEXT.replace("ProcessedStem>", "Stem>").encode(), "h")
+    assert draft.mission.logs == () and [p.code for p in draft.warnings] == ["hpr.no-logs"]
 
 
 def test_a_position_in_the_processing_of_a_stem() -> None:
@@ -107,6 +120,8 @@ def test_an_hpr_in_an_envelope() -> None:
         ("urn:skogforsk:stanford2010", "urn:else", "hpr.namespace"),
         ('messageType="hpr"', 'messageType="pri"', "hpr.message-type"),
         ('"WGS84"', '"RT90"', "mission.datum"),
+        ('"North"', '"Upwards"', "hpr.category"),
+        ('"East"', '""', "hpr.category"),
         ("<LogLength>300", "<LogLength>3x0", "mission.number"),
         ("<LogLength>300", "<LogLength>inf", "mission.number"),
         ("<LogLength>300", "<LogLength>30000", "mission.log-size"),

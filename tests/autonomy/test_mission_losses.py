@@ -53,6 +53,25 @@ def test_an_empty_route_does_not_hide_the_track() -> None:
     assert codes(gpx("<rte/><trk><trkseg/></trk>")) == ["no-waypoints"]
 
 
+def test_a_route_of_one_point_does_not_hide_the_track() -> None:
+    start, way = f"<rte>{gpx_points('rtept', ROUTE[:1])}</rte>", f"<trk><trkseg>{gpx_points('trkpt')}</trkseg></trk>"
+    draft = good(gpx(start + way))
+    assert_route(draft.mission)
+    assert len(draft.notes) == 1
+    assert len(good(gpx(start)).mission.waypoints) == 1
+    assert len(good(gpx(start + way.replace(gpx_points("trkpt"), gpx_points("trkpt", ROUTE[:1])))).notes) == 1
+
+
+def test_points_between_those_of_a_route_are_a_warning() -> None:
+    """Garmin's programs write the way along roads into extensions, and only its corners as route points."""
+    between = '<extensions><g:RoutePointExtension xmlns:g="u"><g:rpt lat="1" lon="2"/><g:rpt lat="1" lon="2"/>'
+    between += "</g:RoutePointExtension></extensions>"
+    data = gpx(f"<rte>{gpx_points('rtept').replace('/>', f'>{between}</rtept>', 1)}</rte>")
+    draft = good(data)
+    assert_route(draft.mission)
+    assert warned(draft) == ["gpx.points-between"] and numbers_in(draft.warnings[0].sentence) == [2]
+
+
 # -- KML --------------------------------------------------------------------------------------------------------
 
 

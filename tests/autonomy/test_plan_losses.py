@@ -33,6 +33,11 @@ SEVERAL, KIND = "plan.several-speeds", "plan.speed-type"
         ([speed(0.5), A, B, speed(-2), C], 0.5, [SEVERAL]),
         ([speed(0.5), A, B, C, speed(0.1)], 0.5, []),
         ([speed(0.5, 0), A, B, C], None, [KIND]),
+        ([speed(0.5) | {"params": [1, 0.5, -1, 1, 0, 0, 0]}, A, B, C], None, [KIND]),  # relative to the speed before
+        ([speed(0.5) | {"params": [1, None, -1, 0, 0, 0, 0]}, A, B, C], None, [KIND]),
+        ([speed(0.5) | {"params": [1, "0.5"]}, A, B, C], None, [KIND]),
+        ([speed(0.5) | {"params": [1]}, A, B, C], None, [KIND]),
+        ([{"type": "SimpleItem", "command": 178}, A, B, C], None, [KIND]),
     ],
 )
 def test_speeds(items: list[dict[str, Any]], speed_m_s: float | None, warned: list[str]) -> None:
@@ -64,6 +69,17 @@ def test_several_keep_in_fences(firmware: int, warned: list[str]) -> None:
     assert [problem.code for problem in draft.warnings] == warned and len(draft.notes) == 1
 
 
+@pytest.mark.parametrize("inclusion", ["false", "true", None, 2, []])
+def test_a_fence_that_does_not_say_its_side_is_refused(inclusion: object) -> None:
+    ring = [[p.latitude_deg, p.longitude_deg] for p in FENCE]
+    assert codes(plan([A, B, C], polygons=[{"inclusion": inclusion, "polygon": ring}])) == ["plan.geofence"]
+
+
+def test_a_part_of_the_fence_that_is_not_read_is_a_warning() -> None:
+    data = plan([A, B, C], circle={"center": [0, 0], "radius": 9}, future=[1], empty=[], breachReturn=[1, 2, 3])
+    assert [problem.code for problem in good(data).warnings] == ["plan.geofence-part"] * 2
+
+
 WAIT = A | {"params": [5, *A["params"][1:]]}
 
 
@@ -78,6 +94,11 @@ WAIT = A | {"params": [5, *A["params"][1:]]}
         ([{"type": "SimpleItem", "command": 112, "frame": 2, "params": [9, 0, 0, 0, 0, 0, 0]}], 1, 0),  # a delay
         ([{"type": "SimpleItem", "command": 206, "frame": 2, "params": [9, 0, 0, 0, 0, 0, 0]}], 0, 1),  # a camera
         ([{"type": "ComplexItem", "complexItemType": "survey"}], 1, 0),
+        (
+            [{"type": "SimpleItem", "command": 5001, "frame": 3, "params": [4, 0, 0, 0, 1, 2, 0]}],
+            1,
+            0,
+        ),  # a fence's corner
         ([WAIT], 1, 0),
         ([A | {"autoContinue": False}], 1, 0),
         ([{"type": "SimpleItem", "command": "x" * 999}, {"type": "SimpleItem", "command": None}], 0, 2),

@@ -184,6 +184,11 @@ def test_a_database_of_another_code_page_is_read(tmp_path: Path) -> None:
     assert codec.load(path).messages["Temps"].signals[0].name == "Oil"
 
 
+def test_one_byte_of_another_encoding_does_not_change_the_rest() -> None:
+    assert decoded("°C ".encode() + "grün".encode("cp1252"), "cp1252") == "°C grün"
+    assert decoded(b"\xb0C", "cp1252") == "°C" and decoded(b"\x81\xb0", "utf-8") == "��"
+
+
 @pytest.mark.parametrize("content", [b"", b"\0", b"\xff\xfe", b"\xff\xfea", b"\xef\xbb\xbf", b"\x81"])
 def test_any_bytes_have_a_text(content: bytes) -> None:
     assert isinstance(decoded(content, "cp1252"), str)
