@@ -140,8 +140,10 @@ class _Reader:
                     self.not_driven.setdefault("wait at a waypoint", []).append(path)
                 self.speeds_m_s.append(speed)
             elif command == DO_CHANGE_SPEED:
-                kind, value, _, relative = (*given, None, None, 0, 0)[:4] if isinstance(given, list) else (None,) * 4
-                if kind == GROUND_SPEED and _number(value) and not relative:
+                quantity, value, _, relative = (
+                    (*given, None, None, 0, 0)[:4] if isinstance(given, list) else (None,) * 4
+                )
+                if quantity == GROUND_SPEED and _number(value) and not relative:
                     if value != NO_CHANGE:
                         speed = None if value == DEFAULT_SPEED else float(value)
                 elif value != NO_CHANGE:
