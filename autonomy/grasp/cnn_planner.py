@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from autonomy.grasp.cylinders import Cylinders, as_cylinders, lowest_m
 from autonomy.grasp.grapple_heights import known_ground_m
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.network import GraspMaps, PixelGrasp, best_pixel
+from autonomy.grasp.plan_picture import write_plan
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.quality import blade_sections, rests_upon, score_grasps
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
@@ -51,11 +53,20 @@ class CnnPlanner:
 
     ``by_rule`` takes the height from the capture rule that also makes the physical labels, where that rule holds.
     ``cameras`` over 1 moves the virtual camera on a circle of ``reach_m`` and averages the predictions (II-C); the
-    paper's results use one camera that stands still.
+    paper's results use one camera that stands still.  ``pictures``: a folder that gets a picture of every plan
+    (`autonomy.grasp.plan_picture`), that of the first camera.
     """
 
-    def __init__(self, network: Network, by_rule: bool = False, cameras: int = 1, reach_m: float = 0.3) -> None:
+    def __init__(
+        self,
+        network: Network,
+        by_rule: bool = False,
+        cameras: int = 1,
+        reach_m: float = 0.3,
+        pictures: Path | None = None,
+    ) -> None:
         self._network, self._by_rule, self._cameras, self._reach_m = network, by_rule, cameras, reach_m
+        self._pictures, self._planned = pictures, 0
 
     def view(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> NetworkView:
         """The virtual camera's image of a scene and the grasp in it.
@@ -98,7 +109,20 @@ class CnnPlanner:
         taken = tuple(places[i] for i in logs_between_jaws(jaws, world, x, y, yaw, level))
         quality = min(max(found.q, 0.0), 1.0)
         reason = f"the network's best pixel ({found.u_px:.0f}, {found.v_px:.0f}) has quality {found.q:.2f}"
+        if self._pictures is not None:
+            reason += self._draw(seen, 2.0 * jaws.half_gap_m * seen.camera.intrinsics.fx_px / depth)
         return GraspCandidate(x, y, yaw, level, taken, quality, reason)
+
+    def _draw(self, seen: NetworkView, opening_px: float) -> str:
+        """Draw a plan; returns what a reader of its reason is told, a full disk included."""
+        assert self._pictures is not None
+        self._planned += 1
+        path = self._pictures / f"plan-{self._planned:03}.png"
+        try:
+            write_plan(path, seen.depth_m, self._network.maps(seen.depth_m).q, seen.best, opening_px)
+        except OSError as error:
+            return f"; {path} cannot be written: {error.strerror}"
+        return f"; {path}"
 
 
 def logs_between_jaws(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level: float) -> tuple[int, ...]:

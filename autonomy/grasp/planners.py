@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from autonomy.grasp.planner import GraspPlanner
@@ -31,16 +32,19 @@ MAX_VIRTUAL_CAMERAS: Final = 32
 
 
 class PlannerChoice(NamedTuple):
-    """A planner's name, and over how many places of the virtual camera a network's predictions are averaged."""
+    """A planner's name, over how many places of the virtual camera a network's predictions are averaged, and the folder
+    that gets a picture of every plan.
+    """
 
     name: str = SEARCH
     virtual_cameras: int = 1
+    pictures: str = ""
 
     def check(self) -> PlannerChoice:
         """The choice itself; nothing is loaded.
 
         Raises:
-            InputRefused: there is no such planner, or it has no virtual camera.
+            InputRefused: there is no such planner, it has no virtual camera, or the folder is none.
         """
         if self.name not in NAMES and not entry_points(group=GRASP_PLANNERS, name=self.name):
             foreign = sorted({point.name for point in entry_points(group=GRASP_PLANNERS)})
@@ -54,6 +58,13 @@ class PlannerChoice(NamedTuple):
                 f"{self.virtual_cameras} virtual cameras: the network's predictions can be averaged over 1 to "
                 f"{MAX_VIRTUAL_CAMERAS}",
             )
+        if self.pictures and self.name not in NETWORKS:
+            raise InputRefused(
+                "planner.no-pictures",
+                f"the planner {self.name!r} draws no pictures of its plans; those that do are: {', '.join(NETWORKS)}",
+            )
+        if self.pictures and not Path(self.pictures).is_dir():
+            raise InputRefused("planner.no-folder", f"{self.pictures} is no folder; make it first")
         if self.virtual_cameras > 1 and self.name not in NETWORKS:
             raise InputRefused(
                 "planner.no-virtual-camera",
@@ -76,12 +87,15 @@ class PlannerChoice(NamedTuple):
             return load_plugin(GRASP_PLANNERS, self.name)  # type: ignore[no-any-return]
         from autonomy.grasp.cnn_planner import CnnPlanner
 
-        return CnnPlanner(network(NETWORKS[self.name]), self.name == PHYSICAL, self.virtual_cameras)
+        pictures = Path(self.pictures) if self.pictures else None
+        return CnnPlanner(network(NETWORKS[self.name]), self.name == PHYSICAL, self.virtual_cameras, pictures=pictures)
 
     def arguments(self) -> tuple[str, ...]:
         """The words that choose this planner on the command line of `autonomy`; none for the default."""
         words = () if self.name == SEARCH else ("--planner", self.name)
-        return words if self.virtual_cameras == 1 else (*words, "--virtual-cameras", str(self.virtual_cameras))
+        if self.virtual_cameras > 1:
+            words = (*words, "--virtual-cameras", str(self.virtual_cameras))
+        return (*words, "--plan-pictures", self.pictures) if self.pictures else words
 
 
 OUR_PLANNER: Final = PlannerChoice()

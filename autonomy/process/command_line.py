@@ -34,6 +34,9 @@ def arguments(argv: list[str]) -> argparse.Namespace:
         help="places of the virtual camera over which a network's predictions are averaged",
     )
     parser.add_argument(
+        "--plan-pictures", default="", metavar="DIR", help="with a network: a picture of every plan into this folder"
+    )
+    parser.add_argument(
         "--memory",
         action="store_true",
         help="the detector's camera looks ahead of the driving machine, and the crane works from memory",
@@ -50,7 +53,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     options = parser.parse_args(argv)
     try:
-        options.planner = PlannerChoice(options.planner, options.virtual_cameras).check()
+        options.planner = PlannerChoice(options.planner, options.virtual_cameras, options.plan_pictures).check()
     except InputRefused as error:
         parser.error(str(error))
     if options.progress is not None and (options.mission is None or options.order_port is None):

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from math import cos, sin, sqrt
 
+import numpy as np
+
+from autonomy.grasp.network import GraspMaps, PixelGrasp
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
 from machine.loading.profile_file import load_profile
@@ -43,3 +46,18 @@ def small_pile() -> list[LogObservation]:
 def cross() -> list[LogObservation]:
     """One log across two others that lie apart."""
     return [log(0, -0.4), log(1, 0.4), log(2, 0.0, 0.2, yaw=1.4)]
+
+
+class Chosen:
+    """A network that always finds the same pixel."""
+
+    def __init__(self, u_px: float, v_px: float, theta: float) -> None:
+        self.found, self.seen = PixelGrasp(u_px, v_px, theta, 0.9), None
+
+    def best(self, depth_m: np.ndarray) -> PixelGrasp:
+        self.seen = depth_m
+        return self.found
+
+    def maps(self, depth_m: np.ndarray) -> GraspMaps:
+        nearest = (depth_m < depth_m.min() + 0.01).astype(float)
+        return GraspMaps(nearest, -np.ones_like(nearest), np.zeros_like(nearest))

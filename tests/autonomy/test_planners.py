@@ -21,6 +21,7 @@ WORDS = ["--controller", "127.0.0.1:1", "--report-port", "2", "--scene", "127.0.
         (OUR_PLANNER, SamplingPlanner),
         (PlannerChoice("cnn"), CnnPlanner),
         (PlannerChoice("cnn-physical", 4), CnnPlanner),
+        (PlannerChoice("cnn", 1, "."), CnnPlanner),
     ],
 )
 def test_a_name_makes_its_planner_and_reaches_the_planning_process(choice, kind):
@@ -33,6 +34,8 @@ def test_a_name_makes_its_planner_and_reaches_the_planning_process(choice, kind)
     [
         (PlannerChoice("nobody"), "planner.unknown"),
         (PlannerChoice("search", 2), "planner.no-virtual-camera"),
+        (PlannerChoice("search", 1, "."), "planner.no-pictures"),
+        (PlannerChoice("cnn", 1, "no/such/folder"), "planner.no-folder"),
         (PlannerChoice("cnn", 0), "planner.virtual-cameras"),
         (PlannerChoice("cnn", planners.MAX_VIRTUAL_CAMERAS + 1), "planner.virtual-cameras"),
     ],
@@ -42,8 +45,9 @@ def test_what_no_planner_can_do_is_refused_before_anything_is_loaded(choice, cod
         choice.check()
     with pytest.raises(InputRefused, check=coded(code)):
         choice.make()
+    words = ("--virtual-cameras", str(choice.virtual_cameras), "--plan-pictures", choice.pictures)
     with pytest.raises(SystemExit, match="2"):
-        arguments([*WORDS, "--planner", choice.name, "--virtual-cameras", str(choice.virtual_cameras)])
+        arguments([*WORDS, "--planner", choice.name, *words])
 
 
 def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch):

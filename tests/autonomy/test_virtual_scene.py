@@ -12,32 +12,17 @@ from hypothesis import strategies as st
 from autonomy.grasp.cnn_planner import CnnPlanner, mean_maps
 from autonomy.grasp.cylinders import as_cylinders
 from autonomy.grasp.jaws import jaws_of
-from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet, PixelGrasp
+from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet
 from autonomy.grasp.planner import GraspRequest, NoGrasp
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from machine.loading.profile_file import load_profile
 from runtime.errors import InputRefused
-from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
+from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, Chosen, X, Y, cross, log, pair, small_pile
 from tests.codes import coded
 
 JAWS = jaws_of(PROFILE)
-
-
-class Chosen:
-    """A network that always finds the same pixel."""
-
-    def __init__(self, u_px: float, v_px: float, theta: float) -> None:
-        self.found, self.seen = PixelGrasp(u_px, v_px, theta, 0.9), None
-
-    def best(self, depth_m: np.ndarray) -> PixelGrasp:
-        self.seen = depth_m
-        return self.found
-
-    def maps(self, depth_m: np.ndarray) -> GraspMaps:
-        nearest = (depth_m < depth_m.min() + 0.01).astype(float)
-        return GraspMaps(nearest, -np.ones_like(nearest), np.zeros_like(nearest))
 
 
 def test_logs_are_shortened_by_the_grapple_and_a_tenth_but_never_to_discs() -> None:

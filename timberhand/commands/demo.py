@@ -19,6 +19,7 @@ from timberhand.commands.options import (
     MaxStopsOption,
     PageOption,
     PagePortOption,
+    PlanPicturesOption,
     ProfileOption,
     SummaryOption,
     TruthOption,
@@ -96,6 +97,7 @@ def demo(
     ] = "",
     planner: GraspPlannerOption = "search",
     virtual_cameras: VirtualCamerasOption = 1,
+    plan_pictures: PlanPicturesOption = None,
     paper_a: Annotated[
         bool,
         typer.Option(
@@ -163,7 +165,7 @@ def demo(
                 ExitCode.USAGE,
             )
         camera, planner, plc = "stick", "cnn", True
-    chosen = planner_of(planner, virtual_cameras)
+    chosen = planner_of(planner, virtual_cameras, plan_pictures)
     try:
         machine = load_profile(profile)
         cameras = machine.cameras

@@ -17,6 +17,7 @@ from timberhand.commands.options import (
     MaxStopsOption,
     PageOption,
     PagePortOption,
+    PlanPicturesOption,
     ProfileOption,
     SummaryOption,
     Terrain,
@@ -81,6 +82,7 @@ def run(
     ] = DetectorKind.OWN,
     planner: GraspPlannerOption = "search",
     virtual_cameras: VirtualCamerasOption = 1,
+    plan_pictures: PlanPicturesOption = None,
     logs: Annotated[
         int, typer.Option(min=0, help="Lay this many logs along the route instead of those of the mission.")
     ] = 0,
@@ -130,7 +132,7 @@ def run(
         refuse_without_effect(context, ("console_port",), "with --no-console")
     if bus not in (Backend.VCAN, Backend.PYTHON_CAN):
         refuse_without_effect(context, ("clock",), f"with --bus {bus.value}")
-    chosen = planner_of(planner, virtual_cameras)
+    chosen = planner_of(planner, virtual_cameras, plan_pictures)
     if not lockstep:
         enter_lab(bus, clock, detects=detector is not DetectorKind.PERFECT)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -69,6 +70,14 @@ VirtualCamerasOption = Annotated[
         help="With a network: places of the virtual camera over which its predictions are averaged.",
     ),
 ]
+PlanPicturesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--plan-pictures",
+        metavar="DIR",
+        help="With a network: what each grasp was planned from, as in Fig. 5 of paper A, as PNG.",
+    ),
+]
 ForeignPlannerOption = Annotated[
     str, typer.Option("--planner", help="grasp-configs: a foreign grasp planner, by entry point, compared with ours.")
 ]
@@ -83,17 +92,21 @@ def check_foreign(experiment: str, planner: str, detector: str) -> None:
         raise typer.BadParameter("--planner and --detector are options of grasp-configs")
 
 
-def planner_of(name: str, virtual_cameras: int) -> PlannerChoice:
-    """The choice of ``--planner`` and ``--virtual-cameras``.
+def planner_of(name: str, virtual_cameras: int, pictures: Path | None) -> PlannerChoice:
+    """The choice of ``--planner``, ``--virtual-cameras`` and ``--plan-pictures``, whose folder is made.
 
     Raises:
-        CommandFailed: there is no such planner, or it has no virtual camera.
+        CommandFailed: there is no such planner, it has no virtual camera or draws no pictures, or the folder is none.
     """
-    from autonomy.grasp.planners import PlannerChoice
+    from autonomy.grasp.planners import NETWORKS, PlannerChoice
     from runtime.errors import InputRefused
 
     try:
-        return PlannerChoice(name, virtual_cameras).check()
+        if pictures is not None and name in NETWORKS:
+            pictures.mkdir(parents=True, exist_ok=True)
+        return PlannerChoice(name, virtual_cameras, str(pictures.resolve()) if pictures else "").check()
+    except OSError as error:
+        raise CommandFailed("planner.no-folder", f"{pictures}: {error.strerror}", ExitCode.USAGE) from None
     except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.USAGE) from None
 
