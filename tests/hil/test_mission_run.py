@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from autonomy.grasp.planners import PlannerChoice
 from hil.missions.summary import MissionSummary
 from host.exit_codes import ExitCode
 from tests.hil.short_missions import mission_file
@@ -33,9 +34,14 @@ def test_a_machine_without_a_carrier_drives_no_mission(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "detector", "planner", "cheats"),
     [
-        ((), "ours", ("search", 1), False),
-        (("--detector", "perfect"), "perfect", ("search", 1), True),
-        (("--detector", "paper-b", "--planner", "cnn", "--virtual-cameras", "3"), "faithful", ("cnn", 3), False),
+        ((), "ours", PlannerChoice("search", 1), False),
+        (("--detector", "perfect"), "perfect", PlannerChoice("search", 1), True),
+        (
+            ("--detector", "paper-b", "--planner", "cnn", "--virtual-cameras", "3"),
+            "faithful",
+            PlannerChoice("cnn", 3),
+            False,
+        ),
     ],
 )
 def test_the_machine_sees_with_its_own_camera_and_perfect_sight_is_called_a_cheat(
