@@ -94,7 +94,7 @@ def assemble(
         (
             line.place,
             "mission.second-route",
-            'is a second route; a mission has one, so delete one of them or give it another "role"',
+            'is a second route; a mission has one, so delete one of them (in GeoJSON or give it another "role")',
         )
         for line in lines[1:]
     ]
