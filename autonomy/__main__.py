@@ -5,7 +5,7 @@ loads one log into the bunk; with ``--mission FILE`` and a machine that drives, 
 ``--planner`` chooses the grasp planner (`autonomy.grasp.planners`).  With
 ``--memory`` the detector is one that looks ahead (`autonomy.perception`, ``--driving``).
 ``--tell HOST:PORT`` receives a mission report and the chosen grasp twice a second, and ``--order-port`` accepts
-operator commands from this computer only (`can_dbc.messages.mission` and `can_dbc.messages.grasp` define them).
+operator commands from this computer only (`can_dbc.messages.mission` and `can_dbc.messages.mission` define them).
 ``--progress FILE`` stores a checkpoint of the mission; if the file exists already, the mission is resumed from it after
 the operator has commanded Auto.
 The mode switch of a machine that has one holds, starts and resumes either job (`autonomy.manager.operator_switch`).
@@ -17,7 +17,7 @@ setpoint, with the controller's reason number), ``detector`` (an invalid log lis
 (logs on board), ``order`` (an operator command, and why it is refused), ``upload`` (a mission's file, and why it is
 refused), ``mission`` (notes and warnings: what its file holds and the mission does not), ``resumed`` (the counts so
 far), ``progress`` (why no checkpoint can be written); ``done``, ``failed`` (reason).
-SIGTERM and SIGINT stop crane and machine smoothly.  Exit codes: `autonomy.process.exit_codes`, and 2 for usage.
+SIGTERM and SIGINT stop crane and machine smoothly.  Exit codes: `autonomy.process.command_line`, and 2 for usage.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ import sys
 import time
 
 from autonomy.missions.model import MissionError
-from autonomy.process.command_line import arguments
-from autonomy.process.event_output import emit
-from autonomy.process.exit_codes import BUSY, CONFIGURATION, FAILED, FINE, INTERRUPTED, SAFETY
+from autonomy.process.command_line import BUSY, CONFIGURATION, FAILED, FINE, INTERRUPTED, SAFETY, arguments, emit
 from autonomy.process.job_setup import make_job, uploaded_missions
 from autonomy.process.planner_process import PlannerProcess
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash

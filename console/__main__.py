@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from console.access_guards import ENTRY
 from console.audit import AuditLog
-from console.exposure import Exposure, check_local
-from console.start_error import StartError
+from console.exposure import Exposure, StartError, check_local
 from machine.loading.profile_file import ProfileError, load_profile, profile_check, profile_file, profile_hash
 from machine.profile import Profile
 
@@ -145,7 +144,7 @@ def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: 
     Raises:
         StartError: the console cannot start.
     """
-    from console.plant_view import create_plant_app
+    from console.plant_link import create_plant_app
 
     check_local(bind, "the view of a plant")
     address = _address(plant, "--plant")

@@ -20,13 +20,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from autonomy.calibration.plan import make_plan
+from autonomy.calibration.plan import make_plan, task_name
 from autonomy.calibration.procedure import Calibration
 from autonomy.calibration.procedure_state import PATIENCE_S
 from autonomy.calibration.profile_file import Change, profile_changes, write_profile
 from autonomy.calibration.report import write_report
 from autonomy.calibration.result import identify
-from autonomy.calibration.tasks import task_name
 from autonomy.commissioning.step_test import StepResult, StepTest
 from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import open_bus

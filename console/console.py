@@ -20,8 +20,13 @@ from typing import Any, Final
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import WATCH_PERIOD_NS, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.mission import MissionAction, MissionCommand, encode_mission_command
-from can_dbc.messages.mission_upload import MissionUpload, encode_mission_upload
+from can_dbc.messages.mission import (
+    MissionAction,
+    MissionCommand,
+    MissionUpload,
+    encode_mission_command,
+    encode_mission_upload,
+)
 from console.access import Access, Page
 from console.accounts import Accounts, Person, Role
 from console.audit import AuditLog

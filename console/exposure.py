@@ -12,11 +12,10 @@ import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from console.accounts import Accounts, read_accounts
-from console.start_error import StartError
-from runtime.errors import ConfigError
+from runtime.errors import ConfigError, TimberhandError
 
 CREDENTIALS: Final = {"passwords": "console-passwords", "tls_cert": "console-cert", "tls_key": "console-key"}
 
@@ -98,3 +97,17 @@ def check_local(bind: str, what: str) -> None:
     if not is_local(bind):
         sentence = f"{what} is served on this machine only, not on {bind}; serve on 127.0.0.1 and use an ssh tunnel"
         raise StartError("console.local-only", sentence, 2)
+
+
+# -- Why the console cannot start.
+
+
+class StartError(TimberhandError):
+    """The console cannot start: an error code, one sentence and the exit code of the process."""
+
+    def __init__(self, code: str, sentence: str, exit_code: int) -> None:
+        super().__init__(code, sentence)
+        self.exit_code = exit_code
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.code, str(self), self.exit_code)

@@ -32,7 +32,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.missions.folder import MissionFolder
-from autonomy.perception.log_list.datagrams import decode_logs, encode_request
+from autonomy.perception.log_list import decode_logs, encode_request
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction
 from can_dbc.messages.mission import MissionAction
 from can_dbc.timing.page import read_timing
@@ -47,8 +47,8 @@ from console.foxglove_server import feed_pictures
 from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy
 from console.panel import Panel, panel_data, panels_of
 from console.plan_api import PlanApi
+from console.plant_link import TrueLogs
 from console.state import CraneState, describe_machine
-from console.true_logs import TrueLogs
 from runtime.errors import InputRefused
 
 # -- The page's buttons to try to break a live run: asks the desk of faults, and follows what becomes of each.

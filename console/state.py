@@ -13,12 +13,11 @@ from dataclasses import asdict, dataclass
 from math import cos, sin
 from typing import Any, Final
 
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import LinkWatch, StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.grasp import ChosenGrasp, decode_grasp
-from can_dbc.messages.mission import MissionReport
+from can_dbc.messages.mission import ChosenGrasp, MissionReport, decode_grasp
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.durations import BINS, edge_ns
 from can_dbc.timing.page import Timing

@@ -50,7 +50,7 @@ class Settings:
     def tx_queue_frames(self) -> tuple[int, int]:
         """How many own frames may wait for crane0 and for mach0: those of `TX_QUEUE_NS`.
 
-        A full queue tells that they are old, and `controller.process.bus_link` cancels them.  The bound is a time,
+        A full queue tells that they are old, and `controller.process.loop` cancels them.  The bound is a time,
         because at 1 kHz a number that is safe at 200 Hz is full after a few ticks.
         """
         plc = self.profile.plc

@@ -357,3 +357,9 @@ def encoders(profile: Profile) -> dict[int, Encoder]:
 def joint_limits(profile: Profile) -> tuple[tuple[float, float], ...]:
     """(lower, upper) of every joint, indexed by ``Joint`` [rad, m for EXT]."""
     return tuple((spec.lower, spec.upper) for spec in (joint(profile, j) for j in JOINTS))
+
+
+# -- How far a controller may go beyond the limits of the profile's joints that a planner keeps.
+
+SPEED_HEADROOM_SHARE: Final = 1.25
+"""Share of a joint's speed limit that a correction may use, so that a joint behind its reference can catch up."""

@@ -32,23 +32,19 @@ from can_dbc.frame import ERROR, REMOTE, Frame, describe
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.grasp import decode_grasp
 from can_dbc.messages.json_schema import flat_schema
-from can_dbc.messages.mission import decode_mission
+from can_dbc.messages.mission import decode_grasp, decode_mission
 from can_dbc.messages.picture import decode_picture
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
 from machine.foxglove.topics import ENCODING, MachineTopics, Message
 from machine.profile import Profile
 from recorder import manifest as manifests
-from recorder.files import CommitFile
 from recorder.manifest import Manifest
 from recorder.recover import RUN_NAME, recover, run_files
-from recorder.segment import Segment
-from recorder.stop import Stop
-from recorder.stop_files import TICK as TICK
-from recorder.stop_files import StopFiles
-from recorder.stop_recorder import StopRecorder
+from recorder.segment import CommitFile, Segment
+from recorder.stop_recorder import TICK as TICK
+from recorder.stop_recorder import Stop, StopFiles, StopRecorder
 from runtime.errors import InputRefused
 
 # -- Decodes the frames of a bus for a recording: message name, and values under their DBC names.

@@ -10,12 +10,21 @@ from __future__ import annotations
 
 import fcntl
 import os
+import struct
+from collections.abc import Callable, Collection, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.writer import Writer
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC, Writer
 
-from recorder.mcap_scan import Channel, Schema, is_complete, scan
+from runtime.errors import InputRefused
 
 RUN_NAME = "run.mcap"
 
@@ -87,3 +96,106 @@ def rewrite(path: Path) -> Recovered:
         os.fsync(file.fileno())
     os.replace(new, path)
     return Recovered(path, messages)
+
+
+# -- Reads an MCAP file from front to back and stops, without an error, where its valid part ends.
+#
+# The index of an MCAP file is at its end, so it is missing if the writer was killed.  Every record has its length
+# and every chunk its CRC, so that all but the unfinished chunk can be read in order (MCAP specification, "Record
+# Content" and "Chunk").
+
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_FOOTER_BYTES = _RECORD.size + 20
+_MAX_CHUNK_BYTES = 256 << 20
+"""A chunk that says it is longer is damaged; the recorder's have a few megabytes."""
+_DAMAGED = (ValueError, struct.error, McapError, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
+"""What the libraries raise for damaged records and chunks."""
+
+
+class Stored(NamedTuple):
+    """A message as stored in the file: channel id, both times [ns] and the payload."""
+
+    channel_id: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+def is_complete(path: Path) -> bool:
+    """Whether the file ends with a footer and the closing magic, that is, whether its writer finished."""
+    with path.open("rb") as file:
+        file.seek(0, 2)
+        if file.tell() < 2 * len(MCAP0_MAGIC) + _FOOTER_BYTES:
+            return False
+        file.seek(-len(MCAP0_MAGIC) - _FOOTER_BYTES, 2)
+        return file.read(1)[0] == Opcode.FOOTER and file.read()[-len(MCAP0_MAGIC) :] == MCAP0_MAGIC
+
+
+def scan(
+    path: Path, topics: Collection[str] | None = None, ended: Callable[[int], None] = lambda at_byte: None
+) -> Iterator[Schema | Channel | Stored]:
+    """Every schema, channel and message (of ``topics``; None: all) up to the end of the valid part; ``ended`` is told
+    the byte of that end if it is not that of the recording.
+
+    Raises:
+        InputRefused: The file does not start like an MCAP file.
+    """
+    with path.open("rb") as file:
+        magic = file.read(len(MCAP0_MAGIC))
+        if not MCAP0_MAGIC.startswith(magic):
+            raise InputRefused("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
+        wanted: set[int] = set()
+        while True:
+            at_byte = file.tell()
+            head = file.read(_RECORD.size)
+            if len(head) < _RECORD.size:
+                return ended(at_byte)
+            opcode, length = _RECORD.unpack(head)
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                return
+            if length > path.stat().st_size - file.tell():
+                return ended(at_byte)
+            body = file.read(length)
+            try:
+                records = _chunk(body) if opcode == Opcode.CHUNK else head + body
+                found = list(_records(records, topics, wanted))
+            except _DAMAGED:
+                return ended(at_byte)
+            yield from found
+
+
+def _chunk(body: bytes) -> bytes:
+    """The records in a chunk; raises one of `_DAMAGED`."""
+    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+    if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
+        raise ValueError("the chunk is too long")
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    return stream.read(size) if size else b""
+
+
+def _records(data: bytes, topics: Collection[str] | None, wanted: set[int]) -> Iterator[Schema | Channel | Stored]:
+    """The records in ``data``; ``wanted`` collects the channels to yield messages of.  Raises one of `_DAMAGED`."""
+    at = 0
+    while at < len(data):
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > len(data):
+            raise ValueError("a record is longer than its chunk")
+        if opcode == Opcode.MESSAGE:
+            if length < _MESSAGE.size:
+                raise ValueError("a message without its header")
+            channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
+            if channel_id in wanted:
+                yield Stored(channel_id, log_ns, publish_ns, data[at + _MESSAGE.size : at + length])
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(data[at : at + length])))
+            if topics is None or channel.topic in topics:
+                wanted.add(channel.id)
+                yield channel
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(ReadDataStream(BytesIO(data[at : at + length])))
+        at += length
+
+
+__all__ = ["Channel", "Schema", "Stored", "is_complete", "scan"]

@@ -1,6 +1,6 @@
 """The stop recorder: the controller's ticks of the last 10 s in memory, and a file for every stop.
 
-A file has the 10 s before the stop, which are written at once, and the 5 s after it (`recorder.stop_files`).  A tick
+A file has the 10 s before the stop, which are written at once, and the 5 s after it.  A tick
 record holds all inputs and outputs of its tick, so these files show why the machine stopped without the rest of the
 recording: `timberhand why` reads them.
 """
@@ -8,17 +8,27 @@ recording: `timberhand why` reads them.
 from __future__ import annotations
 
 import contextlib
+import datetime
+import fcntl
+import os
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
+from can_dbc.messages import datagrams
+from can_dbc.messages.crane import StateReport
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import TickRecord
-from machine.status.explanation import StopDetector
+from machine.status.explanation import Explanation, StopDetector, explain
+from machine.status.modes import Mode
+from machine.status.reasons import known
 from recorder.manifest import Manifest
-from recorder.stop import Stop, report_of, stop_from
-from recorder.stop_files import StopFile, StopFiles
+from recorder.recover import Stored, is_complete, rewrite, scan
+from recorder.segment import Segment
+from runtime.errors import InputRefused
 
 BEFORE_NS: Final = 10_000_000_000
 AFTER_NS: Final = 5_000_000_000
@@ -119,3 +129,217 @@ class StopRecorder:
         self._recent_bytes += len(record)
         while recent[0][0] < now_ns - BEFORE_NS or self._recent_bytes > MAX_MEMORY_BYTES:
             self._recent_bytes -= len(recent.popleft()[1])
+
+
+# -- The record of a stop; when one begins says `machine.status.explanation.StopDetector`.
+
+TOPIC: Final = "/stop"
+
+
+class Stop(msgspec.Struct, frozen=True, kw_only=True):
+    """One stop, as the topic ``/stop`` stores it.
+
+    ``reason`` has the detail in bits 8 to 15; ``numbers`` are those of ``StateReport``, None where there is none.
+    """
+
+    number: int
+    """Counts the stops of a directory; the numbers below the oldest file's are those of removed files."""
+    at_ns: int
+    """Monotonic time at which the reason began."""
+    utc_ns: int | None
+    """The same as UTC; None in lockstep."""
+    mode_before: str
+    mode: str
+    reason: int
+    code: str
+    numbers: tuple[float | None, ...]
+    text: str
+    """The whole explanation, for readers without this program."""
+
+    @property
+    def explanation(self) -> Explanation:
+        """The reason in today's words; raises ValueError for a reason that this release does not know."""
+        return explain(self.reason, self.numbers)
+
+
+def stop_from(report: StateReport, mode_before: str, number: int, utc_offset_ns: int | None) -> Stop:
+    """The record of a stop that begins with a report; ``utc_offset_ns`` is None in lockstep.
+
+    A reason of another release keeps its number; its words say so.
+    """
+    at_ns = report.since_ns or report.stamp_ns
+    found = None if known(report.reason) is None else explain(report.reason, report.numbers)
+    return Stop(
+        number=number,
+        at_ns=at_ns,
+        utc_ns=None if utc_offset_ns is None else at_ns + utc_offset_ns,
+        mode_before=mode_before,
+        mode=Mode(report.mode).name,
+        reason=report.reason,
+        code=found.code if found else f"REASON_{report.reason & 0xFF}",
+        numbers=tuple(None if value != value else value for value in report.numbers),
+        text=found.text if found else f"Unknown reason {report.reason & 0xFF}.",
+    )
+
+
+def report_of(tick: TickRecord) -> StateReport | None:
+    """The state report of a tick; None where it sent none.
+
+    Raises:
+        DatagramRefused: it is one of another release.
+    """
+    report = datagrams.decode(tick.report) if tick.report else None
+    return report if isinstance(report, StateReport) else None
+
+
+# -- The files of stops in one directory: a bounded ring, of which every file is whole or repaired.
+#
+# ``NUMBER-TIME-CODE.mcap``, in the order of their numbers whatever the clock says; the newest `MAX_FILES` that
+# together have at most `MAX_BYTES` stay.  A file grows as ``.mcap.part`` by commits of whole chunks, each with its
+# CRC, and gets its name, flushed to the disk, when it is complete.  A writer that was killed leaves a part, which
+# the next one repairs up to its last chunk (`recorder.recover`).
+
+TICK: Final = "/controller/tick"
+MAX_FILES: Final = 50
+MAX_BYTES: Final = 256 * 2**20
+_PART: Final = ".part"
+_JSON: Final = msgspec.json.Encoder()
+_OBJECT: Final = b'{"type":"object"}'
+
+
+def files_in(directory: Path) -> list[Path]:
+    """The complete files of a directory, oldest first."""
+    return sorted(directory.glob("*-*.mcap"))
+
+
+def parts_in(directory: Path) -> list[Path]:
+    """The files that are being written, or that a killed writer left, oldest first."""
+    return sorted(directory.glob(f"*-*.mcap{_PART}"))
+
+
+class StopFile:
+    """The file of one stop while it is written; its methods raise OSError."""
+
+    def __init__(self, directory: Path, stop: Stop, manifest: Manifest, durable: bool) -> None:
+        self.path = directory / _name(stop)
+        self._part = self.path.with_name(self.path.name + _PART)
+        self._durable = durable
+        self._offset_ns = manifest.utc_offset_ns
+        self._segment = Segment(self._part, durable)
+        self._segment.channel("/manifest", "json", "Manifest", _OBJECT)
+        self._segment.channel(TOPIC, "json", "Stop", _OBJECT)
+        self._segment.channel(TICK, "timberhand.tick")
+        self._add("/manifest", stop.at_ns, _JSON.encode(manifest))
+        self.add_stop(stop)
+
+    @property
+    def pending(self) -> int:
+        """Messages since the last commit."""
+        return self._segment.pending
+
+    def add_stop(self, stop: Stop) -> None:
+        """Adds the record of this stop, or of a second reason while the machine is stopped."""
+        self._add(TOPIC, stop.at_ns, _JSON.encode(stop))
+
+    def add_tick(self, now_ns: int, record: bytes) -> None:
+        """Adds the controller's record of a tick."""
+        self._add(TICK, now_ns, record)
+
+    def commit(self) -> None:
+        """Writes what was added."""
+        self._segment.commit()
+
+    def finish(self) -> None:
+        """Completes the file and gives it its name."""
+        self._segment.finish()
+        _put_in_place(self._part, self.path, self._durable)
+
+    def abandon(self) -> None:
+        """Closes a file that cannot be written; what was committed stays as a part."""
+        self._segment.close()
+
+    def _add(self, topic: str, at_ns: int, data: bytes) -> None:
+        self._segment.add(topic, at_ns + self._offset_ns, at_ns, data)
+
+
+class StopFiles:
+    """The ring; it makes its directory with the first stop."""
+
+    def __init__(self, directory: Path, durable: bool) -> None:
+        self.directory, self._durable = directory, durable
+        self.removed = 0
+        """Files that made room for newer ones."""
+        with contextlib.suppress(OSError):  # a directory that cannot be written shows at the next stop
+            repair(directory)
+        self.next_number = 1 + max(map(_number, [*files_in(directory), *parts_in(directory)]), default=0)
+
+    def begin(self, stop: Stop, manifest: Manifest) -> StopFile:
+        """A file for a new stop; raises OSError."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        self.next_number = max(self.next_number, stop.number + 1)
+        return StopFile(self.directory, stop, manifest, self._durable)
+
+    def remove_oldest(self) -> None:
+        """Removes the oldest files until the bounds hold; raises OSError."""
+        files = files_in(self.directory)
+        sizes = [path.stat().st_size for path in files]
+        while len(files) > 1 and (len(files) > MAX_FILES or sum(sizes) > MAX_BYTES):
+            files.pop(0).unlink()
+            sizes.pop(0)
+            self.removed += 1
+
+
+def repair(directory: Path) -> list[Path]:
+    """Completes the parts that a killed writer left; one without a stop is removed.  Returns the repaired files.
+
+    A part that another process still writes (``flock``) is not touched.
+
+    Raises:
+        OSError: the directory cannot be written; nothing is lost.
+    """
+    repaired: list[Path] = []
+    for part in parts_in(directory):
+        with part.open("rb") as held:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            if not is_complete(part):
+                if not _has_stop(part):
+                    part.unlink()
+                    continue
+                rewrite(part)
+            final = part.with_name(part.name.removesuffix(_PART))
+            _put_in_place(part, final, True)
+            repaired.append(final)
+    return repaired
+
+
+def _has_stop(part: Path) -> bool:
+    try:
+        return any(isinstance(record, Stored) for record in scan(part, {TOPIC}))
+    except InputRefused:
+        return False
+
+
+def _put_in_place(part: Path, final: Path, durable: bool) -> None:
+    os.replace(part, final)
+    if durable:
+        folder = os.open(final.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _name(stop: Stop) -> str:
+    if stop.utc_ns is None:
+        when = f"{stop.at_ns / 1e9:.3f}s"
+    else:
+        when = f"{datetime.datetime.fromtimestamp(stop.utc_ns // 10**9, datetime.UTC):%Y%m%dT%H%M%SZ}"
+    return f"{stop.number:06d}-{when}-{stop.code}.mcap"
+
+
+def _number(path: Path) -> int:
+    first = path.name.partition("-")[0]
+    return int(first) if first.isdigit() else 0

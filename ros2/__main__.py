@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Final
 
 from autonomy.motion.setpoint_stream import SetpointStream
+from autonomy.process.command_line import emit
 from autonomy.process.controller_link import ControllerLink
-from autonomy.process.event_output import emit
-from can_dbc.messages.key_file import read_key
+from can_dbc.messages.envelope import read_key
 from can_dbc.messages.udp_address import address_argument
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from ros2.bridge import Bridge, run

@@ -16,16 +16,13 @@ from can_dbc.messages.crane import StateReport
 from machine.profile import Profile
 from machine.status.reasons import Reason
 from ros2.execution.execution import Outcome, TrajectoryExecution
-from ros2.execution.goal_refused import GoalRefused
+from ros2.execution.goal_motion import GoalRefused
 from ros2.interfaces.action import Status
 from ros2.interfaces.builtin import TFMessage
 from ros2.interfaces.control import ErrorCode, Result
 from ros2.interfaces.diagnostic import DiagnosticArray
 from ros2.interfaces.sensor import JointState
-from ros2.report.diagnostics import SILENT_NS, diagnostics
-from ros2.report.feedback import feedback_message
-from ros2.report.joint_states import joint_state
-from ros2.report.transforms import moving_transforms, static_transforms
+from ros2.report import SILENT_NS, diagnostics, feedback_message, joint_state, moving_transforms, static_transforms
 from ros2.wire.action_server import ActionServer, NewGoal
 from ros2.wire.node import Node, send
 from ros2.wire.qos import latched, reliable

@@ -18,11 +18,11 @@ import time
 from typing import Final
 
 from autonomy.perception.sources.stream import StreamCamera
-from autonomy.process.event_output import emit
+from autonomy.process.command_line import emit
 from machine.loading.profile_file import ProfileError, load_profile
 from ros2.interfaces.sensor import CameraInfo, Image
 from ros2.process import BUSY, add_node_options, catch_signals, complain, exit_code, open_node
-from ros2.report.pictures import camera_info, colour_image, depth_image
+from ros2.report import camera_info, colour_image, depth_image
 from ros2.wire.node import Node, send
 from ros2.wire.qos import sensor_data
 from runtime.errors import LinkError

@@ -20,19 +20,16 @@ from machine.crane_nodes import CraneNode
 from machine.geometry.carrier import ARMS, height_from_arm_angle
 from machine.profile import Encoder, Profile
 from sim.errors import PlantError
-from sim.faults.frame_tap import FrameTap
-from sim.faults.spool_faults import SpoolFaults
+from sim.faults import FrameTap, SpoolFaults
 from sim.hydraulics.layout import PA_PER_BAR
 from sim.nodes import Outbox
-from sim.nodes.arms import ArmNode
 from sim.nodes.device import Device, EstopBox, PressureModule
 from sim.nodes.encoder import EncoderBus, EncoderNode, VirtualNetwork
-from sim.nodes.engine import EngineNode
 from sim.nodes.gnss import GnssNode
 from sim.nodes.imu import ImuNode
+from sim.nodes.mach0 import ArmNode, EngineNode, VehicleNode
 from sim.nodes.messages import MS
 from sim.nodes.valve import CYCLE_NS, FUNCTIONS, ValveInputs, ValveNode
-from sim.nodes.vehicle import VehicleNode
 from sim.truth.load import Truth
 
 SENSE_NS = 10 * MS

@@ -18,7 +18,7 @@ from sim.geometry.shape import Quaternion, Shape, Vector
 from sim.mechanics.carrier import PARKED, Drive, carrier_links
 from sim.mechanics.crane import crane_shapes
 from sim.mechanics.hand_levers import DRIVE, HandLevers
-from sim.nodes.arms import ArmState
+from sim.nodes.mach0 import ArmState
 from sim.nodes.valve import ValveState
 from sim.scenes.arrangements import arrangement, random_scene
 from sim.truth.load import Truth, load_truth

@@ -21,10 +21,10 @@ from can_dbc.protocols.canopen import NMT_ID, NmtCommand
 from machine.crane_nodes import CraneNode
 from machine.profile import Profile
 from runtime.errors import ConfigError
+from sim import faults
 from sim.emulation import EmulatedMachine
 from sim.errors import PlantError
-from sim.faults import frame_tap
-from sim.faults.encoder_fault import EncoderFault
+from sim.faults import EncoderFault
 from sim.nodes.gnss import Fix, GnssNode
 from sim.plant import Plant
 
@@ -155,12 +155,12 @@ def _estop_wire(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
     """The wire of one of the two normally closed contacts breaks."""
     codec = message(plant.profile, "EstopStat")[1]
     channel = "ChannelA" if fault.seed % 2 else "ChannelB"
-    return plant.tap.add(plant.profile.crane_bus, codec.key, frame_tap.rewritten(codec, {channel: 0}))
+    return plant.tap.add(plant.profile.crane_bus, codec.key, faults.rewritten(codec, {channel: 0}))
 
 
 def _person(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
     codec = message(plant.profile, "EstopStat")[1]
-    return plant.tap.add(plant.profile.crane_bus, codec.key, frame_tap.rewritten(codec, {"Person": 1}))
+    return plant.tap.add(plant.profile.crane_bus, codec.key, faults.rewritten(codec, {"Person": 1}))
 
 
 def _lever(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
@@ -255,7 +255,7 @@ def message(profile: Profile, name: str) -> tuple[str, MessageCodec]:
 
 
 def _frames(
-    make: Callable[[PlantFault, MessageCodec], frame_tap.Effect],
+    make: Callable[[PlantFault, MessageCodec], faults.Effect],
 ) -> Callable[[EmulatedMachine, PlantFault, int], End]:
     """An effect on the frames of one message."""
 
@@ -276,10 +276,10 @@ def _late(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
     return plant.tap.delay(bus, codec.key, round(fault.size * 1e6))
 
 
-def _foreign(fault: PlantFault, codec: MessageCodec) -> frame_tap.Effect:
+def _foreign(fault: PlantFault, codec: MessageCodec) -> faults.Effect:
     if codec.data_ids is None:
         raise PlantError("fault.no-data-id", f"{codec.name} has no Data IDs to mistake; choose a protected message")
-    return frame_tap.masqueraded(bytes(b ^ 0x5A for b in codec.data_ids))
+    return faults.masqueraded(bytes(b ^ 0x5A for b in codec.data_ids))
 
 
 def _physical(plant: EmulatedMachine, fault: PlantFault) -> Plant:
@@ -300,11 +300,11 @@ BEGINNERS: Final[dict[str, Callable[[EmulatedMachine, PlantFault, int], End]]] =
     "encoder-noise": _encoder(noise_factor=SIZE),
     "encoder-scale": _encoder(scale=SIZE),
     "encoder-identity": _identity,
-    "message-off": _frames(lambda fault, codec: frame_tap.silent),
+    "message-off": _frames(lambda fault, codec: faults.silent),
     "message-stuck": _stuck,
-    "message-garbage": _frames(lambda fault, codec: frame_tap.garbage(Random(fault.seed))),
-    "message-intermittent": _frames(lambda fault, codec: frame_tap.intermittent(Random(fault.seed), fault.size)),
-    "message-slow": _frames(lambda fault, codec: frame_tap.every(max(2, round(fault.size)))),
+    "message-garbage": _frames(lambda fault, codec: faults.garbage(Random(fault.seed))),
+    "message-intermittent": _frames(lambda fault, codec: faults.intermittent(Random(fault.seed), fault.size)),
+    "message-slow": _frames(lambda fault, codec: faults.every(max(2, round(fault.size)))),
     "message-delayed": _late,
     "message-masquerade": _frames(_foreign),
     "valve-stuck": _spool("stuck"),

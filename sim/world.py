@@ -14,15 +14,13 @@ from typing import Final
 import msgspec
 
 from machine.profile import Profile
-from sim.bullet.body import Body, Pose, fixed_boxes, magnitude
+from sim.bullet.body import Body, JointDef, Pose, fixed_boxes, magnitude
 from sim.bullet.client import GRAVITY_M_S2, new_client
-from sim.bullet.urdf import JointDef
 from sim.geometry.shape import IDENTITY, Vector
 from sim.ground.terrain import Terrain
 from sim.hydraulics.circuit import Hydraulics
 from sim.mechanics.carrier import PARKED, Carrier, Drive, carrier_links
-from sim.mechanics.column import Column
-from sim.mechanics.crane import CRANE_LINKS, FLEX_JOINTS, PASSIVE_JOINTS, crane_links, rigid_pin
+from sim.mechanics.crane import CRANE_LINKS, FLEX_JOINTS, PASSIVE_JOINTS, Column, crane_links, rigid_pin
 from sim.truth.load import Truth, load_truth
 from sim.wood.bunk import bunk_shapes
 from sim.wood.log_shape import LogSpec

@@ -19,16 +19,16 @@ from autonomy.missions.folder import MissionFolder
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, MissionError
 from autonomy.missions.review import review
-from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.key_file import SERVICE_KEY, read_key
+from can_dbc.messages.envelope import SERVICE_KEY, DatagramRefused, read_key
 from can_dbc.messages.mission import (
     MissionAction,
     MissionCommand,
     MissionReport,
+    MissionUpload,
     decode_mission,
     encode_mission_command,
+    encode_mission_upload,
 )
-from can_dbc.messages.mission_upload import MissionUpload, encode_mission_upload
 from host.exit_codes import CommandFailed, ExitCode
 from machine.profile import Profile
 from runtime.errors import ConfigError

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from console.__main__ import serve_replay
-from console.start_error import StartError
+from console.exposure import StartError
 from hil.replay.recording import files_of
 from hil.replay.replay import profile_beside
 from hil.replay.seek import SeekableRecording

@@ -20,12 +20,8 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 from typing import Final
 
-from autonomy.calibration.plan import BEGIN_SHARE
-from autonomy.calibration.procedure_spools import SpoolTasks
-from autonomy.calibration.procedure_state import INTERRUPTIONS
-from autonomy.calibration.spool_run import LEAD_S, TAIL_S, MonitoredSpoolRun, SpoolRun
-from autonomy.calibration.survey import SurveyReading
-from autonomy.calibration.tasks import (
+from autonomy.calibration.plan import (
+    BEGIN_SHARE,
     GrappleTask,
     MoveTask,
     PinReadingTask,
@@ -35,6 +31,10 @@ from autonomy.calibration.tasks import (
     TurnSearchTask,
     YawReadingTask,
 )
+from autonomy.calibration.procedure_spools import SpoolTasks
+from autonomy.calibration.procedure_state import INTERRUPTIONS
+from autonomy.calibration.spool_run import LEAD_S, TAIL_S, MonitoredSpoolRun, SpoolRun
+from autonomy.calibration.survey import SurveyReading
 from autonomy.motion.trajectory import hold, joint_motion
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import GrappleCommand, StateReport

@@ -13,12 +13,11 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from autonomy.calibration.plan import MIN_REACH_M
+from autonomy.calibration.plan import MIN_REACH_M, MoveTask, SpoolTask
 from autonomy.calibration.procedure_state import CalibrationState
 from autonomy.calibration.spool_program import SpoolProgram
 from autonomy.calibration.spool_run import LEAD_S, TAIL_S, SpoolRun, program_for
 from autonomy.calibration.spool_travel import Leg, SpoolTravel, best_order
-from autonomy.calibration.tasks import MoveTask, SpoolTask
 from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, joint

@@ -12,12 +12,11 @@ from dataclasses import dataclass, field
 from math import degrees, isfinite
 from typing import Final
 
-from autonomy.calibration.delay_fit import DelayFit, fit_delay, response_s
+from autonomy.calibration.plan import Findings
 from autonomy.calibration.survey import MIN_POSES, OFFSETS, SurveyFit, fit_survey
-from autonomy.calibration.tasks import Findings
 from autonomy.calibration.trace import SpoolTestRecord
 from autonomy.calibration.turn_fit import SIDES, TurnFit, fit_turns
-from autonomy.calibration.valve_fit import ValveFit, deadband_difference, fit_valve
+from autonomy.calibration.valve_fit import DelayFit, ValveFit, deadband_difference, fit_delay, fit_valve, response_s
 from can_dbc.messages.crane import GrappleCommand
 from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, Profile, joint

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Final
 
 from autonomy.calibration import spool_program
+from autonomy.calibration.plan import SpoolTask
 from autonomy.calibration.spool_program import Allowed, SpoolProgram
-from autonomy.calibration.tasks import SpoolTask
 from can_dbc.messages.crane import SpoolKnot
 from machine.profile import JointSpec
 from runtime.errors import Problem

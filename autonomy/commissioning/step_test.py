@@ -20,7 +20,7 @@ import numpy as np
 from autonomy.calibration.loop_gain import margins
 from autonomy.calibration.plan import free_range
 from autonomy.calibration.trace import BusTrace, SignalColumn
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.setpoint_stream import Axes, SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, joint_motion
 from can_dbc.dbc.codec import Database

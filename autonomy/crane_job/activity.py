@@ -19,27 +19,25 @@ from typing import Final
 from autonomy.crane_job.cycle import Cycle
 from autonomy.crane_job.grapple import GrappleSequence
 from autonomy.crane_job.inbox import Inbox
-from autonomy.crane_job.load_view import LoadView, load_in_view
-from autonomy.crane_job.phase_conditions import is_motion_done, motion_rate
-from autonomy.crane_job.phases import PHASE_RULES, RESUME_PHASE, Phase, grapple_command
+from autonomy.crane_job.phases import PHASE_RULES, RESUME_PHASE, Phase, grapple_command, is_motion_done, motion_rate
 from autonomy.crane_job.rotator_estimate import (
+    LoadView,
     RotatorEstimate,
     has_no_encoder,
+    load_in_view,
     planning_profile,
     rotator_angle_of_hanging_log,
 )
 from autonomy.crane_job.trajectory_tracker import BRAKE_S, TrajectoryTracker
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
-from autonomy.grasp.grasp import Grasp
-from autonomy.grasp.planner import BunkFull, GraspSelector, NoGrasp
+from autonomy.grasp.planner import BunkFull, Grasp, GraspSelector, NoGrasp
 from autonomy.grasp.selection import select_direct
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm_kinematics import LEVEL
+from autonomy.motion.arm_kinematics import LEVEL, Pose
 from autonomy.motion.motion_planner import MotionPlanner, TimeOptimalPlanner
-from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.kinematics import Unreachable
 from machine.joints import JOINTS, Joint

@@ -13,17 +13,17 @@ from typing import Final
 import msgspec
 
 from autonomy.crane_job.grapple import THICK_LOG_M, GrappleSequence, is_between_stakes
-from autonomy.crane_job.grasp_recovery import GraspRecovery, is_camera_measured
 from autonomy.crane_job.grasp_verification import (
     COLUMN_RADIUS_M,
+    GraspRecovery,
     corrected_place,
     is_at_target,
+    is_camera_measured,
     lifted_part,
     visible_grasped_logs,
     with_load_recognized,
 )
 from autonomy.crane_job.inbox import Inbox
-from autonomy.crane_job.load_view import LoadView
 from autonomy.crane_job.phase_motions import (
     approach_motion,
     bundle_lift_motion,
@@ -35,19 +35,16 @@ from autonomy.crane_job.phase_motions import (
     turn_motion,
 )
 from autonomy.crane_job.phases import Phase
-from autonomy.crane_job.rotator_estimate import has_no_encoder
+from autonomy.crane_job.rotator_estimate import LoadView, has_no_encoder
+from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m
-from autonomy.grasp.grasp import Grasp
-from autonomy.grasp.placement import lies_in_bunk, plan_place
-from autonomy.grasp.planner import GraspSelector, NoGrasp
+from autonomy.grasp.planner import Grasp, GraspSelector, NoGrasp
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
-from autonomy.motion.arm_kinematics import LEVEL
+from autonomy.motion.arm_kinematics import LEVEL, Arm, Pose
 from autonomy.motion.motion_planner import MotionPlanner
-from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import Axes
 from autonomy.motion.trajectory import Trajectory, hold, straight_line, with_quick_rotation, with_rotation
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.grapple import grapple_yaw
 from machine.geometry.kinematics import Unreachable
 from machine.geometry.sag import plausible_load_kg

@@ -13,8 +13,8 @@ from typing import Final
 from autonomy.crane_job.inbox import Inbox
 from autonomy.grasp.bunk_load import is_over_bunk
 from autonomy.grasp.grapple_heights import release_angle_rad
-from autonomy.grasp.grasp import Grasp
-from autonomy.motion.arm import Arm
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Arm
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import (
     half_gap_m,

@@ -11,7 +11,7 @@ from math import hypot
 from typing import Final
 
 from autonomy.crane_job.grasp_verification import is_part_of_load
-from autonomy.grasp.bunk_load import is_over_bunk, point_in_bunk
+from autonomy.grasp.bunk_load import STAKE_CLEARANCE_M, is_over_bunk, point_in_bunk
 from autonomy.grasp.grapple_heights import (
     approach_length_m,
     closing_height_curve,
@@ -20,14 +20,12 @@ from autonomy.grasp.grapple_heights import (
     retreat_height_m,
     travel_height_m,
 )
-from autonomy.grasp.grasp import Grasp
-from autonomy.grasp.placement import STAKE_CLEARANCE_M
-from autonomy.motion.arm import Arm
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.motion_planner import MotionPlanner
 from autonomy.motion.obstacles import CollisionScene, HeldLog, collision_scene, held_log
-from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, follow_path, joined, slow_line, straight_line
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.profile import Bunk
 

@@ -16,8 +16,8 @@ from autonomy.grasp.cylinders import MIN_RADIUS_M, Cylinders
 from autonomy.grasp.grapple_heights import closing_height_curve, tip_clearance_m, travel_height_m
 from autonomy.grasp.planner import NoGrasp
 from autonomy.grasp.quality import BladeSections, GraspScores
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.kinematics import Unreachable
 
 ALONG_SHARES: Final = np.linspace(-0.21, 0.21, 7)

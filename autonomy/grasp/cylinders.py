@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.log_list.estimate import (
+from autonomy.perception.log_list import (
     ACROSS_1,
     ACROSS_2,
     END,
@@ -21,9 +21,9 @@ from autonomy.perception.log_list.estimate import (
     START,
     TILT_1,
     TILT_2,
+    LogObservation,
     unpack_covariance,
 )
-from autonomy.perception.log_list.observation import LogObservation
 from runtime.errors import InputRefused
 
 MIN_RADIUS_M: Final = 0.02

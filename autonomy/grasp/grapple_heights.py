@@ -12,10 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.grasp import Grasp
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Arm, Pose
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.grapple import lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
 from machine.profile import JawTable, Profile
 

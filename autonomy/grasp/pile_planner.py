@@ -23,8 +23,8 @@ from autonomy.grasp.grapple_heights import grasp_pose
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.planner import GraspCandidate, GraspPlanner, GraspRequest, NoGrasp
 from autonomy.grasp.quality import STRICT_RULE, BladeSections, blade_sections, rests_upon
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.kinematics import Unreachable
 
 ACROSS_OFFSETS_M: Final = np.linspace(-0.72, 0.72, 37)

@@ -36,9 +36,8 @@ from autonomy.grasp.quality import (
     score_grasps,
 )
 from autonomy.grasp.settled_poses import settled_poses
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.estimate import RADIUS
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import RADIUS, LogObservation
 from machine.geometry.kinematics import Unreachable
 
 # -- Extraction grasp: draws a log off the end of a row that is too wide for the grapple.

@@ -15,13 +15,12 @@ from typing import Final
 
 import numpy as np
 
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import grasp_pose, known_ground_m
-from autonomy.grasp.grasp import Grasp, offset_along
-from autonomy.grasp.placement import lies_in_bunk
-from autonomy.grasp.planner import GraspPlanner, GraspRequest, NoGrasp
+from autonomy.grasp.planner import Grasp, GraspPlanner, GraspRequest, NoGrasp, offset_along
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.profile import Profile
 

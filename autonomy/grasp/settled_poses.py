@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders, axis_offsets, perturbed, transverse_axes
-from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
+from autonomy.perception.log_list import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
 
 GROUND_SIGMA_M: Final = 0.015
 """Standard deviation of the ground's height under a log's end, including bow and taper."""

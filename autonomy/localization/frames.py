@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from autonomy.localization.location import Location
-from autonomy.localization.motion_model import axle_m, tilt
+from autonomy.localization.vehicle_filter import axle_m, tilt
 from autonomy.perception.camera.frame import Pose
 from machine.geometry.carrier import rear_from_base, rear_from_front
 from machine.profile import Carrier

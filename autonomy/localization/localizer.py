@@ -17,8 +17,15 @@ import numpy as np
 
 from autonomy.localization.local_plane import LocalPlane, wrapped, yaw_from_heading
 from autonomy.localization.location import Location, Status
-from autonomy.localization.motion_model import NoiseModel, Odometry, State, antenna_reach, drift_rad, front_attitude
-from autonomy.localization.vehicle_filter import VehicleFilter
+from autonomy.localization.vehicle_filter import (
+    NoiseModel,
+    Odometry,
+    State,
+    VehicleFilter,
+    antenna_reach,
+    drift_rad,
+    front_attitude,
+)
 from can_dbc.messages.vehicle import VehicleReport
 from machine.profile import Carrier
 

@@ -46,7 +46,7 @@ from autonomy.motion.motion_planner import MotionPlanner, MovementPrimitivePlann
 from autonomy.motion.movement_primitives import load
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.standpoint import Standpoint
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode

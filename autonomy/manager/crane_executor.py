@@ -13,19 +13,17 @@ from typing import Final
 from msgspec.structs import replace
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.load_view import LoadView, load_view
 from autonomy.crane_job.phases import Phase
-from autonomy.crane_job.rotator_estimate import RotatorEstimate
-from autonomy.grasp.grasp import Grasp
-from autonomy.grasp.placement import lies_in_bunk
-from autonomy.grasp.planner import GraspSelector
+from autonomy.crane_job.rotator_estimate import LoadView, RotatorEstimate, load_view
+from autonomy.grasp.bunk_load import lies_in_bunk
+from autonomy.grasp.planner import Grasp, GraspSelector
 from autonomy.manager.load_bookkeeping import LoadBookkeeping
 from autonomy.manager.log_memory import LogMemory
 from autonomy.manager.world_model import WorldModel
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.motion_planner import MotionPlanner
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.joints import N_JOINTS
 from machine.profile import Profile

@@ -21,7 +21,7 @@ from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.navigation.clothoid_path import Point2
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.profile import Bunk, Profile
 
 # -- Logs that fell off the machine, told by a camera that only looks ahead.

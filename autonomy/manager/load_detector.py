@@ -16,7 +16,7 @@ from statistics import fmean, median
 from typing import Final
 
 from autonomy.manager.tally import volume_m3
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 
 WINDOW_NS: Final = 2_000_000_000
 """Duration of a lift from start to stop (measured on the plant: at full reach, one second of either half alone reads

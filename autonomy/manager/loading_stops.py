@@ -17,9 +17,9 @@ import numpy as np
 from autonomy.grasp.planner import NoGrasp
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.manager.log_map import MappedLog
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.carrier import pivot_height_m, rear_from_base
 from machine.profile import Carrier
 

@@ -15,13 +15,12 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import KnownLog
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, END, START, TILT_1, unpack_covariance
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import ACROSS_1, ACROSS_2, END, START, TILT_1, LogObservation, unpack_covariance
 from machine.profile import Bunk
 
 MAX_ALONG_M: Final = 0.8

@@ -17,14 +17,12 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.bunk_load import settled_in_bunk
-from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.bunk_load import lies_in_bunk, settled_in_bunk
 from autonomy.manager.load_detector import LoadDetector, WoodScale
 from autonomy.manager.log_map import LogMap
-from autonomy.motion.arm import Arm
-from autonomy.motion.arm_kinematics import slope_of
+from autonomy.motion.arm_kinematics import Arm, slope_of
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.geometry.grapple import grapple_yaw
 from machine.joints import JOINTS

@@ -17,7 +17,7 @@ from autonomy.manager.checkpoint import RouteRemainder
 from autonomy.manager.loading_stops import base_on_path
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.navigation.clothoid_path import Path, PathRefused, Point2, drivable_path
-from autonomy.navigation.dubins import dubins_corners
+from autonomy.navigation.joining_path import dubins_corners
 from autonomy.navigation.navigator import Navigator, Phase
 from autonomy.navigation.path_drive import PathDrive
 from autonomy.navigation.waypoint_drive import Waypoint, WaypointDrive

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.localization.frames import Frames
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.localizer import Localizer
@@ -28,11 +28,10 @@ from autonomy.manager.sorting import Sorting
 from autonomy.missions.area import Area
 from autonomy.missions.local_frame import bearing_from_yaw
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from autonomy.motion.arm import Arm
-from autonomy.motion.arm_kinematics import LEVEL, slope_of
+from autonomy.motion.arm_kinematics import LEVEL, Arm, slope_of
 from autonomy.navigation.clothoid_path import Point2
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.vehicle import VehicleReport

@@ -10,7 +10,7 @@ from typing import Final
 
 from autonomy.missions.model import MissionError
 from autonomy.missions.source import MAX_JSON_BYTES
-from can_dbc.messages.mission_upload import FILE_NAME
+from can_dbc.messages.mission import FILE_NAME
 
 MAX_FILES: Final = 500
 """More are not listed."""

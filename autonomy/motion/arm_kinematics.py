@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, hypot, sin
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from autonomy.motion.pose import Pose
 from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.geometry.kinematics import Unreachable
-from machine.geometry.sag import AIM_TOLERANCE_M, FOOT_SHARE, GRAVITY_M_S2, MAX_AIM_ITERATIONS, aim, true_pin
+from machine.geometry.sag import AIM_TOLERANCE_M, FOOT_SHARE, GRAVITY_M_S2, MAX_AIM_ITERATIONS, aim, aim_free, true_pin
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint_limits
 
@@ -160,3 +159,191 @@ class ArmKinematics:
         q = np.column_stack([slew, lift, tilt, ext, rot])
         low, high = self._joint_bounds(q[0])
         return q, ~np.all((q >= low - STOP_ROUNDING) & (q <= high + STOP_ROUNDING), axis=1) | (heron < 0.0)
+
+
+# -- The pose of the hanger pin in the crane's plane.
+
+
+class Pose(NamedTuple):
+    """Place of the hanger pin in the crane's plane, extension of the telescope, and rotator angle."""
+
+    slew_rad: float
+    r_m: float
+    z_m: float
+    ext_m: float
+    rot_rad: float
+
+    def at_height(self, z_m: float) -> Pose:
+        """The same pose at another height of the pin."""
+        return self._replace(z_m=z_m)
+
+
+# -- Choice of the telescope's extension along a path, the arm's redundancy, for the shortest travel time.
+#
+# With a fixed telescope, a crane raises, lowers and retracts its grapple with the boom, its slowest joint;
+# operators let the telescope do most of it.  The corners of a path get those extensions with which every joint, and
+# the pump, has least to do. Speeds only, no time laws; no clock, no randomness.
+
+EXTENSION_COUNT: Final = 13
+"""Number of extensions that are compared."""
+_SAMPLES: Final = 7
+_TOTAL_WORK_WEIGHT: Final = 0.15
+"""Weight of all joints' work relative to that of the busiest joint."""
+OUTER_RESERVE_M: Final = 0.2
+"""Reserve at the outer end for a descent, where a log may not be exactly where it was detected."""
+END_RESERVE_M: Final = 0.03
+"""Reserve at both ends."""
+
+
+def candidate_extensions(arm: ArmKinematics) -> np.ndarray:
+    """The extensions to compare, m."""
+    low, high = joint_limits(arm.profile)[Joint.EXT]
+    return np.linspace(low + END_RESERVE_M, high - END_RESERVE_M, EXTENSION_COUNT)
+
+
+def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> float | None:
+    """The extension from which the crane gets up and over ``home`` fastest; None where none serves at both heights with
+    `OUTER_RESERVE_M` to spare.
+    """
+    least, most = joint_limits(arm.profile)[Joint.EXT]
+    free = np.linspace(least + END_RESERVE_M, most - OUTER_RESERVE_M, EXTENSION_COUNT)
+    heights = np.array([low, low.at_height(0.5 * (low.z_m + high.z_m)), high])
+    poses = np.repeat(heights[None], len(free), axis=0)
+    poses[:, :, 3] = free[:, None]
+    _, outside = arm.straight_column_joints(poses.reshape(-1, 5))
+    any_way = candidate_extensions(arm)
+    home_s = np.min(full_speed_times(arm, high, home, any_way, any_way), axis=1)
+    seconds = np.min(full_speed_times(arm, low, high, free, any_way) + home_s, axis=1)
+    seconds = np.where(outside.reshape(len(free), 3).any(axis=1), np.inf, seconds)
+    best = int(np.argmin(seconds))
+    return float(free[best]) if np.isfinite(seconds[best]) else None
+
+
+def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Duration of a straight path at full speed, from every extension ``before`` (n,) to every ``after`` (m,), (n, m).
+
+    Infinite where it leaves the crane's reach.
+    """
+    share = np.linspace(0.0, 1.0, _SAMPLES)
+    line = np.array(start) + share[:, None] * (np.array(goal) - np.array(start))
+    n, m = len(before), len(after)
+    poses = np.broadcast_to(line, (n, m, *line.shape)).copy()
+    poses[..., Joint.EXT] = before[:, None, None] + share * (after[None, :, None] - before[:, None, None])
+    q, outside = arm.straight_column_joints(poses.reshape(-1, 5))
+    step = np.diff(q.reshape(n, m, _SAMPLES, 5), axis=2)
+    middle = q.reshape(n, m, _SAMPLES, 5)[:, :, :-1] + 0.5 * step
+    turned = np.sum(np.abs(step), axis=2) / arm.speed
+    oil = arm.pump_load(middle.reshape(-1, 5), step.reshape(-1, 5)).reshape(n, m, -1).sum(axis=2)
+    seconds = np.maximum(np.max(turned, axis=2), oil) + _TOTAL_WORK_WEIGHT * np.sum(turned, axis=2)
+    return np.where(outside.reshape(n, m, _SAMPLES).any(axis=2), np.inf, seconds)
+
+
+def with_fastest_extensions(arm: ArmKinematics, via: Sequence[Pose]) -> tuple[Pose, ...]:
+    """The via points with the fastest extensions between the ends; unchanged where none is in reach."""
+    if len(via) < 3:
+        return tuple(via)
+    free = candidate_extensions(arm)
+    choices = [np.array([via[0].ext_m]), *[np.append(free, p.ext_m) for p in via[1:-1]], np.array([via[-1].ext_m])]
+    best, came = np.zeros(1), []
+    for k in range(len(via) - 1):
+        total = best[:, None] + full_speed_times(arm, via[k], via[k + 1], choices[k], choices[k + 1])
+        came.append(np.argmin(total, axis=0))
+        best = np.min(total, axis=0)
+    if not np.isfinite(best[0]):
+        return tuple(via)
+    at, out = 0, [via[-1]]
+    for k in range(len(via) - 2, 0, -1):
+        at = int(came[k][at])
+        out.append(via[k]._replace(ext_m=float(choices[k][at])))
+    return (via[0], *reversed(out))
+
+
+# -- The arm for planning: poses above a point, with the telescope where it is fastest or most compact.
+#
+# Inputs: one machine with a load.  Failure: ``Unreachable``.
+
+SLEW_MARGIN_RAD: Final = 0.01
+_EXTENSION_CACHE_GRID_M: Final = 0.1
+"""Grid of the cache of extensions: places within one cell share an extension."""
+DEXTEROUS_STRETCH: Final = 0.88
+"""Distance of the pin from the boom pin, as a share of the straight arm's length, that leaves speed in all
+directions."""
+
+
+class Arm(ArmKinematics):
+    """One machine with a load [kg] in its grapple, prepared for planning; ``slope`` as in `ArmKinematics`.
+
+    ``free_telescope``: `pose_above` chooses the extension from which the crane gets over the bunk fastest; otherwise it
+    works like `compact_pose_above`.
+    """
+
+    def __init__(
+        self, profile: Profile, load_kg: float = 0.0, free_telescope: bool = True, slope: tuple[float, float] = LEVEL
+    ) -> None:
+        super().__init__(profile, load_kg, slope)
+        self._free_telescope = free_telescope
+        self._extension_cache: dict[tuple[int, int, int], float | None] = {}
+
+    def loaded(self, load_kg: float) -> Arm:
+        """The same machine with another load."""
+        return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope, self.slope)
+
+    def pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
+        """The pose with the jaws above a point, the pin at ``low_z_m``, whose extension also serves at ``high_z_m``;
+        rotator at 0.
+
+        Raises:
+            Unreachable: the point is out of reach at one of the heights.
+        """
+        x, y = x - self._aside_m[0], y - self._aside_m[1]
+        if not self._free_telescope:
+            return self._compact_pose(x, y, low_z_m, high_z_m)
+        try:
+            return self._pose_with_extension(
+                x, y, low_z_m, high_z_m, self._fastest_extension(hypot(x, y), low_z_m, high_z_m)
+            )
+        except Unreachable:
+            return self._compact_pose(x, y, low_z_m, high_z_m)
+
+    def compact_pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
+        """The same with the telescope out only as far as leaves the arm speed in all directions there.
+
+        Raises:
+            Unreachable: the point is out of reach at one of the heights.
+        """
+        return self._compact_pose(x - self._aside_m[0], y - self._aside_m[1], low_z_m, high_z_m)
+
+    def _compact_pose(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
+        """The pose with the pin above a point."""
+        r = hypot(x, y) - self._kin.a1_m
+        stretch = max(hypot(r, z - self._kin.d1_m) for z in (low_z_m, high_z_m)) / DEXTEROUS_STRETCH
+        return self._pose_with_extension(x, y, low_z_m, high_z_m, stretch - self._kin.a2_m - self._kin.d4_m)
+
+    def _pose_with_extension(self, x: float, y: float, low_z_m: float, high_z_m: float, wish_m: float) -> Pose:
+        least, most = self._limits[Joint.EXT]
+        wish_m = min(max(wish_m, least + 2.0 * STOP_MARGIN), most - 2.0 * STOP_MARGIN)
+        slew, _, _, ext = aim_free(self.profile, x, y, low_z_m, wish_m, self.load_kg)
+        low, high = self._limits[Joint.SLEW]
+        if not low + SLEW_MARGIN_RAD <= slew <= high - SLEW_MARGIN_RAD:
+            raise Unreachable(f"point ({x:.2f}, {y:.2f}) m is at the stop of the slew", "motion.at-slew-stop")
+        pose = Pose(slew, hypot(x, y), low_z_m, ext, 0.0)
+        heights = high_z_m, low_z_m, 0.5 * (low_z_m + high_z_m), high_z_m
+        self.joints(np.array([pose.at_height(z) for z in heights]))
+        return pose
+
+    def _fastest_extension(self, r_m: float, low_z_m: float, high_z_m: float) -> float:
+        """The extension from which the crane gets up and over the bunk fastest, from a horizontal distance, m."""
+        key = (
+            round(r_m / _EXTENSION_CACHE_GRID_M),
+            round(low_z_m / _EXTENSION_CACHE_GRID_M),
+            round(high_z_m / _EXTENSION_CACHE_GRID_M),
+        )
+        if key not in self._extension_cache:
+            r, low, high = (k * _EXTENSION_CACHE_GRID_M for k in key)
+            down, up = (Pose(0.0, r, z, 0.0, 0.0) for z in (low, high))
+            self._extension_cache[key] = fastest_extension(
+                self, down, up, up._replace(r_m=hypot(*self.profile.bunk.center_m))
+            )
+        if (found := self._extension_cache[key]) is None:
+            raise Unreachable("no extension serves at both heights", "motion.no-common-extension")
+        return found

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.obstacles import CollisionScene, Ground, HeldLog, ObstacleArrays, SweptCapsules, swept_capsules
 from autonomy.motion.time_law import PENDULUM_S
 from autonomy.motion.trajectory import Trajectory

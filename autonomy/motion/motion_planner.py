@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.clearance import MARGIN_M, clearance_reserve
 from autonomy.motion.movement_primitives import PrimitiveMotions, Primitives
 from autonomy.motion.obstacles import CollisionScene, HeldLog
 from autonomy.motion.path_search import PathBlocked, plan_path
-from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel_over
 from machine.geometry.kinematics import Unreachable
 

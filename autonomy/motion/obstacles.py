@@ -15,9 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm, Pose
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.bunk import stake_walls
 from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_jaw_pivot_m
 from machine.joints import Joint

@@ -16,11 +16,9 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose, with_fastest_extensions
 from autonomy.motion.clearance import SAMPLE_COUNT, evaluate_clearance, pin_positions
 from autonomy.motion.obstacles import CollisionScene, HeldLog
-from autonomy.motion.pose import Pose
-from autonomy.motion.telescope import with_fastest_extensions
 from autonomy.motion.time_optimal import time_optimal_law
 from autonomy.motion.trajectory import Leg, Trajectory, make_leg, superposed
 from machine.geometry.kinematics import Unreachable

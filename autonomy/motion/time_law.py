@@ -20,7 +20,7 @@ import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
 from scipy.optimize import linprog
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from machine.joints import N_JOINTS
 
 PENDULUM_S: Final = (1.5, 1.65, 1.8, 1.95, 2.1)

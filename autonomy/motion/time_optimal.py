@@ -20,7 +20,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import nnls
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.time_law import GRAVITY_M_S2, PENDULUM_POLES, PENDULUM_RAD_S, SWING_RAD, PathGeometry
 from autonomy.motion.trajectory import STEP_S
 from machine.joints import N_JOINTS

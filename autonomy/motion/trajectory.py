@@ -14,8 +14,7 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.time_law import MIN_DURATION_S, PathGeometry, swing_free_law
 from machine.geometry.kinematics import Unreachable
 from machine.joints import Joint

@@ -4,7 +4,7 @@
 
 With ``--driving`` the camera looks ahead of a machine that drives (`autonomy.perception.driving_requests`).
 
-The process answers requests for logs (``autonomy.perception.log_list.datagrams``) over UDP on the loopback interface.
+The process answers requests for logs (``autonomy.perception.log_list``) over UDP on the loopback interface.
 A request with joints triggers a detection, of several that wait the newest one; as long as there is no new result,
 there is no reply.  A request without joints, as from a page that only displays logs, gets the last list, and a request
 for a picture the last measured one (``can_dbc.messages.picture``).  ``--frames`` is the address of a server of frames
@@ -39,13 +39,12 @@ from autonomy.perception.driving_log_detector import (
     LogLocalizer,
     PaperBLocalizer,
 )
-from autonomy.perception.driving_requests import DrivingRequests, asked_ns
+from autonomy.perception.driving_requests import DrivingRequests, StandingRequests, asked_ns
 from autonomy.perception.log_detector import LogDetector
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter
 from autonomy.perception.shown_picture import MeasuredPicture, NewestPicture
 from autonomy.perception.sources.camera_source import CameraSource
-from autonomy.perception.standing_requests import StandingRequests
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
 from machine.geometry.optics import Intrinsics
 from machine.loading.profile_file import ProfileError, load_profile

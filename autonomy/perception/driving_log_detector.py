@@ -14,12 +14,10 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, rescaled
 from autonomy.perception.fitting.measure import Masked
-from autonomy.perception.log_list.observation import LogObservation
-from autonomy.perception.papers.paper_a import log_from_mask
-from autonomy.perception.papers.paper_b import position_in_box
+from autonomy.perception.log_list import LogObservation
+from autonomy.perception.papers import log_from_mask, position_in_box
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource
@@ -85,7 +83,7 @@ class CylinderLocalizer:
 
 
 class PaperBLocalizer:
-    """``autonomy.perception.papers.paper_b``, extended where the paper is silent.
+    """``autonomy.perception.papers``, extended where the paper is silent.
 
     Half a diameter is added along the line of sight, because the grapple needs the log's middle and the camera sees its
     surface.  The axis is that of the mask's points, as in paper A, because paper B does not say how the grapple turns.

@@ -11,10 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.camera.frame import RgbdFrame, rescaled
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.camera.frame import RgbdFrame, optical_pose, rescaled
 from autonomy.perception.fitting.measure import Masked
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource

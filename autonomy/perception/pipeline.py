@@ -13,9 +13,8 @@ from autonomy.perception.camera.frame import Pose, RgbdFrame, check_frame
 from autonomy.perception.fitting.contour import StereoSensor
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
 from autonomy.perception.fitting.measure import Masked, Rejection, measure
-from autonomy.perception.tracking.displacement import is_displaced
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors, Track
-from autonomy.perception.tracking.log_tracker import LogTracker
+from autonomy.perception.tracking.log_tracker import LogTracker, is_displaced
 from machine.profile import Profile
 from runtime.errors import InputRefused
 

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, content_window
 from autonomy.perception.fitting.measure import Masked
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.picture import (
     MAX_JPEG_BYTES,
     MAX_LOGS,

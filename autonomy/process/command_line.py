@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from pathlib import Path
+from typing import Final
+
+import msgspec
 
 from autonomy.grasp.planners import NAMES, SEARCH, PlannerChoice
 from autonomy.manager.transition_table import TABLES
@@ -63,3 +68,28 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     if options.memory and ((options.mission or options.missions) is None or options.progress is not None):
         parser.error("--memory needs --mission, and cannot resume one: what lies in the bunk is only remembered")
     return options
+
+
+# -- Exit codes of the planning process.
+
+FINE: Final = 0
+"""The log lies in the bunk, or the mission is finished."""
+CONFIGURATION: Final = 3
+"""Profile, mission, checkpoint or key cannot be used."""
+BUSY: Final = 4
+"""A port is in use."""
+SAFETY: Final = 5
+"""Interrupted while the controller was in STOP or FAULT."""
+FAILED: Final = 6
+"""The job failed."""
+INTERRUPTED: Final = 130
+
+
+# -- Events of the planning process: JSON lines on stdout.
+
+
+def emit(event: str, **fields: object) -> None:
+    """Write one event with the time and its fields; fields that are None are left out."""
+    line = {"event": event, "t_s": round(time.monotonic(), 3), **{k: v for k, v in fields.items() if v is not None}}
+    sys.stdout.write(msgspec.json.encode(line).decode() + "\n")
+    sys.stdout.flush()

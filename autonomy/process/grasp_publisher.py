@@ -6,8 +6,8 @@ from math import cos, sin
 from typing import Final, Protocol
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.grasp import Grasp
-from can_dbc.messages.grasp import MAX_LOGS, MAX_REASON_CHARS, ChosenGrasp
+from autonomy.grasp.planner import Grasp
+from can_dbc.messages.mission import MAX_GRASP_LOGS, MAX_REASON_CHARS, ChosenGrasp
 from machine.geometry.grapple import grapple_yaw
 from machine.profile import Profile
 
@@ -38,6 +38,6 @@ def chosen_grasp(activity: CraneJobState | None) -> ChosenGrasp | None:
         1,
         (x_m, y_m, z_m),
         round(float(grapple_yaw(profile, (pose.slew_rad, 0.0, 0.0, pose.ext_m, pose.rot_rad))), 4),
-        tuple(log.id for log in grasp.logs[:MAX_LOGS]),
+        tuple(log.id for log in grasp.logs[:MAX_GRASP_LOGS]),
         grasp.reason[:MAX_REASON_CHARS],
     )

@@ -10,14 +10,13 @@ from autonomy.grasp.pile_planner import PilePlanner
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.checkpoint import Checkpoint
-from autonomy.manager.checkpoint_file import read_checkpoint
+from autonomy.manager.checkpoint import Checkpoint, read_checkpoint
 from autonomy.manager.transition_table import TABLES
 from autonomy.missions.crane_job import CraneJob
 from autonomy.missions.folder import MissionFolder
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, MissionError
-from autonomy.process.event_output import emit
+from autonomy.process.command_line import emit
 from autonomy.process.jobs import ForwardingJob, Job, SingleLogJob
 from autonomy.process.upload import UploadedMissions, WaitingJob, tell_losses
 from machine.loading.profile_file import profile_hash

@@ -14,20 +14,19 @@ import msgspec
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.grasp import Grasp
+from autonomy.grasp.planner import Grasp
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.checkpoint import Checkpoint
 from autonomy.manager.operator_switch import OperatorSwitch
 from autonomy.manager.transition_table import FINAL_STATES, State
 from autonomy.missions.model import ForwardingMission
 from autonomy.perception.driving_log_detector import in_base
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.standpoint import Standpoint
 from autonomy.process.grasp_publisher import chosen_grasp
 from autonomy.process.mission_publisher import MissionPublisher
 from can_dbc.messages.crane import StateReport
-from can_dbc.messages.grasp import ChosenGrasp
-from can_dbc.messages.mission import MissionAction, MissionCommand, MissionReport
+from can_dbc.messages.mission import ChosenGrasp, MissionAction, MissionCommand, MissionReport
 from can_dbc.messages.vehicle import VehicleReport
 from runtime.errors import Problem
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from can_dbc.messages.envelope import DatagramRefused, Kind, kind_of
-from can_dbc.messages.mission import MissionCommand, decode_mission_command
-from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload
+from can_dbc.messages.mission import MissionCommand, MissionUpload, decode_mission_command, decode_mission_upload
 from runtime.errors import TimberhandError
 
 MAX_AGE_NS: Final = 1_000_000_000

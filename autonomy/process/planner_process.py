@@ -18,12 +18,10 @@ from typing import Any, Final
 
 import msgspec
 
-from autonomy.manager.checkpoint_file import CheckpointFile
+from autonomy.manager.checkpoint import CheckpointFile
 from autonomy.missions.model import MissionError
-from autonomy.perception.log_list.datagrams import decode_logs, encode_request
-from autonomy.perception.log_list.observation import LogObservation
-from autonomy.process.command_line import Address
-from autonomy.process.event_output import emit
+from autonomy.perception.log_list import LogObservation, decode_logs, encode_request
+from autonomy.process.command_line import Address, emit
 from autonomy.process.jobs import Job
 from autonomy.process.mission_publisher import short_text
 from autonomy.process.operator_commands import CommandReceiver, CommandRefused
@@ -31,9 +29,7 @@ from autonomy.process.upload import MachineAtRest, UploadedMissions
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.grasp import encode_grasp
-from can_dbc.messages.mission import encode_mission
-from can_dbc.messages.mission_upload import MissionUpload
+from can_dbc.messages.mission import MissionUpload, encode_grasp, encode_mission
 from can_dbc.messages.vehicle import VehicleReport
 from machine.status.modes import Mode
 from machine.status.reasons import Reason

@@ -1,6 +1,6 @@
 """A planner that is started without a mission: it waits for one, and takes an uploaded one while the machine rests.
 
-An upload names a file of the missions folder and its SHA-256 (`can_dbc.messages.mission_upload`).  It is taken when the
+An upload names a file of the missions folder and its SHA-256 (`can_dbc.messages.mission`).  It is taken when the
 controller reports, the machine is neither armed nor moving, and no mission has begun; it is refused otherwise, with a
 code and a sentence.  A taken mission does not start by itself: it waits for the command Auto.
 """
@@ -18,15 +18,13 @@ from autonomy.missions.features import Draft
 from autonomy.missions.folder import MissionFolder
 from autonomy.missions.mission_file import read, verify
 from autonomy.missions.model import ForwardingMission
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.standpoint import Standpoint
-from autonomy.process.event_output import emit
+from autonomy.process.command_line import emit
 from autonomy.process.jobs import Job, JobEvent
 from autonomy.process.operator_commands import CommandRefused
 from can_dbc.messages.crane import StateReport
-from can_dbc.messages.grasp import ChosenGrasp
-from can_dbc.messages.mission import MissionCommand, MissionReport
-from can_dbc.messages.mission_upload import MissionUpload
+from can_dbc.messages.mission import ChosenGrasp, MissionCommand, MissionReport, MissionUpload
 from can_dbc.messages.vehicle import VehicleReport
 from machine.status.modes import Mode
 

@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from can_dbc.bus.batch import Batch, Outbox, enlarge_receive_buffer
-from can_dbc.bus.hardware_clock import HardwareClock
-from can_dbc.bus.receive_clock import ReceiveClock
+from can_dbc.bus.receive_clock import HardwareClock, ReceiveClock
 from can_dbc.frame import ERROR, Frame
 
 CAN_FRAME: Final = struct.Struct("=IB3x8s")
@@ -43,7 +42,7 @@ class FrameSocket:
 
     Stamps are the kernel's (taken in the receive interrupt), converted from CLOCK_REALTIME to CLOCK_MONOTONIC so that
     setting the former does no harm (`can_dbc.bus.receive_clock`); they are never in the future.  Stamps of an adapter
-    are preferred (`can_dbc.bus.hardware_clock`).  `dropped` counts the frames for which the socket's receive buffer had
+    are preferred (`can_dbc.bus.receive_clock`).  `dropped` counts the frames for which the socket's receive buffer had
     no room.
     """
 

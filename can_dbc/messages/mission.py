@@ -8,6 +8,7 @@ directions are degrees clockwise from true north.
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
@@ -193,3 +194,94 @@ def decode_mission(data: bytes, key: bytes | None = None) -> tuple[int, int, Mis
     if sum(len(fence.corners) for fence in report.fences) > MAX_CORNERS:
         raise DatagramRefused(DatagramFault.VALUE)
     return profile_hash, stamp_ns, report
+
+
+# -- The datagram from console to planner that offers a mission: the name and SHA-256 of a file that both can read.
+#
+# It travels as a mission command does, in the same envelope and to the same port.  The
+# file itself is in a folder that both processes know, so a mission of any size fits, and with a key the digest
+# authenticates it.  The planner's next mission report has the upload's sequence number in ``order`` and why it is
+# refused in ``refusal`` and ``refusal_code``, and also goes to the sender.
+
+DIGEST_BYTES: Final = 32
+FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,59}\.geojson")
+"""Names of missions in the folder: no separators, no leading dot."""
+
+
+@dataclass(frozen=True, slots=True)
+class MissionUpload:
+    """An offered mission: its file's name, and the SHA-256 of its bytes."""
+
+    sequence: int
+    profile_hash: int
+    stamp_ns: int
+    name: str
+    digest: bytes
+
+
+def encode_mission_upload(upload: MissionUpload, key: bytes | None = None) -> bytes:
+    """The bytes of an upload."""
+    common = (upload.sequence, upload.profile_hash, upload.stamp_ns)
+    return sealed(Kind.UPLOAD, common, upload.digest + upload.name.encode(), key)
+
+
+def decode_mission_upload(data: bytes, key: bytes | None = None) -> MissionUpload:
+    """The upload in a datagram.
+
+    Raises:
+        DatagramRefused: it is not a valid upload.
+    """
+    kind, common, body = unsealed(data, key)
+    if kind != Kind.UPLOAD:
+        raise DatagramRefused(DatagramFault.KIND)
+    name = body[DIGEST_BYTES:].decode(errors="replace")
+    if not FILE_NAME.fullmatch(name):
+        raise DatagramRefused(DatagramFault.VALUE)
+    return MissionUpload(*common, name, body[:DIGEST_BYTES])
+
+
+# -- The datagram from planner to console about the grasp that the crane is about to make, twice a second until the
+# jaws have closed.
+#
+# It travels in the envelope of `can_dbc.messages.envelope` as JSON, like a mission report, and is only shown: the
+# controller refuses it.  A grasp that does not match its schema in every field is refused as a whole.
+
+MAX_GRASP_LOGS: Final = 20
+MAX_REASON_CHARS: Final = 240
+
+
+class ChosenGrasp(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the hanger pin will be when the jaws begin to close, in the crane's base frame [m], the direction of their
+    opening axis there [rad, counter-clockwise from base x], the logs' numbers, and the planner's sentence why.
+    """
+
+    schema: Literal[1]
+    pin_m: tuple[float, float, float]
+    yaw_rad: float
+    logs: Annotated[tuple[int, ...], msgspec.Meta(max_length=MAX_GRASP_LOGS)]
+    reason: Annotated[str, msgspec.Meta(max_length=MAX_REASON_CHARS)]
+
+
+_GRASP: Final = msgspec.json.Decoder(ChosenGrasp)
+
+
+def encode_grasp(
+    grasp: ChosenGrasp, sequence: int, profile_hash: int, stamp_ns: int, key: bytes | None = None
+) -> bytes:
+    """The bytes of a grasp."""
+    return sealed(Kind.GRASP, (sequence, profile_hash, stamp_ns), msgspec.json.encode(grasp), key)
+
+
+def decode_grasp(data: bytes, key: bytes | None = None) -> tuple[int, int, ChosenGrasp]:
+    """Profile hash, stamp [ns] and grasp in a datagram.
+
+    Raises:
+        DatagramRefused: it is not a valid grasp.
+    """
+    kind, (_, profile_hash, stamp_ns), body = unsealed(data, key)
+    if kind != Kind.GRASP:
+        raise DatagramRefused(DatagramFault.KIND)
+    try:
+        return profile_hash, stamp_ns, _GRASP.decode(body)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        raise DatagramRefused(DatagramFault.VALUE) from None

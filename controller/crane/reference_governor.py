@@ -23,8 +23,7 @@ from typing import Final
 from can_dbc.messages.crane import MAX_KNOTS, CraneSetpoint
 from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, N_JOINTS
-from machine.motion_limits import SPEED_HEADROOM_SHARE
-from machine.profile import Profile, joint
+from machine.profile import SPEED_HEADROOM_SHARE, Profile, joint
 
 # -- The reference between the planner's knots: cubic Hermite curves, evaluated at any time without allocation.
 #

@@ -22,8 +22,7 @@ from can_dbc.messages.crane import MAX_KNOTS, SpoolTest
 from controller.laws.joint import ACCELERATION_FACTOR
 from controller.requests import RequestRefused
 from machine.joints import JOINTS, N_JOINTS, Joint
-from machine.motion_limits import SPEED_HEADROOM_SHARE
-from machine.profile import JointSpec, Profile, joint
+from machine.profile import SPEED_HEADROOM_SHARE, JointSpec, Profile, joint
 from machine.status.reasons import Reason
 
 RATE_SLACK_S: Final = 0.002

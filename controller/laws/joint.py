@@ -19,8 +19,7 @@ from typing import Final
 
 from controller.laws.feedback import law_of
 from controller.laws.valve_map import ValveMap
-from machine.motion_limits import SPEED_HEADROOM_SHARE
-from machine.profile import JointSpec
+from machine.profile import SPEED_HEADROOM_SHARE, JointSpec
 
 # -- Delay compensation: what was commanded within the last delay, which a joint or the articulation cannot show yet.
 

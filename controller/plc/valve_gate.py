@@ -17,8 +17,7 @@ from can_dbc.plc.map import N_AXES, N_JOINTS, Bounds, Command, Feedback, Grapple
 from can_dbc.protocols.punctuality import Punctuality
 from controller.bus_io import ARM_KEY, MessageState, age_out
 from machine.joints import JOINTS
-from machine.motion_limits import SPEED_HEADROOM_SHARE
-from machine.profile import Profile, joint
+from machine.profile import SPEED_HEADROOM_SHARE, Profile, joint
 from machine.status.modes import Mode as ControllerMode
 
 SYNC_NS: Final = 15_000_000

@@ -18,7 +18,7 @@ from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.filters import FilterItem
 from can_dbc.dbc.codec import load as read_dbc
-from can_dbc.messages.key_file import read_key
+from can_dbc.messages.envelope import read_key
 from can_dbc.messages.operator_link import default_path as operator_path
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.record_ring import default_path as ring_path

@@ -2,7 +2,7 @@
 # Build the vcan lab's own user-mode kernel into the user's cache; called by `make lab-kernel`.  Optional: it gives the
 # lab simulated time (`timberhand hil vcan --time-travel`), ISO-TP and a faster start.
 # Takes some minutes, once: the file's name holds the version of the source and a hash of lab.config, by which
-# host/vcan_lab/lab_kernel.py finds it.
+# host/vcan_lab/uml.py finds it.
 # Exit status: 0; 3 when packages are missing or the source does not build.
 set -eu
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)

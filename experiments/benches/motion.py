@@ -17,18 +17,17 @@ from typing import Final
 import numpy as np
 
 from autonomy.crane_job.phase_motions import approach_motion, carry_motion
+from autonomy.grasp.bunk_load import plan_place
 from autonomy.grasp.grapple_heights import approach_length_m, hover_height_m, travel_height_m
-from autonomy.grasp.placement import plan_place
 from autonomy.grasp.planner import NoGrasp
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.clearance import clearance_reserve
 from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.motion.obstacles import CollisionScene, HeldLog, collision_scene, held_log
-from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel_over
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from experiments.common.worlds import wood_of
 from machine.geometry.kinematics import Unreachable
 from machine.profile import Profile

@@ -13,10 +13,10 @@ from autonomy.calibration.profile_file import profile_changes, write_profile
 from autonomy.calibration.result import CalibrationResult, JointResult, identify
 from autonomy.calibration.survey import OFFSETS
 from autonomy.calibration.turn_fit import TurnFit
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, joint_motion
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard

@@ -18,7 +18,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.manager.log_map import CONFIRMED_HITS
 from autonomy.manager.transition_table import State
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from experiments.common.minimum_time import full_limits, minimum_time_s
 from hil.harness.lockstep import START_NS
 from hil.missions.lockstep import MissionRun

@@ -14,7 +14,7 @@ from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.calibration.crane import run_lockstep
-from machine.loading.beside import carry_envelope
+from machine.loading.profile_file import carry_envelope
 from runtime.errors import InputRefused
 
 DATE: Final = "2000-01-01"

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
+from autonomy.motion.arm_kinematics import Arm, Pose
 from machine.geometry.kinematics import Point
 from machine.profile import Profile
 

@@ -15,10 +15,10 @@ from math import dist, isfinite
 from statistics import fmean
 from typing import Final
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, straight_line
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from experiments.crane_accuracy.measure import NEAR_M
 from experiments.crane_accuracy.plan import GOALS_M, Visit, pose_at, start_pose

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.networks.weights import SHIPPED
-from autonomy.perception.papers.box_detector import BoxDetector
+from autonomy.perception.papers import BoxDetector
 from autonomy.perception.segmentation.instances import Instance
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from experiments.common.pool import Job

@@ -30,9 +30,8 @@ from experiments.faults.trial import in_child
 from hil.faults.catalogue import CASES
 from machine.loading.profile_file import ProfileError, load_profile
 from recorder.manifest import describe
-from recorder.mcap_scan import Stored, scan
 from recorder.recorder import Recorder
-from recorder.recover import recover, run_files
+from recorder.recover import Stored, recover, run_files, scan
 
 MS: Final = 1_000_000
 T_NS: Final = 5 * MS

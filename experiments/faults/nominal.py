@@ -31,8 +31,7 @@ from experiments.faults.separation import Separation
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.missions.site import site_of
-from hil.plc.bridged_plant import BridgedPlant, Transport
-from hil.plc.profile import write_plc_profile
+from hil.plc import BridgedPlant, Transport, write_plc_profile
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.reasons import pack

@@ -21,7 +21,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
@@ -35,8 +35,7 @@ from hil.faults.draws import LEASE_MS, Scene
 from hil.faults.injector import Injector
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
-from hil.plc.bridged_plant import BridgedPlant
-from hil.plc.profile import write_plc_profile
+from hil.plc import BridgedPlant, write_plc_profile
 from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS
 from machine.profile import Profile

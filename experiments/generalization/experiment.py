@@ -44,7 +44,7 @@ from experiments.generalization.plots import draw
 from hil.calibration.crane import run_lockstep as calibrate
 from hil.demo.lockstep import run_lockstep as load_one_log
 from hil.replay.recording import PROFILE_FILE
-from machine.loading.beside import carry_envelope
+from machine.loading.profile_file import carry_envelope
 from runtime.errors import InputRefused
 
 # -- One machine with one truth: calibrated, then some logs or a mission with what the calibration has written.

@@ -16,7 +16,7 @@ from autonomy.grasp.network import GraspNet
 from autonomy.grasp.planner import GraspRequest
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.virtual_scene import Camera
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from experiments.common.worlds import profile_named
 from experiments.grasp_configs.pose_sources import true_poses
 from experiments.grasp_configs.trial import arranged

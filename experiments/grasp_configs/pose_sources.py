@@ -18,15 +18,14 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception import papers
+from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, rescaled
 from autonomy.perception.fitting.measure import Masked
-from autonomy.perception.log_list.observation import LogObservation
-from autonomy.perception.papers import paper_a
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.tracking.log_filter import SURVEYED
 from experiments.common import plugins
-from hil.calibration.camera_survey import surveyed_profile
+from hil.calibration.crane import surveyed_profile
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
 from sim.plant import Plant
@@ -108,7 +107,7 @@ class PaperPerception:
 
         seen, begun = self._camera.detect(stamp_ns, q), time.process_time()
         frame, pose = seen.frames[0], seen.pose
-        found = [paper_a.log_from_mask(frame, one.mask) for one in segment(frame)]
+        found = [papers.log_from_mask(frame, one.mask) for one in segment(frame)]
         logs: list[LogObservation] = []
         for log in found:
             if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:

@@ -21,7 +21,7 @@ from autonomy.grasp.planners import NETWORKS as WEIGHT_FILES
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.networks.weights import SHIPPED
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.perception.papers.paper_b import end_on_error_m
+from autonomy.perception.papers import end_on_error_m
 from experiments.common.result import Metric, rate
 from experiments.common.result_page import Section
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.perception.fitting.cylinder import CylinderBatch, outline_distance, pixel_rays
-from autonomy.perception.papers.paper_b import position_in_box
+from autonomy.perception.papers import position_in_box
 from autonomy.perception.pipeline import Perception
 from experiments.log_localization.metrics import CM, DEGREES, PAPER_M, VIEWS
 from experiments.log_localization.site import STOP_M, Site

@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from autonomy.perception import papers
 from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.fitting.measure import Masked
-from autonomy.perception.papers import paper_a
-from autonomy.perception.papers.paper_b import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
+from autonomy.perception.papers import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS, Track
 from experiments.common.pool import Job
@@ -163,7 +163,7 @@ def _log_errors(
         apart = [float(np.linalg.norm(p - log.center_m)) for p in places]
         if apart and min(apart) < FOUND_M:
             out[key] = min(apart)
-    plain = paper_a.log_from_mask(frame, mask) if mask is not None else None
+    plain = papers.log_from_mask(frame, mask) if mask is not None else None
     if plain is not None:
         out["faithful_axis_deg"] = _degrees(pose.rotation @ plain.axis, log.axis)
         out["faithful_diameter_m"] = abs(plain.diameter_m - log.pose.diameter_m)

@@ -17,7 +17,7 @@ from autonomy.navigation.joining_path import joining_path
 from autonomy.navigation.navigator import Navigator, Phase
 from autonomy.navigation.path_drive import PathDrive
 from autonomy.navigation.waypoint_drive import Waypoint, WaypointDrive
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VehicleReport

@@ -15,7 +15,7 @@ from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, rotato
 from machine.geometry.kinematics import Point, Unreachable, inverse, reachable_extensions, solve
 from machine.joints import Joint
 from machine.profile import joint_limits
-from sim.nodes.vehicle import spool_for
+from sim.nodes.mach0 import spool_for
 from sim.world import STEP_S, World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")

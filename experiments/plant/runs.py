@@ -27,7 +27,7 @@ from machine.geometry.kinematics import Unreachable
 from sim.bullet.client import GRAVITY_M_S2
 from sim.hydraulics.circuit import Hydraulics
 from sim.mechanics.carrier import PARKED, Drive
-from sim.nodes.vehicle import spool_for
+from sim.nodes.mach0 import spool_for
 from sim.wood.log_shape import LogSpec
 from sim.world import STEP_S, World
 

@@ -29,8 +29,7 @@ from experiments.common.workers import Trial
 from experiments.common.worlds import profile_named
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
-from hil.plc.bridged_plant import BridgedPlant
-from hil.plc.profile import write_plc_profile
+from hil.plc import BridgedPlant, write_plc_profile
 from machine.geometry.kinematics import pin_position
 from machine.status.modes import Mode
 from recorder.recorder import Recorder

@@ -22,8 +22,7 @@ from typing import Final
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode, encode
-from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.key_file import read_key
+from can_dbc.messages.envelope import DatagramRefused, read_key
 from can_dbc.messages.udp_address import address_argument
 from hil.harness.operator import Operator
 from hil.harness.processes import announce_ready

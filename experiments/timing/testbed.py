@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
-from can_dbc.messages.key_file import write_key
+from can_dbc.messages.envelope import write_key
 from can_dbc.messages.operator_link import guard_path
 from can_dbc.timing.page import Timing, read_timing
 from experiments.common import host_activity
 from experiments.timing.events import Events, Stall, Stop, losses_between
 from hil.harness.processes import ProcessGroup, free_udp_ports
-from hil.wire.bitrates import BITRATES
+from hil.wire.core import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason

@@ -13,7 +13,7 @@ from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import SingleLogJob
 from can_dbc.messages.crane import OperatorAction, StateReport
 from controller.config import Settings
@@ -26,7 +26,7 @@ from hil.faults.order import Order
 from hil.harness.display import Display
 from hil.harness.lockstep import START_NS, Lockstep, LogDetector, Observer
 from hil.harness.operator import MAX_STOPS, Operator
-from hil.plc.bridged_plant import BridgedPlant
+from hil.plc import BridgedPlant
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile

@@ -23,14 +23,13 @@ from rich.console import Console
 
 from autonomy.crane_job.activity import Activity
 from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
-from autonomy.perception.log_list.datagrams import decode_request, encode_error, encode_logs
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation, decode_request, encode_error, encode_logs
 from autonomy.process.grasp_publisher import chosen_grasp
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.grasp import encode_grasp
+from can_dbc.messages.mission import encode_grasp
 from can_dbc.messages.vehicle import VehicleReport
 from controller.process.operator_socket import OperatorSocket
 from controller.process.realtime import sleep_until

@@ -18,10 +18,9 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.grapple_heights import travel_height_m
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.demonstration import AXES
-from autonomy.motion.pose import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import StateReport
 from controller.config import Settings

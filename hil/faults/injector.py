@@ -20,7 +20,7 @@ from hil.faults.order import Order
 from hil.faults.table import FAULTS, Edge
 from hil.faults.wire_faults import wire_fault
 from hil.harness.lockstep import START_NS, Lockstep
-from hil.plc.bridged_plant import BridgedPlant
+from hil.plc import BridgedPlant
 from hil.wire.faults import FOREVER_NS
 from runtime.errors import InputRefused
 from sim.errors import PlantError

@@ -21,7 +21,7 @@ from can_dbc.bus.factory import open_bus
 from can_dbc.bus.wire_client import control
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.key_file import read_key
+from can_dbc.messages.envelope import read_key
 from hil.faults.order import Order
 from hil.faults.table import FAULTS, Edge
 from hil.faults.wire_faults import wire_fault

@@ -21,13 +21,12 @@ from autonomy.crane_job.phases import Phase
 from can_dbc.bus.factory import PYTHON_CAN, VCAN_NAMES, kernel_has_can
 from can_dbc.messages import datagrams, operator_link
 from can_dbc.messages.crane import OperatorAction, StateReport
-from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.key_file import read_key, write_key
+from can_dbc.messages.envelope import DatagramRefused, read_key, write_key
 from can_dbc.timing.page import default_path
 from hil.harness.display import Display
 from hil.harness.operator import Operator
 from hil.harness.processes import ProcessGroup, free_udp_ports
-from hil.wire.bitrates import BITRATES
+from hil.wire.core import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import profile_check, profile_hash
 from machine.profile import Profile

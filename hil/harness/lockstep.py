@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.messages import datagrams
 from can_dbc.messages.crane import StateReport
@@ -26,11 +26,10 @@ from controller.process.tick_recording import record
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from hil.harness.operator import Operator
-from hil.wire.bitrates import CRANE_BITRATE, MACHINE_BITRATE
-from hil.wire.core import WireCore
+from hil.wire.core import CRANE_BITRATE, MACHINE_BITRATE, WireCore
 from hil.wire.inprocess import InProcessBus
 from recorder.recorder import Recorder
-from sim.instruments.ideal_detector import detect
+from sim.instruments import detect
 from sim.plant import Plant
 
 SLICE_NS: Final = 1_250_000

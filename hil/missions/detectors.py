@@ -12,16 +12,16 @@ from typing import Final
 
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingLogDetector, PaperBLocalizer
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
-from hil.calibration.camera_survey import surveyed_profile
+from hil.calibration.crane import surveyed_profile
 from hil.harness.lockstep import LogDetector
 from hil.plant.camera import RigCamera
 from machine.profile import Profile
 from runtime.errors import InputRefused
 from sim.camera.rig import CameraRig
-from sim.instruments.ideal_detector import detect_in_view
+from sim.instruments import detect_in_view
 from sim.plant import Plant
 
 CAMERA: Final = "front"

@@ -20,15 +20,14 @@ from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.manager.tally import Load
 from autonomy.missions.model import ForwardingMission
 from controller.guard.__main__ import profile_path
-from hil.calibration.camera_survey import surveyed_profile
+from hil.calibration.crane import surveyed_profile
 from hil.harness.display import Display
 from hil.harness.live import LiveOptions, LiveRun
 from hil.missions.detectors import CAMERA, PERFECT, check_camera
-from hil.missions.forwarded_report import report_loads
 from hil.missions.site import site_of
-from hil.missions.summary import MissionSummary
+from hil.missions.summary import MissionSummary, report_loads
 from host.exit_codes import CommandFailed, ExitCode
-from sim.instruments.camera_targets import seen_with
+from sim.instruments import seen_with
 
 SITE: Final = "site.json"
 SURVEYED_PROFILE: Final = "surveyed.toml"

@@ -20,7 +20,7 @@ from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.transition_table import FINAL_STATES, TABLES, State
 from autonomy.missions.model import ForwardingMission
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.process.mission_publisher import MissionPublisher
 from autonomy.process.planner_process import REPORT_PERIOD_NS
 from can_dbc.messages.crane import OperatorAction, StateReport
@@ -33,9 +33,8 @@ from hil.harness.display import Display
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.missions.detectors import make_detector
-from hil.missions.forwarded_report import report_loads
 from hil.missions.site import site_of
-from hil.missions.summary import MissionSummary
+from hil.missions.summary import MissionSummary, report_loads
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile

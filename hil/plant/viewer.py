@@ -14,7 +14,7 @@ from rich.console import Console
 
 from hil.harness.live import HOST, START_S
 from hil.harness.processes import ProcessGroup, free_udp_ports
-from hil.wire.bitrates import BITRATES
+from hil.wire.core import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.profile import Profile
 

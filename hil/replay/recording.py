@@ -14,8 +14,7 @@ import msgspec
 
 from host.exit_codes import CommandFailed, ExitCode
 from recorder.manifest import Manifest
-from recorder.mcap_scan import Channel, Stored, is_complete, scan
-from recorder.recover import recover, run_files
+from recorder.recover import Channel, Stored, is_complete, recover, run_files, scan
 from runtime.errors import InputRefused
 
 PROFILE_FILE: Final = "profile.toml"

@@ -30,8 +30,8 @@ from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.vehicle import VehicleReport
 from hil.replay.recording import manifest_of
 from host.exit_codes import CommandFailed, ExitCode
-from recorder.mcap_scan import is_complete
 from recorder.recorder import REPORT, TICK, TIMING, VEHICLE
+from recorder.recover import is_complete
 
 CACHED_CHUNKS: Final = 160
 """About half a minute of a run, some tens of megabytes."""

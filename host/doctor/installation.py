@@ -21,12 +21,12 @@ from typing import Final
 from packaging.requirements import Requirement
 
 from can_dbc.bus.factory import PYTHON_CAN, kernel_has_can
-from can_dbc.messages.key_file import MIN_KEY_BYTES, SERVICE_KEY
+from can_dbc.messages.envelope import MIN_KEY_BYTES, SERVICE_KEY
 from controller.guard.__main__ import profile_path
 from host.doctor.finding import Finding, Severity, fine
 from host.release import installed
 from host.release.updater import SIGNER
-from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab import uml
 from host.vcan_lab.choose import choose, survey
 from host.vcan_lab.spec import LabError, Request
 from machine.loading.profile_file import ProfileError, load_profile, shipped_profiles
@@ -168,7 +168,7 @@ def vcan_lab() -> Finding:
 
 def kernel_of_lab() -> Finding:
     """The optional kernel with simulated time."""
-    if built := lab_kernel.find(shim.user_cache()):
+    if built := uml.find(uml.user_cache()):
         return fine("lab kernel", built)
     gain = "tests in simulated time: hil vcan --time-travel"
     return Finding("lab kernel", ADVICE, "not built", gain, ("make lab-kernel",))

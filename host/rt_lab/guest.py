@@ -99,7 +99,7 @@ def reference_loop() -> dict[str, Any]:
 
 def control_loop(checkout: Path) -> dict[str, Any]:
     """Controller, guard and emulated nodes on vcan; the controller is killed while the crane slews."""
-    from can_dbc.messages.key_file import read_key, write_key
+    from can_dbc.messages.envelope import read_key, write_key
     from can_dbc.timing.page import read_timing
     from host.service_lab import trial
     from host.service_lab.pilot import Pilot

@@ -19,13 +19,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-from can_dbc.messages.key_file import SERVICE_KEY, read_key
-from host.service_lab import authority, loading, lost_bus, perception, trial, updates
+from can_dbc.messages.envelope import SERVICE_KEY, read_key
+from host.service_lab import authority, loading, perception, trial, updates
 from host.service_lab.pilot import Pilot
 from host.systemd import journal, main_pid, process_facts, show, systemctl
 from host.vcan_lab.spec import LabError
-from recorder.mcap_scan import Stored, scan
 from recorder.recorder import TIMING
+from recorder.recover import Stored, scan
 
 PROGRAM: Final = "/opt/timberhand/current/bin/timberhand"
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
@@ -137,8 +137,8 @@ def bus_without_interface(check: Check) -> None:
 
 def plug_in(check: Check) -> None:
     """The installed udev rule sets up a new interface."""
-    subprocess.run(["ip", "link", "add", lost_bus.INTERFACE, "type", "vcan"], check=True)
-    flags = Path(f"/sys/class/net/{lost_bus.INTERFACE}/flags")
+    subprocess.run(["ip", "link", "add", trial.INTERFACE, "type", "vcan"], check=True)
+    flags = Path(f"/sys/class/net/{trial.INTERFACE}/flags")
     limit_s = time.monotonic() + 10.0
     while not (up := int(flags.read_text(), 16) & IFF_UP) and time.monotonic() < limit_s:
         time.sleep(0.2)
@@ -204,7 +204,7 @@ def wait_for_work(check: Check, page: str) -> None:
 
 def has_timing(recording: Path) -> bool:
     """Whether a running recording holds the controller's timing and frames of the bus."""
-    frames = recording.with_name(f"{lost_bus.INTERFACE}.log").stat().st_size
+    frames = recording.with_name(f"{trial.INTERFACE}.log").stat().st_size
     return bool(frames) and any(isinstance(found, Stored) for found in scan(recording, {TIMING}))
 
 
@@ -276,8 +276,8 @@ def evaluate_trial(check: Check, ending: trial.Ending, figures: dict[str, Any]) 
 
 def buses_lost(check: Check, pilot: Pilot, plant_port: int) -> None:
     """The processes survive the loss of their bus, report it, and need an operator but no restart afterwards."""
-    for loss in lost_bus.LOSSES:
-        figures = lost_bus.lose(loss, pilot, plant_port)
+    for loss in trial.LOSSES:
+        figures = trial.lose(loss, pilot, plant_port)
         check.result["trials"].append(figures)
         check.step(f"bus {loss.name}: {figures}")
         check.figure(f"bus_{loss.name}_moved_mrad", figures["moved_mrad"], STILL_MRAD)

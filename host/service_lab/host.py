@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from host.release import bundle
 from host.release.signature import make_keys
-from host.vcan_lab import keeper, lab_kernel, shim
+from host.vcan_lab import keeper, uml
 from host.vcan_lab.spec import VIRTUAL_START_NS, LabError
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -70,8 +70,8 @@ def missing() -> str | None:
     """Why this computer cannot run the lab; None when it can."""
     if platform.machine() != "x86_64":
         return f"user-mode Linux runs on x86_64 only, this is {platform.machine()}"
-    if lab_kernel.find(shim.user_cache()) is None:
-        return lab_kernel.MISSING
+    if uml.find(uml.user_cache()) is None:
+        return uml.MISSING
     if not Path("/lib/systemd/systemd").exists():
         return "systemd is missing: apt-get install systemd"
     if not Path("/lib/systemd/systemd-udevd").exists():
@@ -192,7 +192,7 @@ def _warm_up(python: str, path: str) -> None:
 
 
 def _boot(settings: list[str], timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
-    kernel = lab_kernel.find(shim.user_cache())
+    kernel = uml.find(uml.user_cache())
     assert kernel
     messages, far = os.pipe()
     log = os.memfd_create("kernel log")

@@ -5,15 +5,17 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import socket
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
-from host.vcan_lab import lab_kernel, links, shim
+from host.real_time import LOOK_S, run_probe
+from host.vcan_lab import links, lost_time, uml
 from host.vcan_lab.spec import PACKAGE_ROOT, LabError, Request
 from host.vcan_lab.uml import KERNEL
 
@@ -70,7 +72,7 @@ def choose(facts: HostFacts, kernel: str | None = None) -> Method:
         )
     if kernel == "lab":
         if facts.lab_kernel is None:
-            raise LabError("lab.no-lab-kernel", lab_kernel.MISSING)
+            raise LabError("lab.no-lab-kernel", uml.MISSING)
         return Method("uml", natively, facts.lab_kernel)
     if facts.kernel is None:
         raise LabError("lab.no-uml", f"no vcan here: {natively}; {KERNEL} is missing: apt-get install user-mode-linux")
@@ -91,7 +93,7 @@ def survey(request: Request) -> HostFacts:
         existing_fault = "; ".join(faults) or None
         if existing_fault:
             namespace_fault = _namespace_fault(request)
-    own = lab_kernel.find(shim.user_cache())
+    own = uml.find(uml.user_cache())
     return HostFacts(can_fault, existing_fault, namespace_fault, shutil.which(KERNEL), platform.machine(), own)
 
 
@@ -105,3 +107,79 @@ def _namespace_fault(request: Request) -> str | None:
         check=False,
     )
     return (trial.stderr.strip().splitlines() or ["no message"])[-1] if trial.returncode else None
+
+
+# -- Real or simulated time for a live run in user-mode Linux, by the processor time that the lab would get.
+#
+# The guest has one processor and needs nearly all of it for a live machine (about nine tenths, measured), so a host
+# that takes more than a tenth leaves the processes of lowest priority, the planner among them, with too little:
+# setpoints come late and leases end.  The controller does nothing wrong then, and a faster host does not have the
+# problem; so the run takes place in simulated time, which shows what the processes do and not what the host does.
+#
+# ``measure`` looks at the host for a moment, ``choose_clock`` decides (pure), ``clock_here`` does both.
+
+MAX_LOST_SHARE: Final = 0.08
+"""The guest has about a tenth to spare."""
+MAX_GAP_NS: Final = 25_000_000
+"""Half of a motion input's time-out of 50 ms: the guest needs the other half to catch up."""
+
+
+@dataclass(frozen=True, slots=True)
+class LostTime:
+    """What a process with the lab's share did not get of its processor.
+
+    ``share``: of the time, in gaps; ``longest_ns``: the longest gap; ``steal_share``: of the time, taken by the
+    hypervisor according to /proc/stat (a part of ``share``; the rest went to other processes of this computer).
+    """
+
+    share: float
+    longest_ns: int
+    steal_share: float
+
+    def words(self) -> str:
+        """For a person."""
+        return (
+            f"{100 * self.share:.0f} % of its processor's time lost, at most {self.longest_ns / 1e6:.0f} ms at once "
+            f"(steal by the hypervisor: {100 * self.steal_share:.1f} %)"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The chosen clock, and why."""
+
+    kind: Literal["real", "simulated"]
+    reason: str
+    enough: bool = True
+    """Whether the run may be expected to take place without a stop."""
+
+
+def choose_clock(lost: LostTime, kernel: str | None) -> Clock:
+    """Real time where the host leaves enough; else simulated time, if the lab's own kernel ``kernel`` is there."""
+    if lost.share <= MAX_LOST_SHARE and lost.longest_ns <= MAX_GAP_NS:
+        return Clock("real", f"the host leaves the lab enough: {lost.words()}")
+    busy = f"the host is too busy for a live run in user-mode Linux: {lost.words()}"
+    if kernel is None:
+        return Clock("real", f"{busy}; expect stops, or use simulated time: {uml.MISSING}", enough=False)
+    return Clock("simulated", busy)
+
+
+def measure(seconds: float = LOOK_S) -> LostTime:
+    """Spin beside everything else on the processor and with the share that the lab would get.
+
+    Raises:
+        subprocess.SubprocessError: the probe fails.
+    """
+    found = run_probe(lost_time.__file__, seconds)
+    return LostTime(found["share"], found["longest_ns"], found["steal_share"])
+
+
+def clock_here() -> Clock | None:
+    """The clock for a live run in the lab now; None where the lab is not user-mode Linux, or there is none."""
+    request = Request((), os.getcwd(), {}, os.getuid(), os.getgid(), (), 0o022)
+    try:
+        if choose(survey(request)).kind != "uml":
+            return None
+    except LabError:
+        return None  # the lab itself says why
+    return choose_clock(measure(), uml.find(uml.user_cache()))

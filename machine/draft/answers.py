@@ -13,8 +13,7 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
-from machine.loading.problem import Problem
-from machine.loading.structure import build
+from machine.loading.structure import Problem, build
 from machine.profile import KeepOut
 from runtime.errors import InputRefused
 

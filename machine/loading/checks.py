@@ -16,8 +16,8 @@ from typing import Final
 from machine.geometry.carrier import wheel_gap_m
 from machine.geometry.kinematics import max_reach_m
 from machine.joints import N_JOINTS, Joint
-from machine.loading.problem import Problem
 from machine.loading.ranges import ANGLE_RANGE, TURN_RAD, Range, check_range, out_of_range
+from machine.loading.structure import Problem
 from machine.profile import (
     JOINT_LAWS,
     OWN_LAWS,

@@ -6,6 +6,7 @@ Every problem is one line: the file, the key path, what is wrong, what is allowe
 
 from __future__ import annotations
 
+import shutil
 import tomllib
 import zlib
 from collections.abc import Sequence
@@ -15,8 +16,7 @@ from typing import Any, Final
 import msgspec
 
 from machine.loading.checks import problems_of
-from machine.loading.problem import Problem
-from machine.loading.structure import build, did_you_mean
+from machine.loading.structure import Problem, build, did_you_mean
 from machine.profile import Profile
 from runtime.errors import TimberhandError
 
@@ -116,3 +116,18 @@ def profile_file(name_or_path: str | Path) -> Path:
         f'unknown profile "{text}"{did_you_mean(text, shipped)}; shipped profiles: {", ".join(shipped)}; '
         "or give the path of a .toml file",
     )
+
+
+# -- Files that belong to a machine and lie beside its profile, by name: ``NAME.envelope.toml``, the guard's limits.
+
+
+def carry_envelope(profile: Path, folder: Path) -> None:
+    """Copy the envelope beside a profile into ``folder``, where a changed copy of that profile is written.
+
+    The guard looks beside the profile first, then among the shipped envelopes, so a shipped one is not copied.
+    """
+    if profile.parent.resolve() in (SHIPPED_FOLDER, folder.resolve()):
+        return
+    envelope = profile.with_name(f"{load_profile(profile).name}.envelope.toml")
+    if envelope.is_file():
+        shutil.copy(envelope, folder)

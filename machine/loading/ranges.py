@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
-from machine.loading.problem import Problem
+from machine.loading.structure import Problem
 from machine.profile import (
     Bunk,
     Camera,

@@ -6,13 +6,13 @@ All problems are found in one pass, each with its full key path, so that few rou
 from __future__ import annotations
 
 import types
+from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Final, Literal, get_args, get_origin
 
 import msgspec
 
 from machine.joints import JOINTS
-from machine.loading.problem import Problem
 from machine.profile import JointSpec
 
 _UNIT_SUFFIXES: Final = (
@@ -129,3 +129,21 @@ def _unknown_key(parent: str, key: str, names: tuple[str, ...]) -> Problem:
         return Problem("profile.wrong-unit", parent + key, f'wrong unit in the name; write "{same[0]}"{unit}')
     hint = did_you_mean(key, names) or f"; allowed: {', '.join(names)}"
     return Problem("profile.unknown-key", parent + key, f"unknown key{hint}")
+
+
+# -- One problem of a profile: a code for programs, the key path, and a sentence for people.
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What is wrong with the value at a key path.
+
+    ``code`` is stable (``profile.what``); ``sentence`` says what is wrong and what is allowed, and may be reworded.
+    """
+
+    code: str
+    path: str
+    sentence: str
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.sentence}"

@@ -27,9 +27,7 @@ from machine.profile import Profile, joint
 from machine.status.explanation import describe, sentence_of
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from ros2.execution.goal_motion import GoalMotion, goal_motion, unit_of
-from ros2.execution.goal_refused import GoalRefused
-from ros2.execution.tolerances import Tolerances, beyond, tolerances_of
+from ros2.execution.goal_motion import GoalMotion, GoalRefused, Tolerances, beyond, goal_motion, tolerances_of, unit_of
 from ros2.interfaces.action import Status
 from ros2.interfaces.builtin import NS_PER_S, nanoseconds
 from ros2.interfaces.control import ErrorCode, Goal

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any, Final
@@ -11,16 +11,27 @@ from typing import Any, Final
 import msgspec
 
 from machine.draft.answers import Answers, DriveAnswers, JointAnswers
-from machine.draft.masses import BOOM_CENTRE, STICK_CENTRE, TELESCOPE_CENTRE
-from machine.draft.profile_text import tong, unit_per_count
-from machine.draft.toml_text import DERIVED, GIVEN, LEGEND, START, Line, table
+from machine.draft.toml_text import (
+    BOOM_CENTRE,
+    DERIVED,
+    GIVEN,
+    LEGEND,
+    START,
+    STICK_CENTRE,
+    TELESCOPE_CENTRE,
+    Line,
+    table,
+    tong,
+    unit_per_count,
+)
 from machine.joints import JOINTS, Joint
-from machine.profile import Profile
-from sim.bullet.body import Body
+from machine.profile import Profile, encoders, joint
+from runtime.errors import Problem
+from sim.bullet.body import Body, JointDef, urdf_text
 from sim.bullet.client import BulletClient, new_client
-from sim.bullet.urdf import JointDef, urdf_text
+from sim.errors import PlantError
 from sim.mechanics.crane import FLEX_JOINTS, crane_links
-from sim.truth.load import Truth
+from sim.truth.load import Truth, load_truth
 
 # -- The crane of a machine as URDF, for other tools: the plant's links and joints with a rigid column.
 
@@ -88,7 +99,7 @@ SPREAD: Final = {
 
 
 def truth_text(answers: Answers, least_inertia: dict[str, float]) -> str:
-    """The truth; ``least_inertia`` by function, from `sim.draft.truth`."""
+    """The truth; ``least_inertia`` by function."""
     kin, home, wood, pump = answers.kinematics, answers.home, answers.wood, answers.pump
     hanging, moment = answers.masses.grapple_kg, answers.masses.lifting_moment_nm
     stiffness = STIFFNESS_PER_MOMENT_1_RAD * moment
@@ -396,3 +407,55 @@ def truth_and_urdf(answers: Answers, profile: Profile) -> tuple[str, str]:
     """The texts of the truth file and of the URDF file of the machine of these answers and this profile."""
     links = msgspec.toml.decode(truth_text(answers, _UNKNOWN), type=Truth)
     return truth_text(answers, least_inertia(profile, links)), crane_urdf(profile, links)
+
+
+# -- Whether the truth of a machine and its profile can be about one machine: what the plant would fail or lie about.
+
+FLOW_SHARE: Final = 0.15
+"""Oil per motion of truth and profile may differ by this share: a profile rounds, and nobody measures a bore."""
+
+
+def truth_problems(profile: Profile, choice: str) -> list[Problem]:
+    """What is wrong with the truth of this choice (`sim.individual`) for the machine of ``profile``."""
+    try:
+        truth = load_truth(choice, 0, profile.name)
+    except PlantError as error:
+        return [Problem(error.code, str(error))]
+    return [*_parts(profile, truth)] or [*_joints(profile, truth)]
+
+
+def _parts(profile: Profile, truth: Truth) -> Iterator[Problem]:
+    names = [j.name.lower() for j in JOINTS]
+    links = ("mast", "boom", "stick", "telescope", "hanger", "fork", "rotator", "tong")
+    sensed = {JOINTS[n].name.lower() for n in encoders(profile) if n < len(JOINTS)}
+    wanted = (("links", links), ("functions", (*names, "grapple")), ("encoders", sensed), ("cameras", profile.cameras))
+    for section, keys in wanted:
+        missing = [key for key in keys if key not in getattr(truth, section)]
+        if missing:
+            text = f"[{section}] has no {', '.join(missing)}; the profile has, so describe what is true of it"
+            yield Problem("truth.missing-part", text)
+
+
+def _joints(profile: Profile, truth: Truth) -> Iterator[Problem]:
+    for j in JOINTS:
+        name, spec = j.name.lower(), joint(profile, j)
+        cylinder = truth.functions[name].cylinder
+        if not cylinder.arm_at[0] < spec.lower < spec.upper < cylinder.arm_at[-1]:
+            text = (
+                f"functions.{name}.cylinder.arm_at: the drive's stops {cylinder.arm_at[0]}..{cylinder.arm_at[-1]} are "
+                f"inside the profile's range {spec.lower}..{spec.upper}; the joint would hit them"
+            )
+            yield Problem("truth.stops", text)
+        sides = (("plus", spec.valve.flow_plus, cylinder.area_a), ("minus", spec.valve.flow_minus, cylinder.area_b))
+        for side, flow, area in sides:
+            true = area * abs(cylinder.arm_nominal)
+            if abs(true - flow) > FLOW_SHARE * flow:
+                text = (
+                    f"functions.{name}.cylinder: piston and lever arm need {true:.3g} m^3 per unit of the joint, and "
+                    f"flow_{side} of the profile is {flow:.3g}; one of the two is another cylinder"
+                )
+                yield Problem("truth.flow", text)
+        at = getattr(truth.home, name)
+        if not spec.lower <= at <= spec.upper:
+            text = f"home.{name}: {at} is outside the profile's range {spec.lower}..{spec.upper}"
+            yield Problem("truth.home", text)

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 class Tyre(NamedTuple):
-    """The constants of a run, as in ``sim.truth.carrier``."""
+    """The constants of a run, as in ``sim.truth.body``."""
 
     radius_m: float
     width_m: float

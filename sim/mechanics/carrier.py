@@ -19,12 +19,12 @@ import numpy as np
 from machine.geometry import carrier as geometry
 from machine.profile import Carrier as CarrierProfile
 from machine.profile import Profile
+from sim.bullet.body import JointDef, LinkDef
 from sim.bullet.client import GRAVITY_M_S2, BulletClient
-from sim.bullet.urdf import JointDef, LinkDef
 from sim.geometry.shape import IDENTITY, Quaternion, Shape, Vector, quaternion_rpy, rpy_quaternion
 from sim.ground.terrain import Terrain
 from sim.ground.tyre import Tyre, wheel_step
-from sim.truth.carrier import CarrierTruth
+from sim.truth.body import CarrierTruth
 from sim.truth.load import Truth
 
 CARRIER_JOINTS: Final = ("articulation", *geometry.ARMS)

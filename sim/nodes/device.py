@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 
 from can_dbc.dbc.codec import Database
 from can_dbc.messages.crane import ModeSwitch
-from can_dbc.protocols.canopen import HEARTBEAT_BASE, Emergency, NodeState, emergency_frame
-from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave
+from can_dbc.protocols.canopen import HEARTBEAT_BASE, HEARTBEAT_MS, CanopenSlave, Emergency, NodeState, emergency_frame
 from machine.crane_nodes import CraneNode
 from sim.hydraulics.layout import PA_PER_BAR
 from sim.nodes import Outbox

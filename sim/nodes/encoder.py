@@ -20,9 +20,9 @@ import can_dbc
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER
 from machine.profile import Encoder
 from machine.sensing.encoder import counts_from_position, position_from_counts
-from sim.faults.encoder_fault import EncoderFault
+from sim.faults import EncoderFault
 from sim.nodes import Outbox
-from sim.truth.encoders import EncoderTruth
+from sim.truth.sensors import EncoderTruth
 
 EDS_FOLDER = Path(can_dbc.__file__).parent
 PDO_NOT_VALID = 0x8000_0000

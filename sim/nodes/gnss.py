@@ -21,7 +21,7 @@ from machine.profile import Carrier
 from sim.geometry.geodesy import LocalFrame
 from sim.geometry.shape import Quaternion, Vector, quaternion_rpy
 from sim.nodes import Outbox
-from sim.nodes.j1939 import MARINE, J1939Node
+from sim.nodes.mach0 import MARINE, J1939Node
 from sim.nodes.messages import MS, PeriodicTimer
 from sim.truth.sensors import GnssTruth
 

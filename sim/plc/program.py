@@ -26,8 +26,7 @@ from can_dbc.plc.map import (
     WordOrder,
 )
 from machine.joints import JOINTS
-from machine.motion_limits import SPEED_HEADROOM_SHARE
-from machine.profile import JointSpec, Profile, Valve, joint
+from machine.profile import SPEED_HEADROOM_SHARE, JointSpec, Profile, Valve, joint
 from sim.plc.command_arbiter import MS, CommandArbiter
 
 # -- The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm

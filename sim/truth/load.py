@@ -16,11 +16,9 @@ import msgspec
 
 from sim.errors import PlantError
 from sim.individual import DRAWN, split
-from sim.truth.body import Contact, Home, Link, Steel, Structure
-from sim.truth.carrier import CarrierTruth
-from sim.truth.encoders import EncoderTruth
+from sim.truth.body import CarrierTruth, Contact, Home, Link, Steel, Structure
 from sim.truth.hydraulics import Function, Supply
-from sim.truth.sensors import CameraTruth, GnssTruth
+from sim.truth.sensors import CameraTruth, EncoderTruth, GnssTruth
 from sim.truth.variation import Variation, VariationSampler
 from sim.truth.wood import Wood
 

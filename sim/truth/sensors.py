@@ -92,3 +92,25 @@ class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bound = draw.spread.antenna_m
         main, aux = (tuple(x + draw.within(bound) for x in at) for at in (self.main_offset_m, self.aux_offset_m))
         return msgspec.structs.replace(self, main_offset_m=main, aux_offset_m=aux)
+
+
+# -- Errors of one encoder.
+
+
+class EncoderTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Errors of one encoder in the joint's unit: offset, eccentricity (once per turn), noise; latency."""
+
+    offset: float
+    eccentricity: float
+    phase_rad: float
+    noise: float
+    latency_s: float
+
+    def sampled(self, draw: VariationSampler) -> EncoderTruth:
+        """The encoder of an individual: mounted with its own zero error and eccentricity."""
+        return msgspec.structs.replace(
+            self,
+            offset=self.offset + draw.within(draw.spread.offset),
+            eccentricity=self.eccentricity * draw.factor(draw.spread.eccentricity),
+            phase_rad=draw.rng.uniform(0.0, 2.0 * math.pi),
+        )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from autonomy.localization.local_plane import LocalPlane
-from autonomy.localization.motion_model import antenna_reach, front_attitude
+from autonomy.localization.vehicle_filter import antenna_reach, front_attitude
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from controller.laws.drive import AngleLaw, DriveLaw, SteeringLimits, WaypointLaw, east_north_m
 from machine.geometry.carrier import turning_radius_m

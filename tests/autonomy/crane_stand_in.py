@@ -14,7 +14,7 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, ModeSwitch, StateReport
 from can_dbc.messages.datagrams import decode
 from machine.geometry.grapple import grapple_yaw, half_gap_m, opening_pct_from_jaw_angle, tip_below_pin_m

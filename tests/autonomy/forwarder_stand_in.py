@@ -15,7 +15,7 @@ from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.loading_stops import base_on_path
 from autonomy.manager.log_map import MappedLog
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport

@@ -8,8 +8,8 @@ from math import cos, sin, sqrt
 import numpy as np
 
 from autonomy.grasp.network import GraspMaps, PixelGrasp
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import TRIANGLE, LogObservation
 from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("palms_471")

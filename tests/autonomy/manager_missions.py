@@ -8,7 +8,7 @@ import pytest
 
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
+from autonomy.manager.checkpoint import CheckpointFile, read_checkpoint
 from autonomy.manager.transition_table import FINAL_STATES, OURS, State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import load_profile, profile_hash

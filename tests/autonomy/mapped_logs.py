@@ -8,7 +8,7 @@ import numpy as np
 
 from autonomy.manager.log_map import MappedLog
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 
 
 def base(x_m: float, y_m: float, yaw_rad: float) -> Pose:

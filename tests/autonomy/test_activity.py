@@ -12,13 +12,13 @@ import pytest
 
 from autonomy.crane_job.activity import Activity, Phase
 from autonomy.crane_job.phase_motions import corrected_grasp
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.motion_planner import TimeOptimalPlanner
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, StateReport
 from can_dbc.messages.datagrams import decode
 from machine.geometry.sag import true_pin

@@ -9,8 +9,8 @@ from math import cos, isfinite, nan, pi, sin
 import pytest
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.placement import lies_in_bunk
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.grasp.bunk_load import lies_in_bunk
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash

@@ -10,11 +10,11 @@ import pytest
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phase_motions import BUNDLE_LIFT_S
 from autonomy.crane_job.phases import Phase
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import travel_height_m
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.kinematics import Unreachable

@@ -13,12 +13,12 @@ from autonomy.crane_job.cycle import LOOSE_TURN_S_RAD, MAX_FURTHER_TURNS
 from autonomy.crane_job.grapple import THICK_LOG_M
 from autonomy.crane_job.grasp_verification import is_part_of_load, with_load_recognized
 from autonomy.crane_job.phase_motions import reaches_stakes, turn_motion
+from autonomy.grasp.bunk_load import lies_across_stakes
 from autonomy.grasp.grapple_heights import travel_height_m
-from autonomy.grasp.grasp import Grasp
-from autonomy.grasp.placement import lies_across_stakes
-from autonomy.motion.arm import Arm
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.trajectory import STEP_S
-from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from autonomy.perception.log_list import TRIANGLE, LogObservation
 from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.joints import Joint
 from tests.autonomy.crane_stand_in import GROUND_LOG, TICK_NS, StandIn

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.grasp.placement import lies_in_bunk, plan_place
+from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.planner import BunkFull
 from autonomy.manager.activity_manager import MAX_OUTSIDE_M, ActivityManager
 from autonomy.manager.crane_executor import MAX_STOPS
@@ -16,7 +16,7 @@ from autonomy.manager.tally import Tally
 from autonomy.manager.transition_table import OURS, PAPER_B, RULES, State
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Point
 from autonomy.navigation.clothoid_path import PathRefused
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder

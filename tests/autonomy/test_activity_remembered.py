@@ -8,7 +8,7 @@ from math import dist
 import pytest
 
 from autonomy.crane_job.activity import Activity
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn

@@ -8,7 +8,7 @@ import pytest
 from autonomy.crane_job.activity import Activity, Phase
 from autonomy.grasp.grapple_heights import retreat_height_m
 from autonomy.grasp.planner import NoGrasp
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from can_dbc.messages.crane import GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.kinematics import Unreachable

@@ -12,8 +12,8 @@ from autonomy.crane_job.activity import Phase
 from autonomy.crane_job.cycle import HIGHER_M, MAX_HIGHER
 from autonomy.crane_job.grasp_verification import is_between_jaws
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.grapple import lowest_tip_below_pin_m

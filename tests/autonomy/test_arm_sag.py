@@ -6,8 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.trajectory import straight_line
 from machine.geometry.kinematics import pin_position
 from machine.geometry.sag import true_pin

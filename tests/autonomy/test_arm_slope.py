@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.arm_kinematics import slope_of
+from autonomy.motion.arm_kinematics import Arm, slope_of
 from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.loading.profile_file import load_profile
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.grasp.bunk_load import GRID_M, BunkLoad, log_in_bunk, settled_in_bunk
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.loading.profile_file import load_profile
 from machine.profile import Bunk
 

@@ -8,13 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from autonomy.calibration.delay_fit import fit_delay, response_s
+from autonomy.calibration.plan import Findings
 from autonomy.calibration.result import identify
 from autonomy.calibration.spool_program import reversed_sweep, staircase, sweep, wiggle
 from autonomy.calibration.survey import SurveyReading, fit_survey, most_informative_poses
-from autonomy.calibration.tasks import Findings
 from autonomy.calibration.trace import SpoolTestRecord
-from autonomy.calibration.valve_fit import deadband_difference, fit_valve
+from autonomy.calibration.valve_fit import deadband_difference, fit_delay, fit_valve, response_s
 from machine.geometry.sag import true_pin
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile

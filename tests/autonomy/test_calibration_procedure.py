@@ -7,7 +7,7 @@ from math import nan
 import msgspec
 import pytest
 
-from autonomy.calibration.plan import make_plan, plan_summary
+from autonomy.calibration.plan import MoveTask, SpoolTask, make_plan, plan_summary
 from autonomy.calibration.profile_file import profile_changes
 from autonomy.calibration.report import result_document
 from autonomy.calibration.result import CalibrationResult, identify
@@ -20,7 +20,6 @@ from autonomy.calibration.spool_program import (
     wiggle,
 )
 from autonomy.calibration.survey import fit_survey
-from autonomy.calibration.tasks import MoveTask, SpoolTask
 from autonomy.calibration.turn_fit import fit_turns
 from can_dbc.messages.crane import CraneSetpoint, SpoolTest
 from machine.geometry.kinematics import pin_position

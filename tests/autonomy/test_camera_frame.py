@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, check_frame, rescaled
-from autonomy.perception.log_list.estimate import LogEstimate, across
+from autonomy.perception.log_list import LogEstimate, across
 from machine.geometry.optics import Intrinsics, rpy_matrix
 from runtime.errors import InputRefused
 from tests.codes import coded

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from autonomy.perception.camera.frame import Pose
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.camera.frame import Pose, optical_pose
 from autonomy.perception.camera.survey import surveyed
 from machine.geometry.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
 from machine.loading.profile_file import load_profile

@@ -13,18 +13,20 @@ from hypothesis import strategies as st
 from autonomy.__main__ import main
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
 from autonomy.manager.checkpoint import (
+    PERIOD_NS,
     Checkpoint,
+    CheckpointFile,
     LogKnowledge,
     MissedLog,
     RouteRemainder,
     copied_tally,
     mission_digest,
+    read_checkpoint,
 )
-from autonomy.manager.checkpoint_file import PERIOD_NS, CheckpointFile, read_checkpoint
 from autonomy.manager.tally import Load, LoadedLog, Tally
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, MissionError, Point
-from autonomy.process.exit_codes import CONFIGURATION, FINE
+from autonomy.process.command_line import CONFIGURATION, FINE
 from runtime.errors import InputRefused
 from tests.autonomy.manager_missions import (
     listed_mission,

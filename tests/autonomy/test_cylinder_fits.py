@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
+from autonomy.perception import papers
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.fitting.contour import StereoSensor, log_contour
 from autonomy.perception.fitting.cylinder import (
@@ -19,7 +20,6 @@ from autonomy.perception.fitting.cylinder import (
 )
 from autonomy.perception.fitting.cylinder_fit import fit_cylinder
 from autonomy.perception.fitting.measure import implausibility, initial_cylinder
-from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
 from runtime.errors import InputRefused
 from sim.camera.scene import BUNK, SceneBuilder
@@ -269,13 +269,13 @@ def test_paper_a_takes_the_surface_for_the_log() -> None:
     log, view = lying(1, 4.6, 0.2, 90.0), view_from()
     picture = seen(scene_of(log), view)
     frame = frame_of(picture, view, exact=True)
-    found = paper_a.log_from_mask(frame, picture.mask == 1)
+    found = papers.log_from_mask(frame, picture.mask == 1)
     assert found is not None
     assert found.length_m == pytest.approx(2.0, abs=0.05) and found.diameter_m == pytest.approx(0.25, abs=0.06)
     assert angle_deg(view.rotation @ found.axis, log.axis) < 1.0
     off = view.to_world(found.center_m[None])[0] - log.position_m
     assert 0.06 < np.linalg.norm(off) < 0.13  # towards the camera
-    assert paper_a.log_from_mask(frame, np.zeros_like(picture.mask, bool)) is None
+    assert papers.log_from_mask(frame, np.zeros_like(picture.mask, bool)) is None
 
 
 @pytest.mark.parametrize(("lean_deg", "confirmed"), [(20.0, 1), (40.0, 0)])

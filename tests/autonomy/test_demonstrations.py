@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autonomy.motion import movement_primitives
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.demonstration import (
     AXES,
     GRID_S,
@@ -21,7 +21,6 @@ from autonomy.motion.demonstration import (
     smoothed,
 )
 from autonomy.motion.movement_primitives import PrimitiveMotions, algorithm_1, learn_primitives
-from autonomy.motion.pose import Pose
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import GrappleCommand

@@ -8,8 +8,8 @@ import pytest
 from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.fitting.cylinder import Cylinder
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
-from autonomy.perception.log_list.estimate import LogEstimate
-from autonomy.perception.tracking.displacement import is_displaced
+from autonomy.perception.log_list import LogEstimate
+from autonomy.perception.tracking.log_tracker import is_displaced
 from machine.geometry.optics import Intrinsics
 
 HEIGHT_M = 4.0

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose
 from autonomy.perception.driving_log_detector import (
     MAX_RANGE_M,
     MIN_HITS_WITH_HIDDEN_END,
@@ -17,7 +16,7 @@ from autonomy.perception.driving_log_detector import (
     DrivingLogDetector,
     PaperBLocalizer,
 )
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
 from runtime.errors import LinkError

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list.datagrams import decode_logs, decode_request, encode_logs, encode_request
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation, decode_logs, decode_request, encode_logs, encode_request
 from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
 from runtime.errors import InputRefused
 from tests.codes import coded

@@ -9,8 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.navigation.clothoid_path import Path, drivable_path
-from autonomy.navigation.follower import FollowerState, follow_path
-from autonomy.navigation.path_drive import MIN_SPEED_SHARE, PathDrive, Rocking, terrain_speed_share, tip_margin_m
+from autonomy.navigation.path_drive import (
+    MIN_SPEED_SHARE,
+    FollowerState,
+    PathDrive,
+    Rocking,
+    follow_path,
+    terrain_speed_share,
+    tip_margin_m,
+)
 from tests.autonomy.driven_carrier import CARRIER, SQUARE, at
 
 # -- follower

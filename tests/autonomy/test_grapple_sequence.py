@@ -11,10 +11,9 @@ import pytest
 
 from autonomy.crane_job.grapple import GrappleSequence, is_between_stakes
 from autonomy.grasp.grapple_heights import travel_height_m
-from autonomy.grasp.grasp import Grasp
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Arm, Pose
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile

@@ -8,13 +8,12 @@ from math import pi
 import pytest
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.grasp import Grasp
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from autonomy.process.grasp_publisher import chosen_grasp
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.grasp import decode_grasp, encode_grasp
-from can_dbc.messages.mission import decode_mission
+from can_dbc.messages.mission import decode_grasp, decode_mission, encode_grasp
 from machine.geometry.grapple import rotator_for_yaw
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile

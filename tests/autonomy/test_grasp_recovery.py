@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from autonomy.crane_job.grasp_recovery import MAX_REGRIPS_HIGHER, MAX_RESTARTS, REGRIP_STEP_M, GraspRecovery
+from autonomy.crane_job.grasp_verification import MAX_REGRIPS_HIGHER, MAX_RESTARTS, REGRIP_STEP_M, GraspRecovery
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.grasp import Grasp
-from autonomy.motion.pose import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.grasp.planner import Grasp
+from autonomy.motion.arm_kinematics import Pose
+from autonomy.perception.log_list import LogObservation
 from tests.autonomy.grasp_scenes import MEASURED
 
 

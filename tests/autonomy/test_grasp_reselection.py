@@ -12,7 +12,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from autonomy.perception.log_list import TRIANGLE, LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.crane_stand_in import TICK_NS, StandIn

@@ -11,15 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autonomy.grasp.bunk_load import BELOW_STAKE_TOP_M, lies_in_bunk, plan_place
 from autonomy.grasp.grapple_heights import closing_height_curve, hover_height_m, travel_height_m
-from autonomy.grasp.grasp import hangs_below
-from autonomy.grasp.placement import BELOW_STAKE_TOP_M, lies_in_bunk, plan_place
-from autonomy.grasp.planner import BunkFull
+from autonomy.grasp.planner import BunkFull, hangs_below
 from autonomy.grasp.selection import NoGrasp, plan_single_log_grasp, select_direct
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm, Pose
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.grapple import half_gap_m, lowest_tip_below_pin_m, tip_below_pin_m
 from machine.loading.profile_file import load_profile
 from tests.autonomy.crane_stand_in import GROUND_LOG, log_ends, over_bunk

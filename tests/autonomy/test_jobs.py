@@ -11,7 +11,7 @@ import pytest
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.manager.transition_table import State
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import STOPPING_TIMEOUT_NS, ForwardingJob, SingleLogJob
 from can_dbc.messages.crane import ModeSwitch, StateReport
 from can_dbc.messages.datagrams import decode

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.grasp import restricted_to
+from autonomy.grasp.planner import restricted_to
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.manager.load_bookkeeping import LOOKS, LoadBookkeeping
 from autonomy.manager.load_detector import MIN_WEIGHED, WoodScale, gripped_by_weight
@@ -21,7 +21,7 @@ from autonomy.manager.sorting import Sorting
 from autonomy.manager.tally import LoadedLog
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, Point
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from machine.loading.profile_file import load_profile
 from tests.autonomy.crane_stand_in import over_bunk
 from tests.autonomy.manager_missions import begin, ended, whole

@@ -9,12 +9,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from autonomy.crane_job.load_view import AHEAD_RAD, UNSURE_AHEAD_RAD, UNSURE_RAD, load_in_view, load_view
-from autonomy.crane_job.rotator_estimate import RotatorEstimate
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
-from autonomy.perception.camera.mount import optical_pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.crane_job.rotator_estimate import (
+    AHEAD_RAD,
+    UNSURE_AHEAD_RAD,
+    UNSURE_RAD,
+    RotatorEstimate,
+    load_in_view,
+    load_view,
+)
+from autonomy.motion.arm_kinematics import Arm, Pose
+from autonomy.perception.camera.frame import optical_pose
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m
 from machine.loading.profile_file import load_profile
 

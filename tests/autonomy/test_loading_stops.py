@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autonomy.manager.loading_stops import STEP_M, CraneReach, LoadingStop, base_on_path, best_stop
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from machine.geometry.carrier import rear_from_front
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mapped_logs import lying

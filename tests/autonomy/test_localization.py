@@ -14,7 +14,7 @@ from autonomy.localization.frames import Frames
 from autonomy.localization.local_plane import LocalPlane, wrapped, yaw_from_heading
 from autonomy.localization.localizer import AGREEING_COUNT, Localizer
 from autonomy.localization.location import Location, Status
-from autonomy.localization.motion_model import (
+from autonomy.localization.vehicle_filter import (
     SIZE,
     NoiseModel,
     Odometry,

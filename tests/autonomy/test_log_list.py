@@ -11,15 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.perception.log_list.datagrams import (
+from autonomy.perception.log_list import (
+    LogEstimate,
+    LogObservation,
     decode_logs,
     decode_request,
     encode_error,
     encode_logs,
     encode_request,
+    unpack_covariance,
 )
-from autonomy.perception.log_list.estimate import LogEstimate, unpack_covariance
-from autonomy.perception.log_list.observation import LogObservation
 from runtime.errors import InputRefused
 from tests.codes import coded
 

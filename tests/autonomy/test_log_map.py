@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.manager.log_map import CONFIRMED_HITS, LogMap, nearest
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mapped_logs import base, lying, seen
 

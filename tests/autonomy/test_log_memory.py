@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.grasp import hangs_below
-from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.bunk_load import lies_in_bunk
+from autonomy.grasp.planner import hangs_below
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.manager.load_detector import WINDOW_NS
 from autonomy.manager.log_map import LogMap
 from autonomy.manager.log_memory import PERIOD_NS, LogMemory
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from machine.loading.profile_file import load_profile
 from tests.autonomy.mapped_logs import base, lying, seen
 

@@ -12,7 +12,7 @@ from autonomy.perception.camera.frame import Pose
 from autonomy.perception.fitting.cylinder import Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
 from autonomy.perception.fitting.measure import fragment_groups, joined_cylinder, same_log
-from autonomy.perception.log_list.estimate import END, START, LogEstimate
+from autonomy.perception.log_list import END, START, LogEstimate
 from autonomy.perception.tracking.log_filter import CameraErrors
 from autonomy.perception.tracking.log_tracker import LOST_MISSES, LogTracker
 from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix

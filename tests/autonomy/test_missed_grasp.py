@@ -9,14 +9,14 @@ import pytest
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.cycle import EXTRACTION_DEPTH_M
-from autonomy.crane_job.grasp_recovery import MAX_RESTARTS
+from autonomy.crane_job.grasp_verification import MAX_RESTARTS
 from autonomy.crane_job.phase_motions import EXTRACTION_DISTANCE_M
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import profile_hash

@@ -20,7 +20,7 @@ from autonomy.manager.tally import Tally
 from autonomy.manager.transition_table import OURS, PAPER_B, RULES, State
 from autonomy.missions.model import ForwardingMission, Options
 from autonomy.navigation.clothoid_path import PathRefused, drivable_path
-from autonomy.navigation.dubins import dubins_corners
+from autonomy.navigation.joining_path import dubins_corners
 from autonomy.process.jobs import ForwardingJob
 from can_dbc.messages.mission import MissionAction, MissionCommand
 from machine.loading.profile_file import profile_hash

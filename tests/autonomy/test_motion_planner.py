@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phase_motions import MACHINE_LEAN_M, approach_motion, carry_motion
+from autonomy.grasp.bunk_load import plan_place
 from autonomy.grasp.grapple_heights import hover_height_m, travel_height_m
-from autonomy.grasp.placement import plan_place
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion import motion_planner
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.clearance import MARGIN_M, clearance_reserve
 from autonomy.motion.motion_planner import MovementPrimitivePlanner, TimeOptimalPlanner
 from autonomy.motion.movement_primitives import load
 from autonomy.motion.obstacles import CollisionScene, collision_scene, held_log, tree_capsule
 from autonomy.motion.path_search import PathBlocked, plan_path
-from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel_over
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.loading.profile_file import load_profile
 from tests.codes import coded
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.motion.dmp import Dmp, learn
+from autonomy.motion.movement_primitives import Dmp, learn
 from runtime.errors import InputRefused
 from tests.codes import coded
 

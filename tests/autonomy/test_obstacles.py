@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize_scalar
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.clearance import clearances, least_clearance, motion_between_samples, segment_box, segment_segment
 from autonomy.motion.obstacles import (
     Box,
@@ -24,7 +24,7 @@ from autonomy.motion.obstacles import (
     swept_capsules,
     tree_capsule,
 )
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.loading.profile_file import load_profile
 from sim.wood.bunk import bunk_boxes as plant_boxes
 from sim.wood.bunk import to_bunk

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame
-from autonomy.perception.papers.paper_b import RunningAverage, box_in_picture, end_on_error_m, position_in_box
+from autonomy.perception.papers import RunningAverage, box_in_picture, end_on_error_m, position_in_box
 from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics
 
 PIN = Intrinsics(1280, 720, 530.0, 530.0, 640.0, 360.0)

@@ -10,13 +10,12 @@ import pytest
 
 from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.motion import clearance
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.clearance import clearance_reserve, clearances
 from autonomy.motion.obstacles import Capsule, CollisionScene, HeldLog, collision_scene, swept_capsules, tree_capsule
 from autonomy.motion.path_search import PathBlocked, plan_path
-from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, slow_line, travel_over
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile

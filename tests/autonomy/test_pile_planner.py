@@ -11,15 +11,15 @@ import pytest
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.grasp_verification import is_at_target
 from autonomy.crane_job.phases import Phase
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.pile_planner import DEPTHS_M, FAILED_RADIUS_M, PilePlanner
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Bunk

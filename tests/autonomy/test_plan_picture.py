@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from autonomy.grasp.cnn_planner import CnnPlanner
+from autonomy.grasp.cnn_planner import GAP_PX, GRASP_RGB, QUALITY_RGB, ZOOM, CnnPlanner, write_plan
 from autonomy.grasp.network import PixelGrasp
-from autonomy.grasp.plan_picture import GAP_PX, GRASP_RGB, QUALITY_RGB, ZOOM, write_plan
 from autonomy.grasp.planner import GraspRequest
 from tests.autonomy.grasp_scenes import ARM, Chosen, pair
 

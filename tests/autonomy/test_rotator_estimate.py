@@ -12,9 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.load_view import load_view
-from autonomy.crane_job.rotator_estimate import SCALE_BOUNDS, RotatorEstimate, has_no_encoder, planning_profile
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.crane_job.rotator_estimate import (
+    SCALE_BOUNDS,
+    RotatorEstimate,
+    has_no_encoder,
+    load_view,
+    planning_profile,
+)
+from autonomy.perception.log_list import LogObservation
 from machine.geometry.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash

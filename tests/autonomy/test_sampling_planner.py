@@ -10,16 +10,14 @@ import pytest
 
 from autonomy.grasp.cylinders import as_cylinders, default_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import hover_height_m
-from autonomy.grasp.grasp import restricted_to
 from autonomy.grasp.jaws import jaws_of
-from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
+from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp, restricted_to
 from autonomy.grasp.quality import LAYER_RULE, STRICT_RULE, CaptureRule, blade_sections, rests_upon, score_grasps
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection, select_direct
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.estimate import LogEstimate
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogEstimate, LogObservation
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile
 from runtime.errors import InputRefused

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, default_covariance
 from autonomy.grasp.settled_poses import CONTACT_OVERLAP_M, settled_poses, surface_gaps
-from autonomy.perception.log_list.estimate import ACROSS_2, RADIUS, TILT_2
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import ACROSS_2, RADIUS, TILT_2, LogObservation
 from tests.autonomy.grasp_scenes import GROUND, log, small_pile
 
 WELL = np.array([0.012, 0.018, 0.007, 0.017, 0.02, 0.03, 0.005])

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.camera.mount import optical_pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.camera.frame import RgbdFrame, optical_pose
+from autonomy.perception.log_list import LogObservation
 from autonomy.perception.shown_picture import OUTLINE, MeasuredPicture, NewestPicture
 from can_dbc.messages.picture import (
     MAX_DATAGRAM_BYTES,

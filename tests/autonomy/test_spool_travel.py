@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from autonomy.calibration import spool_travel
+from autonomy.calibration.plan import SpoolTask
 from autonomy.calibration.spool_program import REST_PCT, SpoolProgram, allowed_by
 from autonomy.calibration.spool_run import MonitoredSpoolRun
 from autonomy.calibration.spool_travel import MAX_LEGS, TOLERANCES, Leg, SpoolTravel
-from autonomy.calibration.tasks import SpoolTask
 from controller.crane.spool_test_run import MAX_OPEN_NS
 from controller.estimation.joint_monitors import SHAKEN_S_AT_LIMIT
 from machine.joints import Joint

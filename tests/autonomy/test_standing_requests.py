@@ -7,10 +7,9 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
-from autonomy.perception.log_list.datagrams import decode_logs, encode_request
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.driving_requests import StandingRequests
+from autonomy.perception.log_list import LogObservation, decode_logs, encode_request
 from autonomy.perception.shown_picture import NewestPicture
-from autonomy.perception.standing_requests import StandingRequests
 from can_dbc.messages.picture import decode_picture, encode_picture_request
 from runtime.errors import InputRefused
 from tests.codes import coded

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
 from autonomy.motion.trajectory import STEP_S, Trajectory, straight_line, within_limits
 from machine.geometry.kinematics import Unreachable, pin_position

@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 
 from autonomy.grasp.grapple_heights import travel_height_m
-from autonomy.motion.arm import Arm
-from autonomy.motion.arm_kinematics import STOP_MARGIN
-from autonomy.motion.pose import Pose
-from autonomy.motion.telescope import OUTER_RESERVE_M, fastest_extension, full_speed_times, with_fastest_extensions
+from autonomy.motion.arm_kinematics import (
+    OUTER_RESERVE_M,
+    STOP_MARGIN,
+    Arm,
+    Pose,
+    fastest_extension,
+    full_speed_times,
+    with_fastest_extensions,
+)
 from autonomy.motion.trajectory import Trajectory, hold, with_rotation
 from machine.geometry.kinematics import Unreachable
 from machine.joints import Joint

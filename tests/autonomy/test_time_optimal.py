@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
 from autonomy.motion.time_optimal import STEP_S, time_optimal_law
 from machine.joints import N_JOINTS

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.time_law import SWING_RAD
 from autonomy.motion.trajectory import (
     Trajectory,

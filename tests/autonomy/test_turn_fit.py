@@ -8,10 +8,10 @@ from math import pi
 import numpy as np
 import pytest
 
+from autonomy.calibration.plan import Findings
+from autonomy.calibration.procedure_state import MIN_FIRST_TURN_RAD
 from autonomy.calibration.result import identify
-from autonomy.calibration.rotator_turns import MIN_FIRST_TURN_RAD
 from autonomy.calibration.spool_program import PULSES, TURN_TOPS_PCT, allowed_by, turn_search
-from autonomy.calibration.tasks import Findings
 from autonomy.calibration.turn_fit import YAW_SIGMA_RAD, SideFit, Turn, TurnFit, fit_turns, pulse_to
 from controller.crane.spool_test_run import MAX_OPEN_UNSENSED_NS
 from machine.joints import Joint

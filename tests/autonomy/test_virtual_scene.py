@@ -15,8 +15,8 @@ from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet
 from autonomy.grasp.planner import GraspRequest, NoGrasp
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from machine.loading.profile_file import load_profile
 from runtime.errors import InputRefused
 from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, Chosen, X, Y, cross, log, pair, small_pile

@@ -7,11 +7,11 @@ from itertools import pairwise
 import pytest
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.grasp_recovery import MAX_REGRIPS_HIGHER
+from autonomy.crane_job.grasp_verification import MAX_REGRIPS_HIGHER
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import profile_hash

@@ -15,8 +15,7 @@ from can_dbc.bus.base import ERR_BUSOFF, ERR_RESTARTED, BusStats
 from can_dbc.bus.batch import Batch
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
-from can_dbc.bus.hardware_clock import DRIFT_PPM, HardwareClock
-from can_dbc.bus.receive_clock import ReceiveClock
+from can_dbc.bus.receive_clock import DRIFT_PPM, HardwareClock, ReceiveClock
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
 from can_dbc.messages.tick_record import BusReading, TickRecord, decode, encode
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from starlette.testclient import TestClient
 
-from can_dbc.messages.grasp import ChosenGrasp, encode_grasp
+from can_dbc.messages.mission import ChosenGrasp, encode_grasp
 from can_dbc.messages.picture import PictureFacts, PictureLog, encode_picture
 from console.access import VISITOR
 from console.camera import NO_CAMERA, NO_DETECTOR, NO_PICTURE, SILENT, SILENT_NS, WAITING, CameraState

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from autonomy.perception.log_list.datagrams import decode_logs, decode_request
+from autonomy.perception.log_list import decode_logs, decode_request
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.operator_link import credential_path

@@ -15,8 +15,7 @@ from starlette.testclient import TestClient
 
 from autonomy.missions.export import FORMATS
 from autonomy.missions.mission_file import load_mission
-from can_dbc.messages.mission import encode_mission
-from can_dbc.messages.mission_upload import decode_mission_upload
+from can_dbc.messages.mission import decode_mission_upload, encode_mission
 from console.console import Console
 from console.plan_api import MAX_BODY_BYTES
 from machine.loading.profile_file import load_profile, profile_hash

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 from starlette.testclient import TestClient
 
-from console.plant_view import create_plant_app
+from console.plant_link import create_plant_app
 
 ANSWERS = {"scene": {"title": "a plant"}, "view": {"time_s": 1.5}, "lever": {"ok": True}}
 

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 import pytest
 from starlette.testclient import TestClient
 
-from autonomy.perception.log_list.datagrams import encode_logs
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation, encode_logs
 from console.console import Console
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash

@@ -6,7 +6,7 @@ import pytest
 from controller.config import Settings
 from controller.laws.valve_map import ValveMap
 from machine.loading.profile_file import profile_hash
-from machine.motion_limits import SPEED_HEADROOM_SHARE
+from machine.profile import SPEED_HEADROOM_SHARE
 from machine.status.modes import Mode
 from tests.controller.bench import SETTINGS, SPECS, Bench
 from tests.controller.smooth_motion import GOALS, drive

@@ -2,7 +2,7 @@
 
 import pytest
 
-from can_dbc.messages.key_file import write_key
+from can_dbc.messages.envelope import write_key
 from can_dbc.messages.udp_address import address_argument
 from controller.config import load
 from controller.process.command import bus_address, main, parser

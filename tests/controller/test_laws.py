@@ -21,7 +21,7 @@ from controller.laws.joint import (
 )
 from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, Joint
-from machine.motion_limits import SPEED_HEADROOM_SHARE
+from machine.profile import SPEED_HEADROOM_SHARE
 from tests.controller.bench import PROFILE, SPECS, T
 
 SLEW = SPECS[0]

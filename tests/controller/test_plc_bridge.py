@@ -19,12 +19,12 @@ from can_dbc.plc.map import Command, Fault, Feedback, Grapple, Mode, Role, State
 from can_dbc.protocols.canopen import parse_heartbeat
 from can_dbc.protocols.e2e import Checker, Sender, Status
 from controller.crane.startup import Startup
+from controller.plc import __main__
 from controller.plc import __main__ as process
-from controller.plc import links
 from controller.plc.__main__ import summary
 from controller.plc.bridge import Bridge, role_of
 from controller.plc.handshake import Handshake
-from hil.plc.profile import write_plc_profile
+from hil.plc import write_plc_profile
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
 from machine.status.modes import Mode as ControllerMode
@@ -558,10 +558,10 @@ def test_a_machine_is_connected_again_after_every_loss(monkeypatch: pytest.Monke
     async def at_once(_: float) -> None:
         pass
 
-    monkeypatch.setattr(links.asyncio, "sleep", at_once)
+    monkeypatch.setattr(__main__.asyncio, "sleep", at_once)
     bridge, machine = Bridge(profile("valves"), DATABASE), Flaky()
     with pytest.raises(asyncio.CancelledError):
-        asyncio.run(links.MachineLink(bridge, machine).run())
+        asyncio.run(__main__.MachineLink(bridge, machine).run())
     lost = ["connect", "disconnect"], ["connect", "act", "observe", "act", "observe", "act", "observe", "disconnect"]
     assert machine.calls == [*lost[0], *lost[1], "connect", "act", "observe", "act", "observe"]
     shake = bridge.handshake

@@ -16,7 +16,7 @@ from controller.laws.valve_map import ValveMap
 from controller.process.tick_recording import record, restore_inputs, transmitted
 from controller.step import Controller, step
 from controller.tick import Inputs
-from machine.motion_limits import SPEED_HEADROOM_SHARE
+from machine.profile import SPEED_HEADROOM_SHARE
 from machine.status.modes import Mode
 from tests.controller.bench import AORO, DATABASE, GNSS, MACHINE, MS, SETTINGS, SPECS, Bench, T
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from machine.status.explanation import message_id
 from machine.status.faults import FAULTS
 from machine.status.reasons import Reaction, Reason, pack
-from recorder.journal import stop_fields
-from recorder.stop import Stop
+from recorder.__main__ import stop_fields
+from recorder.stop_recorder import Stop
 
 CATALOG = Path(__file__).parents[2] / "deploy/system/timberhand.catalog"
 

@@ -17,10 +17,9 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planner import GraspRequest, NoGrasp
 from autonomy.grasp.planners import PlannerChoice
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.motion.arm import Arm
-from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.camera.mount import optical_pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.camera.frame import RgbdFrame, optical_pose
+from autonomy.perception.log_list import LogObservation
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.plc.machine import MACHINES
@@ -34,7 +33,7 @@ from experiments.common.plugins import LOG_DETECTORS
 from experiments.loop_design.study import CaseSet, study
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
-from hil.plc.profile import write_plc_profile
+from hil.plc import write_plc_profile
 from machine.loading.profile_file import ProfileError, load_profile, profile_file, profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode

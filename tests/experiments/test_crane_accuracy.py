@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.trajectory import straight_line
 from can_dbc.messages.crane import CraneSetpoint, StateReport
 from can_dbc.messages.datagrams import decode

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import make_result

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from autonomy.manager.checkpoint import Checkpoint, mission_digest
-from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
+from autonomy.manager.checkpoint import Checkpoint, CheckpointFile, mission_digest, read_checkpoint
 from autonomy.manager.tally import Load, LoadedLog, Tally
 from autonomy.missions.mission_file import read as read_mission
 from autonomy.missions.mission_file import verify
@@ -39,8 +38,7 @@ from controller.guard.guard import Guard
 from controller.guard.layout import GuardConfigError, read_layouts
 from machine.draft.from_urdf import answers_from_urdf
 from machine.loading.profile_file import load_profile
-from recorder.mcap_scan import is_complete, scan
-from recorder.recover import recover
+from recorder.recover import is_complete, recover, scan
 from runtime.errors import ConfigError, InputRefused
 from sim.draft.truth import crane_urdf
 from sim.truth.load import load_truth

@@ -19,16 +19,20 @@ from can_dbc.messages.crane import (
 )
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused, is_operator_command
-from can_dbc.messages.grasp import ChosenGrasp, decode_grasp, encode_grasp
 from can_dbc.messages.mission import (
+    ChosenGrasp,
     MissionAction,
     MissionCommand,
+    MissionUpload,
+    decode_grasp,
     decode_mission,
     decode_mission_command,
+    decode_mission_upload,
+    encode_grasp,
     encode_mission,
     encode_mission_command,
+    encode_mission_upload,
 )
-from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload, encode_mission_upload
 from can_dbc.messages.record_ring import MAGIC as RING_MAGIC
 from can_dbc.messages.record_ring import RecordRing, RingReader
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport

@@ -23,8 +23,7 @@ from controller.laws.valve_map import ValveMap
 from hil.harness.lockstep import SLICE_NS, Lockstep, Observer
 from hil.wire.faults import FOREVER_NS, Fault, Kind
 from machine.joints import JOINTS
-from machine.motion_limits import SPEED_HEADROOM_SHARE
-from machine.profile import joint
+from machine.profile import SPEED_HEADROOM_SHARE, joint
 from machine.status.modes import Mode
 from sim.kinematic.machine import KinematicMachine
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 import machine
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, straight_line
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 import machine
+from autonomy.calibration.plan import SpoolTask
 from autonomy.calibration.procedure import Calibration
-from autonomy.calibration.tasks import SpoolTask
 from experiments.calibration.trial import calibrated
 from experiments.common.pool import Job
 from hil.calibration.crane import run_lockstep

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from autonomy.grasp.planners import PlannerChoice
 from hil.demo.lockstep import run_lockstep
-from hil.plc.profile import write_plc_profile
+from hil.plc import write_plc_profile
 from host.exit_codes import ExitCode
 
 

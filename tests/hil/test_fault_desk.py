@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hil.faults import desk
-from hil.faults.desk import OFFERS, Desk, answer
+from hil.faults import __main__
+from hil.faults.__main__ import OFFERS, Desk, answer
 from hil.faults.order import Order, parse
 from hil.faults.table import FAULTS
 from hil.harness.live import ADDRESSES
@@ -32,7 +32,7 @@ def injected(monkeypatch: pytest.MonkeyPatch) -> list[Order]:
         found.append(order)
         return "begun"
 
-    monkeypatch.setattr(desk, "inject", inject)
+    monkeypatch.setattr(__main__, "inject", inject)
     return found
 
 

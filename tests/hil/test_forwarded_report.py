@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 from autonomy.manager.tally import Load, LoadedLog
 from autonomy.missions.model import ForwardingMission, Landing, Point
-from hil.missions.forwarded_report import report_loads
+from hil.missions.summary import report_loads
 from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")

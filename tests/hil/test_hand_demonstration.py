@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.demonstration import joint_track, segment_motions
 from autonomy.motion.movement_primitives import SHIPPED_FOLDER, is_near_bunk, learn_primitives
 from can_dbc.dbc.codec import load as load_database

@@ -12,7 +12,7 @@ from autonomy.grasp.pile_planner import PilePlanner
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
+from autonomy.manager.checkpoint import CheckpointFile, read_checkpoint
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options
 from hil.harness.display import Display

@@ -13,7 +13,7 @@ from autonomy.localization.local_plane import LocalPlane
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.transition_table import OURS
 from autonomy.missions.model import ForwardingMission, Point
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import ForwardingJob, Job, SingleLogJob
 from can_dbc.messages.crane import ModeSwitch, StateReport
 from can_dbc.messages.vehicle import VehicleReport

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console as Screen
 
-from autonomy.perception.log_list.datagrams import decode_logs, encode_request
+from autonomy.perception.log_list import decode_logs, encode_request
 from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.vehicle import VehicleReport

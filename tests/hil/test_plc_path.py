@@ -18,8 +18,7 @@ from controller.guard.__main__ import build as build_guard
 from controller.guard.guard import Verdict
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
-from hil.plc.bridged_plant import BridgedPlant, Transport
-from hil.plc.profile import write_plc_profile
+from hil.plc import BridgedPlant, Transport, write_plc_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from sim.plc.program import Inputs

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from can_dbc.bus.base import ERR_ACK, ERR_BUSOFF, ERR_CRTL, ERR_RESTARTED, BusState
 from can_dbc.frame import ERROR, EXTENDED, Frame
-from hil.wire.core import Node, WireCore
+from hil.wire.core import Node, WireCore, frame_bits, priority
 from hil.wire.faults import Fault, Kind
 from hil.wire.inprocess import InProcessBus
-from hil.wire.stuffing import frame_bits, priority
 from runtime.errors import InputRefused
 from tests.codes import coded
 

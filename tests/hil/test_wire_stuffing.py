@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from can_dbc.frame import EXTENDED, REMOTE
-from hil.wire.stuffing import frame_bits, priority
+from hil.wire.core import frame_bits, priority
 
 STANDARD = st.integers(0, 0x7FF)
 KEYS = STANDARD | st.integers(0, 0x1FFF_FFFF).map(lambda i: i | EXTENDED)

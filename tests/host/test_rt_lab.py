@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from host.rt_lab import guest, package
+from host.rt_lab import guest, host
 from host.rt_lab.host import EXPECTED, POSITIVE, evaluate
 
 GOOD: dict[str, Any] = {
@@ -42,4 +42,4 @@ def test_each_check_can_fail(name: str, value: object) -> None:
 
 
 def test_guest_and_host_name_the_same_modules() -> None:
-    assert guest.MODULES == package.MODULES
+    assert guest.MODULES == host.MODULES

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from host.vcan_lab import guest, shim
+from host.vcan_lab import guest, uml
 from host.vcan_lab.choose import HostFacts, choose
 from host.vcan_lab.spec import LabError
 from tests.codes import coded
@@ -62,15 +62,15 @@ def test_a_requested_kernel_is_the_only_method() -> None:
 
 
 def test_only_a_cpu_with_amx_needs_the_shim() -> None:
-    assert shim.needed("model\t: x\nflags\t\t: fpu amx_tile avx\nbugs\t: y\n")
-    assert not shim.needed("flags\t\t: fpu avx512f\nbugs\t: amx_tile\n")
-    assert not shim.needed("")
+    assert uml.needed("model\t: x\nflags\t\t: fpu amx_tile avx\nbugs\t: y\n")
+    assert not uml.needed("flags\t\t: fpu avx512f\nbugs\t: amx_tile\n")
+    assert not uml.needed("")
 
 
 def test_without_a_compiler_the_shim_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(LabError, check=coded("lab.no-compiler")):
-        shim.library(tmp_path)
+        uml.library(tmp_path)
 
 
 def test_kernel_workers_that_end_meanwhile_do_not_end_the_guest(

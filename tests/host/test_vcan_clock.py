@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 import host.vcan_lab.__main__ as lab_command
-from host.vcan_lab import choose, clock, lab_kernel
-from host.vcan_lab.choose import Method
-from host.vcan_lab.clock import MAX_GAP_NS, MAX_LOST_SHARE, LostTime, choose_clock
+from host.vcan_lab import choose, uml
+from host.vcan_lab.choose import MAX_GAP_NS, MAX_LOST_SHARE, LostTime, Method, choose_clock
 from host.vcan_lab.spec import DEFAULT_MEM_MB
 from timberhand.commands.runs import DETECTOR_MEM_MB, Backend, ClockChoice, enter_lab
 
@@ -34,7 +33,7 @@ def test_a_host_that_takes_too_much_gets_simulated_time(
     chosen = choose_clock(lost, kernel)
     assert (chosen.kind, chosen.enough) == (kind, enough)
     assert lost.words() in chosen.reason
-    assert enough or lab_kernel.MISSING in chosen.reason
+    assert enough or uml.MISSING in chosen.reason
 
 
 @pytest.mark.parametrize(
@@ -58,8 +57,8 @@ def test_the_command_enters_the_lab_with_that_clock_and_says_so(
     monkeypatch.setattr(sys, "argv", ["timberhand", "demo", "--bus", "vcan"])
     monkeypatch.setattr(lab_command, "vcan", lambda words, **more: entered.append((words, more)))
     monkeypatch.setattr(choose, "choose", lambda *_: Method("uml", "no CAN", "linux.uml"))
-    monkeypatch.setattr(lab_kernel, "find", lambda _: KERNEL)
-    monkeypatch.setattr(clock, "measure", lambda: lost)
+    monkeypatch.setattr(uml, "find", lambda _: KERNEL)
+    monkeypatch.setattr(choose, "measure", lambda: lost)
     enter_lab(Backend.VCAN, choice)
     assert [more for _, more in entered] == [{"time_travel": simulated, "mem": DEFAULT_MEM_MB}]
     said = capsys.readouterr().err

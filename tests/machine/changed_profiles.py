@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import machine
-from machine.loading.problem import Problem
 from machine.loading.profile_file import ProfileError, load_profile
+from machine.loading.structure import Problem
 
 FOLDER = Path(machine.__file__).parent
 SHIPPED = FOLDER / "palms_471.toml"

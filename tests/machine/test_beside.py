@@ -8,7 +8,7 @@ import pytest
 
 from controller.guard.__main__ import build, profile_path
 from controller.guard.layout import GuardConfigError
-from machine.loading.beside import carry_envelope
+from machine.loading.profile_file import carry_envelope
 from tests.codes import coded
 from tests.machine.own_machine import NAME, made
 

@@ -10,8 +10,8 @@ import pytest
 
 from machine.draft.answers import answers_of
 from machine.draft.from_urdf import answers_from_urdf
-from machine.draft.profile_text import profile_text
 from machine.draft.questions import Question, answers_text, example, merged, put, questions
+from machine.draft.toml_text import profile_text
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 from runtime.errors import InputRefused

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from autonomy.localization.local_plane import LocalPlane
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.grasp import ChosenGrasp, encode_grasp
-from can_dbc.messages.mission import encode_mission
+from can_dbc.messages.mission import ChosenGrasp, encode_grasp, encode_mission
 from can_dbc.messages.picture import PictureFacts, encode_picture
 from machine.foxglove.topics import MachineTopics
 from machine.geometry import carrier

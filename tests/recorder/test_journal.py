@@ -8,9 +8,9 @@ from pathlib import Path
 
 from machine.status.explanation import message_id
 from machine.status.reasons import Reason, pack
-from recorder import journal
+from recorder import __main__
 from recorder.__main__ import write_to_journal
-from recorder.stop import Stop
+from recorder.stop_recorder import Stop
 from tests.codes import numbers_in
 
 STOP = Stop(
@@ -44,7 +44,7 @@ def fields_in(data: bytes) -> dict[str, str]:
 
 def test_a_value_with_a_line_feed_is_written_with_its_length() -> None:
     fields = {"MESSAGE": "two\nlines = 2", "PRIORITY": "3", "CODE": "a=b"}
-    assert fields_in(journal.encode(fields)) == fields
+    assert fields_in(__main__.encode(fields)) == fields
 
 
 def test_a_stop_has_its_identity_its_numbers_and_its_file(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_a_stop_has_its_identity_its_numbers_and_its_file(tmp_path: Path) -> Non
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(path))
         receiver.settimeout(5)
-        assert journal.send(journal.stop_fields(STOP, Path("/stops/4.mcap")), path)
+        assert __main__.send(__main__.stop_fields(STOP, Path("/stops/4.mcap")), path)
         got = fields_in(receiver.recv(65536))
     assert got["MESSAGE_ID"] == message_id(Reason.ENCODER_LOST)
     assert got["MESSAGE"] == f"STOP: {STOP.text}" and got["PRIORITY"] == "3"
@@ -62,8 +62,8 @@ def test_a_stop_has_its_identity_its_numbers_and_its_file(tmp_path: Path) -> Non
 
 
 def test_without_a_journal_the_text_goes_to_stderr(tmp_path: Path, monkeypatch, capfd) -> None:
-    assert not journal.send({"MESSAGE": "x"}, tmp_path / "none")
-    monkeypatch.setattr(journal.send, "__defaults__", (tmp_path / "none",))
+    assert not __main__.send({"MESSAGE": "x"}, tmp_path / "none")
+    monkeypatch.setattr(__main__.send, "__defaults__", (tmp_path / "none",))
     write_to_journal(STOP, Path("/stops/4.mcap"))
     assert capfd.readouterr().err == f"recorder: STOP: {STOP.text} /stops/4.mcap\n"
 
@@ -72,5 +72,5 @@ def test_a_reason_of_another_release_has_no_identity() -> None:
     import msgspec
 
     unknown = msgspec.structs.replace(STOP, reason=250, code="REASON_250", text="Unknown reason 250.")
-    fields = journal.stop_fields(unknown, Path("x"))
+    fields = __main__.stop_fields(unknown, Path("x"))
     assert "MESSAGE_ID" not in fields and fields["PRIORITY"] == "3" and "250" in fields["MESSAGE"]

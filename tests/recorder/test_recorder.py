@@ -15,12 +15,11 @@ from can_dbc.frame import Frame
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.trace.candump import read_trace
-from recorder import files
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module
-from recorder.mcap_scan import Channel, Stored, is_complete, scan
+from recorder import segment
 from recorder.recorder import CHUNK_NS, Recorder
-from recorder.recover import run_files
+from recorder.recover import Channel, Stored, is_complete, run_files, scan
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.recorder.recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
@@ -226,7 +225,7 @@ class FullDisk:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             return real(fd, data, offset)
 
-        monkeypatch.setattr(files.os, "pwrite", pwrite)
+        monkeypatch.setattr(segment.os, "pwrite", pwrite)
 
 
 def test_full_disk_at_start_is_refused(tmp_path, monkeypatch):

@@ -16,9 +16,8 @@ from can_dbc.messages.record_ring import RingReader
 from can_dbc.timing.page import TimingWriter
 from recorder import manifest as manifests
 from recorder.__main__ import InputCollector, udp_socket, write_all
-from recorder.mcap_scan import Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, Recorder
-from recorder.recover import recover
+from recorder.recover import Stored, is_complete, recover, scan
 from runtime.errors import InputRefused
 from tests.codes import coded, numbers_in
 from tests.recorder.recordings import PROFILE, T_NS, feed, manifest, record, tick

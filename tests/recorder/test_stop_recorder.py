@@ -19,12 +19,11 @@ from machine.status.explanation import StopDetector
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
 from recorder import manifest as manifests
-from recorder import stop_files
+from recorder import stop_recorder
 from recorder import stop_recorder as stop_recorder_module
-from recorder.mcap_scan import is_complete
 from recorder.recorder import TICK
-from recorder.stop import TOPIC, Stop, stop_from
-from recorder.stop_files import StopFiles, files_in, parts_in, repair
+from recorder.recover import is_complete
+from recorder.stop_recorder import TOPIC, Stop, StopFiles, files_in, parts_in, repair, stop_from
 from tests.codes import numbers_in
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 
@@ -150,7 +149,7 @@ def many_stops(directory: Path, stops: int) -> None:
 def test_the_oldest_files_make_room_and_the_numbers_tell_how_many(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stop_files, "MAX_FILES", 3)
+    monkeypatch.setattr(stop_recorder, "MAX_FILES", 3)
     many_stops(tmp_path, 5)
     assert [stop_of(path).number for path in files_in(tmp_path / "stops")] == [3, 4, 5]
     assert StopFiles(tmp_path / "stops", False).next_number == 6
@@ -161,11 +160,11 @@ def test_the_bytes_of_all_files_are_bounded_and_the_newest_stays(
 ) -> None:
     many_stops(tmp_path, 2)
     size = max(path.stat().st_size for path in files_in(tmp_path / "stops"))
-    monkeypatch.setattr(stop_files, "MAX_BYTES", int(2.5 * size))
+    monkeypatch.setattr(stop_recorder, "MAX_BYTES", int(2.5 * size))
     many_stops(tmp_path / "more", 0)
     run_with_a_stop(tmp_path / "third", after=20, stops=tmp_path / "stops")
     assert [stop_of(path).number for path in files_in(tmp_path / "stops")] == [2, 3]
-    monkeypatch.setattr(stop_files, "MAX_BYTES", 1)
+    monkeypatch.setattr(stop_recorder, "MAX_BYTES", 1)
     run_with_a_stop(tmp_path / "fourth", after=20, stops=tmp_path / "stops")
     assert [stop_of(path).number for path in files_in(tmp_path / "stops")] == [4]
 

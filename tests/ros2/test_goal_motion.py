@@ -17,9 +17,7 @@ from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from ros2.execution.execution import MotionCheck, TrajectoryExecution
-from ros2.execution.goal_motion import goal_motion
-from ros2.execution.goal_refused import GoalRefused
-from ros2.execution.tolerances import beyond, tolerances_of
+from ros2.execution.goal_motion import GoalRefused, beyond, goal_motion, tolerances_of
 from ros2.interfaces.control import ErrorCode, Goal
 from tests.codes import coded
 from tests.ros2.goals import NAMES, goal

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.camera.frame import RgbdFrame, optical_pose
 from can_dbc.messages.crane import StateReport
 from machine.geometry.grapple import grapple_yaw
 from machine.geometry.kinematics import chain_points
@@ -22,11 +21,18 @@ from machine.status.stale_inputs import STALE_INPUT_NAMES
 from ros2.execution.execution import Progress
 from ros2.interfaces.builtin import Quaternion, TransformStamped
 from ros2.interfaces.diagnostic import ERROR, OK, STALE, WARN
-from ros2.report.diagnostics import diagnostics
-from ros2.report.feedback import feedback_message
-from ros2.report.joint_states import joint_state
-from ros2.report.pictures import camera_info, colour_image, depth_image
-from ros2.report.transforms import camera_frame, moving_transforms, quaternion, static_transforms
+from ros2.report import (
+    camera_frame,
+    camera_info,
+    colour_image,
+    depth_image,
+    diagnostics,
+    feedback_message,
+    joint_state,
+    moving_transforms,
+    quaternion,
+    static_transforms,
+)
 from tests.codes import numbers_in
 from tests.ros2.test_goal_motion import report
 

@@ -11,11 +11,11 @@ import msgspec
 import sim.truth
 from machine.geometry import carrier as geometry
 from machine.loading.profile_file import load_profile
+from sim.bullet.body import JointDef, LinkDef, urdf_text
 from sim.bullet.client import new_client
-from sim.bullet.urdf import JointDef, LinkDef, urdf_text
 from sim.ground.terrain import Terrain
 from sim.mechanics.carrier import CARRIER_JOINTS, PARKED, Carrier, Drive, carrier_links
-from sim.truth.carrier import CarrierTruth
+from sim.truth.body import CarrierTruth
 
 STEP_S = 0.0025
 GRAVITY = 9.81

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from machine.loading.profile_file import load_profile
-from sim.instruments.ideal_detector import detect
+from sim.instruments import detect
 from sim.plant import Plant
 
 

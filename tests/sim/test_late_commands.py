@@ -12,9 +12,8 @@ import pytest
 from can_dbc.dbc.codec import Database, load
 from can_dbc.protocols.e2e import Sender, frame_crc
 from machine.loading.profile_file import load_profile
-from sim.nodes.arms import ArmNode, ArmState
+from sim.nodes.mach0 import ArmNode, ArmState, VehicleFault, VehicleNode
 from sim.nodes.valve import ExitCode, ValveInputs, ValveNode, ValveState
-from sim.nodes.vehicle import VehicleFault, VehicleNode
 
 MS = 1_000_000
 STEP_NS = 2_500_000

@@ -14,13 +14,13 @@ from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
 from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import Receiver, split_id
-from hil.wire.stuffing import frame_bits
+from hil.wire.core import frame_bits
 from machine.loading.profile_file import load_profile
 from machine.sensing.encoder import position_from_counts
 from sim.errors import PlantError
 from sim.nodes.valve import ValveState
 from sim.plant import Plant
-from sim.process.scene_view import scene_of, view_of
+from sim.process.live_plant import scene_of, view_of
 from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
 from tests.codes import coded

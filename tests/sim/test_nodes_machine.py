@@ -14,10 +14,18 @@ from can_dbc.frame import EXTENDED, identifier
 from can_dbc.protocols.e2e import Checker, Sender, Status
 from can_dbc.protocols.nmea2000 import frames, join_id, split_id
 from machine.loading.profile_file import load_profile
-from sim.nodes.arms import ArmNode, ArmState
-from sim.nodes.engine import EngineNode
-from sim.nodes.j1939 import CLAIM_PGN, NULL_ADDRESS, REQUEST_PGN
-from sim.nodes.vehicle import Gear, VehicleFault, VehicleNode, spool_for
+from sim.nodes.mach0 import (
+    CLAIM_PGN,
+    NULL_ADDRESS,
+    REQUEST_PGN,
+    ArmNode,
+    ArmState,
+    EngineNode,
+    Gear,
+    VehicleFault,
+    VehicleNode,
+    spool_for,
+)
 
 MACHINE = load("machine")
 CARRIER = load_profile("aoro_fc8").carrier

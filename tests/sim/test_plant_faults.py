@@ -11,11 +11,9 @@ import pytest
 from can_dbc.messages.crane import ModeSwitch
 from can_dbc.protocols.e2e import Checker, Status
 from machine.loading.profile_file import load_profile
+from sim import faults
 from sim.errors import PlantError
-from sim.faults import frame_tap
-from sim.faults.encoder_fault import EncoderFault
-from sim.faults.frame_tap import FrameTap
-from sim.faults.spool_faults import SpoolFaults
+from sim.faults import EncoderFault, FrameTap, SpoolFaults
 from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
 from sim.plant_faults import BEGINNERS, PlantFault, begin, database, message
@@ -103,11 +101,11 @@ def test_a_delayed_message_keeps_its_payload() -> None:
 
 
 def test_intermittent_and_slow_lose_frames_reproducibly() -> None:
-    def lost(effect: frame_tap.Effect) -> str:
+    def lost(effect: faults.Effect) -> str:
         return "".join("." if effect(b"x", 0) is None else "x" for _ in range(40))
 
-    assert lost(frame_tap.every(4)) == "...x" * 10
-    one, again = (lost(frame_tap.intermittent(Random(3), 0.5)) for _ in range(2))
+    assert lost(faults.every(4)) == "...x" * 10
+    one, again = (lost(faults.intermittent(Random(3), 0.5)) for _ in range(2))
     assert one == again and 5 < one.count(".") < 35
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from runtime.errors import TimberhandError
-from timberhand.reference import errors_page
+from timberhand.reference import __main__
 from timberhand.reference.__main__ import REPOSITORY
 
 
 def test_a_code_belongs_to_one_area_of_the_program() -> None:
     """Codes begin with their area; one area is one package, or the program's own commands about it."""
-    for code, places in errors_page.codes(REPOSITORY).items():
-        assert errors_page.CODE.fullmatch(code), code
+    for code, places in __main__.codes(REPOSITORY).items():
+        assert __main__.CODE.fullmatch(code), code
         assert len({taker for taker, _, _ in places}) <= 2, f"{code} is raised as {places}"
 
 

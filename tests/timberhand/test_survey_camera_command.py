@@ -12,7 +12,7 @@ import pytest
 from msgspec.structs import replace
 from typer.testing import CliRunner
 
-from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.camera.frame import optical_pose
 from host.exit_codes import CommandFailed, ExitCode
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile, profile_hash

@@ -24,7 +24,7 @@ from machine.status.explanation import sentence_of
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from recorder.stop_files import files_in
+from recorder.stop_recorder import files_in
 from tests.codes import numbers_in
 from tests.controller.bench import Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop

@@ -8,7 +8,7 @@ from rich.console import Console
 from autonomy.networks.graph import parameter_count
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import save
-from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector, box_net, decode_boxes
+from autonomy.perception.papers import SIZE_PX, BoxDetector, box_net, decode_boxes
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import picture

@@ -21,8 +21,19 @@ from autonomy.networks.torch_net import random_net
 from runtime.errors import InputRefused
 from tests.codes import coded
 from training.grasp import network_training
-from training.grasp.cornell import Sample, grouped_folds, load, paper_folds, rectangles
-from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, is_correct, wrapped
+from training.grasp.cornell import (
+    Rectangle,
+    Sample,
+    angle_between,
+    from_corners,
+    grouped_folds,
+    iou,
+    is_correct,
+    load,
+    paper_folds,
+    rectangles,
+    wrapped,
+)
 from training.grasp.views import View, central_view, label_maps, random_view, view_depth, visible_grasps
 
 CORNELL = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "cornell_rgbd_01"

@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 
 def test_sets_are_drawn_in_the_shares_of_the_card(folder):
-    from training.detection.masks.mixture import mixed
+    from training.detection.masks.mask_weights import mixed
 
     shot = (np.zeros((20, 40, 3), np.uint8), np.ones((20, 40), bool))
     bank, counts = mixed(folder, [shot])
@@ -52,7 +52,7 @@ def test_sets_are_drawn_in_the_shares_of_the_card(folder):
 
 
 def test_no_traced_pictures_are_a_coded_error(tmp_path):
-    from training.detection.masks.mixture import mixed
+    from training.detection.masks.mask_weights import mixed
 
     with pytest.raises(InputRefused, check=coded("dataset.no-traced")):
         mixed(tmp_path)
@@ -80,7 +80,7 @@ def test_the_command_writes_weights_card_and_checkpoint(folder):
 @pytest.mark.long
 def test_an_interrupted_training_continues_to_the_same_weights(folder):
     from training.detection.masks import run as training
-    from training.detection.masks.mixture import mixed
+    from training.detection.masks.mask_weights import mixed
 
     bank, _ = mixed(folder)
     plan = training.Run(batch=2, side_px=SIDE, seconds=math.inf, steps=2)

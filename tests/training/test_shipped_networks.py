@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autonomy.networks.weights import SHIPPED
-from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector
+from autonomy.perception.papers import SIZE_PX, BoxDetector
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from training.common.average_precision import box_overlaps
 from training.detection.detector_weights import box_of

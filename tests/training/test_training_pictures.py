@@ -9,7 +9,7 @@ from rich.console import Console
 
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import load, save
-from autonomy.perception.papers.box_detector import BoxDetector
+from autonomy.perception.papers import BoxDetector
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import unet

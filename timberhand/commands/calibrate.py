@@ -68,8 +68,7 @@ def calibrate(
     from autonomy.calibration.profile_file import lowered_gains, profile_changes, write_profile
     from autonomy.calibration.report import result_document, write_report
     from autonomy.calibration.result import identify
-    from machine.loading.beside import carry_envelope
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import ProfileError, carry_envelope, load_profile
     from runtime.errors import InputRefused
 
     try:
@@ -366,7 +365,7 @@ class _Progress:
 
     def show(self, calibration: Calibration) -> None:
         """Show the present state of the run."""
-        from autonomy.calibration.tasks import task_name
+        from autonomy.calibration.plan import task_name
 
         left = calibration.remaining_s()
         if calibration.waiting != self._waiting:

@@ -81,8 +81,7 @@ def console(
       timberhand console --replay runs/demo-1
     """
     from console.__main__ import serve
-    from console.exposure import Exposure
-    from console.start_error import StartError
+    from console.exposure import Exposure, StartError
     from host.exit_codes import CommandFailed, ExitCode
 
     if replay is not None:

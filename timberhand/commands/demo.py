@@ -140,7 +140,7 @@ def demo(
     """
     from rich.console import Console
 
-    from autonomy.crane_job.load_view import VEHICLE_LINKS
+    from autonomy.crane_job.rotator_estimate import VEHICLE_LINKS
     from machine.loading.profile_file import ProfileError, load_profile
 
     if lockstep:
@@ -209,7 +209,7 @@ def demo(
     kind = "lockstep" if lockstep else "paced" if paced else bus.value
     directory = out or new_directory(f"{kind}{'-plc' if plc else ''}-seed{seed}")
     if plc:
-        from hil.plc.profile import write_plc_profile
+        from hil.plc import write_plc_profile
 
         profile = str(write_plc_profile(profile, plc_role.value, directory))
     page = console_port if console else 0

@@ -77,7 +77,7 @@ def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool
 
 def _simulates() -> bool:
     """Whether the lab runs in simulated time; announced on stderr.  False where the lab is not user-mode Linux."""
-    from host.vcan_lab.clock import clock_here
+    from host.vcan_lab.choose import clock_here
 
     chosen = clock_here()
     if chosen is None:

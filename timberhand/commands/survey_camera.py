@@ -48,7 +48,7 @@ def survey_camera(
 
     from autonomy.calibration.profile_file import write_profile
     from autonomy.calibration.targets_file import load_targets
-    from autonomy.perception.camera.mount import link_pose
+    from autonomy.perception.camera.frame import link_pose
     from autonomy.perception.camera.survey import surveyed
     from controller.guard.__main__ import profile_path
     from machine.loading.profile_file import ProfileError, load_profile

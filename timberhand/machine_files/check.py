@@ -17,13 +17,13 @@ from controller.guard.__main__ import profile_path
 from controller.guard.envelope import SHIPPED, read_envelope
 from controller.guard.layout import GuardConfigError
 from controller.step import Controller
-from machine.draft.envelope_text import envelope_kinematics
+from machine.draft.toml_text import envelope_kinematics
 from machine.geometry.grapple import lowest_pin_m, lowest_tip_below_pin_m
 from machine.geometry.kinematics import Unreachable, solve
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from machine.profile import Profile
 from runtime.errors import ConfigError, InputRefused
-from sim.draft.consistency import truth_problems
+from sim.draft.truth import truth_problems
 from sim.individual import beside, split
 
 SAME_M: Final = 1e-3

@@ -10,9 +10,8 @@ from can_dbc.dbc.codec import load
 from controller.crane.startup import TPDO1
 from host.exit_codes import CommandFailed, ExitCode
 from machine.draft.answers import Answers, answers_of
-from machine.draft.envelope_text import envelope_text
-from machine.draft.profile_text import profile_text
 from machine.draft.questions import answers_text
+from machine.draft.toml_text import envelope_text, profile_text
 from machine.loading.profile_file import ProfileError, load_profile
 from runtime.errors import InputRefused
 from sim.draft.truth import truth_and_urdf

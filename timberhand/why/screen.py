@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from machine.status.evidence import EVIDENCE
 from machine.status.reasons import Reason
-from recorder.stop import Stop
+from recorder.stop_recorder import Stop
 from timberhand.why.stops import FoundStop
 from timberhand.why.timeline import Event
 

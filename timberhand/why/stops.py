@@ -25,9 +25,7 @@ from host.exit_codes import CommandFailed, ExitCode
 from machine.status.explanation import StopDetector
 from recorder.manifest import Manifest
 from recorder.recorder import STOPS_NAME, TICK
-from recorder.stop import TOPIC, Stop, report_of, stop_from
-from recorder.stop_files import files_in, parts_in
-from recorder.stop_recorder import AFTER_NS, BEFORE_NS
+from recorder.stop_recorder import AFTER_NS, BEFORE_NS, TOPIC, Stop, files_in, parts_in, report_of, stop_from
 from runtime.errors import InputRefused
 
 SERVICE_RECORDINGS: Final = Path("/var/lib/timberhand")

@@ -32,7 +32,7 @@ from machine.crane_nodes import NODE_NAMES
 from machine.status.explanation import explain
 from machine.status.modes import STOPPED, Mode
 from machine.status.reasons import known
-from recorder.stop import report_of
+from recorder.stop_recorder import report_of
 
 BEFORE_S: Final = 2.0
 """Events of this time before the stop are listed."""

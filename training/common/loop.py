@@ -21,12 +21,11 @@ from typing import Any, Final
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
 from autonomy.networks.graph import Network
 from autonomy.networks.torch_net import TorchNet, random_net
 from runtime.errors import InputRefused
-from training.common.progress import progress_bar
 
 Batch = tuple[torch.Tensor, ...]
 WARM_UP_SHARE: Final = 0.05
@@ -182,3 +181,12 @@ def _read_checkpoint(
     net.load_state_dict(kept["net"])
     optimiser.load_state_dict(kept["optimiser"])
     return list(kept["losses"])
+
+
+# -- Progress bars of trainings, on stderr.
+
+
+def progress_bar(console: Console, *extra: ProgressColumn) -> Progress:
+    """A bar with description, count and remaining time that vanishes at the end."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), *extra)
+    return Progress(*columns, console=console, transient=True)

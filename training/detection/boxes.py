@@ -12,7 +12,7 @@ from rich.console import Console
 from torch.nn import functional as F
 
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.papers.box_detector import STRIDE, box_net, network_input
+from autonomy.perception.papers import STRIDE, box_net, network_input
 from training.common.loop import Schedule, initialised, stacked, train
 from training.detection.augmentation import augmented
 from training.detection.segmentation import Picture

@@ -11,14 +11,13 @@ import numpy as np
 from rich.console import Console
 
 from autonomy.networks.weights import load
-from autonomy.perception.papers.box_detector import box_net
+from autonomy.perception.papers import box_net
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import CHANNELS, unet
 from runtime.errors import InputRefused
 from training.common.average_precision import Matches, average_precision, box_overlaps, curve, mask_overlaps
-from training.common.loop import Schedule
+from training.common.loop import Schedule, progress_bar
 from training.common.model_card import Card, write
-from training.common.progress import progress_bar
 from training.detection import boxes
 from training.detection.segmentation import CROPS, run
 from training.pictures import shards

@@ -26,9 +26,8 @@ from autonomy.perception.segmentation.segment_merging import (
 )
 from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES
 from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, Foreground, Segment
-from training.common.loop import Schedule, train
+from training.common.loop import Schedule, progress_bar, train
 from training.common.model_card import Card, write
-from training.common.progress import progress_bar
 from training.pictures.labels import IGNORED
 from training.pictures.shards import SHARD, pictures, shard
 

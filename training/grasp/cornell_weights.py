@@ -12,9 +12,8 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER, GraspNet
 from training.common.model_card import Card, write
 from training.grasp import network_training
-from training.grasp.cornell import Sample
+from training.grasp.cornell import Rectangle, Sample, is_correct
 from training.grasp.network_training import BATCH, LEARNING_RATE, VIEWS_PER_SAMPLE
-from training.grasp.rectangles import Rectangle, is_correct
 from training.grasp.views import central_view, view_depth, visible_grasps
 
 

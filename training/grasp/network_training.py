@@ -21,8 +21,7 @@ from autonomy.grasp.network import HEADS, PAPER, POOL, GraspMaps, best_pixel, no
 from autonomy.networks.graph import Conv, Network
 from autonomy.networks.torch_net import TorchNet, random_net
 from training.common.loop import Schedule, channels_last, train
-from training.grasp.cornell import Sample
-from training.grasp.rectangles import Rectangle, is_correct
+from training.grasp.cornell import Rectangle, Sample, is_correct
 from training.grasp.views import SIDE_PX, View, central_view, label_maps, random_view, view_depth, visible_grasps
 
 VIEWS_PER_SAMPLE: Final = 10

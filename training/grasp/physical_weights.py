@@ -22,7 +22,7 @@ from autonomy.grasp.quality import rests_upon
 from autonomy.grasp.sampling_planner import CRANE_SIGMA_M, CRANE_SIGMA_RAD
 from autonomy.grasp.virtual_scene import CAMERA_HEIGHT_M, D435, SIDE_PX, operational_area, shortened_logs
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from sim.camera.scene import LogPose
 from training.common.model_card import Card, write
 from training.grasp import network_training

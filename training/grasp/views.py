@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from training.grasp.rectangles import Rectangle, wrapped
+from training.grasp.cornell import Rectangle, wrapped
 
 SIDE_PX: Final = 300
 ZOOM_RANGE: Final = (0.5, 1.0)

@@ -18,7 +18,7 @@ from hil.replay.recording import files_of, manifest_of, no_frames, tell_end
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile, encoders
-from recorder.mcap_scan import Stored, scan
+from recorder.recover import Stored, scan
 from runtime.errors import InputRefused
 
 _RAW: Final = struct.Struct("<IB3x8s")

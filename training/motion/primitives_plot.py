@@ -8,10 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.motion.demonstration import JointTrack
 from autonomy.motion.movement_primitives import Primitives, pose_track, split_by_direction
-from autonomy.motion.pose import Pose
 from machine.profile import Profile
 from runtime.plot_style import OIL, RUST, STEEL, sheet
 

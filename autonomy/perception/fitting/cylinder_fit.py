@@ -31,7 +31,7 @@ from autonomy.perception.fitting.cylinder import (
     outline_distance,
     pixel_rays,
 )
-from autonomy.perception.log_list.estimate import END, START
+from autonomy.perception.log_list import END, START
 from machine.geometry.optics import Intrinsics
 
 MAX_DEPTH_POINTS: Final = 80

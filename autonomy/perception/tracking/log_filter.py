@@ -18,7 +18,7 @@ from filterpy.kalman import InformationFilter
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.fitting.cylinder import across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
-from autonomy.perception.log_list.estimate import SIZE, LogEstimate, across
+from autonomy.perception.log_list import SIZE, LogEstimate, across
 
 STATES: Final = SIZE + 7  # with the scale of depth, three rotations and three shifts of the mount
 MAX_ACROSS_M: Final = 0.25  # between the middles of one log in two pictures, across its axis, beside the uncertainty

@@ -14,8 +14,8 @@ from dataclasses import replace
 import pytest
 
 from autonomy.__main__ import main
-from autonomy.perception.log_list.datagrams import decode_request
-from autonomy.process.exit_codes import BUSY, CONFIGURATION, FAILED, INTERRUPTED, SAFETY
+from autonomy.perception.log_list import decode_request
+from autonomy.process.command_line import BUSY, CONFIGURATION, FAILED, INTERRUPTED, SAFETY
 from can_dbc.messages.crane import CraneSetpoint
 from can_dbc.messages.datagrams import decode, encode
 from machine.loading.profile_file import load_profile

@@ -12,8 +12,7 @@ import pytest
 
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.driving_requests import DrivingRequests
-from autonomy.perception.log_list.datagrams import decode_logs, encode_request
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation, decode_logs, encode_request
 from autonomy.perception.shown_picture import NewestPicture
 from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
 from can_dbc.messages.picture import decode_picture, encode_picture_request

@@ -21,10 +21,12 @@ from can_dbc.messages.mission import (
     MissionAction,
     MissionCommand,
     MissionReport,
+    MissionUpload,
     decode_mission,
+    decode_mission_upload,
     encode_mission_command,
+    encode_mission_upload,
 )
-from can_dbc.messages.mission_upload import MissionUpload, decode_mission_upload, encode_mission_upload
 from machine.status.modes import Mode
 from tests.autonomy.mission_checks import EXAMPLES
 from tests.autonomy.mission_texts import collection, line

@@ -13,11 +13,12 @@ import pytest
 
 from autonomy.process.command_line import arguments
 from autonomy.process.planner_process import PlannerProcess
-from can_dbc.messages.grasp import ChosenGrasp, decode_grasp
 from can_dbc.messages.mission import (
+    ChosenGrasp,
     MissionAction,
     MissionCommand,
     MissionReport,
+    decode_grasp,
     decode_mission,
     encode_mission_command,
 )

@@ -13,7 +13,7 @@ from can_dbc.bus.base import BusStats
 from can_dbc.bus.batch import Batch
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
-from can_dbc.bus.hardware_clock import DRIFT_PPM
+from can_dbc.bus.receive_clock import DRIFT_PPM
 from can_dbc.frame import EXTENDED, REMOTE, Frame
 
 LIMIT = 1024

@@ -7,10 +7,10 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from can_dbc.messages.key_file import write_key
+from can_dbc.messages.envelope import write_key
 from hil.harness.live import HARDWARE_PRIORITY
 from hil.harness.processes import ProcessGroup, free_udp_ports
-from hil.wire.bitrates import BITRATES
+from hil.wire.core import BITRATES
 from tests.live.console.entries import note
 
 START_S = 60.0

@@ -18,11 +18,10 @@ from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
-from autonomy.perception.log_list.datagrams import decode_logs, encode_request
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation, decode_logs, encode_request
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.grasp import ChosenGrasp, encode_grasp
+from can_dbc.messages.mission import ChosenGrasp, encode_grasp
 from console.console import Console
 from console.server import create_app
 from hil.harness.processes import free_udp_ports

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.log_list import LogObservation
 from can_dbc.bus.base import Bus
 from can_dbc.dbc.codec import load
 from can_dbc.messages.crane import StateReport

@@ -20,7 +20,7 @@ from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import encode_mission
 from console.accounts import Accounts, Role
 from console.console import CommissionOptions, Console
-from console.plant_view import create_plant_app
+from console.plant_link import create_plant_app
 from console.replay_server import create_replay_app
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_file, profile_hash

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from console.accounts import Role, account_line
-from console.exposure import Exposure, check_local, is_local
-from console.start_error import StartError
+from console.exposure import Exposure, StartError, check_local, is_local
 from tests.codes import coded
 
 PASSWORD = "hemlock and spruce"

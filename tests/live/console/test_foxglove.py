@@ -30,8 +30,8 @@ from machine.foxglove.topics import MachineTopics
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from recorder.manifest import describe
-from recorder.mcap_scan import Channel, scan
 from recorder.recorder import Recorder
+from recorder.recover import Channel, scan
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.console.played_detector import detector
 from tests.console.state_reports import REPORT

@@ -2,7 +2,7 @@
 
 import json
 
-from can_dbc.messages.key_file import write_key
+from can_dbc.messages.envelope import write_key
 from controller.process.command import main
 from controller.process.warm_up import NullBus
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.messages.key_file import write_key
+from can_dbc.messages.envelope import write_key
 from host.exit_codes import CommandFailed, ExitCode
 from host.release import bundle as bundles
 from tests.codes import coded

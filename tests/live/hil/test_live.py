@@ -25,7 +25,7 @@ from hil.harness.live import ADDRESSES
 from hil.replay.recording import files_of
 from hil.replay.replay import recorded_ticks
 from host.exit_codes import ExitCode
-from host.vcan_lab.clock import clock_here
+from host.vcan_lab.choose import clock_here
 from machine.status.reasons import Reason
 from timberhand.why.timeline import reports_of
 

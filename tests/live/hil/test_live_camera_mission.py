@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab import uml
 from tests.hil.short_missions import mission_file
 
 ROOT = Path(__file__).parents[3]
@@ -32,8 +32,8 @@ LOGS = (
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("bus", ["wire", "vcan"])
 def test_six_logs_are_loaded_by_the_machines_own_camera(tmp_path: Path, bus: str, seed: int) -> None:
-    if lab_kernel.find(shim.user_cache()) is None:
-        pytest.skip(lab_kernel.MISSING)
+    if uml.find(uml.user_cache()) is None:
+        pytest.skip(uml.MISSING)
     path, out = mission_file(tmp_path / "mission.geojson", *LOGS), tmp_path / "run"
     done = subprocess.run(
         [

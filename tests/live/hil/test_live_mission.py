@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab import uml
 from tests.hil.short_missions import mission_file
 
 ROOT = Path(__file__).parents[3]
@@ -56,8 +56,8 @@ sys.exit(summary.exit_code)
 @pytest.mark.timeout(900)
 @pytest.mark.bears(math.inf)
 def test_a_log_is_loaded_although_the_planner_freezes_on_the_route(tmp_path: Path) -> None:
-    if lab_kernel.find(shim.user_cache()) is None:
-        pytest.skip(lab_kernel.MISSING)
+    if uml.find(uml.user_cache()) is None:
+        pytest.skip(uml.MISSING)
     path, out = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0)), tmp_path / "run"
     done = subprocess.run(
         [sys.executable, "-m", "host.vcan_lab", "--time-travel", "--", sys.executable, "-c", FROZEN, path, out],

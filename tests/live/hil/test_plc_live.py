@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.plc.profile import write_plc_profile
+from hil.plc import write_plc_profile
 from hil.wire.launch import wire_daemon
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from can_dbc.dbc.codec import load
 from can_dbc.plc.map import State
+from controller.plc.__main__ import UdpLink
 from controller.plc.bridge import Bridge
 from controller.plc.handshake import Handshake
-from controller.plc.links import UdpLink
-from hil.plc.profile import write_plc_profile
+from hil.plc import write_plc_profile
 from machine.loading.profile_file import load_profile
 from tests.live.sim.plc_server import LOOPBACK, ServedPlc
 

@@ -21,9 +21,9 @@ from can_dbc.bus.factory import kernel_has_can, open_bus
 from can_dbc.bus.wire_client import CONTROL, control, wire_directory
 from can_dbc.bus.wire_records import RECORD
 from can_dbc.frame import ERROR, EXTENDED, Frame
+from hil.wire.core import frame_bits
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
-from hil.wire.stuffing import frame_bits
 from runtime.errors import LinkError
 from tests.codes import coded
 

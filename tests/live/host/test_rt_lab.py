@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from host.rt_lab import package
+from host.rt_lab import host
 from host.rt_lab.host import missing
 from host.vcan_lab.spec import LabError
 from tests.codes import coded
@@ -22,7 +22,7 @@ def test_the_control_loop_runs_on_a_real_time_kernel_and_the_valves_are_neutral_
     if fault := missing():
         pytest.skip(f"rt lab: {fault}")
     try:
-        package.kernel_package(lambda _line: None)
+        host.kernel_package(lambda _line: None)
     except LabError as reason:
         pytest.skip(f"rt lab: {reason}")
     done = subprocess.run(
@@ -52,4 +52,4 @@ def test_a_package_without_a_kernel_is_refused(tmp_path: Path) -> None:
     except FileNotFoundError:
         pytest.skip("dpkg-deb is missing")
     with pytest.raises(LabError, check=coded("rt-lab.no-kernel")):
-        package.unpack(other, tmp_path / "kernel")
+        host.unpack(other, tmp_path / "kernel")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 
-from host.vcan_lab import clock
+from host.vcan_lab import choose
 
 
 def test_the_probe_sees_a_processor_that_others_use() -> None:
-    alone = clock.measure(0.3)
+    alone = choose.measure(0.3)
     assert 0.0 <= alone.share < 1.0 and alone.longest_ns >= 0
     last = max(os.sched_getaffinity(0))
     rivals = []
@@ -22,7 +22,7 @@ def test_the_probe_sees_a_processor_that_others_use() -> None:
                 while True:
                     pass
             rivals.append(pid)
-        assert clock.measure(0.5).share > alone.share
+        assert choose.measure(0.5).share > alone.share
     finally:
         for pid in rivals:
             os.kill(pid, 9)

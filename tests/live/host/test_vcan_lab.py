@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab import uml
 from host.vcan_lab.choose import survey
 from tests.live.host.lab_runs import LAB, REQUEST, ROOT, TIMEOUT_S, Run, environment, require_lab
 
@@ -130,8 +130,8 @@ def test_without_the_own_kernel_simulated_time_is_refused_in_one_sentence(tmp_pa
 
 
 def test_an_hour_of_simulated_time_is_short_and_reproducible() -> None:
-    if lab_kernel.find(shim.user_cache()) is None:
-        pytest.skip(lab_kernel.MISSING)
+    if uml.find(uml.user_cache()) is None:
+        pytest.skip(uml.MISSING)
     script = "import time; print(time.monotonic_ns()); time.sleep(3600); print(time.monotonic_ns() // 1000_000)"
     runs = [
         subprocess.run(

@@ -37,7 +37,7 @@ until [ -S /run/systemd/journal/socket ]; do sleep 0.05; done
 {sys.executable} -c '
 from pathlib import Path
 from recorder.__main__ import write_to_journal
-from recorder.stop import Stop
+from recorder.stop_recorder import Stop
 write_to_journal(Stop(number=4, at_ns=5, utc_ns=6, mode_before="ACTIVE", mode="STOP", reason=25 | 1 << 8,
     code="ENCODER_LOST", numbers=(20.0, 15.0, 0.0), text="{STOP_TEXT}"), Path("/stops/4.mcap"))
 '

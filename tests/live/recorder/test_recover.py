@@ -20,9 +20,8 @@ from can_dbc.messages import tick_record
 from can_dbc.messages.record_ring import RecordRing, RingReader
 from recorder import manifest as manifests
 from recorder.__main__ import FLUSH_PERIOD_S, InputCollector, udp_socket, write_all
-from recorder.mcap_scan import Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, TICK, Recorder
-from recorder.recover import recover
+from recorder.recover import Stored, is_complete, recover, scan
 from tests.recorder.recordings import PROFILE, T_NS, manifest
 
 

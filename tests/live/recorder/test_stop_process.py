@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from can_dbc.messages.record_ring import RecordRing
 from controller.process.tick_recording import record
-from recorder.stop_files import files_in, parts_in
+from recorder.stop_recorder import files_in, parts_in
 from tests.controller.bench import Bench
 from timberhand.cli import app
 

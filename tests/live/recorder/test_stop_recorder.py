@@ -12,8 +12,7 @@ import msgspec
 from can_dbc.messages.tick_record import decode
 from hil.replay.recording import messages
 from recorder.recorder import TICK
-from recorder.stop import TOPIC, Stop
-from recorder.stop_files import files_in, parts_in
+from recorder.stop_recorder import TOPIC, Stop, files_in, parts_in
 from tests.recorder.stopped_run import run_with_a_stop
 
 

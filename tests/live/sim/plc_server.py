@@ -10,8 +10,8 @@ from typing import Any, Self
 
 from can_dbc.plc.map import Command, Mode, Role, State, WordOrder, command_registers
 from machine.loading.profile_file import load_profile
+from sim.plc.__main__ import Datagrams, listen, serve
 from sim.plc.program import MOTION_ALLOWED, Inputs, Program
-from sim.plc.server import Datagrams, listen, serve
 
 HOME = (0.0, 0.75, -1.6, 0.3, 0.0)
 MOVE = Command(Mode.VALVES, True, (0.5, 0, 0, 0, 0, 0, 0))

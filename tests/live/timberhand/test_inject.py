@@ -16,7 +16,7 @@ from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import OperatorCommand
 from can_dbc.messages.datagrams import decode
-from can_dbc.messages.key_file import read_key, write_key
+from can_dbc.messages.envelope import read_key, write_key
 from hil.faults.live import LiveTarget, inject
 from hil.faults.order import make
 from hil.faults.wire_faults import BABBLE_KEY

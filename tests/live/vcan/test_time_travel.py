@@ -26,7 +26,7 @@ from can_dbc.trace.candump import read_trace
 from controller.config import load as load_settings
 from controller.guard.__main__ import PERIOD_NS as GUARD_PERIOD_NS
 from host.service_lab.pilot import LEASE_NS
-from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab import uml
 from host.vcan_lab.spec import VIRTUAL_START_NS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
@@ -110,8 +110,8 @@ def travel() -> Callable[..., subprocess.CompletedProcess[str]]:
     Compiles the packages first: a run that writes bytecode reads the clock more often than the next one, which finds
     it, and is some microseconds behind it ever after.
     """
-    if lab_kernel.find(shim.user_cache()) is None:
-        pytest.skip(lab_kernel.MISSING)
+    if uml.find(uml.user_cache()) is None:
+        pytest.skip(uml.MISSING)
     for package in ROOT.glob("*/__init__.py"):
         assert compileall.compile_dir(package.parent, quiet=1), package
 

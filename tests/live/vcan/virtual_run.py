@@ -17,7 +17,7 @@ from pathlib import Path
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.messages.crane import OperatorAction
-from can_dbc.messages.key_file import read_key, write_key
+from can_dbc.messages.envelope import read_key, write_key
 from host.service_lab.pilot import PERIOD_NS, Pilot
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode

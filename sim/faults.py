@@ -1,18 +1,20 @@
-"""Changes frames between the nodes and the bus: a node that is silent, repeats itself, babbles nonsense or is late.
-
-An effect gets the payload of a frame and returns the payload to send, or None.  It acts on one key of one bus until it
-is removed.  Pure: equal seeds and frames give equal bytes.
-"""
+"""What can be wrong with the emulated nodes: with their frames, an encoder's answers, a valve's spool."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from random import Random
 from typing import Any
 
 from can_dbc.dbc.codec import FrameRefused, MessageCodec
 from can_dbc.protocols.e2e import protect
+
+# -- Changes frames between the nodes and the bus: a node that is silent, repeats itself, babbles nonsense or is late.
+#
+# An effect gets the payload of a frame and returns the payload to send, or None.  It acts on one key of one bus
+# until it is removed.  Pure: equal seeds and frames give equal bytes.
 
 Sent = tuple[str, int, bytes]
 """Bus, key and payload of a frame to send."""
@@ -115,3 +117,56 @@ def rewritten(codec: MessageCodec, values: dict[str, Any]) -> Effect:
 def masqueraded(foreign_ids: bytes) -> Effect:
     """Another message's Data IDs under this identifier: a right checksum from a wrong sender."""
     return lambda data, now_ns: protect(data, data[1], foreign_ids)
+
+
+# -- What can be wrong with an encoder that still answers (docs/reference/safety.md section 5, cases 1 to 5).
+
+
+@dataclass(slots=True)
+class EncoderFault:
+    """Errors of the reading [rad, m], on top of the sensor's own.
+
+    ``frozen``: the last reading is repeated while the time stamp runs.  ``offset`` jumps, ``drift_per_s`` grows from
+    ``since_ns`` on, ``scale`` turns the reading about ``pivot`` (-1: wired the wrong way round), ``noise_factor``
+    multiplies the noise.
+    """
+
+    frozen: bool = False
+    offset: float = 0.0
+    drift_per_s: float = 0.0
+    since_ns: int = 0
+    scale: float = 1.0
+    pivot: float = 0.0
+    noise_factor: float = 1.0
+
+    def position(self, true: float, now_ns: int) -> float:
+        """The position that the faulty sensor sees."""
+        drifted = self.drift_per_s * (now_ns - self.since_ns) * 1e-9
+        return self.pivot + self.scale * (true - self.pivot) + self.offset + drifted
+
+
+# -- Valves that do not do what their node commands (docs/reference/safety.md section 5, cases 16 to 18).
+
+
+class SpoolFaults:
+    """Changes commands, -1..1 of the spool, by the name of their function.
+
+    ``stuck`` holds a spool wherever the node wants it, ``bias`` adds to the command (the spool drifts), ``gain``
+    multiplies it.  They are faults of the amplifiers: without
+    pilot pressure the springs centre the spools.
+    """
+
+    def __init__(self) -> None:
+        self.stuck: dict[str, float] = {}
+        self.bias: dict[str, float] = {}
+        self.gain: dict[str, float] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self.stuck or self.bias or self.gain)
+
+    def apply(self, names: Sequence[str], commands: Sequence[float]) -> list[float]:
+        """The commands that reach the spools; ``names`` in the order of ``commands``."""
+        out = list(commands)
+        for i, name in enumerate(names[: len(out)]):
+            out[i] = self.stuck.get(name, out[i] * self.gain.get(name, 1.0) + self.bias.get(name, 0.0))
+        return out

@@ -1,12 +1,9 @@
-"""The whole PLC path on virtual time with the interface of a plant: `hil.harness.lockstep` runs it as its plant.
-
-The path consists of the bridge (`controller.plc`), the wire format of either transport, and the emulated PLC
-(`sim.plc`).  Every 10 ms a command leaves as real bytes or registers; the PLC gets it one slice later, and the answer
-arrives another slice later, as on a quiet Ethernet.
-"""
+"""The whole PLC path on virtual time, and the profile of a machine with a PLC between crane0 and its valves."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from random import Random
 from typing import Final, Literal
 
@@ -15,9 +12,17 @@ from can_dbc.frame import Frame
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import encode_reply
 from can_dbc.plc.modbus import RegisterRefused
+from controller.guard.__main__ import profile_path
 from controller.plc.bridge import EXCHANGE_NS, Bridge, role_of
+from machine.loading.profile_file import carry_envelope
 from machine.profile import Profile
 from sim.plc.plant import PlcPlant
+
+# -- The whole PLC path on virtual time with the interface of a plant: `hil.harness.lockstep` runs it as its plant.
+#
+# The path consists of the bridge (`controller.plc`), the wire format of either transport, and the emulated PLC
+# (`sim.plc`).  Every 10 ms a command leaves as real bytes or registers; the PLC gets it one slice later, and the
+# answer arrives another slice later, as on a quiet Ethernet.
 
 Transport = Literal["modbus", "udp"]
 _CLIENT: Final = 1
@@ -79,3 +84,24 @@ class BridgedPlant(PlcPlant):
         if offer is None and not gate.session.number:
             return None
         return encode_reply(offer or gate.session.reply_header(now_ns), feedback)
+
+
+# -- The profile of a machine with a PLC between crane0 and its valves.
+
+PLC_DELAY_S: Final = 0.04
+"""Delay that bridge, exchange and PLC cycle add to every valve: 10 ms each way, and two cycles between."""
+_DELAY: Final = re.compile(r"^delay_s = ([0-9.]+)", re.MULTILINE)
+
+
+def write_plc_profile(name: str, role: Literal["references", "valves"], directory: Path) -> Path:
+    """Write ``NAME_plc.toml`` into a directory, from the name of a shipped profile or a file.
+
+    The valve delays of the joints grow by `PLC_DELAY_S`: the controller uses them to lead its references and to monitor
+    whether a joint follows its command.
+    """
+    text = _DELAY.sub(lambda found: f"delay_s = {float(found[1]) + PLC_DELAY_S:g}", profile_path(name).read_text())
+    directory.mkdir(parents=True, exist_ok=True)
+    path = directory / f"{Path(name).stem}_plc.toml"
+    path.write_text(f'{text}\n# The machine PLC on Ethernet\n[plc]\nrole = "{role}"\n')
+    carry_envelope(profile_path(name), directory)
+    return path

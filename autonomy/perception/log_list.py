@@ -1,16 +1,4 @@
-"""The log list's datagrams: a request for logs and the reply of a detector.
-
-The request is ``{"op":"logs","q":"..."}``.  ``q`` holds the joint positions [rad, m] in the order of ``Joint``, "nan"
-where a joint is not measured: a detector whose camera rides on the crane needs them.  For a camera of a machine that
-drives, ``"at_ns"`` and ``"standpoint"`` say where the machine is in the plane (`autonomy.perception.standpoint`), and
-``"load":true`` that its crane holds a load in front of the camera, which lies nowhere.  The reply is
-``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame,
-``{"plane": [...]}`` in that plane, or ``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the
-list), ``covariance`` may be missing, and ``seen`` is false when the log is remembered from an earlier picture.
-
-A list is accepted or refused as a whole.  It is refused for a number that is not finite, an axis without length, a log
-that is wider than long (the cause of paper A's only real failures), a negative variance, or a number used twice.
-"""
+"""What perception reports: log observations, their estimates with covariance, their datagrams."""
 
 from __future__ import annotations
 
@@ -20,13 +8,112 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import msgspec
+import numpy as np
 
-from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
 from autonomy.perception.standpoint import NUMBERS, Standpoint, from_numbers
 from machine.joints import N_JOINTS
 from runtime.errors import InputRefused
 
+# -- One log as the rest of the machine receives it from perception.
+
 _ROWS: Final = 7
+TRIANGLE: Final = _ROWS * (_ROWS + 1) // 2
+"""Numbers in the upper triangle of an observation's covariance."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogObservation:
+    """One log in the crane's base frame: centre [m], unit axis in either sense, length and diameter [m].
+
+    ``covariance`` is the upper triangle, row by row (``TRIANGLE`` numbers), of the covariance of a ``LogEstimate``;
+    None when it is unknown.  ``seen`` is True when the newest
+    picture shows the log and False when the log is remembered from an earlier picture.  A remembered log that hung in
+    the grapple is no longer where it was.
+    """
+
+    id: int
+    center_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    length_m: float
+    diameter_m: float
+    covariance: tuple[float, ...] | None = None
+    seen: bool = True
+
+
+# -- The estimate of one log: seven numbers and their covariance.
+
+ACROSS_1, ACROSS_2, TILT_1, TILT_2, START, END, RADIUS = range(7)
+SIZE: Final = 7
+
+
+@dataclass(frozen=True, slots=True)
+class LogEstimate:
+    """One log: centre (3,) [m] and unit axis (3,) in the crane's base frame, length and diameter [m].
+
+    ``covariance`` (7, 7) is that of errors in the order ACROSS_1, ACROSS_2 [m] (of the axis at the centre, along the
+    two directions of ``frame``), TILT_1, TILT_2 [rad] (of the axis towards these), START, END [m] (of the ends at
+    -length/2 and +length/2, along the axis), RADIUS [m].  ``ends_seen`` says which ends are visible, not cut off by the
+    edge of the picture or by something in front; the length is a lower bound unless both are.  ``score`` is in 0..1.
+    """
+
+    center_m: np.ndarray
+    axis: np.ndarray
+    length_m: float
+    diameter_m: float
+    covariance: np.ndarray
+    ends_seen: tuple[bool, bool] = (True, True)
+    score: float = 1.0
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """The two unit vectors (3,) across the axis to which the covariance refers: level, and up."""
+        return across(self.axis)
+
+    def position_sigma_m(self) -> np.ndarray:
+        """Standard deviation (3,) [m] of the centre: along ``frame``'s two directions and along the axis."""
+        c = self.covariance
+        along = 0.25 * (c[START, START] + c[END, END] + 2.0 * c[START, END])
+        return np.sqrt(np.maximum([c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along], 0.0))
+
+    def observation(self, number: int, seen: bool = True) -> LogObservation:
+        """The observation with this number; ``seen``: the newest picture shows the log."""
+        x, y, z = (float(v) for v in self.center_m)
+        ax, ay, az = (float(v) for v in self.axis)
+        # Four digits suffice, and a reply about a hundred logs must fit into one datagram.
+        known = tuple(float(f"{v:.4g}") for v in self.covariance[np.triu_indices(SIZE)])
+        length_m, diameter_m = float(self.length_m), float(self.diameter_m)
+        return LogObservation(number, (x, y, z), (ax, ay, az), length_m, diameter_m, known, seen)
+
+
+def unpack_covariance(triangle: tuple[float, ...]) -> np.ndarray:
+    """The covariance (7, 7) of a ``LogObservation``."""
+    upper = np.zeros((SIZE, SIZE))
+    upper[np.triu_indices(SIZE)] = triangle
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across a unit axis (3,): the first level (to the left of the axis), the second upward."""
+    up = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.95 else np.array([1.0, 0.0, 0.0])
+    level = np.cross(up, axis)
+    level /= np.linalg.norm(level)
+    return level, np.cross(axis, level)
+
+
+# -- The log list's datagrams: a request for logs and the reply of a detector.
+#
+# The request is ``{"op":"logs","q":"..."}``.  ``q`` holds the joint positions [rad, m] in the order of ``Joint``,
+# "nan" where a joint is not measured: a detector whose camera rides on the crane needs them.  For a camera of a
+# machine that drives, ``"at_ns"`` and ``"standpoint"`` say where the machine is in the plane
+# (`autonomy.perception.standpoint`), and ``"load":true`` that its crane holds a load in front of the camera, which
+# lies nowhere.  The reply is ``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in
+# the crane's base frame, ``{"plane": [...]}`` in that plane, or ``{"error": SENTENCE}``.  ``id`` is the log's
+# number (default: its index in the list), ``covariance`` may be missing, and ``seen`` is false when the log is
+# remembered from an earlier picture.
+#
+# A list is accepted or refused as a whole.  It is refused for a number that is not finite, an axis without length,
+# a log that is wider than long (the cause of paper A's only real failures), a negative variance, or a number used
+# twice.
+
 _DIAGONAL: Final = tuple(TRIANGLE - k * (k + 1) // 2 for k in range(_ROWS, 0, -1))
 _MIN_AXIS_NORM: Final = 1e-6
 

@@ -1,1 +1,0 @@
-"""What perception reports: log observations, their covariance, their datagrams."""

@@ -1,0 +1,236 @@
+"""The perception of papers A and B, implemented faithfully for comparison."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
+from autonomy.networks.openvino_net import OpenVinoNet
+from autonomy.networks.weights import SHIPPED, load
+from autonomy.perception.camera.frame import Pose, RgbdFrame
+from machine.geometry.optics import Intrinsics
+from runtime.errors import InputRefused
+
+# -- Paper A's perception (II-B), implemented faithfully: pose, length and diameter from a mask and a point cloud.
+#
+# The paper names the steps (masks of a segmentation network "coupled with a point-cloud obtained from a depth
+# camera are then combined to infer the length and diameter of the logs, and localize them") but gives no formulas.
+# This is their plainest reading: the centroid of the cloud is the centre, its first principal axis the axis, its
+# extents along the first and second principal axes are length and diameter.  The method takes the visible surface,
+# with its fattened edges, for the log.  When the diameter comes out greater than the length, the axis is 90 degrees
+# off; these are the paper's two failures (IV).
+
+MIN_POINTS: Final = 16
+
+
+@dataclass(frozen=True, slots=True)
+class LogCylinder:
+    """Centre (3,) [m] and unit axis (3,) in the optical frame, length and diameter [m]."""
+
+    center_m: np.ndarray
+    axis: np.ndarray
+    length_m: float
+    diameter_m: float
+
+
+def log_from_mask(frame: RgbdFrame, mask: np.ndarray) -> LogCylinder | None:
+    """The log of a mask (H, W) bool; None with fewer than ``MIN_POINTS`` points of known depth."""
+    v, u = np.nonzero(mask & np.isfinite(frame.depth_m))
+    if len(u) < MIN_POINTS:
+        return None
+    pin, z = frame.intrinsics, frame.depth_m[v, u].astype(float)
+    cloud = np.stack([(u - pin.cx_px) / pin.fx_px * z, (v - pin.cy_px) / pin.fy_px * z, z], axis=1)
+    center = cloud.mean(axis=0)
+    _, _, axes = np.linalg.svd(cloud - center, full_matrices=False)
+    along, across = ((cloud - center) @ axis for axis in axes[:2])
+    return LogCylinder(center, axes[0], float(np.ptp(along)), float(np.ptp(across)))
+
+
+# -- Paper B's vision node (3.2.3), implemented faithfully: a position from a box and the depth at its middle.
+#
+# The box comes from a detector that sees the picture letterboxed to 608 x 608 (3.2.2).  Depth is the mean over 8 x
+# 8 px at the middle of the box.  The pinhole model (equation 2) turns it into a point, the kinematic chain
+# transforms the point into the machine's frame, and estimates of one log are averaged.  The result is a point of
+# the surface that is seen through the middle of the box: near the log's middle when the log lies across the view,
+# and up to three decimetres short of it when the log is seen end-on.
+
+Box = tuple[float, float, float, float]
+
+DETECTOR_PX: Final = 608
+DEPTH_WINDOW_PX: Final = 8
+MAX_ASSOCIATION_M: Final = 1.5
+"""An estimate this close to an average belongs to it; the paper does not state it (assumed)."""
+
+
+def box_in_picture(box_px: Box, picture: Intrinsics) -> Box:
+    """A box (left, top, right, bottom) of the 608 x 608 letterbox in pixels of the original picture."""
+    letterbox = picture.letterbox(DETECTOR_PX)
+    scale = letterbox.inner.width_px / picture.width_px
+    left, top, right, bottom = box_px
+    at_u, at_v = letterbox.left_px, letterbox.top_px
+    return ((left - at_u) / scale, (top - at_v) / scale, (right - at_u) / scale, (bottom - at_v) / scale)
+
+
+def position_in_box(frame: RgbdFrame, box_px: Box) -> np.ndarray | None:
+    """Point (3,) [m] in the optical frame of the log in a box (left, top, right, bottom; edges of pixels).
+
+    None when none of the 8 x 8 px has depth or the middle of the box is outside the picture.
+    """
+    u, v = 0.5 * (box_px[0] + box_px[2]) - 0.5, 0.5 * (box_px[1] + box_px[3]) - 0.5
+    height, width = frame.depth_m.shape
+    if not (0.0 <= u <= width - 1 and 0.0 <= v <= height - 1):
+        return None
+    left, top = round(u - 0.5 * DEPTH_WINDOW_PX + 0.5), round(v - 0.5 * DEPTH_WINDOW_PX + 0.5)
+    window = frame.depth_m[max(0, top) : top + DEPTH_WINDOW_PX, max(0, left) : left + DEPTH_WINDOW_PX]
+    known = window[np.isfinite(window)]
+    return frame.intrinsics.deproject(u, v, float(known.mean())) if len(known) else None
+
+
+class RunningAverage:
+    """The averaged positions of the logs so far."""
+
+    def __init__(self, radius_m: float = 0.0, association_m: float = MAX_ASSOCIATION_M) -> None:
+        """``radius_m`` is added along the line of sight, from the surface to the middle (not in the paper)."""
+        self._radius_m, self._association_m = radius_m, association_m
+        self._sums: list[np.ndarray] = []
+        self._counts: list[int] = []
+
+    def add(self, frame: RgbdFrame, pose: Pose, boxes_px: list[Box]) -> None:
+        """Add the boxes of one frame."""
+        for box in boxes_px:
+            point = position_in_box(frame, box)
+            if point is None:
+                continue
+            base = pose.to_base(point * (1.0 + self._radius_m / float(np.linalg.norm(point))))
+            apart = [float(np.linalg.norm(s / n - base)) for s, n in zip(self._sums, self._counts, strict=True)]
+            if apart and min(apart) < self._association_m:
+                i = int(np.argmin(apart))
+                self._sums[i] = self._sums[i] + base
+                self._counts[i] += 1
+            else:
+                self._sums.append(base)
+                self._counts.append(1)
+
+    def positions_m(self) -> list[np.ndarray]:
+        """One position (3,) [m] for each log."""
+        return [s / n for s, n in zip(self._sums, self._counts, strict=True)]
+
+
+def end_on_error_m(
+    near_m: float, far_m: float, height_m: float, diameter_m: float, pitch_rad: float = 0.0
+) -> tuple[float, float]:
+    """Distance [m] by which the box's middle lies short of a log's middle, and above it, when the log is seen end-on.
+
+    Closed form.  The log lies on level ground along the line of sight, its ends ``near_m`` and ``far_m`` ahead of a
+    camera ``height_m`` above the ground that is pitched down by ``pitch_rad``.  The box extends from the lower edge of
+    the near end to the upper edge of the far end.  Equal steps in the picture are equal steps in inverse distance, so
+    the box's middle lies near the harmonic mean of the distances, and shows the upper surface (or, in a steeper view,
+    the near end).
+    """
+    top_m = height_m - diameter_m
+    rows = [math.tan(math.atan2(h, d) - pitch_rad) for h, d in ((height_m, near_m), (top_m, far_m))]
+    slope = math.tan(math.atan(0.5 * sum(rows)) + pitch_rad)
+    ahead_m = max(near_m, top_m / slope)
+    return 0.5 * (near_m + far_m) - ahead_m, height_m - slope * ahead_m - 0.5 * diameter_m
+
+
+# -- A box detector in the role of paper B's (3.2.2): a letterboxed picture of 608 x 608 px in, boxes of logs out.
+#
+# The paper uses YOLOv3 (62 million parameters).  This is a small network for the same task: at every eighth pixel
+# it predicts whether the middle of a log's box is there, and the distances of the box's sides.
+
+SIZE_PX: Final = 608
+STRIDE: Final = 8
+MIN_SCORE: Final = 0.05
+MAX_OVERLAP: Final = 0.75  # intersection over union of two logs' boxes: those of slanting neighbours overlap a lot
+SIDE_COUNT: Final = 4  # left, top, right, bottom: logarithms of distances in STRIDE
+
+
+def box_net() -> Network:
+    """The network: colour (3, H, W), about -1..1, in; ``boxes`` (5, H / 8, W / 8) out: a logit and four sides."""
+    layers: list[Layer] = []
+
+    def conv(name: str, out: int, stride: int = 1, dilation: int = 1) -> str:
+        layers.append(Conv(name, out, 3, stride, dilation, bias=False))
+        layers.extend((BatchNorm(f"{name}_norm"), Relu(f"{name}_relu")))
+        return f"{name}_relu"
+
+    conv("in2", 16, stride=2)
+    conv("in4", 32, stride=2)
+    conv("at4", 32)
+    conv("in8", 64, stride=2)
+    at8 = conv("at8", 64)
+    conv("in16", 96, stride=2)
+    conv("at16", 96)
+    conv("wide16", 96, dilation=2)
+    conv("wider16", 96, dilation=4)
+    layers.append(Conv("to8", 64, 1))
+    layers.append(Resize("to8_up", 2))
+    layers.append(Add("sum8", ("to8_up", at8)))
+    conv("out8", 64)
+    conv("more8", 64)
+    layers.append(Conv("boxes", 1 + SIDE_COUNT, 1))
+    return Network("log_boxes", 3, tuple(layers), ("boxes",))
+
+
+class BoxDetector:
+    """The detector with its weights (default: the shipped ones), on one thread.
+
+    Raises:
+        InputRefused: the weights are missing, damaged or of another network.
+    """
+
+    def __init__(self, weights: Path | None = None, precision: str = "f32") -> None:
+        network = box_net()
+        arrays, self.facts = load(weights or SHIPPED / "log_boxes.safetensors", network)
+        self._net = OpenVinoNet(network, arrays, (1, 3, SIZE_PX, SIZE_PX), precision)
+
+    def detect(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,),
+        descending.
+
+        Raises:
+            InputRefused: the picture has another size or type.
+        """
+        if rgb.shape != (SIZE_PX, SIZE_PX, 3) or rgb.dtype != np.uint8:
+            raise InputRefused(
+                "network.bad-picture",
+                f"the box detector needs letterboxed pictures of {SIZE_PX} x {SIZE_PX} px, uint8, not {rgb.dtype} of "
+                f"shape {rgb.shape}",
+            )
+        return decode_boxes(self._net(network_input(rgb)[None])["boxes"][0])
+
+
+def network_input(rgb: np.ndarray) -> np.ndarray:
+    """The network's input (3, H, W) float32 from a picture (H, W, 3) uint8."""
+    return np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32) * np.float32(1.0 / 127.5) - np.float32(1.0)
+
+
+def decode_boxes(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 4) [px] and scores (N,) of maps (5, h, w): local maxima after non-maximum suppression."""
+    score = 1.0 / (1.0 + np.exp(-maps[0]))
+    peak = (score >= MIN_SCORE) & (score == ndimage.maximum_filter(score, 3, mode="constant"))
+    y, x = np.nonzero(peak)
+    order = np.argsort(-score[y, x], kind="stable")
+    y, x = y[order], x[order]
+    middle = np.stack([x, y], axis=1) * STRIDE + 0.5 * STRIDE
+    sides = np.exp(np.clip(maps[1:, y, x].T, -4.0, 5.0)) * STRIDE
+    boxes = np.concatenate([middle - sides[:, :2], middle + sides[:, 2:]], axis=1)
+    boxes = np.clip(boxes, 0.0, (maps.shape[2] * STRIDE, maps.shape[1] * STRIDE) * 2)
+    kept: list[int] = []
+    for i in range(len(boxes)):
+        if not kept or _overlaps(boxes[i], boxes[kept]).max() < MAX_OVERLAP:
+            kept.append(i)
+    return boxes[kept], score[y[kept], x[kept]]
+
+
+def _overlaps(box: np.ndarray, others: np.ndarray) -> np.ndarray:
+    shared = np.prod(np.maximum(np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2]), 0.0), axis=1)
+    areas = np.prod(others[:, 2:] - others[:, :2], axis=1) + np.prod(box[2:] - box[:2])
+    return np.asarray(np.divide(shared, areas - shared, out=np.zeros_like(shared), where=areas > shared))

@@ -1,1 +1,0 @@
-"""The perception of papers A and B, implemented faithfully for comparison."""

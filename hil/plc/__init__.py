@@ -1,1 +1,0 @@
-"""The emulated PLC path between crane0 and the plant."""
