@@ -19,8 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from console.access_guards import ENTRY
-from console.audit import AuditLog
+from console.access_guards import ENTRY, AuditLog
 from console.exposure import Exposure, StartError, check_local
 from machine.loading.profile_file import ProfileError, load_profile, profile_check, profile_file, profile_hash
 from machine.profile import Profile

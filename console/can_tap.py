@@ -11,8 +11,7 @@ import contextlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Final
 
-from can_dbc.bus.base import Bus
-from can_dbc.bus.bitrates import BITRATES
+from can_dbc.bus.base import BITRATES, Bus
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.dbc.codec import Database, load

@@ -28,8 +28,8 @@ from can_dbc.messages.mission import (
     encode_mission_upload,
 )
 from console.access import Access, Page
+from console.access_guards import AuditLog
 from console.accounts import Accounts, Person, Role
-from console.audit import AuditLog
 from console.can_tap import CanTap
 from console.foxglove_server import FoxgloveServer
 from console.state import CraneState

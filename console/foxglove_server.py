@@ -21,7 +21,7 @@ from can_dbc.messages.json_schema import flat_schema
 from can_dbc.messages.mission import MissionReport
 from can_dbc.messages.vehicle import VehicleReport
 from console.camera import Camera
-from machine.foxglove.topics import ENCODING, MachineTopics, Message
+from machine.foxglove import ENCODING, MachineTopics, Message
 from machine.profile import Profile
 
 REPORT: Final = "/controller/report"

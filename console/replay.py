@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, Protocol
 
-from can_dbc.bus.bitrates import BITRATES
+from can_dbc.bus.base import BITRATES
 from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import StateReport

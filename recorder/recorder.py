@@ -8,7 +8,7 @@ stamp; the recorder has no clock.  Outputs, in one directory:
   16 bytes of the kernel's ``struct can_frame``, then the sender's name if it is known), ``/<bus>/<message>``
   (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.messages.tick_record``), ``/controller/report``,
   ``/timing`` (the controller's timing page) and ``/manifest`` (JSON), and what Foxglove and Lichtblick draw of the
-  machine (``machine.foxglove.topics``).
+  machine (``machine.foxglove``).
   Publish time is monotonic; log time is UTC if the manifest has it (live), else monotonic, too.
 * ``manifest.json``: see ``recorder.manifest``.
 * ``stops/``: a file for every stop of the machine, see ``recorder.stop_recorder``.
@@ -37,7 +37,7 @@ from can_dbc.messages.mission import decode_grasp, decode_mission
 from can_dbc.messages.picture import decode_picture
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
-from machine.foxglove.topics import ENCODING, MachineTopics, Message
+from machine.foxglove import ENCODING, MachineTopics, Message
 from machine.profile import Profile
 from recorder import manifest as manifests
 from recorder.manifest import Manifest

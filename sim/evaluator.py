@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from sim.geometry.shape import IDENTITY, Vector
+from sim.geometry import IDENTITY, Vector
 from sim.hydraulics.layout import PA_PER_BAR
 from sim.mechanics.crane import FLEX_JOINTS
 from sim.wood.bunk import to_bunk

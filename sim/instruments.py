@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from sim.camera.geometry import quaternion_matrix
-from sim.geometry.shape import Vector, quaternion_rpy
+from sim.geometry import Vector, quaternion_rpy
 from sim.plant import Plant
 from sim.truth.load import load_truth
 

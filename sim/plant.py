@@ -14,7 +14,7 @@ from machine.profile import Profile
 from sim.emulation import COMMANDED, EmulatedMachine
 from sim.errors import PlantError
 from sim.evaluator import Evaluation, Evaluator
-from sim.geometry.shape import Quaternion, Shape, Vector
+from sim.geometry import Quaternion, Shape, Vector
 from sim.mechanics.carrier import PARKED, Drive, carrier_links
 from sim.mechanics.crane import crane_shapes
 from sim.mechanics.hand_levers import DRIVE, HandLevers

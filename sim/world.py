@@ -16,7 +16,7 @@ import msgspec
 from machine.profile import Profile
 from sim.bullet.body import Body, JointDef, Pose, fixed_boxes, magnitude
 from sim.bullet.client import GRAVITY_M_S2, new_client
-from sim.geometry.shape import IDENTITY, Vector
+from sim.geometry import IDENTITY, Vector
 from sim.ground.terrain import Terrain
 from sim.hydraulics.circuit import Hydraulics
 from sim.mechanics.carrier import PARKED, Carrier, Drive, carrier_links

@@ -21,7 +21,7 @@ from autonomy.calibration.spool_travel import Leg, SpoolTravel, best_order
 from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, joint
-from machine.sensing.weighing import lever_share
+from machine.sensing import lever_share
 
 # -- What the first, gentle opening of a valve tells of it: dead-band, full speed and dead time, roughly.
 #

@@ -22,7 +22,7 @@ from can_dbc.messages.crane import GrappleCommand
 from machine.joints import Joint
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import JointSpec, Profile, joint
-from machine.sensing.weighing import lever_share
+from machine.sensing import lever_share
 from runtime.errors import InputRefused
 
 SPEED_LIMIT_SHARE: Final = 0.9

@@ -28,7 +28,7 @@ from machine.geometry.kinematics import Point
 from machine.geometry.sag import true_pin
 from machine.joints import N_JOINTS, Joint
 from machine.profile import Kinematics, Sag
-from machine.sensing.weighing import empty_moment_nm
+from machine.sensing import empty_moment_nm
 from runtime.errors import InputRefused
 
 OFFSETS: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)

@@ -19,8 +19,7 @@ from can_dbc.dbc.codec import Database, MessageCodec
 from can_dbc.frame import Frame
 from machine.joints import JOINTS, Joint
 from machine.profile import Encoder, Profile, joint
-from machine.sensing.encoder import position_from_counts
-from machine.sensing.weighing import lift_moment_nm
+from machine.sensing import lift_moment_nm, position_from_counts
 
 GRID_S: Final = 0.005
 FINE_FACTOR: Final = 4

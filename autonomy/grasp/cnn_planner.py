@@ -19,10 +19,9 @@ from PIL import Image, ImageDraw
 
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, lowest_m
 from autonomy.grasp.grapple_heights import known_ground_m
-from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.network import GraspMaps, PixelGrasp, best_pixel
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
-from autonomy.grasp.quality import blade_sections, rests_upon, score_grasps
+from autonomy.grasp.quality import Jaws, blade_sections, jaws_of, rests_upon, score_grasps
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from runtime.errors import InputRefused
 

@@ -20,9 +20,8 @@ import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders, as_cylinders
 from autonomy.grasp.grapple_heights import grasp_pose
-from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.planner import GraspCandidate, GraspPlanner, GraspRequest, NoGrasp
-from autonomy.grasp.quality import STRICT_RULE, BladeSections, blade_sections, rests_upon
+from autonomy.grasp.quality import STRICT_RULE, BladeSections, Jaws, blade_sections, jaws_of, rests_upon
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
 from machine.geometry.kinematics import Unreachable

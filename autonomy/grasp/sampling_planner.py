@@ -20,7 +20,6 @@ import numpy as np
 from autonomy.grasp.candidates import ALONG_SHARES, CandidateArrays, candidate_grid, finalists, reachable_stations
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, log_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import grasp_pose, known_ground_m
-from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.quality import (
     LAYER_RULE,
@@ -31,7 +30,9 @@ from autonomy.grasp.quality import (
     BladeSections,
     CaptureRule,
     GraspScores,
+    Jaws,
     blade_sections,
+    jaws_of,
     rests_upon,
     score_grasps,
 )

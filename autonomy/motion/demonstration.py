@@ -20,7 +20,7 @@ from can_dbc.frame import Frame
 from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, Joint
 from machine.profile import Encoder, Profile, joint
-from machine.sensing.encoder import position_from_counts
+from machine.sensing import position_from_counts
 from runtime.errors import InputRefused
 
 AXES: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)

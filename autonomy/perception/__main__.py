@@ -49,8 +49,8 @@ from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
 from machine.geometry.optics import Intrinsics
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
-from runtime.allocator import keep_memory
 from runtime.errors import InputRefused, LinkError
+from runtime.memory import keep_memory
 from runtime.notifier import Notifier
 
 EXIT_OK, EXIT_CONFIGURATION, EXIT_PORT = 0, 3, 4

@@ -16,9 +16,9 @@ import numpy as np
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, rescaled
 from autonomy.perception.fitting.measure import Masked
+from autonomy.perception.log_detector import Perception
 from autonomy.perception.log_list import LogObservation
 from autonomy.perception.papers import log_from_mask, position_in_box
-from autonomy.perception.pipeline import Perception
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors
@@ -58,7 +58,7 @@ class LogLocalizer(Protocol):
 
 
 class CylinderLocalizer:
-    """``autonomy.perception.pipeline``: cylinder fits and tracks."""
+    """``autonomy.perception.log_detector``: cylinder fits and tracks."""
 
     def __init__(self, profile: Profile, errors: CameraErrors = NOMINAL_ERRORS) -> None:
         self._perception = Perception(profile, errors)

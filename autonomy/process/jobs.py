@@ -23,8 +23,7 @@ from autonomy.missions.model import ForwardingMission
 from autonomy.perception.driving_log_detector import in_base
 from autonomy.perception.log_list import LogObservation
 from autonomy.perception.standpoint import Standpoint
-from autonomy.process.grasp_publisher import chosen_grasp
-from autonomy.process.mission_publisher import MissionPublisher
+from autonomy.process.mission_publisher import MissionPublisher, chosen_grasp
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.mission import ChosenGrasp, MissionAction, MissionCommand, MissionReport
 from can_dbc.messages.vehicle import VehicleReport

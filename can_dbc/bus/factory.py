@@ -12,8 +12,7 @@ import socket
 from collections.abc import Iterable
 from typing import Final
 
-from can_dbc.bus.base import Bus
-from can_dbc.bus.filters import FilterItem, filter_of
+from can_dbc.bus.base import Bus, FilterItem, filter_of
 from runtime.errors import LinkError
 
 PYTHON_CAN: Final = "python-can:"
@@ -32,7 +31,7 @@ def open_bus(
 
     Args:
         address: See the module docstring.
-        filters: Exact keys and (key, mask) pairs to receive (`can_dbc.bus.filters`); None for all.  Error frames always
+        filters: Exact keys and (key, mask) pairs to receive (`can_dbc.bus.base`); None for all.  Error frames always
             arrive.  The kernel accepts at most 512; a few dozen cost nothing.
         receive_own: Also returns own frames after they were on the bus.
         tx_queue: Limit of the own frames waiting on the wire, like ``txqueuelen`` in the kernel; a process that

@@ -15,8 +15,7 @@ from typing import Final
 
 import can
 
-from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusState
-from can_dbc.bus.filters import Filter
+from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusState, Filter
 from can_dbc.bus.receive_clock import ReceiveClock
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, identifier
 from runtime.errors import LinkError

@@ -16,8 +16,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusState
-from can_dbc.bus.filters import Filter
+from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusState, Filter
 from can_dbc.bus.frame_socket import FrameSocket
 from can_dbc.frame import Frame
 from runtime.errors import LinkError

@@ -20,9 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus.base import BaseBus, BusState
+from can_dbc.bus.base import BaseBus, BusState, Filter
 from can_dbc.bus.batch import Batch
-from can_dbc.bus.filters import Filter
 from can_dbc.bus.wire_records import RECORD, RECORD_BYTES, pack, read
 from can_dbc.frame import Frame
 from runtime.errors import LinkError

@@ -14,7 +14,7 @@ from typing import Final
 from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import N_JOINTS, Joint
 from machine.profile import Profile, Stability, joint
-from machine.sensing.weighing import (
+from machine.sensing import (
     MIN_LEVER_ARM_M,
     PA_PER_BAR,
     empty_moment_nm,
@@ -32,7 +32,7 @@ STEADY_SHARE: Final = 0.04
 class LoadEstimator:
     """Filtered load [kg] by the pressures of the lift cylinder, on a machine without a load cell; NaN while unknown.
 
-    The moment held by the cylinder less that of the empty crane (`machine.sensing.weighing`, both from calibration),
+    The moment held by the cylinder less that of the empty crane (`machine.sensing`, both from calibration),
     divided by the pin's distance.  Only pressures of a lift that rests or moves steadily count; between them the last
     value is kept.  The cylinder's friction is an error of some 20 kg at 5 m, and more nearer by.  A swinging load is
     averaged over `FILTER_S`.  The estimate is updated 50 times a second, not in every tick.

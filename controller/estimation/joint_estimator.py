@@ -16,7 +16,7 @@ from typing import Final, Protocol
 
 from controller.bus_io import MessageState, Signal
 from machine.profile import CarrierValve, Encoder, Valve
-from machine.sensing.encoder import EncoderScale
+from machine.sensing import EncoderScale
 
 # -- Noise monitor: has an encoder become noisy, by what its profile says, or by what it was?  (docs/reference/safety.md
 # case 4)

@@ -35,8 +35,8 @@ from controller.guard.layout import GuardConfigError, read_layouts
 from controller.guard.operator import OperatorActions
 from controller.process.bus_link import BusLink
 from controller.process.realtime import prepare, sleep_until, stop_garbage_collection
-from runtime.allocator import keep_memory
 from runtime.errors import LinkError
+from runtime.memory import keep_memory
 from runtime.notifier import Notifier
 
 PERIOD_NS: Final = 5_000_000

@@ -37,8 +37,8 @@ from controller.plc.handshake import Handshake
 from controller.process.bus_link import BusLink
 from controller.process.realtime import prepare, stop_garbage_collection
 from machine.loading.profile_file import ProfileError, load_profile
-from runtime.allocator import keep_memory
 from runtime.errors import ConfigError, LinkError
+from runtime.memory import keep_memory
 from runtime.notifier import Notifier
 from runtime.plugins import load_plugin
 

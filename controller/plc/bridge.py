@@ -37,7 +37,7 @@ from controller.plc.valve_gate import ValveGate, fault_bits, state_of
 from machine.crane_nodes import PRESSURE_NODES, CraneNode
 from machine.joints import JOINTS, Joint
 from machine.profile import Encoder, Profile, joint
-from machine.sensing.encoder import counts_from_position
+from machine.sensing import counts_from_position
 from runtime.errors import ConfigError
 
 MS: Final = 1_000_000

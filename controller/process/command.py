@@ -14,9 +14,8 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus.base import Bus
+from can_dbc.bus.base import Bus, FilterItem
 from can_dbc.bus.factory import default_address, open_bus
-from can_dbc.bus.filters import FilterItem
 from can_dbc.dbc.codec import load as read_dbc
 from can_dbc.messages.envelope import read_key
 from can_dbc.messages.operator_link import default_path as operator_path
@@ -34,10 +33,9 @@ from controller.process.warm_up import warm_up
 from controller.step import Controller
 from machine.status.explanation import describe
 from machine.status.modes import Mode
-from runtime.allocator import keep_memory
 from runtime.compiled import running
 from runtime.errors import ConfigError, LinkError
-from runtime.huge_pages import collapse_heap
+from runtime.memory import collapse_heap, keep_memory
 
 PRIORITY: Final = 80
 

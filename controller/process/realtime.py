@@ -1,6 +1,6 @@
 """Real-time set-up of a Linux process: absolute sleep, FIFO scheduling, locked memory, no garbage collection.
 
-Call `runtime.allocator.keep_memory` before anything is built, `prepare` when everything is, and
+Call `runtime.memory.keep_memory` before anything is built, `prepare` when everything is, and
 `stop_garbage_collection` last.  `prepare` returns what the system refused as text; the caller prints it and continues,
 because a demonstration on a desktop must run too.  The process must not have a second thread
 (docs/reference/real-time.md section 2).

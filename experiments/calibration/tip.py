@@ -17,7 +17,7 @@ from machine.geometry.kinematics import Unreachable, pin_position
 from machine.geometry.sag import aim_free, true_pin
 from machine.joints import Joint
 from machine.profile import Profile, joint
-from machine.sensing.weighing import hanging_load_kg, lift_moment_nm
+from machine.sensing import hanging_load_kg, lift_moment_nm
 from sim.world import GRAPPLE_LINKS, STEP_S, World
 
 LOAD_KG: Final = 200.0

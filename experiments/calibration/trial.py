@@ -24,7 +24,7 @@ from controller.guard.__main__ import profile_path
 from experiments.calibration.tip import tip_errors
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named, trial_world
-from hil.calibration.crane import run_lockstep
+from hil.calibration import run_lockstep
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.joints import JOINTS, Joint

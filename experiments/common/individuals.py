@@ -13,7 +13,7 @@ from autonomy.calibration.result import identify
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from hil.calibration.crane import run_lockstep
+from hil.calibration import run_lockstep
 from machine.loading.profile_file import carry_envelope
 from runtime.errors import InputRefused
 

@@ -14,8 +14,8 @@ from typing import Any, Final
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 
-from runtime.allocator import keep_memory
 from runtime.errors import InputRefused
+from runtime.memory import keep_memory
 
 WAITING_PER_WORKER: Final = 2
 DEATHS: Final = 3

@@ -22,7 +22,7 @@ from experiments.common.checkpoint import Checkpoint as Checkpoint
 from experiments.common.fingerprint import installation
 from experiments.common.trial_cost import TrialCost, measured
 from experiments.common.workers import Trial, Workers
-from runtime.allocator import keep_memory
+from runtime.memory import keep_memory
 
 SPEED_PERIOD_S: Final = 1800.0
 """The time left is estimated from so long: a mission takes minutes."""

@@ -111,6 +111,6 @@ def _own(identity: Callable[[], str]) -> str:
 @functools.cache
 def begin_worker() -> None:
     """What every worker process does first: keep its memory, as the local ones do."""
-    from runtime.allocator import keep_memory
+    from runtime.memory import keep_memory
 
     keep_memory()

@@ -41,7 +41,7 @@ from machine.joints import JOINTS
 from machine.profile import Profile
 from machine.status.modes import Mode
 from runtime.errors import InputRefused
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 from sim.plant import Plant
 
 STEP_NS: Final = 2_500_000

@@ -21,7 +21,7 @@ from experiments.common.pool import Job
 from experiments.faults.running import Running, build, warm
 from hil.faults.catalogue import CASES, Where
 from hil.faults.draws import Injection
-from hil.faults.order import Order
+from hil.faults.table import Order
 from hil.harness.lockstep import SLICE_NS, START_NS
 from machine.joints import JOINTS
 from machine.status.modes import Mode

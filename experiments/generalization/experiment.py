@@ -41,7 +41,7 @@ from experiments.generalization.metrics import (
 )
 from experiments.generalization.mission import MISSION, driven
 from experiments.generalization.plots import draw
-from hil.calibration.crane import run_lockstep as calibrate
+from hil.calibration import run_lockstep as calibrate
 from hil.demo.lockstep import run_lockstep as load_one_log
 from hil.replay.recording import PROFILE_FILE
 from machine.loading.profile_file import carry_envelope

@@ -11,9 +11,9 @@ import numpy as np
 
 from autonomy.grasp.cnn_planner import CnnPlanner
 from autonomy.grasp.cylinders import as_cylinders
-from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.network import GraspNet
 from autonomy.grasp.planner import GraspRequest
+from autonomy.grasp.quality import Jaws, jaws_of
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.virtual_scene import Camera
 from autonomy.motion.arm_kinematics import Arm

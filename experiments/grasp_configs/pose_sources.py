@@ -21,11 +21,11 @@ from scipy.optimize import linear_sum_assignment
 from autonomy.perception import papers
 from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, rescaled
 from autonomy.perception.fitting.measure import Masked
+from autonomy.perception.log_detector import Perception
 from autonomy.perception.log_list import LogObservation
-from autonomy.perception.pipeline import Perception
 from autonomy.perception.tracking.log_filter import SURVEYED
 from experiments.common import plugins
-from hil.calibration.crane import surveyed_profile
+from hil.calibration import surveyed_profile
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
 from sim.plant import Plant

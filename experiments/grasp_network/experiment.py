@@ -86,7 +86,7 @@ def _cornell(
     """Add to ``metrics``; returns what was skipped and why, and the available pictures as network inputs."""
     from training.grasp.cornell import load as load_samples
     from training.grasp.cornell_weights import on_samples
-    from training.grasp.views import central_view, view_depth
+    from training.grasp.network_training import central_view, view_depth
 
     folder = options.data or data_root() / CORNELL
     if options.data is None and not folder.is_dir():

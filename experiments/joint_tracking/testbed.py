@@ -21,7 +21,7 @@ from controller.laws.crane import LOADS, CraneLaw
 from machine.joints import JOINTS, N_JOINTS
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile, joint
-from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.sensing import counts_from_position, position_from_counts
 from machine.status.reasons import Reason
 from runtime.errors import InputRefused
 from sim.world import STEP_NS, World

@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.perception.fitting.cylinder import CylinderBatch, outline_distance, pixel_rays
+from autonomy.perception.log_detector import Perception
 from autonomy.perception.papers import position_in_box
-from autonomy.perception.pipeline import Perception
 from experiments.log_localization.metrics import CM, DEGREES, PAPER_M, VIEWS
 from experiments.log_localization.site import STOP_M, Site
 from experiments.log_localization.trial import RANGES_M, Segmenter, detected

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
-from hil.calibration.crane import survey
+from hil.calibration import survey
 from machine.geometry.optics import intrinsics, rpy_matrix
 from machine.profile import Camera, Profile
 from sim.camera.geometry import View, look_at, mount_view

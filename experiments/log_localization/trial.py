@@ -12,8 +12,8 @@ import numpy as np
 from autonomy.perception import papers
 from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.fitting.measure import Masked
+from autonomy.perception.log_detector import Perception
 from autonomy.perception.papers import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
-from autonomy.perception.pipeline import Perception
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS, Track
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named

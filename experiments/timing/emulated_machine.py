@@ -26,7 +26,7 @@ from can_dbc.frame import Frame
 from experiments.timing.bus_observer import Continuity, databases
 from machine.loading.profile_file import load_profile
 from runtime.errors import LinkError
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 from sim.process.live import TX_QUEUE_FRAMES, LiveMachine
 
 STEP_NS = 2_500_000

@@ -24,8 +24,8 @@ from experiments.common import host_activity
 from experiments.timing.measurement import system_calls
 from experiments.timing.testbed import HOST, START_S, TestbedConfig, TimingTestbed
 from hil.harness.processes import free_udp_ports
+from hil.tick.compare import compared
 from hil.tick.instructions import INSTRUCTIONS, count, open_counter
-from hil.tick.ratio import compared
 
 PROFILE: Final = "palms_471"
 RATE_HZ: Final = 200

@@ -22,7 +22,7 @@ from controller.guard.__main__ import profile_path
 from controller.tick import Outputs
 from hil.demo.summary import Summary, is_settled, outcome_sentence
 from hil.faults.injector import Injector
-from hil.faults.order import Order
+from hil.faults.table import Order
 from hil.harness.display import Display
 from hil.harness.lockstep import START_NS, Lockstep, LogDetector, Observer
 from hil.harness.operator import MAX_STOPS, Operator

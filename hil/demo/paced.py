@@ -24,7 +24,7 @@ from rich.console import Console
 from autonomy.crane_job.activity import Activity
 from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.perception.log_list import LogObservation, decode_request, encode_error, encode_logs
-from autonomy.process.grasp_publisher import chosen_grasp
+from autonomy.process.mission_publisher import chosen_grasp
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode

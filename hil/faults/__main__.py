@@ -15,8 +15,7 @@ from typing import Any, Final
 
 from can_dbc.bus.factory import PYTHON_CAN, VCAN_NAMES
 from hil.faults.live import LiveTarget, inject
-from hil.faults.order import parse
-from hil.faults.table import FAULTS, Edge
+from hil.faults.table import FAULTS, Edge, parse
 from runtime.errors import InputRefused
 from runtime.shared_file import make_own_folder
 

@@ -12,7 +12,7 @@ from random import Random
 from typing import Final
 
 from controller.crane.inputs import sample_timeout_ns
-from hil.faults.order import Order
+from hil.faults.table import Order
 from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.plant_faults import ENCODER_MESSAGES, message

@@ -16,8 +16,7 @@ from can_dbc.messages.crane import CraneSetpoint, Knot, OperatorAction, Operator
 from can_dbc.messages.datagrams import Datagram, decode, encode
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.vehicle import DriveSetpoint
-from hil.faults.order import Order
-from hil.faults.table import FAULTS, Edge
+from hil.faults.table import FAULTS, Edge, Order
 from hil.faults.wire_faults import wire_fault
 from hil.harness.lockstep import START_NS, Lockstep
 from hil.plc import BridgedPlant

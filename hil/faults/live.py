@@ -22,8 +22,7 @@ from can_dbc.bus.wire_client import control
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import read_key
-from hil.faults.order import Order
-from hil.faults.table import FAULTS, Edge
+from hil.faults.table import FAULTS, Edge, Order
 from hil.faults.wire_faults import wire_fault
 from hil.harness.live import ADDRESSES, HOST
 from hil.wire.faults import FOREVER_NS, Fault, Kind

@@ -6,7 +6,7 @@ from typing import Final
 
 from can_dbc.frame import EXTENDED, EXTENDED_MASK
 from can_dbc.protocols.e2e import protect
-from hil.faults.order import Order
+from hil.faults.table import Order
 from hil.wire.faults import Fault, Kind
 from machine.profile import Profile
 from runtime.errors import InputRefused

@@ -15,7 +15,7 @@ from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingL
 from autonomy.perception.log_list import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
-from hil.calibration.crane import surveyed_profile
+from hil.calibration import surveyed_profile
 from hil.harness.lockstep import LogDetector
 from hil.plant.camera import RigCamera
 from machine.profile import Profile

@@ -20,7 +20,7 @@ from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.manager.tally import Load
 from autonomy.missions.model import ForwardingMission
 from controller.guard.__main__ import profile_path
-from hil.calibration.crane import surveyed_profile
+from hil.calibration import surveyed_profile
 from hil.harness.display import Display
 from hil.harness.live import LiveOptions, LiveRun
 from hil.missions.detectors import CAMERA, PERFECT, check_camera

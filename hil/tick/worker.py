@@ -319,7 +319,7 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
 def _use_huge_pages() -> None:
     """As the controller does before its first tick; the release that is judged may be older."""
     with contextlib.suppress(ImportError):
-        from runtime.huge_pages import collapse_heap
+        from runtime.memory import collapse_heap
 
         collapse_heap()
 

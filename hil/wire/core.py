@@ -22,9 +22,18 @@ from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import Final
 
-from can_dbc.bus.base import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
-from can_dbc.bus.bitrates import BITRATES, CRANE_BITRATE, MACHINE_BITRATE
-from can_dbc.bus.filters import FilterItem, filter_of
+from can_dbc.bus.base import (
+    BITRATES,
+    CRANE_BITRATE,
+    ERR_ACK,
+    ERR_BUSERROR,
+    ERR_PROT,
+    ERR_RESTARTED,
+    MACHINE_BITRATE,
+    BusState,
+    FilterItem,
+    filter_of,
+)
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
 from hil.wire.faults import Damage, Fault, Kind
 from hil.wire.node import Flight, Node, Pending, Segment
@@ -417,6 +426,6 @@ def priority(key: int) -> int:
     return (key & STANDARD_MASK) << 21 | remote << 20
 
 
-# -- The bit rates of the machine's two buses, as the wire runs them (`can_dbc.bus.bitrates`).
+# -- The bit rates of the machine's two buses, as the wire runs them (`can_dbc.bus.base`).
 
 __all__ = ["BITRATES", "CRANE_BITRATE", "MACHINE_BITRATE"]

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from can_dbc.bus.base import BaseBus, BusState
-from can_dbc.bus.filters import FilterItem
+from can_dbc.bus.base import BaseBus, BusState, FilterItem
 from can_dbc.frame import ERROR, Frame
 from hil.wire.core import WireCore
 

@@ -72,8 +72,7 @@ MODULES: Final = (
     "machine.geometry.carrier",
     "machine.geometry.kinematics",
     "machine.geometry.sag",
-    "machine.sensing.encoder",
-    "machine.sensing.weighing",
+    "machine.sensing",
 )
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from sim.bullet.client import BulletClient
-from sim.geometry.shape import Quaternion, Shape, Vector, quaternion_rpy
+from sim.geometry import Quaternion, Shape, Vector, quaternion_rpy
 
 Pose = tuple[Vector, Quaternion]
 

@@ -18,7 +18,7 @@ from sim.camera.ground_cover import CLEARING, LANDING, Density, GroundCover
 from sim.camera.noise import StereoNoise
 from sim.camera.render import ImagingConditions, Picture, render
 from sim.camera.scene import Scene, WorldScenes
-from sim.geometry.shape import Vector
+from sim.geometry import Vector
 from sim.truth.load import Truth
 from sim.world import World
 

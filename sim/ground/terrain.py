@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sim.bullet.client import BulletClient
 from sim.errors import PlantError
-from sim.geometry.shape import Vector
+from sim.geometry import Vector
 
 # -- Ground that is drawn from a seed: a slope, undulation, the ruts of earlier machines, stones and stumps.
 #

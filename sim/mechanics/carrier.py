@@ -21,7 +21,7 @@ from machine.profile import Carrier as CarrierProfile
 from machine.profile import Profile
 from sim.bullet.body import JointDef, LinkDef
 from sim.bullet.client import GRAVITY_M_S2, BulletClient
-from sim.geometry.shape import IDENTITY, Quaternion, Shape, Vector, quaternion_rpy, rpy_quaternion
+from sim.geometry import IDENTITY, Quaternion, Shape, Vector, quaternion_rpy, rpy_quaternion
 from sim.ground.terrain import Terrain
 from sim.ground.tyre import Tyre, wheel_step
 from sim.truth.body import CarrierTruth

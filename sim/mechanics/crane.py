@@ -15,7 +15,7 @@ from typing import Final
 
 from machine.profile import Kinematics, Profile
 from sim.bullet.body import JointDef, LinkDef
-from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
+from sim.geometry import IDENTITY, Shape, Vector, rpy_quaternion
 from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.truth.body import Steel, Structure
 from sim.truth.load import Truth

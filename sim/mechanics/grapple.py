@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from machine.profile import Kinematics, Profile
-from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
+from sim.geometry import IDENTITY, Shape, Vector, rpy_quaternion
 
 PIVOT_Y_M = -0.0193
 PALMS_CHORD_M = 0.648  # blades, widths and beam below belong to this grapple; others are scaled by their chord

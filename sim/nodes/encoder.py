@@ -19,7 +19,7 @@ from canopen.objectdictionary import ODVariable
 import can_dbc
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER
 from machine.profile import Encoder
-from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.sensing import counts_from_position, position_from_counts
 from sim.faults import EncoderFault
 from sim.nodes import Outbox
 from sim.truth.sensors import EncoderTruth

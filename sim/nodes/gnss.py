@@ -18,8 +18,7 @@ from typing import Any, Final
 from can_dbc.dbc.codec import Database
 from can_dbc.protocols.nmea2000 import encode, frames
 from machine.profile import Carrier
-from sim.geometry.geodesy import LocalFrame
-from sim.geometry.shape import Quaternion, Vector, quaternion_rpy
+from sim.geometry import LocalFrame, Quaternion, Vector, quaternion_rpy
 from sim.nodes import Outbox
 from sim.nodes.mach0 import MARINE, J1939Node
 from sim.nodes.messages import MS, PeriodicTimer

@@ -16,7 +16,7 @@ import msgspec
 from can_dbc.bus.base import Bus
 from machine.geometry.carrier import ARMS
 from sim.errors import PlantError
-from sim.geometry.shape import Quaternion, Vector
+from sim.geometry import Quaternion, Vector
 from sim.ground.terrain import Terrain
 from sim.hydraulics.layout import PA_PER_BAR
 from sim.instruments import TotalStation, detect, detect_in_view, grapple_yaw

@@ -12,7 +12,7 @@ from machine.profile import Profile
 from sim.bullet.client import new_client
 from sim.camera.noise import StereoNoise
 from sim.camera.scene import LogPose
-from sim.geometry.shape import IDENTITY
+from sim.geometry import IDENTITY
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import Truth, load_truth

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from machine.profile import Bunk, Profile
-from sim.geometry.shape import Shape, Vector, rpy_quaternion
+from sim.geometry import Shape, Vector, rpy_quaternion
 
 STAKE_M: Final = 0.08
 FRAME_M: Final = 0.12  # floor beams of a bunk that stands on a carrier

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from sim.geometry.shape import Quaternion, Vector
+from sim.geometry import Quaternion, Vector
 
 DISC_COUNT: Final = 60  # discs over which mass, centre and inertia are summed
 STRAIGHT_M: Final = 0.03  # up to this sagitta a log has 3 straight pieces, beyond it 5: less than 4 mm off the arc

@@ -21,7 +21,7 @@ from machine.profile import Profile
 from sim.bullet.body import Pose
 from sim.bullet.client import GRAVITY_M_S2, BulletClient, new_client
 from sim.errors import PlantError
-from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
+from sim.geometry import Quaternion, Vector, rpy_quaternion
 from sim.ground.terrain import Terrain
 from sim.truth.body import Contact
 from sim.truth.load import Truth

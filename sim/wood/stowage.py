@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from machine.profile import Profile
 from sim.bullet.body import Body, Pose
 from sim.bullet.client import GRAVITY_M_S2, BulletClient
-from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
+from sim.geometry import Quaternion, Vector, rpy_quaternion
 from sim.wood.bunk import to_bunk
 from sim.wood.logs import LogBodies
 

@@ -23,8 +23,7 @@ from machine.geometry.sag import true_pin
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile, Sag, Valve, joint
-from machine.sensing.encoder import counts_from_position
-from machine.sensing.weighing import empty_moment_nm, lever_share
+from machine.sensing import counts_from_position, empty_moment_nm, lever_share
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 

@@ -18,7 +18,7 @@ from machine.geometry.sag import true_pin
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag
-from machine.sensing.weighing import empty_moment_nm
+from machine.sensing import empty_moment_nm
 from runtime.errors import InputRefused
 from tests.autonomy.valve_stand_in import StandIn
 from tests.codes import coded

@@ -20,7 +20,7 @@ from autonomy.perception.fitting.cylinder import (
 )
 from autonomy.perception.fitting.cylinder_fit import fit_cylinder
 from autonomy.perception.fitting.measure import implausibility, initial_cylinder
-from autonomy.perception.pipeline import Perception
+from autonomy.perception.log_detector import Perception
 from runtime.errors import InputRefused
 from sim.camera.scene import BUNK, SceneBuilder
 from tests.autonomy.log_views import (

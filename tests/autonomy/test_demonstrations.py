@@ -28,7 +28,7 @@ from machine.geometry.kinematics import Unreachable
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
-from machine.sensing.encoder import counts_from_position
+from machine.sensing import counts_from_position
 from runtime.errors import InputRefused
 from tests.codes import coded
 

@@ -11,7 +11,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planner import Grasp
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
-from autonomy.process.grasp_publisher import chosen_grasp
+from autonomy.process.mission_publisher import chosen_grasp
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.mission import decode_grasp, decode_mission, encode_grasp
 from machine.geometry.grapple import rotator_for_yaw

@@ -26,7 +26,7 @@ from autonomy.localization.vehicle_filter import (
 )
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from machine.loading.profile_file import load_profile
-from sim.geometry.geodesy import LocalFrame
+from sim.geometry import LocalFrame
 from tests.autonomy.carrier_model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, heading_from_yaw, individual
 from tests.codes import coded
 

@@ -12,9 +12,9 @@ from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.grasp_verification import is_at_target
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.bunk_load import lies_in_bunk
-from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.pile_planner import DEPTHS_M, FAILED_RADIUS_M, PilePlanner
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
+from autonomy.grasp.quality import jaws_of
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.missions.crane_job import CraneJob

@@ -10,9 +10,16 @@ import pytest
 
 from autonomy.grasp.cylinders import as_cylinders, default_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import hover_height_m
-from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp, restricted_to
-from autonomy.grasp.quality import LAYER_RULE, STRICT_RULE, CaptureRule, blade_sections, rests_upon, score_grasps
+from autonomy.grasp.quality import (
+    LAYER_RULE,
+    STRICT_RULE,
+    CaptureRule,
+    blade_sections,
+    jaws_of,
+    rests_upon,
+    score_grasps,
+)
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection, select_direct
 from autonomy.missions.crane_job import CraneJob

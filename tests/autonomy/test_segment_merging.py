@@ -13,8 +13,7 @@ from autonomy.perception.segmentation.segment_merging import (
     shipped_scorers,
 )
 from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES, SegmentTable, pair_features
-from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, make_segment
-from autonomy.perception.segmentation.watershed import boundary_map, watershed
+from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, boundary_map, make_segment, watershed
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from autonomy.grasp.cnn_planner import CnnPlanner, mean_maps
 from autonomy.grasp.cylinders import as_cylinders
-from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet
 from autonomy.grasp.planner import GraspRequest, NoGrasp
+from autonomy.grasp.quality import jaws_of
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation

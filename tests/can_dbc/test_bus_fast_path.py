@@ -11,9 +11,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from can_dbc.bus.base import ERR_BUSOFF, ERR_RESTARTED, BusStats
+from can_dbc.bus.base import ERR_BUSOFF, ERR_RESTARTED, BusStats, Filter
 from can_dbc.bus.batch import Batch
-from can_dbc.bus.filters import Filter
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
 from can_dbc.bus.receive_clock import DRIFT_PPM, HardwareClock, ReceiveClock
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame

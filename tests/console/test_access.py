@@ -19,9 +19,8 @@ from can_dbc.messages.crane import OperatorAction
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
 from console.access import FAILURES_NS, LEASE_NS, MAX_FAILURES, MAX_PAGES, SESSION_NS, ControlLease
-from console.access_guards import TOKEN_HEADER
+from console.access_guards import MAX_REFUSED, TOKEN_HEADER, AuditLog
 from console.accounts import Accounts, Role, account_line, read_accounts, with_account
-from console.audit import MAX_REFUSED, AuditLog
 from console.console import Console
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash

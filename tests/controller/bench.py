@@ -38,7 +38,7 @@ from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import encoders, joint
-from machine.sensing.encoder import counts_from_position
+from machine.sensing import counts_from_position
 from machine.status.modes import Mode
 
 DATABASE = load("crane")

@@ -11,7 +11,7 @@ from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleRe
 from machine.geometry.carrier import heading_rate_rad_s
 from machine.profile import Carrier
 from machine.status.modes import Mode
-from sim.geometry.geodesy import LocalFrame
+from sim.geometry import LocalFrame
 from tests.controller.bench import AORO, MS, Bench, T
 
 CARRIER = AORO.profile.carrier

@@ -22,7 +22,7 @@ from controller.laws.drive import (
 from controller.laws.suspension import MAX_LEVEL_M_S, Suspension, spool_pct
 from machine.geometry.carrier import heading_rate_rad_s
 from machine.status.modes import Mode
-from sim.geometry.geodesy import LocalFrame
+from sim.geometry import LocalFrame
 from sim.nodes.mach0 import spool_for
 from tests.controller.drive_bench import CARRIER, DriveBench, T
 

@@ -16,7 +16,7 @@ from controller.estimation.joint_estimator import (
     steady_gains,
 )
 from machine.loading.profile_file import load_profile
-from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.sensing import counts_from_position, position_from_counts
 from tests.controller.bench import MS, SPECS, T
 
 SLEW = SPECS[0]

@@ -20,7 +20,7 @@ from controller.estimation.joint_monitors import (
 )
 from controller.laws.joint import INCH_SHARE
 from machine.loading.profile_file import load_profile
-from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.sensing import counts_from_position, position_from_counts
 from machine.status.faults import FAULTS
 from machine.status.reasons import Reason
 from tests.controller.bench import SPECS, T

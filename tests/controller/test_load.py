@@ -22,7 +22,7 @@ from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Sag, Stability
-from machine.sensing.weighing import MIN_LEVER_ARM_M, empty_moment_nm, lever_share
+from machine.sensing import MIN_LEVER_ARM_M, empty_moment_nm, lever_share
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason

@@ -6,8 +6,7 @@ import os
 
 import pytest
 
-from can_dbc.bus.base import BusState
-from can_dbc.bus.filters import Filter
+from can_dbc.bus.base import BusState, Filter
 from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from can_dbc.frame import Frame
 from can_dbc.messages import operator_link

@@ -10,7 +10,7 @@ import pytest
 
 from controller.estimation.joint_estimator import JointEstimator
 from machine.loading.profile_file import load_profile
-from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.sensing import counts_from_position, position_from_counts
 from tests.controller.bench import T
 
 SENSED = [

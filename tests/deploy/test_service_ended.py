@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from tests.codes import numbers_in
 from timberhand.cli import app
 from timberhand.commands import why
-from timberhand.why import failures as records
-from timberhand.why.failures import Failure, newest_failure
+from timberhand.why import stops as records
+from timberhand.why.stops import Failure, newest_failure
 
 GUARD = "timberhand-guard.service"
 RUNNER = CliRunner()

@@ -20,7 +20,7 @@ from experiments.faults.running import HeldSwing, Swing, build, warm
 from experiments.faults.separation import Separation, merged
 from experiments.faults.trial import in_child, inject, judge
 from hil.faults.catalogue import BY_NAME, CASES
-from hil.faults.order import parse
+from hil.faults.table import parse
 from hil.harness.lockstep import START_NS
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode

@@ -29,7 +29,7 @@ from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from sim.kinematic.machine import KinematicMachine, KinematicWorld
+from sim.kinematic import KinematicMachine, KinematicWorld
 from sim.nodes.valve import FUNCTIONS
 from sim.truth.load import load_truth
 from timberhand.cli import app

@@ -40,7 +40,7 @@ from machine.draft.from_urdf import answers_from_urdf
 from machine.loading.profile_file import load_profile
 from recorder.recover import is_complete, recover, scan
 from runtime.errors import ConfigError, InputRefused
-from sim.draft.truth import crane_urdf
+from sim.draft import crane_urdf
 from sim.truth.load import load_truth
 from tests.controller.guard_traffic import MOVING, Traffic
 from tests.fuzz.engine import Run, Target, coded, in_file, of_file, outcome

@@ -25,7 +25,7 @@ from hil.wire.faults import FOREVER_NS, Fault, Kind
 from machine.joints import JOINTS
 from machine.profile import SPEED_HEADROOM_SHARE, joint
 from machine.status.modes import Mode
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 
 MS: Final = 1_000_000
 PROFILE: Final = "palms_471"

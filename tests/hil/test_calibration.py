@@ -14,7 +14,7 @@ from autonomy.calibration.plan import SpoolTask
 from autonomy.calibration.procedure import Calibration
 from experiments.calibration.trial import calibrated
 from experiments.common.pool import Job
-from hil.calibration.crane import run_lockstep
+from hil.calibration import run_lockstep
 from hil.replay.recording import files_of
 from hil.replay.replay import replay
 from machine.loading.profile_file import load_profile
@@ -97,7 +97,7 @@ def test_an_abort_leaves_the_valves_neutral_and_the_run_replays(tmp_path: Path) 
 
 @pytest.mark.long
 def test_the_command_records_every_bus_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hil.calibration.crane.MAX_DURATION_S", 3.0)
+    monkeypatch.setattr("hil.calibration.MAX_DURATION_S", 3.0)
     asked = ["calibrate", "--profile", "aoro_fc8", "--lockstep", "--out", str(tmp_path / "mine.toml")]
     done = CliRunner().invoke(app, asked)
     assert getattr(done.exception, "code", "") == "calibrate.ended-early"

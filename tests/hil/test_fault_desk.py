@@ -12,8 +12,7 @@ import pytest
 
 from hil.faults import __main__
 from hil.faults.__main__ import OFFERS, Desk, answer
-from hil.faults.order import Order, parse
-from hil.faults.table import FAULTS
+from hil.faults.table import FAULTS, Order, parse
 from hil.harness.live import ADDRESSES
 
 

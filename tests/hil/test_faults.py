@@ -14,8 +14,7 @@ from can_dbc.messages.envelope import DatagramFault, DatagramRefused
 from hil.faults.catalogue import BY_NAME, CASES, Where
 from hil.faults.draws import Scene
 from hil.faults.injector import Injector, effect_of
-from hil.faults.order import Order, make, parse
-from hil.faults.table import FAULTS, Edge, Word, find
+from hil.faults.table import FAULTS, Edge, Order, Word, find, make, parse
 from hil.faults.wire_faults import wire_fault
 from hil.harness.operator import Operator
 from hil.wire.faults import Kind

@@ -13,7 +13,7 @@ from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.demonstration import joint_track, segment_motions
 from autonomy.motion.movement_primitives import SHIPPED_FOLDER, is_near_bunk, learn_primitives
 from can_dbc.dbc.codec import load as load_database
-from hil.demonstrations.hand_levers import AXES, demonstrate, script
+from hil.demonstrations import AXES, demonstrate, script
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 from recorder.manifest import describe

@@ -26,8 +26,8 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from recorder.manifest import describe
 from recorder.recorder import Recorder
-from sim.geometry.geodesy import LocalFrame
-from sim.kinematic.machine import KinematicMachine
+from sim.geometry import LocalFrame
+from sim.kinematic import KinematicMachine
 from sim.plant import Plant
 
 pytestmark = pytest.mark.long

@@ -26,7 +26,7 @@ from machine.joints import Joint
 from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 from tests.autonomy.crane_stand_in import GROUND_LOG
 
 REPORT_S = 0.02

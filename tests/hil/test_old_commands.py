@@ -22,7 +22,7 @@ from hil.harness.operator import Operator
 from hil.wire.faults import Fault, Kind
 from hil.wire.node import Flight, Segment
 from machine.status.modes import Mode
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 from sim.plant import Plant
 
 pytestmark = pytest.mark.long

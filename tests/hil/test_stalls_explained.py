@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from can_dbc.dbc.codec import load
 from hil.demo import lockstep
-from hil.faults.order import parse
+from hil.faults.table import parse
 from hil.wire.faults import Fault, Kind
 from machine.status.reasons import Reason
 from timberhand.cli import app

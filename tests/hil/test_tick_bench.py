@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.tick import counted, release
-from hil.tick.ratio import compared, median_interval, verdict
+from hil.tick.compare import compared, median_interval, verdict
 from host.exit_codes import CommandFailed
 from tests.codes import coded
 from timberhand.cli import app

@@ -15,7 +15,7 @@ from machine.draft.toml_text import profile_text
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 from runtime.errors import InputRefused
-from sim.draft.truth import crane_urdf, least_inertia
+from sim.draft import crane_urdf, least_inertia
 from sim.truth.load import load_truth
 from tests.codes import coded
 from tests.machine.own_machine import answers

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from machine.loading.profile_file import load_profile
 from machine.profile import Encoder
-from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.sensing import counts_from_position, position_from_counts
 
 PALMS = load_profile("palms_471")
 SLEW = PALMS.joints["slew"].encoder

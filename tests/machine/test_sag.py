@@ -23,7 +23,7 @@ from machine.geometry.sag import (
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag, joint_limits
-from machine.sensing.weighing import empty_moment_nm, hanging_load_kg, lift_moment_nm
+from machine.sensing import empty_moment_nm, hanging_load_kg, lift_moment_nm
 from tests.codes import coded
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")

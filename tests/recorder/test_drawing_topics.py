@@ -18,7 +18,7 @@ from autonomy.localization.local_plane import LocalPlane
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import ChosenGrasp, encode_grasp, encode_mission
 from can_dbc.messages.picture import PictureFacts, encode_picture
-from machine.foxglove.topics import MachineTopics
+from machine.foxglove import MachineTopics
 from machine.geometry import carrier
 from machine.geometry.kinematics import chain_points
 from machine.loading.profile_file import load_profile, profile_hash

@@ -1,6 +1,6 @@
 """Huge pages: which memory is put on them, and that the kernel really does so."""
 
-from runtime.huge_pages import collapse_heap, huge_places
+from runtime.memory import collapse_heap, huge_places
 
 SIZE = 0x200000
 MAPS = """\
@@ -21,5 +21,5 @@ def test_only_own_writable_memory_is_taken_and_whole_pages_of_it():
 
 
 def test_a_kernel_without_huge_pages_is_no_error(monkeypatch, tmp_path):
-    monkeypatch.setattr("runtime.huge_pages._HUGE_PAGE_BYTES", tmp_path / "none")
+    monkeypatch.setattr("runtime.memory._HUGE_PAGE_BYTES", tmp_path / "none")
     assert collapse_heap() == 0

@@ -11,7 +11,7 @@ from machine.geometry.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
 from machine.loading.profile_file import load_profile
 from sim.camera.geometry import look_at, mount_view, orbit, quaternion_matrix
 from sim.errors import PlantError
-from sim.geometry.shape import rpy_quaternion
+from sim.geometry import rpy_quaternion
 from tests.codes import coded
 
 angles = st.floats(-1.5, 1.5)

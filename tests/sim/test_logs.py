@@ -12,7 +12,7 @@ from experiments.plant.runs import record
 from machine.loading.profile_file import load_profile
 from sim.bullet.client import BulletClient, new_client
 from sim.errors import PlantError
-from sim.geometry.shape import IDENTITY
+from sim.geometry import IDENTITY
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import load_truth

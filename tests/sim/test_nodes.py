@@ -22,7 +22,7 @@ from can_dbc.protocols.canopen import (
 )
 from can_dbc.protocols.e2e import Checker, Sender, Status
 from machine.loading.profile_file import load_profile
-from machine.sensing.encoder import position_from_counts
+from machine.sensing import position_from_counts
 from sim.nodes.valve import ExitCode, ValveState
 from sim.plant import Plant
 

@@ -16,7 +16,7 @@ from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import Receiver, split_id
 from hil.wire.core import frame_bits
 from machine.loading.profile_file import load_profile
-from machine.sensing.encoder import position_from_counts
+from machine.sensing import position_from_counts
 from sim.errors import PlantError
 from sim.nodes.valve import ValveState
 from sim.plant import Plant

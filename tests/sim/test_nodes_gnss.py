@@ -19,8 +19,7 @@ from can_dbc.dbc.codec import load
 from can_dbc.frame import identifier
 from can_dbc.protocols.nmea2000 import Receiver, split_id
 from machine.loading.profile_file import load_profile
-from sim.geometry.geodesy import LocalFrame
-from sim.geometry.shape import rpy_quaternion
+from sim.geometry import LocalFrame, rpy_quaternion
 from sim.nodes.gnss import Fix, GnssNode
 from sim.truth.load import load_truth
 

@@ -14,7 +14,7 @@ from machine.loading.profile_file import load_profile
 from sim import faults
 from sim.errors import PlantError
 from sim.faults import EncoderFault, FrameTap, SpoolFaults
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 from sim.plant import Plant
 from sim.plant_faults import BEGINNERS, PlantFault, begin, database, message
 from sim.process import live_plant

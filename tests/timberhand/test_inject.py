@@ -12,8 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.faults.live import LiveTarget, inject
-from hil.faults.order import make
-from hil.faults.table import FAULTS
+from hil.faults.table import FAULTS, make
 from hil.harness.live import ADDRESSES
 from host.exit_codes import CommandFailed
 from machine.loading.profile_file import load_profile

@@ -11,9 +11,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from autonomy.grasp.cylinders import Cylinders
-from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import GraspNet
-from autonomy.grasp.quality import blade_sections, rests_upon, score_grasps
+from autonomy.grasp.quality import blade_sections, jaws_of, rests_upon, score_grasps
 from autonomy.grasp.virtual_scene import DOWNWARD_AXES, Camera, render
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile

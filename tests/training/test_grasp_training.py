@@ -34,7 +34,7 @@ from training.grasp.cornell import (
     rectangles,
     wrapped,
 )
-from training.grasp.views import View, central_view, label_maps, random_view, view_depth, visible_grasps
+from training.grasp.network_training import View, central_view, label_maps, random_view, view_depth, visible_grasps
 
 CORNELL = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "cornell_rgbd_01"
 OBJECTS = (100, 102, 106, 110, 114, 118, 122, 126, *range(129, 180, 4))

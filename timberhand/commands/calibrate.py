@@ -171,7 +171,7 @@ def _lockstep(
     folder: Path,
     screen: Console,
 ) -> Calibration:
-    from hil.calibration.crane import run_lockstep
+    from hil.calibration import run_lockstep
     from recorder.manifest import describe
     from recorder.recorder import Recorder
 

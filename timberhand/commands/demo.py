@@ -215,7 +215,7 @@ def demo(
     page = console_port if console else 0
     if lockstep:
         from hil.demo.lockstep import run_lockstep
-        from hil.faults.order import parse
+        from hil.faults.table import parse
         from runtime.errors import InputRefused
 
         try:

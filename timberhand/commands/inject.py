@@ -51,7 +51,7 @@ def inject(
     """
     from rich.console import Console
 
-    from hil.faults.order import FOREVER_S, make
+    from hil.faults.table import FOREVER_S, make
     from runtime.errors import InputRefused
 
     if list_all or not name:
@@ -82,7 +82,7 @@ def _in_lockstep(profile: str, seed: int, truth: str, order: object) -> None:
     from rich.console import Console
 
     from hil.demo.lockstep import run_lockstep
-    from hil.faults.order import Order
+    from hil.faults.table import Order
     from timberhand.commands.runs import new_directory
 
     assert isinstance(order, Order)

@@ -97,7 +97,7 @@ def demonstrate(
 
     from autonomy.motion.demonstration import format_demonstrations, joint_track, segment_motions
     from can_dbc.dbc.codec import load
-    from hil.demonstrations.hand_levers import demonstrate as demonstrate_motions
+    from hil.demonstrations import demonstrate as demonstrate_motions
     from machine.loading.profile_file import ProfileError, load_profile
     from recorder.manifest import describe
     from recorder.recorder import Recorder

@@ -54,8 +54,7 @@ def why(
     import msgspec
 
     from host.exit_codes import CommandFailed, ExitCode
-    from timberhand.why.failures import newest_failure
-    from timberhand.why.stops import SERVICE_STOPS
+    from timberhand.why.stops import SERVICE_STOPS, newest_failure
 
     if page:
         _open_page(run, port)

@@ -23,7 +23,7 @@ from machine.geometry.kinematics import Unreachable, solve
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from machine.profile import Profile
 from runtime.errors import ConfigError, InputRefused
-from sim.draft.truth import truth_problems
+from sim.draft import truth_problems
 from sim.individual import beside, split
 
 SAME_M: Final = 1e-3

@@ -14,7 +14,7 @@ from machine.draft.questions import answers_text
 from machine.draft.toml_text import envelope_text, profile_text
 from machine.loading.profile_file import ProfileError, load_profile
 from runtime.errors import InputRefused
-from sim.draft.truth import truth_and_urdf
+from sim.draft import truth_and_urdf
 
 ENCODER_SENDER: Final = "ENC"
 """The sender of encoder frames in crane.dbc."""

@@ -13,8 +13,14 @@ from autonomy.grasp.network import PAPER, GraspNet
 from training.common.model_card import Card, write
 from training.grasp import network_training
 from training.grasp.cornell import Rectangle, Sample, is_correct
-from training.grasp.network_training import BATCH, LEARNING_RATE, VIEWS_PER_SAMPLE
-from training.grasp.views import central_view, view_depth, visible_grasps
+from training.grasp.network_training import (
+    BATCH,
+    LEARNING_RATE,
+    VIEWS_PER_SAMPLE,
+    central_view,
+    view_depth,
+    visible_grasps,
+)
 
 
 def produce(samples: Sequence[Sample], seed: int, epochs: int, out: Path, console: Console) -> tuple[Path, Path]:

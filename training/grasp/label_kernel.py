@@ -16,7 +16,7 @@ from numba import njit
 from autonomy.grasp import quality
 from autonomy.grasp.candidates import CENTRING_SCALE_M
 from autonomy.grasp.grapple_heights import HALF_PLATE_M, SCOOP_SHARE, TIP_CLEARANCE_M
-from autonomy.grasp.jaws import Jaws
+from autonomy.grasp.quality import Jaws
 
 HALF_GAP, BLADE, PLATE, CAPACITY, TIP_FORCE, SCOOP_SPAN, ROOM = range(7)
 _TIP, _SLACK = quality.TIP_HEIGHT_M, quality.STRICT_RULE.slack_m

@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from autonomy.grasp.cylinders import Cylinders, default_covariance, sample_cylinders
-from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.network import MAX_RELIEF, PAPER, POOL, RELIEF_SCALE
-from autonomy.grasp.quality import rests_upon
+from autonomy.grasp.quality import Jaws, jaws_of, rests_upon
 from autonomy.grasp.sampling_planner import CRANE_SIGMA_M, CRANE_SIGMA_RAD
 from autonomy.grasp.virtual_scene import CAMERA_HEIGHT_M, D435, SIDE_PX, operational_area, shortened_logs
 from autonomy.networks.torch_net import TorchNet

@@ -22,7 +22,7 @@ from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 from runtime.errors import InputRefused
 from sim.camera.scene import Ground, LogPose
-from sim.geometry.shape import Vector
+from sim.geometry import Vector
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import KINDS
 from sim.scenes.settled_logs import settle_logs

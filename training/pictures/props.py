@@ -13,7 +13,7 @@ from machine.geometry.optics import rpy_matrix
 from machine.profile import Profile
 from sim.camera.geometry import quaternion_matrix
 from sim.camera.scene import BUNK, CARRIER, CRANE, Boxes, LogPose
-from sim.geometry.shape import Shape
+from sim.geometry import Shape
 from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.wood.bunk import bunk_shapes
 from training.pictures.piles import profile_of

@@ -16,8 +16,7 @@ from scipy import ndimage
 from autonomy.perception.segmentation.network import ENDS, MASK, STRIDE
 from autonomy.perception.segmentation.resize import bilinear
 from autonomy.perception.segmentation.segment_merging import LogSegment, SegmentScorers, segment_logs
-from autonomy.perception.segmentation.segments import Foreground, make_foreground
-from autonomy.perception.segmentation.watershed import sigmoid
+from autonomy.perception.segmentation.segments import Foreground, make_foreground, sigmoid
 
 MIN_MASK_PROBABILITY: Final = 0.5
 MIN_END_PROBABILITY: Final = 0.3

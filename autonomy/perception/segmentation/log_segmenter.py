@@ -32,7 +32,7 @@ from autonomy.perception.segmentation.network import (
 )
 from autonomy.perception.segmentation.resize import bilinear, doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import SegmentScorers, shipped_scorers
-from autonomy.perception.segmentation.watershed import sigmoid
+from autonomy.perception.segmentation.segments import sigmoid
 from machine.geometry.optics import Intrinsics
 
 SIZE_PX: Final = 304

@@ -32,7 +32,7 @@ from autonomy.perception.segmentation.mask_network import (
 from autonomy.perception.segmentation.network import COS2, ENDS, MAPS, MASK, SIN2, STRIDE
 from autonomy.perception.segmentation.resize import doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import LogSegment
-from autonomy.perception.segmentation.watershed import boundary_map, sigmoid, watershed
+from autonomy.perception.segmentation.segments import boundary_map, sigmoid, watershed
 from machine.geometry.optics import Intrinsics
 
 # -- Logs from the mask network's kernels: a mask for each place where a log's middle may be, the best of them kept.

@@ -23,8 +23,9 @@ from autonomy.perception.segmentation.segments import (
     Segment,
     make_segment,
     segment_features,
+    sigmoid,
+    watershed,
 )
-from autonomy.perception.segmentation.watershed import sigmoid, watershed
 
 MIN_SEGMENT_PX: Final = 6  # pixels of a map; smaller segments are dropped
 MAX_SEGMENTS: Final = 100  # of a picture; only the largest are kept, because more are noise

@@ -26,7 +26,7 @@ from console.__main__ import main
 from console.console import Console
 from console.foxglove_server import FoxgloveServer
 from console.server import create_app
-from machine.foxglove.topics import MachineTopics
+from machine.foxglove import MachineTopics
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from recorder.manifest import describe

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from tests.codes import numbers_in
-from timberhand.why.failures import failures
+from timberhand.why.stops import failures
 
 SCRIPT = Path(__file__).parents[3] / "deploy/system/service-ended"
 GUARD = "timberhand-guard.service"

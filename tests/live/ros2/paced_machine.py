@@ -24,7 +24,7 @@ from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
-from sim.kinematic.machine import KinematicMachine
+from sim.kinematic import KinematicMachine
 
 HOST = "127.0.0.1"
 SETTINGS = load_settings("palms_471")

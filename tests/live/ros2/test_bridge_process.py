@@ -17,7 +17,7 @@ import pytest
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from machine.loading.profile_file import load_profile
 from machine.profile import joint_limits
-from sim.kinematic.machine import START_SHARE
+from sim.kinematic import START_SHARE
 
 DOMAIN = 100 + secrets.randbelow(50)
 """Another one than a ROS 2 of this computer has, most likely; ports of greater domains may be the system's."""

@@ -5,7 +5,7 @@ import sys
 
 COUNT = """
 import resource, sys
-from runtime.allocator import keep_memory
+from runtime.memory import keep_memory
 if sys.argv[1] == "kept":
     keep_memory()
 def faults():

@@ -12,7 +12,7 @@ def test_a_process_keeps_its_memory_and_has_it_on_huge_pages():
     if not Path("/sys/kernel/mm/transparent_hugepage").is_dir():
         pytest.skip("this kernel has no transparent huge pages")
     script = (
-        "from runtime.huge_pages import collapse_heap\n"
+        "from runtime.memory import collapse_heap\n"
         "kept = [bytes([k % 251]) * 100 for k in range(300_000)]\n"
         "print(collapse_heap(), all(kept[k] == bytes([k % 251]) * 100 for k in range(300_000)))\n"
         "print(open('/proc/self/smaps_rollup').read())\n"

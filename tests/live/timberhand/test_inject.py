@@ -18,7 +18,7 @@ from can_dbc.messages.crane import OperatorCommand
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import read_key, write_key
 from hil.faults.live import LiveTarget, inject
-from hil.faults.order import make
+from hil.faults.table import make
 from hil.faults.wire_faults import BABBLE_KEY
 from hil.wire.launch import wire_daemon
 from machine.loading.profile_file import load_profile

@@ -30,7 +30,7 @@ TIMEOUT_S = 30.0
 
 def nodes() -> None:
     """The machine's nodes, until SIGTERM."""
-    from sim.kinematic.machine import KinematicMachine
+    from sim.kinematic import KinematicMachine
     from sim.process.live import TX_QUEUE_FRAMES, LiveMachine
 
     machine = KinematicMachine(load_profile(PROFILE), seed=1, step_ns=2_500_000)

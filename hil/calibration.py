@@ -39,7 +39,7 @@ from recorder.recorder import Recorder
 from runtime.errors import InputRefused
 from sim.camera.geometry import mount_view
 from sim.camera.noise import StereoNoise
-from sim.geometry.shape import IDENTITY
+from sim.geometry import IDENTITY
 from sim.instruments import TotalStation, grapple_yaw
 from sim.plant import Plant
 

@@ -21,7 +21,7 @@ from machine.geometry.carrier import (
 from machine.joints import JOINTS
 from machine.profile import Carrier, CarrierValve, Profile, Valve
 from sim.emulation import EmulatedMachine
-from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
+from sim.geometry import Quaternion, Vector, rpy_quaternion
 from sim.nodes.valve import CYCLE_NS, FUNCTIONS
 from sim.truth.load import Truth, load_truth
 

@@ -1,1 +1,0 @@
-"""Calibration of a virtual machine, and the emulated survey of its cameras."""

@@ -1,1 +1,0 @@
-"""Demonstrations of crane motions by an emulated operator at the hand levers."""

@@ -1,1 +1,0 @@
-"""A machine without physics: every joint moves exactly as its valve's characteristic says."""
