@@ -154,11 +154,16 @@ class Clock:
     """Whether the run may be expected to take place without a stop."""
 
 
-def choose_clock(lost: LostTime, kernel: str | None) -> Clock:
-    """Real time where the host leaves enough; else simulated time, if the lab's own kernel ``kernel`` is there."""
-    if lost.share <= MAX_LOST_SHARE and lost.longest_ns <= MAX_GAP_NS:
+def choose_clock(lost: LostTime, kernel: str | None, detects: bool = False) -> Clock:
+    """Real time where the host leaves enough; else simulated time, if the lab's own kernel ``kernel`` is there.
+
+    ``detects``: a camera's detector runs in the guest, which needs more than its one processor.
+    """
+    if lost.share <= MAX_LOST_SHARE and lost.longest_ns <= MAX_GAP_NS and not detects:
         return Clock("real", f"the host leaves the lab enough: {lost.words()}")
     busy = f"the host is too busy for a live run in user-mode Linux: {lost.words()}"
+    if detects:
+        busy = "a live run with a camera needs more than the one processor of user-mode Linux"
     if kernel is None:
         return Clock("real", f"{busy}; expect stops, or use simulated time: {uml.MISSING}", enough=False)
     return Clock("simulated", busy)
@@ -174,12 +179,15 @@ def measure(seconds: float = LOOK_S) -> LostTime:
     return LostTime(found["share"], found["longest_ns"], found["steal_share"])
 
 
-def clock_here() -> Clock | None:
-    """The clock for a live run in the lab now; None where the lab is not user-mode Linux, or there is none."""
+def clock_here(detects: bool = False) -> Clock | None:
+    """The clock for a live run in the lab now; None where the lab is not user-mode Linux, or there is none.
+
+    ``detects``: as in `choose_clock`.
+    """
     request = Request((), os.getcwd(), {}, os.getuid(), os.getgid(), (), 0o022)
     try:
         if choose(survey(request)).kind != "uml":
             return None
     except LabError:
         return None  # the lab itself says why
-    return choose_clock(measure(), uml.find(uml.user_cache()))
+    return choose_clock(measure(), uml.find(uml.user_cache()), detects)

@@ -36,6 +36,14 @@ def test_a_host_that_takes_too_much_gets_simulated_time(
     assert enough or uml.MISSING in chosen.reason
 
 
+@pytest.mark.parametrize(("kernel", "kind", "enough"), [(KERNEL, "simulated", True), (None, "real", False)])
+def test_a_camera_s_detector_gets_simulated_time_on_the_quietest_host(
+    kernel: str | None, kind: str, enough: bool
+) -> None:
+    chosen = choose_clock(QUIET, kernel, detects=True)
+    assert (chosen.kind, chosen.enough) == (kind, enough)
+
+
 @pytest.mark.parametrize(
     ("choice", "lost", "simulated"),
     [
@@ -77,9 +85,12 @@ def test_a_kernel_with_vcan_keeps_its_own_time(
     assert entered == [{"time_travel": False, "mem": DEFAULT_MEM_MB}] and capsys.readouterr().err == ""
 
 
-def test_a_detector_gets_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_detector_gets_more_memory_and_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
     entered: list[dict[str, Any]] = []
     monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
     monkeypatch.setattr(lab_command, "vcan", lambda words, **more: entered.append(more))
-    enter_lab(Backend.VCAN, ClockChoice.SIMULATED, detects=True)
+    monkeypatch.setattr(choose, "choose", lambda *_: Method("uml", "no CAN", "linux.uml"))
+    monkeypatch.setattr(choose, "measure", lambda: QUIET)
+    monkeypatch.setattr(uml, "find", lambda _: KERNEL)
+    enter_lab(Backend.VCAN, detects=True)
     assert entered == [{"time_travel": True, "mem": DETECTOR_MEM_MB}] and DETECTOR_MEM_MB > DEFAULT_MEM_MB

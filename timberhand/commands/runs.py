@@ -58,8 +58,8 @@ of it, and every process waits for them to be read again."""
 def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool = False) -> None:
     """Prepare a live run.  For vcan outside the lab: run this command again inside it, and exit with its code.
 
-    Where the lab is user-mode Linux, the clock is chosen by the processor time that the host leaves, and announced;
-    ``detects``: a camera's detector runs in it.
+    Where the lab is user-mode Linux, the clock is chosen by the processor time that the host leaves and the run needs,
+    and announced; ``detects``: a camera's detector runs in it.
     """
     if "TIMBERHAND_LAB" in os.environ:
         return
@@ -67,7 +67,7 @@ def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool
         from host.vcan_lab.__main__ import vcan
         from host.vcan_lab.spec import DEFAULT_MEM_MB
 
-        simulated = clock is ClockChoice.SIMULATED or (clock is ClockChoice.AUTO and _simulates())
+        simulated = clock is ClockChoice.SIMULATED or (clock is ClockChoice.AUTO and _simulates(detects))
         vcan(
             [sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])],
             time_travel=simulated,
@@ -75,11 +75,11 @@ def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool
         )
 
 
-def _simulates() -> bool:
+def _simulates(detects: bool) -> bool:
     """Whether the lab runs in simulated time; announced on stderr.  False where the lab is not user-mode Linux."""
     from host.vcan_lab.choose import clock_here
 
-    chosen = clock_here()
+    chosen = clock_here(detects)
     if chosen is None:
         return False
     sys.stderr.write(f"vcan lab: {chosen.kind} time: {chosen.reason}\n")
