@@ -85,7 +85,6 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
             "%",
             "No stop, no refused request, and no value that the calibration itself rejects.",
             least=0.95,
-            scale=100.0,
         ),
         m(
             "deadband_max",
@@ -102,10 +101,9 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
             "%",
             "Against the plant's own speed at the same place, measured without bus, controller and sensors.",
             most=GAIN,
-            scale=100.0,
         ),
-        m("gain_rms", "Full speed, RMS error", "%", "The same values.", scale=100.0),
-        m("gain_before", "Full speed of the shipped profile, largest error", "%", "Before calibration.", scale=100.0),
+        m("gain_rms", "Full speed, RMS error", "%", "The same values."),
+        m("gain_before", "Full speed of the shipped profile, largest error", "%", "Before calibration."),
         m(
             "delay_max",
             "Dead time, largest error",
@@ -161,7 +159,6 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
             "Compliance of the column, largest error",
             "%",
             "Identified lean per moment over the truth's; it contains what the profile has wrong of the lift cylinder.",
-            scale=100.0,
         ),
         m(
             "load_max",
@@ -217,15 +214,8 @@ def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
             "%",
             "Against the truth of its valve.",
             most=GAIN,
-            scale=100.0,
         ),
-        m(
-            "rot_gain_before",
-            "Rotator: full speed of the shipped profile, largest error",
-            "%",
-            "Before calibration.",
-            scale=100.0,
-        ),
+        m("rot_gain_before", "Rotator: full speed of the shipped profile, largest error", "%", "Before calibration."),
         m(
             "rot_quarter_max",
             "Rotator without encoder: quarter turn, largest error",
@@ -233,15 +223,13 @@ def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
             "True angle of the quarter turns that a planner commands, two to either side: the drift of the dead "
             "reckoning.",
             most=ROT_QUARTER,
-            scale=100.0,
         ),
-        m("rot_quarter_rms", "Rotator: quarter turn, RMS error", "%", "The same values.", scale=100.0),
+        m("rot_quarter_rms", "Rotator: quarter turn, RMS error", "%", "The same values."),
         m(
             "rot_quarter_before",
             "Rotator: quarter turn with the shipped profile, largest error",
             "%",
             "Before calibration.",
-            scale=100.0,
         ),
     )
 

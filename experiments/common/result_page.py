@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,8 @@ from experiments.common.result import Metric, Result
 from experiments.common.seeds import sealed_seed
 from experiments.common.standing import judge, marked
 
+MAX_TITLES: Final = 4
+"""Of metrics that are measured alike, on one line."""
 _FIELD: Final = re.compile(r"\{(paper:)?([^{}]+)\}")
 
 
@@ -96,12 +99,20 @@ def markdown(result: Result, page: Page) -> str:
             value = m.text(result.metrics[m.name]) + result.interval_text(m)
             paper = f" (paper: {m.text(result.paper[m.name])})" if m.name in result.paper else ""
             out.append(f"| {m.title} | {value}{paper} | {m.limit_text()} | {_state(m, result)} |")
-        out += ["", "How each is measured:", ""] if shown else []
-        out += [f"- *{m.title}*: {m.how}" for m in shown]
-        out += [""] if shown else []
+        out += _measured(shown)
         for plot in section.plots:
             out += [*_plot(result, *plot), ""] if plot != first else []
     return "\n".join(out).rstrip() + "\n"
+
+
+def _measured(metrics: Sequence[Metric]) -> list[str]:
+    """How the metrics are measured; neighbours that are measured alike share a line."""
+    lines = []
+    for how, group in groupby(metrics, lambda m: m.how):
+        titles = [f"*{m.title}*" for m in group]
+        which = "; ".join(titles) if len(titles) <= MAX_TITLES else f"{titles[0]} to {titles[-1]}"
+        lines += [f"- {which}: {how}"] if how else []
+    return ["", "How each is measured:", "", *lines, ""] if lines else [""] if metrics else []
 
 
 def conclusion(result: Result, page: Page) -> str:

@@ -9,8 +9,6 @@ from experiments.common.result_page import Section
 from experiments.plant.bench import LOG_COUNTS
 from experiments.plant.bench import METRICS as SPEED
 
-MM, PERCENT, MPA, DEG = 1e3, 100.0, 1e-6, 57.29577951308232
-
 CONCLUSION: Final = (
     "The simulated crane lifts {single_success} of single logs and {pile3_success} of three-log piles by friction "
     "alone.",
@@ -38,7 +36,6 @@ SECTIONS: Final = (
                 "%",
                 "At least half a metre off the ground one second after the lift.",
                 least=0.98,
-                scale=PERCENT,
             ),
             Metric(
                 "pile3_success",
@@ -46,7 +43,6 @@ SECTIONS: Final = (
                 "%",
                 "All three logs, counted as for single logs.",
                 least=0.98,
-                scale=PERCENT,
             ),
             Metric(
                 "unload_success",
@@ -55,7 +51,6 @@ SECTIONS: Final = (
                 "Carried to the bunk, lowered and released; then inside, released and at rest. Share of the lifted "
                 "single logs.",
                 least=0.98,
-                scale=PERCENT,
             ),
             Metric(
                 "yaw90_lifted",
@@ -63,7 +58,6 @@ SECTIONS: Final = (
                 "%",
                 "The same grasp with the grapple along the log instead of across it.",
                 most=0.02,
-                scale=PERCENT,
             ),
             Metric(
                 "off1m_lifted",
@@ -71,7 +65,6 @@ SECTIONS: Final = (
                 "%",
                 "The same grasp one metre across the log's axis.",
                 most=0.02,
-                scale=PERCENT,
             ),
             Metric(
                 "penetration_max_m",
@@ -79,7 +72,6 @@ SECTIONS: Final = (
                 "mm",
                 "Largest contact penetration in all single and pile trials.",
                 most=5e-3,
-                scale=MM,
             ),
             Metric(
                 "log_speed_max_m_s",
@@ -93,7 +85,6 @@ SECTIONS: Final = (
                 "Error of the load cell",
                 "%",
                 "Mean absolute error against the true mass of the logs held, at the end of the lift.",
-                scale=PERCENT,
             ),
         ),
         (
@@ -113,14 +104,12 @@ SECTIONS: Final = (
                 "Load on the hook from 0 to 250 kg with all spools closed; true tip against the tip by encoders.",
                 least=0.08,
                 most=0.12,
-                scale=MM,
             ),
             Metric(
                 "sag_seen_by_encoders_m",
                 "Part of the drop that encoders show",
                 "mm",
                 "The cylinders give way as well, and encoders show that: oil spring and damping orifices.",
-                scale=MM,
             ),
             Metric(
                 "ring_hz",
@@ -131,7 +120,7 @@ SECTIONS: Final = (
                 most=2.0,
             ),
             Metric("ring_zeta", "Damping ratio of that ringing", "", "Decay of its peaks.", least=0.005, most=0.3),
-            Metric("ring_pp_m_empty", "First swing of that ringing, peak to peak", "mm", "The same run.", scale=MM),
+            Metric("ring_pp_m_empty", "First swing of that ringing, peak to peak", "mm", "The same run."),
             Metric(
                 "ring_hz_250kg",
                 "Frequency of that ringing with 250 kg",
@@ -143,14 +132,9 @@ SECTIONS: Final = (
                 "Holding pressure of the lift cylinder at 6 m, empty",
                 "MPa",
                 "Chamber A, all spools closed.",
-                scale=MPA,
             ),
             Metric(
-                "pressure_200kg_pa",
-                "Holding pressure of the lift cylinder at 6 m with 200 kg",
-                "MPa",
-                "Chamber A.",
-                scale=MPA,
+                "pressure_200kg_pa", "Holding pressure of the lift cylinder at 6 m with 200 kg", "MPa", "Chamber A."
             ),
             Metric(
                 "pressure_rise_200kg",
@@ -165,7 +149,6 @@ SECTIONS: Final = (
                 "%",
                 "Full spool on slew, lift, tilt and telescope; mean of the four shares.",
                 most=0.95,
-                scale=PERCENT,
             ),
             Metric(
                 "shared_limited",
@@ -173,17 +156,9 @@ SECTIONS: Final = (
                 "%",
                 "As the plant reports it.",
                 least=0.5,
-                scale=PERCENT,
             ),
             Metric("slew_pendulum_hz", "Frequency of the load's swing after a slew stop", "Hz", "A grasped log."),
-            Metric(
-                "slew_pendulum_rad",
-                "Amplitude of that swing",
-                "deg",
-                "First swing after the stop.",
-                least=0.01,
-                scale=DEG,
-            ),
+            Metric("slew_pendulum_rad", "Amplitude of that swing", "deg", "First swing after the stop.", least=0.01),
         ),
         (
             ("sag.png", "Load on the hook at 6 m: sag of the true tip, and pressure of the lift cylinder."),
@@ -217,7 +192,6 @@ SECTIONS: Final = (
                 "deg",
                 "Largest angle of the hanging grapple from the vertical.",
                 least=0.01,
-                scale=DEG,
             ),
         ),
         (
@@ -237,7 +211,7 @@ SECTIONS: Final = (
                 "s",
                 "Take a log, lay it down elsewhere, return home, repeat.",
             ),
-            Metric("endurance_moved", "Cycles that moved the log", "%", "The same run.", least=0.9, scale=PERCENT),
+            Metric("endurance_moved", "Cycles that moved the log", "%", "The same run.", least=0.9),
             Metric(
                 "endurance_not_finite",
                 "Cycles that ended with a value that is not finite",
@@ -258,7 +232,6 @@ SECTIONS: Final = (
                 "mm",
                 "True tip height at the end of every cycle against the fourth.",
                 most=0.01,
-                scale=MM,
             ),
         ),
         (

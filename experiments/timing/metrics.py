@@ -83,7 +83,7 @@ OWN: Final = Section(
             "bytes per millisecond do not fit on a CAN bus of 1 Mbit/s.",
             most=250.0,
         ),
-        Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage, quiet windows.", scale=100.0),
+        Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage, quiet windows."),
         Metric("frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's own counters."),
         Metric("frames_lost", _LOST, "", "The controller's own counters, whole measurement.", most=0.0),
         Metric(
@@ -143,13 +143,7 @@ WAKEUPS: Final = Section(
         Metric("judged_cycles", "Cycles compared", "", "Ticks of the controller in the windows that are compared."),
         Metric("missed", "Deadlines missed in these cycles", "", "The limit is zero in 100,000 cycles.", most=0.0),
         Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat, all processors, all windows."),
-        Metric(
-            "pressure",
-            "Share of time in which a process waited for a processor",
-            "%",
-            "/proc/pressure/cpu.",
-            scale=100.0,
-        ),
+        Metric("pressure", "Share of time in which a process waited for a processor", "%", "/proc/pressure/cpu."),
     ),
     (("wakeups.png", "Lateness of wake-ups on a quiet host and with every core loaded; dashed: one period."),),
 )
@@ -161,12 +155,7 @@ LOADED: Final = Section(
         *_lateness("_loaded", "", "p50", "p99"),
         *_missed("", ""),
         Metric(
-            "missed_loaded_share",
-            "Deadlines missed, controller over sleep loop",
-            "%",
-            "200 Hz.",
-            most=MAX_MISSED_SHARE,
-            scale=100.0,
+            "missed_loaded_share", "Deadlines missed, controller over sleep loop", "%", "200 Hz.", most=MAX_MISSED_SHARE
         ),
         *_lateness("1k", " at 1 kHz, quiet", "p99"),
         Metric("missed_1k", "Deadlines missed by the controller at 1 kHz, quiet", "", "Fixed crane."),

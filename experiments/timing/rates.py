@@ -239,7 +239,7 @@ FAST: Final = Section(
         Metric("forwarder1k_frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's counters."),
         Metric("forwarder1k_cpu_p50_us", "CPU time of a tick, median", "us", "The thread's own clock."),
         Metric("forwarder1k_cpu_p99_us", "CPU time of a tick, p99", "us", "As for the median."),
-        Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage.", scale=100.0),
+        Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage."),
         Metric("forwarder1k_ticks", "Ticks", "", "Executed."),
         Metric("forwarder1k_missed", "Missed periods", "", "The host's stalls included."),
         Metric("frames_lost", "Frames refused or lost, all machines and rates", "", "Its own counters.", most=0.0),
@@ -272,19 +272,11 @@ COST: Final = Section(
                     "%",
                     "Of the largest load.",
                     most=MAX_RESIDUAL,
-                    scale=100.0,
                 ),
             )
         ),
         Metric("function_us", "CPU time per function and period", "us", "Slope of the line, both machines."),
-        Metric(
-            "function_residual",
-            "Functions: largest residual",
-            "%",
-            "Of the largest cost.",
-            most=MAX_RESIDUAL,
-            scale=100.0,
-        ),
+        Metric("function_residual", "Functions: largest residual", "%", "Of the largest cost.", most=MAX_RESIDUAL),
     ),
 )
 CRANES: Final = Section(

@@ -103,7 +103,6 @@ TIMES: Final = Section(
             "%",
             "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
             least=MIN_ACTIVE_SHARE,
-            scale=100.0,
         ),
         Metric("wakeup_p50_us", "Lateness, median", "us", "All ticks."),
         Metric("wakeup_p99_us", "Lateness, p99", "us", "All ticks."),

@@ -53,7 +53,7 @@ INTRODUCTION: Final = (
 
 def _metrics(kind: str, title: str) -> Iterator[Metric]:
     yield Metric(f"{kind}_runs", f"Runs: {title}", "", "One seed each, one after the other.")
-    yield Metric(f"{kind}_done", f"Done: {title}", "%", "By the plant's physics.", least=1.0, scale=100.0)
+    yield Metric(f"{kind}_done", f"Done: {title}", "%", "By the plant's physics.", least=1.0)
     yield Metric(f"{kind}_stops", f"Stops: {title}", "", "All runs, whatever their clock.", most=0.0, clocked=True)
     yield Metric(f"{kind}_leases_lost", f"Ended leases among them: {title}", "", "Setpoints that came too late.")
     yield Metric(f"{kind}_refused", f"Refused setpoints: {title}", "", "By the controller, at the end of each run.")
@@ -66,7 +66,6 @@ def _metrics(kind: str, title: str) -> Iterator[Metric]:
         "%",
         "In user-mode Linux or natively; simulated only where the host's lost time leaves no other choice.",
         least=1.0,
-        scale=100.0,
         clocked=True,
     )
     yield Metric(f"{kind}_wall_s", f"Duration on the host: {title}", "s", "Mean, with the start of every process.")
