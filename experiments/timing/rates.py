@@ -22,9 +22,8 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing.evaluation import load_metrics, spread_us, unmeasured
 from experiments.timing.events import STALL_NS, Events, event_metrics, explained
-from experiments.timing.measurement import between
+from experiments.timing.metrics import spread_us, unmeasured
 from experiments.timing.testbed import TestbedConfig, TimingTestbed, cores
 from hil.harness.processes import ProcessGroup
 from hil.replay.recording import files_of, manifest_of
@@ -48,6 +47,7 @@ MISSED_SHARE: Final = 0.001
 """Share of the periods that may be missed before a processor carries too many controllers."""
 REPLAY_TICKS: Final = 1000
 PERIOD_NS: Final = 5_000_000
+REPLAY: Final = "experiments.timing.replayed_crane"
 MAX_RESIDUAL: Final = 0.1
 """Of a straight line, as a share of its largest value."""
 
@@ -126,13 +126,12 @@ def measure_rate(machine: str, rate_hz: int, seconds: float, directory: Path) ->
     """Measure one machine at one rate."""
     with TimingTestbed(TestbedConfig(machine, rate_hz, bitrates=BITRATES), directory) as testbed:
         testbed.wait(2.0)
-        begin = testbed.fresh_timing()
+        mark = testbed.mark()
         testbed.wait(seconds)
-        end = testbed.fresh_timing()
+        span = testbed.since(mark)
         testbed.wait(0.5)
-    figures = spread_us("cpu", between(begin, end)["cpu"]) | load_metrics(begin.facts, end.facts)
-    figures |= {n: float(getattr(end.facts, n) - getattr(begin.facts, n)) for n in ("ticks", "missed")}
-    return RatePoint(machine, rate_hz, figures, testbed.events, end.facts.tick)
+    figures = {**spread_us("cpu", span.durations["cpu"]), **span.load, "ticks": span.ticks, "missed": span.missed}
+    return RatePoint(machine, rate_hz, figures, testbed.events, span.end.tick)
 
 
 def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[CranePoint]:
@@ -159,17 +158,8 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
     start_ns = time.monotonic_ns() + round((3.0 + 2.0 * cranes) * 1e9)
     try:
         for k in range(cranes):
-            family.start(
-                f"crane-{k}",
-                "experiments.timing.replayed_crane",
-                recording,
-                "--ticks",
-                ticks,
-                "--cpu",
-                cpu,
-                "--start-at",
-                start_ns + k * PERIOD_NS // cranes,
-            )
+            at_ns = start_ns + k * PERIOD_NS // cranes
+            family.start(f"crane-{k}", REPLAY, recording, ticks=ticks, cpu=cpu, start_at=at_ns)
         limit = time.monotonic() + 60.0 + 3.0 * cranes + 3.0 * ticks * PERIOD_NS * 1e-9
         while len(outputs) < cranes:
             for name, message in family.messages():
@@ -307,11 +297,7 @@ INTRODUCTION: Final = (
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
-    e = result.environment
-    setting = (
-        f"Commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python "
-        f"{e['python']}, tick: {e['tick']}."
-    )
+    setting = f"Commit `{result.commit}`. {host_activity.sentence(result.environment)}"
     return Page("Rates experiment", CONCLUSION, INTRODUCTION, SECTIONS, setting)
 
 

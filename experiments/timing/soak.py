@@ -18,11 +18,10 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing.evaluation import MIN_STEADY_TICKS, block_growth, spread_us
-from experiments.timing.events import event_metrics
-from experiments.timing.measurement import between
+from experiments.timing.events import event_metrics, losses_between
+from experiments.timing.metrics import MIN_STEADY_TICKS, block_growth, spread_us
 from experiments.timing.plots import draw_exceeded
-from experiments.timing.testbed import TestbedConfig, TimingTestbed
+from experiments.timing.testbed import Span, TestbedConfig, TimingTestbed
 from machine.loading.profile_file import load_profile
 from runtime.plot_style import OIL, TIMBER, sheet
 
@@ -144,29 +143,28 @@ def run(options: Options, console: Console) -> Result:
     first = host_activity.sample()
     with console.status("soak: starting") as status, TimingTestbed(setting, options.out / "testbed") as testbed:
         testbed.wait(WARM_S)
-        begin, before = testbed.fresh_timing(), testbed.counters()
+        mark, before = testbed.mark(), testbed.counters()
         began, readings = time.monotonic(), list[Reading]()
         while (passed := time.monotonic() - began) < 60.0 * minutes:
             readings.append(read(testbed, passed))
             status.update(f"soak: {passed / 60:.1f} of {minutes:.3g} min, {readings[-1].facts.words}")
             testbed.wait(min(READING_PERIOD_S, 60.0 * minutes / MIN_READINGS, 60.0 * minutes - passed))
-        end = testbed.fresh_timing()
+        span = testbed.since(mark)
         readings.append(read(testbed, time.monotonic() - began))
         counted = testbed.counters()
         counted.subtract(before)
-    durations = between(begin, end)
     told = event_metrics([testbed.events])
     metrics = {
         "minutes": minutes,
-        "ticks": float(end.facts.ticks - begin.facts.ticks),
-        "missed": float(end.facts.missed - begin.facts.missed),
+        "ticks": float(span.ticks),
+        "missed": float(span.missed),
         **{name: told[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
         "steal_ms": host_activity.between(first, host_activity.sample()).steal_ms,
         **memory(readings),
-        **frames(counted, begin.facts, end.facts),
-        **spread_us("wakeup", durations["wake"]),
-        **spread_us("tick_cpu", durations["cpu"]),
+        **frames(counted, span),
+        **spread_us("wakeup", span.durations["wake"]),
+        **spread_us("tick_cpu", span.durations["cpu"]),
     }
     result = make_result(
         "soak",
@@ -188,7 +186,7 @@ def run(options: Options, console: Console) -> Result:
     options.out.mkdir(parents=True, exist_ok=True)
     draw_memory(readings, options.out / "memory.png")
     with sheet(options.out / "lateness.png") as axis:
-        draw_exceeded(axis, {"controller": durations["wake"]}, setting.period_ns)
+        draw_exceeded(axis, {"controller": span.durations["wake"]}, setting.period_ns)
     publish(result, page_of(result, {}), options, console)
     return result
 
@@ -197,10 +195,8 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
     e = result.environment
     rate = f" at {e['rate_hz']} Hz" if "rate_hz" in e else ""
-    setting = (
-        f"Commit `{result.commit}`, `{result.profile}`{rate} on {e['bus']}{e['lab']}. Host: "
-        f"{e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python {e['python']}."
-    )
+    where = f"`{result.profile}`{rate} on {e['bus']}{e['lab']}"
+    setting = f"Commit `{result.commit}`, {where}. {host_activity.sentence(e)}"
     return Page("Soak test", CONCLUSION, INTRODUCTION, SECTIONS, setting, "make soak")
 
 
@@ -241,9 +237,9 @@ def memory(readings: Sequence[Reading]) -> dict[str, float]:
     }
 
 
-def frames(counted: Counter[str], begin: Facts, end: Facts) -> dict[str, float]:
+def frames(counted: Counter[str], span: Span) -> dict[str, float]:
     """Counts of frames in a run, by bus observer, emulated machine and controller."""
-    lost = sum(b.dropped + b.refused for b in end.buses) - sum(b.dropped + b.refused for b in begin.buses)
+    lost = sum(loss.frames for loss in losses_between(span.begin, span.end))
     names = ("received", "sent", "gaps", "gaps_rig", "damaged", "unanswered", "records_lost")
     return {
         **{name: float(counted[name]) for name in names},
