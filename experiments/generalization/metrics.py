@@ -7,8 +7,7 @@ from typing import Any, Final
 
 from experiments.common.result import Metric, mean, rate
 from experiments.common.result_page import Section
-from experiments.generalization.matrix import is_drawn, is_mission, title_of
-from experiments.generalization.mission import MISSION
+from experiments.generalization.matrix import MISSION, is_drawn, is_mission, title_of
 
 CONCLUSION: Final = (
     "With a truth at either end of every parameter, or everything drawn, {calibrated_share} of the machines are "

@@ -48,6 +48,7 @@ MISSED_SHARE: Final = 0.001
 REPLAY_TICKS: Final = 1000
 PERIOD_NS: Final = 5_000_000
 REPLAY: Final = "experiments.timing.replayed_crane"
+LINES: Final = (*((f"{machine}_frame", title) for machine, title in MACHINES.items()), ("function", "Functions"))
 MAX_RESIDUAL: Final = 0.1
 """Of a straight line, as a share of its largest value."""
 
@@ -215,9 +216,9 @@ def undecided(metrics: Mapping[str, float], points: Sequence[RatePoint]) -> dict
     """The metrics that this run cannot decide, with the reason."""
     found = unmeasured(METRICS, metrics) | explained(metrics)
     stalled = any(s.length_ns >= STALL_NS for p in points for s in p.events.stalls)
-    for name in (*(f"{machine}_frame_residual" for machine in MACHINES), "function_residual"):
-        if metrics[name] > MAX_RESIDUAL and stalled:
-            found[name] = "the host stalled during the measurement"
+    for name, _ in LINES:
+        if metrics[f"{name}_residual"] > MAX_RESIDUAL and stalled:
+            found[f"{name}_residual"] = "the host stalled during the measurement"
     return found
 
 
@@ -228,45 +229,27 @@ FAST: Final = Section(
     (
         Metric("forwarder1k_frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's counters."),
         Metric("forwarder1k_cpu_p50_us", "CPU time of a tick, median", "us", "The thread's own clock."),
-        Metric("forwarder1k_cpu_p99_us", "CPU time of a tick, p99", "us", "As for the median."),
+        Metric("forwarder1k_cpu_p99_us", "CPU time of a tick, p99", "us", "The thread's own clock."),
         Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage."),
-        Metric("forwarder1k_ticks", "Ticks", "", "Executed."),
+        Metric("forwarder1k_ticks", "Ticks", ""),
         Metric("forwarder1k_missed", "Missed periods", "", "The host's stalls included."),
         Metric("frames_lost", "Frames refused or lost, all machines and rates", "", "Its own counters.", most=0.0),
         Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "", "By the witness.", most=0.0),
         Metric("stops", "Stops, all machines and rates", "", "By the controller's reports.", most=0.0),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness.", most=0.0),
     ),
-    (
-        (
-            "rates.png",
-            "CPU load against frames per second, and CPU time per period against the functions moved; lines: "
-            "least squares.",
-        ),
-    ),
+    (("rates.png", "CPU load against frames per second, CPU time per period against the functions moved; fitted."),),
 )
 COST: Final = Section(
     "Cost against frames and joints",
     "Both are straight lines: a frame and a function cost the same whether there are few or many. The load against "
     "frames is measured live at 100 to 1000 Hz, so that its slope contains the ticks that carry the frames. The cost "
-    "against functions is that of several controllers at 200 Hz on one processor.",
+    "against functions is that of several controllers at 200 Hz on one processor. A residual is the largest of a line, "
+    "as a share of the largest value.",
     (
-        *(
-            metric
-            for machine, title in MACHINES.items()
-            for metric in (
-                Metric(f"{machine}_frame_us", f"{title}: CPU time per frame", "us", "Slope of the line."),
-                Metric(
-                    f"{machine}_frame_residual",
-                    f"{title}: largest residual",
-                    "%",
-                    "Of the largest load.",
-                    most=MAX_RESIDUAL,
-                ),
-            )
-        ),
+        *(Metric(f"{machine}_frame_us", f"{title}: CPU time per frame", "us") for machine, title in MACHINES.items()),
         Metric("function_us", "CPU time per function and period", "us", "Slope of the line, both machines."),
-        Metric("function_residual", "Functions: largest residual", "%", "Of the largest cost.", most=MAX_RESIDUAL),
+        *(Metric(f"{name}_residual", f"{title}: largest residual", "%", most=MAX_RESIDUAL) for name, title in LINES),
     ),
 )
 CRANES: Final = Section(

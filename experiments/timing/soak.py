@@ -44,13 +44,7 @@ MEMORY: Final = Section(
     "Read every few seconds. Growth is the maximum of the second half of the run less the maximum of the first half. "
     "The interpreter's memory blocks come and go, so their minima are compared.",
     (
-        Metric(
-            "controller_growth_kb",
-            "Growth of the controller's resident memory",
-            "kB",
-            "VmRSS of /proc/PID/status.",
-            most=FLAT_KB,
-        ),
+        Metric("controller_growth_kb", "Growth of the controller's resident memory", "kB", "VmRSS.", most=FLAT_KB),
         Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS.", most=FLAT_KB),
         Metric(
             "allocated_blocks_growth",
@@ -59,8 +53,8 @@ MEMORY: Final = Section(
             "sys.getallocatedblocks, from the timing page.",
             most=0.0,
         ),
-        Metric("gc_runs", "Runs of the garbage collector", "", "In the controller.", most=0.0),
-        Metric("major_faults", "Major page faults", "", "In the controller.", most=0.0),
+        Metric("gc_runs", "Runs of the garbage collector in the controller", "", most=0.0),
+        Metric("major_faults", "Major page faults in the controller", "", most=0.0),
     ),
     (("memory.png", "Resident memory of controller and guard, and memory blocks of the controller, over the run."),),
 )
@@ -71,19 +65,13 @@ FRAMES: Final = Section(
     "carry none, but every SYNC must be answered. The emulated machine checks its received frames in the same way.",
     (
         Metric("minutes", "Duration", "min", "After a few seconds of warm-up."),
-        Metric("received", "Frames received by the controller", "", "All buses."),
-        Metric("sent", "Frames sent by the controller", "", "All buses."),
-        Metric("gaps", "Gaps in its protected frames, received and sent", "", "By the bus observer.", most=0.0),
-        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", "By itself.", most=0.0),
+        Metric("received", "Frames received by the controller", ""),
+        Metric("sent", "Frames sent by the controller", ""),
+        Metric("gaps", "Gaps in its protected frames, received and sent", "", most=0.0),
+        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", most=0.0),
         Metric("damaged", "Frames with a wrong CRC", "", "By both.", most=0.0),
-        Metric("unanswered", "SYNCs not answered by an encoder", "", "By the bus observer.", most=0.0),
-        Metric(
-            "frames_lost",
-            "Frames refused by a bus or lost before they were read",
-            "",
-            "Controller and emulated machine.",
-            most=0.0,
-        ),
+        Metric("unanswered", "SYNCs not answered by an encoder", "", most=0.0),
+        Metric("frames_lost", "Frames refused by a bus or lost before they were read", "", "By both.", most=0.0),
         Metric("records_lost", "Missing tick records", "", "By their nominal times.", most=0.0),
     ),
 )
@@ -92,7 +80,7 @@ TIMES: Final = Section(
     "The histogram of the whole run. In user-mode Linux a system call costs a hundred times as much as on the host, so "
     "these numbers show that the machine works there, not what the controller costs.",
     (
-        Metric("ticks", "Ticks", "", "Executed."),
+        Metric("ticks", "Ticks", ""),
         Metric("missed", "Missed periods", "", "Whole periods skipped."),
         Metric("stops", "Stops of the machine", "", "The emulated operator arms it again after each."),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness of the testbed."),
@@ -103,10 +91,10 @@ TIMES: Final = Section(
             "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
             least=MIN_ACTIVE_SHARE,
         ),
-        Metric("wakeup_p50_us", "Lateness, median", "us", "All ticks."),
-        Metric("wakeup_p99_us", "Lateness, p99", "us", "All ticks."),
-        Metric("wakeup_max_us", "Lateness, longest", "us", "All ticks."),
-        Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us", "All ticks."),
+        Metric("wakeup_p50_us", "Lateness, median", "us"),
+        Metric("wakeup_p99_us", "Lateness, p99", "us"),
+        Metric("wakeup_max_us", "Lateness, longest", "us"),
+        Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us"),
         Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat."),
     ),
     (("lateness.png", "Share of wake-ups later than x."),),
@@ -213,14 +201,10 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
 
 def read(testbed: TimingTestbed, at_s: float) -> Reading:
     """Read a running testbed."""
-    controller, guard = (resident_kb(testbed.family.children[n].process.pid) for n in ("controller", "guard"))
+    status = (Path(f"/proc/{testbed.family.children[n].process.pid}/status") for n in ("controller", "guard"))
+    resident = (re.search(r"^VmRSS:\s+(\d+)", path.read_text(), re.MULTILINE) for path in status)
+    controller, guard = (int(found[1]) if found else 0 for found in resident)
     return Reading(at_s, testbed.timing().facts, controller, guard, testbed.mode)
-
-
-def resident_kb(pid: int) -> int:
-    """VmRSS of a process."""
-    found = re.search(r"^VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
-    return int(found[1]) if found else 0
 
 
 def memory(readings: Sequence[Reading]) -> dict[str, float]:

@@ -34,6 +34,15 @@ MAX_LOST_SHARE: Final = 0.01
 """Of the time of the runs, by the witness: a host that takes more is not quiet."""
 MAX_LONGEST_MS: Final = 25.0
 """Half of a motion input's time-out."""
+MISSION: Final = "docs/examples/paper_b.geojson"
+MISSION_LOGS: Final = 3
+LIMIT_S: Final = 1800.0
+"""Of the host; a run that takes longer is ended and counts as not done."""
+PROBE_PRIORITY: Final = 99
+LATE_US: Final = 500
+"""Ordinary wake-ups are earlier."""
+_CLOCK: Final = re.compile(r"^vcan lab: (real|simulated) time: (.*)$", re.MULTILINE)
+_MODE: Final = re.compile(r"^ *[0-9.]+ s +(STOP|FAULT): (.*)$", re.MULTILINE)
 KINDS: Final = {"demo": "one log into the bunk", "mission": "mission with three logs"}
 CLOCKS: Final = ("real", "simulated", "native")
 SEED_FIGURES: Final = (
@@ -164,17 +173,6 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     return Page("Live runs on SocketCAN", CONCLUSION, INTRODUCTION, SECTIONS, setting)
 
 
-MISSION: Final = "docs/examples/paper_b.geojson"
-MISSION_LOGS: Final = 3
-LIMIT_S: Final = 1800.0
-"""Of the host; a run that takes longer is ended and counts as not done."""
-PROBE_PRIORITY: Final = 99
-LATE_US: Final = 500
-"""Ordinary wake-ups are earlier."""
-_CLOCK: Final = re.compile(r"^vcan lab: (real|simulated) time: (.*)$", re.MULTILINE)
-_MODE: Final = re.compile(r"^ *[0-9.]+ s +(STOP|FAULT): (.*)$", re.MULTILINE)
-
-
 def command(kind: str, seed: int, out: Path) -> list[str]:
     """The user's command line for one run."""
     job = f"mission run {MISSION} --logs {MISSION_LOGS}" if kind == "mission" else "demo"
@@ -215,16 +213,12 @@ def run_command(words: Sequence[str]) -> tuple[str, str, int]:
         words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         try:
-            told, said = process.communicate(timeout=LIMIT_S)
+            return *process.communicate(timeout=LIMIT_S), process.returncode
         except subprocess.TimeoutExpired:
             process.terminate()  # the lab forwards it; killed, the lab would go on beside the next run
-            told, said = process.communicate()
-            return told, said, 124
-        except BaseException:  # Ctrl-C that reached this process alone
-            process.terminate()
-            process.wait()
-            raise
-        return told, said, process.returncode
+            return *process.communicate(), 124
+        finally:
+            process.terminate()  # after Ctrl-C that reached this process alone
 
 
 def read_output(told: str, said: str) -> dict[str, Any]:

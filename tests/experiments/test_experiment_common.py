@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments.common import pool
-from experiments.common.fingerprint import ALL_SOURCES, SOURCES, source_hash
+from experiments.common.checkpoint import ALL_SOURCES, SOURCES, source_hash
 from experiments.common.overview import read
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
