@@ -8,7 +8,6 @@ interval: other load and shared caches change it.
 
 from __future__ import annotations
 
-import platform
 import statistics
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -19,7 +18,6 @@ from typing import Any, Final
 
 from websockets.sync.client import ClientConnection, connect
 
-from experiments.common import host_activity
 from experiments.timing.measurement import system_calls
 from experiments.timing.testbed import HOST, START_S, TestbedConfig, TimingTestbed
 from hil.harness.processes import free_udp_ports
@@ -147,8 +145,3 @@ def _compared(found: dict[str, list[Window]], name: str) -> dict[str, Any]:
         sides[side] = statistics.median(values)
     same = abs(sides["open"] - sides["none"]) <= SAME * sides["none"]
     return {side: round(value, 2) for side, value in sides.items()} | {"same": same}
-
-
-def environment() -> dict[str, str]:
-    """What the figures depend on."""
-    return {"python": platform.python_version(), "machine": platform.machine()} | host_activity.describe()
