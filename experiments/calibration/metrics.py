@@ -77,7 +77,8 @@ def _prefixes(found: Mapping[str, float]) -> list[str]:
 def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
     def m(name: str, title: str, unit: str, how: str, **more: Any) -> Metric:
         # The name of a user's machine may hold what looks like a unit.
-        return Metric(f"{short}_{name}", title, unit, how, **({"scale": 1.0} if unit == "mm" else {}) | more)
+        more.setdefault("scale", 1.0 if unit == "mm" else None)
+        return Metric(f"{short}_{name}", title, unit, how, **more)
 
     return (
         m(
