@@ -13,8 +13,7 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.checkpoint import Checkpoint
 from experiments.common.pool import Job
-from experiments.common.trial_cost import overhead_s
-from experiments.common.workers import Trial, Workers
+from experiments.common.workers import Trial, Workers, overhead_s
 
 TRIALS: Final = 100
 WAIT_S: Final = 0.1

@@ -5,13 +5,23 @@ Without ``--profile`` these are machines of both shipped kinds; with a profile o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
 
-from experiments.calibration.metrics import INTRODUCTION, conclusion, machines_of, metrics_in, metrics_of, sections
-from experiments.calibration.plots import draw
+from experiments.calibration.metrics import (
+    DEADBAND_PCT,
+    DELAY_MS,
+    GAIN,
+    INTRODUCTION,
+    conclusion,
+    machines_of,
+    metrics_in,
+    metrics_of,
+    sections,
+)
 from experiments.calibration.trial import calibrated
 from experiments.common import pool
 from experiments.common.pool import Job
@@ -19,6 +29,7 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint, sampled_unless_given
+from runtime.plot_style import MOSS, OIL, STEEL, limit_band, sheet
 
 TRIALS: Final = 20
 QUICK_TRIALS: Final = 1
@@ -65,3 +76,29 @@ def run(options: Options, console: Console) -> Result:
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
     return Page("Calibration experiment", conclusion(result.metrics), INTRODUCTION, sections(result.metrics))
+
+
+def draw(path: Path, outcomes: Sequence[dict[str, Any]]) -> None:
+    """Plot the errors of every joint: dead-band, full speed, dead time."""
+    ended = [o for o in outcomes if not o["failure"]]
+    names = list(dict.fromkeys(n for o in ended for n in o["joints"]))
+    with sheet(path, 3, 9.0, 3.0) as (deadband, gain, delay):
+        for x, name in enumerate(names):
+            found = [o["joints"][name] for o in ended]
+            for axis, values in (
+                (deadband, [r["deadband_pct"] for r in found]),
+                (gain, [[100.0 * e for e in r["gain"]] for r in found]),
+                (delay, [[r["delay_ms"]] for r in found]),
+            ):
+                for i, color in ((0, OIL), (-1, MOSS)):
+                    axis.plot(
+                        [x + 0.12 * (1 if i else -1)] * len(values), [v[i] for v in values], ".", ms=4, color=color
+                    )
+        for axis, title, bound in (
+            (deadband, "dead-band error [% of spool]", DEADBAND_PCT),
+            (gain, "full speed error [%]", 100.0 * GAIN),
+            (delay, "dead time error [ms]", DELAY_MS),
+        ):
+            axis.set(title=title, xticks=range(len(names)), xticklabels=names, ylim=(-1.4 * bound, 1.4 * bound))
+            limit_band(axis, -bound, bound)
+            axis.axhline(0.0, color=STEEL, lw=0.6)

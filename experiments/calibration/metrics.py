@@ -75,8 +75,10 @@ def _prefixes(found: Mapping[str, float]) -> list[str]:
 
 
 def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
-    def m(name: str, *rest: Any, **limits: Any) -> Metric:
-        return Metric(f"{short}_{name}", *rest, **limits)
+    def m(name: str, title: str, unit: str, how: str, **more: Any) -> Metric:
+        # The name of a user's machine may hold what looks like a unit.
+        more.setdefault("scale", 1.0 if unit == "mm" else None)
+        return Metric(f"{short}_{name}", title, unit, how, **more)
 
     return (
         m(
@@ -85,7 +87,6 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
             "%",
             "No stop, no refused request, and no value that the calibration itself rejects.",
             least=0.95,
-            scale=100.0,
         ),
         m(
             "deadband_max",
@@ -102,10 +103,9 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
             "%",
             "Against the plant's own speed at the same place, measured without bus, controller and sensors.",
             most=GAIN,
-            scale=100.0,
         ),
-        m("gain_rms", "Full speed, RMS error", "%", "The same values.", scale=100.0),
-        m("gain_before", "Full speed of the shipped profile, largest error", "%", "Before calibration.", scale=100.0),
+        m("gain_rms", "Full speed, RMS error", "%", "The same values."),
+        m("gain_before", "Full speed of the shipped profile, largest error", "%", "Before calibration."),
         m(
             "delay_max",
             "Dead time, largest error",
@@ -161,7 +161,6 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
             "Compliance of the column, largest error",
             "%",
             "Identified lean per moment over the truth's; it contains what the profile has wrong of the lift cylinder.",
-            scale=100.0,
         ),
         m(
             "load_max",
@@ -217,15 +216,8 @@ def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
             "%",
             "Against the truth of its valve.",
             most=GAIN,
-            scale=100.0,
         ),
-        m(
-            "rot_gain_before",
-            "Rotator: full speed of the shipped profile, largest error",
-            "%",
-            "Before calibration.",
-            scale=100.0,
-        ),
+        m("rot_gain_before", "Rotator: full speed of the shipped profile, largest error", "%", "Before calibration."),
         m(
             "rot_quarter_max",
             "Rotator without encoder: quarter turn, largest error",
@@ -233,15 +225,13 @@ def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
             "True angle of the quarter turns that a planner commands, two to either side: the drift of the dead "
             "reckoning.",
             most=ROT_QUARTER,
-            scale=100.0,
         ),
-        m("rot_quarter_rms", "Rotator: quarter turn, RMS error", "%", "The same values.", scale=100.0),
+        m("rot_quarter_rms", "Rotator: quarter turn, RMS error", "%", "The same values."),
         m(
             "rot_quarter_before",
             "Rotator: quarter turn with the shipped profile, largest error",
             "%",
             "Before calibration.",
-            scale=100.0,
         ),
     )
 

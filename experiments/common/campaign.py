@@ -25,8 +25,7 @@ from experiments.common.checkpoint import Checkpoint
 from experiments.common.recording import RECORD
 from experiments.common.registry import EXPERIMENTS, Options, load
 from experiments.common.result import Result, mean
-from experiments.common.trial_cost import TrialCost, overhead_s
-from experiments.common.workers import Trial, Workers
+from experiments.common.workers import Trial, TrialCost, Workers, overhead_s
 
 TABLE: Final = "table.jsonl"
 SUMMARY: Final = "campaign.json"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,6 +17,20 @@ from host.doctor import facts
 
 _STEAL: Final = 8
 """Index of steal in a line of /proc/stat: name user nice system idle iowait irq softirq steal."""
+
+
+FACTS: Final = {
+    "processor": "{}",
+    "cpus": "{} cores",
+    "hypervisor": "hypervisor: {}",
+    "kernel": "kernel {}",
+    "preemption": "preemption {}",
+    "clock": "clock {}",
+    "governor": "governor {}",
+    "isolated": "isolated processors {}",
+    "python": "Python {}",
+    "tick": "tick: {}",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +102,12 @@ def describe() -> dict[str, str]:
         "hypervisor": "no" if found.machine in ("", "a container") else "yes",
         "rt_runtime_us": "unknown" if found.rt_runtime_us is None else str(found.rt_runtime_us),
     }
+
+
+def sentence(environment: Mapping[str, str]) -> str:
+    """The host that measured, for a page; facts that a result does not hold are left out."""
+    told = (words.format(environment[name]) for name, words in FACTS.items() if name in environment)
+    return f"Host: {', '.join(told)}."
 
 
 def _read(path: str) -> str:

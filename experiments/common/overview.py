@@ -95,9 +95,8 @@ def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]
         "## Later published systems",
         "",
         "Settings differ, so a row compares questions, not machines. Here everything runs on the bus through "
-        "controller and guard, with our own detector and depth camera. "
-        "`timberhand experiment grasp-configs --planner NAME` compares another method with ours on "
-        "the same scenes ([campaigns](how-to/campaigns.md)).",
+        "controller and guard, with our own detector and depth camera. `timberhand experiment grasp-configs --planner "
+        "NAME` compares another method with ours on the same scenes ([campaigns](how-to/campaigns.md)).",
         "",
         "| system | setting | measure | published | nearest here | command |",
         "|---|---|---|---|---|---|",

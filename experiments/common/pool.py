@@ -19,9 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from experiments.common.checkpoint import Checkpoint as Checkpoint
-from experiments.common.fingerprint import installation
-from experiments.common.trial_cost import TrialCost, measured
-from experiments.common.workers import Trial, Workers
+from experiments.common.checkpoint import installation
+from experiments.common.workers import Trial, TrialCost, Workers, measured
 from runtime.memory import keep_memory
 
 SPEED_PERIOD_S: Final = 1800.0

@@ -7,10 +7,12 @@ metric that misses its limit on a noisy host is ``inconclusive`` instead, becaus
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,23 +23,44 @@ from typing import Final
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("numpy", "numba", "pybullet")
 Z_95: Final = 1.959963984540054
+FIRST_SEALED: Final = 100_000
+SEALED_SEEDS: Final = 900_000
+"""Sealed seeds are these many from the first; tuning and validation use smaller ones."""
+PRINTED: Final = {
+    "%": ("", 100.0),
+    "mm": ("m", 1e3),
+    "cm": ("m", 100.0),
+    "deg": ("rad", math.degrees(1.0)),
+    "MPa": ("pa", 1e-6),
+    "min": ("s", 1 / 60),
+}
+"""Printed units: the SI unit in a metric's name, and the factor from there."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric: its key in ``metrics``, title, printed unit, how it is measured, limits (None: only reported).
+    """One metric: its key in ``metrics``, title, printed unit, how it is measured (empty: the title says it), limits
+    (None: only reported).
 
-    ``scale`` converts the number into the printed unit.  ``clocked``: the number depends on the host's speed.
+    ``scale`` converts the number into the printed unit; None: from the SI unit in its name, a share into per cent.
+    ``clocked``: the number depends on the host's speed.
     """
 
     name: str
     title: str
     unit: str
-    how: str
+    how: str = ""
     least: float | None = None
     most: float | None = None
-    scale: float = 1.0
+    scale: float | None = None
     clocked: bool = False
+
+    @property
+    def factor(self) -> float:
+        """The printed number over that in ``metrics``."""
+        si_unit, factor = PRINTED.get(self.unit, ("", 1.0))
+        named = self.unit == "%" or si_unit in re.split(r"[_.]", self.name)
+        return self.scale if self.scale is not None else factor if named else 1.0
 
     def holds(self, value: float) -> bool:
         """Whether a value is finite and within the limits."""
@@ -47,14 +70,14 @@ class Metric:
 
     def limit_text(self) -> str:
         """The limit in the printed unit."""
-        low, high = (None if v is None else _digits(v * self.scale) for v in (self.least, self.most))
+        low, high = (None if v is None else _digits(v * self.factor) for v in (self.least, self.most))
         if low and high:
             return f"{low} to {high}" if low != high else f"exactly {low}"
         return f"at least {low}" if low else f"at most {high}" if high else ""
 
     def text(self, value: float) -> str:
         """The value in the printed unit."""
-        return f"{_digits(value * self.scale)}{' ' if self.unit and self.unit != '%' else ''}{self.unit}"
+        return f"{_digits(value * self.factor)}{' ' if self.unit and self.unit != '%' else ''}{self.unit}"
 
 
 def _digits(value: float) -> str:
@@ -89,7 +112,7 @@ class Result:
         if low is None or high is None:
             return ""
         n = self.metrics[f"{metric.name}_n"]
-        return f" ({low * metric.scale:.1f} to {high * metric.scale:.1f}, n = {n:.0f})"
+        return f" ({low * metric.factor:.1f} to {high * metric.factor:.1f}, n = {n:.0f})"
 
     def save(self, path: Path) -> None:
         """Write it as JSON with sorted metrics."""
@@ -227,3 +250,13 @@ def _processor() -> str:
     except OSError:
         return platform.processor()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def sealed_seed(commit: str, experiment: str) -> int:
+    """The seed of an experiment, drawn from the commit that is measured, so that nobody can have tuned on it.
+
+    The rule is part of the commit, and its hash is not known before the commit is made: each change of the code brings
+    other trials, and anyone with the checkout can draw the same.
+    """
+    digest = hashlib.sha256(f"{commit}/{experiment}".encode()).digest()
+    return FIRST_SEALED + int.from_bytes(digest[:8], "big") % SEALED_SEEDS

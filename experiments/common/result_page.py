@@ -11,17 +11,21 @@ import re
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from itertools import groupby
 from pathlib import Path
 from typing import Final
 
 from rich.console import Console
 
 from experiments.common import overview
+from experiments.common.checkpoint import read_published
 from experiments.common.registry import EXPERIMENTS, Options
-from experiments.common.result import Metric, Result
-from experiments.common.seeds import sealed_seed
+from experiments.common.result import Metric, Result, sealed_seed
 from experiments.common.standing import judge, marked
 
+MAX_TITLES: Final = 4
+"""Of metrics that are measured alike, on one line."""
 _FIELD: Final = re.compile(r"\{(paper:)?([^{}]+)\}")
 
 
@@ -96,12 +100,20 @@ def markdown(result: Result, page: Page) -> str:
             value = m.text(result.metrics[m.name]) + result.interval_text(m)
             paper = f" (paper: {m.text(result.paper[m.name])})" if m.name in result.paper else ""
             out.append(f"| {m.title} | {value}{paper} | {m.limit_text()} | {_state(m, result)} |")
-        out += ["", "How each is measured:", ""] if shown else []
-        out += [f"- *{m.title}*: {m.how}" for m in shown]
-        out += [""] if shown else []
+        out += _measured(shown)
         for plot in section.plots:
             out += [*_plot(result, *plot), ""] if plot != first else []
     return "\n".join(out).rstrip() + "\n"
+
+
+def _measured(metrics: Sequence[Metric]) -> list[str]:
+    """How the metrics are measured; neighbours that are measured alike share a line."""
+    lines = []
+    for how, group in groupby(metrics, lambda m: m.how):
+        titles = [f"*{m.title}*" for m in group]
+        which = "; ".join(titles) if len(titles) <= MAX_TITLES else f"{titles[0]} to {titles[-1]}"
+        lines += [f"- {which}: {how}"] if how else []
+    return ["", "How each is measured:", "", *lines, ""] if lines else [""] if metrics else []
 
 
 def conclusion(result: Result, page: Page) -> str:
@@ -182,3 +194,29 @@ def _line(metric: Metric, result: Result) -> str:
     limit = f"[dim]({metric.limit_text()})[/dim]" if metric.limit_text() else ""
     note = " [yellow]inconclusive[/yellow]" if metric.name in result.inconclusive else ""
     return f"{mark} {metric.title}: {metric.text(result.metrics[metric.name])}{interval} {limit}{note}"
+
+
+def rewrite(docs: Path) -> list[Path]:
+    """Write every ``docs/NAME.md`` that exists from ``docs/results``, and the overview page; returns their paths.
+
+    Measurements, plots and the commit that a page names stay as they are.  Where all outcomes are published, they are
+    read again by the criteria of today.
+
+    Raises:
+        ValueError: a saved result or its published trials cannot be read.
+    """
+    written = []
+    for name, result in overview.results_in(docs).items():
+        path = docs / f"{name}.md"
+        if not path.exists():
+            continue
+        module = import_module(EXPERIMENTS[name].module)
+        trials = read_published(docs / module.PUBLISHED_TRIALS) if hasattr(module, "PUBLISHED_TRIALS") else {}
+        if trials and hasattr(module, "evaluated_again"):
+            result = module.evaluated_again(result, trials)
+            result.save(docs / "results" / f"{name}.json")
+        path.write_text(
+            marked(markdown(result, module.page_of(result, trials)), judge(result.commit, EXPERIMENTS[name]))
+        )
+        written.append(path)
+    return [*written, overview.write(docs)]

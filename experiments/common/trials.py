@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from experiments.common.checkpoint import Checkpoint
-from experiments.common.fingerprint import libraries, source_hash
+from experiments.common.checkpoint import Checkpoint, libraries, source_hash
 from experiments.common.registry import Options
 from experiments.common.worlds import profile_named, trial_world
 from host.exit_codes import CommandFailed, ExitCode

@@ -1,12 +1,15 @@
-"""Where the trials of a run are performed, and the list of those that it performed."""
+"""Where the trials of a run are performed, the list of those that it performed, and what each cost there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import resource
+import socket
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
-
-from experiments.common.trial_cost import TrialCost
+from itertools import pairwise
+from typing import Any, Final
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,3 +32,37 @@ class Workers:
     count: int = 1
     ray: str = ""
     trials: list[Trial] | None = None
+
+
+KIB: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class TrialCost:
+    """Cost of one trial: worker (host/process), begin (UTC) and duration [s], greatest memory of its process [B]."""
+
+    worker: str
+    begin_s: float
+    seconds: float
+    peak_bytes: int
+
+
+def measured(function: Callable[[Any], Any], job: Any) -> tuple[Any, TrialCost]:
+    """The outcome of ``function(job)`` and its cost, measured in the process that runs it."""
+    begin_s, begun_ns = time.time(), time.monotonic_ns()
+    outcome = function(job)
+    seconds = (time.monotonic_ns() - begun_ns) * 1e-9
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIB
+    return outcome, TrialCost(f"{socket.gethostname()}/{os.getpid()}", round(begin_s, 6), round(seconds, 6), peak_bytes)
+
+
+def overhead_s(costs: Sequence[TrialCost]) -> float:
+    """Mean time between the end of a trial and the begin of the next one on the same worker; NaN without a pair.
+
+    It holds the dispatch, the way of the outcome to the disk, and what a worker waited for others.
+    """
+    gaps = []
+    for worker in {cost.worker for cost in costs}:
+        its = sorted((c for c in costs if c.worker == worker), key=lambda c: c.begin_s)
+        gaps += [b.begin_s - a.begin_s - a.seconds for a, b in pairwise(its)]
+    return sum(gaps) / len(gaps) if gaps else float("nan")

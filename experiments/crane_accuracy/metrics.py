@@ -11,7 +11,7 @@ from experiments.common.result import Metric, rate
 from experiments.common.result_page import Section
 from experiments.crane_accuracy.plan import LAWS, OWN, UNCALIBRATED, UNCOMPENSATED, UNSHAPED
 
-MM, PERCENT = 1e3, 100.0
+MM: Final = 1e3
 PAPER: Final = {"encoder_error_mean_m": 0.08, "encoder_error_xy_mean_m": 0.04, "encoder_error_z_mean_m": 0.06}
 """Paper B, Fig. 20: means of 80 points, tip from forward kinematics of the joint sensors."""
 
@@ -34,7 +34,7 @@ INTRODUCTION: Final = (
 
 
 def _mm(name: str, title: str, how: str, most: float | None = None) -> Metric:
-    return Metric(name, title, "mm", how, most=most, scale=MM)
+    return Metric(name, title, "mm", how, most=most)
 
 
 ACCURACY: Final = (
@@ -96,14 +96,13 @@ MOTION: Final = (
     Metric("time_ratio_p95", "Motion time over the shortest possible, 95th percentile", "", "The same motions."),
     Metric("planned_ratio", "Planned duration over the shortest possible, mean", "", "Duration of the reference."),
     Metric("motion_s", "Motion time, mean", "s", "The same motions."),
-    Metric("ended", "Completed motions", "%", "The pin stays within 20 mm of the end.", least=0.99, scale=PERCENT),
+    Metric("ended", "Completed motions", "%", "The pin stays within 20 mm of the end.", least=0.99),
     Metric(
         "limit_cycle_share",
         "Valve commands that are not zero after settling",
         "%",
         "Share of the valve commands on the bus with any joint not exactly zero, from 2 s after arrival on.",
         most=0.05,
-        scale=PERCENT,
     ),
     Metric("stops", "Controlled stops", "", "All runs of all variants.", most=0),
     Metric("failures", "Failed motions", "", "Stopped, refused or never started; all variants.", most=0),
@@ -133,12 +132,7 @@ SWING: Final = (
     ),
     Metric("unshaped_sway_residual_mean_deg", "Swing with unshaped references, mean", "deg", "The same motions."),
     Metric(
-        "sway_reduction",
-        "Reduction of the swing by shaping",
-        "%",
-        "One minus the ratio of the two means.",
-        least=0.6,
-        scale=PERCENT,
+        "sway_reduction", "Reduction of the swing by shaping", "%", "One minus the ratio of the two means.", least=0.6
     ),
 )
 LAW_NAMES: Final = {"pd": "PD", "smc": "sliding mode", "sta": "super-twisting"}
@@ -153,13 +147,7 @@ def _law(prefix: str) -> tuple[Metric, ...]:
         _mm(f"{prefix}.tip_error_mean_m", f"{name}: true pin from the goal, mean", how),
         Metric(f"{prefix}.time_ratio", f"{name}: motion time over the shortest possible, mean", "", how),
         Metric(f"{prefix}.sway_residual_deg", f"{name}: swing of the grapple, 95th percentile", "deg", how),
-        Metric(
-            f"{prefix}.limit_cycle_share",
-            f"{name}: valve commands that are not zero after settling",
-            "%",
-            how,
-            scale=PERCENT,
-        ),
+        Metric(f"{prefix}.limit_cycle_share", f"{name}: valve commands that are not zero after settling", "%", how),
     )
 
 
@@ -180,15 +168,13 @@ SECTIONS: Final = (
             ),
             (
                 "points.png",
-                "As Fig. 19 of paper B, enlarged: rest positions of the pin by encoders, from above, "
-                "relative "
-                "to the commanded point. Squares: empty; x: with 200 kg.",
+                "As Fig. 19 of paper B, enlarged: rest positions of the pin by encoders, from above, relative to the "
+                "commanded point. Squares: empty; x: with 200 kg.",
             ),
             (
                 "true_points.png",
-                "True pin at the same times relative to the goal, from the side. Squares: empty; x: "
-                "with "
-                "200 kg; light: without sag compensation.",
+                "True pin at the same times relative to the goal, from the side. Squares: empty; x: with 200 kg; "
+                "light: without sag compensation.",
             ),
         ),
     ),
@@ -200,9 +186,8 @@ SECTIONS: Final = (
         (
             (
                 "motion.png",
-                "One motion to point 3 with 200 kg: path of the pin, its errors, the valve commands, the lean "
-                "of "
-                "the grapple.",
+                "One motion to point 3 with 200 kg: path of the pin, its errors, the valve commands, the lean of the "
+                "grapple.",
             ),
         ),
     ),

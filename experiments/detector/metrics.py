@@ -42,9 +42,8 @@ BOXES: Final = (
     _share(
         "map50",
         "Boxes, mAP@0.5",
-        "COCO's measure; pictures of 608 px, processed as on the machine: at half size, "
-        "and "
-        "regions with wood enlarged.",
+        "COCO's measure; pictures of 608 px, processed as on the machine: at half size, and regions with wood "
+        "enlarged.",
         0.95,
     ),
     _share("map50_95", "Boxes, mAP@0.5:0.95", "Mean over ten minimum overlaps from 0.5 to 0.95.", 0.80),

@@ -48,9 +48,8 @@ CAMPAIGN: Final = (
         "neutral_max_ms",
         "Longest time to neutral valves after the loss of a needed input",
         "ms",
-        "From the fault "
-        "to the moment after which the outputs of valve node, vehicle or PLC are neutral for good (ground truth; a "
-        "frame tells it up to its period later). Entries of which a needed input is lost.",
+        "From the fault to the moment after which the outputs of valve node, vehicle or PLC are neutral for good "
+        "(ground truth; a frame tells it up to its period later). Entries of which a needed input is lost.",
         most=100.0,
     ),
     Metric(

@@ -38,11 +38,9 @@ OURS: Final = (
         "detected",
         "Logs detected",
         "%",
-        "Before the log was taken, the machine's log map held a log within 80 cm "
-        "of "
-        "it while it lay in its original place. All our missions.",
+        "Before the log was taken, the machine's log map held a log within 80 cm of it while it lay in its original "
+        "place. All our missions.",
         least=0.99,
-        scale=100.0,
     ),
     Metric(
         "loaded",
@@ -50,27 +48,19 @@ OURS: Final = (
         "%",
         "At the end the log lies between the stakes of the bunk, by the plant's physics.",
         least=0.98,
-        scale=100.0,
     ),
     Metric(
         "grasp_offset_mean_m",
         "Grapple to log, mean",
         "cm",
-        "Ground truth on top of the log, just before the "
-        "grapple "
-        "is activated: from the point between the open tips to the middle of the log, across, along and up (less "
-        "the planned height); all grasps of one log.",
+        "Ground truth on top of the log, just before the grapple is activated: from the point between the open tips to "
+        "the middle of the log, across, along and up (less the planned height); all grasps of one log.",
         most=0.08,
-        scale=CM,
     ),
-    Metric("grasp_offset_p95_m", "Grapple to log, 95th percentile", "cm", "The same grasps.", scale=CM),
-    Metric(
-        "grasp_offset_across_m", "Grapple to log across the machine, mean absolute", "cm", "The same grasps.", scale=CM
-    ),
-    Metric(
-        "grasp_offset_along_m", "Grapple to log along the machine, mean absolute", "cm", "The same grasps.", scale=CM
-    ),
-    Metric("grasp_offset_up_m", "Grapple to log in height, mean absolute", "cm", "The same grasps.", scale=CM),
+    Metric("grasp_offset_p95_m", "Grapple to log, 95th percentile", "cm", "The same grasps."),
+    Metric("grasp_offset_across_m", "Grapple to log across the machine, mean absolute", "cm", "The same grasps."),
+    Metric("grasp_offset_along_m", "Grapple to log along the machine, mean absolute", "cm", "The same grasps."),
+    Metric("grasp_offset_up_m", "Grapple to log in height, mean absolute", "cm", "The same grasps."),
     Metric(
         "faults",
         "Stops and faults",
@@ -85,14 +75,7 @@ OURS: Final = (
         "",
         "The one on the original field, and those on other fields, of which 20 are planned.",
     ),
-    Metric(
-        "finished",
-        "Missions driven to the end of the route",
-        "%",
-        "Share of the missions driven.",
-        least=1.0,
-        scale=100.0,
-    ),
+    Metric("finished", "Missions driven to the end of the route", "%", "Share of the missions driven.", least=1.0),
     Metric(
         "uncalibrated",
         "Machines without a calibrated profile",
@@ -101,21 +84,19 @@ OURS: Final = (
         most=0.0,
     ),
     Metric("missed", "Grasps without a log", "", "All our missions."),
-    Metric(
-        "mission_mean_s", "Duration of a mission, mean", "min", "From arming to the end of the route.", scale=1 / 60
-    ),
+    Metric("mission_mean_s", "Duration of a mission, mean", "min", "From arming to the end of the route."),
     Metric("stops_mean", "Loading stops per mission, mean", "", "Paper B stops twice for every log."),
 )
 BOTH: Final = tuple(
-    Metric(f"{prefix}.{name}", f"{who}: {title}", unit, "As above, for one mission on the original field.", scale=scale)
+    Metric(f"{prefix}.{name}", f"{who}: {title}", unit, "As above, for one mission on the original field.")
     for prefix, who in (("faithful", "Paper B's method"), ("first", "Ours"))
-    for name, title, unit, scale in (
-        ("detected", "logs detected", "%", 100.0),
-        ("loaded", "logs loaded", "%", 100.0),
-        ("grasp_offset_mean_m", "grapple to log, mean", "cm", CM),
-        ("mission_mean_s", "duration of the mission", "min", 1 / 60),
-        ("stops_mean", "loading stops", "", 1.0),
-        ("faults", "stops and faults", "", 1.0),
+    for name, title, unit in (
+        ("detected", "logs detected", "%"),
+        ("loaded", "logs loaded", "%"),
+        ("grasp_offset_mean_m", "grapple to log, mean", "cm"),
+        ("mission_mean_s", "duration of the mission", "min"),
+        ("stops_mean", "loading stops", ""),
+        ("faults", "stops and faults", ""),
     )
 )
 METRICS: Final = OURS + BOTH
@@ -146,9 +127,8 @@ def sections(outcomes: Mapping[str, Any]) -> tuple[Section, ...]:
             (
                 (
                     "offsets.png",
-                    "Grapple to log just before the grapple is activated, all missions. Dark: ours; light: "
-                    "Table "
-                    "1 of paper B.",
+                    "Grapple to log just before the grapple is activated, all missions. Dark: ours; light: Table 1 of "
+                    "paper B.",
                 ),
             ),
         ),

@@ -7,9 +7,16 @@
 from __future__ import annotations
 
 import io
+import math
+import random
 import shutil
 import tempfile
-from collections.abc import Mapping
+
+# -- One machine with one truth: calibrated, then some logs or a mission with what the calibration has written.
+#
+# Outcome: whether a profile was written, and if not, what was said; how wrong its valves are against the truth; and
+# for every job whether the log lies in the bunk, whether the machine says so, its closings, stops and time.
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,9 +24,12 @@ from rich.console import Console
 
 from autonomy.calibration.profile_file import profile_changes, write_profile
 from autonomy.calibration.result import CalibrationResult, identify
+from autonomy.localization.local_plane import LocalPlane
+from autonomy.missions.model import ForwardingMission, Point
 from controller.guard.__main__ import profile_path
 from experiments.common import pool
 from experiments.common.individuals import DATE
+from experiments.common.mission_trial import run_mission
 from experiments.common.pool import Job
 from experiments.common.recording import RECORD
 from experiments.common.registry import Options
@@ -28,7 +38,17 @@ from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
 from experiments.common.workers import Trial
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.generalization.matrix import COMBINED, DRAWN, UNSEEN, names, nominal_file, write_truth
+from experiments.generalization.matrix import (
+    COMBINED,
+    DRAWN,
+    MISSION,
+    UNSEEN,
+    ground_of,
+    names,
+    nominal_file,
+    title_of,
+    write_truth,
+)
 from experiments.generalization.metrics import (
     CONCLUSION,
     INTRODUCTION,
@@ -39,19 +59,14 @@ from experiments.generalization.metrics import (
     sentences,
     succeeded,
 )
-from experiments.generalization.mission import MISSION, driven
-from experiments.generalization.plots import draw
 from hil.calibration import run_lockstep as calibrate
 from hil.demo.lockstep import run_lockstep as load_one_log
+from hil.missions.site import site_of
 from hil.replay.recording import PROFILE_FILE
 from machine.loading.profile_file import carry_envelope
+from machine.profile import Carrier
 from runtime.errors import InputRefused
-
-# -- One machine with one truth: calibrated, then some logs or a mission with what the calibration has written.
-#
-# Outcome: whether a profile was written, and if not, what was said; how wrong its valves are against the truth; and
-# for every job whether the log lies in the bunk, whether the machine says so, its closings, stops and time.
-
+from runtime.plot_style import MOSS, STEEL, sheet
 
 LIMIT_S: Final = 180.0
 SCENES: Final = 100
@@ -141,6 +156,9 @@ DRAWN_MACHINES: Final = 20
 JOBS: Final = 3
 """Logs that every calibrated machine loads."""
 MISSIONS: Final = 20
+MISSION_LIMIT_S: Final = 3600.0
+LEG_M: Final = 20.0
+MOST_TURN_DEG: Final = 35.0
 MISSION_LOGS: Final = 8
 FIRST_SEED: Final = 96_000
 SEEDS_PER_RUN: Final = 1000
@@ -208,3 +226,48 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
     truths = [key.removesuffix(".calibrated") for key in result.metrics if key.endswith(".calibrated")]
     return Page("A world it has never seen", CONCLUSION, INTRODUCTION, sections(truths))
+
+
+def draw(path: Path, truths: Sequence[str], metrics: Mapping[str, float]) -> None:
+    """A bar for every truth: the share of its logs in the bunk, hollow where no profile was written."""
+    with sheet(path, 1, 8.0, 0.6 + 0.28 * len(truths)) as axis:
+        for y, name in enumerate(truths):
+            if metrics.get(f"{name}.calibrated", 0.0) > 0.0:
+                axis.barh(y, 100.0 * metrics.get(f"{name}.success", 0.0), color=MOSS)
+            else:
+                axis.barh(y, 100.0, fill=False, edgecolor=STEEL, hatch="//")
+        axis.set(yticks=range(len(truths)), yticklabels=[title_of(n) for n in truths], xlim=(0.0, 100.0))
+        axis.set(xlabel="logs in the bunk [%]")
+        axis.margins(y=0.01)
+        axis.invert_yaxis()
+
+
+def driven(job: Job, truth: Path, text: str) -> dict[str, Any]:
+    """Drive the mission of a job with the calibrated profile ``text``; the places of its logs are not in it.
+
+    Options: profile, truth (its number chooses the ground), logs (their number).
+    """
+    o = job.options
+    profile = profile_named(o["profile"])
+    assert profile.carrier is not None, "a mission is for a machine that drives"
+    mission = drawn_mission(profile.carrier, job.seed)
+    site = site_of(mission, profile, job.seed, str(truth), o["logs"], ground_of(o["truth"]))
+    options = o | {"truth": str(truth), "text": text, "way": "ours", "eyes": "ours", "limit_s": MISSION_LIMIT_S}
+    found = run_mission(Job(job.name, MISSION, job.seed, options), mission, site)
+    return {
+        "ground": ground_of(o["truth"]),
+        "logs": len(found["logs"]),
+        "believed": found["loaded"],
+        "in_bunk": sum(log["in_bunk"] for log in found["logs"]),
+        "given_up": len(found["given_up"]),
+        **{key: found[key] for key in ("finished", "failure", "stops", "refused", "seconds", "driven_m", "remarks")},
+    }
+
+
+def drawn_mission(carrier: Carrier, seed: int) -> ForwardingMission:
+    """A route of two legs with a turn between them; nothing is said of the logs."""
+    rng = random.Random(f"unseen route {seed}")
+    plane = LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg)
+    turn = math.radians(rng.uniform(-MOST_TURN_DEG, MOST_TURN_DEG))
+    ends = ((0.0, 0.0), (LEG_M, 0.0), (LEG_M * (1.0 + math.cos(turn)), LEG_M * math.sin(turn)))
+    return ForwardingMission("unseen", tuple(Point(*plane.geodetic(*at)[:2]) for at in ends))

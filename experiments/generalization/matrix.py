@@ -24,6 +24,8 @@ DRAWN: Final = "drawn"
 """Prefix of truths with everything drawn: drawn-0, drawn-1, ..."""
 UNSEEN: Final = "unseen"
 """Prefix of truths with everything drawn, and a wood for missions: unseen-0, ..."""
+MISSION: Final = "mission"
+"""Kind of a job that drives a mission, and its outcome."""
 WOOD: Final = {"length_m": [1.7, 2.6], "diameter_m": [0.11, 0.32]}
 """Logs of missions, from the thinnest top to the thickest butt that lies in one stand."""
 

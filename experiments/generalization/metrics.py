@@ -7,8 +7,7 @@ from typing import Any, Final
 
 from experiments.common.result import Metric, mean, rate
 from experiments.common.result_page import Section
-from experiments.generalization.matrix import is_drawn, is_mission, title_of
-from experiments.generalization.mission import MISSION
+from experiments.generalization.matrix import MISSION, is_drawn, is_mission, title_of
 
 CONCLUSION: Final = (
     "With a truth at either end of every parameter, or everything drawn, {calibrated_share} of the machines are "
@@ -32,7 +31,6 @@ CALIBRATED: Final = Metric(
     "%",
     "No stop, no implausible value; all machines.",
     least=1.0,
-    scale=100.0,
 )
 OVERALL: Final = (
     CALIBRATED,
@@ -42,23 +40,14 @@ OVERALL: Final = (
         "%",
         "By the plant's physics, without a stop that a person must end; all jobs of calibrated drawn machines.",
         least=0.97,
-        scale=100.0,
     ),
-    Metric(
-        "grasp_first_closing",
-        "The same at the first closing",
-        "%",
-        "The grapple was closed once.",
-        least=0.95,
-        scale=100.0,
-    ),
+    Metric("grasp_first_closing", "The same at the first closing", "%", "The grapple was closed once.", least=0.95),
     Metric(
         "ends_success",
         "Logs in the bunk, one parameter at an end",
         "%",
         "As above, and the named combinations.",
         least=0.97,
-        scale=100.0,
     ),
     Metric("stops_per_job", "Stops per single log", "", "Of all calibrated machines.", most=0.1),
     Metric(
@@ -67,7 +56,6 @@ OVERALL: Final = (
         "%",
         "In the bunk by the plant's physics; of all logs, those of machines that could not be calibrated included.",
         least=0.95,
-        scale=100.0,
     ),
     Metric("stops_per_mission", "Stops per mission", "", "Each needs a person.", most=0.1),
     Metric(
@@ -86,13 +74,12 @@ def of_truth(name: str) -> tuple[Metric, ...]:
     """The metrics of one truth."""
     title, whole = title_of(name), is_mission(name)
     return (
-        Metric(f"{name}.calibrated", f"{title}: calibrated", "%", "Share of its machines.", scale=100.0),
+        Metric(f"{name}.calibrated", f"{title}: calibrated", "%", "Share of its machines."),
         Metric(
             f"{name}.success",
             f"{title}: logs in the bunk",
             "%",
             "By the plant's physics." if whole else "Without a stop.",
-            scale=100.0,
         ),
         Metric(f"{name}.seconds", f"{title}: duration", "s", "The mission." if whole else "Mean of its jobs."),
     )

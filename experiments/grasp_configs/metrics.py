@@ -35,10 +35,8 @@ INTRODUCTION: Final = (
 def _pair(poses: str, planner: str) -> tuple[Metric, ...]:
     name, title = f"{poses}.{planner}", f"{POSE_TITLES.get(poses, poses)}, {PLANNER_TITLES.get(planner, planner)}"
     return (
-        Metric(
-            f"{name}.success", f"Success: {title}", "%", "Share of all attempts, by the plant's physics.", scale=100.0
-        ),
-        Metric(f"{name}.optimal", f"Optimal grasps: {title}", "%", "Share of the successful ones.", scale=100.0),
+        Metric(f"{name}.success", f"Success: {title}", "%", "Share of all attempts, by the plant's physics."),
+        Metric(f"{name}.optimal", f"Optimal grasps: {title}", "%", "Share of the successful ones."),
         Metric(f"{name}.logs_per_grasp_10_12", f"Logs per grasp in configurations 10 to 12: {title}", "", "Mean."),
     )
 
@@ -61,25 +59,22 @@ EVALUATED: Final = (
         "%",
         "Five attempts with each configuration: at least one log hangs clear of the ground after 2 s, and no stop "
         "needed a person.",
-        scale=100.0,
     ),
-    Metric("success", "Success", "%", "The same criterion, all attempts.", least=0.99, scale=100.0),
+    Metric("success", "Success", "%", "The same criterion, all attempts.", least=0.99),
     Metric(
         "first_closing",
         "Lifted with the first closing of the grapple",
         "%",
         "The other successful attempts closed again before the lift.",
         least=0.97,
-        scale=100.0,
     ),
     Metric("stopped", "Attempts with a stop that needed a person", "", "They count as failures, lifted or not."),
-    Metric("nominal.success", "Success of the nominal machine", "%", "Share of its attempts.", scale=100.0),
+    Metric("nominal.success", "Success of the nominal machine", "%", "Share of its attempts."),
     Metric(
         "individuals.success",
         "Success of calibrated individuals",
         "%",
         "Share of the attempts of five machines drawn around the nominal one.",
-        scale=100.0,
     ),
     Metric(
         "success_wilson_low",
@@ -87,7 +82,6 @@ EVALUATED: Final = (
         "%",
         "The limit is paper A's 59 of 60.",
         least=0.9833,
-        scale=100.0,
     ),
     Metric(
         "optimal",
@@ -96,19 +90,12 @@ EVALUATED: Final = (
         "Not from under another log nor at an edge (NI), aligned within 20 deg (MA), and not misled by perception "
         "(SE).",
         least=0.95,
-        scale=100.0,
     ),
     Metric("ni", "Sub-optimal: not intuitive (NI)", "", "From under another log, or at an edge."),
     Metric("se", "Sub-optimal: segmentation error (SE)", "", "Sub-optimal where perception missed or misplaced a log."),
     Metric("ma", "Sub-optimal: misaligned (MA)", "", "More than 20 deg off the mean direction of the logs."),
     Metric("logs_per_grasp_10_12", "Logs per grasp in configurations 10 to 12", "", "Mean of all attempts.", least=1.5),
-    Metric(
-        "all_logs",
-        "All logs at once in configurations 2, 4, 5, 6, 7",
-        "%",
-        "As the paper observed consistently.",
-        scale=100.0,
-    ),
+    Metric("all_logs", "All logs at once in configurations 2, 4, 5, 6, 7", "%", "As the paper observed consistently."),
     Metric(
         "plan_ms",
         "Perception and planning",
@@ -122,12 +109,12 @@ EVALUATED: Final = (
 )
 ABLATION: Final = tuple(m for poses in POSE_TITLES for planner in PLANNER_TITLES for m in _pair(poses, planner))
 PER_CONFIGURATION: Final = tuple(
-    Metric(f"config{n}.{key}", f"Configuration {n}: {title}", unit, "Share or mean of its attempts.", scale=scale)
+    Metric(f"config{n}.{key}", f"Configuration {n}: {title}", unit, "Share or mean of its attempts.")
     for n in range(1, 13)
-    for key, title, unit, scale in (
-        ("success", "success", "%", 100.0),
-        ("optimal", "optimal", "%", 100.0),
-        ("logs", "logs per grasp", "", 1.0),
+    for key, title, unit in (
+        ("success", "success", "%"),
+        ("optimal", "optimal", "%"),
+        ("logs", "logs per grasp", ""),
     )
 )
 METRICS: Final = (*EVALUATED, *PER_CONFIGURATION, *ABLATION)
@@ -147,8 +134,7 @@ SECTIONS: Final = (
         (
             (
                 "chain.png",
-                "As Fig. 5 of paper A: the pile, the virtual depth picture with the grasp of the search, and "
-                "the "
+                "As Fig. 5 of paper A: the pile, the virtual depth picture with the grasp of the search, and the "
                 "quality map of the network with its grasp.",
             ),
         ),

@@ -44,7 +44,6 @@ CORNELL = (
         "%",
         f"10 folds over ten views of every sample. {_CORRECT}. Views of one picture are in both parts and not "
         "independent, so the interval is too narrow.",
-        scale=100.0,
     ),
     Metric(
         "cornell_grouped",
@@ -52,21 +51,18 @@ CORNELL = (
         "%",
         "10 folds of neighbouring numbers; 4 numbers on either side are left out of the training; tested on the "
         "original crops.",
-        scale=100.0,
     ),
     Metric(
         "cornell_paper_split_own_size",
         "Correct grasps with the size of the label, views split at random",
         "%",
         "The rectangle has the size of the label it is compared with: only place and direction count.",
-        scale=100.0,
     ),
     Metric(
         "cornell_grouped_own_size",
         "Correct grasps with the size of the label, objects kept apart",
         "%",
         "As with views split at random.",
-        scale=100.0,
     ),
 )
 
@@ -76,14 +72,12 @@ DATA = (
         "Correct grasps on the folder given by --data",
         "%",
         f"Shipped weights, original crops, f32 as on the machine. {_CORRECT}.",
-        scale=100.0,
     ),
     Metric(
         "data_own_size",
         "Correct grasps on that folder with the size of the label",
         "%",
         "Only place and direction count.",
-        scale=100.0,
     ),
     Metric("data_trained_on", "Samples in that folder that were used for training", "", "By number."),
 )
@@ -154,9 +148,8 @@ SECTIONS: Final = (
     ),
     Section(
         "Logs",
-        "The network was trained on objects of a hand's size and has never seen a log. These are its maps "
-        "of "
-        "logs seen by paper A's virtual camera, as in Fig. 5 of the paper.",
+        "The network was trained on objects of a hand's size and has never seen a log. These are its maps of logs seen "
+        "by paper A's virtual camera, as in Fig. 5 of the paper.",
         (),
         (
             (

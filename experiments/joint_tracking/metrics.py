@@ -68,16 +68,14 @@ def _machine(short: str, law: str) -> tuple[Metric, ...]:
             "Distance of the tip from its goal by the true joint positions, last half second before the next "
             "motion; mean over the ends of all cycles with the law of the profile.",
             most=REST_M,
-            scale=MM,
         ),
-        Metric(f"{mine}_cycle_rest_m_max", "Error of the tip at rest, worst", "mm", "The same ends.", scale=MM),
+        Metric(f"{mine}_cycle_rest_m_max", "Error of the tip at rest, worst", "mm", "The same ends."),
         Metric(f"{mine}_cycle_settle_s", "Settling time to 15 mm", "s", "After the end of a motion, mean."),
         Metric(
             f"{raw}_cycle_rest_m",
             "As shipped: error of the tip at rest, mean",
             "mm",
             "The same with the valves that the shipped profile assumes, on individual machines.",
-            scale=MM,
         ),
         Metric(
             f"{raw}_cycle_alarms", "As shipped: false alarms of the motion monitors", "joints", "All cycles.", most=0.0
@@ -106,7 +104,6 @@ def _machine(short: str, law: str) -> tuple[Metric, ...]:
                     "(or from when the tip stays within 15 mm, if later) to the next motion; mean over all motions "
                     "that settle.",
                     least=None if name == "pid" else SHUT,
-                    scale=PERCENT,
                 )
             )
             every.append(
@@ -115,7 +112,6 @@ def _machine(short: str, law: str) -> tuple[Metric, ...]:
                     f"{title}, {state}: motions that do not settle",
                     "%",
                     "The tip does not stay within 15 mm until the next motion begins, 7 to 9 s later.",
-                    scale=PERCENT,
                 )
             )
     return own + tuple(every)

@@ -36,7 +36,6 @@ def _positions(prefix: str, title: str, limits: Mapping[int, float | None]) -> t
             "cm",
             "Distance in space from the estimate to the middle of the log's pith, both logs of all approaches.",
             most=limits[d],
-            scale=CM,
         )
         for d in DEGREES
     )
@@ -44,14 +43,7 @@ def _positions(prefix: str, title: str, limits: Mapping[int, float | None]) -> t
 
 OURS: Final = (
     *_positions("", "Ours", LIMITS_M),
-    Metric(
-        "p95_m",
-        "Ours: error of the position, 95th percentile",
-        "cm",
-        "The same distances, all angles.",
-        most=0.10,
-        scale=CM,
-    ),
+    Metric("p95_m", "Ours: error of the position, 95th percentile", "cm", "The same distances, all angles.", most=0.10),
     Metric("axis_median_deg", "Ours: error of the axis, median", "deg", "Angle to the chord of the log.", most=2.0),
     Metric(
         "diameter_median_m",
@@ -59,12 +51,9 @@ OURS: Final = (
         "cm",
         "Against the diameter at half length.",
         most=0.015,
-        scale=CM,
     ),
-    Metric(
-        "length_median_m", "Ours: error of the length, median", "cm", "If both ends are visible.", most=0.10, scale=CM
-    ),
-    Metric("found", "Logs found", "%", "An estimate within 1 m of the log at its stop.", least=0.95, scale=100.0),
+    Metric("length_median_m", "Ours: error of the length, median", "cm", "If both ends are visible.", most=0.10),
+    Metric("found", "Logs found", "%", "An estimate within 1 m of the log at its stop.", least=0.95),
     Metric(
         "honesty",
         "Squared error over the claimed variance, mean",
@@ -82,26 +71,15 @@ FAITHFUL: Final = (
             f"Paper B's pipeline with a radius added, log {VIEWS[d]}: median error",
             "cm",
             "12.5 cm, half of the paper's mean diameter, are added along the line of sight to every estimate.",
-            scale=CM,
         )
         for d in DEGREES
     ),
-    Metric(
-        "faithful.p95_m", "Paper B's pipeline: error of the position, 95th percentile", "cm", "All angles.", scale=CM
-    ),
+    Metric("faithful.p95_m", "Paper B's pipeline: error of the position, 95th percentile", "cm", "All angles."),
     Metric(
         "faithful.axis_median_deg", "Paper A's perception: error of the axis, median", "deg", "Last frame at the stop."
     ),
-    Metric(
-        "faithful.diameter_median_m",
-        "Paper A's perception: error of the diameter, median",
-        "cm",
-        "Last frame.",
-        scale=CM,
-    ),
-    Metric(
-        "faithful.length_median_m", "Paper A's perception: error of the length, median", "cm", "Last frame.", scale=CM
-    ),
+    Metric("faithful.diameter_median_m", "Paper A's perception: error of the diameter, median", "cm", "Last frame."),
+    Metric("faithful.length_median_m", "Paper A's perception: error of the length, median", "cm", "Last frame."),
 )
 METRICS: Final = OURS + FAITHFUL
 INTRODUCTION: Final = (
@@ -156,9 +134,8 @@ def sections(masks: str) -> tuple[Section, ...]:
             (
                 (
                     "errors.png",
-                    "Errors of the position at the stops, as in Figs 16 to 18 of paper B. Dark: ours; "
-                    "light: "
-                    "the paper's pipeline.",
+                    "Errors of the position at the stops, as in Figs 16 to 18 of paper B. Dark: ours; light: the "
+                    "paper's pipeline.",
                 ),
                 (
                     "overlay.png",
@@ -173,9 +150,8 @@ def sections(masks: str) -> tuple[Section, ...]:
             (
                 (
                     "curve.png",
-                    "Error of single frames over the angle and over the range: 10, 50 and 90 % of all "
-                    "trials. "
-                    "Dark: ours; light: the paper's pipeline.",
+                    "Error of single frames over the angle and over the range: 10, 50 and 90 % of all trials. Dark: "
+                    "ours; light: the paper's pipeline.",
                 ),
             ),
         ),

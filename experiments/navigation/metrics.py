@@ -34,21 +34,17 @@ OURS: Final = (
         "True middle of the front axle from the planned path, after the bend at the first waypoint; all grounds, "
         "starts and laps.",
         most=0.08,
-        scale=CM,
     ),
     *(
-        Metric(
-            f"{g}.lateral_p95_m", f"Ours on {title}: lateral error, 95th percentile", "cm", "On this ground.", scale=CM
-        )
+        Metric(f"{g}.lateral_p95_m", f"Ours on {title}: lateral error, 95th percentile", "cm", "On this ground.")
         for g, title in GROUNDS.items()
     ),
-    Metric("lateral_max_m", "Ours: largest lateral error", "cm", "All grounds.", scale=CM),
+    Metric("lateral_max_m", "Ours: largest lateral error", "cm", "All grounds."),
     Metric(
         "own_p95_m",
         "Ours: lateral error by the machine's own location, 95th percentile",
         "cm",
         "The error of the follower; the rest is localization.",
-        scale=CM,
     ),
     Metric(
         "stop_max_m",
@@ -56,7 +52,6 @@ OURS: Final = (
         "cm",
         "Rest position of the front axle at the end of each drive.",
         most=0.05,
-        scale=CM,
     ),
 )
 FAITHFUL: Final = (
@@ -66,7 +61,6 @@ FAITHFUL: Final = (
         "cm",
         "From the common path, the mean of the last laps of all starts.",
         most=0.20,
-        scale=CM,
     ),
     *(
         Metric(
@@ -74,7 +68,6 @@ FAITHFUL: Final = (
             f"Paper B's law on {title}: lateral error on the last lap, 95th percentile",
             "cm",
             "On this ground.",
-            scale=CM,
         )
         for g, title in GROUNDS.items()
     ),
@@ -83,7 +76,6 @@ FAITHFUL: Final = (
         "Paper B's law: lateral error before the last lap, 95th percentile",
         "cm",
         "From the first corner to the last lap: distance between the starts while they converge.",
-        scale=CM,
     ),
     Metric(
         "heading_deg_per_m",
@@ -107,16 +99,13 @@ BOTH: Final = (
         "Localization: error of the position, 95th percentile",
         "cm",
         "Middle of the front axle in the plane, all drives; antennas are mounted up to 3 cm off.",
-        scale=CM,
     ),
     Metric(
         "honesty",
         "Localization: squared error over the claimed variance, mean",
         "",
-        "Error of the position over "
-        "the "
-        "claimed standard deviation of its worst direction; 2 is consistent in two dimensions, more is "
-        "overconfident.",
+        "Error of the position over the claimed standard deviation of its worst direction; 2 is consistent in two "
+        "dimensions, more is overconfident.",
         most=4.0,
     ),
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice, product
 from statistics import median
@@ -23,8 +23,8 @@ from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
 from experiments.common.result import Metric
 from experiments.common.worlds import carrier_profile, profile_named, step_neutral, trial_world
-from experiments.plant.driver import Driver
-from experiments.plant.trial import over_stakes_m, pick_logs, unload
+from experiments.plant.grasps import ARM, Driver, over_stakes_m, pick_logs, unload
+from machine.geometry.carrier import ARMS
 from machine.geometry.kinematics import Unreachable
 from runtime.errors import InputRefused
 from sim.mechanics.carrier import PARKED, Drive
@@ -37,6 +37,8 @@ from sim.world import STEP_NS, STEP_S, World
 CYCLE_STEPS: Final = 2
 SLOW_STEPS: Final = 8
 MACHINE_BUS: Final = "mach0"
+CRANE_MESSAGES: Final = ("GuardStat", "GuardPilot", "ValveCmdA", "ValveCmdB")
+CARRIER_MESSAGES: Final = ("GuardAlive", "VehCmd", "ArmCmdA", "ArmCmdB")
 LOG_COUNTS: Final = (1, 12, 50, 200)
 PICTURE_LOGS: Final = 12
 PER_SECOND: Final = round(1.0 / STEP_S)
@@ -47,7 +49,7 @@ METRICS: Final = (
         "rtf_crane12",
         "Real-time factor, crane at work among 12 logs, no camera",
         "x",
-        "Physics and hydraulics of the fixed crane while it drives its functions among 12 logs.",
+        "Physics and hydraulics of the fixed crane while it drives its functions.",
         least=5.0,
         clocked=True,
     ),
@@ -198,12 +200,8 @@ class BusWorld:
     def __init__(self, plant: Plant) -> None:
         self.plant, self._world = plant, plant.world
         crane, machine = load("crane"), load("machine")
-        self._valve_a, self._valve_b, self._guard, self._pilot = (
-            ProtectedMessage(crane, name) for name in ("ValveCmdA", "ValveCmdB", "GuardStat", "GuardPilot")
-        )
-        self._vehicle, self._arms_a, self._arms_b, self._alive = (
-            ProtectedMessage(machine, name) for name in ("VehCmd", "ArmCmdA", "ArmCmdB", "GuardAlive")
-        )
+        self._send = {name: ProtectedMessage(crane, name).frame for name in CRANE_MESSAGES}
+        self._send |= {name: ProtectedMessage(machine, name).frame for name in CARRIER_MESSAGES}
         self.now_ns, self._steps, self._sync = 1_000_000_000, 0, 1
         self._crane_bus = plant.profile.crane_bus
         self._pass([(self._crane_bus, *nmt_frame(NmtCommand.START))])
@@ -213,37 +211,34 @@ class BusWorld:
 
     def step(self, spools: Sequence[float], drive: Drive = PARKED, articulation_rad_s: float = 0.0) -> None:
         """One physics step of the plant with the spools (-1 to 1) commanded over the bus."""
+        pct = {n: 100.0 * max(-1.0, min(1.0, u)) for n, u in zip(self._world.functions, spools, strict=True)}
         frames: list[tuple[str, int, bytes]] = []
         if self._steps % CYCLE_STEPS == 0:
-            frames += [(self._crane_bus, *frame) for frame in self._fast(spools)]
+            frames += [(self._crane_bus, *frame) for frame in self._fast(pct)]
         if self._world.carrier is not None and self._steps % SLOW_STEPS == 0:
-            frames += [(MACHINE_BUS, *frame) for frame in self._slow(spools, drive, articulation_rad_s)]
+            frames += [(MACHINE_BUS, *frame) for frame in self._slow(pct, drive, articulation_rad_s)]
         self._pass(frames)
         self._steps += 1
 
-    def _fast(self, spools: Sequence[float]) -> list[tuple[int, bytes]]:
-        pct = {n: 100.0 * max(-1.0, min(1.0, u)) for n, u in zip(self._world.functions, spools, strict=True)}
+    def _fast(self, pct: Mapping[str, float]) -> list[tuple[int, bytes]]:
         grapple = pct["grapple"]
         grapple_mode = 1 if grapple > 0.0 else 2 if grapple < 0.0 else 0
         self._sync = self._sync % 240 + 1
         return [
-            self._guard.frame(ARM_KEY, 0, 0, 0, 0, 0),
-            self._pilot.frame(ARM_KEY, 0, 0),
-            self._valve_a.frame(MODE_SPOOL, pct["slew"], pct["lift"], pct["tilt"], pct["ext"]),
-            self._valve_b.frame(ARM_KEY, pct["rot"], abs(grapple), 0.0, grapple_mode, 0, 100.0),
+            self._send["GuardStat"](ARM_KEY, 0, 0, 0, 0, 0),
+            self._send["GuardPilot"](ARM_KEY, 0, 0),
+            self._send["ValveCmdA"](MODE_SPOOL, *(pct[name] for name in ARM)),
+            self._send["ValveCmdB"](ARM_KEY, pct["rot"], abs(grapple), 0.0, grapple_mode, 0, 100.0),
             sync_frame(self._sync),
         ]
 
-    def _slow(self, spools: Sequence[float], drive: Drive, articulation_rad_s: float) -> list[tuple[int, bytes]]:
-        pct = {n: 100.0 * u for n, u in zip(self._world.functions, spools, strict=True)}
-        brake = 100.0 if drive.brake else 0.0
+    def _slow(self, pct: Mapping[str, float], drive: Drive, articulation_rad_s: float) -> list[tuple[int, bytes]]:
         key = ARM_KEY if self._steps > SLOW_STEPS else 0  # a controller starts disarmed
-        arms = (pct[name] for name in ("arm_fl", "arm_fr", "arm_rl", "arm_rr"))
         return [
-            self._alive.frame(ARM_KEY, 0, 0, 0),
-            self._vehicle.frame(key, articulation_rad_s, drive.speed_m_s, brake),
-            self._arms_a.frame(key, *arms),
-            self._arms_b.frame(key, 0, 0),
+            self._send["GuardAlive"](ARM_KEY, 0, 0, 0),
+            self._send["VehCmd"](key, articulation_rad_s, drive.speed_m_s, 100.0 if drive.brake else 0.0),
+            self._send["ArmCmdA"](key, *(pct[name] for name in ARMS)),
+            self._send["ArmCmdB"](key, 0, 0),
         ]
 
     def _pass(self, frames: list[tuple[str, int, bytes]]) -> None:

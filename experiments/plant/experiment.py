@@ -15,7 +15,7 @@ from experiments.common.result import Result, make_result, mean, rate
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import check_truth, checkpoint
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.plant import bench, runs, trial
+from experiments.plant import bench, grasps, runs
 from experiments.plant.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS
 from experiments.plant.plots import draw
 
@@ -42,7 +42,7 @@ CRANE: Final = {
     "falling": runs.falling,
 }
 CARRIER: Final = {"turning": runs.turning, "braking": runs.braking}
-FUNCTIONS: Final = {"shift": runs.shift, **dict.fromkeys(GRASPS, trial.grasp), **CRANE, **CARRIER}
+FUNCTIONS: Final = {"shift": runs.shift, **dict.fromkeys(GRASPS, grasps.grasp), **CRANE, **CARRIER}
 
 
 def perform(job: Job) -> Any:

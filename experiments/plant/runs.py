@@ -20,8 +20,7 @@ from msgspec.structs import replace
 
 from experiments.common.pool import Job
 from experiments.common.worlds import hang, home_at, profile_named, step_neutral, trial_world
-from experiments.plant.driver import DRIVEN, Driver
-from experiments.plant.trial import pick_logs
+from experiments.plant.grasps import DRIVEN, Driver, pick_logs
 from machine.geometry.grapple import lowest_tip_below_pin_m, tip_below_pin_m
 from machine.geometry.kinematics import Unreachable
 from sim.bullet.client import GRAVITY_M_S2

@@ -182,7 +182,6 @@ def _metrics(path: str, title: str) -> Iterator[Metric]:
         "%",
         "Share of the trials, by the plant's ground truth.",
         least=1.0,
-        scale=100.0,
     )
     yield Metric(f"{path}_stops", f"Stops in all trials: {title}", "", "The emulated operator arms again after each.")
     yield Metric(f"{path}_seconds", f"Duration of a job: {title}", "s", "Mean of the trials.")

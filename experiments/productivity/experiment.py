@@ -5,9 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import random
-from collections.abc import Mapping
+
+# -- The tasks: route, landing and logs for one machine and seed.
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from msgspec.structs import replace
 from rich.console import Console
 
@@ -22,16 +26,23 @@ from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures
 from experiments.common.workers import Trial
 from experiments.common.worlds import carrier_profile, profile_named, wood_of
-from experiments.productivity.metrics import CONCLUSION, INTRODUCTION, METRICS, gather, sections
-from experiments.productivity.plots import draw
+from experiments.productivity.metrics import (
+    CONCLUSION,
+    EXPERT_S,
+    INTRODUCTION,
+    KIND_TITLES,
+    METRICS,
+    Cycle,
+    cycles,
+    gather,
+    sections,
+)
 from machine.profile import Profile
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 from sim.scenes.arrangements import LogSampler, arrangement
 from sim.site.site_file import Site
 from sim.wood.log_shape import LogSpec
 from sim.wood.stacking import upon
-
-# -- The tasks: route, landing and logs for one machine and seed.
-
 
 BEFORE_M: Final = 10.0
 """Route before the first log."""
@@ -202,3 +213,47 @@ def plan(options: Options, profile: str, trials: int) -> list[Job]:
         for i in range(trials)
         for kind, amount in amounts.items()
     ]
+
+
+COLOURS: Final = {
+    "LOOK": STEEL,
+    "ABOVE": OIL,
+    "DESCEND": "#5b93b8",
+    "CLOSE": MOSS,
+    "LIFT": "#87a978",
+    "CARRY": TIMBER,
+    "LOWER": "#c29a6b",
+    "OPEN": "#d9c3a5",
+    "RETREAT": "#8a6fae",
+}
+MAX_SHOWN_COUNT: Final = 30
+
+
+def draw(outcomes: Mapping[str, Any], grapple_s: float, out: Path) -> None:
+    """Write the plot into ``out``."""
+    groups = {
+        title: [c for name, o in outcomes.items() if name.startswith(f"{kind}/") for c in cycles(o, grapple_s)]
+        for kind, title in KIND_TITLES.items()
+    }
+    groups = {title: some[:MAX_SHOWN_COUNT] for title, some in groups.items() if some}
+    with sheet(out / "cycles.png", max(1, len(groups)), width=4.2 * max(1, len(groups)), height=4.2) as axes:
+        for axis, (title, some) in zip(np.atleast_1d(axes), groups.items(), strict=False):
+            _bars(axis, some, title)
+
+
+def _bars(axis: Any, some: Sequence[Cycle], title: str) -> None:
+    named: set[str] = set()
+    for row, cycle in enumerate(some):
+        begin = 0.0
+        for name, seconds in cycle.phases:
+            label = None if name in named or name not in COLOURS else name.lower()
+            named.add(name)
+            axis.barh(row, seconds, left=begin, color=COLOURS.get(name, "#dddddd"), height=0.75, label=label)
+            begin += seconds
+        axis.plot([cycle.shortest_s] * 2, [row - 0.4, row + 0.4], color="black", lw=1.6)
+        if not cycle.good:
+            axis.plot(begin + 0.8, row, "x", color=RUST, ms=5)
+    axis.axvspan(*EXPERT_S, color=MOSS, alpha=0.12, lw=0)
+    axis.set(title=title, xlabel="time [s]", ylabel="grasp", ylim=(len(some) - 0.4, -0.6))
+    if named:
+        axis.legend(fontsize=7, loc="lower right")

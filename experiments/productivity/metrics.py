@@ -29,9 +29,8 @@ CYCLES: Final = (
         "cycle_median_s",
         "Crane cycle, one log from the ground into the bunk: median",
         "s",
-        "From the detection of "
-        "the logs until the crane is clear of the stakes with the log in the bunk; grasps of one log on the route "
-        "of single logs.",
+        "From the detection of the logs until the crane is clear of the stakes with the log in the bunk; grasps of one "
+        "log on the route of single logs.",
         most=25.0,
     ),
     Metric(
@@ -41,9 +40,8 @@ CYCLES: Final = (
         "shortest_median_s",
         "Shortest possible time for the same paths, median",
         "s",
-        "What joint speeds, joint "
-        "accelerations and the pump's flow allow for the same paths, plus closing and opening of the grapple; "
-        "without detection, settling and jerk limit.",
+        "What joint speeds, joint accelerations and the pump's flow allow for the same paths, plus closing and opening "
+        "of the grapple; without detection, settling and jerk limit.",
     ),
     Metric("over_shortest", "Crane cycle over the shortest possible time, mean", "", "The same grasps."),
     Metric("piles.cycle_median_s", "Crane cycle from a pile: median", "s", "One grasp of any number of logs."),
@@ -60,24 +58,18 @@ HOURS: Final = (
     Metric("crane_logs_per_hour", "Single logs: logs per hour of crane work", "", "The same, without driving."),
     Metric("piles.logs_per_hour", "Piles: logs per hour", "", "As for single logs."),
     Metric("piles.m3_per_hour", "Piles: wood per hour", "m³", "As for single logs."),
-    Metric(
-        "loaded", "Logs loaded", "%", "Share of all single logs and logs in piles, by the plant's physics.", scale=100.0
-    ),
+    Metric("loaded", "Logs loaded", "%", "Share of all single logs and logs in piles, by the plant's physics."),
     Metric("faults", "Stops and faults", "", "All runs.", most=0.0),
 )
 UNLOADING: Final = (
     Metric(
-        "unload_s",
-        "Time to unload a full bunk",
-        "min",
-        "From the start of the first grasp to the end of the last.",
-        scale=1 / 60,
+        "unload_s", "Time to unload a full bunk", "min", "From the start of the first grasp to the end of the last."
     ),
     Metric("unload_logs_per_hour", "Logs per hour while unloading", "", "The same time."),
     Metric("unload_m3_per_hour", "Wood per hour while unloading", "m³", "The same time."),
     Metric("unload_cycle_median_s", "Crane cycle while unloading: median", "s", "One grasp of any number of logs."),
     Metric("unload_logs_per_grasp", "Logs per grasp while unloading", "", "Grasps with at least one log."),
-    Metric("unloaded", "Logs delivered to the landing", "%", "Within 3 m of its middle and not on board.", scale=100.0),
+    Metric("unloaded", "Logs delivered to the landing", "%", "Within 3 m of its middle and not on board."),
 )
 METRICS: Final = CYCLES + HOURS + UNLOADING
 INTRODUCTION: Final = (

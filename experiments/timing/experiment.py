@@ -1,11 +1,11 @@
-"""The timing experiment: two testbeds, quiet and loaded windows on each, evaluation, plots and page."""
+"""The timing experiment: two testbeds, quiet and loaded windows on each, metrics, plots and page."""
 
 from __future__ import annotations
 
 import math
-import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,12 +16,10 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
-from experiments.timing import evaluation, plots
-from experiments.timing.evaluation import OTHERS, Measured, gather, pooled
+from experiments.timing import metrics, plots
 from experiments.timing.measurement import MeasurementWindow, load, measure, missing_tools, system_calls
-from experiments.timing.metrics import CONCLUSION, INTRODUCTION, METRICS, SECTIONS
+from experiments.timing.metrics import METRICS, OTHERS, Measured
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
-from hil.tick.instructions import INSTRUCTIONS, count, open_counter
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 
@@ -78,31 +76,33 @@ def run(options: Options, console: Console) -> Result:
         measure_testbed(setting, plan, options.out / name, console)
         for setting, plan, name in zip(settings, plans, ("slow", "fast"), strict=True)
     )
-    metrics, compared = gather(slow, fast)
-    metrics |= frame_costs(options.quick, console) | compiled_ratios(options.quick, console)
-    undecided = evaluation.undecided(metrics)
+    found, compared = metrics.gather(slow, fast)
+    from experiments.timing import receive_cost
+
+    with console.status("timing: cost of a frame, interpreter and compiled tick") as status:
+        found |= receive_cost.measure(*((1_000, 3) if options.quick else (10_000, 9)))["metrics"]
+        found |= compiled_ratios(options.quick, status.update, console)
+    undecided = metrics.undecided(found)
     result = make_result(
         "timing",
         METRICS,
-        metrics,
+        found,
         profile=machine,
         seed=options.seed,
         trials=len(slow.quiet),
         more={
             **host_activity.describe(),
-            "host_verdict": "quiet enough" if metrics["host_verdict"] else "inconclusive",
+            "host_verdict": "quiet enough" if found["host_verdict"] else "inconclusive",
             "events": "; ".join(
                 f"{hz} Hz: {text}" for hz, of in ((200, slow), (FAST_HZ, fast)) for text in of.events.sentences()
             ),
-            "instructions": "counted" if "tick_instructions" in metrics else "not counted by this host",
+            "instructions": "counted" if "tick_instructions" in found else "not counted by this host",
             "tick": compared[-1].end.tick,
         },
         undecided=undecided,
     )
     options.out.mkdir(parents=True, exist_ok=True)
-    durations = {name: pooled([w.durations[name] for w in compared]) for name in compared[0].durations}
-    inputs = compared[-1].end.inputs
-    plots.draw(evaluation.loops(compared), evaluation.loops(slow.loaded), durations, inputs, options.out)
+    plots.draw(compared, slow.loaded, options.out)
     publish(result, page_of(result, {}), options, console)
     for name in result.inconclusive:
         console.print(f"[yellow]inconclusive[/yellow] {name}: {undecided[name]}", highlight=False, soft_wrap=True)
@@ -111,7 +111,6 @@ def run(options: Options, console: Console) -> Result:
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
-    e = result.environment
     slow, fast = FULL if result.trials == FULL[0].quiet else QUICK
     quiet = "The host was quiet enough for the comparison of wake-ups."
     if not result.metrics["host_verdict"]:
@@ -119,12 +118,9 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     setting = (
         f"Commit `{result.commit}`; `{result.profile}` on both buses at 200 Hz, quiet windows {slow.quiet} x "
         f"{slow.quiet_s:.0f} s, loaded ones {slow.loaded} x {slow.loaded_s:.0f} s; `{FIXED_CRANE}` at 1 kHz, "
-        f"{fast.quiet} of {fast.quiet_s:.0f} s each. Host: {e['processor']}, {e['cpus']} cores, hypervisor: "
-        f"{e['hypervisor']}, kernel {e['kernel']}, preemption {e['preemption']}, clock {e['clock']}, governor "
-        f"{e['governor']}, isolated processors {e['isolated']}, Python {e['python']}, tick: "
-        f"{e.get('tick', 'interpreter')}. {quiet}"
+        f"{fast.quiet} of {fast.quiet_s:.0f} s each. {host_activity.sentence(result.environment)} {quiet}"
     )
-    return Page("Timing experiment", CONCLUSION, INTRODUCTION, SECTIONS, setting)
+    return Page("Timing experiment", metrics.CONCLUSION, metrics.INTRODUCTION, metrics.SECTIONS, setting)
 
 
 def machines(profile: str) -> tuple[str, str]:
@@ -146,26 +142,19 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
 
         testbed.wait(plan.warm_s)
         before = testbed.counters()
-        counter = open_counter(testbed.family.children["controller"].process.pid, INSTRUCTIONS)
-        executed = count(counter) if counter is not None else 0
         quiet = windows("quiet", plan.quiet, plan.quiet_s)
-        instructions = math.nan
-        if counter is not None:
-            passed = quiet[-1].end.ticks - quiet[0].begin.ticks
-            instructions = (count(counter) - executed) / max(1, passed)
-            os.close(counter)
         with load(testbed, 2 * plan.loaded * (plan.loaded_s + OVERHEAD_S) + 60.0):
             pressed = windows("loaded", plan.loaded, plan.loaded_s)
         testbed.wait(1.0)  # for the last words of every process
         after = testbed.counters()
-        events = testbed.take_events()  # now, because tracing may stop the machine
+        events = deepcopy(testbed.events)  # now, because tracing may stop the machine
         others = {name: float(after[name] - before[name]) for name in OTHERS}
         status.update(f"{what}: counting system calls")
         calls = system_calls(testbed, plan.trace_s, directory) if plan.trace_s else None
-        return Measured(quiet, pressed, calls, events, instructions, others)
+        return Measured(quiet, pressed, calls, events, others)
 
 
-def compiled_ratios(quick: bool, console: Console) -> dict[str, float]:
+def compiled_ratios(quick: bool, progress: Callable[[str], None], console: Console) -> dict[str, float]:
     """How many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the kept recordings.
 
     NaN if there is no compiled tick or no recording.
@@ -173,7 +162,7 @@ def compiled_ratios(quick: bool, console: Console) -> dict[str, float]:
     from hil.tick import compare
 
     names = ("compiled_ratio_cold", "compiled_ratio_hot")
-    with console.status("timing: interpreter and compiled tick") as status, tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
         try:
             compare.need_build()
             places = compare.kept_recordings(Path(folder))
@@ -181,15 +170,5 @@ def compiled_ratios(quick: bool, console: Console) -> dict[str, float]:
             console.print(f"timing: no ratio: {error}", highlight=False, soft_wrap=True)
             return dict.fromkeys(names, math.nan)
         ticks, rounds = (300, 1) if quick else (2000, 3)
-        rows = [compare.compare_cost(place, ticks, rounds, status.update) for place in places]
+        rows = [compare.compare_cost(place, ticks, rounds, progress) for place in places]
     return {name: float(min(row[name] for row in rows)) for name in names}
-
-
-def frame_costs(quick: bool, console: Console) -> dict[str, float]:
-    """Cost of receiving one frame, with a raw socket and with python-can, on this host."""
-    from experiments.timing import receive_cost
-
-    frames, rounds = (1_000, 3) if quick else (10_000, 9)
-    with console.status("timing: cost of a frame"):
-        found: dict[str, float] = receive_cost.measure(frames, rounds)["metrics"]
-    return found

@@ -1,28 +1,33 @@
-"""Judges whether a computer is fit to run the control loop: a minute on the timing testbed, then verdicts.
+"""Judges whether a computer is fit to run the control loop: a minute on the timing testbed, verdicts, and a report.
 
 Beside the controller run cyclictest, if there is one, and a sleep loop.
 
 A bad figure that depends on the clock is *inconclusive* when the computer was disturbed meanwhile; a good one stays
-good.  The limits are shares of the control period.
+good.  The limits are shares of the control period.  The report is one Markdown file with its data as JSON inside, made
+to be sent: every text passes `without_private`, which removes names of host and user and paths that are not the
+system's own.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import re
 import shutil
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from can_dbc.bus.factory import VCAN_NAMES
-from experiments.timing import evaluation
 from experiments.timing.events import losses_between
 from experiments.timing.measurement import measure
+from experiments.timing.metrics import loops, pooled, process_metrics, spread_us
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
-from host.doctor.facts import UNLIMITED, Facts, interrupt_counts
+from host.doctor.facts import UNLIMITED, Computer, Facts, interrupt_counts
+from host.doctor.finding import Finding, Severity
 from host.doctor.timing import PRIORITY
 from host.systemd import process_facts
 from host.vcan_lab import links
@@ -145,11 +150,11 @@ def measure_computer(
             show(f"window {i + 1} of {count}, {seconds / count:.0f} s")
             windows.append(measure(testbed, seconds / count, directory, with_cyclictest))
         after = _interrupts(testbed.cpu)
-    ours, theirs, plain = evaluation.loops(windows)
-    late = evaluation.spread_us("late", ours)
-    beside = evaluation.spread_us("reference", theirs if with_cyclictest else plain)
-    cost = evaluation.spread_us("tick", evaluation.pooled([w.durations["cpu"] for w in windows]))
-    process = evaluation.process_metrics(windows)
+    ours, theirs, plain = loops(windows)
+    late = spread_us("late", ours)
+    beside = spread_us("reference", theirs if with_cyclictest else plain)
+    cost = spread_us("tick", pooled([w.durations["cpu"] for w in windows]))
+    process = process_metrics(windows)
     figures = Figures(
         seconds=sum(w.host.seconds for w in windows),
         period_us=setting.period_ns / 1e3,
@@ -289,3 +294,93 @@ def stops(f: Figures) -> Judgement:
     said = f"the supervisor stopped the machine {f.stops} times"
     advice = "the reasons are under 'stop_reasons'; correct wake-ups first"
     return _clocked(f, "stops", Verdict.UNFIT if f.stops else Verdict.GOOD, said, advice)
+
+
+REMOVED: Final = "(removed)"
+_SYSTEM: Final = r"etc|proc|sys|dev"
+_PATH: Final = re.compile(rf"(?<![\w.:/])/(?!(?:{_SYSTEM})\b)\w[^\s'\"`,;)|]*/[^\s'\"`,;)|]*")
+_COMMON: Final = frozenset({"root", "localhost", ""})
+VERSION: Final = 1
+
+
+def private_words(*words: str) -> frozenset[str]:
+    """Words to remove from a report, for example names of host and user; common ones say nothing and stay."""
+    return frozenset(words) - _COMMON
+
+
+def without_private(value: Any, words: Iterable[str]) -> Any:
+    """The same plain value; in every text ``words`` and paths outside the system's own folders are removed."""
+    if isinstance(value, str):
+        text = _PATH.sub(REMOVED, value)
+        for word in sorted(words, key=len, reverse=True):
+            text = re.sub(rf"(?<!\w){re.escape(word)}(?!\w)", REMOVED, text)
+        return text
+    if isinstance(value, Mapping):
+        return {str(key): without_private(inner, words) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_private(inner, words) for inner in value]
+    if isinstance(value, frozenset | set):
+        return sorted(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def data_of(
+    facts: Facts, computer: Computer, findings: Sequence[Finding], measured: Measured | str, words: Iterable[str]
+) -> dict[str, Any]:
+    """The data of a report; ``measured`` is a sentence when the measurement failed, ``words`` are removed."""
+    if isinstance(measured, str):
+        advice = "correct what the sentence and the settings below say, and measure again; else send this report"
+        judged: tuple[Judgement, ...] = (Judgement("run", Verdict.UNFIT, measured, advice),)
+        more: dict[str, Any] = {"measured": None, "disturbed": []}
+    else:
+        judged = judge(measured.figures)
+        more = {"measured": asdict(measured), "disturbed": disturbances(measured.figures)}
+    data = {
+        "report": VERSION,
+        "verdict": overall(judged).value,
+        "judgements": [asdict(j) for j in judged],
+        **more,
+        "computer": asdict(computer),
+        "settings": asdict(facts),
+        "findings": [f.document() for f in findings],
+    }
+    found: dict[str, Any] = without_private(data, words)
+    return found
+
+
+def text_of(data: dict[str, Any]) -> str:
+    """The report of these data."""
+    lines = ["# Real-time report", "", f"Verdict: **{data['verdict']}**.", ""]
+    if data["disturbed"]:
+        lines += [f"The computer was disturbed: {'; '.join(data['disturbed'])}.", ""]
+    lines += ["| topic | verdict | found | what to do |", "|---|---|---|---|"]
+    for j in data["judgements"]:
+        lines.append(f"| {j['topic']} | **{j['verdict']}** | {_cell(j['sentence'])} | {_cell(j['advice'])} |")
+    lines += ["", "## Computer", "", "| fact | value |", "|---|---|"]
+    parts = [data["computer"], data["settings"], data["measured"] or {}, (data["measured"] or {}).get("figures", {})]
+    lines += [f"| {name} | {_cell(value)} |" for part in parts for name, value in part.items() if name != "figures"]
+    lines += ["", "## Settings to change, the most useful first", ""]
+    wanted = [f for f in data["findings"] if f["severity"] != Severity.FINE.name.lower()]
+    for f in wanted:
+        lines.append(f"- {f['what']}: {f['sentence']}; gain: {f['gain']}")
+        lines += [f"  - `{command}`" for command in f["commands"]]
+    lines += [] if wanted else ["None."]
+    lines += ["", "## Data", "", "```json", json.dumps(data, indent=1), "```", ""]
+    return "\n".join(lines)
+
+
+def read_data(text: str) -> dict[str, Any]:
+    """The data inside a report; raises ValueError when there are none."""
+    found = re.search(r"^```json\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise ValueError("this is not a real-time report: it holds no JSON")
+    data: dict[str, Any] = json.loads(found[1])
+    return data
+
+
+def _cell(value: object) -> str:
+    """Lists as words; a line feed or a column's mark would end the cell."""
+    text = ", ".join(map(str, value)) if isinstance(value, list | dict) else str(value)
+    return text.replace("|", "\\|").replace("\n", " ")

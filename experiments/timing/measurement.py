@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from can_dbc.timing.durations import Durations, bin_of
-from can_dbc.timing.page import Facts, Timing
 from experiments.common import host_activity
-from experiments.timing.testbed import TimingTestbed
+from experiments.timing.testbed import Span, TimingTestbed
 from host.exit_codes import CommandFailed, ExitCode
 
 PRIORITY: Final = 80
@@ -48,25 +47,12 @@ class SleepLoopReport:
 
 
 @dataclass(frozen=True, slots=True)
-class MeasurementWindow:
-    """One window: the controller's totals at ``begin`` and ``end``, and the histograms of the time between."""
+class MeasurementWindow(Span):
+    """One window of the controller, with the reference loops over the same time, and the host's activity."""
 
-    begin: Facts
-    end: Facts
-    durations: dict[str, Durations]
     cyclictest: Durations
     sleep_loop: SleepLoopReport
     host: host_activity.HostActivity
-
-    @property
-    def ticks(self) -> int:
-        """Ticks executed."""
-        return self.end.ticks - self.begin.ticks
-
-    @property
-    def missed(self) -> int:
-        """Periods skipped."""
-        return self.end.missed - self.begin.missed
 
 
 def missing_tools() -> dict[str, str]:
@@ -83,44 +69,27 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
     report, period_ns = directory / "cyclictest.json", testbed.setting.period_ns
     report.unlink(missing_ok=True)
     if with_cyclictest:
-        testbed.helpers.launch(
-            "cyclictest",
-            "cyclictest",
-            "-q",
-            "-m",
-            "-t",
-            1,
-            "-a",
-            testbed.cpu,
-            "-p",
-            PRIORITY,
-            "--policy",
-            "fifo",
-            "-i",
-            period_ns // 1000,
-            "--secaligned",
-            offset_us(testbed.stamp_ns, period_ns),
-            "-h",
-            MAX_LATENESS_US,
-            "--histfile=/dev/null",
-            f"--json={report}",
-        )
+        how = f"-q -m -t 1 -a {testbed.cpu} -p {PRIORITY} --policy fifo -i {period_ns // 1000} -h {MAX_LATENESS_US}"
+        when = f"--secaligned {offset_us(testbed.stamp_ns, period_ns)} --histfile=/dev/null"
+        testbed.helpers.launch("cyclictest", "cyclictest", *how.split(), *when.split(), f"--json={report}")
         testbed.wait(START_S)
-    first, begin = host_activity.sample(), testbed.fresh_timing()
-    loop = ("--period-us", period_ns // 1000, "--seconds", seconds)
-    child = testbed.helpers.start("sleep-loop", "experiments.timing.sleep_loop", *loop)
+    first, mark = host_activity.sample(), testbed.mark()
+    child = testbed.helpers.start(
+        "sleep-loop", "experiments.timing.sleep_loop", period_us=period_ns // 1000, seconds=seconds
+    )
     os.sched_setaffinity(child.process.pid, {testbed.cpu})
     output = testbed.await_end("sleep-loop", seconds + GRACE_S)
-    end, last = testbed.fresh_timing(), host_activity.sample()
+    span, last = testbed.since(mark), host_activity.sample()
     if with_cyclictest:
         testbed.end_helper("cyclictest")
     return MeasurementWindow(
-        begin=begin.facts,
-        end=end.facts,
-        durations=between(begin, end),
-        cyclictest=read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
-        sleep_loop=read_sleep_loop(output),
-        host=host_activity.between(first, last),
+        span.begin,
+        span.end,
+        span.durations,
+        span.instructions,
+        read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
+        read_sleep_loop(output),
+        host_activity.between(first, last),
     )
 
 
@@ -145,11 +114,6 @@ def read_sleep_loop(output: dict[str, Any]) -> SleepLoopReport:
     for i, n in output["bins"].items():
         lateness.bins[int(i)] = n
     return SleepLoopReport(lateness, output["missed"], output["cpu_us"])
-
-
-def between(begin: Timing, end: Timing) -> dict[str, Durations]:
-    """Histograms of the time between two readings of the timing page."""
-    return {name: end.durations[name] - begin.durations[name] for name in end.durations}
 
 
 @contextlib.contextmanager

@@ -8,7 +8,6 @@ interval: other load and shared caches change it.
 
 from __future__ import annotations
 
-import platform
 import statistics
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -19,13 +18,10 @@ from typing import Any, Final
 
 from websockets.sync.client import ClientConnection, connect
 
-from can_dbc.timing.page import Facts
-from experiments.common import host_activity
 from experiments.timing.measurement import system_calls
 from experiments.timing.testbed import HOST, START_S, TestbedConfig, TimingTestbed
 from hil.harness.processes import free_udp_ports
 from hil.tick.compare import compared
-from hil.tick.instructions import INSTRUCTIONS, count, open_counter
 
 PROFILE: Final = "palms_471"
 RATE_HZ: Final = 200
@@ -60,25 +56,19 @@ def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: 
         CommandFailed: a process does not start or ends.
     """
     reports, port = free_udp_ports(2)
-    setting = TestbedConfig(PROFILE, RATE_HZ, arguments=("--report", f"{HOST}:{reports}"))
+    setting = TestbedConfig(PROFILE, RATE_HZ, report_ports=(reports,))
     found: dict[str, list[Window]] = {"none": [], "open": []}
     with TimingTestbed(setting, directory) as testbed:
         testbed.helpers.environment = testbed.family.environment  # the console listens on the same wire
         testbed.helpers.start(
             "console",
             "console",
-            "--profile",
-            PROFILE,
-            "--port",
-            port,
-            "--report-port",
-            reports,
-            "--timing",
-            testbed.page,
-            "--bus",
-            "crane0=wire:crane0",
-            "--key-file",
-            testbed.key_file,
+            profile=PROFILE,
+            port=port,
+            report_port=reports,
+            timing=testbed.page,
+            bus="crane0=wire:crane0",
+            key_file=testbed.key_file,
         )
         testbed.helpers.await_message("console", "url", START_S)
         for number in range(rounds):
@@ -113,26 +103,19 @@ def _opened(testbed: TimingTestbed, port: int, pages: int) -> Iterator[list[int]
 
 
 def _window(testbed: TimingTestbed, seconds: float, directory: Path) -> Window:
-    counter = open_counter(testbed.family.children["controller"].process.pid, INSTRUCTIONS)
-    begin = testbed.fresh_timing().facts
-    counted = None if counter is None else count(counter)
+    mark = testbed.mark()
     testbed.wait(seconds)
-    end = testbed.fresh_timing().facts
-    executed = None if counter is None or counted is None else count(counter) - counted
+    span = testbed.since(mark)
     traced = system_calls(testbed, seconds, directory)
-    ticks = end.ticks - begin.ticks
+    sent = [sum(bus.sent for bus in facts.buses) for facts in (span.begin, span.end)]
     return Window(
-        ticks=ticks,
-        missed=end.missed - begin.missed,
-        cpu_us=(end.process.cpu_ns - begin.process.cpu_ns) / ticks / 1e3,
-        frames=(_sent(end) - _sent(begin)) / ticks,
-        instructions=None if executed is None else executed / ticks,
+        ticks=span.ticks,
+        missed=span.missed,
+        cpu_us=span.cpu_ns / span.ticks / 1e3,
+        frames=(sent[1] - sent[0]) / span.ticks,
+        instructions=None if span.instructions is None else span.instructions / span.ticks,
         calls=None if traced is None else sum(traced[0].values()) / traced[1],
     )
-
-
-def _sent(facts: Facts) -> int:
-    return sum(bus.sent for bus in facts.buses)
 
 
 def judge(found: dict[str, list[Window]]) -> dict[str, Any]:
@@ -162,8 +145,3 @@ def _compared(found: dict[str, list[Window]], name: str) -> dict[str, Any]:
         sides[side] = statistics.median(values)
     same = abs(sides["open"] - sides["none"]) <= SAME * sides["none"]
     return {side: round(value, 2) for side, value in sides.items()} | {"same": same}
-
-
-def environment() -> dict[str, str]:
-    """What the figures depend on."""
-    return {"python": platform.python_version(), "machine": platform.machine()} | host_activity.describe()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from can_dbc.timing.durations import BINS, Durations
 from can_dbc.timing.page import STAGES, InputAge
-from experiments.timing.evaluation import EDGES_NS, quantile_us
+from experiments.timing.measurement import MeasurementWindow
+from experiments.timing.metrics import EDGES_NS, loops, pooled, quantile_us
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 WHOLE: Final = {
@@ -21,20 +22,17 @@ WHOLE: Final = {
 WITHIN: Final = tuple(name for name in STAGES if name not in (*WHOLE, "wake", "sync"))
 COLOURS: Final = {"controller": OIL, "cyclictest": MOSS, "time.sleep loop": RUST}
 PERIOD_NS: Final = 5_000_000
-Loops = tuple[Durations, Durations, Durations]
 
 
-def draw(
-    quiet: Loops, loaded: Loops, durations: Mapping[str, Durations], inputs: Mapping[str, InputAge], out: Path
-) -> None:
-    """Write every plot into ``out``."""
+def draw(quiet: Sequence[MeasurementWindow], loaded: Sequence[MeasurementWindow], out: Path) -> None:
+    """Write every plot into ``out``: stages and inputs in the quiet windows, wake-ups in both."""
     with sheet(out / "wakeups.png", 2, height=3.4) as axes:
-        for axis, loops, title in zip(axes, (quiet, loaded), ("Quiet", "Every core loaded"), strict=True):
-            draw_exceeded(axis, dict(zip(COLOURS, loops, strict=True)), PERIOD_NS)
+        for axis, windows, title in zip(axes, (quiet, loaded), ("Quiet", "Every core loaded"), strict=True):
+            draw_exceeded(axis, dict(zip(COLOURS, loops(windows), strict=True)), PERIOD_NS)
             axis.set_title(title)
         axes[0].legend()
-    stages(durations, out / "stages.png")
-    ages(inputs, out / "ages.png")
+    stages({name: pooled([w.durations[name] for w in quiet]) for name in quiet[0].durations}, out / "stages.png")
+    ages(quiet[-1].end.inputs, out / "ages.png")
 
 
 def draw_exceeded(axis: Any, histograms: Mapping[str, Durations], period_ns: int) -> None:
@@ -55,7 +53,7 @@ def stages(durations: Mapping[str, Durations], path: Path) -> None:
     with sheet(path, height=0.5 + 0.34 * len(names)) as axis:
         for y, name in enumerate(reversed(names)):
             h = durations[name]
-            p50, p99 = (max(0.3, quantile_us(np.array(h.bins, float), share, h.longest_ns)) for share in (0.5, 0.99))
+            p50, p99 = (max(0.3, quantile_us(h, share)) for share in (0.5, 0.99))
             colour = TIMBER if name in WITHIN else OIL
             axis.barh(y, p50, color=colour, height=0.6)
             axis.plot([p50, p99], [y, y], color=colour, lw=3, alpha=0.55, solid_capstyle="butt")

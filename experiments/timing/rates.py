@@ -22,9 +22,8 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing.evaluation import load_metrics, spread_us, unmeasured
 from experiments.timing.events import STALL_NS, Events, event_metrics, explained
-from experiments.timing.measurement import between
+from experiments.timing.metrics import spread_us, unmeasured
 from experiments.timing.testbed import TestbedConfig, TimingTestbed, cores
 from hil.harness.processes import ProcessGroup
 from hil.replay.recording import files_of, manifest_of
@@ -48,6 +47,8 @@ MISSED_SHARE: Final = 0.001
 """Share of the periods that may be missed before a processor carries too many controllers."""
 REPLAY_TICKS: Final = 1000
 PERIOD_NS: Final = 5_000_000
+REPLAY: Final = "experiments.timing.replayed_crane"
+LINES: Final = (*((f"{machine}_frame", title) for machine, title in MACHINES.items()), ("function", "Functions"))
 MAX_RESIDUAL: Final = 0.1
 """Of a straight line, as a share of its largest value."""
 
@@ -126,13 +127,12 @@ def measure_rate(machine: str, rate_hz: int, seconds: float, directory: Path) ->
     """Measure one machine at one rate."""
     with TimingTestbed(TestbedConfig(machine, rate_hz, bitrates=BITRATES), directory) as testbed:
         testbed.wait(2.0)
-        begin = testbed.fresh_timing()
+        mark = testbed.mark()
         testbed.wait(seconds)
-        end = testbed.fresh_timing()
+        span = testbed.since(mark)
         testbed.wait(0.5)
-    figures = spread_us("cpu", between(begin, end)["cpu"]) | load_metrics(begin.facts, end.facts)
-    figures |= {n: float(getattr(end.facts, n) - getattr(begin.facts, n)) for n in ("ticks", "missed")}
-    return RatePoint(machine, rate_hz, figures, testbed.events, end.facts.tick)
+    figures = {**spread_us("cpu", span.durations["cpu"]), **span.load, "ticks": span.ticks, "missed": span.missed}
+    return RatePoint(machine, rate_hz, figures, testbed.events, span.end.tick)
 
 
 def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[CranePoint]:
@@ -159,17 +159,8 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
     start_ns = time.monotonic_ns() + round((3.0 + 2.0 * cranes) * 1e9)
     try:
         for k in range(cranes):
-            family.start(
-                f"crane-{k}",
-                "experiments.timing.replayed_crane",
-                recording,
-                "--ticks",
-                ticks,
-                "--cpu",
-                cpu,
-                "--start-at",
-                start_ns + k * PERIOD_NS // cranes,
-            )
+            at_ns = start_ns + k * PERIOD_NS // cranes
+            family.start(f"crane-{k}", REPLAY, recording, ticks=ticks, cpu=cpu, start_at=at_ns)
         limit = time.monotonic() + 60.0 + 3.0 * cranes + 3.0 * ticks * PERIOD_NS * 1e-9
         while len(outputs) < cranes:
             for name, message in family.messages():
@@ -225,9 +216,9 @@ def undecided(metrics: Mapping[str, float], points: Sequence[RatePoint]) -> dict
     """The metrics that this run cannot decide, with the reason."""
     found = unmeasured(METRICS, metrics) | explained(metrics)
     stalled = any(s.length_ns >= STALL_NS for p in points for s in p.events.stalls)
-    for name in (*(f"{machine}_frame_residual" for machine in MACHINES), "function_residual"):
-        if metrics[name] > MAX_RESIDUAL and stalled:
-            found[name] = "the host stalled during the measurement"
+    for name, _ in LINES:
+        if metrics[f"{name}_residual"] > MAX_RESIDUAL and stalled:
+            found[f"{name}_residual"] = "the host stalled during the measurement"
     return found
 
 
@@ -238,53 +229,27 @@ FAST: Final = Section(
     (
         Metric("forwarder1k_frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's counters."),
         Metric("forwarder1k_cpu_p50_us", "CPU time of a tick, median", "us", "The thread's own clock."),
-        Metric("forwarder1k_cpu_p99_us", "CPU time of a tick, p99", "us", "As for the median."),
-        Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage.", scale=100.0),
-        Metric("forwarder1k_ticks", "Ticks", "", "Executed."),
+        Metric("forwarder1k_cpu_p99_us", "CPU time of a tick, p99", "us", "The thread's own clock."),
+        Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage."),
+        Metric("forwarder1k_ticks", "Ticks", ""),
         Metric("forwarder1k_missed", "Missed periods", "", "The host's stalls included."),
         Metric("frames_lost", "Frames refused or lost, all machines and rates", "", "Its own counters.", most=0.0),
         Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "", "By the witness.", most=0.0),
         Metric("stops", "Stops, all machines and rates", "", "By the controller's reports.", most=0.0),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness.", most=0.0),
     ),
-    (
-        (
-            "rates.png",
-            "CPU load against frames per second, and CPU time per period against the functions moved; lines: "
-            "least squares.",
-        ),
-    ),
+    (("rates.png", "CPU load against frames per second, CPU time per period against the functions moved; fitted."),),
 )
 COST: Final = Section(
     "Cost against frames and joints",
     "Both are straight lines: a frame and a function cost the same whether there are few or many. The load against "
     "frames is measured live at 100 to 1000 Hz, so that its slope contains the ticks that carry the frames. The cost "
-    "against functions is that of several controllers at 200 Hz on one processor.",
+    "against functions is that of several controllers at 200 Hz on one processor. A residual is the largest of a line, "
+    "as a share of the largest value.",
     (
-        *(
-            metric
-            for machine, title in MACHINES.items()
-            for metric in (
-                Metric(f"{machine}_frame_us", f"{title}: CPU time per frame", "us", "Slope of the line."),
-                Metric(
-                    f"{machine}_frame_residual",
-                    f"{title}: largest residual",
-                    "%",
-                    "Of the largest load.",
-                    most=MAX_RESIDUAL,
-                    scale=100.0,
-                ),
-            )
-        ),
+        *(Metric(f"{machine}_frame_us", f"{title}: CPU time per frame", "us") for machine, title in MACHINES.items()),
         Metric("function_us", "CPU time per function and period", "us", "Slope of the line, both machines."),
-        Metric(
-            "function_residual",
-            "Functions: largest residual",
-            "%",
-            "Of the largest cost.",
-            most=MAX_RESIDUAL,
-            scale=100.0,
-        ),
+        *(Metric(f"{name}_residual", f"{title}: largest residual", "%", most=MAX_RESIDUAL) for name, title in LINES),
     ),
 )
 CRANES: Final = Section(
@@ -315,11 +280,7 @@ INTRODUCTION: Final = (
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
-    e = result.environment
-    setting = (
-        f"Commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python "
-        f"{e['python']}, tick: {e['tick']}."
-    )
+    setting = f"Commit `{result.commit}`. {host_activity.sentence(result.environment)}"
     return Page("Rates experiment", CONCLUSION, INTRODUCTION, SECTIONS, setting)
 
 

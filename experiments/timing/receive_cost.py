@@ -171,13 +171,12 @@ def _round(
 
 def _discard(lane: Lane) -> int:
     """Receive and discard all waiting frames; returns their number."""
-    count = 0
-    while True:
-        scrap: list[Any] = []
+    scrap: list[Any] = []
+    last = -1
+    while len(scrap) > last:
+        last = len(scrap)
         lane.drain(scrap)
-        if not scrap:
-            return count
-        count += len(scrap)
+    return last
 
 
 def _lanes(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
@@ -229,27 +228,26 @@ class _BusOnPair(PythonCanBus):
 
 def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
     """Ours, python-can's and python-can as a bus, each on an AF_UNIX datagram pair."""
-    (ours, to_ours), (theirs, to_theirs), (behind, to_behind) = (
-        socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)
-    )
-    for end in (ours, to_ours, theirs, to_theirs, behind, to_behind):
-        stack.enter_context(end)
-    link, stats = FrameSocket(ours), BusStats()
 
-    def through(sock: socket.socket) -> Callable[[list[RawFrame]], None]:
+    def pair() -> tuple[socket.socket, Callable[[list[RawFrame]], None]]:
+        near, far = map(stack.enter_context, socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM))
+
         def send(frames: list[RawFrame]) -> None:
             for key, data in frames:
-                sock.send(CAN_FRAME.pack(key, len(data), data))
+                far.send(CAN_FRAME.pack(key, len(data), data))
 
-        return send
+        return near, send
+
+    (ours, to_ours), (theirs, to_theirs), (behind, to_behind) = pair(), pair(), pair()
+    link, stats = FrameSocket(ours), BusStats()
 
     def drain(frames: list[Any]) -> None:
         link.receive(frames, DRAIN_LIMIT, stats.note_error)
 
     return (
-        Lane("ours", "ours on an AF_UNIX pair", through(to_ours), drain),
-        Lane("pythoncan", "python-can on an AF_UNIX pair", through(to_theirs), _recv_all(_OnPair(theirs)), True),
-        Lane("pythoncan_bus", "--bus python-can:... on an AF_UNIX pair", through(to_behind), _BusOnPair(behind).drain),
+        Lane("ours", "ours on an AF_UNIX pair", to_ours, drain),
+        Lane("pythoncan", "python-can on an AF_UNIX pair", to_theirs, _recv_all(_OnPair(theirs)), True),
+        Lane("pythoncan_bus", "--bus python-can:... on an AF_UNIX pair", to_behind, _BusOnPair(behind).drain),
     )
 
 

@@ -18,11 +18,10 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result
 from experiments.common.result_page import Page, Section, publish
-from experiments.timing.evaluation import MIN_STEADY_TICKS, block_growth, spread_us
-from experiments.timing.events import event_metrics
-from experiments.timing.measurement import between
+from experiments.timing.events import event_metrics, losses_between
+from experiments.timing.metrics import MIN_STEADY_TICKS, block_growth, spread_us
 from experiments.timing.plots import draw_exceeded
-from experiments.timing.testbed import TestbedConfig, TimingTestbed
+from experiments.timing.testbed import Span, TestbedConfig, TimingTestbed
 from machine.loading.profile_file import load_profile
 from runtime.plot_style import OIL, TIMBER, sheet
 
@@ -45,13 +44,7 @@ MEMORY: Final = Section(
     "Read every few seconds. Growth is the maximum of the second half of the run less the maximum of the first half. "
     "The interpreter's memory blocks come and go, so their minima are compared.",
     (
-        Metric(
-            "controller_growth_kb",
-            "Growth of the controller's resident memory",
-            "kB",
-            "VmRSS of /proc/PID/status.",
-            most=FLAT_KB,
-        ),
+        Metric("controller_growth_kb", "Growth of the controller's resident memory", "kB", "VmRSS.", most=FLAT_KB),
         Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS.", most=FLAT_KB),
         Metric(
             "allocated_blocks_growth",
@@ -60,8 +53,8 @@ MEMORY: Final = Section(
             "sys.getallocatedblocks, from the timing page.",
             most=0.0,
         ),
-        Metric("gc_runs", "Runs of the garbage collector", "", "In the controller.", most=0.0),
-        Metric("major_faults", "Major page faults", "", "In the controller.", most=0.0),
+        Metric("gc_runs", "Runs of the garbage collector in the controller", "", most=0.0),
+        Metric("major_faults", "Major page faults in the controller", "", most=0.0),
     ),
     (("memory.png", "Resident memory of controller and guard, and memory blocks of the controller, over the run."),),
 )
@@ -72,19 +65,13 @@ FRAMES: Final = Section(
     "carry none, but every SYNC must be answered. The emulated machine checks its received frames in the same way.",
     (
         Metric("minutes", "Duration", "min", "After a few seconds of warm-up."),
-        Metric("received", "Frames received by the controller", "", "All buses."),
-        Metric("sent", "Frames sent by the controller", "", "All buses."),
-        Metric("gaps", "Gaps in its protected frames, received and sent", "", "By the bus observer.", most=0.0),
-        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", "By itself.", most=0.0),
+        Metric("received", "Frames received by the controller", ""),
+        Metric("sent", "Frames sent by the controller", ""),
+        Metric("gaps", "Gaps in its protected frames, received and sent", "", most=0.0),
+        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", most=0.0),
         Metric("damaged", "Frames with a wrong CRC", "", "By both.", most=0.0),
-        Metric("unanswered", "SYNCs not answered by an encoder", "", "By the bus observer.", most=0.0),
-        Metric(
-            "frames_lost",
-            "Frames refused by a bus or lost before they were read",
-            "",
-            "Controller and emulated machine.",
-            most=0.0,
-        ),
+        Metric("unanswered", "SYNCs not answered by an encoder", "", most=0.0),
+        Metric("frames_lost", "Frames refused by a bus or lost before they were read", "", "By both.", most=0.0),
         Metric("records_lost", "Missing tick records", "", "By their nominal times.", most=0.0),
     ),
 )
@@ -93,7 +80,7 @@ TIMES: Final = Section(
     "The histogram of the whole run. In user-mode Linux a system call costs a hundred times as much as on the host, so "
     "these numbers show that the machine works there, not what the controller costs.",
     (
-        Metric("ticks", "Ticks", "", "Executed."),
+        Metric("ticks", "Ticks", ""),
         Metric("missed", "Missed periods", "", "Whole periods skipped."),
         Metric("stops", "Stops of the machine", "", "The emulated operator arms it again after each."),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness of the testbed."),
@@ -103,12 +90,11 @@ TIMES: Final = Section(
             "%",
             "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
             least=MIN_ACTIVE_SHARE,
-            scale=100.0,
         ),
-        Metric("wakeup_p50_us", "Lateness, median", "us", "All ticks."),
-        Metric("wakeup_p99_us", "Lateness, p99", "us", "All ticks."),
-        Metric("wakeup_max_us", "Lateness, longest", "us", "All ticks."),
-        Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us", "All ticks."),
+        Metric("wakeup_p50_us", "Lateness, median", "us"),
+        Metric("wakeup_p99_us", "Lateness, p99", "us"),
+        Metric("wakeup_max_us", "Lateness, longest", "us"),
+        Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us"),
         Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat."),
     ),
     (("lateness.png", "Share of wake-ups later than x."),),
@@ -145,29 +131,28 @@ def run(options: Options, console: Console) -> Result:
     first = host_activity.sample()
     with console.status("soak: starting") as status, TimingTestbed(setting, options.out / "testbed") as testbed:
         testbed.wait(WARM_S)
-        begin, before = testbed.fresh_timing(), testbed.counters()
+        mark, before = testbed.mark(), testbed.counters()
         began, readings = time.monotonic(), list[Reading]()
         while (passed := time.monotonic() - began) < 60.0 * minutes:
             readings.append(read(testbed, passed))
             status.update(f"soak: {passed / 60:.1f} of {minutes:.3g} min, {readings[-1].facts.words}")
             testbed.wait(min(READING_PERIOD_S, 60.0 * minutes / MIN_READINGS, 60.0 * minutes - passed))
-        end = testbed.fresh_timing()
+        span = testbed.since(mark)
         readings.append(read(testbed, time.monotonic() - began))
         counted = testbed.counters()
         counted.subtract(before)
-    durations = between(begin, end)
     told = event_metrics([testbed.events])
     metrics = {
         "minutes": minutes,
-        "ticks": float(end.facts.ticks - begin.facts.ticks),
-        "missed": float(end.facts.missed - begin.facts.missed),
+        "ticks": float(span.ticks),
+        "missed": float(span.missed),
         **{name: told[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
         "steal_ms": host_activity.between(first, host_activity.sample()).steal_ms,
         **memory(readings),
-        **frames(counted, begin.facts, end.facts),
-        **spread_us("wakeup", durations["wake"]),
-        **spread_us("tick_cpu", durations["cpu"]),
+        **frames(counted, span),
+        **spread_us("wakeup", span.durations["wake"]),
+        **spread_us("tick_cpu", span.durations["cpu"]),
     }
     result = make_result(
         "soak",
@@ -189,7 +174,7 @@ def run(options: Options, console: Console) -> Result:
     options.out.mkdir(parents=True, exist_ok=True)
     draw_memory(readings, options.out / "memory.png")
     with sheet(options.out / "lateness.png") as axis:
-        draw_exceeded(axis, {"controller": durations["wake"]}, setting.period_ns)
+        draw_exceeded(axis, {"controller": span.durations["wake"]}, setting.period_ns)
     publish(result, page_of(result, {}), options, console)
     return result
 
@@ -198,10 +183,8 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
     e = result.environment
     rate = f" at {e['rate_hz']} Hz" if "rate_hz" in e else ""
-    setting = (
-        f"Commit `{result.commit}`, `{result.profile}`{rate} on {e['bus']}{e['lab']}. Host: "
-        f"{e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python {e['python']}."
-    )
+    where = f"`{result.profile}`{rate} on {e['bus']}{e['lab']}"
+    setting = f"Commit `{result.commit}`, {where}. {host_activity.sentence(e)}"
     return Page("Soak test", CONCLUSION, INTRODUCTION, SECTIONS, setting, "make soak")
 
 
@@ -218,14 +201,10 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
 
 def read(testbed: TimingTestbed, at_s: float) -> Reading:
     """Read a running testbed."""
-    controller, guard = (resident_kb(testbed.family.children[n].process.pid) for n in ("controller", "guard"))
+    status = (Path(f"/proc/{testbed.family.children[n].process.pid}/status") for n in ("controller", "guard"))
+    resident = (re.search(r"^VmRSS:\s+(\d+)", path.read_text(), re.MULTILINE) for path in status)
+    controller, guard = (int(found[1]) if found else 0 for found in resident)
     return Reading(at_s, testbed.timing().facts, controller, guard, testbed.mode)
-
-
-def resident_kb(pid: int) -> int:
-    """VmRSS of a process."""
-    found = re.search(r"^VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
-    return int(found[1]) if found else 0
 
 
 def memory(readings: Sequence[Reading]) -> dict[str, float]:
@@ -242,9 +221,9 @@ def memory(readings: Sequence[Reading]) -> dict[str, float]:
     }
 
 
-def frames(counted: Counter[str], begin: Facts, end: Facts) -> dict[str, float]:
+def frames(counted: Counter[str], span: Span) -> dict[str, float]:
     """Counts of frames in a run, by bus observer, emulated machine and controller."""
-    lost = sum(b.dropped + b.refused for b in end.buses) - sum(b.dropped + b.refused for b in begin.buses)
+    lost = sum(loss.frames for loss in losses_between(span.begin, span.end))
     names = ("received", "sent", "gaps", "gaps_rig", "damaged", "unanswered", "records_lost")
     return {
         **{name: float(counted[name]) for name in names},

@@ -17,15 +17,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
 from can_dbc.messages.envelope import write_key
 from can_dbc.messages.operator_link import guard_path
-from can_dbc.timing.page import Timing, read_timing
+from can_dbc.timing.durations import Durations
+from can_dbc.timing.page import Facts, Timing, read_timing
 from experiments.common import host_activity
 from experiments.timing.events import Events, Stall, Stop, losses_between
 from hil.harness.processes import ProcessGroup, free_udp_ports
+from hil.tick.instructions import INSTRUCTIONS, count, open_counter
 from hil.wire.core import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
@@ -54,18 +56,58 @@ MEMORY: Final = Path("/dev/shm")  # only mkdtemp makes names in it  # nosec B108
 
 @dataclass(frozen=True, slots=True)
 class TestbedConfig:
-    """Configuration of a testbed: profile, rate, bus, bit rates, and further arguments of the controller."""
+    """Profile, rate, bus, bit rates, and further ports that hear the controller's reports."""
 
     profile: str
     rate_hz: int
     bus: str = "wire"
     bitrates: tuple[tuple[str, int], ...] = tuple(BITRATES.items())
-    arguments: tuple[str, ...] = ()
+    report_ports: tuple[int, ...] = ()
 
     @property
     def period_ns(self) -> int:
         """Period of the controller [ns]."""
         return 1_000_000_000 // self.rate_hz
+
+
+class Mark(NamedTuple):
+    """The beginning of a `Span`: the controller's timing page, and its instructions so far."""
+
+    page: Timing
+    instructions: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """What the controller did between two of its timing pages: totals, histograms of the time between, instructions
+    (None: not counted on this host)."""
+
+    begin: Facts
+    end: Facts
+    durations: dict[str, Durations]
+    instructions: int | None
+
+    @property
+    def ticks(self) -> int:
+        """Ticks executed."""
+        return self.end.ticks - self.begin.ticks
+
+    @property
+    def missed(self) -> int:
+        """Periods skipped."""
+        return self.end.missed - self.begin.missed
+
+    @property
+    def cpu_ns(self) -> int:
+        """Processor time of the whole process."""
+        return self.end.process.cpu_ns - self.begin.process.cpu_ns
+
+    @property
+    def load(self) -> dict[str, float]:
+        """Share of a processor that the controller used, and its frames per second, both directions."""
+        seconds = (self.end.written_ns - self.begin.written_ns) * 1e-9
+        frames = [sum(b.received + b.sent for b in facts.buses) for facts in (self.begin, self.end)]
+        return {"cpu_share": self.cpu_ns * 1e-9 / seconds, "frames_per_s": (frames[1] - frames[0]) / seconds}
 
 
 def cores() -> tuple[int, set[int]]:
@@ -89,6 +131,7 @@ class TimingTestbed:
         self._last: Timing | None = None
         self._was = ""
         self._cpu_s: list[tuple[float, float]] = []
+        self._counter: int | None = None
         directory.mkdir(parents=True, exist_ok=True)
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
@@ -117,77 +160,46 @@ class TimingTestbed:
         with contextlib.suppress(OSError):  # without the privilege the window edges are less precise
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(HARNESS_PRIORITY))
         s = self.setting
+        common: dict[str, object] = {"profile": s.profile}
         profile = load_profile(s.profile)
         names = [b for b in (profile.crane_bus, profile.machine_bus) if b]
-        vcan = s.bus == "vcan"
-        addresses = {n: f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}" for n in names}
-        buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
+        vcan, rates, cycle_us = s.bus == "vcan", dict(s.bitrates), min(5000, s.period_ns // 1000)
+        buses = [f"{n}=" + (f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}") for n in names]
         control, reports = free_udp_ports(2)
-        ticks, operators = self._private / "controller.ticks", self._operators
-        keyed = ("--key-file", write_key(self.key_file))
+        ticks, operators, key = self._private / "controller.ticks", self._operators, write_key(self.key_file)
+        own_cpu = None if self.cpu in self.others else self.cpu
         if not vcan:
-            rates = dict(s.bitrates)
-            self._start("wire", "hil.wire.daemon", *(x for n in names for x in ("--bus", f"{n}:{rates[n]}")))
-        cycle_us = min(5000, s.period_ns // 1000)
-        for name, cpu in (("witness", min(self.others)), ("witness-controller", self.cpu)):
-            if name == "witness" or self.cpu not in self.others:
-                self._start(name, "experiments.common.stall_witness", "--period-us", min(WITNESS_US[name], cycle_us))
+            self._start("wire", "hil.wire.daemon", bus=[f"{n}:{rates[n]}" for n in names])
+        for name, cpu in (("witness", min(self.others)), ("witness-controller", own_cpu)):
+            if cpu is not None:
+                self._start(name, "experiments.common.stall_witness", period_us=min(WITNESS_US[name], cycle_us))
                 os.sched_setaffinity(self.family.children[name].process.pid, {cpu})
-        self._start(
-            "machine", "experiments.timing.emulated_machine", "--profile", s.profile, *buses, "--cycle-us", cycle_us
-        )
+        self._start("machine", "experiments.timing.emulated_machine", **common, bus=buses, cycle_us=cycle_us)
         self._start(
             "setpoints",
             "experiments.timing.setpoint_source",
-            "--profile",
-            s.profile,
-            "--controller",
-            f"{HOST}:{control}",
-            "--operator",
-            operators,
-            "--report-port",
-            reports,
-            *keyed,
+            **common,
+            controller=f"{HOST}:{control}",
+            operator=operators,
+            report_port=reports,
+            key_file=key,
         )
-        self._start(
-            "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
-        )
-        guard = self.family.start(
-            "guard",
-            "controller.guard",
-            "--profile",
-            s.profile,
-            *buses,
-            "--rate",
-            s.rate_hz,
-            "--state",
-            self.page.with_suffix(".latched"),
-            "--operator",
-            operators,
-        )
+        self._start("observer", "experiments.timing.bus_observer", **common, rate=s.rate_hz, ticks=ticks)
+        common |= {"bus": buses, "rate": s.rate_hz, "operator": operators}
+        guard = self.family.start("guard", "controller.guard", **common, state=self.page.with_suffix(".latched"))
         os.sched_setaffinity(guard.process.pid, self.others)
         self.family.start(
             "controller",
             "controller",
-            "--profile",
-            s.profile,
-            *buses,
-            "--setpoint-port",
-            control,
-            "--report",
-            f"{HOST}:{reports}",
-            "--record",
-            ticks,
-            "--operator",
-            operators,
-            "--rate",
-            s.rate_hz,
-            "--timing",
-            self.page,
-            *keyed,
-            *(("--cpu", self.cpu) if self.cpu not in self.others else ()),
-            *s.arguments,
+            **common,
+            setpoint_port=control,
+            report=[f"{HOST}:{port}" for port in (reports, *s.report_ports)],
+            record=ticks,
+            timing=self.page,
+            key_file=key,
+            cpu=own_cpu,
         )
+        self._counter = open_counter(self.family.children["controller"].process.pid, INSTRUCTIONS)
         if not self.until(lambda: self.mode == "ACTIVE" and self.page.exists(), ACTIVE_S):
             raise CommandFailed(
                 "timing-testbed.not-moving",
@@ -195,8 +207,8 @@ class TimingTestbed:
                 ExitCode.SAFETY_STOP,
             )
 
-    def _start(self, name: str, module: str, *arguments: object) -> None:
-        child = self.family.start(name, module, *arguments)
+    def _start(self, name: str, module: str, **options: object) -> None:
+        child = self.family.start(name, module, **options)
         self.family.await_message(name, "ready", START_S)
         if name in PRIORITY:
             self.family.set_fifo_priority(name, PRIORITY[name])
@@ -260,11 +272,6 @@ class TimingTestbed:
             }
         )
 
-    def take_events(self) -> Events:
-        """What was lost, stopped or stalled since the start or the last call."""
-        taken, self.events = self.events, Events()
-        return taken
-
     def timing(self) -> Timing:
         """The controller's timing page now, its losses noted; raises CommandFailed when there is none."""
         try:
@@ -293,6 +300,18 @@ class TimingTestbed:
             )
         return now
 
+    def mark(self) -> Mark:
+        """Begin a span with the next timing page."""
+        page = self.fresh_timing()
+        return Mark(page, None if self._counter is None else count(self._counter))
+
+    def since(self, mark: Mark) -> Span:
+        """The span since a mark, up to the next timing page."""
+        now, begun = self.mark(), mark.instructions
+        between = {name: after - mark.page.durations[name] for name, after in now.page.durations.items()}
+        executed = None if begun is None or now.instructions is None else now.instructions - begun
+        return Span(mark.page.facts, now.page.facts, between, executed)
+
     def until(self, reached: Callable[[], bool], seconds: float, period_s: float = 0.02) -> bool:
         """Check the processes until something is reached; False if it is not within this time."""
         limit = time.monotonic() + seconds
@@ -305,10 +324,7 @@ class TimingTestbed:
 
     def wait(self, seconds: float) -> None:
         """Let the testbed run for a time and check its processes."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self.poll()
-            time.sleep(min(0.1, left))
+        self.until(lambda: False, seconds, 0.1)
 
     def await_end(self, name: str, seconds: float) -> dict[str, Any]:
         """Wait until a helper ends by itself; returns its output.
@@ -346,6 +362,8 @@ class TimingTestbed:
         """Stop everything, neutral commands first."""
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        if self._counter is not None:
+            os.close(self._counter)
         self.helpers.stop_all(())
         self.family.stop_all(END_ORDER)
         shutil.rmtree(self._private, ignore_errors=True)

@@ -1,21 +1,32 @@
-"""The vcan experiment: ten demos and ten missions on SocketCAN in a row, with what the host took meanwhile."""
+"""The vcan experiment: ten demos and ten missions on SocketCAN in a row, with what the host took meanwhile.
+
+A run is the command that a user types; its outcome is what its output, its summary and the host say about it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
 
-from experiments.common import pool
+from experiments.common import host_activity, pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import Metric, Result, make_result, mean, rate
 from experiments.common.result_page import Page, Section, publish
+from experiments.common.stall_witness import Witness
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
 from experiments.common.workers import Workers
 from experiments.common.worlds import profile_named
-from experiments.vcan.trial import perform
+from machine.status.explanation import describe
+from machine.status.reasons import Reason
 
 TRIALS: Final = 10
 QUICK_TRIALS: Final = 1
@@ -23,6 +34,15 @@ MAX_LOST_SHARE: Final = 0.01
 """Of the time of the runs, by the witness: a host that takes more is not quiet."""
 MAX_LONGEST_MS: Final = 25.0
 """Half of a motion input's time-out."""
+MISSION: Final = "docs/examples/paper_b.geojson"
+MISSION_LOGS: Final = 3
+LIMIT_S: Final = 1800.0
+"""Of the host; a run that takes longer is ended and counts as not done."""
+PROBE_PRIORITY: Final = 99
+LATE_US: Final = 500
+"""Ordinary wake-ups are earlier."""
+_CLOCK: Final = re.compile(r"^vcan lab: (real|simulated) time: (.*)$", re.MULTILINE)
+_MODE: Final = re.compile(r"^ *[0-9.]+ s +(STOP|FAULT): (.*)$", re.MULTILINE)
 KINDS: Final = {"demo": "one log into the bunk", "mission": "mission with three logs"}
 CLOCKS: Final = ("real", "simulated", "native")
 SEED_FIGURES: Final = (
@@ -53,7 +73,7 @@ INTRODUCTION: Final = (
 
 def _metrics(kind: str, title: str) -> Iterator[Metric]:
     yield Metric(f"{kind}_runs", f"Runs: {title}", "", "One seed each, one after the other.")
-    yield Metric(f"{kind}_done", f"Done: {title}", "%", "By the plant's physics.", least=1.0, scale=100.0)
+    yield Metric(f"{kind}_done", f"Done: {title}", "%", "By the plant's physics.", least=1.0)
     yield Metric(f"{kind}_stops", f"Stops: {title}", "", "All runs, whatever their clock.", most=0.0, clocked=True)
     yield Metric(f"{kind}_leases_lost", f"Ended leases among them: {title}", "", "Setpoints that came too late.")
     yield Metric(f"{kind}_refused", f"Refused setpoints: {title}", "", "By the controller, at the end of each run.")
@@ -66,7 +86,6 @@ def _metrics(kind: str, title: str) -> Iterator[Metric]:
         "%",
         "In user-mode Linux or natively; simulated only where the host's lost time leaves no other choice.",
         least=1.0,
-        scale=100.0,
         clocked=True,
     )
     yield Metric(f"{kind}_wall_s", f"Duration on the host: {title}", "s", "Mean, with the start of every process.")
@@ -149,9 +168,78 @@ def environment_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """The result page."""
-    e = result.environment
-    setting = (
-        f"Commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}; "
-        f"witness at {e['probe']}."
-    )
+    host, probe = host_activity.sentence(result.environment), result.environment["probe"]
+    setting = f"Commit `{result.commit}`. {host} The witness ran at {probe}."
     return Page("Live runs on SocketCAN", CONCLUSION, INTRODUCTION, SECTIONS, setting)
+
+
+def command(kind: str, seed: int, out: Path) -> list[str]:
+    """The user's command line for one run."""
+    job = f"mission run {MISSION} --logs {MISSION_LOGS}" if kind == "mission" else "demo"
+    words = f"{job} --detector perfect --bus vcan --seed {seed} --no-console --out"
+    return [sys.executable, "-m", "timberhand", *words.split(), str(out)]
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """Run it; the outcome as plain data.
+
+    A witness beside it on the lab's processor, which is the last one, tells what the hypervisor took, also where
+    /proc/stat reports none; without real-time priority other processes delay it, too.
+    """
+    out = Path(job.options["out"]) / job.name
+    first = host_activity.sample()
+    with Witness(max(os.sched_getaffinity(0)), PROBE_PRIORITY, LATE_US) as witness:
+        told, said, code = run_command(command(job.kind, job.seed, out))
+    host = host_activity.between(first, host_activity.sample())
+    late_ms = [stall.stall_ns * 1e-6 for stall in witness.stalls()]
+    summary = out / "summary.json"
+    return {
+        "kind": job.kind,
+        "seed": job.seed,
+        "exit": code,
+        "wall_s": host.seconds,
+        "steal_ms": host.steal_ms,
+        "lost_ms": sum(late_ms),
+        "longest_ms": max(late_ms, default=0.0),
+        "probe_real_time": witness.real_time,
+        **read_output(told, said),
+        **read_summary(json.loads(summary.read_text()) if summary.exists() else {}),
+    }
+
+
+def run_command(words: Sequence[str]) -> tuple[str, str, int]:
+    """Standard output, standard error and exit code of a command; 124 when it took too long."""
+    with subprocess.Popen(
+        words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            return *process.communicate(timeout=LIMIT_S), process.returncode
+        except subprocess.TimeoutExpired:
+            process.terminate()  # the lab forwards it; killed, the lab would go on beside the next run
+            return *process.communicate(), 124
+        finally:
+            process.terminate()  # after Ctrl-C that reached this process alone
+
+
+def read_output(told: str, said: str) -> dict[str, Any]:
+    """Clock with its reason, reasons of the stops, ended leases."""
+    clock = _CLOCK.search(said)
+    reasons = [reason for _, reason in _MODE.findall(told)]
+    return {
+        "clock": clock[1] if clock else "native",
+        "clock_reason": clock[2] if clock else "",
+        "stop_reasons": reasons,
+        "leases_lost": reasons.count(describe(Reason.LEASE_LOST)),
+    }
+
+
+def read_summary(summary: dict[str, Any]) -> dict[str, Any]:
+    """Whether the job is done by the plant's physics, stops, refused setpoints, missed ticks, machine time [s]."""
+    missions = summary.get("finished", False) and summary.get("in_bunk") == summary.get("loaded")
+    return {
+        "done": bool(missions if "finished" in summary else summary.get("in_bunk", False)),
+        "stops": int(summary.get("stops", 0)),
+        "refused": int(summary.get("refused_setpoints", summary.get("refused", 0))),
+        "missed_ticks": int(summary.get("missed_ticks", 0)),
+        "seconds": float(summary.get("seconds", 0.0)),
+    }

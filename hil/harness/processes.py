@@ -19,6 +19,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,9 +61,9 @@ class ProcessGroup:
     own_sessions: bool = True
     """Each child gets its own session; else all share that of the harness, with one scheduling weight."""
 
-    def start(self, name: str, module: str, *arguments: object) -> Child:
-        """Start ``python -m module arguments...`` under ``name``."""
-        return self.launch(name, sys.executable, "-m", module, *arguments)
+    def start(self, name: str, module: str, *arguments: object, **options: object) -> Child:
+        """Start ``python -m module arguments... options...`` under ``name`` (`words_of`)."""
+        return self.launch(name, sys.executable, "-m", module, *arguments, *words_of(options))
 
     def launch(self, name: str, *command: object) -> Child:
         """Start a program under ``name``."""
@@ -172,6 +173,15 @@ class ProcessGroup:
         for name in (*order, *reversed(tuple(self.children))):
             self.stop(name)
         self.selector.close()
+
+
+def words_of(options: Mapping[str, object]) -> list[object]:
+    """Options of a command line: ``report_port=5`` is ``--report-port 5``; a list repeats its option, None omits it."""
+    words: list[object] = []
+    for name, value in options.items():
+        for one in value if isinstance(value, list) else [] if value is None else [value]:
+            words += [f"--{name.replace('_', '-')}", one]
+    return words
 
 
 def announce_ready() -> list[int]:

@@ -147,7 +147,7 @@ ENTRIES: Final = (
     "controller.guard.__main__",
     "experiments.timing.bus_observer",
     "experiments.timing.emulated_machine",
-    "experiments.timing.fitness_report",
+    "experiments.timing.fitness",
     "experiments.timing.setpoint_source",
     "experiments.timing.sleep_loop",
     "host.doctor.timing",

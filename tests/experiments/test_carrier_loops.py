@@ -141,5 +141,3 @@ def test_twice_the_gains_lose_their_margins():
 def test_the_page_shows_the_carrier(tmp_path):
     few = replace(case_set("aoro_fc8"), delays_s=(0.08,), gains=(1.0,))
     assert write([(PROFILE, study(PROFILE, few) + loops.studies(PROFILE, few), few)], tmp_path)
-    assert (tmp_path / "loop-design.md").exists()
-    assert (tmp_path / "results/loop-design/aoro_fc8-swing-arm.png").exists()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments.common import pool
-from experiments.common.fingerprint import ALL_SOURCES, SOURCES, source_hash
+from experiments.common.checkpoint import ALL_SOURCES, SOURCES, source_hash
 from experiments.common.overview import read
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
@@ -27,7 +27,7 @@ from tests.codes import numbers_in
 
 QUIET = Console(quiet=True)
 SPEED = Metric("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
-SHARE = Metric("share", "How often", "%", "By counting.", most=0.02, scale=100.0)
+SHARE = Metric("share", "How often", "%", "By counting.", most=0.02)
 
 
 def square(job: Job) -> dict[str, int]:
@@ -49,6 +49,24 @@ def failing(job: Job) -> None:
 
 def jobs(n: int) -> list[Job]:
     return [Job(f"square/{i}", "square", i, {}) for i in range(n)]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "factor"),
+    [
+        ("rest_m_max", "mm", 1e3),
+        ("deg0.median_m", "cm", 100.0),
+        ("rest_mm", "mm", 1.0),
+        ("swing_rad", "deg", math.degrees(1.0)),
+        ("swing_deg", "deg", 1.0),
+        ("share", "%", 100.0),
+        ("mean_s", "min", 1 / 60),
+        ("mean_s", "s", 1.0),
+    ],
+)
+def test_a_number_is_printed_in_its_unit_by_the_unit_in_its_name(name, unit, factor):
+    assert Metric(name, "", unit).factor == factor
+    assert Metric(name, "", unit, scale=7.0).factor == 7.0
 
 
 def test_wilson_agrees_with_published_values():

@@ -8,8 +8,19 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from experiments.timing.fitness import Figures, Measured, Verdict, judge, overall
-from experiments.timing.fitness_report import REMOVED, data_of, private_words, read_data, text_of, without_private
+from experiments.timing.fitness import (
+    REMOVED,
+    Figures,
+    Measured,
+    Verdict,
+    data_of,
+    judge,
+    overall,
+    private_words,
+    read_data,
+    text_of,
+    without_private,
+)
 from host.doctor import facts
 from host.doctor.facts import interrupt_counts
 from timberhand.cli import app

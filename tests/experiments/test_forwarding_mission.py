@@ -14,10 +14,9 @@ from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
 from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG, shuffled
-from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, trial
+from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, perform, short, trial
 from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw
-from experiments.forwarding_mission.trial import perform, short
 from tests.codes import numbers_in
 
 OPTIONS = SimpleNamespace(seed=3, quick=False)

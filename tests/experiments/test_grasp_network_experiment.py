@@ -158,7 +158,4 @@ def test_the_whole_experiment_on_a_folder(tmp_path: Path) -> None:
     assert result.metrics["parameters"] == 78_803
     assert result.metrics["argmax_px"] <= 3 and result.metrics["angle_deg"] <= 3
     assert "parameters" not in result.missed and "argmax_px" not in result.missed
-    assert (tmp_path / "docs" / "grasp-network.md").exists()
     assert json.loads((tmp_path / "out" / "result.json").read_text())["metrics"]["data_right_n"] == 2
-    for name in ("cornell.png", "latency.png", "logs.png"):
-        assert (tmp_path / "docs" / "results" / "grasp-network" / name).stat().st_size > 5000

@@ -184,12 +184,8 @@ def test_the_page_has_every_law_of_every_joint(works, tmp_path):
     profile = load_profile("palms_471")
     few = replace(works["palms_471"], delays_s=(0.08,), gains=(1.0,))
     assert write([(profile, study(profile, few), few)], tmp_path)
-    text = (tmp_path / "loop-design.md").read_text()
     document = json.loads((tmp_path / "results" / "loop-design.json").read_text())
     assert set(document["machines"]["palms_471"]) == {*LAWS, "undamped"} and document["reached"]
-    for joint in profile.joints:
-        assert (tmp_path / f"results/loop-design/palms_471-{joint}.png").exists()
-        assert f"results/loop-design/palms_471-{joint}.png" in text
     eager = with_law(profile, "pd")
     eager = msgspec.structs.replace(
         eager,
@@ -209,7 +205,6 @@ def test_the_command_prints_draws_and_fails(tmp_path):
     assert document["reached"] and set(document["machines"]["palms_471"]) == {"slew", "lift", "tilt", "ext", "rot"}
     lift = document["machines"]["palms_471"]["lift"]
     assert lift["worst_by_python_control"]["gain_db"] == pytest.approx(lift["gain_margin_db"], abs=0.1)
-    assert (tmp_path / "palms_471-lift.png").stat().st_size > 10_000
     eager = tmp_path / "eager.toml"
     text = (Path(machine.__file__).parent / "palms_471.toml").read_text()
     eager.write_text(text.replace("kp_1_s = 2.0 ", "kp_1_s = 5.0 "))

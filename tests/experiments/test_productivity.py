@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from autonomy.missions.validation import problems_of
-from experiments.productivity.experiment import AMOUNTS, KINDS, QUICK, plan, task
+from experiments.productivity.experiment import AMOUNTS, KINDS, QUICK, draw, plan, task
 from experiments.productivity.metrics import METRICS, cycles, gather
-from experiments.productivity.plots import draw
 from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.result import evaluate
-from experiments.vcan.experiment import METRICS, gather, noisy
-from experiments.vcan.trial import command, read_output, read_summary
+from experiments.vcan.experiment import METRICS, command, gather, noisy, read_output, read_summary
 from machine.status.explanation import describe
 from machine.status.reasons import Reason
 

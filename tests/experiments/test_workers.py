@@ -15,8 +15,7 @@ from experiments.common import pool, ray_workers
 from experiments.common.campaign import line_of
 from experiments.common.checkpoint import Checkpoint
 from experiments.common.pool import Job
-from experiments.common.trial_cost import TrialCost, overhead_s
-from experiments.common.workers import Workers
+from experiments.common.workers import TrialCost, Workers, overhead_s
 from experiments.plant.experiment import perform
 from runtime.errors import InputRefused
 from tests.codes import coded

@@ -10,8 +10,7 @@ import pytest
 from experiments.common.pool import Job
 from experiments.common.worlds import step_neutral, trial_world
 from experiments.plant import runs
-from experiments.plant.driver import DRIVEN, Driver
-from experiments.plant.trial import pick_logs
+from experiments.plant.grasps import DRIVEN, Driver, pick_logs
 from sim.world import STEP_S
 
 OPTIONS = {"profile": "palms_471", "truth": "nominal", "quick": False}

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from experiments.common.worlds import home_at, step_neutral, trial_world
-from experiments.plant.driver import Driver
+from experiments.plant.grasps import Driver, pick_logs
 from experiments.plant.runs import SAMPLE_S, released, ringing, stopped
-from experiments.plant.trial import pick_logs
 from machine.geometry.kinematics import solve
 from machine.loading.profile_file import load_profile
 from sim.bullet.client import GRAVITY_M_S2

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from experiments.common.worlds import trial_world
-from experiments.plant.driver import Driver
+from experiments.plant.grasps import Driver, pick_logs, unload
 from experiments.plant.runs import values_of
-from experiments.plant.trial import pick_logs, unload
 from machine.loading.profile_file import load_profile
 from sim.evaluator import Evaluator
 from sim.scenes.arrangements import random_scene

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from experiments.common.seeds import sealed_seed
+from experiments.common.result import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.cli import app
 

@@ -216,6 +216,8 @@ def pages(
     import tempfile
     from pathlib import Path
 
+    from experiments.common import host_activity
+    from experiments.common.result import environment
     from experiments.timing import open_pages
     from host.exit_codes import ExitCode
 
@@ -224,11 +226,11 @@ def pages(
 
     with tempfile.TemporaryDirectory() as folder:
         found = open_pages.judge(open_pages.measure(rounds, seconds, number, Path(folder), progress))
-    environment = open_pages.environment()
+    where = environment() | host_activity.describe()
     if as_json:
-        print(json.dumps({"environment": environment, "pages": number, **found}, indent=2))
+        print(json.dumps({"environment": where, "pages": number, **found}, indent=2))
     else:
-        print("  ".join(f"{name} {value}" for name, value in environment.items()))
+        print("  ".join(f"{name} {value}" for name, value in where.items()))
         _show_pages(found, number)
     if not found["reached"]:
         raise typer.Exit(ExitCode.FIGURE_MISSED)

@@ -81,7 +81,7 @@ def loop_design(
         machines.append((machine, studies, work))
         documents[machine.name] = {joint.name: joint.document() for joint in studies}
         if out is not None:
-            from experiments.loop_design.plots import draw
+            from experiments.loop_design.page import draw
 
             for file in draw(machine.name, studies, out):
                 screen.print(f"[dim]{file}[/dim]")

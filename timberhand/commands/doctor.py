@@ -96,8 +96,7 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
 
     from rich.console import Console
 
-    from experiments.timing.fitness import Measured, Verdict, loopback_bus, measure_computer
-    from experiments.timing.fitness_report import data_of, text_of
+    from experiments.timing.fitness import Measured, Verdict, data_of, loopback_bus, measure_computer, text_of
     from experiments.timing.testbed import cores
     from host.doctor import facts, timing
     from host.exit_codes import CommandFailed, ExitCode
@@ -141,7 +140,7 @@ def _private() -> frozenset[str]:
     import platform
     import pwd
 
-    from experiments.timing.fitness_report import private_words
+    from experiments.timing.fitness import private_words
 
     users = [os.environ.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER")]
     with contextlib.suppress(KeyError):  # no entry in the user database

@@ -103,8 +103,7 @@ def experiment(
     from rich.console import Console
 
     from experiments.common.registry import Options, load
-    from experiments.common.result import ROOT, commit
-    from experiments.common.seeds import sealed_seed
+    from experiments.common.result import ROOT, commit, sealed_seed
     from experiments.common.standing import CHANGES, UNKNOWN
     from experiments.common.workers import Workers
     from host.exit_codes import CommandFailed, ExitCode

@@ -32,7 +32,7 @@ def report(
 
       timberhand report --docs /srv/timberhand/docs
     """
-    from experiments.common import overview, pages
+    from experiments.common import overview, result_page
     from experiments.loop_design import page as loop_design
     from host.exit_codes import CommandFailed, ExitCode
 
@@ -47,7 +47,7 @@ def report(
         if check:
             _check(found)
             return
-        written = pages.rewrite(docs)
+        written = result_page.rewrite(docs)
         if (docs / "results" / "loop-design.json").exists() and (docs / "loop-design.md").exists():
             written = [loop_design.rewrite(docs), *written]
         print("\n".join(map(str, written)))

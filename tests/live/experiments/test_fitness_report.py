@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from experiments.timing.fitness_report import private_words, read_data, without_private
+from experiments.timing.fitness import private_words, read_data, without_private
 from host.exit_codes import ExitCode
 from timberhand.cli import app
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from experiments.common.overview import page, read, results_in, write
-from experiments.common.pages import rewrite
 from experiments.common.registry import EXPERIMENTS
+from experiments.common.result_page import rewrite
 from experiments.common.standing import Standing, has_history, judge
 from experiments.loop_design import page as loop_design
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from experiments.common.registry import EXPERIMENTS, Entry
-from experiments.common.result import ROOT
-from experiments.common.seeds import sealed_seed
+from experiments.common.result import ROOT, sealed_seed
 from experiments.common.standing import Standing, Verdict, changed_since, has_history, judge, marked
 
 ENTRY = Entry("?", "m", ("plant", "law.py"))

@@ -19,7 +19,6 @@ def test_a_short_soak_loses_no_frame_and_does_not_grow(tmp_path):
     assert result.exit_code == 0, (document["missed"], result.output[-2000:])
     metrics = document["metrics"]
     assert metrics["received"] > 40_000 and metrics["gaps"] == metrics["frames_lost"] == metrics["unanswered"] == 0
-    assert (tmp_path / "memory.png").stat().st_size > 10_000
 
 
 @pytest.mark.timeout(300)
@@ -37,6 +36,3 @@ def test_a_quick_measurement_writes_everything_and_leaves_undecided_limits_incon
     metrics = document["metrics"]
     assert metrics["ticks"] > 600 and metrics["ticks_1k"] > 2000 and metrics["frames_per_s"] > 3000
     assert metrics["cyclictest_p50_us"] > 0 and metrics["rx_decode_us"] > 0 and metrics["syscalls_per_tick"] > 4
-    assert (tmp_path / "docs" / "timing.md").exists()
-    plots = {path.name for path in (tmp_path / "docs" / "results" / "timing").iterdir()}
-    assert plots == {"wakeups.png", "stages.png", "ages.png"}
