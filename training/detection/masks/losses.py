@@ -20,10 +20,10 @@ KERNELS_OF_A_PICTURE: Final = 20
 
 
 def loss(
-    out: dict[str, torch.Tensor], g: Goals, generator: torch.Generator
+    out: tuple[torch.Tensor, torch.Tensor], g: Goals, generator: torch.Generator
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The loss of a batch, and its parts for the record."""
-    maps, kernels = out["maps"].float(), out["kernels"].float()
+    """The loss of a batch, and its parts for the record; ``out`` are maps and kernels."""
+    maps, kernels = (values.float() for values in out)
     parts = {
         "maps": maps_loss(maps, g),
         "heat": heat_loss(kernels[:, 0], g),
