@@ -1,23 +1,22 @@
 """Paper A's grasp network (section II-D, Table I): a depth image in, grasp quality and closing direction out.
 
-78 803 parameters.  Table I prints 12 832 for the second 32-channel layer; its sum holds only with 25 632.  The faster
-forms below compute the same function.  (Merging the first two convolutions into one of 17 x 17 would not: the zero
-padding between them is lost, and objects at the border of an image then attract the grasp.)
+The network itself is `training.grasp.network_training.GraspNetwork`.  Its heads stand before the last upsampling, which
+gives the same function as in Table I and a grasp without the upsampled maps.  (Merging the first two convolutions into
+one of 17 x 17 would not: the zero padding between them is lost, and objects at the border of an image then attract the
+grasp.)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from autonomy.networks.graph import AveragePool, BatchNorm, Conv, MaxPool, Network, Relu, Resize
-from autonomy.networks.openvino_net import OpenVinoNet
-from autonomy.networks.weights import SHIPPED, load
+from autonomy.networks import SHIPPED, Interface, OpenVinoNet, Weights, load
 from runtime.errors import InputRefused
 
 SIDE_PX: Final = 300
@@ -29,7 +28,7 @@ HEADS: Final = ("q", "cos2", "sin2")
 CANDIDATE_COUNT: Final = 32
 NOT_FINITE: Final = "the quality map is not finite: no grasp can be chosen from it"
 PRECISIONS: Final = ("f32", "mixed")
-WEIGHTS: Final = SHIPPED / "grasp_cornell.safetensors"
+WEIGHTS: Final = SHIPPED / "grasp_cornell.onnx"
 RELIEF_SCALE: Final = 0.005
 """Relief, as a share of the ground's distance, at which the arsinh bends: twice as much is not twice as salient."""
 MAX_RELIEF: Final = 0.5
@@ -39,36 +38,8 @@ ROBUST_SCALES: Final = (0.2, 0.1, 0.05, 0.03, 0.02, 0.015, 0.01, 0.01, 0.01, 0.0
 FARTHER_FACTOR: Final = 3.0
 RIDGE_TERM: Final = np.diag([0.0, 1e-6, 1e-6])
 
-PAPER: Final = Network(
-    "grasp",
-    1,
-    (
-        AveragePool("pool", POOL),
-        Conv("conv1", 16, 11),
-        Conv("conv2", 16, 7),
-        Relu("relu2"),
-        BatchNorm("norm2"),
-        MaxPool("half", 2),
-        Conv("conv3", 16, 5),
-        Relu("relu3"),
-        Conv("conv4", 16, 5),
-        BatchNorm("norm4"),
-        Conv("conv5", 32, 5),
-        Conv("conv6", 32, 5),
-        Relu("relu6"),
-        BatchNorm("norm6"),
-        Resize("up2", 2),
-        Conv("conv7", 16, 5),
-        Relu("relu7"),
-        Resize("up3", POOL),
-        *(Conv(head, 1, 1, source="up3") for head in HEADS),
-    ),
-    HEADS,
-)
-"""Table I."""
-
-Arrays = Mapping[str, np.ndarray]
-Form = tuple[Network, dict[str, np.ndarray]]
+PAPER: Final = Interface("grasp", 1, {"norm6": 32, "heads": len(HEADS), "maps": len(HEADS)})
+"""``maps`` at every pixel; ``heads``, the same at a third of the side; ``norm6``, the features before both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,47 +134,25 @@ def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     return ground_inverse
 
 
-def heads_first(network: Network, arrays: Arrays) -> Form:
-    """The three heads merged and moved before the upsampling: a 1 x 1 convolution commutes with bilinear
-    interpolation."""
-    body = tuple(layer for layer in network.layers if layer.name not in (*HEADS, "up3"))
-    joint = Conv("heads", len(HEADS), 1, source=body[-1].name)
-    kept = {name: a for name, a in arrays.items() if name.split(".")[0] not in HEADS}
-    for kind in ("weight", "bias"):
-        kept[f"heads.{kind}"] = np.concatenate([arrays[f"{head}.{kind}"] for head in HEADS])
-    return replace(network, layers=(*body, joint, Resize("up3", POOL)), outputs=("up3",)), kept
-
-
-def low_resolution(network: Network, arrays: Arrays) -> Form:
-    """The network without the upsampling, with maps at a third of the side, for ``best_pixel``; after
-    ``heads_first``."""
-    return replace(network, layers=network.layers[:-1], outputs=("heads",)), dict(arrays)
-
-
 class GraspNet:
     """The network as it runs on the machine: full maps for display, and the grasp alone from maps at a third of the
     side.
 
     Args:
-        arrays: weights of ``PAPER``.
+        weights: weights of ``PAPER``; the shipped ones by default.
         precision: "f32", or "mixed": bf16 where the processor has it, and f32 for the decision.
+
+    Raises:
+        InputRefused: the weights are missing, damaged or of another network, or the precision is unknown.
     """
 
-    def __init__(self, arrays: Arrays, precision: str = "f32") -> None:
+    def __init__(self, weights: Path = WEIGHTS, precision: str = "f32") -> None:
         if precision not in PRECISIONS:
             raise InputRefused("grasp.unknown-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
-        self._form = heads_first(PAPER, arrays)
+        self._weights = load(weights, PAPER)
+        self.facts = self._weights.facts
         self._full: OpenVinoNet | None = None
-        self._infer = pixel_grasp_inference(arrays, precision)
-
-    @classmethod
-    def shipped(cls, path: Path = WEIGHTS, precision: str = "f32") -> GraspNet:
-        """The network with the weights of a file.
-
-        Raises:
-            WeightsRefused: damaged or foreign weights.
-        """
-        return cls(load(path, PAPER)[0], precision)
+        self._infer = pixel_grasp_inference(self._weights, precision)
 
     def maps(self, depth_m: np.ndarray) -> GraspMaps:
         """Maps of all pixels of a 300 x 300 depth image [m], f32.
@@ -211,8 +160,8 @@ class GraspNet:
         Raises:
             InputRefused: another size, or no depth at all (``InputRefused``).
         """
-        self._full = self._full or OpenVinoNet(*self._form, SHAPE)
-        return stack_maps(self._full(_picture(depth_m)))
+        self._full = self._full or OpenVinoNet(self._weights, SHAPE, outputs=("maps",))
+        return grasp_maps(self._full(_picture(depth_m))["maps"][0])
 
     def best(self, depth_m: np.ndarray) -> PixelGrasp:
         """The grasp of eq. 4 in a 300 x 300 depth image [m].
@@ -223,19 +172,20 @@ class GraspNet:
         return self._infer(_picture(depth_m))
 
 
-def pixel_grasp_inference(arrays: Arrays, precision: str = "f32") -> Callable[[np.ndarray], PixelGrasp]:
+def pixel_grasp_inference(weights: Weights, precision: str = "f32") -> Callable[[np.ndarray], PixelGrasp]:
     """A function from a prepared image (1, 1, 300, 300) to its grasp, by maps at a third of the side.
 
     "mixed" runs everything in bf16, in which neighbouring pixels of a flat quality become equal and the grasp would
     wander; the last convolution and the heads are therefore repeated in f32 at the best pixels, and these decide.
     """
-    network, kept = low_resolution(*heads_first(PAPER, arrays))
     if precision == "f32":
-        net = OpenVinoNet(network, kept, SHAPE)
-        return lambda picture: best_pixel(stack_maps(net(picture)))
-    front = OpenVinoNet(replace(network, outputs=("norm6", "heads")), kept, SHAPE, "bf16")
-    weight = kept["conv7.weight"].reshape(len(kept["conv7.bias"]), -1).T
-    heads = kept["heads.weight"][:, :, 0, 0].T
+        net = OpenVinoNet(weights, SHAPE, outputs=("heads",))
+        return lambda picture: best_pixel(grasp_maps(net(picture)["heads"][0]))
+    front = OpenVinoNet(weights, SHAPE, "bf16", ("norm6", "heads"))
+    arrays = weights.arrays()
+    weight = arrays["conv7.weight"].reshape(len(arrays["conv7.bias"]), -1).T
+    heads = np.concatenate([arrays[f"{head}.weight"] for head in HEADS])[:, :, 0, 0].T
+    heads_bias = np.concatenate([arrays[f"{head}.bias"] for head in HEADS])
 
     def infer(picture: np.ndarray) -> PixelGrasp:
         found = front(picture)
@@ -243,8 +193,8 @@ def pixel_grasp_inference(arrays: Arrays, precision: str = "f32") -> Callable[[n
         if not np.isfinite(quality).all():
             raise InputRefused("grasp.quality-not-finite", NOT_FINITE)
         v, u = np.divmod(np.argpartition(quality, -CANDIDATE_COUNT, axis=None)[-CANDIDATE_COUNT:], quality.shape[1])
-        hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + kept["conv7.bias"], 0.0)
-        again = hidden @ heads + kept["heads.bias"]
+        hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + arrays["conv7.bias"], 0.0)
+        again = hidden @ heads + heads_bias
         maps = np.full((len(HEADS), *quality.shape), -np.inf, np.float32)
         maps[:, v, u] = again.T
         return _at(GraspMaps(maps[0], maps[1], maps[2], POOL), int(np.argmax(maps[0])))
@@ -270,10 +220,9 @@ def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
     return patches
 
 
-def stack_maps(found: Mapping[str, np.ndarray]) -> GraspMaps:
-    """The maps of the first image, from the outputs of any form."""
-    q, cos2, sin2 = np.concatenate([v[0] for v in found.values()])
-    return GraspMaps(q, cos2, sin2, SIDE_PX // len(q))
+def grasp_maps(heads: np.ndarray) -> GraspMaps:
+    """The HEADS (3, h, w) by name, at whatever scale they are."""
+    return GraspMaps(heads[0], heads[1], heads[2], SIDE_PX // heads.shape[1])
 
 
 def _picture(depth_m: np.ndarray) -> np.ndarray:

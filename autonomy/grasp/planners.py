@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from autonomy.grasp.planner import GraspPlanner
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.networks.weights import SHIPPED
+from autonomy.networks import SHIPPED
 from runtime.errors import InputRefused
 from runtime.plugins import load_plugin
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 GRASP_PLANNERS: Final = "timberhand.grasp_planners"
 SEARCH: Final = "search"
 PHYSICAL: Final = "cnn-physical"
-NETWORKS: Final = {"cnn": "grasp_cornell.safetensors", PHYSICAL: "grasp_physical.safetensors"}
+NETWORKS: Final = {"cnn": "grasp_cornell.onnx", PHYSICAL: "grasp_physical.onnx"}
 """Planners with a network, and their weights."""
 NAMES: Final = (SEARCH, *NETWORKS)
 MAX_VIRTUAL_CAMERAS: Final = 32
@@ -110,4 +110,4 @@ def network(weights: str) -> GraspNet:
     """
     from autonomy.grasp.network import GraspNet  # loads OpenVINO, which a search does not need
 
-    return GraspNet.shipped(SHIPPED / weights)
+    return GraspNet(SHIPPED / weights)

@@ -1,17 +1,16 @@
-"""The area where a machine may drive: fences as polygons in the local plane [m].
-
-Pure numpy geometry, exact for straight edges.  A point on an edge is inside.
-"""
+"""The area where a machine may drive: fences as polygons in the local plane [m].  A point on an edge is inside."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
+import shapely
 
 ON_EDGE_M: Final = 1e-3
+TOUCHING_M: Final = 1e-6
+"""Edges closer together than this meet: a corner on an edge is only nearly there, once it is in local metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +22,13 @@ class Area:
 
     def outside_m(self, points: np.ndarray) -> np.ndarray:
         """Distance of each point (n, 2) outside the area [m]; 0 inside."""
-        points = np.asarray(points, dtype=float).reshape(-1, 2)
-        away = np.zeros(len(points))
+        places = shapely.points(np.asarray(points, dtype=float).reshape(-1, 2))
+        away = np.zeros(len(places))
         if self.keep_in:
-            each = [np.where(inside(ring, points), 0.0, edge_distance_m(ring, points)) for ring in self.keep_in]
-            away = np.min(each, axis=0)
+            away = np.min([shapely.distance(shapely.Polygon(ring), places) for ring in self.keep_in], axis=0)
         for ring in self.keep_out:
-            deep = np.where(inside(ring, points), edge_distance_m(ring, points), 0.0)
+            forbidden = shapely.Polygon(ring)
+            deep = np.where(shapely.contains(forbidden, places), shapely.distance(forbidden.exterior, places), 0.0)
             away = np.maximum(away, deep)
         return np.where(away <= ON_EDGE_M, 0.0, away)
 
@@ -37,43 +36,17 @@ class Area:
         """Greatest distance outside the area along the straight line from ``start`` to ``end`` (2,) [m], at least; 0
         when it stays inside.
         """
-        cuts = [0.0, 1.0]
-        for ring in (*self.keep_in, *self.keep_out):
-            cuts += _cuts(ring, start, end)
-        shares = np.unique(cuts)
-        middles = 0.5 * (shares[1:] + shares[:-1])
-        probes = np.concatenate([shares, middles])
-        return float(np.max(self.outside_m(start + probes[:, None] * (end - start)), initial=0.0))
-
-
-def inside(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether each point (n, 2) lies within a ring, by counting the edges to its right."""
-    x, y = points[:, 0], points[:, 1]
-    found = np.zeros(len(points), dtype=bool)
-    for (ax, ay), (bx, by) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        between = (ay > y) != (by > y)
-        found[between] ^= x[between] < ax + (bx - ax) * (y[between] - ay) / (by - ay)
-    return found
-
-
-def edge_distance_m(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance of each point (n, 2) from the edge of a ring [m]."""
-    closed = np.vstack([ring, ring[:1]])
-    return path_distance_m(closed, points)
+        line = shapely.LineString([start, end])
+        rings = (shapely.LinearRing(ring) for ring in (*self.keep_in, *self.keep_out))
+        stops = np.vstack([start, end, *(shapely.get_coordinates(shapely.intersection(line, ring)) for ring in rings)])
+        stops = stops[np.argsort(np.linalg.norm(stops - start, axis=1))]
+        return float(self.outside_m(np.vstack([stops, 0.5 * (stops[1:] + stops[:-1])])).max())
 
 
 def path_distance_m(path: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Distance of each point (n, 2) from a polyline (m, 2) [m]."""
-    nearest: np.ndarray = np.full(len(points), np.inf)
-    if len(path) == 1:
-        nearest = np.linalg.norm(points - path[0], axis=1)
-        return nearest
-    for a, b in pairwise(path):
-        along = b - a
-        square = float(along @ along)
-        share = np.clip((points - a) @ along / square, 0.0, 1.0) if square > 0.0 else np.zeros(len(points))
-        nearest = np.minimum(nearest, np.linalg.norm(points - a - share[:, None] * along, axis=1))
-    return nearest
+    line = shapely.LineString(path) if len(path) > 1 else shapely.Point(path[0])
+    return np.asarray(shapely.distance(line, shapely.points(points)))
 
 
 def signed_area_m2(ring: np.ndarray) -> float:
@@ -83,45 +56,17 @@ def signed_area_m2(ring: np.ndarray) -> float:
 
 
 def crossing(ring: np.ndarray) -> tuple[int, int] | None:
-    """The first two edges of a ring, by their first corners, that cross or touch without being neighbours."""
-    count = len(ring)
-    start, end = ring, np.roll(ring, -1, axis=0)
-    for i in range(count):
-        others = np.arange(i + 1, count)
-        # Neighbours share a corner; they only cross if the second turns back over the first.
-        far = others[(others != i + 1) & ((others + 1) % count != i)]
-        hits = _meet(start[i], end[i], start[far], end[far])
-        if hits.any():
-            return i, int(far[np.argmax(hits)])
-        before, corner, after = start[i], end[i], end[(i + 1) % count]
-        back, on = before - corner, after - corner
-        if abs(_cross(back, on)) <= 1e-9 * np.linalg.norm(back) * np.linalg.norm(on) and back @ on > 0.0:
-            return i, (i + 1) % count
-    return None
+    """The first two edges of a ring, by their first corners, that cross or touch without being neighbours.
 
-
-def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Whether the edge a-b meets each of the edges c-d (n, 2)."""
-    sides = _cross(b - a, c - a), _cross(b - a, d - a), _cross(d - c, a - c), _cross(d - c, b - c)
-    one, two, three, four = (np.sign(np.where(np.abs(s) < 1e-9, 0.0, s)) for s in sides)
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    near = (np.minimum(c, d) <= high).all(axis=1) & (np.maximum(c, d) >= low).all(axis=1)
-    met: np.ndarray = (one * two <= 0) & (three * four <= 0) & near
-    return met
-
-
-def _cuts(ring: np.ndarray, start: np.ndarray, end: np.ndarray) -> list[float]:
-    """Positions, as shares of the line from ``start`` to ``end``, at which it meets the edges of a ring."""
-    a, along = ring, np.roll(ring, -1, axis=0) - ring
-    way = end - start
-    flat = _cross(way, along)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = _cross(a - start, along) / flat
-        edge = _cross(a - start, way) / flat
-    hit = (np.abs(flat) > 1e-12) & (share >= 0.0) & (share <= 1.0) & (edge >= -1e-12) & (edge <= 1.0 + 1e-12)
-    return [float(s) for s in share[hit]]
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    product: np.ndarray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    Neighbours share a corner; they only cross if one turns back over the other.
+    """
+    count, corners = len(ring), shapely.points(ring)
+    edges = shapely.linestrings(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
+    one, other = shapely.STRtree(edges).query(edges, "dwithin", TOUCHING_M)
+    far = (other - one > 1) & (other - one < count - 1)
+    met = sorted(zip(one[far].tolist(), other[far].tolist(), strict=True))
+    back = shapely.dwithin(np.roll(corners, -2), edges, TOUCHING_M) | shapely.dwithin(
+        corners, np.roll(edges, -1), TOUCHING_M
+    )
+    met += [(i, (i + 1) % count) for i in np.flatnonzero(back).tolist()]
+    return min(met, key=lambda pair: pair[0], default=None)

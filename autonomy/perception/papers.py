@@ -10,9 +10,7 @@ from typing import Final
 import numpy as np
 from scipy import ndimage
 
-from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
-from autonomy.networks.openvino_net import OpenVinoNet
-from autonomy.networks.weights import SHIPPED, load
+from autonomy.networks import SHIPPED, Interface, OpenVinoNet, load
 from autonomy.perception.camera.frame import Pose, RgbdFrame
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
@@ -152,31 +150,8 @@ MAX_OVERLAP: Final = 0.75  # intersection over union of two logs' boxes: those o
 SIDE_COUNT: Final = 4  # left, top, right, bottom: logarithms of distances in STRIDE
 
 
-def box_net() -> Network:
-    """The network: colour (3, H, W), about -1..1, in; ``boxes`` (5, H / 8, W / 8) out: a logit and four sides."""
-    layers: list[Layer] = []
-
-    def conv(name: str, out: int, stride: int = 1, dilation: int = 1) -> str:
-        layers.append(Conv(name, out, 3, stride, dilation, bias=False))
-        layers.extend((BatchNorm(f"{name}_norm"), Relu(f"{name}_relu")))
-        return f"{name}_relu"
-
-    conv("in2", 16, stride=2)
-    conv("in4", 32, stride=2)
-    conv("at4", 32)
-    conv("in8", 64, stride=2)
-    at8 = conv("at8", 64)
-    conv("in16", 96, stride=2)
-    conv("at16", 96)
-    conv("wide16", 96, dilation=2)
-    conv("wider16", 96, dilation=4)
-    layers.append(Conv("to8", 64, 1))
-    layers.append(Resize("to8_up", 2))
-    layers.append(Add("sum8", ("to8_up", at8)))
-    conv("out8", 64)
-    conv("more8", 64)
-    layers.append(Conv("boxes", 1 + SIDE_COUNT, 1))
-    return Network("log_boxes", 3, tuple(layers), ("boxes",))
+BOXES: Final = Interface("log_boxes", 3, {"boxes": 1 + SIDE_COUNT})
+"""Colour (3, H, W), about -1..1, in; ``boxes`` (5, H / 8, W / 8) out: a logit and four sides."""
 
 
 class BoxDetector:
@@ -187,9 +162,9 @@ class BoxDetector:
     """
 
     def __init__(self, weights: Path | None = None, precision: str = "f32") -> None:
-        network = box_net()
-        arrays, self.facts = load(weights or SHIPPED / "log_boxes.safetensors", network)
-        self._net = OpenVinoNet(network, arrays, (1, 3, SIZE_PX, SIZE_PX), precision)
+        read = load(weights or SHIPPED / "log_boxes.onnx", BOXES)
+        self.facts = read.facts
+        self._net = OpenVinoNet(read, (1, 3, SIZE_PX, SIZE_PX), precision)
 
     def detect(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,),

@@ -131,19 +131,19 @@ EXPERIMENTS: Final = {
     "grasp-network": Entry(
         "Is it paper A's network, what has it learnt, how fast is it? Parameters, Cornell folds, latency.",
         "experiments.grasp_network.experiment",
-        ("autonomy/grasp", "autonomy/networks", "autonomy/weights", "training", "experiments/grasp_network"),
+        ("autonomy/grasp", "autonomy/networks.py", "autonomy/weights", "training", "experiments/grasp_network"),
         scale=40.0,
     ),
     "detector": Entry(
         "Are logs found in worlds unlike those of the training? mAP of boxes and masks; photographs.",
         "experiments.detector.experiment",
-        ("autonomy/perception", "autonomy/networks", "autonomy/weights", "sim", "training", "experiments/detector"),
+        ("autonomy/perception", "autonomy/networks.py", "autonomy/weights", "sim", "training", "experiments/detector"),
         scale=15.0,
     ),
     "log-localization": Entry(
         "How precisely is a log located? Paper B's approach to logs at 0, 45 and 90 degrees: its pipeline and ours.",
         "experiments.log_localization.experiment",
-        (*_PLANT, "autonomy/perception", "autonomy/networks", "autonomy/weights", "experiments/log_localization"),
+        (*_PLANT, "autonomy/perception", "autonomy/networks.py", "autonomy/weights", "experiments/log_localization"),
         scale=30.0,
     ),
     "grasp-configs": Entry(

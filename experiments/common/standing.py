@@ -19,7 +19,7 @@ from typing import Final
 from experiments.common.registry import Entry
 from experiments.common.result import ROOT
 
-SUFFIXES: Final = (".py", ".toml", ".dbc", ".eds", ".safetensors", ".geojson")
+SUFFIXES: Final = (".py", ".toml", ".dbc", ".eds", ".onnx", ".geojson")
 """Files on which a measurement depends."""
 CHANGES: Final = "+changes"
 UNKNOWN: Final = "unknown"

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.networks.weights import SHIPPED
+from autonomy.networks import SHIPPED
 from autonomy.perception.papers import BoxDetector
 from autonomy.perception.segmentation.instances import Instance
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
@@ -37,7 +37,7 @@ FAITHFUL: Final = "faithful"
 def shipped() -> tuple[str, ...]:
     """The variants of SIZES and FAITHFUL that have weights."""
     files = {name: f"logs_{_variant(name)}" for name in SIZES} | {FAITHFUL: "log_boxes"}
-    return tuple(name for name, file in files.items() if (SHIPPED / f"{file}.safetensors").is_file())
+    return tuple(name for name, file in files.items() if (SHIPPED / f"{file}.onnx").is_file())
 
 
 def _variant(name: str) -> str:

@@ -42,7 +42,7 @@ def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
         picture = render(scene_from_world(plant.world), view, ImagingConditions()).rgb
     finally:
         plant.close()
-    jaws, net = jaws_of(profile), GraspNet.shipped()
+    jaws, net = jaws_of(profile), GraspNet()
     seen = CnnPlanner(net).view(as_cylinders(logs), jaws, profile.workspace.ground_z_m)
     quality = net.maps(seen.depth_m).q
     chosen = SamplingPlanner()(GraspRequest(Arm(profile), logs, 0.0))

@@ -20,7 +20,7 @@ from autonomy.grasp.planners import GRASP_PLANNERS, SEARCH, PlannerChoice
 from autonomy.grasp.planners import NETWORKS as WEIGHT_FILES
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.motion.motion_planner import TimeOptimalPlanner
-from autonomy.networks.weights import SHIPPED
+from autonomy.networks import SHIPPED
 from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
 from controller.config import Settings
@@ -44,7 +44,7 @@ from sim.wood.log_shape import LogSpec
 LIMIT_NS: Final = 60_000_000_000
 HELD_NS: Final = 2_000_000_000
 SEEDS_PER_ATTEMPT: Final = 16
-SEGMENTATION: Final = "logs_rgbd.safetensors"
+SEGMENTATION: Final = "logs_rgbd.onnx"
 NETWORKS: Final = {"cnn": "cnn", "cnn_physical": "cnn-physical"}
 """Names of the networks' planners in the results, and in `autonomy.grasp.planners`."""
 

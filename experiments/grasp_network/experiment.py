@@ -14,8 +14,7 @@ from rich.console import Console
 
 from autonomy.grasp.network import PAPER as NETWORK
 from autonomy.grasp.network import WEIGHTS, GraspNet, normalized_relief
-from autonomy.networks.graph import parameter_count
-from autonomy.networks.weights import load
+from autonomy.networks import load
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
@@ -48,16 +47,18 @@ def run(options: Options, console: Console) -> Result:
             ExitCode.CONFIGURATION,
         ) from None
     from runtime.errors import InputRefused
+    from training.common.weight_file import parameter_count
+    from training.grasp.network_training import GraspNetwork
 
-    metrics = {"parameters": float(parameter_count(NETWORK))}
+    metrics = {"parameters": float(parameter_count(GraspNetwork()))}
     try:
-        arrays, facts = load(WEIGHTS, NETWORK)
-        skipped, pictures = _cornell(options, facts, arrays, metrics, console)
+        weights = load(WEIGHTS, NETWORK)
+        skipped, pictures = _cornell(options, metrics, console)
     except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     scenes = [picture for _, picture in latency.log_scenes(options.seed)]
     with console.status("timing"):
-        paths = latency.inference_paths(arrays)
+        paths = latency.inference_paths(weights)
         times = latency.times_ms(paths, scenes, QUICK_ROUNDS if options.quick else ROUNDS)
         metrics |= latency.metrics(times, latency.agreement(paths, [*scenes, *pictures]))
     metrics["prepare_ms"] = _prepare_ms(options.seed)
@@ -72,7 +73,7 @@ def run(options: Options, console: Console) -> Result:
         paper=PAPER,
     )
     options.out.mkdir(parents=True, exist_ok=True)
-    draw(metrics, times, GraspNet(arrays), options.seed, options.out)
+    draw(metrics, times, GraspNet(), options.seed, options.out)
     publish(result, page_of(result, {}), options, console)
     (options.out / "folds.jsonl").unlink(missing_ok=True)
     if skipped:
@@ -80,9 +81,7 @@ def run(options: Options, console: Console) -> Result:
     return result
 
 
-def _cornell(
-    options: Options, facts: dict[str, str], arrays: dict[str, Any], metrics: dict[str, float], console: Console
-) -> tuple[str, list[np.ndarray]]:
+def _cornell(options: Options, metrics: dict[str, float], console: Console) -> tuple[str, list[np.ndarray]]:
     """Add to ``metrics``; returns what was skipped and why, and the available pictures as network inputs."""
     from training.grasp.cornell import load as load_samples
     from training.grasp.cornell_weights import on_samples
@@ -97,7 +96,8 @@ def _cornell(
         for s in samples[:: 8 if options.quick else 1]
     ]
     if options.data is not None:
-        found = on_samples(GraspNet(arrays), samples, facts)
+        net = GraspNet()
+        found = on_samples(net, samples, net.facts)
         metrics |= rate("data_right", sum(f["right"] for f in found), len(found))
         metrics |= rate("data_own_size", sum(f["own_size"] for f in found), len(found))
         metrics["data_trained_on"] = float(sum(f["trained_on"] for f in found))

@@ -14,15 +14,14 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from autonomy.networks.graph import fingerprint
 from experiments.common.pool import Job
 from training.grasp.cornell import Sample, grouped_folds, load, paper_folds
 from training.grasp.network_training import (
     BATCH,
-    BODY,
     LEARNING_RATE,
     VIEWS_PER_SAMPLE,
     Example,
+    GraspNetwork,
     augmented_examples,
     evaluate,
     median_size_px,
@@ -68,7 +67,7 @@ def _examples(folder: str, seed: int) -> tuple[tuple[Sample, ...], list[Example]
 def identity(samples: tuple[Sample, ...], seed: int, epochs: int) -> str:
     """Hash of everything that decides the outcome of a fold: network, schedule, and the preprocessed pictures."""
     digest = hashlib.sha256(
-        f"{fingerprint(BODY)} {seed} {epochs} {VIEWS_PER_SAMPLE} {BATCH} {LEARNING_RATE} {len(samples)}".encode()
+        f"{GraspNetwork()} {seed} {epochs} {VIEWS_PER_SAMPLE} {BATCH} {LEARNING_RATE} {len(samples)}".encode()
     )
     for example in (*plain_examples(samples[:2]), *augmented_examples(samples[:1], seed, 2)):
         digest.update(example.low.tobytes() + example.projected.tobytes())

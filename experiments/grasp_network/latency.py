@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
-from autonomy.grasp.network import (
-    PAPER,
-    SHAPE,
-    PixelGrasp,
-    best_pixel,
-    heads_first,
-    normalized_relief,
-    pixel_grasp_inference,
-    stack_maps,
-)
+from autonomy.grasp.network import SHAPE, PixelGrasp, best_pixel, grasp_maps, normalized_relief, pixel_grasp_inference
 from autonomy.grasp.virtual_scene import camera_above, operational_area, render
-from autonomy.networks.openvino_net import OpenVinoNet
+from autonomy.networks import Interface, OpenVinoNet, Weights, load
 
 EAGER: Final = "PyTorch eager, original"
 PATHS: Final = {
@@ -35,35 +28,40 @@ MAX_DISTANCE_PX: Final = 3.0
 MAX_ANGLE_DEG: Final = 3.0
 SCENES: Final = 12
 
+ORIGINAL: Final = Interface("grasp in the original order", 1, {"maps": 3})
+
 InferencePath = Callable[[np.ndarray], PixelGrasp]
 
 
-def inference_paths(arrays: Mapping[str, np.ndarray]) -> dict[str, InferencePath]:
+def inference_paths(weights: Weights) -> dict[str, InferencePath]:
     """The paths by name; each maps a picture (1, 1, 300, 300) to its grasp."""
     import torch
 
-    from autonomy.networks.torch_net import random_net
+    from training.common.weight_file import restore, save
+    from training.grasp.network_training import OriginalOrder
 
     torch.set_num_threads(1)
-    net = random_net(PAPER, 0).eval()
-    net.load(arrays)
+    net = OriginalOrder().eval()
+    restore(net, weights.arrays())
 
     def eager(picture: np.ndarray) -> PixelGrasp:
         with torch.inference_mode():
-            found = net(torch.from_numpy(picture))
-        return best_pixel(stack_maps({name: v.numpy() for name, v in found.items()}))
+            return best_pixel(grasp_maps(net(torch.from_numpy(picture))[0].numpy()))
 
+    with tempfile.TemporaryDirectory() as folder:
+        save(Path(folder) / "original.onnx", net, ORIGINAL, {})
+        original = load(Path(folder) / "original.onnx", ORIGINAL)
     return {
         "torch": eager,
-        "f32": _through(OpenVinoNet(PAPER, arrays, SHAPE)),
-        "heads": _through(OpenVinoNet(*heads_first(PAPER, arrays), SHAPE)),
-        "low": pixel_grasp_inference(arrays),
-        "mixed": pixel_grasp_inference(arrays, "mixed"),
+        "f32": _through(OpenVinoNet(original, SHAPE)),
+        "heads": _through(OpenVinoNet(weights, SHAPE, outputs=("maps",))),
+        "low": pixel_grasp_inference(weights),
+        "mixed": pixel_grasp_inference(weights, "mixed"),
     }
 
 
-def _through(net: Callable[[np.ndarray], dict[str, np.ndarray]]) -> InferencePath:
-    return lambda picture: best_pixel(stack_maps(net(picture)))
+def _through(net: OpenVinoNet) -> InferencePath:
+    return lambda picture: best_pixel(grasp_maps(net(picture)["maps"][0]))
 
 
 def times_ms(paths: Mapping[str, InferencePath], pictures: Sequence[np.ndarray], rounds: int) -> dict[str, list[float]]:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from autonomy.networks.weights import SHIPPED
+from autonomy.networks import SHIPPED
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
@@ -45,7 +45,7 @@ def run(options: Options, console: Console) -> Result:
             ExitCode.CONFIGURATION,
         )
     check_truth(name, truth)
-    masks = "network" if (SHIPPED / "logs_rgbd.safetensors").exists() else "true"
+    masks = "network" if (SHIPPED / "logs_rgbd.onnx").exists() else "true"
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, name, truth, trials, masks)
     with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:

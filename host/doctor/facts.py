@@ -15,29 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-BOOT_WORDS: Final = frozenset(
-    {
-        "isolcpus",
-        "nohz_full",
-        "rcu_nocbs",
-        "irqaffinity",
-        "preempt",
-        "threadirqs",
-        "idle",
-        "processor.max_cstate",
-        "intel_idle.max_cstate",
-        "intel_pstate",
-        "amd_pstate",
-        "clocksource",
-        "tsc",
-        "skew_tick",
-        "nosoftlockup",
-        "nmi_watchdog",
-        "mitigations",
-        "maxcpus",
-        "nosmt",
-        "mce",
-    }
+BOOT_WORDS: Final = re.compile(
+    "isolcpus|nohz_full|rcu_nocbs|irqaffinity|preempt|threadirqs|idle|processor.max_cstate|intel_idle.max_cstate|"
+    "intel_pstate|amd_pstate|clocksource|tsc|skew_tick|nosoftlockup|nmi_watchdog|mitigations|maxcpus|nosmt|mce"
 )
 """Words of the kernel's command line that change its timing (admin-guide/kernel-parameters)."""
 UNLIMITED: Final = -1
@@ -199,7 +179,7 @@ def read_computer(root: Path, version: str, cpu: int) -> Computer:
         processors=len(re.findall(r"^processor\s*:", info, re.MULTILINE)),
         memory_mb=int(memory[1]) >> 10 if memory else 0,
         kernel_version=version,
-        boot_words=tuple(w for w in words if w.partition("=")[0] in BOOT_WORDS),
+        boot_words=tuple(w for w in words if BOOT_WORDS.fullmatch(w.partition("=")[0])),
         interrupts=tuple(sorted(n for n, cpus in affinity.items() if cpu in cpus)),
         interrupts_all=len(affinity),
         new_interrupts=_text(root / "proc/irq/default_smp_affinity"),

@@ -1,15 +1,17 @@
-"""The result of one check with the suggested change, and findings on a terminal: changes first, then what is fine."""
+"""A check is one row: its topic, what is good about it, or what is wrong, what a change gains and its commands.
+
+There is one way to print rows: what to change comes first, then what is fine.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import IntEnum
 from typing import Any
 
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 
@@ -34,18 +36,17 @@ class Finding:
 
     def document(self) -> dict[str, Any]:
         """The finding as plain values for JSON."""
-        return {
-            "what": self.what,
-            "severity": self.severity.name.lower(),
-            "sentence": self.sentence,
-            "gain": self.gain,
-            "commands": list(self.commands),
-        }
+        return asdict(self) | {"severity": self.severity.name.lower(), "commands": list(self.commands)}
 
 
 def fine(what: str, sentence: str) -> Finding:
     """A finding without a suggested change."""
     return Finding(what, Severity.FINE, sentence)
+
+
+def row(what: str, good: str, severity: Severity, wrong: str, gain: str, *commands: str) -> Finding:
+    """One topic: what is said where it is good, else (empty) what is wrong, what a change gains, its commands."""
+    return fine(what, good) if good else Finding(what, severity, wrong, gain, commands)
 
 
 _MARKS = {
@@ -65,17 +66,13 @@ _CONCLUSIONS = {
 def show(console: Console, title: str, findings: Sequence[Finding]) -> None:
     """Print one group of findings."""
     console.print(Text(title, style="bold"))
-    for finding in findings:
-        if finding.severity is not Severity.FINE:
-            _print(console, finding)
-    table = Table.grid(padding=(0, 1))
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True, min_width=12)
-    table.add_column(overflow="fold")
-    for finding in findings:
-        if finding.severity is Severity.FINE:
-            table.add_row(Text(*_MARKS[finding.severity]), Text(finding.what), Text(finding.sentence, style="dim"))
-    console.print(table)
+    for finding in sorted(findings, key=lambda f: f.severity is Severity.FINE):
+        mark, style = _MARKS[finding.severity]
+        console.print(Text.assemble((f"{mark} {finding.what}: ", style), finding.sentence))
+        if finding.gain:
+            console.print(Padding(Text(f"gain: {finding.gain}", style="dim"), (0, 0, 0, 4)))
+        for command in finding.commands:  # not folded, so that they can be copied
+            console.print(Text(f"    $ {command}", style="cyan"), soft_wrap=True)
     console.print()
 
 
@@ -84,13 +81,3 @@ def conclusion(findings: Sequence[Finding]) -> str:
     worst = max((f.severity for f in findings), default=Severity.FINE)
     count = sum(f.severity is worst for f in findings)
     return _CONCLUSIONS[worst].format(count, "" if count == 1 else "s")
-
-
-def _print(console: Console, finding: Finding) -> None:
-    mark, style = _MARKS[finding.severity]
-    head = Text.assemble((mark, style), " ", (f"{finding.what}: ", style), finding.sentence)
-    console.print(head)
-    if finding.gain:
-        console.print(Padding(Text(f"gain: {finding.gain}", style="dim"), (0, 0, 0, 4)))
-    for command in finding.commands:  # not folded, so that they can be copied
-        console.print(Text(f"    $ {command}", style="cyan"), soft_wrap=True)

@@ -23,7 +23,7 @@ from packaging.requirements import Requirement
 from can_dbc.bus.factory import PYTHON_CAN, kernel_has_can
 from can_dbc.messages.envelope import MIN_KEY_BYTES, SERVICE_KEY
 from controller.guard.__main__ import profile_path
-from host.doctor.finding import Finding, Severity, fine
+from host.doctor.finding import Finding, Severity, fine, row
 from host.release import installed
 from host.release.updater import SIGNER
 from host.vcan_lab import uml
@@ -55,27 +55,32 @@ def examine() -> tuple[Finding, ...]:
 def python() -> Finding:
     """The interpreter; pip refuses versions that are too old, and pybullet has no wheels for the newest."""
     version = sys.version.split()[0]
-    if sys.version_info >= (3, 12):
-        command = "make setup PYTHON=python3.11"
-        return Finding("python", ADVICE, f"Python {version} has no pybullet", "the simulated plant", (command,))
-    return fine("python", f"Python {version} in {sys.prefix}")
+    return row(
+        "python",
+        f"Python {version} in {sys.prefix}" if sys.version_info < (3, 12) else "",
+        ADVICE,
+        f"Python {version} has no pybullet",
+        "the simulated plant",
+        "make setup PYTHON=python3.11",
+    )
 
 
 def packages() -> Iterator[Finding]:
     """Whether every required package is installed in a suitable version."""
-    gain, mend = "a working program", ("make setup",)
+    gain, mend = "a working program", "make setup"
     try:
         wanted = [Requirement(text) for text in metadata.requires("timberhand") or ()]
     except metadata.PackageNotFoundError:
-        yield Finding("packages", FAULT, "timberhand itself is not installed", gain, mend)
+        yield row("packages", "", FAULT, "timberhand itself is not installed", gain, mend)
         return
     base = [need for need in wanted if need.marker is None or need.marker.evaluate({"extra": ""})]
     lacking = [fault for need in base if (fault := _missing(need))]
-    if lacking:
-        yield Finding("packages", FAULT, f"missing: {', '.join(lacking)}", gain, mend)
-    else:
-        version = metadata.version("timberhand")
-        yield fine("packages", f"timberhand {version}; all {len(base)} required packages are installed")
+    good = (
+        ""
+        if lacking
+        else f"timberhand {metadata.version('timberhand')}; all {len(base)} required packages are installed"
+    )
+    yield row("packages", good, FAULT, f"missing: {', '.join(lacking)}", gain, mend)
     for extra, purpose in EXTRAS.items():
         needs = [n for n in wanted if n.marker and n.marker.evaluate({"extra": extra}) and n not in base]
         if faults := [fault for need in needs if (fault := _missing(need))]:
@@ -96,10 +101,8 @@ def tick() -> Finding:
     program = "from runtime.compiled import activate; found = activate(); print(found, found.reason, sep='|')"
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout.strip()
     running, _, reason = answer.partition("|")
-    if running.startswith("compiled"):
-        return fine("tick", running)
-    gain = "less than half the time for every tick"
-    return Finding("tick", ADVICE, f"runs on the interpreter: {reason or 'unknown'}", gain, ("timberhand compile",))
+    gain, wrong = "less than half the time for every tick", f"runs on the interpreter: {reason or 'unknown'}"
+    return row("tick", running if running.startswith("compiled") else "", ADVICE, wrong, gain, "timberhand compile")
 
 
 def profiles() -> Iterator[Finding]:
@@ -168,10 +171,8 @@ def vcan_lab() -> Finding:
 
 def kernel_of_lab() -> Finding:
     """The optional kernel with simulated time."""
-    if built := uml.find(uml.user_cache()):
-        return fine("lab kernel", built)
     gain = "tests in simulated time: hil vcan --time-travel"
-    return Finding("lab kernel", ADVICE, "not built", gain, ("make lab-kernel",))
+    return row("lab kernel", uml.find(uml.user_cache()) or "", ADVICE, "not built", gain, "make lab-kernel")
 
 
 def places() -> Iterator[Finding]:
@@ -197,12 +198,15 @@ def ports() -> Finding:
     wanted = {name: int(value) for name, value in _settings().items() if name.endswith("_PORT") and value.isdigit()}
     wanted = wanted or {"CONSOLE_PORT": 8471}
     taken = {name: port for name, port in wanted.items() if not _free(port, name == "CONSOLE_PORT")}
-    if taken:
-        which = ", ".join(f"{name} {port}" for name, port in taken.items())
-        command = f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'"
-        wrong = f"in use: {which}; expected while the services run"
-        return Finding("ports", ADVICE, wrong, "the processes find their ports", (command,))
-    return fine("ports", f"free: {', '.join(map(str, wanted.values()))}")
+    which = ", ".join(f"{name} {port}" for name, port in taken.items())
+    return row(
+        "ports",
+        "" if taken else f"free: {', '.join(map(str, wanted.values()))}",
+        ADVICE,
+        f"in use: {which}; expected while the services run",
+        "the processes find their ports",
+        f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'",
+    )
 
 
 def key() -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from host.doctor.facts import UNLIMITED, CanLink, Facts
-from host.doctor.finding import Finding, Severity, fine
+from host.doctor.finding import Finding, Severity, fine, row
 
 PRIORITY = 80
 """SCHED_FIFO priority of the controller and its unit; that of the guard is 85."""
@@ -22,6 +22,7 @@ FAST_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "timer", "hyperv_clocksou
 SETTINGS = "sudo nano /etc/timberhand/timberhand.conf"
 LIMITS = "sudo tee -a /etc/security/limits.d/timberhand.conf  # then log in again"
 TUNE = "sudo sh deploy/tune.sh --apply"
+LASTING = "sudo tuned-adm profile realtime  # instead, over restarts, too: docs/how-to/real-time.md"
 ALONE = "no other process and no interrupt uses the processor of the loop"
 ADVICE, CHANGE = Severity.ADVICE, Severity.CHANGE
 
@@ -31,17 +32,12 @@ def evaluate(facts: Facts) -> tuple[Finding, ...]:
     return (*_rights(facts), *_processors(facts), *_kernel_settings(facts), *_can_interfaces(facts))
 
 
-def _row(what: str, good: str, severity: Severity, wrong: str, gain: str, *commands: str) -> Finding:
-    """One topic: what is said where it is good, else (empty) what is wrong, what a change gains, its commands."""
-    return fine(what, good) if good else Finding(what, severity, wrong, gain, commands)
-
-
 def _rights(f: Facts) -> Iterator[Finding]:
     """Priority of the controller (the largest single gain), its memory, the kernel, the machine."""
     limit, unit = f.rtprio_limit or 0, (f.unit_rtprio or 0) if f.unit_there else 0
     granted = f"this user may use FIFO {PRIORITY}"
     granted = granted if f.may_prioritise or limit == UNLIMITED or limit >= PRIORITY else ""
-    yield _row(
+    yield row(
         "priority",
         f"the service may use FIFO {unit}" if unit >= PRIORITY else granted,
         CHANGE,
@@ -52,7 +48,7 @@ def _rights(f: Facts) -> Iterator[Finding]:
     )
     locks = f.may_lock or f.memlock_limit == UNLIMITED
     who = "the service" if f.unit_there and f.unit_memlock == UNLIMITED else "this user" if locks else ""
-    yield _row(
+    yield row(
         "memory",
         f"{who} may lock all its memory" if who else "",
         CHANGE,
@@ -62,7 +58,7 @@ def _rights(f: Facts) -> Iterator[Finding]:
         f'echo "$USER - memlock unlimited" | {LIMITS}',
     )
     how = f"uses preemption '{f.preemption}'" if f.preemption else "does not report its preemption model"
-    yield _row(
+    yield row(
         "kernel",
         f"{f.release} is PREEMPT_RT" if f.preemption == "rt" else "",
         ADVICE if f.machine else CHANGE,
@@ -70,12 +66,13 @@ def _rights(f: Facts) -> Iterator[Finding]:
         "longest kernel delay of tens of microseconds instead of milliseconds",
         "sudo apt-get install linux-image-rt-amd64  # then reboot and select it",
     )
-    yield _row(
+    yield row(
         "machine",
         "" if f.machine else "this is real hardware",
         ADVICE,
         f"this is {f.machine}, which its host may interrupt",
         "meaningful measurements and reliable deadlines: use the machine's own computer",
+        "sudo rtla osnoise top  # how long the host takes the processors away",
     )
 
 
@@ -85,19 +82,20 @@ def _processors(f: Facts) -> Iterator[Finding]:
     governors = {c: g for c, g in f.governors.items() if mine in (None, c)}  # none: virtual, or firmware hides it
     slow = {c: f"'{g}'" for c, g in governors.items() if g != "performance"}
     if governors:
-        yield _row(
+        yield row(
             "clock rate",
             "" if slow else "the governor is 'performance'",
             CHANGE,
             f"the governor of processor {_list(slow)} is {' and '.join(sorted(set(slow.values())))}",
             "each tick runs at full speed from its start, not some milliseconds later",
             _tune(f),
+            LASTING,
         )
     yield _processor(f)
     if mine is None:
         return
     if others:
-        yield _row(
+        yield row(
             "sibling",
             f"processor {_list(others)} of the same core is isolated, too" if others <= f.isolated else "",
             ADVICE,
@@ -109,7 +107,7 @@ def _processors(f: Facts) -> Iterator[Finding]:
     shared = [link for link in real if mine in link.interrupt_cpus]
     if real:
         numbers = ", ".join(str(n) for link in shared for n in link.interrupts)
-        yield _row(
+        yield row(
             "interrupts",
             "" if shared else f"interrupts of {_names(real)} do not use processor {mine}",
             CHANGE,
@@ -119,7 +117,7 @@ def _processors(f: Facts) -> Iterator[Finding]:
         )
     if f.irqbalance:
         keeps_off = mine in f.irqbalance_banned | f.isolated
-        yield _row(
+        yield row(
             "irqbalance",
             f"running; it does not use processor {mine}" if keeps_off else "",
             CHANGE,
@@ -150,7 +148,7 @@ def _processor(f: Facts) -> Finding:
         gain = "nothing else delays it; pinned to a shared processor it is later than unpinned"
         return Finding(what, CHANGE, wrong, gain, (*_boot(f, mine), _unpin(f, "or: ")))
     ticking = [name for name, s in (("nohz_full", f.tickless), ("rcu_nocbs", f.rcu_offloaded)) if mine not in s]
-    return _row(
+    return row(
         what,
         "" if ticking else f"processor {mine} is isolated for the controller",
         ADVICE,
@@ -168,7 +166,7 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
         good = "the controller disables deep idle states while it runs (--dma-latency)"
         good = good if "--dma-latency" in f.options else ""
         access = "" if f.dma_latency else "; this user may not write /dev/cpu_dma_latency"
-        yield _row(
+        yield row(
             "sleep",
             f"the deepest enabled idle state has an exit latency of {us} us" if us <= MAX_WAKE_US else good,
             ADVICE,
@@ -176,10 +174,11 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
             f"every tick starts up to {us} us earlier, at higher power consumption",
             f"{SETTINGS}  # CONTROLLER_OPTIONS=--dma-latency",
             f"{_tune(f)}  # alternatively",
+            LASTING,
         )
     if f.softirq_threads and f.links:
         ordinary = "OTHER" in f.softirq_threads.values()
-        yield _row(
+        yield row(
             "delivery",
             "" if ordinary else "ksoftirqd delivers deferred frames at real-time priority",
             ADVICE,
@@ -194,7 +193,7 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
     elif f.rt_runtime_us is not None:
         share = f.rt_runtime_us / f.rt_period_us
         good = f"real-time processes get {share:.0%} of the time, more than a loop that sleeps needs"
-        yield _row(
+        yield row(
             "throttling",
             good if share >= MIN_RT_SHARE else "",
             CHANGE,
@@ -203,7 +202,7 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
             _tune(f),
         )
     if f.clock_source:
-        yield _row(
+        yield row(
             "clock",
             f"{f.clock_source} is fast" if f.clock_source in FAST_CLOCKS else "",
             CHANGE,
@@ -213,13 +212,14 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
             "cat /sys/devices/system/clocksource/clocksource0/available_clocksource",
         )
     if f.hugepages:
-        yield _row(
+        yield row(
             "huge pages",
             "" if f.hugepages == "always" else f"transparent huge pages: {f.hugepages}",
             ADVICE,
             "transparent huge pages are enabled for every process",
             "no page of the loop moves while it runs",
             _tune(f),
+            LASTING,
         )
     if f.slack_ns is not None:
         yield fine("timer slack", f"{f.slack_ns / 1000:.0f} us for ordinary processes, none for FIFO processes")
@@ -253,7 +253,7 @@ def _link(link: CanLink) -> Finding:
         commands = (f"sudo ip link set {name} down", up)
         return Finding(what, CHANGE, f"{rate}, sampled at {percent:.1f} % of the bit", gain, commands)
     sampled = f" sampled at {percent:.1f} %," if link.sample_point else ""
-    return _row(
+    return row(
         what,
         f"{rate},{sampled} restart after {link.restart_ms} ms, queue of {link.tx_queue} frames, no errors"
         if link.restart_ms

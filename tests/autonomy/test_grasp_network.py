@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,17 +19,16 @@ from autonomy.grasp.network import (
     PixelGrasp,
     _patches,
     best_pixel,
-    heads_first,
-    low_resolution,
+    grasp_maps,
     normalized_relief,
     pixel_grasp_inference,
-    stack_maps,
 )
-from autonomy.networks.graph import parameter_count, parameter_shapes
-from autonomy.networks.openvino_net import OpenVinoNet
-from autonomy.networks.torch_net import random_net
+from autonomy.networks import OpenVinoNet, Weights, load
 from runtime.errors import InputRefused
 from tests.codes import coded
+from training.common.loop import seeded
+from training.common.weight_file import parameter_count, restore, save
+from training.grasp.network_training import GraspNetwork, OriginalOrder
 
 TABLE_1 = {
     "conv1": 1952,
@@ -49,8 +49,16 @@ SHAPE = (1, 1, 300, 300)
 
 
 @pytest.fixture(scope="module")
-def arrays() -> dict[str, np.ndarray]:
-    return random_net(PAPER, 3).arrays()
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A weight file of random weights."""
+    file = tmp_path_factory.mktemp("weights") / "grasp.onnx"
+    save(file, seeded(GraspNetwork, 3), PAPER, {})
+    return file
+
+
+@pytest.fixture(scope="module")
+def weights(path: Path) -> Weights:
+    return load(path, PAPER)
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +68,12 @@ def picture() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def unchanged(arrays, picture) -> GraspMaps:
-    return stack_maps(OpenVinoNet(PAPER, arrays, SHAPE)(picture))
+def unchanged(weights: Weights, picture: np.ndarray) -> GraspMaps:
+    """The maps by torch, in the order of Table I."""
+    net = OriginalOrder().eval()
+    restore(net, weights.arrays())
+    with torch.inference_mode():
+        return grasp_maps(net(torch.from_numpy(picture))[0].numpy())
 
 
 def largest(a: GraspMaps, b: GraspMaps) -> float:
@@ -71,38 +83,29 @@ def largest(a: GraspMaps, b: GraspMaps) -> float:
 
 def test_the_paper_s_parameters_layer_by_layer() -> None:
     counted: dict[str, int] = {}
-    for name, shape in parameter_shapes(PAPER).items():
-        if "running" not in name:
-            counted[name.split(".")[0]] = counted.get(name.split(".")[0], 0) + math.prod(shape)
+    for name, values in GraspNetwork().named_parameters():
+        counted[name.split(".")[0]] = counted.get(name.split(".")[0], 0) + values.numel()
     assert counted == TABLE_1
-    assert parameter_count(PAPER) == 78_803
+    assert parameter_count(GraspNetwork()) == 78_803
 
 
-def test_torch_gives_the_same(arrays, picture, unchanged: GraspMaps) -> None:
-    net = random_net(PAPER, 3).eval()
-    with torch.inference_mode():
-        wanted = stack_maps({name: v.numpy() for name, v in net(torch.from_numpy(picture)).items()})
-    assert unchanged.q.shape == (300, 300) and unchanged.scale_px == 1
-    assert largest(unchanged, wanted) <= 1e-4
-
-
-def test_heads_before_the_upsampling_change_nothing(arrays, picture, unchanged: GraspMaps) -> None:
-    form = heads_first(PAPER, arrays)
-    assert largest(stack_maps(OpenVinoNet(*form, SHAPE)(picture)), unchanged) <= 1e-6
-    assert parameter_count(form[0]) == 78_803
+def test_heads_before_the_upsampling_give_the_paper_s_maps(weights, picture, unchanged: GraspMaps) -> None:
+    maps = grasp_maps(OpenVinoNet(weights, SHAPE, outputs=("maps",))(picture)["maps"][0])
+    assert maps.q.shape == (300, 300) and maps.scale_px == 1
+    assert largest(maps, unchanged) <= 1e-4
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_mixed_net_chooses_like_the_exact_one(arrays, seed: int) -> None:
+def test_the_mixed_net_chooses_like_the_exact_one(weights, seed: int) -> None:
     coarse = torch.randn(1, 1, 12, 12, generator=torch.Generator().manual_seed(seed))
     picture = 3.0 * torch.nn.functional.interpolate(coarse, scale_factor=25, mode="bicubic").numpy()
-    exact, mixed = pixel_grasp_inference(arrays)(picture), pixel_grasp_inference(arrays, "mixed")(picture)
+    exact, mixed = pixel_grasp_inference(weights)(picture), pixel_grasp_inference(weights, "mixed")(picture)
     assert math.hypot(exact.u_px - mixed.u_px, exact.v_px - mixed.v_px) <= 3.0
     assert abs(exact.theta_rad - mixed.theta_rad) <= math.radians(3.0)
     assert math.isclose(exact.q, mixed.q, rel_tol=0.01)
 
 
-def test_what_the_last_convolution_sees(arrays) -> None:
+def test_what_the_last_convolution_sees() -> None:
     """Borders included: zeros beyond the doubled features, which repeat their own border."""
     features = np.random.default_rng(5).normal(size=(4, 10, 12)).astype(np.float32)
     up = torch.nn.functional.interpolate(torch.from_numpy(features)[None], scale_factor=2, mode="bilinear")
@@ -121,11 +124,9 @@ def test_a_third_of_the_side_gives_the_same_grasp(seed: int) -> None:
     assert math.isclose(a.q, b.q, rel_tol=1e-5) and math.isclose(a.theta_rad, b.theta_rad, abs_tol=1e-4)
 
 
-def test_the_low_form_is_the_full_one_seen_at_every_third_pixel(arrays, picture) -> None:
-    form = heads_first(PAPER, arrays)
-    low, full = (stack_maps(OpenVinoNet(*f, SHAPE)(picture)) for f in (low_resolution(*form), form))
-    assert low.scale_px == 3
-    assert np.abs(low.q - full.q[1::3, 1::3]).max() <= 1e-6
+def test_the_heads_are_the_maps_seen_at_every_third_pixel(weights, picture) -> None:
+    found = OpenVinoNet(weights, SHAPE)(picture)
+    assert np.abs(found["heads"] - found["maps"][:, :, 1::3, 1::3]).max() <= 1e-6
 
 
 def test_the_grasp_is_where_quality_is_greatest() -> None:
@@ -172,7 +173,7 @@ def test_unknown_depth_is_ground() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0, np.inf])
-def test_a_picture_without_depth_is_refused(value: float, arrays) -> None:
+def test_a_picture_without_depth_is_refused(value: float) -> None:
     with pytest.raises(InputRefused, check=coded("grasp.no-depth")):
         normalized_relief(np.full((300, 300), value, np.float32))
 
@@ -185,14 +186,14 @@ def test_strange_pictures_give_finite_inputs() -> None:
         assert np.isfinite(normalized_relief(depth)).all()
 
 
-def test_maps_and_grasp_of_the_running_net_agree(arrays) -> None:
-    net, depth = GraspNet(arrays), plane(0.2)
+def test_maps_and_grasp_of_the_running_net_agree(path: Path) -> None:
+    net, depth = GraspNet(path), plane(0.2)
     depth[120:180, 140:160] *= 0.9
     full, fast = best_pixel(net.maps(depth)), net.best(depth)
     assert isinstance(fast, PixelGrasp)
     assert math.hypot(full.u_px - fast.u_px, full.v_px - fast.v_px) <= 3.0
 
 
-def test_another_size_is_refused(arrays) -> None:
+def test_another_size_is_refused(path: Path) -> None:
     with pytest.raises(InputRefused, check=coded("grasp.image-size")):
-        GraspNet(arrays).best(np.ones((480, 640), np.float32))
+        GraspNet(path).best(np.ones((480, 640), np.float32))

@@ -7,18 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import save
 from autonomy.perception.camera.frame import RgbdFrame, content_window
 from autonomy.perception.segmentation.instances import decode_instances
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter, fuse_scales
-from autonomy.perception.segmentation.network import OFFSET_PX, STRIDE, unet
+from autonomy.perception.segmentation.network import OFFSET_PX, STRIDE, interface_of
 from autonomy.perception.segmentation.resize import doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture
+from training.common.loop import seeded
+from training.common.weight_file import save
+from training.detection.networks import UNet
 from training.detection.segmentation import targets
 
 CROSSED = (((80, 80), 0.3, 100, 12), ((80, 80), 1.7, 90, 12))
@@ -128,9 +129,8 @@ def test_a_doubled_picture_shrinks_to_itself():
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "logs.safetensors"
-    network = unet("rgbd")
-    save(path, network, random_net(network, 3).arrays(), {})
+    path = tmp_path_factory.mktemp("weights") / "logs.onnx"
+    save(path, seeded(lambda: UNet("rgbd"), 3), interface_of("rgbd"), {})
     return path
 
 
@@ -226,7 +226,7 @@ def test_invalid_frames_are_refused(untrained):
 
 
 def test_corrupt_or_foreign_weights_are_refused(untrained, tmp_path):
-    cut = tmp_path / "cut.safetensors"
+    cut = tmp_path / "cut.onnx"
     cut.write_bytes(untrained.read_bytes()[:5000])
     with pytest.raises(InputRefused):
         LogSegmenter("rgbd", cut)

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from autonomy.networks.graph import parameter_count
-from autonomy.perception.segmentation.mask_network import FEATURES, KERNEL, mask_input, mask_network
+from autonomy.perception.segmentation.mask_network import FEATURES, KERNEL, mask_input
 from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter, decoded, kernel_logs
 from autonomy.perception.segmentation.network import COS2, MAPS, MASK
 from machine.geometry.optics import Intrinsics
+from training.common.weight_file import parameter_count
+from training.detection.networks import MaskNetwork
 
 
 def answer() -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +58,7 @@ def test_a_missing_sense_is_zero():
 
 
 def test_the_network_is_light():
-    assert parameter_count(mask_network()) < 1_700_000
+    assert parameter_count(MaskNetwork()) < 1_700_000
 
 
 @pytest.mark.parametrize("mode", ["rgbd", "colour", "depth"])

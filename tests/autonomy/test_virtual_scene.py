@@ -117,7 +117,7 @@ def test_with_physical_labels_the_height_is_that_of_the_rule() -> None:
 
 @pytest.mark.parametrize("yaw", [-0.8, 0.0, 0.8])
 def test_the_shipped_weights_from_physical_labels_close_across_a_log_near_its_middle(yaw: float) -> None:
-    net = GraspNet.shipped(WEIGHTS.with_name("grasp_physical.safetensors"))
+    net = GraspNet(WEIGHTS.with_name("grasp_physical.onnx"))
     p = CnnPlanner(net, by_rule=True)(GraspRequest(ARM, [log(0, yaw=yaw, diameter=0.24)], 0.0))
     assert p.logs == (0,) and hypot(p.x_m - X, p.y_m - Y) < 0.6, "on a log of 2.6 m"
     assert abs(remainder(p.yaw_rad - yaw - pi / 2, pi)) < 0.25

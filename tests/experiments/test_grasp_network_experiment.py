@@ -14,8 +14,8 @@ from rich.console import Console
 from scipy.ndimage import binary_dilation
 from typer.testing import CliRunner
 
-from autonomy.grasp.network import PAPER, WEIGHTS, GraspNet, best_pixel, normalized_relief
-from autonomy.networks.weights import load
+from autonomy.grasp.network import PAPER, GraspNet, best_pixel, normalized_relief
+from autonomy.networks import load
 from experiments.common.registry import Options
 from experiments.grasp_network import experiment, folds, latency
 from host.exit_codes import CommandFailed, ExitCode
@@ -74,16 +74,15 @@ def test_rates_of_both_cross_validations() -> None:
 def test_without_data_the_folds_are_skipped_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TIMBERHAND_DATA", str(tmp_path / "nowhere"))
     metrics: dict[str, float] = {}
-    words, pictures = experiment._cornell(options(tmp_path), {}, {}, metrics, QUIET)
+    words, pictures = experiment._cornell(options(tmp_path), metrics, QUIET)
     assert words
     assert not pictures and not metrics
 
 
 def test_any_folder_in_the_layout_is_evaluated(tmp_path: Path) -> None:
     folder = layout(tmp_path / "mine", (100, 500, 501))
-    arrays, facts = load(WEIGHTS, PAPER)
     metrics: dict[str, float] = {}
-    words, pictures = experiment._cornell(options(tmp_path, data=folder), facts, arrays, metrics, QUIET)
+    words, pictures = experiment._cornell(options(tmp_path, data=folder), metrics, QUIET)
     assert "--data" in words and pictures
     assert metrics["data_right_n"] == 3 and metrics["data_own_size"] >= metrics["data_right"]
     assert metrics["data_trained_on"] == 1
@@ -110,7 +109,7 @@ def test_a_checkpoint_belongs_to_its_seed_schedule_and_data(tmp_path: Path) -> N
 
 def test_the_shipped_weights_close_across_a_log() -> None:
     """They were never trained on one; it works because depth is relative to the ground."""
-    net = GraspNet.shipped()
+    net = GraspNet()
     for depth, _ in latency.log_scenes(3, 9)[::4]:  # one log each
         logs = binary_dilation(normalized_relief(depth) > 1.0, iterations=5)
         v, u = np.nonzero(logs)
@@ -139,13 +138,14 @@ def test_train_writes_weights_and_card(tmp_path: Path) -> None:
     folder = layout(tmp_path / "data", (7, 8))
     made = []
     for name in ("a", "b"):
-        out = tmp_path / f"{name}.safetensors"
+        out = tmp_path / f"{name}.onnx"
         done = CliRunner().invoke(train.app, ["grasp", "--data", str(folder), "--epochs", "1", "--out", str(out)])
         assert done.exception is None, done.exception
         made.append(load(out, PAPER))
         card = out.with_suffix(".md").read_text()
         assert all(value in card for value in ("78,803", "timberhand train grasp", "0007", "0008"))
-    (first, facts), (second, _) = made
+    first, second = (weights.arrays() for weights in made)
+    facts = made[0].facts
     assert all((first[k] == second[k]).all() for k in first)
     assert facts["numbers"] == "7 8" and facts["seed"] == "1"
     assert not list(tmp_path.glob("*.checkpoint"))

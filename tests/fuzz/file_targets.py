@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from autonomy import networks
 from autonomy.manager.checkpoint import Checkpoint, CheckpointFile, mission_digest, read_checkpoint
 from autonomy.manager.tally import Load, LoadedLog, Tally
 from autonomy.missions.mission_file import read as read_mission
 from autonomy.missions.mission_file import verify
 from autonomy.missions.model import ForwardingMission, KnownLog, MissionError, Point
-from autonomy.networks import weights
-from autonomy.networks.graph import parameter_shapes
 from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK
 from can_dbc.dbc.codec import Database, FrameRefused
 from can_dbc.dbc.codec import load as load_dbc
@@ -327,15 +326,18 @@ def start_envelope() -> Run:
 
 
 def weight_seeds() -> list[bytes]:
-    path = in_file("seed.safetensors")
-    arrays = {name: np.zeros(shape, np.float32) for name, shape in parameter_shapes(QUALITY_NETWORK).items()}
-    weights.save(path, QUALITY_NETWORK, arrays, {"data": "fuzz"})
-    return [path.read_bytes(), path.read_bytes()[:200]]
+    """The smallest network shipped, whole and cut."""
+    whole = (networks.SHIPPED / f"{QUALITY_NETWORK.name}.onnx").read_bytes()
+    return [whole, whole[:200]]
 
 
 def load_weights(path: Path) -> dict[str, Any]:
-    """Of the network that scores segments, the smallest one shipped."""
-    return weights.load(path, QUALITY_NETWORK)[0]
+    """Of the network that scores segments; what the fuzzer changed is sealed again, so that the parser sees it."""
+    data = path.read_bytes()
+    if len(data) > networks.DIGEST_BYTES:
+        body = data[: -networks.DIGEST_BYTES]
+        path.write_bytes(body + networks.digest(body))
+    return networks.load(path, QUALITY_NETWORK).arrays()
 
 
 def finite(arrays: dict[str, Any]) -> Hashable:
@@ -402,5 +404,5 @@ FILES = (
     _files("guard-dbc", of_file("guard.dbc", (), guard_dbc, tuple), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
     _files("guard-profile", _GUARD_PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     Target("guard-envelope", "files", start_envelope, envelope_seeds, _TOML, sealed),
-    _files("weights", of_file("fuzz.safetensors", InputRefused, load_weights, finite), weight_seeds, _JSON),
+    _files("weights", of_file("fuzz.onnx", InputRefused, load_weights, finite), weight_seeds, _JSON),
 )

@@ -30,7 +30,7 @@ def small_wheel(folder: Path, version: str, deploy: Path | None = None) -> Path:
     with zipfile.ZipFile(path, "w") as archive:
         for name in ("machine/palms.toml", "machine/palms.envelope.toml", "can_dbc/crane.dbc", "can_dbc/encoder.eds"):
             archive.writestr(name, f"{name} of {version}\n")
-        archive.writestr("autonomy/weights/logs.safetensors", f"weights of {version}\n")
+        archive.writestr("autonomy/weights/logs.onnx", f"weights of {version}\n")
         archive.writestr("machine/__init__.py", "")
         for file in deploy.rglob("*") if deploy is not None else ():
             if file.is_file() and "__pycache__" not in file.parts:

@@ -45,7 +45,7 @@ def test_a_bundle_is_what_was_signed(unpacked: tuple[Path, Path, Path]) -> None:
         "machine/palms.envelope.toml",
         "can_dbc/crane.dbc",
         "can_dbc/encoder.eds",
-        "autonomy/weights/logs.safetensors",
+        "autonomy/weights/logs.onnx",
         "machine/__init__.py",
     } <= program.keys()
     text = (folder / bundles.REQUIREMENTS).read_text()

@@ -58,7 +58,7 @@ def test_an_untouched_release_has_no_problem(program: tuple[Path, Path, Path]) -
         "machine/palms.envelope.toml",
         "can_dbc/crane.dbc",
         "can_dbc/encoder.eds",
-        "autonomy/weights/logs.safetensors",
+        "autonomy/weights/logs.onnx",
         "machine/__init__.py",
     ],
 )

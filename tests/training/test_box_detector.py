@@ -5,16 +5,15 @@ import pytest
 import torch
 from rich.console import Console
 
-from autonomy.networks.graph import parameter_count
-from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import save
-from autonomy.perception.papers import SIZE_PX, BoxDetector, box_net, decode_boxes
+from autonomy.perception.papers import BOXES, SIZE_PX, BoxDetector, decode_boxes
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.training.drawn_logs import picture
-from training.common.loop import Schedule
+from training.common.loop import Schedule, seeded
+from training.common.weight_file import parameter_count, save
 from training.detection import boxes
 from training.detection.boxes import run, targets
+from training.detection.networks import BoxNetwork
 
 LOGS = (((60.0, 70.0), 0.4, 80, 14), ((140.0, 120.0), 1.2, 100, 16))
 
@@ -53,16 +52,16 @@ def test_empty_maps_give_no_boxes():
 
 
 def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
-    path = tmp_path / "boxes.safetensors"
-    save(path, box_net(), random_net(box_net(), 1).arrays(), {})
+    path = tmp_path / "boxes.onnx"
+    save(path, seeded(BoxNetwork, 1), BOXES, {})
     detector = BoxDetector(path)
     with pytest.raises(InputRefused, check=coded("network.bad-picture")):
         detector.detect(np.zeros((304, 304, 3), np.uint8))
     found, _ = detector.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
     assert found.shape[1] == 4
     with pytest.raises(InputRefused):
-        BoxDetector(tmp_path / "none.safetensors")
-    assert parameter_count(box_net()) < 500_000
+        BoxDetector(tmp_path / "none.onnx")
+    assert parameter_count(BoxNetwork()) < 500_000
 
 
 @pytest.mark.long
@@ -92,12 +91,12 @@ def test_the_generalised_overlap_of_two_boxes():
 @pytest.mark.long
 def test_training_starts_from_weights(tmp_path):
     sample = [picture(((90.0, 80.0), 0.3, 60, 14), size=304)]
-    start = random_net(box_net(), 7).arrays()
+    start = {name: values.numpy() for name, values in seeded(BoxNetwork, 7).state_dict().items()}
     quiet = Console(stderr=True, quiet=True)
     net, _ = run([(sample.__getitem__, 1)], Schedule(1, 1e-9), 2, 5, None, quiet, start)
-    assert np.abs(net.arrays()["boxes.weight"] - start["boxes.weight"]).max() < 1e-6
+    assert np.abs(net.boxes.weight.detach().numpy() - start["boxes.weight"]).max() < 1e-6
     other, _ = run([(sample.__getitem__, 1)], Schedule(1, 1e-9), 2, 5, None, quiet)
-    assert np.abs(other.arrays()["boxes.weight"] - start["boxes.weight"]).max() > 1e-3
+    assert np.abs(other.boxes.weight.detach().numpy() - start["boxes.weight"]).max() > 1e-3
 
 
 def test_batches_of_small_and_large_pictures_alternate():

@@ -151,12 +151,12 @@ def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monke
 
     monkeypatch.setattr(physical_weights, "piles", lain)
     monkeypatch.setattr(physical_weights, "TEST_FRAMES", 4)
-    out = tmp_path / "grasp_physical.safetensors"
+    out = tmp_path / "grasp_physical.onnx"
     made, card = physical_weights.produce(3, out, Console(quiet=True), count=8, epochs=1)
-    assert made == out and GraspNet.shipped(out).maps(np.full((300, 300), 3.0, np.float32)).q.shape[0] > 0
+    assert made == out and GraspNet(out).maps(np.full((300, 300), 3.0, np.float32)).q.shape[0] > 0
     told = card.read_text()
     assert 8 in numbers_in(told)
-    assert "timberhand train grasp --labels physical --seed 3 --epochs 1 --out grasp_physical.safetensors" in told
+    assert "timberhand train grasp --labels physical --seed 3 --epochs 1 --out grasp_physical.onnx" in told
 
 
 @pytest.mark.parametrize(

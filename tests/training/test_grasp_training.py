@@ -15,9 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from autonomy.grasp.network import PAPER, GraspMaps, heads_first
-from autonomy.networks.graph import parameter_shapes
-from autonomy.networks.torch_net import random_net
+from autonomy.grasp.network import GraspMaps
 from runtime.errors import InputRefused
 from tests.codes import coded
 from training.grasp import network_training
@@ -216,19 +214,13 @@ def test_equation_5_at_a_third_of_the_side() -> None:
 
 
 def test_what_is_trained_is_the_paper_s_network() -> None:
-    assert parameter_shapes(network_training.BODY) == parameter_shapes(PAPER)
-    arrays = random_net(PAPER, 1).arrays()
-    full, body = random_net(PAPER, 0).eval(), random_net(network_training.BODY, 0).eval()
-    full.load(arrays)
-    body.load(arrays)
+    body, full = network_training.GraspNetwork().eval(), network_training.OriginalOrder().eval()
+    full.load_state_dict(body.state_dict())
     picture = torch.randn(1, 1, 300, 300, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
-        wanted = full(picture)
-        low = body(torch.nn.functional.avg_pool2d(picture, 3))
-        for head in network_training.HEADS:
-            got = torch.nn.functional.interpolate(low[head], scale_factor=3, mode="bilinear")
-            assert (got - wanted[head]).abs().max() <= 1e-5
-    assert heads_first(PAPER, arrays)[1]["heads.weight"].shape == (3, 16, 1, 1)
+        low = body.heads(torch.nn.functional.avg_pool2d(picture, 3))
+        got = torch.nn.functional.interpolate(low, scale_factor=3, mode="bilinear")
+        assert (got - full(picture)).abs().max() <= 1e-5
 
 
 def bar(number: int, theta: float) -> Sample:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from autonomy.networks.weights import load
-from autonomy.perception.segmentation.mask_network import mask_network
+from autonomy.networks import load
+from autonomy.perception.segmentation.mask_network import MASKS
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
 from tests.codes import coded, numbers_in
@@ -68,11 +68,11 @@ def test_without_compiler_and_blender_the_error_says_what_to_install(monkeypatch
 
 @pytest.mark.long
 def test_the_command_writes_weights_card_and_checkpoint(folder):
-    out = folder / "made.safetensors"
+    out = folder / "made.onnx"
     few = ["--device", "cpu", "--steps", "1", "--batch", "2", "--side", str(SIDE), "--out", str(out)]
     result = CliRunner().invoke(app, ["masks", str(folder), *few])
     assert result.exit_code == 0, result.output
-    load(out, mask_network())
+    load(out, MASKS)
     assert 1 in numbers_in(out.with_suffix(".md").read_text()) and out.with_suffix(".checkpoint").is_file()
     assert out.with_suffix(".jsonl").is_file()
 

@@ -5,12 +5,13 @@ import pytest
 import torch
 from rich.console import Console
 
-from autonomy.networks.graph import parameter_count
-from autonomy.perception.segmentation.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, network_input, unet
+from autonomy.perception.segmentation.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, interface_of, network_input
 from tests.training.drawn_logs import perfect_maps, picture
 from training.common.loop import Schedule
+from training.common.weight_file import parameter_count
 from training.detection import segmentation
 from training.detection.augmentation import augmented, recoloured
+from training.detection.networks import UNet
 from training.detection.segmentation import batches, loss, run, targets
 from training.pictures.labels import IGNORED
 
@@ -50,7 +51,7 @@ def test_a_perfect_net_has_the_lowest_loss():
     perfect = torch.from_numpy(perfect_maps(maps[0].numpy())[None])
 
     def value(out):
-        return loss(lambda _: {"maps": out}, perfect, maps, weights).item()
+        return loss(lambda _: out, perfect, maps, weights).item()
 
     assert value(perfect) < 0.5  # soft outlines cost something even so
     for i in range(len(MAPS)):
@@ -79,8 +80,8 @@ def test_networks_are_small_and_accept_the_input():
     sample = picture(((50.0, 50.0), 0.4, 60, 10), size=96)
     for variant, width in CHANNELS.items():
         assert network_input(sample.rgb, sample.depth_m, sample.intrinsics, variant).shape == (width, 96, 96)
-        assert unet(variant).channels == width
-        assert parameter_count(unet(variant)) < 500_000
+        assert interface_of(variant).channels == width
+        assert parameter_count(UNet(variant)) < 500_000
 
 
 @pytest.mark.long

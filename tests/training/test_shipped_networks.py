@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from autonomy.networks.weights import SHIPPED
+from autonomy.networks import SHIPPED
 from autonomy.perception.papers import SIZE_PX, BoxDetector
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from training.common.average_precision import box_overlaps
@@ -35,7 +35,7 @@ def found(boxes_of, seen) -> float:
     return float(np.mean(np.concatenate(best) > 0.5))
 
 
-@pytest.mark.parametrize("weights", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("weights", sorted(SHIPPED.glob("*.onnx")), ids=lambda path: path.stem)
 def test_the_card_matches_the_weights(weights):
     assert hashlib.sha256(weights.read_bytes()).hexdigest() in weights.with_suffix(".md").read_text()
     assert weights.stat().st_size < 5_000_000

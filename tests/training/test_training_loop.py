@@ -10,14 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 from rich.console import Console
+from torch import nn
 
-from autonomy.networks.graph import BatchNorm, Conv, Network, Relu
-from autonomy.networks.torch_net import TorchNet, random_net
 from runtime.errors import InputRefused
 from tests.codes import coded
-from training.common.loop import Schedule, train
+from training.common.loop import Schedule, seeded, train
 
-SMALL = Network("small", 1, (Conv("a", 4, 3), BatchNorm("n"), Relu("r"), Conv("y", 1, 1)), ("y",))
+
+def small() -> nn.Module:
+    return nn.Sequential(nn.Conv2d(1, 4, 3, padding=1), nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 1, 1))
 
 
 def batch(step: int) -> tuple[torch.Tensor, ...]:
@@ -25,18 +26,25 @@ def batch(step: int) -> tuple[torch.Tensor, ...]:
     return x, 0.5 * x
 
 
-def loss(net: TorchNet, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    return (net(x)["y"] - y).square().mean()
+def loss(net: nn.Module, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    return (net(x) - y).square().mean()
 
 
 def run(path: Path | None, steps: int = 40, give=batch, every_s: float = 1e9, run_name: str = "r"):
-    net = random_net(SMALL, 1)
+    net = seeded(small, 1)
     schedule = Schedule(steps, 1e-2, checkpoint_every_s=every_s)
     return net, train(net, give, loss, schedule, path, run_name, "small", Console(file=io.StringIO()))
 
 
-def same(a: TorchNet, b: TorchNet) -> bool:
+def same(a: nn.Module, b: nn.Module) -> bool:
     return all(torch.equal(x, b.state_dict()[k]) for k, x in a.state_dict().items())
+
+
+def test_a_seed_gives_the_same_net_and_leaves_the_global_generator_alone() -> None:
+    before = torch.random.get_rng_state()
+    first, second, other = (seeded(small, seed) for seed in (1, 1, 2))
+    assert same(first, second) and not same(first, other)
+    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 @pytest.mark.long

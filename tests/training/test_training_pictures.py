@@ -7,19 +7,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import load, save
+from autonomy.networks import load
 from autonomy.perception.papers import BoxDetector
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
-from autonomy.perception.segmentation.network import unet
+from autonomy.perception.segmentation.network import interface_of
 from autonomy.perception.segmentation.segment_merging import load_scorers
 from machine.geometry.optics import pinhole
 from runtime.errors import InputRefused
 from sim.camera.geometry import look_at
 from sim.camera.scene import LogPose
 from tests.codes import coded
+from training.common.loop import seeded
+from training.common.weight_file import restore, save
 from training.detection import detector_weights, scorer_weights
+from training.detection.networks import UNet
 from training.pictures import drawing, piles, shards
 from training.pictures.drawing import MAX_LOGS, draw, labelled
 from training.pictures.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
@@ -159,32 +161,35 @@ def test_a_damaged_shard_is_refused(few):
 def test_weights_are_written_with_a_card(few, monkeypatch):
     monkeypatch.setattr(detector_weights, "BATCH", 2)
     monkeypatch.setattr(detector_weights, "TEST_PICTURES", 2)
-    out = few / "logs_depth.safetensors"
+    out = few / "logs_depth.onnx"
     card = detector_weights.produce("depth", detector_weights.Plan(2, 2, 1), few, out, Console(quiet=True))
     assert "mAP@0.5" in card.read_text() and "timberhand train segmentation --variant depth" in card.read_text()
     assert LogSegmenter("depth", out).facts["seed"] == "1"
-    boxes = few / "log_boxes.safetensors"
+    boxes = few / "log_boxes.onnx"
     detector_weights.produce_boxes(detector_weights.Plan(2, 2, 1, large=2), few, boxes, Console(quiet=True))
     assert BoxDetector(boxes).facts["command"].startswith("timberhand train detector --pictures 2 --large 2")
     on = detector_weights.Plan(2, 1, 1, 1e-6, out)
-    text = detector_weights.produce("depth", on, few, few / "on.safetensors", Console(quiet=True)).read_text()
-    assert "logs_depth.safetensors" in text
+    text = detector_weights.produce("depth", on, few, few / "on.onnx", Console(quiet=True)).read_text()
+    assert "logs_depth.onnx" in text
     before, after = (
-        load(few / f"{name}.safetensors", unet("depth"))[0]["maps.weight"] for name in ("logs_depth", "on")
+        load(few / f"{name}.onnx", interface_of("depth")).arrays()["maps.weight"] for name in ("logs_depth", "on")
     )
     assert np.abs(before - after).max() < 1e-4
 
 
 def test_the_depth_variant_can_start_from_weights_of_the_rgbd_variant(tmp_path):
     """Its first layer is the depth part of the other's; weights of other networks are refused."""
-    both, alone = tmp_path / "logs_rgbd.safetensors", tmp_path / "logs_depth.safetensors"
-    arrays = random_net(unet("rgbd"), 1).arrays()
-    save(both, unet("rgbd"), arrays, {})
+    both, alone = tmp_path / "logs_rgbd.onnx", tmp_path / "logs_depth.onnx"
+    net, other = seeded(lambda: UNet("rgbd"), 1), UNet("depth")
+    arrays = {name: values.numpy() for name, values in net.state_dict().items() if not name.endswith("tracked")}
+    save(both, net, interface_of("rgbd"), {})
     taken = detector_weights.initial_arrays(both, "depth")
-    assert np.array_equal(taken["in2.weight"], arrays["in2.weight"][:, 3:])
-    assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
-    save(alone, unet("depth"), taken, {})
-    assert np.array_equal(detector_weights.initial_arrays(alone, "depth")["in2.weight"], taken["in2.weight"])
+    assert taken.keys() == arrays.keys()
+    assert np.array_equal(taken["in2.0.weight"], arrays["in2.0.weight"][:, 3:])
+    assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.0.weight")
+    restore(other, taken)
+    save(alone, other, interface_of("depth"), {})
+    assert np.array_equal(detector_weights.initial_arrays(alone, "depth")["in2.0.weight"], taken["in2.0.weight"])
     with pytest.raises(InputRefused, check=coded("weights.other-network")):
         detector_weights.initial_arrays(alone, "rgbd")
 

@@ -56,14 +56,14 @@ def grasp(
 
       timberhand train grasp --data ~/cornell
 
-      timberhand train grasp --data ~/cornell --epochs 30 --out my.safetensors
+      timberhand train grasp --data ~/cornell --epochs 30 --out my.onnx
 
       timberhand train grasp --labels physical     needs no data
 
       timberhand experiment grasp-network --data ~/other_cornell
     """
     prepare_torch()
-    weights = out or Path(f"grasp_{labels.value}.safetensors")
+    weights = out or Path(f"grasp_{labels.value}.onnx")
     if labels is Labels.PHYSICAL:
         if data is not None:
             raise CommandFailed(
@@ -150,14 +150,14 @@ def segmentation(
         raise CommandFailed(
             "train.unknown-variant", f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}", ExitCode.USAGE
         )
-    weights = out or Path(f"logs_{variant}.safetensors")
+    weights = out or Path(f"logs_{variant}.onnx")
     plan = Plan(pictures, steps, seed, learning_rate, start, large)
     _train_on_pictures(weights, folder, lambda kept, screen: produce(variant, plan, kept, weights, screen))
 
 
 @app.command()
 def detector(
-    out: Out = Path("log_boxes.safetensors"),
+    out: Out = Path("log_boxes.onnx"),
     seed: Seed = 1,
     steps: Annotated[int, typer.Option(min=1, help="Training batches.")] = 4000,
     pictures: Pictures = 25_088,
@@ -279,7 +279,7 @@ def traced_pictures(
 @app.command()
 def masks(
     folder: TracedFolder,
-    out: Out = Path("logs.safetensors"),
+    out: Out = Path("logs.onnx"),
     trunk: Annotated[
         Path | None, typer.Option(help="ImageNet weights, torchvision's mobilenet_v2-b0353104.pth (default: random).")
     ] = None,

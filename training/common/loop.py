@@ -16,18 +16,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
-from autonomy.networks.graph import Network
-from autonomy.networks.torch_net import TorchNet, random_net
 from runtime.errors import InputRefused
+from training.common.weight_file import restore
 
 Batch = tuple[torch.Tensor, ...]
+Net = TypeVar("Net", bound=torch.nn.Module)
 WARM_UP_SHARE: Final = 0.05
 """Share of the steps in which the learning rate rises."""
 LOSS_SMOOTHING: Final = 0.98
@@ -106,17 +106,24 @@ def train(
     return losses
 
 
-def initialised(network: Network, seed: int, start: Mapping[str, np.ndarray] | None) -> TorchNet:
+def seeded(make: Callable[[], Net], seed: int) -> Net:
+    """A network with random parameters from a seed; torch's global generator is not affected."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()
+
+
+def initialised(make: Callable[[], Net], seed: int, start: Mapping[str, np.ndarray] | None) -> Net:
     """A network of pictures with the arrays ``start``, or with random parameters from ``seed``."""
-    net = random_net(network, seed)
+    net = seeded(make, seed)
     if start is not None:
-        net.load(start)
+        restore(net, start)
     return channels_last(net)
 
 
-def channels_last(net: TorchNet) -> TorchNet:
+def channels_last(net: Net) -> Net:
     """The net with its parameters in channels-last layout, which convolutions on a CPU prefer."""
-    moved: TorchNet = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # absent from the stubs
+    moved: Net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # absent from the stubs
     return moved
 
 

@@ -11,10 +11,10 @@ import torch
 from rich.console import Console
 from torch.nn import functional as F
 
-from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.papers import STRIDE, box_net, network_input
+from autonomy.perception.papers import STRIDE, network_input
 from training.common.loop import Schedule, initialised, stacked, train
 from training.detection.augmentation import augmented
+from training.detection.networks import BoxNetwork
 from training.detection.segmentation import Picture
 from training.pictures.labels import ID, IGNORED, Labelled
 
@@ -60,7 +60,7 @@ def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
 def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     """The loss of a batch: focal cross entropy of the peaks (Zhou et al. 2019), distance of the logarithms of the
     sides, and 1 minus the generalised overlap of the boxes."""
-    found = net(images)["boxes"].float()
+    found = net(images).float()
     peak, logit = maps[:, 0], found[:, 0]
     probability = torch.sigmoid(logit)
     hit = (peak == 1.0).float()
@@ -94,13 +94,13 @@ def run(
     checkpoint: Path | None,
     console: Console,
     start: Mapping[str, np.ndarray] | None = None,
-) -> tuple[TorchNet, list[float]]:
+) -> tuple[BoxNetwork, list[float]]:
     """Train in batches of ``size``; returns the net and the loss of every step.
 
     ``sources`` are small pictures and, optionally, large ones, each with their count.  The training starts from the
     arrays ``start``, or from random parameters.
     """
-    net = initialised(box_net(), seed, start)
+    net = initialised(BoxNetwork, seed, start)
     what = f"boxes, {' and '.join(str(count) for _, count in sources)} pictures, batch {size}, seed {seed}"
     losses = train(net, batches(sources, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
     return net.eval(), losses

@@ -10,15 +10,16 @@ from typing import Final
 import numpy as np
 from rich.console import Console
 
-from autonomy.networks.weights import load
-from autonomy.perception.papers import box_net
+from autonomy.networks import load
+from autonomy.perception.papers import BOXES
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
-from autonomy.perception.segmentation.network import CHANNELS, unet
+from autonomy.perception.segmentation.network import CHANNELS, interface_of
 from runtime.errors import InputRefused
 from training.common.average_precision import Matches, average_precision, box_overlaps, curve, mask_overlaps
 from training.common.loop import Schedule, progress_bar
-from training.common.model_card import Card, write
+from training.common.weight_file import Card, write
 from training.detection import boxes
+from training.detection.networks import UNet
 from training.detection.segmentation import CROPS, run
 from training.pictures import shards
 from training.pictures.labels import ID, Labelled
@@ -81,7 +82,7 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
     net, losses = run(some, count, variant, schedule, BATCH, plan.seed, kept, console, start)
-    return ship(variant, net.arrays(), losses, plan, source, out)
+    return ship(variant, net, losses, plan, source, out)
 
 
 def initial_arrays(weights: Path, variant: str) -> dict[str, np.ndarray]:
@@ -92,13 +93,12 @@ def initial_arrays(weights: Path, variant: str) -> dict[str, np.ndarray]:
         InputRefused: as ``load``.
     """
     try:
-        return load(weights, unet(variant))[0]
+        return load(weights, interface_of(variant)).arrays()
     except InputRefused:
         if variant != "depth":
             raise
-    arrays = load(weights, unet("rgbd"))[0]
-    first = unet(variant).layers[0].name
-    return arrays | {f"{first}.weight": arrays[f"{first}.weight"][:, -CHANNELS[variant] :]}
+    arrays = load(weights, interface_of("rgbd")).arrays()
+    return arrays | {"in2.0.weight": arrays["in2.0.weight"][:, -CHANNELS[variant] :]}
 
 
 def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path:
@@ -107,7 +107,7 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
     Raises:
         InputRefused: as ``produce``.
     """
-    start = load(plan.start, box_net())[0] if plan.start else None
+    start = load(plan.start, BOXES).arrays() if plan.start else None
     source = small_pictures(folder, plan.count, console)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
@@ -126,7 +126,7 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
         "photographs: its colours are drawn. How it does on worlds that are drawn otherwise is in docs/detector.md.",
         plan.command("detector", out),
     )
-    return write(out, box_net(), net.arrays(), card, {})
+    return write(out, net, BOXES, card, {})
 
 
 def small_pictures(folder: Path, count: int, console: Console) -> Callable[[int], Labelled]:
@@ -160,14 +160,13 @@ def _draw_missing(folder: Path, numbers: Sequence[int], size_px: int, console: C
 
 def ship(
     variant: str,
-    arrays: dict[str, np.ndarray],
+    net: UNet,
     losses: list[float],
     plan: Plan,
     source: Callable[[int], Labelled],
     out: Path,
 ) -> Path:
     """Write trained weights with their card; returns the card's path."""
-    network = unet(variant)
     card = Card(
         f"Logs in pictures, from {'colour and depth' if variant == 'rgbd' else 'depth alone'}",
         "Picture in, eight maps out, from which logs are decoded: mask, centre, offset to it, angle, ends, edges.",
@@ -179,9 +178,9 @@ def ship(
         "that are drawn otherwise is in docs/detector.md.",
         plan.command(f"segmentation --variant {variant}", out),
     )
-    write(out, network, arrays, card, {})
+    write(out, net, interface_of(variant), card, {})
     figures = test_metrics(LogSegmenter(variant, out), source)
-    return write(out, network, arrays, replace(card, metrics={**card.metrics, **figures}), {})
+    return write(out, net, interface_of(variant), replace(card, metrics={**card.metrics, **figures}), {})
 
 
 def test_metrics(segmenter: LogSegmenter, source: Callable[[int], Labelled]) -> dict[str, str]:

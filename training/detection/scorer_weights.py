@@ -11,8 +11,7 @@ import torch
 from rich.console import Console
 from torch.nn import functional as F
 
-from autonomy.networks.graph import Network
-from autonomy.networks.torch_net import random_net
+from autonomy.networks import Interface
 from autonomy.perception.segmentation.instances import foreground_of
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.segment_merging import (
@@ -26,8 +25,9 @@ from autonomy.perception.segmentation.segment_merging import (
 )
 from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES
 from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, Foreground, Segment
-from training.common.loop import Schedule, progress_bar, train
-from training.common.model_card import Card, write
+from training.common.loop import Schedule, progress_bar, seeded, train
+from training.common.weight_file import Card, write
+from training.detection.networks import scoring_network
 from training.pictures.labels import IGNORED
 from training.pictures.shards import SHARD, pictures, shard
 
@@ -112,11 +112,9 @@ def owner(foreground: Foreground, ids: np.ndarray, segment: Segment) -> tuple[in
     return int(count.argmax()), float(count.max() / len(segment.members))
 
 
-def train_scorer(
-    network: Network, examples: Examples, steps: int, seed: int, console: Console
-) -> dict[str, np.ndarray]:
-    """The arrays of a scorer, trained with the cross entropy to the targets, which may be fractions."""
-    net = random_net(network, seed)
+def train_scorer(network: Interface, examples: Examples, steps: int, seed: int, console: Console) -> torch.nn.Module:
+    """A scoring network, trained with the cross entropy to the targets, which may be fractions."""
+    net = seeded(lambda: scoring_network(network.channels), seed)
     features = torch.from_numpy(examples.features.T[None, :, None].copy())
     target = torch.from_numpy(examples.target)
     weight = torch.from_numpy(examples.weight / examples.weight.mean())
@@ -126,12 +124,12 @@ def train_scorer(
         return features[..., some], target[some], weight[some]
 
     def loss(net: torch.nn.Module, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-        logit = net(features)["logit"].reshape(-1)
+        logit = net(features).reshape(-1)
         return (F.binary_cross_entropy_with_logits(logit, target, reduction="none") * weight).mean()
 
     schedule = Schedule(steps, 1e-2, weight_decay=1e-3)
     train(net, batch, loss, schedule, None, f"{network.name}, seed {seed}", network.name, console)
-    return net.eval().arrays()
+    return net.eval()
 
 
 # -- The weight files of the segment scorers, from drawn pictures that the segmentation network was not trained on
@@ -148,7 +146,7 @@ DESCRIPTIONS: Final = {
 }
 
 
-def _zero_scorer(network: Network) -> Scorer:
+def _zero_scorer(network: Interface) -> Scorer:
     return Scorer(np.zeros((HIDDEN_UNITS, network.channels)), np.zeros(HIDDEN_UNITS), np.zeros(HIDDEN_UNITS), 0.0)
 
 
@@ -178,7 +176,7 @@ def produce(count: int, seed: int, folder: Path, out: Path, weights: Path | None
     training, held_out = (
         Examples.joined([merge_examples(f, ids, rng) for f, ids in part]) for part in (seen.training, seen.held_out)
     )
-    merge = Scorer.of(_ship(MERGE_NETWORK, training, held_out, count, seed, out, console))
+    merge = _ship(MERGE_NETWORK, training, held_out, count, seed, out, console)
     training, held_out = (
         Examples.joined([quality_examples(f, ids, merge) for f, ids in part]) for part in (seen.training, seen.held_out)
     )
@@ -211,10 +209,10 @@ def labelled_foregrounds(count: int, folder: Path, weights: Path | None, console
 
 
 def _ship(
-    network: Network, training: Examples, held_out: Examples, count: int, seed: int, out: Path, console: Console
-) -> dict[str, np.ndarray]:
-    arrays = train_scorer(network, training, STEPS, seed, console)
-    scorer = Scorer.of(arrays)
+    network: Interface, training: Examples, held_out: Examples, count: int, seed: int, out: Path, console: Console
+) -> Scorer:
+    net = train_scorer(network, training, STEPS, seed, console)
+    scorer = Scorer.of({name: values.numpy() for name, values in net.state_dict().items()})
     card = Card(
         f"Scorer of segments: {network.name}",
         DESCRIPTIONS[network.name],
@@ -230,8 +228,8 @@ def _ship(
         "maps of any other network: train it again after that network.",
         f"timberhand train scorers --pictures {count} --seed {seed}",
     )
-    write(out / f"{network.name}.safetensors", network, arrays, card, {})
-    return arrays
+    write(out / f"{network.name}.onnx", net, network, card, {})
+    return scorer
 
 
 def cross_entropy(scorer: Scorer, examples: Examples) -> float:

@@ -15,10 +15,10 @@ from rich.console import Console
 from scipy import ndimage
 from torch.nn import functional as F
 
-from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.segmentation.network import MAPS, MASK, OFFSET_PX, STRIDE, network_input, unet
+from autonomy.perception.segmentation.network import MAPS, MASK, OFFSET_PX, STRIDE, network_input
 from training.common.loop import Schedule, initialised, stacked, train
 from training.detection.augmentation import augmented
+from training.detection.networks import UNet
 from training.pictures.labels import (
     ANGLE,
     CENTRE_U,
@@ -155,7 +155,7 @@ def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights
 
     Offsets and angles of a log are weighted with the square root of its size.
     """
-    found = net(images)["maps"].float()
+    found = net(images).float()
     weight, of_offset, of_angle = weights[:, :3].unbind(1)
     total = weight.sum() + 1.0
 
@@ -207,12 +207,12 @@ def run(
     checkpoint: Path | None,
     console: Console,
     start: Mapping[str, np.ndarray] | None = None,
-) -> tuple[TorchNet, list[float]]:
+) -> tuple[UNet, list[float]]:
     """Train a variant on ``count`` pictures in batches of ``size``; returns the net and the loss of every step.
 
     The training starts from the arrays ``start``, or from random parameters.
     """
-    net = initialised(unet(variant), seed, start)
+    net = initialised(lambda: UNet(variant), seed, start)
     what = (
         f"segmentation {variant}, {count} pictures, batch {size}, seed {seed}, {'scratch' if start is None else 'on'}"
     )

@@ -10,13 +10,14 @@ import numpy as np
 from rich.console import Console
 
 from autonomy.grasp.network import PAPER, GraspNet
-from training.common.model_card import Card, write
+from training.common.weight_file import Card, save, write
 from training.grasp import network_training
 from training.grasp.cornell import Rectangle, Sample, is_correct
 from training.grasp.network_training import (
     BATCH,
     LEARNING_RATE,
     VIEWS_PER_SAMPLE,
+    GraspNetwork,
     central_view,
     view_depth,
     visible_grasps,
@@ -29,11 +30,11 @@ def produce(samples: Sequence[Sample], seed: int, epochs: int, out: Path, consol
         examples = network_training.augmented_examples(samples, seed)
     kept = out.with_suffix(".checkpoint")
     net, losses = network_training.train_network(examples, seed, "grasp network", console, kept, epochs=epochs)
-    return out, ship(net.arrays(), losses, samples, seed, epochs, out)
+    return out, ship(net, losses, samples, seed, epochs, out)
 
 
 def ship(
-    arrays: Mapping[str, np.ndarray],
+    net: GraspNetwork,
     losses: Sequence[float],
     samples: Sequence[Sample],
     seed: int,
@@ -47,7 +48,8 @@ def ship(
         "opening_px": f"{opening:.3f}",
         "jaw_px": f"{jaw:.3f}",
     }
-    results = on_samples(GraspNet(arrays), samples, facts)
+    save(out, net, PAPER, facts)
+    results = on_samples(GraspNet(out), samples, facts)
     hits = sum(r["right"] for r in results)
     views = len(samples) * VIEWS_PER_SAMPLE
     card = Card(
@@ -67,7 +69,7 @@ def ship(
         "anything but depth seen from above or aslant with ground around the objects. It was not trained on logs.",
         f"timberhand train grasp --data CORNELL --seed {seed} --epochs {epochs} --out {out.name}",
     )
-    return write(out, PAPER, arrays, card, facts)
+    return write(out, net, PAPER, card, facts)
 
 
 def on_samples(net: GraspNet, samples: Sequence[Sample], facts: Mapping[str, str]) -> list[dict[str, Any]]:

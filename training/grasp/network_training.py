@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from rich.console import Console
 from scipy.ndimage import map_coordinates
+from torch import nn
+from torch.nn import functional as F
 
-from autonomy.grasp.network import HEADS, PAPER, POOL, GraspMaps, best_pixel, normalized_relief
-from autonomy.networks.graph import Conv, Network
-from autonomy.networks.torch_net import TorchNet, random_net
-from training.common.loop import Schedule, channels_last, train
+from autonomy.grasp.network import HEADS, POOL, GraspMaps, best_pixel, grasp_maps, normalized_relief
+from training.common.loop import Schedule, channels_last, seeded, train
 from training.grasp.cornell import Rectangle, Sample, is_correct, wrapped
 
 # -- Views of a labelled depth picture: the network's 300 x 300 window, its labels, and random copies.
@@ -114,17 +114,64 @@ BATCH: Final = 4
 EPOCHS: Final = 6
 LEARNING_RATE: Final = 2e-3
 LOW_PX: Final = SIDE_PX // POOL
+KINDS: Final = ("weight", "bias")
 
-BODY: Final = Network(
-    "grasp at a third",
-    1,
-    (
-        *(layer for layer in PAPER.layers[1:] if layer.name not in (*HEADS, "up3")),
-        *(Conv(head, 1, 1, source="relu7") for head in HEADS),
-    ),
-    HEADS,
-)
-"""The paper's network from pooled pictures to maps at a third of the side, with the same parameters."""
+
+class GraspNetwork(nn.Module):
+    """Table I of paper A, its three heads before the last upsampling: a 1 x 1 convolution commutes with it.
+
+    78 803 parameters.  Table I prints 12 832 for the second 32-channel layer; its sum holds only with 25 632.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(1, 16, 11, padding=5)
+        self.conv2 = nn.Conv2d(16, 16, 7, padding=3)
+        self.norm2 = nn.BatchNorm2d(16)
+        self.conv3 = nn.Conv2d(16, 16, 5, padding=2)
+        self.conv4 = nn.Conv2d(16, 16, 5, padding=2)
+        self.norm4 = nn.BatchNorm2d(16)
+        self.conv5 = nn.Conv2d(16, 32, 5, padding=2)
+        self.conv6 = nn.Conv2d(32, 32, 5, padding=2)
+        self.norm6 = nn.BatchNorm2d(32)
+        self.conv7 = nn.Conv2d(32, 16, 5, padding=2)
+        self.q, self.cos2, self.sin2 = (nn.Conv2d(16, 1, 1) for _ in HEADS)
+
+    def features(self, pooled: torch.Tensor) -> torch.Tensor:
+        """Features (N, 32, h / 2, w / 2) of pictures at a third of the side (N, 1, h, w)."""
+        x = F.max_pool2d(self.norm2(F.relu(self.conv2(self.conv1(pooled)))), 2)
+        x = self.norm4(self.conv4(F.relu(self.conv3(x))))
+        found: torch.Tensor = self.norm6(F.relu(self.conv6(self.conv5(x))))
+        return found
+
+    def hidden(self, features: torch.Tensor) -> torch.Tensor:
+        """What the heads read (N, 16, h, w)."""
+        return F.relu(self.conv7(F.interpolate(features, scale_factor=2.0, mode="bilinear", align_corners=False)))
+
+    def heads_of(self, hidden: torch.Tensor) -> torch.Tensor:
+        """The HEADS (N, 3, h, w), as one convolution."""
+        weights, biases = (torch.cat([getattr(self, head).get_parameter(kind) for head in HEADS]) for kind in KINDS)
+        return F.conv2d(hidden, weights, biases)
+
+    def heads(self, pooled: torch.Tensor) -> torch.Tensor:
+        """Maps (N, 3, h, w) at a third of the side."""
+        return self.heads_of(self.hidden(self.features(pooled)))
+
+    def forward(self, pictures: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Outputs of ``autonomy.grasp.network.PAPER``."""
+        features = self.features(F.avg_pool2d(pictures, POOL))
+        heads = self.heads_of(self.hidden(features))
+        return features, heads, F.interpolate(heads, scale_factor=float(POOL), mode="bilinear", align_corners=False)
+
+
+class OriginalOrder(GraspNetwork):
+    """Table I as it stands, with the heads on the upsampled features, for comparison."""
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        """Maps (N, 3, H, W)."""
+        hidden = self.hidden(self.features(F.avg_pool2d(pictures, POOL)))
+        up = F.interpolate(hidden, scale_factor=float(POOL), mode="bilinear", align_corners=False)
+        return torch.cat([self.q(up), self.cos2(up), self.sin2(up)], 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +228,7 @@ def train_network(
     checkpoint: Path | None = None,
     epochs: int = EPOCHS,
     batch: int = BATCH,
-) -> tuple[TorchNet, list[float]]:
+) -> tuple[GraspNetwork, list[float]]:
     """Train a net on the examples; returns it and the loss of every step."""
     low, projected = (torch.from_numpy(np.stack([getattr(e, name) for e in examples])) for name in ("low", "projected"))
     square = torch.tensor([e.square for e in examples])
@@ -197,11 +244,10 @@ def train_network(
         chosen = torch.from_numpy(orders[epoch][place * batch : (place + 1) * batch])
         return low[chosen][:, None].contiguous(memory_format=torch.channels_last), projected[chosen], square[chosen]
 
-    def loss(net: TorchNet, pictures: torch.Tensor, labels: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
-        found = net(pictures)
-        return equation_5(torch.cat([found[head] for head in HEADS], 1).float(), labels, squares, a_side)
+    def loss(net: GraspNetwork, pictures: torch.Tensor, labels: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
+        return equation_5(net.heads(pictures).float(), labels, squares, a_side)
 
-    net = channels_last(random_net(BODY, seed))
+    net = channels_last(seeded(GraspNetwork, seed))
     schedule = Schedule(epochs * per_epoch, LEARNING_RATE, bf16=True)
     run = f"grasp seed {seed}, {len(examples)} examples, batch {batch}"
     return net, train(net, batch_of, loss, schedule, checkpoint, run, title, console)
@@ -217,15 +263,14 @@ def equation_5(maps: torch.Tensor, projected: torch.Tensor, square: torch.Tensor
     return whole / (len(maps) * SIDE_PX * SIDE_PX)
 
 
-def predict(net: TorchNet, examples: Sequence[Example]) -> list[GraspMaps]:
+def predict(net: GraspNetwork, examples: Sequence[Example]) -> list[GraspMaps]:
     """Maps at a third of the side, float32."""
     net.eval()
     found = []
     with torch.inference_mode():
         for e in examples:
-            out = net(torch.from_numpy(e.low)[None, None].contiguous(memory_format=torch.channels_last))
-            q, cos2, sin2 = (out[head][0, 0].numpy() for head in HEADS)
-            found.append(GraspMaps(q, cos2, sin2, POOL))
+            out = net.heads(torch.from_numpy(e.low)[None, None].contiguous(memory_format=torch.channels_last))
+            found.append(grasp_maps(out[0].numpy()))
     return found
 
 

@@ -20,13 +20,12 @@ from autonomy.grasp.network import MAX_RELIEF, PAPER, POOL, RELIEF_SCALE
 from autonomy.grasp.quality import Jaws, jaws_of, rests_upon
 from autonomy.grasp.sampling_planner import CRANE_SIGMA_M, CRANE_SIGMA_RAD
 from autonomy.grasp.virtual_scene import CAMERA_HEIGHT_M, D435, SIDE_PX, operational_area, shortened_logs
-from autonomy.networks.torch_net import TorchNet
 from autonomy.perception.log_list import LogObservation
 from sim.camera.scene import LogPose
-from training.common.model_card import Card, write
+from training.common.weight_file import Card, write
 from training.grasp import network_training
 from training.grasp.label_kernel import draw, facts_of, label
-from training.grasp.network_training import LEARNING_RATE
+from training.grasp.network_training import LEARNING_RATE, GraspNetwork
 from training.pictures.piles import CHUNK, HELD_OUT, piles, profile_of
 
 # -- Training frames for the grasp network with physical labels: settled piles, the virtual camera, the label rule.
@@ -194,7 +193,7 @@ def examples_of(found: list[GraspFrame]) -> list[network_training.Example]:
     return out
 
 
-def quality_share(net: TorchNet, found: list[GraspFrame]) -> float:
+def quality_share(net: GraspNetwork, found: list[GraspFrame]) -> float:
     """Mean ratio of the label's quality at the network's best pixel to the best quality in the frame."""
     maps = network_training.predict(net, examples_of(found))
     shares = []
@@ -232,4 +231,4 @@ def produce(
         "anything but the virtual depth picture of logs as cylinders on level ground",
         f"timberhand train grasp --labels physical --seed {seed} --epochs {epochs} --out {out.name}",
     )
-    return out, write(out, PAPER, net.arrays(), card, {"frames": str(count)})
+    return out, write(out, net, PAPER, card, {"frames": str(count)})

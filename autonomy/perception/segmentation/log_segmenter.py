@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.networks.openvino_net import OpenVinoNet
-from autonomy.networks.weights import SHIPPED, load
+from autonomy.networks import SHIPPED, OpenVinoNet, load
 from autonomy.perception.camera.frame import RgbdFrame, check_frame, content_window
 from autonomy.perception.segmentation.instances import Instance, decode_instances, shifted_instance
 from autonomy.perception.segmentation.network import (
@@ -27,8 +26,8 @@ from autonomy.perception.segmentation.network import (
     OFFSET_V,
     SIN2,
     STRIDE,
+    interface_of,
     network_input,
-    unet,
 )
 from autonomy.perception.segmentation.resize import bilinear, doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import SegmentScorers, shipped_scorers
@@ -80,8 +79,8 @@ class LogSegmenter:
     ) -> None:
         self._use_window = use_window
         self.variant, self.size_px, self._precision = variant, size_px, precision
-        self._network = unet(variant)
-        self._arrays, self.facts = load(weights or SHIPPED / f"logs_{variant}.safetensors", self._network)
+        self._weights = load(weights or SHIPPED / f"logs_{variant}.onnx", interface_of(variant))
+        self.facts = self._weights.facts
         self._scorers = scorers or shipped_scorers()
         self._nets: dict[tuple[int, int], OpenVinoNet] = {}
 
@@ -183,7 +182,7 @@ class LogSegmenter:
         padded = np.zeros((1, len(image), high, wide), np.float32)
         padded[0, :, :h, :w] = image
         if (high, wide) not in self._nets:
-            self._nets[high, wide] = OpenVinoNet(self._network, self._arrays, padded.shape, self._precision)
+            self._nets[high, wide] = OpenVinoNet(self._weights, padded.shape, self._precision)
         maps = self._nets[high, wide](padded)["maps"][0]
         return np.asarray(maps[:, : -(-h // STRIDE), : -(-w // STRIDE)])
 

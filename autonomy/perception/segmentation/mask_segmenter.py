@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 from scipy import ndimage
 
-from autonomy.networks.openvino_net import OpenVinoNet
-from autonomy.networks.weights import SHIPPED, load
+from autonomy.networks import SHIPPED, OpenVinoNet, load
 from autonomy.perception.camera.frame import RgbdFrame, check_frame, content_window
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.instances import Instance, instance_at, shifted_instance
@@ -24,10 +23,10 @@ from autonomy.perception.segmentation.log_segmenter import View, crop, window_ar
 from autonomy.perception.segmentation.mask_network import (
     FEATURES,
     KERNEL_STRIDE,
+    MASKS,
     MULTIPLE,
     PLACE_PX,
     mask_input,
-    mask_network,
 )
 from autonomy.perception.segmentation.network import COS2, ENDS, MAPS, MASK, SIN2, STRIDE
 from autonomy.perception.segmentation.resize import doubled, shrunk
@@ -205,8 +204,8 @@ class MaskSegmenter:
         use_window: bool = True,
     ) -> None:
         self.mode, self.size_px, self._precision, self._use_window = mode, size_px, precision, use_window
-        self._network = mask_network()
-        self._arrays, self.facts = load(weights or SHIPPED / "logs.safetensors", self._network)
+        self._weights = load(weights or SHIPPED / "logs.onnx", MASKS)
+        self.facts = self._weights.facts
         self._nets: dict[tuple[int, int], OpenVinoNet] = {}
 
     def segment(self, frame: RgbdFrame) -> tuple[Instance, ...]:
@@ -254,7 +253,7 @@ class MaskSegmenter:
         padded = np.zeros((1, len(image), high, wide), np.float32)
         padded[0, :, :h, :w] = image
         if (high, wide) not in self._nets:
-            self._nets[high, wide] = OpenVinoNet(self._network, self._arrays, padded.shape, self._precision)
+            self._nets[high, wide] = OpenVinoNet(self._weights, padded.shape, self._precision)
         answer = self._nets[high, wide](padded)
         return answer["maps"][0][:, : -(-h // STRIDE), : -(-w // STRIDE)], answer["kernels"][0]
 

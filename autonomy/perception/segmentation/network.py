@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
+from autonomy.networks import Interface
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
@@ -30,7 +30,7 @@ MIN_KNOWN_SHARE: Final = 0.1  # of pixels with depth, for the statistics of colo
 HEIGHT_RANGE_M: Final = (-0.5, 1.5)
 
 
-def unet(variant: str) -> Network:
+def interface_of(variant: str) -> Interface:
     """The network of a variant in CHANNELS; its only output ``maps`` has a channel for each of MAPS.
 
     Raises:
@@ -40,45 +40,7 @@ def unet(variant: str) -> Network:
         raise InputRefused(
             "network.unknown-variant", f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}"
         )
-    layers: list[Layer] = []
-
-    def conv(name: str, out: int, kernel: int = 3, stride: int = 1, dilation: int = 1, source: str = "") -> str:
-        layers.append(Conv(name, out, kernel, stride, dilation, bias=False, source=source))
-        layers.extend((BatchNorm(f"{name}_norm"), Relu(f"{name}_relu")))
-        return f"{name}_relu"
-
-    def residual(name: str, out: int, dilation: int = 1) -> None:
-        """A residual convolution."""
-        before = layers[-1].name
-        layers.append(Conv(name, out, 3, 1, dilation, bias=False))
-        layers.extend((BatchNorm(f"{name}_norm"), Add(f"{name}_sum", (f"{name}_norm", before))))
-
-    def up(name: str, out: int) -> str:
-        layers.append(Conv(name, out, 1))
-        layers.append(Resize(f"{name}_up", 2))
-        return f"{name}_up"
-
-    conv("in2", 16, stride=2)
-    at2 = conv("at2", 16)
-    conv("in4", 32, stride=2)
-    at4 = conv("at4", 32)
-    conv("in8", 48, stride=2)
-    at8 = conv("at8", 48)
-    conv("in16", 96, stride=2)
-    conv("at16", 96)
-    residual("more16", 96, dilation=2)
-    # A log may be longer than the picture is wide: its middle depends on distant pixels.
-    conv("wide16", 96, dilation=4)
-    conv("wider16", 96, dilation=8)
-    layers.append(Add("sum8", (up("to8", 48), at8)))
-    conv("out8", 48)
-    residual("more8", 48)
-    layers.append(Add("sum4", (up("to4", 32), at4)))
-    conv("out4", 32)
-    layers.append(Add("sum2", (up("to2", 16), at2)))
-    conv("out2", 24)
-    layers.append(Conv("maps", len(MAPS), 1))
-    return Network(f"logs_{variant}", CHANNELS[variant], tuple(layers), ("maps",))
+    return Interface(f"logs_{variant}", CHANNELS[variant], {"maps": len(MAPS)})
 
 
 def network_input(

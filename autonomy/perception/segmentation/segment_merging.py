@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.networks.graph import Conv, Network, Relu
-from autonomy.networks.weights import SHIPPED, load
+from autonomy.networks import SHIPPED, Interface, load
 from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES, SegmentTable, may_merge, pair_features
 from autonomy.perception.segmentation.segments import (
     SEGMENT_FEATURES,
@@ -33,13 +32,9 @@ HIDDEN_UNITS: Final = 24
 MIN_MERGE_PROBABILITY: Final = 0.5
 
 
-def scoring_network(name: str, inputs: int) -> Network:
-    """A network with ``inputs`` features in and the logit of a probability out, both as channels of a picture."""
-    return Network(name, inputs, (Conv("first", HIDDEN_UNITS, 1), Relu("bent"), Conv("logit", 1, 1)), ("logit",))
-
-
-MERGE_NETWORK: Final = scoring_network("segment_merging", len(PAIR_FEATURES))
-QUALITY_NETWORK: Final = scoring_network("segment_quality", len(SEGMENT_FEATURES))
+MERGE_NETWORK: Final = Interface("segment_merging", len(PAIR_FEATURES), {"logit": 1})
+QUALITY_NETWORK: Final = Interface("segment_quality", len(SEGMENT_FEATURES), {"logit": 1})
+"""Features in and the logit of a probability out, both as channels of a picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +48,7 @@ class Scorer:
 
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray]) -> Scorer:
-        """From the arrays of a ``scoring_network``."""
+        """From the arrays of a scoring network."""
         return cls(
             arrays["first.weight"][:, :, 0, 0],
             arrays["first.bias"],
@@ -75,13 +70,13 @@ class SegmentScorers:
 
 
 def load_scorers(folder: Path = SHIPPED) -> SegmentScorers:
-    """From ``segment_merging.safetensors`` and ``segment_quality.safetensors`` of a folder.
+    """From ``segment_merging.onnx`` and ``segment_quality.onnx`` of a folder.
 
     Raises:
         InputRefused: the files are missing, damaged or of other networks.
     """
     networks = (MERGE_NETWORK, QUALITY_NETWORK)
-    merge, quality = (Scorer.of(load(folder / f"{network.name}.safetensors", network)[0]) for network in networks)
+    merge, quality = (Scorer.of(load(folder / f"{network.name}.onnx", network).arrays()) for network in networks)
     return SegmentScorers(merge, quality)
 
 

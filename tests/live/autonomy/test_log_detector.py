@@ -16,7 +16,7 @@ def test_the_process_refuses_a_camera_that_the_machine_does_not_have() -> None:
 
 
 def test_the_process_refuses_damaged_weights(tmp_path: Path) -> None:
-    bad = tmp_path / "bad.safetensors"
+    bad = tmp_path / "bad.onnx"
     bad.write_bytes(b"nothing")
     done = run("--camera", CAMERA, "--frames", "127.0.0.1:1", "--weights", bad)
     assert done.returncode == 3

@@ -1,4 +1,4 @@
-"""Network descriptions: torch and OpenVINO agree on every layer, and an invalid weight file is refused."""
+"""What OpenVINO must not do to a process: open a connection, or take its signals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def test_openvino_opens_no_connection() -> None:
         "import socket, sys\n"
         "def never(*a, **k): raise SystemExit('a socket was opened')\n"
         "socket.socket.connect = socket.create_connection = socket.getaddrinfo = never\n"
-        "from autonomy.networks.openvino_net import _core\n"
+        "from autonomy.networks import _core\n"
         "_core()\n"
         "from openvino.tools.ovc import telemetry_utils\n"
         "print(telemetry_utils.tm.__name__, 'torch' in sys.modules)\n"
@@ -24,10 +24,10 @@ def test_signals_arrive_after_two_networks_are_gone() -> None:
     """A process that loads one network after another must still end properly on Ctrl-C."""
     program = (
         "import signal\n"
-        "from autonomy.networks.graph import Network, Resize\n"
-        "from autonomy.networks.openvino_net import OpenVinoNet\n"
-        "up = Network('up', 1, (Resize('y', 2),), ('y',))\n"
-        "nets = [OpenVinoNet(up, {}, (1, 1, 1, n)) for n in (2, 3)]\n"
+        "from autonomy.networks import SHIPPED, OpenVinoNet, load\n"
+        "from autonomy.perception.segmentation.segment_merging import QUALITY_NETWORK as QUALITY\n"
+        "weights = load(SHIPPED / 'segment_quality.onnx', QUALITY)\n"
+        "nets = [OpenVinoNet(weights, (1, QUALITY.channels, 1, n)) for n in (2, 3)]\n"
         "while nets: nets.pop(0)\n"
         "received = []\n"
         "signal.signal(signal.SIGINT, lambda number, _: received.append(number))\n"

@@ -71,10 +71,10 @@ def test_words_and_layout_are_no_change_and_every_number_is(checkout: Checkout) 
 
 
 def test_new_moved_and_deleted_sources_and_weights_count(checkout: Checkout) -> None:
-    checkout.write("plant/weights.safetensors", "1")
+    checkout.write("plant/weights.onnx", "1")
     (checkout.root / "law.py").rename(checkout.root / "plant" / "law.py")
     checkout.save()
-    assert checkout.judge().changed == ("law.py", "plant/law.py", "plant/weights.safetensors")
+    assert checkout.judge().changed == ("law.py", "plant/law.py", "plant/weights.onnx")
 
 
 def test_a_commit_that_is_not_in_the_history_or_was_never_one_is_told(checkout: Checkout) -> None:

@@ -99,7 +99,7 @@ def is_whole(trees: Trees) -> str:
     name = trees.state().current
     assert name in trees.whole(), f"{name} is in use and not whole"
     tree = trees.tree(name) / "site"
-    for file in ("machine/palms.toml", "can_dbc/crane.dbc", "autonomy/weights/logs.safetensors"):
+    for file in ("machine/palms.toml", "can_dbc/crane.dbc", "autonomy/weights/logs.onnx"):
         assert version(name) in (tree / file).read_text()
     return version(name)
 

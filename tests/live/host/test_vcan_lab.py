@@ -80,7 +80,7 @@ def test_the_shim_is_harmless_where_it_is_not_needed(lab: Run, tmp_path: Path) -
     if require_lab() != "uml" or not any(Path(folder, "cc").exists() for folder in os.get_exec_path()):
         pytest.skip("needs user-mode Linux and a C compiler")
     wrapper = (
-        "import sys; from host.vcan_lab import shim; shim.needed = lambda text: True; "
+        "import sys; from host.vcan_lab import uml; uml.needed = lambda text: True; "
         "import typer; from host.vcan_lab.__main__ import CONTEXT, vcan; "
         "app = typer.Typer(); app.command(context_settings=CONTEXT)(vcan); app()"
     )

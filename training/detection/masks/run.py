@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from autonomy.networks.graph import fingerprint
-from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.segmentation.mask_network import FEATURES, KERNEL_STRIDE, PLACE_PX, mask_network
+from autonomy.perception.segmentation.mask_network import FEATURES, KERNEL_STRIDE, PLACE_PX
 from autonomy.perception.segmentation.network import MAPS, STRIDE
 from training.common.loop import channels_last, deferred_interrupt
 from training.detection.masks.bank import Bank, windows
 from training.detection.masks.disturbances import Chance, inputs
 from training.detection.masks.goals import Goals, goals
+from training.detection.networks import MaskNetwork
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,22 +40,20 @@ class Run:
     """Every so manieth batch has fewer windows of half again the side."""
 
 
-def start_net(trunk: Mapping[str, np.ndarray] | None, seed: int) -> TorchNet:
+def start_net(trunk: Mapping[str, np.ndarray] | None, seed: int) -> MaskNetwork:
     """The network, its trunk from ``pretrained`` arrays."""
     torch.manual_seed(seed)
-    net = TorchNet(mask_network())
+    net = MaskNetwork()
     with torch.no_grad():
         for module in net.modules():
             if isinstance(module, torch.nn.Conv2d):
                 torch.nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
                 if module.bias is not None:
                     torch.nn.init.zeros_(module.bias)
-        for name in ("maps", "kernels"):
-            torch.nn.init.normal_(_conv(net, name).weight, std=0.01)
-        for name in ("maps", "kernels"):
-            bias = _conv(net, name).bias
-            if bias is not None:
-                bias[0] = -3.0
+        for last in (net.maps, net.kernels):
+            torch.nn.init.normal_(last.weight, std=0.01)
+            if last.bias is not None:
+                last.bias[0] = -3.0
         if trunk is not None:
             state = net.state_dict()
             for name, array in trunk.items():
@@ -94,7 +91,7 @@ def train(
     optimiser = torch.optim.AdamW(groups, run.learning_rate, weight_decay=run.weight_decay, fused=fast)
     mean = {k: v.detach().float().clone() for k, v in net.state_dict().items()}
     sums: dict[str, Any] = {}
-    identity = f"{run} {len(bank)} {fingerprint(mask_network())} {trunk is not None}"
+    identity = f"{run} {len(bank)} {trunk is not None}"
     step, before = _continued(checkpoint, identity, net, optimiser, mean, generator)
     began, told, kept = time.monotonic() - before, before, before
 
@@ -160,10 +157,10 @@ def train(
                 )
                 sums, told = {}, now
             if now - kept > 60.0:
-                keep(_arrays(net, mean), step)
+                keep(_arrays(mean), step)
                 note()
                 kept = now
-    done = _arrays(net, mean)
+    done = _arrays(mean)
     keep(done, step)
     note()
     return done
@@ -172,7 +169,7 @@ def train(
 def _continued(
     checkpoint: Path | None,
     name: str,
-    net: TorchNet,
+    net: MaskNetwork,
     optimiser: torch.optim.Optimizer,
     mean: dict[str, torch.Tensor],
     generator: torch.Generator,
@@ -193,14 +190,8 @@ def _continued(
     return int(state["step"]), float(state["s"])
 
 
-def _arrays(net: TorchNet, mean: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:
-    return {name: mean[name].cpu().numpy().copy() for name in net.arrays()}
-
-
-def _conv(net: TorchNet, name: str) -> torch.nn.Conv2d:
-    found = net.get_submodule(name)
-    assert isinstance(found, torch.nn.Conv2d)
-    return found
+def _arrays(mean: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:
+    return {name: values.cpu().numpy().copy() for name, values in mean.items() if not name.endswith("batches_tracked")}
 
 
 # -- The loss of the mask network: of its maps, of where kernels are, and of the masks that kernels make.
@@ -214,10 +205,10 @@ KERNELS_OF_A_PICTURE: Final = 20
 
 
 def loss(
-    out: dict[str, torch.Tensor], g: Goals, generator: torch.Generator
+    out: tuple[torch.Tensor, torch.Tensor], g: Goals, generator: torch.Generator
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The loss of a batch, and its parts for the record."""
-    maps, kernels = out["maps"].float(), out["kernels"].float()
+    """The loss of a batch, and its parts for the record; ``out`` are maps and kernels."""
+    maps, kernels = (values.float() for values in out)
     parts = {
         "maps": maps_loss(maps, g),
         "heat": heat_loss(kernels[:, 0], g),
