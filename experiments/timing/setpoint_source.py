@@ -26,7 +26,7 @@ from can_dbc.messages.envelope import DatagramRefused, read_key
 from can_dbc.messages.udp_address import address_argument
 from hil.harness.operator import Operator
 from hil.harness.processes import announce_ready
-from machine.joints import JOINTS
+from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_check, profile_hash
 from machine.profile import Profile
 from machine.status.explanation import describe
@@ -47,11 +47,17 @@ SPEED_SHARE: Final = 0.4
 
 
 class Swing:
-    """The motion of one joint: ``start + reach * (1 - cos(w t)) / 2``, at rest at t = 0, towards the farther end."""
+    """The motion of one joint: ``start + reach * (1 - cos(w t)) / 2``, at rest at t = 0, towards the farther end.
 
-    def __init__(self, start: float, lower: float, upper: float, speed: float, acceleration: float) -> None:
+    ``rises``: towards the upper end wherever the range allows it, as a boom that sinks takes the grapple to the ground.
+    """
+
+    def __init__(
+        self, start: float, lower: float, upper: float, speed: float, acceleration: float, rises: bool = False
+    ) -> None:
         self.start = start
-        self.reach = 2 * SWING_SHARE * (upper - lower) * (1.0 if upper - start > start - lower else -1.0)
+        reach = 2 * SWING_SHARE * (upper - lower)
+        self.reach = reach if upper - start > (reach if rises else start - lower) else -reach
         half = abs(self.reach) / 2
         self.w = SPEED_SHARE * min(speed / half, math.sqrt(acceleration / half))
 
@@ -102,8 +108,8 @@ class SetpointSource:
         """A joint without an encoder has no position; it starts at 0, as the controller's own reference does."""
         starts = [0.0 if math.isnan(q) else q for q in reference]
         return [
-            Swing(q, s.lower, s.upper, s.speed_limit, s.acceleration_limit)
-            for q, s in zip(starts, self._specs, strict=True)
+            Swing(q, s.lower, s.upper, s.speed_limit, s.acceleration_limit, rises=j is Joint.LIFT)
+            for j, q, s in zip(JOINTS, starts, self._specs, strict=True)
         ]
 
     def _knot(self, after_ms: int, t_s: float) -> Knot:

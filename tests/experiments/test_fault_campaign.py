@@ -236,7 +236,7 @@ def test_burst_and_overload_of_a_machine_with_physics_are_answered_in_time() -> 
 def test_a_fault_at_every_edge_is_answered_and_named() -> None:
     for scene, text, reaction, reason in (
         ("crane palms_471", "estop-pressed", "R0", "ESTOP_PRESSED"),
-        ("crane palms_471", "bus-stub/crane0", "R1", "BUS_PASSIVE"),
+        ("crane palms_471", "bus-stub/crane0", "R0", "BUS_PASSIVE"),  # all inputs are lost at once
         ("crane palms_471", "process-off/planner", "H", "LEASE_LOST"),
         ("crane palms_471", "process-off/guard", "R0", "GUARD_LOST"),
         ("crane palms_471", "process-stuck/controller+30ms", "R0", "COMPUTER_STALLED"),  # no SYNC meanwhile

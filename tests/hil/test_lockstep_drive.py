@@ -168,8 +168,10 @@ def test_the_machine_stops_when_the_planner_dies_on_the_route() -> None:
         assert reports[-1].reason == Reason.LEASE_LOST and plant.world.carrier.speed_m_s > 0.5
         begin = plant.world.carrier.front_axle()
         run(system, 2.0)
-        assert abs(plant.world.carrier.speed_m_s) < 0.01
-        assert math.dist(begin, plant.world.carrier.front_axle()) < 0.45
+        stopped = plant.world.carrier.front_axle()
+        assert math.dist(begin, stopped) < 0.45
+        run(system, 1.0)  # it rocks on its tyres, and stays where it is
+        assert math.dist(stopped, plant.world.carrier.front_axle()) < 0.005
         assert planner.vehicle is not None and planner.vehicle.driving == Driving.STANDING
         assert Driving.BRAKING in {r.driving for r in planner.heard}
     finally:

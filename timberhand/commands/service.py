@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,7 +23,6 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the steps without
     "timberhand service install --dry-run"
 )
 def install(
-    context: typer.Context,
     wheel: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Wheel to install (default: built from this checkout).")
     ] = None,
@@ -55,13 +54,23 @@ def install(
     around itself. From the wheel alone: sudo python3.11 timberhand-
     VERSION.whl/deploy
     """
-    _script(context)
+    options = {
+        "--wheel": wheel,
+        "--bundle": bundle,
+        "--public-key": public_key,
+        "--find-links": find_links,
+        "--from-environment": from_environment,
+        "--python": python,
+        "--cpu": cpu,
+        "--root": root,
+    }
+    _script([word for name, value in options.items() if value is not None for word in (name, str(value))], dry_run)
 
 
 @app.command()
-def uninstall(context: typer.Context, root: Root = None, dry_run: DryRun = False) -> None:
+def uninstall(root: Root = None, dry_run: DryRun = False) -> None:
     """Remove the installation; recordings, users and changed settings remain."""
-    _script(context, "--uninstall")
+    _script(["--uninstall", *(["--root", str(root)] if root else [])], dry_run)
 
 
 @app.command()
@@ -189,11 +198,7 @@ def _updater() -> Updater:
     )
 
 
-def _script(context: typer.Context, *words: str) -> None:
-    """Run the installer with the options that this command was given; it knows them by the same names."""
+def _script(options: list[str], dry_run: bool) -> Any:
     from deploy.__main__ import install as run
 
-    for name, value in context.params.items():
-        if value not in (None, False):
-            words = (*words, f"--{name.replace('_', '-')}", *([] if value is True else [str(value)]))
-    raise typer.Exit(run([*words]))
+    raise typer.Exit(run([*options, *(["--dry-run"] if dry_run else [])]))
