@@ -218,9 +218,10 @@ def evaluate_clearance(
     room = room * left[:, None]
     low, high = np.min(np.minimum(body.a, body.b), axis=(0, 1)), np.max(np.maximum(body.a, body.b), axis=(0, 1))
     things = scene.arrays.near(low - BROAD_PHASE_M, high + BROAD_PHASE_M)
-    # All samples with every lean, and both ends as they stand, at once.
+    # All samples with every lean and with none (a grapple that swings less than predicted must not need its swing to
+    # come past a stake), and both ends as they stand, at once.
     leans = [] if step_s is None else [body.shifted(lean * depth, depth) for lean in _predicted_swing(pin, step_s)]
-    bodies = [*(leans or [body]), body.rows([0, -1])]
+    bodies = [*leans, body, body.rows([0, -1])]
     whole = replace(body, a=np.concatenate([b.a for b in bodies]), b=np.concatenate([b.b for b in bodies]))
     times = len(bodies) - 1
     near = np.concatenate([np.tile(room, (times, 1)), np.zeros((2, room.shape[1]))]) + MARGIN_M + CONTACT_ALLOWANCE_M
