@@ -19,7 +19,8 @@ from typing import Final
 from autonomy.crane_job.cycle import Cycle
 from autonomy.crane_job.grapple import GrappleSequence
 from autonomy.crane_job.inbox import Inbox
-from autonomy.crane_job.phases import PHASE_RULES, RESUME_PHASE, Phase, grapple_command, is_motion_done, motion_rate
+from autonomy.crane_job.phase_conditions import is_motion_done, motion_rate
+from autonomy.crane_job.phases import PHASE_RULES, RESUME_PHASE, Phase, grapple_command
 from autonomy.crane_job.rotator_estimate import (
     LoadView,
     RotatorEstimate,

@@ -8,7 +8,8 @@ import pytest
 
 from can_dbc.dbc.codec import load
 from hil.tick.compare import compare_cost, compare_random, kept_recordings
-from hil.tick.worker import RandomTicks, recorded
+from hil.tick.random_ticks import RandomTicks
+from hil.tick.worker import recorded
 from host.compiled.build import check_tools, compile_tick
 from host.exit_codes import CommandFailed
 

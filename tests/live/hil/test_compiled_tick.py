@@ -23,7 +23,8 @@ from controller.process.tick_recording import restore_inputs, transmitted
 from controller.step import Controller, step
 from controller.tick import Inputs
 from hil.tick.compare import kept_recordings
-from hil.tick.worker import RandomTicks, digest_of, recorded
+from hil.tick.random_ticks import RandomTicks
+from hil.tick.worker import digest_of, recorded
 from host.compiled.build import check_tools, compile_tick
 from host.exit_codes import CommandFailed
 from runtime.compiled import SWITCH

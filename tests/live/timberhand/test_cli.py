@@ -35,6 +35,14 @@ def test_matrix_products_use_one_thread_unless_the_environment_says_otherwise(gi
     assert done.stdout.splitlines()[-1] == f"threads {threads}"
 
 
+@pytest.mark.parametrize("module", ["timberhand.cli", "hil.harness.live", "controller.process.command"])
+def test_what_starts_first_loads_no_numerics(module: str) -> None:
+    heavy = ("numpy", "scipy", "matplotlib", "pybullet", "openvino", "torch")
+    code = f"import sys, {module}; print(*(set({heavy}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 @pytest.mark.parametrize("words", [["demo"], ["mission", "run"], ["plan", "check"], ["experiment"]])
 def test_help_at_80_columns_has_each_option_on_a_line_and_its_words_below(words: list[str]) -> None:
     environment = {**os.environ, "COLUMNS": "80", "TERMINAL_WIDTH": "80"}
