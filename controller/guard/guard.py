@@ -229,7 +229,8 @@ class Guard:
             return Verdict.PERSON, DRIVE_AXIS
         if not self._status.old(now_ns) and self._status.raw("Mode") in _OPERATING:
             self._operated_ns = now_ns
-        self._armed = self._armed and now_ns - self._operated_ns <= AGREE_NS
+        if self._armed and now_ns - self._operated_ns > AGREE_NS:  # it stopped by itself, and the carrier brakes
+            self._armed, self._stopped_ns = False, self._operated_ns
         carried = self._carrier is not None and (self._carrier.driven or self._carrier.raised)
         if carried and self.enabled and not self._armed and now_ns - self._stopped_ns > PERSON_CARRIER_NS:
             return Verdict.NOT_ARMED, DRIVE_AXIS

@@ -171,6 +171,7 @@ def test_the_machine_stops_when_the_planner_dies_on_the_route() -> None:
         stopped = plant.world.carrier.front_axle()
         assert math.dist(begin, stopped) < 0.45
         run(system, 1.0)  # it rocks on its tyres, and stays where it is
+        assert not system.guard.latched, "braking is no motion that nobody asked for"
         assert math.dist(stopped, plant.world.carrier.front_axle()) < 0.005
         assert planner.vehicle is not None and planner.vehicle.driving == Driving.STANDING
         assert Driving.BRAKING in {r.driving for r in planner.heard}
