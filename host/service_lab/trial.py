@@ -114,7 +114,7 @@ def run_trial(ending: Ending, pilot: Pilot) -> dict[str, Any]:
         stop.wait()
         # The signal came at most a tick before the last frames; systemd took longer than that to send it.
         began_ns = pilot.disarmed_ns - TICK_NS
-        opening_pct = max((v.opening_pct for v in pilot.valves if v.stamp_ns <= began_ns), default=0.0)
+        opening_pct = max((v.opening_pct for v in pilot.valves if v.stamp_ns <= began_ns), default=opening_pct)
     figures: dict[str, Any] = {
         "way": ending.name,
         "moving_until_then": not stop or pilot.mode_when_disarmed is Mode.ACTIVE,

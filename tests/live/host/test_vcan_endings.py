@@ -112,7 +112,12 @@ def test_a_lab_ends_when_its_caller_is_killed(tmp_path: Path) -> None:
     require_lab()
     out = tmp_path / "out"
     lab = shlex.join([*LAB, "--", "sh", "-c", "echo up; while :; do :; done"])
-    caller = subprocess.Popen(["sh", "-c", f"{lab} >{out}; true"], cwd=ROOT, env=environment())
+    caller = subprocess.Popen(
+        ["sh", "-c", f"{lab} >{out}; true"],
+        cwd=ROOT,
+        env=environment(),
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # a lab goes on under nohup
+    )
     wait_until(lambda: out.exists() and out.read_text() == "up\n", "the lab does not start")
     below = descendants(caller.pid)
     caller.kill()
