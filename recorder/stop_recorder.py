@@ -1,8 +1,8 @@
 """The stop recorder: the controller's ticks of the last 10 s in memory, and a file for every stop.
 
-A file has the 10 s before the stop, which are written at once, and the 5 s after it.  A tick
-record holds all inputs and outputs of its tick, so these files show why the machine stopped without the rest of the
-recording: `timberhand why` reads them.
+A file has the 10 s before the stop, which are written at once, and the 5 s after it.  A tick record holds all inputs
+and outputs of its tick, so these files show why the machine stopped without the rest of the recording: `timberhand why`
+reads them.
 """
 
 from __future__ import annotations

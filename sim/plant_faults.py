@@ -24,7 +24,6 @@ from runtime.errors import ConfigError
 from sim import faults
 from sim.emulation import EmulatedMachine
 from sim.errors import PlantError
-from sim.faults import EncoderFault
 from sim.nodes.gnss import Fix, GnssNode
 from sim.plant import Plant
 
@@ -77,7 +76,7 @@ def _encoder(**error: float | bool) -> Callable[[EmulatedMachine, PlantFault, in
             )
         sized = {k: fault.size if isinstance(v, float) and math.isnan(v) else v for k, v in error.items()}
         pivot = encoder.measure(now_ns) if "scale" in error else 0.0
-        encoder.fault = EncoderFault(since_ns=now_ns, pivot=pivot, **sized)  # type: ignore[arg-type]
+        encoder.fault = faults.EncoderFault(since_ns=now_ns, pivot=pivot, **sized)  # type: ignore[arg-type]
 
         def end() -> None:
             encoder.fault = None

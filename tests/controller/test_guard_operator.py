@@ -14,6 +14,7 @@ from can_dbc.messages.datagrams import encode
 from controller.guard.layout import GuardConfigError
 from controller.guard.operator import AGE_NS, OperatorActions, action_of
 from controller.guard.verdicts import DRIVE_AXIS, NO_AXIS, Verdict
+from machine.status.modes import Mode
 from tests.codes import coded
 from tests.controller.bench import MS, Bench, T, count_until
 from tests.controller.guard_traffic import DRIVING, MOVING, Traffic
@@ -88,6 +89,16 @@ def test_a_carrier_has_the_time_of_its_brake_after_a_stop() -> None:
     traffic.drive = dict(DRIVING)
     traffic.tick(40)
     assert traffic.press(STOP).tick(439) is Verdict.GOOD
+    count_until(traffic.tick, lambda: not traffic.guard.enabled, 3)
+    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.NOT_ARMED, DRIVE_AXIS)
+
+
+def test_a_carrier_has_that_time_after_its_controller_s_own_stop_too() -> None:
+    traffic = Traffic("aoro_fc8").good()
+    traffic.drive = dict(DRIVING)
+    traffic.tick(40)
+    traffic.controller = {"Mode": Mode.STOP}
+    assert traffic.tick(439) is Verdict.GOOD
     count_until(traffic.tick, lambda: not traffic.guard.enabled, 3)
     assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.NOT_ARMED, DRIVE_AXIS)
 
