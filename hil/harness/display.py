@@ -1,7 +1,7 @@
 """The terminal view of a run: phase, joints, bus, timing and every event in words.
 
-On a terminal a small table is redrawn in place; elsewhere (a pipe, CI) one line per second is printed.  Input: state
-reports and events.
+On a terminal a small table is redrawn in place; elsewhere (a pipe, CI) one row of a table is printed per second, 80
+columns wide.  Input: state reports and events.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from machine.status.modes import Mode
 _LINE_EVERY_NS = 1_000_000_000
 _DRAW_EVERY_NS = 100_000_000
 _ROOM_MIN = 20
+_ROWS_PER_HEADING = 40
+_COLUMNS = (*(j.name.lower() for j in JOINTS), "opening")
+_HEADING = f"{'time':>8}  {'mode':<8}{'phase':<8}" + "".join(f" {name:>8}" for name in _COLUMNS)
 
 
 def say(console: Console, lead: str, text: str, style: str = "") -> None:
@@ -47,10 +50,11 @@ class Display:
         self._next_ns = 0
         self._tick_ns = 0
         self._late_ns = 0
+        self._rows = 0
         self._live: Live | None = None
 
     def __enter__(self) -> Display:
-        self._console.print(f"[bold]{self._title}[/bold]")
+        say(self._console, "", self._title, "bold")
         if self._console.is_terminal:
             self._live = Live(console=self._console, refresh_per_second=10, transient=True)
             self._live.start()
@@ -84,8 +88,10 @@ class Display:
             self._live.update(self._table(report))
         else:
             self._next_ns += _LINE_EVERY_NS
-            self._console.print(self._line(report), highlight=False, soft_wrap=True)
-            self._tick_ns = self._late_ns = 0
+            if self._rows % _ROWS_PER_HEADING == 0:
+                self._console.print(_HEADING, highlight=False, soft_wrap=True)
+            self._rows += 1
+            self._console.print(self._row(report), highlight=False, soft_wrap=True)
 
     def _elapsed_s(self) -> float:
         now = self._report.stamp_ns if self._report else 0
@@ -99,13 +105,10 @@ class Display:
             self._rate_hz = frames * 1e9 / (report.stamp_ns - self._rate_mark[0])
             self._rate_mark = (report.stamp_ns, report.frames_received)
 
-    def _line(self, report: StateReport) -> str:
-        joints = "  ".join(f"{j.name.lower()} {_value_text(j, report.position[j])}" for j in JOINTS)
-        return (
-            f"{self._elapsed_s():6.1f} s  {Mode(report.mode).name:<8}{self._phase:<9}{joints}  "
-            f"bus {self._rate_hz:4.0f} frames/s  tick {self._tick_ns / 1e6:4.2f} ms  "
-            f"late {self._late_ns / 1e6:4.2f} ms"
-        )
+    def _row(self, report: StateReport) -> str:
+        joints = "".join(f" {_value_text(j, report.position[j]):>8}" for j in JOINTS)
+        opening = _whole_text(report.opening_pct, "%")
+        return f"{self._elapsed_s():6.1f} s  {Mode(report.mode).name:<8}{self._phase:<8}{joints} {opening:>8}"
 
     def _table(self, report: StateReport) -> Table:
         mode = Mode(report.mode)
