@@ -95,6 +95,7 @@ class Facts:
     options: str
     swap: bool
     hugepages: str
+    groups_by_session: bool
     irqbalance: bool
     irqbalance_banned: frozenset[int]
     softirq_threads: dict[int, str]
@@ -159,6 +160,7 @@ def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts
         options=options,
         swap=len(_text(root / "proc/swaps").splitlines()) > 1,
         hugepages=_chosen(_text(root / "sys/kernel/mm/transparent_hugepage/enabled")),
+        groups_by_session=_text(root / "proc/sys/kernel/sched_autogroup_enabled") == "1",
         irqbalance="irqbalance" in daemons,
         irqbalance_banned=cpu_set(banned[1]) if banned else frozenset(),
         softirq_threads=softirq,

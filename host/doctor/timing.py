@@ -159,7 +159,7 @@ def _processor(f: Facts) -> Finding:
 
 
 def _kernel_settings(f: Facts) -> Iterator[Finding]:
-    """Idle states, delivery of frames, throttling, clock source, huge pages, timer slack."""
+    """Idle states, delivery of frames, throttling, clock source, huge pages, task groups, timer slack."""
     if f.idle:
         deepest = max((state for state in f.idle if not state.disabled), key=lambda s: s.latency_us, default=None)
         name, us = (deepest.name, deepest.latency_us) if deepest else ("", 0)
@@ -220,6 +220,15 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
             "no page of the loop moves while it runs",
             _tune(f),
             LASTING,
+        )
+    if f.groups_by_session:
+        yield row(
+            "task groups",
+            "",
+            ADVICE,
+            "the kernel groups ordinary processes by session, and `nice` counts only inside a session",
+            "work at low priority in another terminal leaves the planner and the cameras their time",
+            "sudo sysctl -w kernel.sched_autogroup_enabled=0",
         )
     if f.slack_ns is not None:
         yield fine("timer slack", f"{f.slack_ns / 1000:.0f} us for ordinary processes, none for FIFO processes")

@@ -210,6 +210,7 @@ CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
         "--dma-latency",
     ),
     ("delivery", {"proc__15__stat": GOOD["proc/15/stat"].replace(" 60 1 ", " 0 0 ")}, Severity.ADVICE, "", "chrt"),
+    ("task groups", {"proc__sys__kernel__sched_autogroup_enabled": "1"}, Severity.ADVICE, "session", "=0"),
     ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "-1"}, Severity.ADVICE, "", "950000"),
     ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "500000"}, Severity.CHANGE, "50%", "tune.sh"),
     (
