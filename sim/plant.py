@@ -6,7 +6,7 @@ clock and no socket; equal inputs and seed give equal bytes.  ``PlantError``: th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from machine.joints import JOINTS
@@ -49,6 +49,7 @@ class Plant(EmulatedMachine):
     """The whole machine: the nodes, and the physics in ``world``.  Public names give test harnesses the ground truth.
 
     ``scene`` is the name of an arrangement of ``logs`` logs, or the logs themselves; by default they lie at random.
+    ``home``: joint positions [rad, m] at the start that differ from the truth's.
     """
 
     def __init__(
@@ -60,9 +61,10 @@ class Plant(EmulatedMachine):
         *,
         scene: str | Sequence[LogSpec] | None = None,
         terrain: str = "flat",
+        home: Mapping[str, float] | None = None,
     ) -> None:
         facts = load_truth(truth, seed, profile.name)
-        self.world = World(profile, facts, seed, _scene(profile, facts, seed, logs, scene), terrain)
+        self.world = World(profile, facts, seed, _scene(profile, facts, seed, logs, scene), terrain, home)
         self._evaluator = Evaluator(self.world)
         self._floats = (False, False)
         # Commands arrive in the order of the nodes; the world has an order of its own.

@@ -129,11 +129,12 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
             for kind, sampled in (("nominal", False), ("individuals", True)):
                 hits = [succeeded(o) for _, o in trials if o["individual"] is sampled]
                 metrics |= rate(f"{kind}.success", sum(hits), len(hits)) if hits else {}
-            metrics["first_closing"] = _mean([float(succeeded(o) and o["closings"] == 1) for _, o in trials])
+            metrics["first_closing"] = _mean([float(at_first(o)) for _, o in trials])
             metrics["stopped"] = float(sum(o["stops"] > 0 for _, o in trials))
             for number in CONFIGURATIONS:
                 its = [o for _, o in trials if o["configuration"] == number]
                 metrics |= rate(f"config{number}.success", sum(succeeded(o) for o in its), len(its))
+                metrics[f"config{number}.first"] = _mean([float(at_first(o)) for o in its])
                 metrics[f"config{number}.optimal"] = _share(its, "optimal")
                 metrics[f"config{number}.logs"] = _mean([o["lifted"] for o in its])
     return metrics
@@ -142,6 +143,11 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
 def succeeded(outcome: Mapping[str, Any]) -> bool:
     """Whether at least one log was lifted and nobody had to arm again: a stop that needs a person is a failure."""
     return outcome["lifted"] > 0 and not outcome["stops"]
+
+
+def at_first(outcome: Mapping[str, Any]) -> bool:
+    """Whether the first closing of the jaws lifted at least one log, as the paper counts: one plan, one closing."""
+    return succeeded(outcome) and bool(outcome["closings"] == 1)
 
 
 def failed(trial: Trial) -> bool:

@@ -65,8 +65,8 @@ EVALUATED: Final = (
         "first_closing",
         "Lifted with the first closing of the grapple",
         "%",
-        "The other successful attempts closed again before the lift.",
-        least=0.97,
+        "One closing, one lift. The other successful attempts closed again. The limit is paper A's 59 of 60.",
+        least=0.9833,
     ),
     Metric("stopped", "Attempts with a stop that needed a person", "", "They count as failures, lifted or not."),
     Metric("nominal.success", "Success of the nominal machine", "%", "Share of its attempts."),
@@ -109,27 +109,29 @@ EVALUATED: Final = (
 )
 ABLATION: Final = tuple(m for poses in POSE_TITLES for planner in PLANNER_TITLES for m in _pair(poses, planner))
 PER_CONFIGURATION: Final = tuple(
-    Metric(f"config{n}.{key}", f"Configuration {n}: {title}", unit, "Share or mean of its attempts.")
+    Metric(f"config{n}.{key}", f"Configuration {n}: {title}", unit, "Share or mean of its attempts.", least=least)
     for n in range(1, 13)
-    for key, title, unit in (
-        ("success", "success", "%"),
-        ("optimal", "optimal", "%"),
-        ("logs", "logs per grasp", ""),
+    for key, title, unit, least in (
+        ("success", "success", "%", None),
+        ("first", "lifted with the first closing", "%", 0.93),
+        ("optimal", "optimal", "%", None),
+        ("logs", "logs per grasp", "", None),
     )
 )
 METRICS: Final = (*EVALUATED, *PER_CONFIGURATION, *ABLATION)
 SECTIONS: Final = (
     Section(
         "Twelve configurations",
-        "Logs of random size lie at a random place in a random direction in one of paper A's arrangements, rebuilt "
-        "from its text. One grasp is lifted and held for two seconds; the physics decides the outcome. The mount of "
-        "the camera and the scale of its depth are surveyed before the run. The camera sees the logs from the start "
-        "position of the crane. If a grasp is of logs among others, the planner looks again from above, at most twice, "
-        "and plans anew. The feedback of the grapple before the lift is used as well. If the jaws stall at the sides "
-        "of a heap, or wider than expected, they open and close again higher up, at most three times. If they have "
-        "closed on nothing, pinch a log that they should be under, or are closed without weight after rising by 0.2 m, "
-        "they open, look again and start anew, at most twice. All of this counts as one attempt; the share that needed "
-        "no second closing is reported as well.",
+        "Logs of random size lie in a random direction in one of paper A's arrangements, rebuilt from its text, at a "
+        "random place 3.5 to 6.5 m from the crane's column, at any angle of the slew that is clear of the bunk. The "
+        "crane starts turned to the place, at most 30 degrees aside. One grasp is lifted and held for two seconds; "
+        "the physics decides the outcome. The mount of the camera and the scale of its depth are surveyed before the "
+        "run. The camera sees the logs from the start position of the crane. If a grasp is of logs among others, the "
+        "planner looks again from above, at most twice, and plans anew. The feedback of the grapple before the lift "
+        "is used as well. If the jaws stall at the sides of a heap, or wider than expected, they open and close "
+        "again higher up, at most three times. If they have closed on nothing, pinch a log that they should be "
+        "under, or are closed without weight after rising by 0.2 m, they open, look again and start anew, at most "
+        "twice. All of this counts as one attempt; the share that needed no second closing is reported as well.",
         EVALUATED,
         (
             (

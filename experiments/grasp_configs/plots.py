@@ -34,7 +34,7 @@ COLOURS: Final = {"optimal": MOSS, "NI": TIMBER, "SE": OIL, "MA": STEEL, "failed
 def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
     """Draw the pile, the virtual depth with the grasp of the search, and the quality map with that of the network."""
     profile = profile_named(name)
-    plant = Plant(profile, seed, truth, scene=arranged(name, truth, SHOWN_CONFIGURATION, seed))
+    plant = Plant(profile, seed, truth, scene=arranged(name, truth, SHOWN_CONFIGURATION, seed)[0])
     try:
         logs = true_poses(plant)
         x, y, z = (float(v) for v in np.mean([log.center_m for log in logs], axis=0))

@@ -8,6 +8,7 @@ plant (poses ``true``).  The physics decides the outcome.
 from __future__ import annotations
 
 import math
+import random
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,14 +38,26 @@ from hil.harness.operator import Operator
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from recorder.recorder import Recorder
+from sim.errors import PlantError
 from sim.plant import Plant
 from sim.scenes.arrangements import configuration
 from sim.wood.log_shape import LogSpec
+from sim.wood.stacking import footprint_gap
+from sim.world import home_pose
 
 LIMIT_NS: Final = 60_000_000_000
 HELD_NS: Final = 2_000_000_000
 SEEDS_PER_ATTEMPT: Final = 16
 SEGMENTATION: Final = "logs_rgbd.onnx"
+REACH_M: Final = (3.5, 6.5)
+"""Distances of the places from the crane's column."""
+ASIDE_RAD: Final = math.radians(30.0)
+"""A place lies at most this far aside of the direction in which the crane starts; its camera sees 45 degrees."""
+END_RAD: Final = math.radians(5.0)
+"""Places and starts keep this distance from the slew's end stops."""
+BUNK_GAP_M: Final = 1.0
+"""Least distance of the logs from the bunk, in which open jaws come down."""
+PLACES: Final = 100
 NETWORKS: Final = {"cnn": "cnn", "cnn_physical": "cnn-physical"}
 """Names of the networks' planners in the results, and in `autonomy.grasp.planners`."""
 
@@ -155,8 +168,8 @@ def _attempt(job: Job, profile: Profile, name: str, recorder: Recorder | None) -
     o = job.options
     number, field = o["configuration"], o.get("scene", job.seed)
     digest = profile_hash(profile)
-    scene = arranged(o["profile"], o["truth"], number, field)
-    plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=scene)
+    scene, slew_rad = arranged(o["profile"], o["truth"], number, field)
+    plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=scene, home={"slew": slew_rad})
     try:
         before = plant.logs()
         timed = TimedPlanner(planner_named(o["planner"]))
@@ -222,7 +235,27 @@ def _grip(plant: Plant) -> Grip:
     return Grip(x, y, math.atan2(m[3], m[0]))
 
 
-def arranged(profile: str, truth: str, number: int, seed: int) -> tuple[LogSpec, ...]:
-    """The logs of an attempt: random place, direction and sizes."""
-    wood = wood_of(profile, truth)
-    return configuration(number, profile_named(profile), wood, seed * SEEDS_PER_ATTEMPT + number)
+def arranged(profile: str, truth: str, number: int, seed: int) -> tuple[tuple[LogSpec, ...], float]:
+    """The logs of an attempt, of random sizes, at a random place in a random direction, and the slew angle [rad] at
+    which the crane starts.
+
+    A fixed crane gets a place anywhere in its reach, clear of the bunk; it starts turned so far that its camera sees
+    the place.  A forwarder gets its pick area.
+    """
+    machine, wood, drawn = profile_named(profile), wood_of(profile, truth), seed * SEEDS_PER_ATTEMPT + number
+    if machine.carrier is not None:
+        return configuration(number, machine, wood, drawn), home_pose(machine, truth)["slew"]
+    slew, bunk, rng = machine.joints["slew"], machine.bunk, random.Random(drawn)
+    stakes = LogSpec(*bunk.center_m, bunk.yaw_rad, bunk.length_m, bunk.width_m, 0.0)
+    for _ in range(PLACES):
+        reach_m, slew_rad = rng.uniform(*REACH_M), rng.uniform(slew.lower + END_RAD, slew.upper - END_RAD)
+        aside_rad = rng.uniform(-ASIDE_RAD, ASIDE_RAD)
+        turn_rad = machine.kinematics.theta1_offset_rad + slew_rad
+        at = (reach_m * math.cos(turn_rad), reach_m * math.sin(turn_rad))
+        logs = configuration(number, machine, wood, drawn, at=at)
+        if min(footprint_gap(log, stakes) for log in logs) >= BUNK_GAP_M:
+            return logs, min(max(slew_rad + aside_rad, slew.lower + END_RAD), slew.upper - END_RAD)
+    raise PlantError(
+        "scene.no-place",
+        f"configuration {number} fits nowhere in the reach of {profile} beside its bunk; move the bunk",
+    )

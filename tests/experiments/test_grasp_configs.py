@@ -14,6 +14,7 @@ from autonomy.perception.log_list import LogObservation
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import make_result
+from experiments.common.worlds import profile_named
 from experiments.grasp_configs.experiment import (
     BEST,
     MACHINES,
@@ -29,7 +30,7 @@ from experiments.grasp_configs.experiment import (
 from experiments.grasp_configs.grasp_categories import Grip, category, lies_on, lifted
 from experiments.grasp_configs.metrics import METRICS, SECTIONS, sections
 from experiments.grasp_configs.pose_sources import TRUE, misled
-from experiments.grasp_configs.trial import attempt
+from experiments.grasp_configs.trial import arranged, attempt
 from runtime.errors import InputRefused
 from sim.scenes.arrangements import CONFIGURATIONS
 from sim.wood.logs import LogState
@@ -155,7 +156,26 @@ def test_the_evaluated_pair_has_plain_names_and_every_pair_has_a_prefix() -> Non
         "success",
         "first_closing",
         "success_wilson_low",
+        "config4.first",
+        "config5.first",
     ]
+    assert metrics["config4.first"] == 0.0 and metrics["config5.first"] == pytest.approx(5 / 6)
+
+
+def test_the_attempts_lie_all_over_the_reach_clear_of_the_bunk_and_in_view() -> None:
+    machine = profile_named("palms_471")
+    turn_rad, bunk = machine.kinematics.theta1_offset_rad, machine.bunk
+    reaches, slews = [], []
+    for seed in range(40):
+        logs, start_rad = arranged("palms_471", "nominal", 12, seed)
+        assert (logs, start_rad) == arranged("palms_471", "nominal", 12, seed)
+        x, y = (sum(at) / len(logs) for at in zip(*((log.x_m, log.y_m) for log in logs), strict=True))
+        assert math.dist((x, y), bunk.center_m) > 0.5 * bunk.width_m + 1.0
+        reaches.append(math.hypot(x, y))
+        slews.append(math.atan2(y, x) - turn_rad)
+        assert abs(start_rad - slews[-1]) < math.radians(40.0) and abs(start_rad) < machine.joints["slew"].upper
+    assert min(reaches) < 4.0 and max(reaches) > 6.0
+    assert math.degrees(min(slews)) < -20.0 and math.degrees(max(slews)) > 80.0
 
 
 def test_a_quick_run_keeps_the_published_ablation_and_its_commit(tmp_path: Path) -> None:
