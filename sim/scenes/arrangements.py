@@ -89,15 +89,18 @@ class LogSampler:
         )
 
 
-def random_scene(profile: Profile, wood: Wood, seed: int, logs: int) -> tuple[LogSpec, ...]:
-    """``logs`` logs inside the profile's pick area, apart from each other.
+def random_scene(
+    profile: Profile, wood: Wood, seed: int, logs: int, at: tuple[float, float] | None = None
+) -> tuple[LogSpec, ...]:
+    """``logs`` logs inside the profile's pick area, or an area of its size about ``at``, apart from each other.
 
     Their sizes are those of papers A and B (docs/reference/machines.md section 9).
 
     Raises:
         PlantError: the pick area has no room for so many logs.
     """
-    sampler, (cx, cy), half = LogSampler(wood, seed), _pick_center(profile), profile.workspace.pick_half_size_m
+    sampler, half = LogSampler(wood, seed), profile.workspace.pick_half_size_m
+    cx, cy = _pick_center(profile) if at is None else at
     found: list[LogSpec] = []
     failed = 0
     while len(found) < logs and failed < MAX_TRY_COUNT:
@@ -145,7 +148,7 @@ def arrangement(
             "scene.log-count", f"scene {kind!r} consists of {low} to {high} logs, not {logs}; request another number"
         )
     if kind == "separate":
-        return random_scene(profile, wood, seed, logs)
+        return random_scene(profile, wood, seed, logs, at)
     sampler = LogSampler(wood, seed)
     if kind in ("row", "bunk"):
         return _row(sampler, logs, route) if kind == "row" else _bunk(sampler, logs, profile)

@@ -167,13 +167,14 @@ def test_the_attempts_lie_all_over_the_reach_clear_of_the_bunk_and_in_view() -> 
     turn_rad, bunk = machine.kinematics.theta1_offset_rad, machine.bunk
     reaches, slews = [], []
     for seed in range(40):
-        logs, start_rad = arranged("palms_471", "nominal", 12, seed)
-        assert (logs, start_rad) == arranged("palms_471", "nominal", 12, seed)
+        number = 8 if seed % 2 else 12  # separate logs, and a pile
+        logs, start_rad = arranged("palms_471", "nominal", number, seed)
+        assert (logs, start_rad) == arranged("palms_471", "nominal", number, seed)
         x, y = (sum(at) / len(logs) for at in zip(*((log.x_m, log.y_m) for log in logs), strict=True))
         assert math.dist((x, y), bunk.center_m) > 0.5 * bunk.width_m + 1.0
         reaches.append(math.hypot(x, y))
         slews.append(math.atan2(y, x) - turn_rad)
-        assert abs(start_rad - slews[-1]) < math.radians(40.0) and abs(start_rad) < machine.joints["slew"].upper
+        assert abs(start_rad - slews[-1]) < math.radians(50.0) and abs(start_rad) < machine.joints["slew"].upper
     assert min(reaches) < 4.0 and max(reaches) > 6.0
     assert math.degrees(min(slews)) < -20.0 and math.degrees(max(slews)) > 80.0
 
