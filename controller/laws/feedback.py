@@ -1,10 +1,12 @@
-"""Feedback laws that turn a joint's error into a velocity correction, behind one interface: four own, and foreign ones.
+"""Feedback laws that turn a joint's error into a velocity correction, behind one interface: five own, and foreign ones.
 
-All are of the velocity type (docs/reference/machines.md section 4) and share one budget: ``kp_1_s`` is the small-signal
-gain inside the ``layer``, which `timberhand bench loop-design` bounds; how a law uses it is written here and nowhere
-else.  Sliding mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales
-2015, whose equations were not available.  Any other ``kind`` is an entry point of the group ``timberhand.joint_laws``,
-a factory that takes the `Law` and returns a `Feedback` (docs/how-to/extend.md).
+All are of the velocity type (docs/reference/machines.md section 4) and share one budget: ``kp_1_s`` is the greatest
+small-signal gain inside the ``layer``, which `timberhand bench loop-design` bounds; how a law uses it is written here
+and nowhere else.  A joint that is commanded by velocity has relative degree one: its sliding surface is the error, and
+its velocity enters by the perturbation estimate of both sliding laws (`controller.laws.joint.ValveGain`).  Sliding mode
+and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales 2015, whose
+equations were not available.  Any other ``kind`` is an entry point of the group ``timberhand.joint_laws``, a factory
+that takes the `Law` and returns a `Feedback` (docs/how-to/extend.md).
 """
 
 from __future__ import annotations
@@ -17,15 +19,19 @@ from runtime.errors import ConfigError
 from runtime.plugins import load_plugin
 
 REACHING_SHARE: Final = 0.5
-"""Share of the budget in the switching term; the rest is the proportional term lambda e."""
+"""Share of the budget in super-twisting's switching term; the rest is the proportional term lambda e of both laws."""
+SLIDING_SHARE: Final = 0.25
+"""Share of the budget in sliding mode's switching term: with the whole rest it would chatter more than a PD law."""
 INTEGRAL_SHARE: Final = 0.05
 """Integral gain of the three laws that have one, inside the layer, over the budget squared [-].  More would take the
 gain margin of the slew, whose load swings at its crossover.
 """
-PID_SHARE: Final = 0.25
-"""Share of the budget that the plain PID uses.  It has no delay compensation and no pressure feedback; more would take
+PLAIN_SHARE: Final = 0.25
+"""Share of the budget that the plain PD uses.  It has no delay compensation and no pressure feedback; more would take
 its margins when a load swings under the slew.
 """
+PLAIN_PERIOD_S: Final = 0.02
+"""Period of paper A's PLC, which holds the command in between."""
 
 
 class Feedback(Protocol):
@@ -39,7 +45,7 @@ class Feedback(Protocol):
 
 
 class Pd:
-    """Paper A's law: Kp e + Kd e'."""
+    """Kp e + Kd e', with everything that `controller.laws.joint` adds."""
 
     __slots__ = ("_kd", "_kp")
 
@@ -53,13 +59,36 @@ class Pd:
         return self._kp * error + self._kd * error_rate
 
 
+class PlainPd:
+    """Paper A's law as its PLC runs it: Kp e + Kd e' at 50 Hz, without lead of the feed-forward, delay compensation and
+    damping (docs/reference/machines.md section 4).
+    """
+
+    __slots__ = ("_held", "_kd", "_kp", "_left_s")
+
+    def __init__(self, law: Law) -> None:
+        self._kp, self._kd = PLAIN_SHARE * law.kp_1_s, law.kd
+        self.reset()
+
+    def reset(self) -> None:
+        """The next step computes."""
+        self._held = self._left_s = 0.0
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        if self._left_s <= 0.5 * elapsed_s:
+            self._left_s += PLAIN_PERIOD_S
+            self._held = self._kp * error + self._kd * error_rate
+        self._left_s -= elapsed_s
+        return self._held
+
+
 class Pid:
-    """The baseline: PD with an integral, used without feed-forward and delay compensation."""
+    """PD with an integral, with everything that `controller.laws.joint` adds; tuned by the same margins."""
 
     __slots__ = ("_integral", "_kd", "_ki", "_kp")
 
     def __init__(self, law: Law) -> None:
-        self._kp, self._kd = PID_SHARE * law.kp_1_s, law.kd
+        self._kp, self._kd = law.kp_1_s, law.kd
         self._ki = INTEGRAL_SHARE * self._kp**2
         self._integral = 0.0
 
@@ -73,18 +102,15 @@ class Pid:
 
 
 class SlidingMode:
-    """lambda e + Kd e' + k1 tanh(sigma / phi),  sigma = e + mu integral e.
-
-    The surface is slower than that of docs/reference/machines.md section 4.
-    """
+    """lambda e + Kd e' + k1 tanh(sigma / phi),  sigma = e + mu integral e."""
 
     __slots__ = ("_integral", "_k1", "_kd", "_lambda", "_layer", "_mu")
 
     def __init__(self, law: Law) -> None:
         self._kd, self._layer = law.kd, law.layer
-        self._k1 = REACHING_SHARE * law.kp_1_s * law.layer
+        self._k1 = SLIDING_SHARE * law.kp_1_s * law.layer
         self._lambda = (1.0 - REACHING_SHARE) * law.kp_1_s
-        self._mu = INTEGRAL_SHARE / REACHING_SHARE * law.kp_1_s
+        self._mu = INTEGRAL_SHARE / SLIDING_SHARE * law.kp_1_s
         self._integral = 0.0
 
     def reset(self) -> None:
@@ -151,8 +177,9 @@ class Foreign:
         return velocity
 
 
-LAWS: Final[dict[str, type[Pd] | type[Pid] | type[SlidingMode] | type[SuperTwisting]]] = {
+LAWS: Final[dict[str, type[Pd] | type[PlainPd] | type[Pid] | type[SlidingMode] | type[SuperTwisting]]] = {
     "pd": Pd,
+    "pd_plain": PlainPd,
     "pid": Pid,
     "sliding_mode": SlidingMode,
     "super_twisting": SuperTwisting,
@@ -160,7 +187,7 @@ LAWS: Final[dict[str, type[Pd] | type[Pid] | type[SlidingMode] | type[SuperTwist
 """The laws named in `machine.profile.OWN_LAWS`."""
 
 
-def law_of(law: Law) -> Pd | Pid | SlidingMode | SuperTwisting | Foreign:
+def law_of(law: Law) -> Pd | PlainPd | Pid | SlidingMode | SuperTwisting | Foreign:
     """The law that a profile names.
 
     Raises:

@@ -17,9 +17,9 @@ from experiments.common.result_page import Page, publish
 from experiments.common.trials import check_truth, checkpoint, sampled_unless_given
 from experiments.common.worlds import profile_named
 from experiments.joint_tracking.individuals import CORNERS
-from experiments.joint_tracking.metrics import INTRODUCTION, LAWS, MACHINES, conclusion, sections
+from experiments.joint_tracking.metrics import BASELINES, INTRODUCTION, LAWS, MACHINES, SLIDING, conclusion, sections
 from experiments.joint_tracking.plots import draw
-from experiments.joint_tracking.trial import perform
+from experiments.joint_tracking.trial import CHANGES, perform
 
 TRIALS: Final = 6
 QUICK_TRIALS: Final = 1
@@ -27,7 +27,7 @@ FIRST_SEED: Final = 1000
 """These machines were not looked at while the laws were tuned."""
 SEEDS_PER_RUN: Final = 1000
 STATES: Final = {"calibrated": True, "shipped": False}
-CALIBRATED: Final = ("cycle", "steps", "ramps", "pick_up", "pump", "dip", "wide", "corner")
+CALIBRATED: Final = ("cycle", "steps", "ramps", "pick_up", "pump", "dip", "wide", "corner", "matched")
 SHIPPED: Final = ("cycle", "wide", "corner")
 QUICK_CORNERS: Final = (7,)
 TRACED: Final = "aoro"
@@ -44,7 +44,10 @@ def machines(options: Options) -> dict[str, str]:
 def plan(options: Options, trials: int) -> list[Job]:
     """Every job of the run."""
     first = FIRST_SEED + options.seed * SEEDS_PER_RUN
-    corners = QUICK_CORNERS if options.quick else range(len(CORNERS))
+    numbers = {
+        "corner": QUICK_CORNERS if options.quick else range(len(CORNERS)),
+        "matched": range(len(CHANGES) * trials),
+    }
     jobs = []
     for short, profile in machines(options).items():
         # Unless the caller gives a truth, every trial is another individual: one machine says little about a law.
@@ -55,8 +58,10 @@ def plan(options: Options, trials: int) -> list[Job]:
             if options.quick and law != own_law(profile):
                 kinds = ("cycle",) if calibrated else ()
             for kind in kinds:
-                for i in corners if kind == "corner" else range(trials):
+                for i in numbers.get(kind, range(trials)):
                     more: dict[str, Any] = {"corner": i} if kind == "corner" else {}
+                    if kind == "matched":
+                        more |= {"change": list(CHANGES)[i % len(CHANGES)]}
                     if short == TRACED and kind == "cycle" and calibrated and i == 0:
                         more["trace"] = True
                     more |= {**what, "law": law, "calibrated": calibrated}
@@ -130,7 +135,21 @@ def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
             metrics[f"{group}_{key}"] = float(sum(values)) if key in COUNTED else sum(values) / len(values)
             if key in WORST:
                 metrics[f"{group}_{key}_max"] = float(max(values))
+    metrics |= _compared(metrics)
     return {k: v for k, v in (metrics | _over_all(outcomes)).items() if not math.isnan(v)}
+
+
+def _compared(metrics: Mapping[str, float]) -> dict[str, float]:
+    """The sliding mode over the best of the PD and PID laws: tracking error and chatter, undisturbed and changed."""
+    found: dict[str, float] = {}
+    for short, kind in product(MACHINES, ("cycle", "matched")):
+        names = {law: f"{short}_{law}_calibrated_{kind}" for law in (*BASELINES, SLIDING)}
+        if all(f"{name}_tip_rms_m" in metrics for name in names.values()):
+            best = min(BASELINES, key=lambda law: metrics[f"{names[law]}_tip_rms_m"])
+            for key, what in (("tip_rms_m", "rms"), ("chatter_pct_s", "chatter")):
+                ratio = metrics[f"{names[SLIDING]}_{key}"] / metrics[f"{names[best]}_{key}"]
+                found[f"{short}_{kind}_{what}_ratio"] = ratio
+    return found
 
 
 def _over_all(outcomes: Mapping[str, Any]) -> dict[str, float]:

@@ -14,6 +14,7 @@ from experiments.common.worlds import home_at, profile_named, trial_world
 from experiments.joint_tracking.testbed import Calibration, JointTestbed, controller_profile
 from machine.geometry.kinematics import max_reach_m
 from machine.loading.profile_file import load_profile
+from sim.truth.load import Truth
 from sim.world import World
 
 REACH_SHARE, HEIGHT_M = 0.55, 1.0
@@ -30,17 +31,25 @@ def kind_of(job: Job) -> str:
 
 
 class Machine:
-    """Context of a testbed on a world of its own; ``machine`` changes the truth of the individual."""
+    """Context of a testbed on a world of its own; ``machine`` changes the truth of the individual, ``later`` what it
+    is after its calibration.
+    """
 
-    def __init__(self, job: Job, machine: Callable[[Job, World], Any] | None = None) -> None:
+    def __init__(
+        self,
+        job: Job,
+        machine: Callable[[Job, World], Any] | None = None,
+        later: Callable[[Truth], Truth] | None = None,
+    ) -> None:
         o = job.options
         profile = load_profile(o["profile"])
         home = home_at(o["profile"], REACH_SHARE * max_reach_m(profile), HEIGHT_M)
         with trial_world(o["profile"], o["truth"], job.seed) as world:
             truth = world.truth if machine is None else machine(job, world)
-        self._world = world = World(profile, truth, job.seed, (), home=home)
+        now = truth if later is None else later(truth)
+        self._world = world = World(profile, now, job.seed, (), home=home)
         calibration = Calibration(job.seed) if o["calibrated"] else None
-        made = controller_profile(profile, world, o["law"], calibration, o.get("damped", True))
+        made = controller_profile(profile, truth, o["law"], calibration, o.get("damped", True))
         self._rig = JointTestbed(made, world, job.seed)
 
     def __enter__(self) -> JointTestbed:
@@ -48,6 +57,21 @@ class Machine:
 
     def __exit__(self, *_: object) -> None:
         self._world.close()
+
+
+def with_valves(truth: Truth, gain: float, delay: float = 1.0) -> Truth:
+    """The truth with all valves' gains and dead times times these factors."""
+    functions = {}
+    for name, function in truth.functions.items():
+        valve = function.valve
+        valve = msgspec.structs.replace(
+            valve,
+            full_speed_plus=gain * valve.full_speed_plus,
+            full_speed_minus=gain * valve.full_speed_minus,
+            delay_s=delay * valve.delay_s,
+        )
+        functions[name] = msgspec.structs.replace(function, valve=valve)
+    return msgspec.structs.replace(truth, functions=functions)
 
 
 def widened(job: Job, world: World) -> Any:

@@ -24,6 +24,7 @@ from machine.profile import Profile, joint
 from machine.sensing import counts_from_position, position_from_counts
 from machine.status.reasons import Reason
 from runtime.errors import InputRefused
+from sim.truth.load import Truth
 from sim.world import STEP_NS, World
 
 NAMES: Final = tuple(j.name.lower() for j in JOINTS)
@@ -159,16 +160,18 @@ class JointTestbed:
 
 
 def controller_profile(
-    profile: Profile, world: World, kind: str, calibration: Calibration | None, damped: bool
+    profile: Profile, truth: Truth, kind: str, calibration: Calibration | None, damped: bool
 ) -> Profile:
-    """The profile with another law, with or without pressure damping, and with calibrated or shipped valves."""
+    """The profile with another law, with or without pressure damping, and with calibrated or shipped valves; ``truth``
+    is that of the calibration.
+    """
     import msgspec
 
     joints: dict[str, Any] = {}
     for name, spec in profile.joints.items():
         damping = spec.law.damping_per_bar if damped else 0.0
         law = msgspec.structs.replace(spec.law, kind=kind, damping_per_bar=damping)
-        valve = spec.valve if calibration is None else calibration.valve(spec.valve, world.truth.functions[name].valve)
+        valve = spec.valve if calibration is None else calibration.valve(spec.valve, truth.functions[name].valve)
         joints[name] = msgspec.structs.replace(spec, law=law, valve=valve)
     return msgspec.structs.replace(profile, joints=joints)
 

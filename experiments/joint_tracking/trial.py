@@ -16,10 +16,11 @@ import numpy as np
 from experiments.common.pool import Job
 from experiments.common.worlds import hang
 from experiments.joint_tracking import motions
-from experiments.joint_tracking.individuals import CORNERS, Machine, cornered, kind_of, widened
+from experiments.joint_tracking.individuals import CORNERS, Machine, cornered, kind_of, widened, with_valves
 from experiments.joint_tracking.motions import START_S, duration_s, legs
 from experiments.joint_tracking.testbed import NAMES, JointTestbed, Trace
 from machine.geometry.kinematics import pin_position
+from sim.truth.load import Truth
 from sim.world import World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")
@@ -47,6 +48,12 @@ PICK_KG_S: Final = 400.0
 """Rate at which the load comes on the hook: a log leaves the ground within a quarter to half a second."""
 DIP, DIP_S = 0.25, 1.0
 """In the middle of a motion the supply delivers this share of its pressure for this time."""
+CHANGES: Final = {"slow": (0.7, 1.0), "fast": (1.3, 1.0), "cold": (0.85, 1.3), "load": (1.0, 1.0), "supply": (1.0, 1.0)}
+"""Factors on gain and dead time of every valve; a load and a supply that droops come and go in the motions."""
+LOADED: Final = (0.3, 0.8)
+"""Share of a motion from which a load hangs on the hook, or the supply droops, and until when."""
+DROOP: Final = 0.4
+"""Share of the supply pressure that is left."""
 STOPPED: Final = ("lift", "slew")
 STOP_SHARE: Final = 0.8
 STOP_S: Final = 4.0
@@ -61,9 +68,18 @@ def perform(job: Job) -> dict[str, Any]:
     return KINDS[job.kind](job)
 
 
-def cycle(job: Job, machine: Callable[[Job, World], Any] | None = None) -> dict[str, Any]:
-    """Move there and back with all joints together, quasi-parabolic, within the pump's flow."""
-    with Machine(job, machine) as testbed:
+def cycle(
+    job: Job,
+    machine: Callable[[Job, World], Any] | None = None,
+    later: Callable[[Truth], Truth] | None = None,
+    on_leg: Callable[[World, float], None] | None = None,
+) -> dict[str, Any]:
+    """Move there and back with all joints together, quasi-parabolic, within the pump's flow.
+
+    ``later`` changes the machine after its calibration; ``on_leg`` gets the time since the start of each of the two
+    motions over its duration, before every tick.
+    """
+    with Machine(job, machine, later) as testbed:
         if load_kg := job.options.get("load_kg", 0.0):
             hang(testbed.world, load_kg)
         start, ways = testbed.positions(), CYCLE[kind_of(job)]
@@ -80,11 +96,15 @@ def cycle(job: Job, machine: Callable[[Job, World], Any] | None = None) -> dict[
         legs_of = ((START_S, there_s), (there_s + REST_S, there_s + REST_S + out))
         full_pa = testbed.world.hydraulics.relief_pa
 
-        def dip(time_s: float) -> None:
-            low = any(0.0 <= time_s - (begin_s + 0.5 * out) < DIP_S for begin_s, _ in legs_of)
-            testbed.world.hydraulics.relief_pa = (DIP if low else 1.0) * full_pa
+        def disturb(time_s: float) -> None:
+            begin_s = max((begin_s for begin_s, _ in legs_of if begin_s <= time_s), default=math.inf)
+            if on_leg is not None:
+                on_leg(testbed.world, (time_s - begin_s) / out)
+            elif job.kind == "dip":
+                low = 0.0 <= time_s - (begin_s + 0.5 * out) < DIP_S
+                testbed.world.hydraulics.relief_pa = (DIP if low else 1.0) * full_pa
 
-        trace = testbed.run(legs(start, moves), there_s + REST_S + out + REST_S, dip if job.kind == "dip" else None)
+        trace = testbed.run(legs(start, moves), there_s + REST_S + out + REST_S, disturb)
         return _tip_metrics(testbed, trace, legs_of, job)
 
 
@@ -102,6 +122,27 @@ def corner(job: Job) -> dict[str, Any]:
     """The cycle on a machine in a corner of twice the spread; the option ``corner`` is an index of `CORNERS`."""
     loaded = CORNERS[job.options["corner"]][2]
     return cycle(_with(job, load_kg=LOAD_KG[kind_of(job)] if loaded else 0.0), cornered)
+
+
+def matched(job: Job) -> dict[str, Any]:
+    """The cycle of a calibrated machine that has changed since; the option ``change`` is one of `CHANGES`."""
+    load_kg, relief_pa = LOAD_KG[kind_of(job)], [0.0]
+
+    def load(world: World, share: float) -> None:
+        hang(world, load_kg if LOADED[0] <= share < LOADED[1] else 0.0)
+
+    def droop(world: World, share: float) -> None:
+        relief_pa[0] = relief_pa[0] or world.hydraulics.relief_pa
+        world.hydraulics.relief_pa = (DROOP if LOADED[0] <= share < LOADED[1] else 1.0) * relief_pa[0]
+
+    match job.options["change"]:
+        case "load":
+            return cycle(job, on_leg=load)
+        case "supply":
+            return cycle(job, on_leg=droop)
+        case change:
+            gain, delay = CHANGES[change]
+            return cycle(job, later=lambda truth: with_valves(truth, gain, delay))
 
 
 def steps(job: Job) -> dict[str, Any]:
@@ -200,6 +241,7 @@ KINDS: Final[Mapping[str, Callable[[Job], dict[str, Any]]]] = {
     "dip": cycle,
     "wide": wide,
     "corner": corner,
+    "matched": matched,
     "steps": steps,
     "ramps": ramps,
     "pick_up": pick_up,

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from controller.estimation.joint_estimator import acceleration_density, measurement_variance, steady_gains
-from controller.laws.feedback import INTEGRAL_SHARE, PID_SHARE, REACHING_SHARE
+from controller.laws.feedback import INTEGRAL_SHARE, PLAIN_PERIOD_S, PLAIN_SHARE, REACHING_SHARE, SLIDING_SHARE
 from controller.laws.joint import PRESSURE_MEAN_S, PRESSURE_SMOOTH_S
 from experiments.loop_design.mechanics import Mechanics
 from machine.profile import JointSpec
@@ -62,8 +62,10 @@ class LawResponse:
         length = max(1, round((spec.valve.delay_s + spec.valve.lag_s) / t))
         flying = t * back * (1.0 - back**length) / (1.0 - back)
         smooth, mean = (_low_pass(t / tau, back) for tau in (PRESSURE_SMOOTH_S, PRESSURE_MEAN_S))
-        if law.kind == "pid":
-            return feedback * position + rate * velocity, 0.0 * s
+        if law.kind == "pd_plain":
+            held = max(1, round(PLAIN_PERIOD_S / t))
+            hold = sum(back**k for k in range(held)) / held
+            return hold * (feedback * position + rate * velocity), 0.0 * s
         predicted = 1.0 + feedback * flying
         to_load = law.damping_per_bar * smooth * (1.0 - mean)
         return (feedback * position + rate * velocity) / predicted, to_load / predicted
@@ -84,9 +86,11 @@ class LawResponse:
         kp = law.kp_1_s
         if law.kind == "pd":
             return kp + 0.0 * summed, law.kd
-        if law.kind == "pid":
-            kp *= PID_SHARE
+        if law.kind == "pd_plain":
+            return PLAIN_SHARE * kp + 0.0 * summed, law.kd
         integral = INTEGRAL_SHARE * kp * kp * summed
+        if law.kind == "sliding_mode":
+            kp *= 1.0 - REACHING_SHARE + SLIDING_SHARE
         if law.kind == "super_twisting":
             kp *= 1.0 - REACHING_SHARE * (1.0 - math.sqrt(self._amplitude))
         return kp + integral, law.kd

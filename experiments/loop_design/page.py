@@ -27,7 +27,8 @@ NAMES: Final = {
     "pd": "PD",
     "sliding_mode": "sliding mode",
     "super_twisting": "super-twisting",
-    "pid": "PID baseline",
+    "pid": "PID",
+    "pd_plain": "plain PD (paper A)",
     "undamped": "own law without pressure feedback",
 }
 INTRODUCTION: Final = (
@@ -51,9 +52,10 @@ LEAST: Final = (
     "(`damping_per_bar`):"
 )
 HOW: Final = (
-    "- *Law*: all laws use the gain `kp_1_s` of the profile (the PID a quarter of it) inside their boundary layer, "
-    "where they are linear. Super-twisting is nonlinear there as well; its gain depends on the amplitude, so several "
-    "amplitudes are evaluated.\n"
+    "- *Law*: all laws use the gain `kp_1_s` of the profile (the plain PD a quarter of it, sliding mode three "
+    "quarters) inside their boundary layer, where they are linear. Super-twisting is nonlinear there as well; its gain "
+    "depends on the amplitude, so several amplitudes are evaluated. The sliding laws' estimate of the valve's gain is "
+    "slower than the loop and brings its gain back to the profile's; the margins are those without it.\n"
     "- *Phase, gain*: the least margins over all machines. Every crossing of the unit circle and of the negative real "
     "axis counts, so a loop that a swinging load makes cross twice is evaluated twice.\n"
     "- *Bandwidth*: frequency at which the closed loop of the nominal machine at working reach falls below -3 dB. "

@@ -1,4 +1,4 @@
-"""The joint laws: the four feedbacks, their common structure, end positioning, and all joints together."""
+"""The joint laws: the five feedbacks, their common structure, end positioning, and all joints together."""
 
 import math
 
@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 
 from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.crane import FLOW_SHARE, CraneLaw
-from controller.laws.feedback import INTEGRAL_SHARE, LAWS, PID_SHARE
+from controller.laws.feedback import INTEGRAL_SHARE, LAWS, PLAIN_PERIOD_S, PLAIN_SHARE, REACHING_SHARE, SLIDING_SHARE
 from controller.laws.joint import (
     ACCELERATION_FACTOR,
+    GAIN_RANGE,
+    GAIN_SPEED_SHARE,
     INCH_SHARE,
     MAX_OPENING_SHARE,
     DelayCompensation,
@@ -27,6 +29,7 @@ from tests.controller.bench import PROFILE, SPECS, T
 SLEW = SPECS[0]
 T_S = T * 1e-9
 KINDS = tuple(LAWS)
+SLIDING = ("sliding_mode", "super_twisting")
 
 
 def spec_of(kind="pd", spec=SLEW, **law):
@@ -40,7 +43,8 @@ def made(kind="pd", spec=SLEW, **law):
 
 def budget(kind, law):
     """Greatest gain of a law over its budget."""
-    return law.kp_1_s * (PID_SHARE if kind == "pid" else 1.0)
+    shares = {"pd_plain": PLAIN_SHARE, "sliding_mode": 1.0 - REACHING_SHARE + SLIDING_SHARE}
+    return law.kp_1_s * shares.get(kind, 1.0)
 
 
 def step(law, q_ref=0.0, v_ref=0.0, lead=0.0, q=0.0, v=0.0, load=math.nan, elapsed_s=T_S, cap=1.0):
@@ -59,9 +63,8 @@ def test_gain_is_the_budget_at_most(kind):
         assert once == pytest.approx(gain * small, rel=1e-3)
     assert LAWS[kind](law).step(large, 0.0, 0.0, True) <= gain * large * (1 + 1e-9)
     at_layer = LAWS[kind](law).step(law.layer, 0.0, 0.0, True)
-    assert at_layer == pytest.approx(
-        gain * law.layer * (0.5 + 0.5 * math.tanh(1)) if kind == "sliding_mode" else gain * law.layer
-    )
+    sliding = law.kp_1_s * law.layer * (1.0 - REACHING_SHARE + SLIDING_SHARE * math.tanh(1.0))
+    assert at_layer == pytest.approx(sliding if kind == "sliding_mode" else gain * law.layer)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -73,7 +76,7 @@ def test_every_feedback_is_odd(kind, error, rate):
         assert one.step(error, rate, T_S, False) == pytest.approx(-other.step(-error, -rate, T_S, False))
 
 
-@pytest.mark.parametrize("kind", KINDS[1:])
+@pytest.mark.parametrize("kind", ["pid", *SLIDING])
 def test_integrals_grow_freeze_and_reset(kind):
     law = spec_of(kind, kd=0.0).law
     feedback, error = LAWS[kind](law), 0.01 * spec_of(kind).law.layer
@@ -82,12 +85,12 @@ def test_integrals_grow_freeze_and_reset(kind):
         assert feedback.step(error, 0.0, T_S, True) == first
     for _ in range(200):
         grown = feedback.step(error, 0.0, T_S, False)
-    assert grown - first == pytest.approx(INTEGRAL_SHARE * budget(kind, law) ** 2 * error, rel=0.02)
+    assert grown - first == pytest.approx(INTEGRAL_SHARE * law.kp_1_s**2 * error, rel=0.02)
     feedback.reset()
     assert feedback.step(error, 0.0, T_S, True) == first
 
 
-@pytest.mark.parametrize("kind", KINDS[2:])
+@pytest.mark.parametrize("kind", SLIDING)
 def test_integrals_of_the_sliding_laws_are_bounded(kind):
     law = spec_of(kind).law
     feedback = LAWS[kind](law)
@@ -105,8 +108,59 @@ def test_feed_forward_leads_and_the_change_per_second_is_limited():
     assert command == pytest.approx(0.2)
 
 
-def test_plain_pid_has_no_feed_forward():
-    assert step(made("pid"), v_ref=0.2, lead=0.2, v=0.2) == 0.0
+def test_paper_as_pd_has_no_lead_and_holds_its_command_for_a_cycle_of_the_plc():
+    assert step(made("pd_plain"), v_ref=0.0, lead=0.2, v=0.0) == 0.0
+    law = LAWS["pd_plain"](spec_of("pd_plain", kd=0.0).law)
+    given = [law.step(1e-3 * k, 0.0, T_S, False) for k in range(1, 9)]
+    cycle = round(PLAIN_PERIOD_S / T_S)
+    assert given == [given[0]] * cycle + [given[cycle]] * cycle and given[cycle] == pytest.approx(
+        (cycle + 1) * given[0]
+    )
+
+
+class Followed:
+    """A joint whose valve gives a share of what is commanded, a reaction time later, under its law at half speed."""
+
+    def __init__(self, kind, share, stuck_after_s=math.inf):
+        self.law, self.share, self.stuck_after_s = made(kind), share, stuck_after_s
+        self.reaction = [0.0] * round((SLEW.valve.delay_s + SLEW.valve.lag_s) / T_S)
+        self.q = self.q_ref = self.time_s = 0.0
+
+    def drive(self, seconds, speed):
+        """The errors [rad] while the reference moves at a speed [rad/s]."""
+        errors = []
+        for _ in range(round(seconds / T_S)):
+            command = step(self.law, self.q_ref, speed, speed, self.q, speed)
+            self.reaction.append(command)
+            moves = self.time_s < self.stuck_after_s
+            self.q += self.share * self.reaction.pop(0) * T_S * moves
+            self.q_ref += speed * T_S
+            self.time_s += T_S
+            errors.append(self.q_ref - self.q)
+        return errors
+
+
+@pytest.mark.parametrize("share", [0.7, 1.3])
+@pytest.mark.parametrize("kind", SLIDING)
+def test_a_sliding_law_learns_what_the_valve_gives_and_keeps_it(kind, share):
+    speed = 0.5 * SLEW.speed_limit
+    trailing = abs(Followed("pd", share).drive(6.0, speed)[-1])
+    joint = Followed(kind, share)
+    first = joint.drive(6.0, speed)
+    assert abs(first[-1]) < 0.1 * trailing
+    assert joint.law._gain.of(speed) == pytest.approx(share, rel=0.03)
+    joint.law.reset()
+    assert joint.law._gain.of(speed) == pytest.approx(share, rel=0.03), "a stop does not change the valve"
+    assert joint.law._gain.of(-speed) == 1.0, "the other direction is another edge of the spool"
+
+
+def test_an_estimate_stays_within_what_calibration_temperature_and_load_leave():
+    joint = Followed("sliding_mode", 1.0, stuck_after_s=3.0)
+    joint.drive(6.0, 0.5 * SLEW.speed_limit)
+    assert joint.law._gain.of(1.0) == GAIN_RANGE[0]
+    joint = Followed("sliding_mode", 1.0)
+    joint.drive(3.0, 0.5 * GAIN_SPEED_SHARE * SLEW.speed_limit)
+    assert joint.law._gain.of(1.0) == 1.0, "a slow joint says little about its valve"
 
 
 def test_travel_in_flight_is_not_commanded_again():
