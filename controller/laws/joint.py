@@ -110,7 +110,8 @@ class CommandBound:
 # (Elmali and Olgac 1992, "Sliding mode control with perturbation estimation"), for a perturbation that is a factor.
 
 
-GAIN_RANGE: Final = (0.6, 1.6)
+LEAST_GAIN: Final = 0.6
+MOST_GAIN: Final = 1.6
 """What calibration, temperature and load leave."""
 GAIN_WINDOW_S: Final = 0.25
 """Arrived commands and travel are both averaged over this time: a swinging load moves the joint to and fro."""
@@ -152,9 +153,8 @@ class ValveGain:
         speed, side = abs(self._arrived), self._arrived > 0.0
         if speed > self._least:
             ratio = self._moved / self._arrived
-            low, high = GAIN_RANGE
             learned = self._gain[side] + min(1.0, elapsed_s / GAIN_TIME_S) * (ratio - self._gain[side])
-            self._gain[side] = min(max(learned, low), high)
+            self._gain[side] = min(max(learned, LEAST_GAIN), MOST_GAIN)
 
 
 # -- End positioning: bring a joint to its goal and keep it there, without a limit cycle.

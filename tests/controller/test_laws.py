@@ -12,9 +12,9 @@ from controller.laws.crane import FLOW_SHARE, CraneLaw
 from controller.laws.feedback import INTEGRAL_SHARE, LAWS, PLAIN_PERIOD_S, PLAIN_SHARE, REACHING_SHARE, SLIDING_SHARE
 from controller.laws.joint import (
     ACCELERATION_FACTOR,
-    GAIN_RANGE,
     GAIN_SPEED_SHARE,
     INCH_SHARE,
+    LEAST_GAIN,
     MAX_OPENING_SHARE,
     DelayCompensation,
     EndPositioning,
@@ -157,7 +157,7 @@ def test_a_sliding_law_learns_what_the_valve_gives_and_keeps_it(kind, share):
 def test_an_estimate_stays_within_what_calibration_temperature_and_load_leave():
     joint = Followed("sliding_mode", 1.0, stuck_after_s=3.0)
     joint.drive(6.0, 0.5 * SLEW.speed_limit)
-    assert joint.law._gain.of(1.0) == GAIN_RANGE[0]
+    assert joint.law._gain.of(1.0) == LEAST_GAIN
     joint = Followed("sliding_mode", 1.0)
     joint.drive(3.0, 0.5 * GAIN_SPEED_SHARE * SLEW.speed_limit)
     assert joint.law._gain.of(1.0) == 1.0, "a slow joint says little about its valve"
