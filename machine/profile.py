@@ -75,7 +75,7 @@ class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lever: tuple[float, ...] = ()
 
 
-OWN_LAWS: Final = ("pd", "pd_plain", "pid", "sliding_mode", "super_twisting")
+OWN_LAWS: Final = ("pd", "pd_plain", "pid", "sliding_mode", "sliding_mode_pe", "super_twisting")
 JOINT_LAWS: Final = "timberhand.joint_laws"
 """Entry points of other laws: a factory that takes the `Law` and returns a `controller.laws.feedback.Feedback`."""
 

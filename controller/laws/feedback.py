@@ -1,12 +1,12 @@
-"""Feedback laws that turn a joint's error into a velocity correction, behind one interface: five own, and foreign ones.
+"""Feedback laws that turn a joint's error into a velocity correction, behind one interface: six own, and foreign ones.
 
 All are of the velocity type (docs/reference/machines.md section 4) and share one budget: ``kp_1_s`` is the greatest
 small-signal gain inside the ``layer``, which `timberhand bench loop-design` bounds; how a law uses it is written here
 and nowhere else.  A joint that is commanded by velocity has relative degree one: its sliding surface is the error, and
-its velocity enters by the perturbation estimate of both sliding laws (`controller.laws.joint.ValveGain`).  Sliding mode
-and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales 2015, whose
-equations were not available.  Any other ``kind`` is an entry point of the group ``timberhand.joint_laws``, a factory
-that takes the `Law` and returns a `Feedback` (docs/how-to/extend.md).
+its velocity enters by the estimate of the perturbation (``sliding_mode_pe``, `controller.laws.joint.ValveGain`).
+Sliding mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales
+2015, whose equations were not available.  Any other ``kind`` is an entry point of the group ``timberhand.joint_laws``,
+a factory that takes the `Law` and returns a `Feedback` (docs/how-to/extend.md).
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from runtime.errors import ConfigError
 from runtime.plugins import load_plugin
 
 REACHING_SHARE: Final = 0.5
-"""Share of the budget in super-twisting's switching term; the rest is the proportional term lambda e of both laws."""
-SLIDING_SHARE: Final = 0.25
-"""Share of the budget in sliding mode's switching term: with the whole rest it would chatter more than a PD law."""
+"""Share of the budget in the switching term; the rest is the proportional term lambda e."""
+ESTIMATING: Final = "sliding_mode_pe"
+"""Sliding mode with perturbation estimation (Elmali and Olgac 1992)."""
+ESTIMATING_SHARE: Final = 0.25
+"""Share of the budget in its switching term: with the whole rest it would chatter more than a PD law."""
 INTEGRAL_SHARE: Final = 0.05
 """Integral gain of the three laws that have one, inside the layer, over the budget squared [-].  More would take the
 gain margin of the slew, whose load swings at its crossover.
@@ -108,9 +110,10 @@ class SlidingMode:
 
     def __init__(self, law: Law) -> None:
         self._kd, self._layer = law.kd, law.layer
-        self._k1 = SLIDING_SHARE * law.kp_1_s * law.layer
+        share = ESTIMATING_SHARE if law.kind == ESTIMATING else REACHING_SHARE
+        self._k1 = share * law.kp_1_s * law.layer
         self._lambda = (1.0 - REACHING_SHARE) * law.kp_1_s
-        self._mu = INTEGRAL_SHARE / SLIDING_SHARE * law.kp_1_s
+        self._mu = INTEGRAL_SHARE / share * law.kp_1_s
         self._integral = 0.0
 
     def reset(self) -> None:
@@ -182,6 +185,7 @@ LAWS: Final[dict[str, type[Pd] | type[PlainPd] | type[Pid] | type[SlidingMode] |
     "pd_plain": PlainPd,
     "pid": Pid,
     "sliding_mode": SlidingMode,
+    "sliding_mode_pe": SlidingMode,
     "super_twisting": SuperTwisting,
 }
 """The laws named in `machine.profile.OWN_LAWS`."""

@@ -17,7 +17,7 @@ from array import array
 from enum import IntEnum
 from typing import Final
 
-from controller.laws.feedback import law_of
+from controller.laws.feedback import ESTIMATING, law_of
 from controller.laws.valve_map import ValveMap
 from machine.profile import SPEED_HEADROOM_SHARE, JointSpec
 
@@ -366,8 +366,6 @@ class EndPositioning:
 # -- The law
 
 
-ESTIMATING: Final = ("sliding_mode", "super_twisting")
-"""Laws that estimate the gain of the valve."""
 ACCELERATION_FACTOR: Final = 4.0
 """The command may change this many times faster than the planner's acceleration limit."""
 END_GAIN_1_S: Final = 4.0
@@ -453,7 +451,7 @@ class JointLaw:
         """Lead of the feed-forward."""
         self._bound = CommandBound(spec.speed_limit, reaction_s + valve.oil_s, period_s)
         self._gain: ValveGain | None = None
-        if self.has_encoder and law.kind in ESTIMATING:
+        if self.has_encoder and law.kind == ESTIMATING:
             self._gain = ValveGain(spec.speed_limit, reaction_s + valve.oil_s, period_s)
         self._position = 0.0
         self.reset()

@@ -11,7 +11,7 @@ from experiments.joint_tracking.metrics import KILO, LAWS, MM, PERCENT, REST_M, 
 from experiments.joint_tracking.trial import DIVERGED_M
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
 
-COLOURS: Final = dict(zip(LAWS, (OIL, STEEL, TIMBER, MOSS, RUST), strict=True))
+COLOURS: Final = dict(zip(LAWS, (OIL, STEEL, TIMBER, "black", MOSS, RUST), strict=True))
 SHADES: Final = (("calibrated", -0.19, 1.0), ("shipped", 0.19, 0.45))
 PANELS: Final = (
     ("rest_m", "rests [mm]", MM, None, REST_M),

@@ -15,7 +15,14 @@ from typing import Any, Final
 import numpy as np
 
 from controller.estimation.joint_estimator import acceleration_density, measurement_variance, steady_gains
-from controller.laws.feedback import INTEGRAL_SHARE, PLAIN_PERIOD_S, PLAIN_SHARE, REACHING_SHARE, SLIDING_SHARE
+from controller.laws.feedback import (
+    ESTIMATING,
+    ESTIMATING_SHARE,
+    INTEGRAL_SHARE,
+    PLAIN_PERIOD_S,
+    PLAIN_SHARE,
+    REACHING_SHARE,
+)
 from controller.laws.joint import PRESSURE_MEAN_S, PRESSURE_SMOOTH_S
 from experiments.loop_design.mechanics import Mechanics
 from machine.profile import JointSpec
@@ -89,8 +96,8 @@ class LawResponse:
         if law.kind == "pd_plain":
             return PLAIN_SHARE * kp + 0.0 * summed, law.kd
         integral = INTEGRAL_SHARE * kp * kp * summed
-        if law.kind == "sliding_mode":
-            kp *= 1.0 - REACHING_SHARE + SLIDING_SHARE
+        if law.kind == ESTIMATING:
+            kp *= 1.0 - REACHING_SHARE + ESTIMATING_SHARE
         if law.kind == "super_twisting":
             kp *= 1.0 - REACHING_SHARE * (1.0 - math.sqrt(self._amplitude))
         return kp + integral, law.kd

@@ -26,6 +26,7 @@ from runtime.plot_style import OIL, RUST, STEEL, sheet
 NAMES: Final = {
     "pd": "PD",
     "sliding_mode": "sliding mode",
+    "sliding_mode_pe": "sliding mode, estimating",
     "super_twisting": "super-twisting",
     "pid": "PID",
     "pd_plain": "plain PD (paper A)",
@@ -52,10 +53,10 @@ LEAST: Final = (
     "(`damping_per_bar`):"
 )
 HOW: Final = (
-    "- *Law*: all laws use the gain `kp_1_s` of the profile (the plain PD a quarter of it, sliding mode three "
-    "quarters) inside their boundary layer, where they are linear. Super-twisting is nonlinear there as well; its gain "
-    "depends on the amplitude, so several amplitudes are evaluated. The sliding laws' estimate of the valve's gain is "
-    "slower than the loop and brings its gain back to the profile's; the margins are those without it.\n"
+    "- *Law*: all laws use the gain `kp_1_s` of the profile (the plain PD a quarter of it, the estimating sliding mode "
+    "three quarters) inside their boundary layer, where they are linear. Super-twisting is nonlinear there as well; "
+    "its gain depends on the amplitude, so several amplitudes are evaluated. The estimate of a valve's gain is slower "
+    "than the loop and brings its gain back to the profile's; the margins are those without it.\n"
     "- *Phase, gain*: the least margins over all machines. Every crossing of the unit circle and of the negative real "
     "axis counts, so a loop that a swinging load makes cross twice is evaluated twice.\n"
     "- *Bandwidth*: frequency at which the closed loop of the nominal machine at working reach falls below -3 dB. "

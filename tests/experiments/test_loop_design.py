@@ -29,7 +29,7 @@ from timberhand.cli import app
 
 T_S, LEAD_S = 0.005, 0.0025
 S = 1j * FREQUENCY_RAD_S
-KINDS = ("pd", "pd_plain", "pid", "sliding_mode", "super_twisting")
+KINDS = ("pd", "pd_plain", "pid", "sliding_mode", "sliding_mode_pe", "super_twisting")
 
 
 def spec_of(kind="pd", name="slew", **law):
