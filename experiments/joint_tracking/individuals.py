@@ -14,7 +14,6 @@ from experiments.common.worlds import home_at, profile_named, trial_world
 from experiments.joint_tracking.testbed import Calibration, JointTestbed, controller_profile
 from machine.geometry.kinematics import max_reach_m
 from machine.loading.profile_file import load_profile
-from sim.truth.load import Truth
 from sim.world import World
 
 REACH_SHARE, HEIGHT_M = 0.55, 1.0
@@ -39,7 +38,7 @@ class Machine:
         self,
         job: Job,
         machine: Callable[[Job, World], Any] | None = None,
-        later: Callable[[Truth], Truth] | None = None,
+        later: Callable[[Any], Any] | None = None,
     ) -> None:
         o = job.options
         profile = load_profile(o["profile"])
@@ -59,7 +58,7 @@ class Machine:
         self._world.close()
 
 
-def with_valves(truth: Truth, gain: float, delay: float = 1.0) -> Truth:
+def with_valves(truth: Any, gain: float, delay: float = 1.0) -> Any:
     """The truth with all valves' gains and dead times times these factors."""
     functions = {}
     for name, function in truth.functions.items():

@@ -24,7 +24,6 @@ from machine.profile import Profile, joint
 from machine.sensing import counts_from_position, position_from_counts
 from machine.status.reasons import Reason
 from runtime.errors import InputRefused
-from sim.truth.load import Truth
 from sim.world import STEP_NS, World
 
 NAMES: Final = tuple(j.name.lower() for j in JOINTS)
@@ -160,7 +159,7 @@ class JointTestbed:
 
 
 def controller_profile(
-    profile: Profile, truth: Truth, kind: str, calibration: Calibration | None, damped: bool
+    profile: Profile, truth: Any, kind: str, calibration: Calibration | None, damped: bool
 ) -> Profile:
     """The profile with another law, with or without pressure damping, and with calibrated or shipped valves; ``truth``
     is that of the calibration.

@@ -20,7 +20,6 @@ from experiments.joint_tracking.individuals import CORNERS, Machine, cornered, k
 from experiments.joint_tracking.motions import START_S, duration_s, legs
 from experiments.joint_tracking.testbed import NAMES, JointTestbed, Trace
 from machine.geometry.kinematics import pin_position
-from sim.truth.load import Truth
 from sim.world import World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")
@@ -71,7 +70,7 @@ def perform(job: Job) -> dict[str, Any]:
 def cycle(
     job: Job,
     machine: Callable[[Job, World], Any] | None = None,
-    later: Callable[[Truth], Truth] | None = None,
+    later: Callable[[Any], Any] | None = None,
     on_leg: Callable[[World, float], None] | None = None,
 ) -> dict[str, Any]:
     """Move there and back with all joints together, quasi-parabolic, within the pump's flow.
