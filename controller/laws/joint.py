@@ -521,12 +521,18 @@ class JointLaw:
         self.velocity_desired = command
         return command
 
+    def _surplus(self, command: float) -> float:
+        """How much faster than commanded the joint is known to go, at least 1: that a valve gives too little may be the
+        word of a wrong encoder, and loosens no bound.
+        """
+        return 1.0 if self._gain is None else max(1.0, self._gain.of(command))
+
     def feasible_share(self, cap: float) -> float:
         """Share of the desired velocity within valve and speed limit; ``cap`` scales the speed limit."""
         desired = self.velocity_desired
         limit = min(self._speed * cap, self._valve.full_plus if desired >= 0.0 else self._valve.full_minus)
         if self.has_encoder:
-            limit = min(limit, self._bound.limit(desired))
+            limit = min(limit, self._bound.limit(desired) / self._surplus(desired))
         return limit / abs(desired) if abs(desired) > limit else 1.0
 
     def command(self, share: float, elapsed_s: float) -> float:
@@ -539,7 +545,7 @@ class JointLaw:
         self._flight.add((expected - self._lead) * elapsed_s)
         self.velocity_command = command
         if self.has_encoder:
-            self._bound.add(command, self._position, elapsed_s)
+            self._bound.add(command * self._surplus(command), self._position, elapsed_s)
         if self._gain is not None:
             self._gain.add(command, self._position, elapsed_s)
         return command

@@ -24,6 +24,7 @@ from controller.laws.joint import (
     INCH_SHARE,
     LEAST_GAIN,
     MAX_OPENING_SHARE,
+    MOST_SHARE,
     DelayCompensation,
     EndPositioning,
     JointLaw,
@@ -132,7 +133,7 @@ class Followed:
     def __init__(self, kind, share, stuck_after_s=math.inf):
         self.law, self.share, self.stuck_after_s = made(kind), share, stuck_after_s
         self.reaction = [0.0] * round((SLEW.valve.delay_s + SLEW.valve.lag_s) / T_S)
-        self.q = self.q_ref = self.time_s = 0.0
+        self.q = self.q_ref = self.time_s = self.greatest = 0.0
 
     def drive(self, seconds, speed):
         """The errors [rad] while the reference moves at a speed [rad/s]."""
@@ -140,6 +141,7 @@ class Followed:
         for _ in range(round(seconds / T_S)):
             command = step(self.law, self.q_ref, speed, speed, self.q, speed)
             self.reaction.append(command)
+            self.greatest = max(self.greatest, command)
             moves = self.time_s < self.stuck_after_s
             self.q += self.share * self.reaction.pop(0) * T_S * moves
             self.q_ref += speed * T_S
@@ -159,6 +161,16 @@ def test_the_estimating_law_learns_what_the_valve_gives_and_keeps_it(share):
     joint.law.reset()
     assert joint.law._gain.of(speed) == pytest.approx(share, rel=0.03), "a stop does not change the valve"
     assert joint.law._gain.of(-speed) == 1.0, "the other direction is another edge of the spool"
+
+
+@pytest.mark.parametrize(("share", "most"), [(1.3, MOST_SHARE / 1.3), (0.7, MOST_SHARE)])
+def test_a_valve_that_gives_more_is_commanded_less_at_the_speed_limit_and_one_that_gives_less_no_more(share, most):
+    joint = Followed(ESTIMATING, share)
+    joint.q = joint.q_ref = 0.9 * SLEW.lower
+    joint.drive(3.0, 0.5 * SLEW.speed_limit)
+    joint.q_ref += 1.0  # far behind its reference: the law asks for all that it may
+    joint.drive(1.0, SLEW.speed_limit)
+    assert joint.greatest <= 1.01 * most * SLEW.speed_limit
 
 
 def test_an_estimate_stays_within_what_calibration_temperature_and_load_leave():
