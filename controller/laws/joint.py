@@ -117,6 +117,8 @@ GAIN_WINDOW_S: Final = 0.25
 """Arrived commands and travel are both averaged over this time: a swinging load moves the joint to and fro."""
 GAIN_TIME_S: Final = 0.3
 """Time constant of the estimate at speed."""
+STEADY_SHARE: Final = 0.3
+"""A command that differs from its own mean by this share of it teaches nothing, a steady one most."""
 GAIN_SPEED_SHARE: Final = 0.05
 """Slower than this share of the speed limit a joint says little about its valve."""
 
@@ -148,12 +150,15 @@ class ValveGain:
         moved = 0.0 if self._position != self._position else position - self._position
         self._position = position
         share = min(1.0, elapsed_s / GAIN_WINDOW_S)
+        change = abs(arrived / elapsed_s - self._arrived)
         self._arrived += share * (arrived / elapsed_s - self._arrived)
         self._moved += share * (moved / elapsed_s - self._moved)
         speed, side = abs(self._arrived), self._arrived > 0.0
         if speed > self._least:
+            # While the speed changes, the ratio tells how late the joint is rather than what its valve gives.
+            steady = max(0.0, 1.0 - change / (STEADY_SHARE * speed))
             ratio = self._moved / self._arrived
-            learned = self._gain[side] + min(1.0, elapsed_s / GAIN_TIME_S) * (ratio - self._gain[side])
+            learned = self._gain[side] + steady * min(1.0, elapsed_s / GAIN_TIME_S) * (ratio - self._gain[side])
             self._gain[side] = min(max(learned, LEAST_GAIN), MOST_GAIN)
 
 
