@@ -27,6 +27,8 @@ SOURCES: Final = ("machine", "sim", "can_dbc", "experiments")
 """Folders of the checkout on which the outcome of every trial depends."""
 ALL_SOURCES: Final = ("autonomy", "controller", "hil", "host", "recorder", "runtime", "training", "docs/examples")
 """The others on which the outcome of some trial depends."""
+PARTIAL: Final = "trials.partial.jsonl.xz"
+"""Beside a published file: what an interrupted run has finished."""
 LIBRARIES: Final = ("numpy", "scipy", "numba", "pybullet", "openvino", "torch")
 """Libraries that compute."""
 
@@ -41,8 +43,9 @@ class Kept(NamedTuple):
 class Checkpoint:
     """The finished trials of one run.
 
-    ``published``: the same lines in an xz file, used if the file at ``path`` holds no trial of this run.  ``stays``:
-    whether the file stays on the disk after a complete run.
+    ``published``: the same lines in an xz file, used if the file at ``path`` holds no trial of this run; an interrupted
+    run leaves them beside it (`PARTIAL`), so that another checkout can go on.  ``stays``: whether the file stays on the
+    disk after a complete run.
 
     Raises:
         InputRefused: another process writes the same file, or the disk refuses it.
@@ -73,9 +76,10 @@ class Checkpoint:
         self._file.truncate(data.rfind(b"\n") + 1)  # the last run may have been cut off while it wrote
         self._take(data)
         if not self.done and published is not None:
-            self._take(_unpacked(published))
-            for name, outcome, origin in _lines(_unpacked(published)):
-                if name in self.done:
+            data = _unpacked(published) + _unpacked(published.with_name(PARTIAL))
+            self._take(data)
+            for name, outcome, origin in _lines(data):
+                if origin.get("run") == fingerprint:
                     self._write([name, outcome, origin])
 
     def find(self, digest: str) -> Kept | None:
@@ -89,13 +93,10 @@ class Checkpoint:
         self._remember(*json.loads(line))
 
     def publish(self) -> None:
-        """Write the trials of this run to the published file, if there is one."""
+        """Write the trials of this complete run to the published file, if there is one."""
         if self._published is not None:
-            self._file.seek(0)
-            lines = [line for line in _lines(self._file.read()) if line[2].get("run") == self._fingerprint]
-            self._published.parent.mkdir(parents=True, exist_ok=True)
-            with lzma.open(self._published, "wb") as file:
-                file.writelines(json.dumps(line).encode() + b"\n" for line in lines)
+            self._pack(self._published)
+            self._published.with_name(PARTIAL).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file; it stays on disk for the next run."""
@@ -105,10 +106,19 @@ class Checkpoint:
         return self
 
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
-        """Remove the file after a complete run unless it ``stays``; an interrupted run leaves it."""
+        """Remove the file after a complete run unless it ``stays``; an interrupted run leaves it, also in the docs."""
+        if failure is not None and self.done and self._published is not None:
+            self._pack(self._published.with_name(PARTIAL))
         self.close()
         if failure is None and not self._stays:
             self._path.unlink()
+
+    def _pack(self, path: Path) -> None:
+        self._file.seek(0)
+        lines = [line for line in _lines(self._file.read()) if line[2].get("run") == self._fingerprint]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with lzma.open(path, "wb") as file:
+            file.writelines(json.dumps(line).encode() + b"\n" for line in lines)
 
     def _write(self, line: list[Any]) -> str:
         text = json.dumps(line)

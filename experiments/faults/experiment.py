@@ -1,8 +1,8 @@
 """The fault campaign: 45 catalogue entries at random moments, and hours of nominal work (docs/reference/safety.md 5).
 
 ``--trials`` is the number of injections of each entry, spread over its scenes; ``--minutes`` bounds the run: finished
-jobs stay in the checkpoint, and the same command continues.  The page is written once all injections are done, with
-the hours of work that there are by then.
+jobs stay in the checkpoint and, with ``--docs``, in the docs, and the same command continues.  The page is written once
+all injections are done, with the hours of work that there are by then.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ QUICK_NOMINAL_S: Final = 120.0
 PROFILES: Final = ("palms_471", "aoro_fc8")
 BATCH: Final = 25
 """Injections of one job: a checkpoint keeps whole jobs."""
+TRIALS_FILE: Final = "results/faults/trials.jsonl.xz"
 PHYSICS: Final = " physics"
 TIME_OVER: Final = "experiment.time-over"
 
@@ -46,7 +47,7 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     injections = plan(options.seed, trials)
     jobs = [*injections, *nominal_plan(options.seed, QUICK_NOMINAL_S if options.quick else NOMINAL_S)]
-    with checkpoint(options, jobs, PROFILES, options.truth, LOCKSTEP_SOURCES) as kept:
+    with checkpoint(options, jobs, PROFILES, options.truth, LOCKSTEP_SOURCES, TRIALS_FILE) as kept:
         over: InputRefused | None = None
         try:
             with _limited(options.minutes, kept, len(jobs)):
@@ -70,6 +71,8 @@ def run(options: Options, console: Console) -> Result:
         write_evidence(outcomes, metrics, options.out / "evidence")
         if options.docs is not None:
             write_evidence(outcomes, metrics, options.docs / "results" / "faults")
+            if over is None:
+                kept.publish()
         if over is not None:
             raise over  # which keeps the checkpoint
     return result

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments.common import pool
-from experiments.common.checkpoint import ALL_SOURCES, SOURCES, source_hash
+from experiments.common.checkpoint import ALL_SOURCES, SOURCES, read_published, source_hash
 from experiments.common.overview import read
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
@@ -133,6 +133,20 @@ def test_a_run_continues_from_published_trials_if_it_has_no_checkpoint(tmp_path)
     assert Checkpoint(path, "run", published).done == {"square/0": 0, "square/1": 1}
     published.write_bytes(b"no xz")
     assert Checkpoint(tmp_path / "third.jsonl", "run", published).done == {}
+
+
+def test_an_interrupted_run_goes_on_in_another_checkout(tmp_path):
+    docs = tmp_path / "docs" / "trials.jsonl.xz"
+    with pytest.raises(KeyboardInterrupt), Checkpoint(tmp_path / "one.jsonl", "run", docs) as checkpoint:
+        checkpoint.add("square/0", 0)
+        raise KeyboardInterrupt
+    assert not docs.exists()
+    with Checkpoint(tmp_path / "two.jsonl", "run", docs) as checkpoint:
+        assert checkpoint.done == {"square/0": 0}
+        checkpoint.add("square/1", 1)
+        checkpoint.publish()
+    assert read_published(docs) == {"square/0": 0, "square/1": 1}
+    assert list(docs.parent.iterdir()) == [docs]
 
 
 def test_a_run_with_another_truth_starts_anew(tmp_path):
