@@ -166,7 +166,13 @@ class LiveRun(ABC, Generic[Outcome]):
                 signal.signal(number, signal.SIG_IGN)  # the end is short; a second Ctrl-C must not disturb it
             self._processes.stop_all(END_ORDER)
             self._socket.close()
-            self._key_file.unlink(missing_ok=True)
+            self._remove_shared_files()
+
+    def _remove_shared_files(self) -> None:
+        """Remove the key, the guard's latch, and what processes that were killed have left in shared memory."""
+        for folder in (self._ticks.parent, operator_link.guard_path(self._operators).parent):
+            for path in folder.glob(f"{self._ticks.stem}.*"):
+                path.unlink(missing_ok=True)
 
     def _start_all(self) -> dict[str, int]:
         ports = dict(zip(PORTS, free_udp_ports(len(PORTS)), strict=True))

@@ -91,8 +91,9 @@ class LiveRun:
 
 
 def shared_memory() -> set[str]:
-    """This project's files in shared memory, and those in its folder there."""
-    return {str(path) for top in SHARED_MEMORY.glob("timberhand-*") for path in (top, *top.glob("*"))}
+    """This project's files in shared memory; its folders there stay."""
+    found = (path for top in SHARED_MEMORY.glob("timberhand-*") for path in (top, *top.glob("*")))
+    return {str(path) for path in found if not path.is_dir()}
 
 
 def running() -> dict[int, str]:
