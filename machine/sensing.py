@@ -1,4 +1,4 @@
-"""From raw readings to quantities: encoder counts to joint positions, lift pressures to a load."""
+"""From raw readings to quantities: encoder counts to joint positions, lift pressures to a load, a load to a moment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import Joint
-from machine.profile import Encoder, Kinematics, Profile, Sag, Valve, joint
+from machine.profile import Encoder, Kinematics, Profile, Sag, Stability, Valve, joint
 
 # -- Encoder counts to joint position and back (CiA 406 objects 6001h, 6002h, 6004h).
 #
@@ -96,3 +96,22 @@ def hanging_load_kg(sag: Sag | None, kin: Kinematics, q: Sequence[float], moment
     if not ahead_m >= MIN_LEVER_ARM_M:
         return math.nan
     return (moment_nm - empty_moment_nm(sag, kin, q)) / (GRAVITY_M_S2 * ahead_m)
+
+
+# -- What the machine bears: the moment of crane and load about the tipping line (`machine.profile.Stability`).
+
+
+def level_moment_nm(of: Stability, kin: Kinematics, q: Sequence[float], load_kg: float) -> float:
+    """Moment of the crane with a load in its grapple about the tipping line, on level ground [Nm]."""
+    head_m, pin_m, _ = distances(kin, q)
+    return GRAVITY_M_S2 * ((of.pin_kg + load_kg) * (pin_m - of.edge_m) + of.head_kg * (head_m - of.edge_m))
+
+
+def bearable_load_kg(of: Stability, kin: Kinematics, q: Sequence[float], falls_rad: float = 0.0) -> float:
+    """The greatest load that the machine bears with its joints at ``q`` [kg], 0 where it bears none.
+
+    ``falls_rad``: how much the ground falls in the direction of the boom.
+    """
+    left_nm = of.share * of.stabilising_nm - of.slope_nm_rad * falls_rad - level_moment_nm(of, kin, q, 0.0)
+    arm_m = max(distances(kin, q)[1] - of.edge_m, MIN_LEVER_ARM_M)
+    return max(left_nm / (GRAVITY_M_S2 * arm_m), 0.0)

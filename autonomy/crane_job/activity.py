@@ -289,6 +289,8 @@ class Activity(ActivityState):
         self._elapsed_s += 0.0 if self._is_halting else dt_s
         stops = self._is_halting or self.phase is Phase.FAILED or self._restart_phase is not None
         wanted = 0.0 if stops else motion_rate(self.phase, self._elapsed_s, tracker, self._grapple, self.grasp)
+        if self.phase is Phase.LIFT and self._cycle.is_bundle:
+            wanted *= self._cycle.lift_rate(self._position())
         tracker.advance(dt_s, wanted, self._position())
         if self.phase is Phase.FAILED and tracker.is_stopped:
             tracker.hold_here()
@@ -327,6 +329,9 @@ class Activity(ActivityState):
         if lifts_bundle and self._cycle.has_slipped_off(self._grapple, self._position()):
             self._restart_phase = Phase.ABOVE
             return
+        if lifts_bundle and self._tracker.is_stopped and self._cycle.lift_rate(self._position()) == 0.0:
+            self._drop_load()
+            return
         if self.phase in (Phase.CARRY, Phase.LOWER) and self._touches_down():
             self._restart_phase = Phase.OPEN
             return
@@ -345,6 +350,14 @@ class Activity(ActivityState):
         elif self._elapsed_s > _TIMEOUT_FACTOR * self.motion.duration_s + rule.settle_s + rule.slack_s:
             off = self._tracker.worst_joint(self._position())
             self._fail(rule.timeout._replace(sentence=f"{rule.timeout.sentence} within {self._elapsed_s:.0f} s{off}"))
+
+    def _drop_load(self) -> None:
+        """Open here, for what the jaws lift is too heavy, and grip anew: it has risen by a hand's breadth at most."""
+        if not self._cycle.drop_load(self._position()):
+            self._put_back_reason = Problem(
+                "activity.too-heavy", "what the jaws take here is too heavy for the machine"
+            )
+        self._enter(Phase.OPEN, self._tracker.setpoint)
 
     def _next(self, now_ns: int) -> Phase | None:
         """The phase after this one, whose motion is done; None while a condition is not met."""
@@ -395,9 +408,10 @@ class Activity(ActivityState):
         assert self._arrived_ns is not None
         if not self._cycle.needs_reselection:
             return Phase.DESCEND
-        if self._inbox.logs_ns < self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS or self._cycle.sees_a_part:
-            return None if now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS else Phase.DESCEND
-        return Phase.ABOVE if self._cycle.reselect_grasp(self.motion.goal) else Phase.DESCEND
+        seen = self._inbox.logs_ns >= self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS
+        if (not seen or self._cycle.sees_a_part) and now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS:
+            return None
+        return Phase.ABOVE if seen and self._cycle.reselect_grasp(self.motion.goal) else Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
         if self._cycle.confirm_lift((self._position(), self._tracker.setpoint), self._grapple):
@@ -430,6 +444,8 @@ class Activity(ActivityState):
         if self._put_back_reason:
             self._fail(self._put_back_reason)
             return None
+        if self._cycle.drops_load:
+            return Phase.ABOVE
         if self._fetches_next is None or not self._direct:
             return Phase.RETREAT
         self._ready_ns = self._ready_ns or now_ns

@@ -39,6 +39,7 @@ from autonomy.crane_job.rotator_estimate import LoadView, has_no_encoder
 from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m
 from autonomy.grasp.planner import Grasp, GraspSelector, NoGrasp
+from autonomy.grasp.weight import bearable_kg
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import LEVEL, Arm, Pose
 from autonomy.motion.motion_planner import MotionPlanner
@@ -77,6 +78,11 @@ _SAME_GRASP_M, _SAME_GRASP_RAD = 0.02, 0.03
 """Grasps that differ by less share the same descent."""
 _BUNDLE_RELEASE_HEIGHT_M: Final = 0.2
 """Height above the grasp at which a bundle is released again: pressed onto other logs, it would stop the crane."""
+FREE_LOAD_SHARE, MOST_LOAD_SHARE = 0.3, 0.75
+"""A bundle is lifted more slowly from this share of what the machine bears on, and from the other one not at all: the
+oil lifts on for half a second, and a heap that was held by one log weighed a third more by then."""
+HEAVY_LIFT_RATE: Final = 0.4
+"""Rate just below `MOST_LOAD_SHARE`: the heaviest pile is up within the phase's time."""
 _AT_PLACE_M, _AT_PLACE_RAD = 0.03, 0.03
 """A crane this near to the place need not move to release the log."""
 
@@ -119,6 +125,8 @@ class Cycle:
         self._previous_grasp: Grasp | None = None
         self._stirred = False
         """Whether the jaws have closed in vain since the last selection."""
+        self.drops_load = False
+        """Whether the jaws open to grip anew, because the load was too heavy."""
         self._load_id: int | None = None
         """The number under which the load was last seen in the jaws."""
         self._load_ids: set[int] = set()
@@ -158,15 +166,15 @@ class Cycle:
 
     @property
     def needs_reselection(self) -> bool:
-        """Whether a detection from above may improve the grasp: it is of camera-measured logs among others, jaws that
-        closed in vain may have moved its log, or only a part of it was in view.
+        """Whether a detection from above may improve the grasp.
+
+        It is of camera-measured logs among others, jaws that closed in vain may have moved its log, only a part of it
+        was in view, or the crane comes to rest above it anyway: there it sees what lay hidden.
         """
-        return (
-            self.grasp is not None
-            and (self.is_bundle or self._stirred or self.grasp.log.length_m < SHORTEST_LOG_M)
-            and is_camera_measured(self.grasp)
-            and self._reselection_count < MAX_RESELECTIONS
-        )
+        if self.grasp is None or not is_camera_measured(self.grasp) or self._reselection_count == MAX_RESELECTIONS:
+            return False
+        part = self.grasp.log.length_m < SHORTEST_LOG_M
+        return self.is_bundle or self._stirred or part or not self._motion_planner.direct
 
     def reselect_grasp(self, q: Axes) -> bool:
         """Select again by the detection from above the grasp; returns whether the crane must move above another one."""
@@ -202,7 +210,7 @@ class Cycle:
     def has_slipped_off(self, grapple: GrappleSequence, q: Axes) -> bool:
         """Whether the rising jaws are measured empty; then the grasp restarts from above."""
         assert self.grasp is not None
-        if not WEIGHABLE_RISE_M < self.risen_m(q) < VERIFY_LIFT_M:
+        if self.risen_m(q) < WEIGHABLE_RISE_M:
             return False
         restarted = self._recovery.after_rising(self.grasp, grapple)
         if restarted is None:
@@ -210,6 +218,30 @@ class Cycle:
         self.grasp = restarted
         self._allow_reselection()
         return True
+
+    def lift_rate(self, q: Axes) -> float:
+        """The rate at which a bundle may be lifted on.
+
+        1, less where its load comes near what the machine bears, for a pile that comes loose springs up and weighs
+        more, and 0 where it comes too near.
+        """
+        most_kg = bearable_kg(self._arm, q)
+        share = plausible_load_kg(self._inbox.report.load_kg) / most_kg if most_kg > 0.0 else 1.0
+        if share > MOST_LOAD_SHARE:
+            return 0.0
+        heavy = max(share - FREE_LOAD_SHARE, 0.0) / (MOST_LOAD_SHARE - FREE_LOAD_SHARE)
+        return 1.0 - (1.0 - HEAVY_LIFT_RATE) * heavy
+
+    def drop_load(self, q: Axes) -> bool:
+        """The jaws open here, and the grasp restarts from above; False after too many times."""
+        assert self.grasp is not None
+        self.place = self._arm.pose(q)
+        restarted = self._recovery.after_overload(self.grasp)
+        self.drops_load = restarted is not None
+        if restarted is not None:
+            self.grasp = restarted
+            self._allow_reselection()
+        return self.drops_load
 
     def _allow_reselection(self) -> None:
         self._reselection_count = min(self._reselection_count, MAX_RESELECTIONS - 1)
@@ -244,6 +276,7 @@ class Cycle:
                 deeper_m = EXTRACTION_DEPTH_M if grasp.extracts else 0.0
                 return straight_line(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
             case Phase.CLOSE:
+                self.drops_load = False
                 if grasp.dragging:
                     return extraction_motion(arm, start, grasp)
                 return closing_motion(arm, start, grasp, closing_s)

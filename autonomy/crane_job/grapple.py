@@ -29,7 +29,7 @@ _STATE_CLOSED_EMPTY, _STATE_HOLDING = 4, 5
 _OPEN_FROM_PCT: Final = 92.0
 _ASSUMED_GRIP_RAD: Final = 1.5
 """Jaw angle assumed when jaws without a sensor release a log: past the point where the tips meet."""
-_STALLED_WIDE_PCT, _STALLED_WIDE_STEP_PCT, _STALLED_EXCESS_M = 70.0, 3.0, 0.15
+_STALLED_WIDE_PCT, _STALLED_EXCESS_M = 70.0, 0.15
 """Jaws that stop closing this wide open, or with a gap this much wider than their logs side by side, clasp the sides
 of a pile: their tips are not under it."""
 THICK_LOG_M: Final = 0.2
@@ -183,14 +183,10 @@ class GrappleSequence:
         """Whether the jaws are open."""
         return is_open(self._profile, self._inbox.report, self._opening_s)
 
-    def is_stalled_wide(self, grasp: Grasp, raised_count: int) -> bool:
-        """Whether the jaws are measured too wide open to lift what they hold; False without a sensor.
-
-        ``raised_count`` counts the grasps already repeated higher up, where less lies between the jaws.
-        """
+    def is_stalled_wide(self, grasp: Grasp) -> bool:
+        """Whether the jaws are measured too wide open to be under what they hold; False without a sensor."""
         wood_m = sum(log.diameter_m for log in grasp.logs)
-        too_open = self._inbox.report.opening_pct > _STALLED_WIDE_PCT - _STALLED_WIDE_STEP_PCT * raised_count
-        return too_open or self._gap_m() > wood_m + _STALLED_EXCESS_M
+        return self._inbox.report.opening_pct > _STALLED_WIDE_PCT or self._gap_m() > wood_m + _STALLED_EXCESS_M
 
     def has_missed(self, grasp: Grasp) -> bool:
         """Whether the jaws are measured to have closed on nothing where thick logs were, or to pinch the upper half

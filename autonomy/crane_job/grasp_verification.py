@@ -136,16 +136,14 @@ def corrected_place(
 
 # -- Recovery from a failed grasp: what closed jaws tell before anything is lifted, and what is tried then.
 #
-# Jaws that stall too wide open clasp the sides of a pile: they close again higher up, around what lies on top.
-# Jaws that pinch the upper half of a log in a row drag it out and close on it there.  Jaws that close on nothing
-# open again, and the logs are detected once more from above; where the jaws slid over a row that was too wide for
-# them, the next grasp extracts a log at its end.  The same happens where the jaws turn out to be closed and empty
-# as soon as they rise: they slipped off, or the thin log that they might have held is not there.  All this applies
-# only to logs that a camera measured: a log that is given exactly lies where it should.  Without an opening sensor
-# nothing is known of the jaws.
+# Jaws that stall too wide open clasp the sides of a pile.  They are lifted all the same, while they keep closing: the
+# pile comes loose, and they close under what they hold; to open and to close again higher up, around what lies on top,
+# lifted less and took three closings.  Where they slip off and come up empty, the logs are detected once more from
+# above, and the next grasp takes one at the end of a row.  The same happens where jaws close on nothing, or turn out to
+# be empty as they rise.  Jaws that pinch the upper half of a log in a row drag it out and close on it there.  All this
+# applies only to logs that a camera measured: a log that is given exactly lies where it should.  Without an opening
+# sensor nothing is known of the jaws.
 
-MAX_REGRIPS_HIGHER, REGRIP_STEP_M = 3, 0.1
-"""A pile too wide for the jaws is gripped this often and each time this much higher."""
 MAX_RESTARTS: Final = 2
 """Missed logs are gripped again this often before the crane goes up empty."""
 
@@ -154,12 +152,12 @@ MAX_RESTARTS: Final = 2
 class GraspRecovery:
     """The attempts at one grasp.
 
-    ``raised_count`` counts the repetitions higher up since the logs were last detected, ``restart_count`` the restarts
-    from above.  ``excluded_logs`` are the numbers of logs that the next selection leaves out: an extraction of them
-    failed, or they are inside of a row that the jaws failed to lift.
+    ``clasps``: the jaws stalled at the sides of what lies between them.  ``restart_count`` counts the restarts from
+    above.  ``excluded_logs`` are the numbers of logs that the next selection leaves out: an extraction of them failed,
+    or they are inside of a row that the jaws failed to lift.
     """
 
-    raised_count: int = 0
+    clasps: bool = False
     restart_count: int = 0
     excluded_logs: tuple[int, ...] = ()
 
@@ -167,20 +165,13 @@ class GraspRecovery:
         """The next phase, None while the jaws still move, and the grasp as it is tried next."""
         if not is_camera_measured(grasp):
             return Phase.LIFT, grasp
-        wide = self.raised_count < MAX_REGRIPS_HIGHER and grapple.is_stalled_wide(grasp, self.raised_count)
-        # Higher up, closed jaws may hold a thin log that was not detected: its weight tells.
-        vain = grapple.holds_nothing if self.raised_count else grapple.has_missed(grasp)
-        if self.raised_count and grapple.empty and not grapple.is_still:
-            return None, grasp  # the crane still swings, which disturbs the load cell
-        missed = vain and self.restart_count < MAX_RESTARTS
-        if not wide and not missed:
-            return Phase.LIFT, grasp
-        if not grapple.is_still:
+        clasps = grapple.is_stalled_wide(grasp)
+        missed = not clasps and grapple.has_missed(grasp) and self.restart_count < MAX_RESTARTS
+        if (clasps or missed) and not grapple.is_still:
             return None, grasp
-        if wide:
-            self.raised_count += 1
-            pose = grasp.pose.at_height(grasp.pose.z_m + REGRIP_STEP_M)
-            return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + REGRIP_STEP_M)
+        self.clasps = clasps
+        if not missed:
+            return Phase.LIFT, grasp
         if grasp.extracts and not grasp.dragging and not grapple.empty:
             return Phase.CLOSE, replace(grasp, dragging=True)
         return Phase.ABOVE, self._restarted(grasp)
@@ -190,9 +181,13 @@ class GraspRecovery:
         empty = is_camera_measured(grasp) and grapple.is_still and grapple.holds_nothing
         return self._restarted(grasp) if empty and self.restart_count < MAX_RESTARTS else None
 
+    def after_overload(self, grasp: Grasp) -> Grasp | None:
+        """The grasp to restart where the load is too heavy; None after too many times."""
+        return self._restarted(grasp) if self.restart_count < MAX_RESTARTS else None
+
     def _restarted(self, grasp: Grasp) -> Grasp:
-        self.excluded_logs += _inner_logs(grasp) if self.raised_count else (grasp.log.id,) if grasp.extracts else ()
-        self.restart_count, self.raised_count = self.restart_count + 1, 0
+        self.excluded_logs += _inner_logs(grasp) if self.clasps else (grasp.log.id,) if grasp.extracts else ()
+        self.restart_count, self.clasps = self.restart_count + 1, False
         return replace(grasp, dragging=False)
 
 

@@ -41,7 +41,7 @@ BUNDLE_LIFT_S: Final = 10.0
 """Duration of lifting a bundle to the travel height, while its logs settle and askew ones clear the ground."""
 EXTRACTION_DISTANCE_M, EXTRACTION_S = 0.35, 2.5
 """Distance and duration of dragging a log out of a row."""
-PILE_LIFT_S: Final = 4.0
+PILE_LIFT_S: Final = 6.0
 """Duration of lifting out of a pile, which is nearer to the travel height."""
 
 

@@ -26,6 +26,7 @@ from autonomy.grasp.quality import (
     LOWEST_ROW_M,
     MAX_AXIS_OBLIQUITY,
     STRICT_RULE,
+    TIP_HEIGHT_M,
     WIDE_RULE,
     BladeSections,
     CaptureRule,
@@ -37,6 +38,7 @@ from autonomy.grasp.quality import (
     score_grasps,
 )
 from autonomy.grasp.settled_poses import settled_poses
+from autonomy.grasp.weight import HEAP_HEAVIER, HEAVIER, refuse_too_heavy, wood_kg
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import RADIUS, LogObservation
 from machine.geometry.kinematics import Unreachable
@@ -120,10 +122,16 @@ PENETRATION_M: Final = 0.15
 """How much lower than planned, down to the ground, the open jaws go among logs that a camera measured: it sees high
 logs up to 0.1 m too high, and tips that are too high close above them; tips that are too low come to rest on what
 lies there."""
+MOST_UNDER_M: Final = 0.06
+"""The jaws do not go lower than this under the lowest log that they take: deeper down they clasp the logs below it.
+Of 22 grasps from heaps up to 0.06 m under it 20 came up at the first closing, of 16 lower ones 6."""
 FREE_PENETRATION_M: Final = 0.05
 """The same where the tips come down beside all logs: nothing stops them, and they may close around too much."""
 TIP_HALF_WIDTH_M: Final = 0.08
 """Half the width of a jaw's tip, plus its position uncertainty."""
+PASSED_SHARE: Final = 0.4
+"""Tips that penetrate pass over the logs of the lowest row this share of their radius above their axis: lower ones
+clasp them.  Over higher ones, whose heights a camera measures less well, they pass as `LAYER_RULE` says."""
 LAST_RESORT_PROBABILITY: Final = 0.3
 """Success of penetrating over the topmost log where no grasp is safe."""
 MAX_FLOATING_M, MAX_FLOATING_ON_WHEELS_M = 0.4, 1.5
@@ -182,53 +190,68 @@ class SamplingPlanner:
                 held = 1.0 - OFF_CENTRE_PENALTY * np.maximum(1.0 - found.balance / GOOD_LEVERAGE, 0.0)
                 plans.append((best, found, trust * held * share))
         lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
-        likely = bool(plans) and max(float(np.max(plan[2])) for plan in plans) >= TRY_ABOVE_PROBABILITY
-        if measured.any() and not likely:
+        likely, topmost = max((float(np.max(plan[2])) for plan in plans), default=0.0), int(top[0])
+        if measured.any() and likely < TRY_ABOVE_PROBABILITY:
             extraction = extract_end_log(arm, jaws, world, upon, logs, stays, lowest, rot_rad)
             if extraction is not None:
                 return extraction
         if not plans:
             if measured.any():
-                return self._penetrate_over(arm, logs, int(top[0]), stations[0], lowest, rot_rad)
+                return self._topmost(arm, jaws, logs, world, topmost, stations[0], lowest, rot_rad)
             raise NoGrasp(
                 "grasp.none-safe",
                 f"no grasp of the {wanted} is safe: every one closes on a log that stays, takes one from under another "
                 "or takes more than the grapple holds",
             )
-        best, found, probability = max(plans, key=lambda plan: float(np.max(plan[2])))
-        captured, trouble = found.captured, ""
-        for i in _rank(probability, found.count):
-            try:
-                self._check_reach(arm, best, int(i), logs, captured[i], rot_rad)
-            except Unreachable as error:
-                trouble = str(error)
-                continue
-            proposal = self._proposal(best, int(i), captured[i], float(probability[i]), logs)
-            deep_m = _penetration_m(jaws, world, proposal) if measured.any() else 0.0
-            return _penetrating(proposal, deep_m, lowest)
-        raise NoGrasp("grasp.none-in-reach", f"no grasp of the {wanted} is in reach: {trouble}")
+        trouble: list[Unreachable | NoGrasp] = []
+        for best, found, probability in sorted(plans, key=lambda plan: -float(np.max(plan[2]))):
+            captured = found.captured
+            for i in _rank(probability, found.count):
+                try:
+                    self._check(arm, best, int(i), logs, captured[i], rot_rad)
+                except (Unreachable, NoGrasp) as error:
+                    trouble.append(error)
+                    continue
+                proposal = self._proposal(best, int(i), captured[i], float(probability[i]), logs)
+                deep_m = _penetration_m(jaws, world, proposal) if measured.any() else 0.0
+                return _penetrating(proposal, deep_m, lowest)
+        heavy = next((error for error in trouble if isinstance(error, NoGrasp)), None)
+        if heavy is None:
+            raise NoGrasp("grasp.none-in-reach", f"no grasp of the {wanted} is in reach: {trouble[-1]}")
+        if not measured.any():
+            raise heavy
+        return self._topmost(arm, jaws, logs, world, topmost, stations[0], lowest, rot_rad)
 
-    def _penetrate_over(
-        self, arm: Arm, logs: Sequence[LogObservation], i: int, stations: np.ndarray, lowest_m: float, rot: float
+    def _topmost(
+        self,
+        arm: Arm,
+        jaws: Jaws,
+        logs: Sequence[LogObservation],
+        world: Cylinders,
+        i: int,
+        stations: np.ndarray,
+        lowest_m: float,
+        rot: float,
     ) -> GraspCandidate:
-        """A penetrating grasp over log ``i`` at the reachable station nearest to its middle."""
+        """A penetrating grasp of log ``i`` alone, the topmost, at the reachable station nearest to its middle."""
         log = logs[i]
         along = log.length_m * float(min(ALONG_SHARES[stations], key=abs))
-        x, y, z = (c + along * a for c, a in zip(log.center_m, log.axis, strict=True))
+        x, y, _ = (c + along * a for c, a in zip(log.center_m, log.axis, strict=True))
         yaw, captured = atan2(log.axis[1], log.axis[0]) + pi / 2, np.arange(len(logs)) == i
-        level = max(z - log.diameter_m / 2, lowest_m)
+        level = max(
+            _least_level_m(jaws, world, blade_sections(jaws, world, *map(np.array, (x, y, yaw))), [i]), lowest_m
+        )
         at = CandidateArrays(*(np.array([v]) for v in (x, y, yaw, level)))
         try:
-            self._check_reach(arm, at, 0, logs, captured, rot)
+            self._check(arm, at, 0, logs, captured, rot)
         except Unreachable as error:
             raise NoGrasp(
                 "grasp.last-resort-out-of-reach",
                 f"no grasp of the {_log_count(logs)} is safe, and log {log.id} is out of reach: {error}",
             ) from None
         reason = f"no grasp of the {_log_count(logs)} is surely safe: penetrates over log {log.id}, the topmost"
-        return _penetrating(
-            GraspCandidate(x, y, yaw, level, (i,), LAST_RESORT_PROBABILITY, reason), PENETRATION_M, lowest_m
-        )
+        penetrates = level > lowest_m + LOWEST_ROW_M
+        return GraspCandidate(x, y, yaw, level, (i,), LAST_RESORT_PROBABILITY, reason, penetrates=penetrates)
 
     def _probability(
         self,
@@ -252,12 +275,15 @@ class SamplingPlanner:
         share: np.ndarray = np.mean(found.safe & np.any(found.captured & captured, axis=-1), axis=0)
         return share
 
-    def _check_reach(
+    def _check(
         self, arm: Arm, best: CandidateArrays, i: int, logs: Sequence[LogObservation], captured: np.ndarray, rot: float
     ) -> None:
-        thinnest = min(log.diameter_m for log, c in zip(logs, captured, strict=True) if c)
+        """Raises ``Unreachable`` where a candidate is out of reach, ``NoGrasp`` where its logs are too heavy there."""
+        taken = [log for log, c in zip(logs, captured, strict=True) if c]
         x, y, yaw, level = (float(v[i]) for v in (best.x, best.y, best.yaw, best.level))
-        grasp_pose(arm, x, y, yaw, level, thinnest, rot)
+        pose = grasp_pose(arm, x, y, yaw, level, min(log.diameter_m for log in taken), rot)
+        heavier = HEAVIER if len(taken) == 1 else HEAP_HEAVIER
+        refuse_too_heavy(arm, pose, heavier * wood_kg(taken), "log " + " with ".join(str(log.id) for log in taken))
 
     def _proposal(
         self, best: CandidateArrays, i: int, captured: np.ndarray, probability: float, logs: Sequence[LogObservation]
@@ -277,8 +303,11 @@ class SamplingPlanner:
 
 
 def _penetration_m(jaws: Jaws, world: Cylinders, p: GraspCandidate) -> float:
-    """How much lower than planned the jaws may penetrate: not at all where a log between them lies across the captured
-    ones and would come along; little where nothing stops them."""
+    """How much lower than planned the jaws may penetrate.
+
+    Not at all where a log between them lies across the captured ones and would come along; little where nothing stops
+    them; and never so far that they would clasp the logs that they have to pass over.
+    """
     at = blade_sections(jaws, world, *(np.array(v) for v in (p.x_m, p.y_m, p.yaw_rad)))
     between = at.inside & (at.low_u < jaws.half_gap_m) & (at.high_u > -jaws.half_gap_m)
     between[list(p.logs)] = False
@@ -288,7 +317,18 @@ def _penetration_m(jaws: Jaws, world: Cylinders, p: GraspCandidate) -> float:
         np.any(at.inside & (at.low_u < tip + TIP_HALF_WIDTH_M) & (at.high_u > tip - TIP_HALF_WIDTH_M))
         for tip in (-jaws.half_gap_m, jaws.half_gap_m)
     ]
-    return PENETRATION_M if any(beneath) else FREE_PENETRATION_M
+    deepest_m = max(p.support_z_m - _least_level_m(jaws, world, at, list(p.logs)), 0.0)
+    return min(PENETRATION_M if any(beneath) else FREE_PENETRATION_M, deepest_m)
+
+
+def _least_level_m(jaws: Jaws, world: Cylinders, at: BladeSections, taken: list[int]) -> float:
+    """Height down to which jaws may penetrate that take some logs and pass over the others between them."""
+    passed = at.inside & (np.maximum(at.low_u, -at.high_u) < jaws.half_gap_m)
+    passed[taken] = False
+    bottom = world.center[:, 2] - world.radius
+    share = np.where(bottom < np.min(bottom) + LOWEST_ROW_M, PASSED_SHARE, LAYER_RULE.pass_over_share)
+    over = at.middle + share * (at.top - at.middle) + jaws.plate_m / 2 - TIP_HEIGHT_M
+    return max(float(np.min(bottom[taken])) - MOST_UNDER_M, float(np.max(over[passed], initial=-np.inf)))
 
 
 def _penetrating(p: GraspCandidate, deep_m: float, lowest_m: float) -> GraspCandidate:

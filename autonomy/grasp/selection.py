@@ -18,6 +18,7 @@ import numpy as np
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import grasp_pose, known_ground_m
 from autonomy.grasp.planner import Grasp, GraspPlanner, GraspRequest, NoGrasp, offset_along
+from autonomy.grasp.weight import HEAVIER, refuse_too_heavy, wood_kg
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
@@ -82,7 +83,7 @@ def plan_single_log_grasp(arm: Arm, log: LogObservation, rot_rad: float) -> Gras
     """The grasp of one log.
 
     Raises:
-        NoGrasp: the log stands too steep, or is out of reach.
+        NoGrasp: the log stands too steep, is out of reach, or is too heavy where it lies.
     """
     profile = arm.profile
     if abs(log.axis[2]) > MAX_AXIS_SLOPE:
@@ -95,6 +96,7 @@ def plan_single_log_grasp(arm: Arm, log: LogObservation, rot_rad: float) -> Gras
         support = max(known_ground_m(profile), z - log.diameter_m / 2)
         try:
             pose = grasp_pose(arm, x, y, yaw + pi / 2, support, log.diameter_m, rot_rad)
+            refuse_too_heavy(arm, pose, HEAVIER * wood_kg([log]), f"log {log.id}")
         except Unreachable as error:
             trouble = trouble or error
             continue

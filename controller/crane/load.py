@@ -19,6 +19,7 @@ from machine.sensing import (
     PA_PER_BAR,
     empty_moment_nm,
     hanging_load_kg,
+    level_moment_nm,
     lever_share,
     lift_moment_nm,
 )
@@ -242,15 +243,12 @@ class LoadMoment:
 
     def moment_nm(self, position: Sequence[float], load_kg: float, roll_rad: float, pitch_rad: float) -> float:
         """Moment about the tipping line [Nm]; NaN while a joint is unknown."""
-        of = self._stability
-        head_m, pin_m, _ = distances(self._kinematics, position)
-        hanging_kg = of.pin_kg + (load_kg if load_kg > 0.0 else 0.0)
-        level_nm = GRAVITY_M_S2 * (hanging_kg * (pin_m - of.edge_m) + of.head_kg * (head_m - of.edge_m))
+        level_nm = level_moment_nm(self._stability, self._kinematics, position, load_kg if load_kg > 0.0 else 0.0)
         if roll_rad != roll_rad or pitch_rad != pitch_rad:
             return level_nm
         direction = position[Joint.SLEW] + self._yaw_rad
         falls_rad = -pitch_rad * cos(direction) - roll_rad * sin(direction)
-        return level_nm + of.slope_nm_rad * falls_rad
+        return level_nm + self._stability.slope_nm_rad * falls_rad
 
     def raised_by_motion(self, position: Sequence[float], velocity: Sequence[float]) -> bool:
         """Whether a motion leads outward or up [rad, m; per second]."""

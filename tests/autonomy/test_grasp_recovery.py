@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from autonomy.crane_job.grasp_verification import MAX_REGRIPS_HIGHER, MAX_RESTARTS, REGRIP_STEP_M, GraspRecovery
+from autonomy.crane_job.grasp_verification import MAX_RESTARTS, GraspRecovery
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planner import Grasp
 from autonomy.motion.arm_kinematics import Pose
@@ -20,7 +20,7 @@ class Told(SimpleNamespace):
 
     is_still, empty, wide, missed, holds_nothing = True, False, False, False, False
 
-    def is_stalled_wide(self, grasp: Grasp, raised_count: int) -> bool:
+    def is_stalled_wide(self, grasp: Grasp) -> bool:
         return self.wide
 
     def has_missed(self, grasp: Grasp) -> bool:
@@ -42,13 +42,8 @@ def test_moving_jaws_are_waited_for(trouble: str) -> None:
     assert GraspRecovery().after_closing(grasp(), Told(is_still=False, **{trouble: True}))[0] is None
 
 
-def test_jaws_that_stall_wide_close_again_higher_up() -> None:
-    regrip, now = GraspRecovery(), grasp()
-    for i in range(MAX_REGRIPS_HIGHER):
-        phase, now = regrip.after_closing(now, Told(wide=True))
-        assert phase is Phase.DESCEND
-        assert now.pose.z_m == pytest.approx(grasp().pose.z_m + (i + 1) * REGRIP_STEP_M)
-    assert regrip.after_closing(now, Told(wide=True))[0] is Phase.LIFT
+def test_jaws_that_stall_wide_lift_what_they_clasp() -> None:
+    assert GraspRecovery().after_closing(grasp(), Told(wide=True)) == (Phase.LIFT, grasp())
 
 
 def test_a_miss_restarts_from_above_a_few_times() -> None:
@@ -68,19 +63,6 @@ def test_a_pinched_log_in_a_row_is_dragged_once_before_a_restart() -> None:
     )
 
 
-def test_closed_jaws_higher_up_may_hold_an_undetected_thin_log() -> None:
-    regrip = GraspRecovery()
-    _, now = regrip.after_closing(grasp(), Told(wide=True))
-    assert regrip.after_closing(now, Told(missed=True, empty=True))[0] is Phase.LIFT
-
-
-def test_closed_jaws_higher_up_are_weighed_once_the_crane_is_still() -> None:
-    regrip = GraspRecovery()
-    _, now = regrip.after_closing(grasp(), Told(wide=True))
-    assert regrip.after_closing(now, Told(empty=True, is_still=False))[0] is None, "its load swings, too"
-    assert regrip.after_closing(now, Told(empty=True, holds_nothing=True))[0] is Phase.ABOVE
-
-
 def test_jaws_that_rise_empty_restart_as_often_as_jaws_that_closed_on_nothing() -> None:
     regrip, empty = GraspRecovery(), Told(empty=True, holds_nothing=True)
     assert regrip.after_rising(grasp(), Told()) is None
@@ -97,21 +79,24 @@ def row(*across_m: float) -> Grasp:
 
 
 def test_after_a_failed_row_its_inner_logs_are_excluded() -> None:
-    regrip, wide = GraspRecovery(), row(0.3, -0.3, 0.0)
-    _, now = regrip.after_closing(wide, Told(wide=True))
-    assert regrip.after_closing(now, Told(empty=True, holds_nothing=True))[0] is Phase.ABOVE
-    assert regrip.excluded_logs == (3,) and regrip.raised_count == 0, "one at its end is taken, from the ground"
+    regrip, wide, empty = GraspRecovery(), row(0.3, -0.3, 0.0), Told(empty=True, holds_nothing=True)
+    regrip.after_closing(wide, Told(wide=True))
+    assert regrip.after_rising(wide, empty) is not None and regrip.excluded_logs == (3,)
     drawn = replace(row(0.3), extracts=True)
     regrip.after_closing(drawn, Told(missed=True, empty=True))
     assert regrip.excluded_logs == (3, 1)
-    _, now = regrip.after_closing(row(0.3), Told(wide=True))
-    assert regrip.after_closing(now, Told(empty=True, holds_nothing=True))[0] is Phase.LIFT, "twice, and no more"
+    regrip.after_closing(row(0.3), Told(wide=True))
+    assert regrip.after_rising(row(0.3), empty) is None, "twice, and no more"
 
 
-def test_a_grasp_of_two_has_no_inner_logs() -> None:
+@pytest.mark.parametrize(("across_m", "wide"), [((0.0, 0.3), True), ((0.3, -0.3, 0.0), False)])
+def test_no_inner_logs_are_excluded_of_two_or_where_the_jaws_had_closed(
+    across_m: tuple[float, ...], wide: bool
+) -> None:
     regrip = GraspRecovery()
-    _, now = regrip.after_closing(row(0.0, 0.3), Told(wide=True))
-    assert regrip.after_closing(now, Told(holds_nothing=True))[0] is Phase.ABOVE and regrip.excluded_logs == ()
+    regrip.after_closing(row(*across_m), Told(wide=wide))
+    regrip.after_rising(row(*across_m), Told(holds_nothing=True))
+    assert regrip.restart_count == 1 and regrip.excluded_logs == ()
 
 
 def test_exactly_known_logs_are_lifted_as_they_are() -> None:

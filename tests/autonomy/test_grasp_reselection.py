@@ -12,6 +12,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
+from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.perception.log_list import TRIANGLE, LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import profile_hash
@@ -87,6 +88,41 @@ def test_without_a_detection_from_above_the_crane_continues_after_a_moment() -> 
     since_ns = crane.now_ns
     assert len(until(crane, planner, Phase.DESCEND)) == 1
     assert crane.now_ns - since_ns <= DETECTION_TIMEOUT_NS + 4 * TICK_NS
+
+
+class Edge(Camera):
+    """From aside the camera sees one end of a log, from above the same end and a whole log."""
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        part, whole = Camera.seen(self)
+        x, y, z = part.center_m
+        part = replace(part, center_m=(x + 0.7, y, z), length_m=1.2)
+        return (part, whole) if abs(self.pin()[1] - y) < 0.5 else (part,)
+
+
+def test_a_log_that_stays_a_part_is_not_gripped_before_the_others_are_looked_at() -> None:
+    _, planner = made()
+    edge = Edge(PROFILE, pair())
+    until(edge, planner, Phase.ABOVE)
+    assert planner.grasp is not None and planner.grasp.log.id == 0
+    until(edge, planner, Phase.DESCEND)
+    assert 1 in [log.id for log in planner.grasp.logs]
+
+
+@pytest.mark.parametrize(("direct", "selections"), [(False, 2), (True, 1)])
+def test_above_a_single_log_it_is_selected_again_where_the_crane_rests_anyway(direct: bool, selections: int) -> None:
+    asked = []
+
+    def counting(request: GraspRequest) -> GraspCandidate:
+        asked.append(len(request.logs))
+        return SamplingPlanner()(request)
+
+    crane = Camera(PROFILE, pair()[:1])
+    crane.off_m = 0.0
+    motions, selector = TimeOptimalPlanner(direct=direct), PlannerSelection(counting)
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=selector, motion_planner=motions)
+    until(crane, planner, Phase.CLOSE)
+    assert len(asked) == selections
 
 
 def test_a_better_grasp_without_a_path_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -137,6 +137,7 @@ def laid(log: LogObservation, grasp: Pose, place: Pose) -> LogObservation:
         (log_at(-6.0, 6.0), "grasp.log-out-of-reach", "log 0"),
         (log_at(0.5, -4.0), "grasp.log-out-of-reach", "slew"),
         (replace(GROUND_LOG, axis=(0.0, 0.6, 0.8)), "grasp.log-too-steep", "53 deg"),
+        (replace(log_at(0.0, 6.0), length_m=5.0, diameter_m=0.45), "grasp.too-heavy", "log 0 may weigh 503 kg"),
     ],
 )
 def test_an_impossible_log_gives_one_error(log: LogObservation, code: str, value: str) -> None:

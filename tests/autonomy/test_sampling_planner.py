@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import atan2, pi, remainder
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -20,7 +21,7 @@ from autonomy.grasp.quality import (
     rests_upon,
     score_grasps,
 )
-from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.sampling_planner import MOST_UNDER_M, SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection, select_direct
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm
@@ -110,6 +111,32 @@ def test_the_log_on_top_is_taken_and_those_below_are_left() -> None:
 )
 def test_the_rule(logs: list[LogObservation], across_m: float, yaw: float, safe: bool) -> None:
     assert is_safe(logs, across_m, yaw) is safe
+
+
+@pytest.mark.parametrize(("half_m", "upon", "safe"), [(0.3, True, False), (0.3, False, True), (0.26, True, True)])
+def test_a_row_with_logs_upon_it_is_not_pressed_together(half_m: float, upon: bool, safe: bool) -> None:
+    """The log that lies upon two others keeps them apart, or upon a third one that it hides."""
+    row = [log(0, -half_m, diameter=0.26), log(1, half_m, diameter=0.26)]
+    assert is_safe([*row, log(2, 0.0, 0.1, diameter=0.3)] if upon else row, 0.0) is safe
+
+
+def test_an_outer_log_that_floats_counts_to_the_row() -> None:
+    """Its underside is hidden: a camera measured the visible strip of a thicker log."""
+    beside, upon = log(0, -0.3, diameter=0.26), log(2, 0.0, 0.1, diameter=0.3)
+    assert is_safe([beside, upon], 0.0)
+    assert not is_safe([beside, upon, log(1, 0.33, 0.12, diameter=0.12)], 0.0)
+
+
+def test_of_logs_that_are_too_heavy_together_one_is_taken() -> None:
+    both = [log(0, -0.32, diameter=0.28), log(1, 0.32, diameter=0.28)]
+    assert planned(both).logs == (0, 1)
+    weak = PROFILE.stability
+    assert weak is not None
+    arm = Arm(msgspec.structs.replace(PROFILE, stability=msgspec.structs.replace(weak, stabilising_nm=21e3)))
+    assert len(SamplingPlanner()(GraspRequest(arm, both, 0.0)).logs) == 1
+    arm = Arm(msgspec.structs.replace(PROFILE, stability=msgspec.structs.replace(weak, stabilising_nm=12e3)))
+    with pytest.raises(NoGrasp, check=coded("grasp.too-heavy")):
+        SamplingPlanner()(GraspRequest(arm, both, 0.0))
 
 
 def test_no_log_is_pulled_from_under_another() -> None:
@@ -254,9 +281,16 @@ def test_jaws_penetrate_a_pile_that_a_camera_measured_but_not_the_ground() -> No
     known, seen = planned(heap), planned(measured(heap))
     assert known.logs == seen.logs == (7,)
     assert not known.penetrates and seen.penetrates
-    assert seen.support_z_m == pytest.approx(max(known.support_z_m - 0.15, GROUND), abs=0.02)
+    assert seen.support_z_m == pytest.approx(GROUND + 0.18 - MOST_UNDER_M, abs=0.01)
     whole = planned(measured(pair()))
     assert not whole.penetrates and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
+
+
+def test_jaws_that_penetrate_still_pass_over_the_logs_beside_what_they_take() -> None:
+    """They would clasp them, come up with the whole pile or slip off."""
+    p = planned(measured([*(log(i, 0.3 * i, diameter=0.28) for i in range(-3, 4)), log(9, 0.15, 0.2)]))
+    assert p.logs == (7,) and p.penetrates
+    assert p.support_z_m > GROUND + 0.2 - MOST_UNDER_M + 0.01
 
 
 def test_jaws_do_not_penetrate_over_a_log_that_lies_across() -> None:

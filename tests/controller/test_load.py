@@ -22,7 +22,7 @@ from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Sag, Stability
-from machine.sensing import MIN_LEVER_ARM_M, empty_moment_nm, lever_share
+from machine.sensing import MIN_LEVER_ARM_M, bearable_load_kg, empty_moment_nm, lever_share
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
@@ -53,6 +53,15 @@ def test_moment_is_that_of_three_weights_about_the_edge():
     assert found == pytest.approx(wanted, rel=1e-12)
     assert LoadMoment(AORO, of).moment_nm(q, math.nan, 0.0, 0.0) < found, "an unknown load counts as none"
     assert math.isnan(LoadMoment(AORO, of).moment_nm((0.0, math.nan, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("falls_rad", [0.0, 0.1, -0.1])
+def test_the_load_that_the_machine_bears_is_that_of_the_planner(falls_rad):
+    q, of = (0.0, *STRAIGHT[1:]), AORO.stability
+    bears_kg = bearable_load_kg(of, AORO.kinematics, q, falls_rad)
+    moment = LoadMoment(AORO, of)
+    assert moment.moment_nm(q, bears_kg, 0.0, falls_rad) == pytest.approx(moment.limit_nm)
+    assert bearable_load_kg(msgspec.structs.replace(of, stabilising_nm=1.0), AORO.kinematics, q) == 0.0
 
 
 @pytest.mark.parametrize(
