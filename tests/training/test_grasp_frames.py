@@ -89,7 +89,7 @@ def test_the_compiled_rule_is_the_planners() -> None:
         level = rng.choice([GROUND, *(w.center[:, 2] + w.radius)], 40)
         ours = score_grasps(JAWS, w, upon, blade_sections(JAWS, w, x, y, yaw), level)
         for k in range(40):
-            at, captured = np.empty((w.count, 2)), np.empty(w.count, np.bool_)
+            at, captured = np.empty((w.count, 3)), np.empty(w.count, np.bool_)
             lever, mass = evaluate_candidate(*facts, packed(w), upon, x[k], y[k], yaw[k], level[k], at, captured)
             assert (lever > 0.0) == ours.safe[k], (seed, k)
             if ours.safe[k]:

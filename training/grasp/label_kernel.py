@@ -24,6 +24,7 @@ _MAX_OBLIQUITY, _LEVER = quality.MAX_AXIS_OBLIQUITY, quality.LEVER_SCALE_M
 _SCOOP, _FRICTION, _DENSITY = quality.STRICT_RULE.scoop_share, quality.FRICTION_COEFFICIENT, quality.DENSITY_KG_M3
 _GRAVITY: Final = quality.GRAVITY_M_S2
 _MIDDLE, _ALONE, _ROW = CENTRING_SCALE_M, quality.OFF_CENTRE_SCALE_M, quality.LOWEST_ROW_M
+_WEDGED: Final = quality.WEDGED_SHARE
 _LOW, _HIGH = TIP_CLEARANCE_M
 _HALF_PLATE, _UNDER = HALF_PLATE_M, SCOOP_SHARE
 
@@ -69,7 +70,7 @@ def evaluate_candidate(
     at: np.ndarray,
     captured: np.ndarray,
 ) -> tuple[float, float]:
-    """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 2) and ``captured`` (n,) are
+    """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 3) and ``captured`` (n,) are
     scratch."""
     n = len(world)
     cu, su = math.cos(yaw), math.sin(yaw)
@@ -111,11 +112,12 @@ def evaluate_candidate(
             return 0.0, 0.0
         captured[i] = some = True
         left, right = min(left, low_u), max(right, high_u)
-        at[i, 0], at[i, 1] = z - high, dv
+        at[i, 0], at[i, 1], at[i, 2] = z - high, dv, u
     if not some:
         return 0.0, 0.0
     area = mass = tilt = row = far = 0.0
-    in_row = 0
+    in_row, wedged = 0, False
+    first_u, last_u = math.inf, -math.inf
     for i in range(n):
         if not captured[i]:
             continue
@@ -128,10 +130,16 @@ def evaluate_candidate(
         mass += wood
         tilt += wood * at[i, 1]
         far = max(far, abs(at[i, 1]))
-        if at[i, 0] < level + _ROW:
+        if at[i, 0] < level + _ROW or not upon[:, i].any():
             row += 2.0 * r
             in_row += 1
-    if in_row > 1 and row * (in_row - 1) / in_row >= facts[SCOOP_SPAN]:
+            first_u, last_u = min(first_u, at[i, 2]), max(last_u, at[i, 2])
+        else:
+            wedged = True
+    apart = row * (in_row - 1) / max(in_row, 1)
+    if wedged and in_row > 0:
+        apart = max(apart, _WEDGED * (last_u - first_u))
+    if apart >= facts[SCOOP_SPAN]:
         return 0.0, 0.0
     if area >= facts[CAPACITY] or _GRAVITY * abs(tilt) >= _FRICTION * facts[TIP_FORCE] * facts[BLADE]:
         return 0.0, 0.0
@@ -229,7 +237,7 @@ def label(
     ``near`` contribute their direction.
     """
     n, draws = worlds.shape[1], len(moves)
-    at, captured = np.empty((n, 2)), np.empty(n, np.bool_)
+    at, captured = np.empty((n, 3)), np.empty(n, np.bool_)
     seen = worlds[0]
     wood = 0.0
     for i in range(n):
