@@ -115,7 +115,8 @@ def _from_zip(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
         raise MissionError("mission.archive", sentence, name)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            files = [e for e in archive.infolist() if not e.is_dir() and not e.filename.startswith("__MACOSX/")]
+            named = [e for e in archive.infolist() if e.filename]  # is_dir fails without a name
+            files = [e for e in named if not e.is_dir() and not e.filename.startswith("__MACOSX/")]
             found = [e for e in files if e.filename.lower().endswith(_MISSION_NAMES)]
             found = [e for e in found if e.filename.lower() == "doc.kml"] or found
             if len(found) != 1:

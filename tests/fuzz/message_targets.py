@@ -122,7 +122,10 @@ def start_gate() -> Run:
             except RequestRefused as refused:
                 gate.count_refusal(refused.reason, refused.detail, now_ns)
                 found.append(refused.reason)
-        found.append(outcome(CommandRefused, missions_gate.accept, data, now_ns, then=lambda command: command.action))
+        told = outcome(
+            CommandRefused, missions_gate.accept, data, now_ns, then=lambda o: getattr(o, "action", "upload")
+        )
+        found.append(told)
         return tuple(found)
 
     return run

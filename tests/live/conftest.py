@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,7 +40,7 @@ class LiveRun:
         os.environ.pop(TAG, None)  # the witnesses are no part of the run that they watch
         self.witnesses = [Witness(cpu, priority=98) for cpu in sorted(os.sched_getaffinity(0))]
         os.environ[TAG] = str(os.getpid())
-        self._memory = shared_memory()
+        self._files = files()
         self.left: list[str] = []
         self.inconclusive: list[str] = []
 
@@ -78,7 +79,7 @@ class LiveRun:
         left = remaining(set(), PATIENCE_S)
         self.left += [f"process {pid}: {command}" for pid, command in left.items()]
         kill(left)
-        self.left += [f"shared memory: {name}" for name in sorted(shared_memory() - self._memory)]
+        self.left += [f"file: {name}" for name in sorted(files() - self._files)]
         if self.left and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -90,10 +91,11 @@ class LiveRun:
             terminalreporter.write_line(f"left by this run: {words}", red=True)
 
 
-def shared_memory() -> set[str]:
-    """This project's files in shared memory; its folders there stay."""
-    found = (path for top in SHARED_MEMORY.glob("timberhand-*") for path in (top, *top.glob("*")))
-    return {str(path) for path in found if not path.is_dir()}
+def files() -> set[str]:
+    """This project's files in shared memory, where its folders stay, and its temporary files and folders."""
+    memory = (path for top in SHARED_MEMORY.glob("timberhand-*") for path in (top, *top.glob("*")))
+    temporary = Path(tempfile.gettempdir()).glob("timberhand-*")
+    return {str(path) for path in memory if not path.is_dir()} | set(map(str, temporary))
 
 
 def running() -> dict[int, str]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import shutil
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -54,8 +56,12 @@ class Browser:
             f"--user-data-dir={folder / 'chromium'}",
             f"--window-size={size[0]},{size[1]}",
         )
+        self._sockets = tempfile.TemporaryDirectory(prefix="timberhand-browser-")  # it leaves its socket there
         self._process = subprocess.Popen(
-            [program, *options, "about:blank"], stdout=subprocess.DEVNULL, stderr=self._said
+            [program, *options, "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            env=os.environ | {"TMPDIR": self._sockets.name},
         )
         self._number = 0
         port = folder / "chromium" / "DevToolsActivePort"
@@ -79,6 +85,7 @@ class Browser:
         self._process.terminate()
         self._process.wait(10)
         self._said.close()
+        self._sockets.cleanup()
 
     def open(self, url: str, enters: bool = True) -> None:
         """Load a page, by the printed address if it ``enters``."""

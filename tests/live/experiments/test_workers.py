@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -131,8 +132,10 @@ def cluster() -> Iterator[Any]:
             raise
         pytest.skip("Ray did not start: its agent gets 15 s by Ray's own limit, and this host is too busy for that")
     yield made
+    session = made.head_node.get_session_dir_path()
     ray.shutdown()
     made.shutdown()
+    shutil.rmtree(session, ignore_errors=True)
 
 
 def free_ports() -> dict[str, int]:
