@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
+from controller.supervisor import STALL_MEMORY_NS, STALL_NS
 from machine.status.explanation import describe
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
@@ -133,3 +135,44 @@ def test_a_stall_that_the_machine_bus_feels_is_the_computer_s() -> None:
     for _ in range(30):
         bench.tick(late_ns=8 * MS)
     assert bench.reason == Reason.COMPUTER_STALLED
+
+
+# -- At the edges of the rule.
+
+
+def lost(*nodes: tuple[tuple[bool, int], ...], heard_ms: int = 0, bench: Bench | None = None) -> Reason:
+    """The common cause of what is lost, by (here, time-out [ms]) of every message of every node."""
+    states = [[SimpleNamespace(values=() if here else None, timeout_ns=ms * MS) for here, ms in node] for node in nodes]
+    supervisor, now_ns = (bench or Bench()).controller.supervisor, (bench or Bench()).now_ns
+    return supervisor._lost_together(states, now_ns - heard_ms * MS, now_ns)
+
+
+@pytest.mark.parametrize(
+    ("heard_ms", "reason"), [(0, Reason.NONE), (40, Reason.NONE), (50, Reason.NONE), (51, Reason.INPUTS_LOST)]
+)
+def test_one_lost_message_is_the_bus_s_fault_once_it_was_silent_for_half_its_time_out(
+    heard_ms: int, reason: Reason
+) -> None:
+    assert lost(((False, 100), (True, 10)), ((True, 100),), heard_ms=heard_ms) == reason
+
+
+def test_two_nodes_are_lost_together_by_a_message_each() -> None:
+    assert lost(((False, 100), (True, 100)), ((False, 100), (True, 100))) == Reason.INPUTS_LOST
+    assert lost(((False, 100), (False, 100)), ((True, 100),)) == Reason.NONE
+    assert lost(((True, 100),), ((True, 100),)) == Reason.NONE
+
+
+def test_a_stall_is_remembered_for_its_time_and_no_longer() -> None:
+    bench, both = Bench(), (((False, 100),), ((False, 100),))
+    supervisor, begin_ns = bench.controller.supervisor, bench.now_ns
+    supervisor._note_stall(STALL_NS, begin_ns)
+    assert supervisor.stall_ns == 0 and lost(*both, bench=bench) == Reason.INPUTS_LOST
+    supervisor._note_stall(9 * MS, begin_ns)
+    bench.now_ns = begin_ns + STALL_MEMORY_NS - 1
+    assert lost(*both, bench=bench) == Reason.COMPUTER_STALLED
+    supervisor._note_stall(6 * MS, bench.now_ns)
+    assert supervisor.stall_ns == 9 * MS
+    bench.now_ns += STALL_MEMORY_NS
+    assert lost(*both, bench=bench) == Reason.INPUTS_LOST
+    supervisor._note_stall(6 * MS, bench.now_ns)
+    assert supervisor.stall_ns == 6 * MS
