@@ -353,10 +353,13 @@ class Activity(ActivityState):
 
     def _drop_load(self) -> None:
         """Open here, for what the jaws lift is too heavy, and grip anew: it has risen by a hand's breadth at most."""
-        if not self._cycle.drop_load(self._position()):
-            self._put_back_reason = Problem(
-                "activity.too-heavy", "what the jaws take here is too heavy for the machine"
+        q, load_kg = self._position(), self._inbox.report.load_kg
+        if not self._cycle.drop_load(q):
+            sentence = (
+                f"what the jaws lift weighs {load_kg:.0f} kg or more, too much for the machine "
+                f"{self._cycle.arm.pose(q).r_m:.1f} m away; bring it nearer, or lay the logs apart"
             )
+            self._put_back_reason = Problem("activity.too-heavy", sentence)
         self._enter(Phase.OPEN, self._tracker.setpoint)
 
     def _next(self, now_ns: int) -> Phase | None:

@@ -17,6 +17,7 @@ from machine.geometry.kinematics import pin_position
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.crane_stand_in import StandIn
 from tests.autonomy.grasp_scenes import GROUND, PROFILE, measured, small_pile
+from tests.codes import numbers_in
 
 STALL_RAD = 0.5  # of 2.25: opened by four fifths
 
@@ -93,6 +94,7 @@ def test_what_is_too_heavy_is_released_before_the_machine_stops_and_gripped_anew
         assert planner.phase is not Phase.LIFT or heap.pin_m() < begun_m + 0.3
     assert max(loads) < 1.0
     assert phases.count(Phase.LIFT) == 1 + MAX_RESTARTS and planner.failure_code == "activity.too-heavy"
+    assert planner.failure is not None and 350.0 < numbers_in(planner.failure)[0] <= 600.0
     assert Phase.LIFT not in {b for a, b in pairwise(phases) if a is Phase.OPEN}
 
 
