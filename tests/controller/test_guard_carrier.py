@@ -58,6 +58,19 @@ def test_a_normal_drive_passes():
     assert traffic.tick(200) is Verdict.GOOD, "it has time to stop"
 
 
+def test_a_carrier_that_nobody_armed_does_not_raise_its_frame():
+    traffic = Traffic("aoro_fc8")
+    traffic.tick(700)
+    assert traffic.guard.verdict is Verdict.GOOD
+    traffic.arms_a = {"ArmKey": 0xA, "Arm1": 40.0}
+    count_until(traffic.tick, lambda: not traffic.guard.enabled)
+    assert traffic.guard.verdict is Verdict.NOT_ARMED
+    traffic = Traffic("aoro_fc8")
+    traffic.tick(700)
+    traffic.press().arms_a = {"ArmKey": 0xA, "Arm1": 40.0}
+    assert traffic.tick(6) is Verdict.GOOD
+
+
 def test_steering_back_from_beyond_the_range_passes():
     traffic = forwarder()
     traffic.vehicle["Articulation"] = 0.72

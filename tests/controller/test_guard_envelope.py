@@ -1,7 +1,9 @@
 """The guard's envelope file: sealed, apart from the profile, and never exceeded by it."""
 
 import itertools
+import math
 import re
+import zlib
 
 import pytest
 
@@ -10,7 +12,7 @@ from controller.config import load as load_settings
 from controller.crane.trajectory_check import WorkspaceCheck
 from controller.guard import seal
 from controller.guard.__main__ import DATABASES, build
-from controller.guard.envelope import SHIPPED, read_envelope
+from controller.guard.envelope import RATES_HZ, SHIPPED, _axis, _limits, _number, _within, read_envelope
 from controller.guard.layout import GuardConfigError, read_layouts
 from machine.geometry.bunk import stake_walls
 from machine.geometry.grapple import lowest_pin_m
@@ -127,6 +129,94 @@ def test_numbers_that_would_switch_a_rule_off_or_end_the_guard_stop_the_start(fi
     profile.write_text(changed)
     with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
         build(profile)
+
+
+def resealed(envelope, old, new):
+    """Change an envelope file as its owner may: with a new seal."""
+    text = envelope.read_text()
+    assert old in text
+    envelope.write_text(text.replace(old, new))
+    assert seal.main([str(envelope)]) == 0
+
+
+@pytest.mark.parametrize("high", ["[9.0, 9.0, -9.0]", "[-1.0, 9.0, 9.0]"])
+def test_one_box_of_several_without_a_volume_stops_the_start(files, high):
+    """The first has its corners the wrong way round or on one face; the others are those of the machine."""
+    profile, envelope = files
+    resealed(envelope, "[[boxes]]", f"[[boxes]]\nlow_m = [-1.0, -1.0, -1.0]\nhigh_m = {high}\n\n[[boxes]]")
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
+        build(profile)
+
+
+@pytest.mark.parametrize(
+    ("limit", "taken"), [(0.0007, False), (0.001, True), (0.7, True), (7.0, True), (10.0, True), (10.5, False)]
+)
+def test_a_limit_of_the_carrier_has_bounds(tmp_path, limit, taken):
+    profile, envelope = tmp_path / "machine.toml", tmp_path / "aoro_fc8.envelope.toml"
+    text = (SHIPPED / "aoro_fc8.toml").read_text()
+    profile.write_text(re.sub(r"(?m)^speed_limit_m_s = [\d.]+", "speed_limit_m_s = 0.0001", text))
+    envelope.write_text((SHIPPED / envelope.name).read_text())
+    old = re.search(r"(?m)^speed_limit_m_s = [\d.]+", envelope.read_text())
+    assert old is not None
+    resealed(envelope, old[0], f"speed_limit_m_s = {limit}")
+    if taken:
+        carrier = read_envelope(profile).carrier
+        assert carrier is not None and carrier.speed_limit_m_s == limit
+    else:
+        with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
+            read_envelope(profile)
+
+
+def test_a_limit_of_the_carrier_that_is_no_number_stops_the_start(tmp_path):
+    profile = tmp_path / "machine.toml"
+    text = (SHIPPED / "aoro_fc8.toml").read_text()
+    profile.write_text(re.sub(r"(?m)^speed_limit_m_s = [\d.]+", "speed_limit_m_s = nan", text))
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
+        read_envelope(profile)
+
+
+def test_the_check_of_a_profile_has_24_bits(files):
+    profile, _ = files
+    text = profile.read_text()
+    for k in range(64):
+        content = f"{text}# {k}\n".encode()
+        if zlib.crc32(content) & 0x800000:
+            break
+    profile.write_bytes(content)
+    assert read_envelope(profile).profile_check == zlib.crc32(content) & 0xFFFFFF
+
+
+@pytest.mark.parametrize("value", ["1.0", None, math.inf, math.nan])
+def test_what_is_no_finite_number_is_no_limit(value):
+    with pytest.raises(ValueError):
+        _number(value)
+
+
+def test_a_number_may_be_at_either_end_of_its_range():
+    ends = {"a": 1.0, "b": 2.0}
+    assert _within(ends, {"a": (1.0, 2.0), "b": (1.0, 2.0)}) == ends
+    with pytest.raises(ValueError):
+        _within({"a": 2.1}, {"a": (1.0, 2.0)})
+
+
+def test_a_joint_without_a_range_has_no_limits():
+    with pytest.raises(ValueError):
+        _limits({"lower": 1.0, "upper": 1.0, "speed_limit": 1.0, "acceleration_limit": 1.0})
+
+
+def test_a_spool_s_time_to_close_is_exact_to_the_nanosecond():
+    ends = {f"{name}_{side}": 1.0 for name in ("full_speed",) for side in ("plus", "minus")}
+    ends |= {f"deadband_{side}_pct": 10.0 for side in ("plus", "minus")}
+    valve = {"signal": "Slew", "sign": 1, "delay_s": 0.5, "lag_s": 0.25} | ends
+    limits = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
+    assert _axis(0, {"valve": valve}, limits).closing_ns == 1_500_000_000
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+def test_a_control_rate_may_be_at_either_end_of_its_range(rate_hz):
+    build(PROFILE, rate_hz=rate_hz)
+    with pytest.raises(GuardConfigError, check=coded("guard.rate")):
+        build(PROFILE, rate_hz=rate_hz - 1 if rate_hz == min(RATES_HZ) else rate_hz + 1)
 
 
 @pytest.mark.parametrize("damage", [b"\x81", b"@1+ (x,0)", b"0|99999999999@1+ (1,0)"])

@@ -4,7 +4,7 @@ import pytest
 
 from controller.guard.envelope import read_envelope
 from controller.guard.reach import Reach
-from controller.guard.verdicts import Verdict
+from controller.guard.verdicts import FINE, Verdict
 from machine.geometry.kinematics import pin_position, solve
 from machine.loading.profile_file import load_profile
 from tests.controller.bench import MS, T, count_until
@@ -229,3 +229,18 @@ def test_jaws_that_work_or_hold_move_a_joint_by_more_until_a_moment_later(grappl
     assert traffic.guard.verdict is Verdict.GOOD, "it stands where it was pressed to"
     assert slide(traffic, 0.1, 60) > 0
     assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.MOVING, 1)
+
+
+@pytest.mark.parametrize(
+    ("asked_pct", "verdict"), [(0.0, Verdict.GOOD), (13.0, Verdict.GOOD), (60.0, Verdict.OVERSPEED)]
+)
+def test_a_rotator_may_follow_a_log_while_its_valve_asks_for_nothing(asked_pct, verdict):
+    """A log turns it by 0.1 rad at once: far more than a joint may be ahead of the speed that its valve gives it."""
+    traffic = Traffic().good()
+    traffic.b["GrappleMode"] = 3
+    while traffic.b.get("Rot", 0.0) < asked_pct:
+        traffic.a["Mode"], traffic.b["Rot"] = 2, min(traffic.b.get("Rot", 0.0) + 1.0, asked_pct)
+        assert traffic.tick() is Verdict.GOOD
+    traffic.encoder["EncRot"] += round(0.1 / RAD)
+    found = [(traffic.tick(), traffic.guard.axis) for _ in range(5)]
+    assert next((one for one in found if one != FINE), FINE) == (FINE if verdict is Verdict.GOOD else (verdict, 4))
