@@ -70,8 +70,8 @@ export function createProtocol(settings, alarm) {
 
   async function list() {
     const names = await (await fetch("api/commission/protocols")).json();
-    $("saved").replaceChildren(...names.map((name) => new Option(name, name)));
-    $("open").disabled = !names.length;
+    $("saved").replaceChildren(...(names.length ? names.map((name) => new Option(name, name)) : [new Option("none yet", "")]));
+    $("saved").disabled = $("open").disabled = !names.length;
   }
   list().catch((error) => alarm(error.message));
 
