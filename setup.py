@@ -20,14 +20,14 @@ FIRST_DAY_S = "315532800"
 
 
 def commit_time_s() -> str:
-    """When this commit was made, as seconds since 1970."""
-    here = Path(__file__).resolve().parent
-    command = ["git", "-C", str(here), "log", "-1", "--format=%ct", "--", "."]
+    """Return when this commit was made, as seconds since 1970."""
+    project_folder = Path(__file__).resolve().parent
+    command = ["git", "-C", str(project_folder), "log", "-1", "--format=%ct", "--", "."]
     try:
-        found = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        timestamp_s = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return FIRST_DAY_S
-    return found if (here / ".git").exists() and found else FIRST_DAY_S
+    return timestamp_s if (project_folder / ".git").exists() and timestamp_s else FIRST_DAY_S
 
 
 os.environ.setdefault("SOURCE_DATE_EPOCH", commit_time_s())

@@ -35,7 +35,7 @@ from runtime.errors import ConfigError, InputRefused
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one job; returns the exit code."""
+    """Run one job; return the exit code."""
     options = arguments(sys.argv[1:] if argv is None else argv)
     try:
         profile = load_profile(options.profile)

@@ -43,17 +43,17 @@ class Weights:
     facts: dict[str, str]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The trained arrays as float32, by their names in training."""
+        """Return the trained arrays as float32, by their names in training."""
         return {name: data.astype(np.float32) for name, data in _constants(self.model) if _is_trained(name)}
 
 
 def digest(body: bytes) -> bytes:
-    """What a weight file ends with after ``body``."""
+    """Compute what a weight file ends with after ``body``."""
     return hashlib.sha256(body).hexdigest().encode()
 
 
 def load(path: Path, interface: Interface) -> Weights:
-    """The network of a weight file.
+    """Load the network of a weight file.
 
     Raises:
         InputRefused: the file is missing, damaged, or of another network.
@@ -72,11 +72,11 @@ def load(path: Path, interface: Interface) -> Weights:
         model = _core().read_model(data)
         metadata = model.rt_info["framework"] if model.has_rt_info("framework") else {}
         facts = {key: value.astype(str) for key, value in metadata.items()}
-        found = (facts.get("network"), *_ports(model))
+        file_interface = (facts.get("network"), *_ports(model))
     except (RuntimeError, ValueError, LookupError) as error:
         reason = str(error).strip().splitlines()[-1]
         raise InputRefused("weights.damaged", f"{path}: OpenVINO cannot read it ({reason}); train it again") from None
-    if found != (interface.name, interface.channels, dict(interface.outputs)):
+    if file_interface != (interface.name, interface.channels, dict(interface.outputs)):
         raise InputRefused(
             "weights.other-network",
             f"{path}: weights of {facts.get('network', 'an unknown network')!r} do not fit this version of "
@@ -131,7 +131,7 @@ class OpenVinoNet:
         self._request = _core().compile_model(model, "CPU", settings).create_infer_request()
 
     def __call__(self, images: np.ndarray) -> dict[str, np.ndarray]:
-        """Every output by name, (N, C, H, W) float32; the caller owns the arrays.
+        """Compute every output by name, (N, C, H, W) float32; the caller owns the arrays.
 
         Raises:
             InputRefused: the images have another shape than the compiled one.
@@ -140,12 +140,12 @@ class OpenVinoNet:
             raise InputRefused(
                 "network.bad-images", f"network {self.name} was compiled for images {self.shape}, not {images.shape}"
             )
-        found = self._request.infer([np.ascontiguousarray(images, np.float32)])
-        return {name: found[name] for name in self._outputs}
+        outputs = self._request.infer([np.ascontiguousarray(images, np.float32)])
+        return {name: outputs[name] for name in self._outputs}
 
 
 def _ports(model: Any) -> tuple[int, dict[str, int]]:
-    """Channels of the input and of every output."""
+    """Return the channels of the input and of every output."""
 
     def channels(port: Any) -> int:
         width = port.partial_shape[1]
@@ -159,13 +159,15 @@ def _constants(model: Any) -> list[tuple[str, np.ndarray]]:
 
 
 def _is_trained(name: str) -> bool:
-    """An array's name is LAYER.weight and so on; a constant of the graph has a path with slashes or a number."""
+    """Tell by its name whether an array is trained: LAYER.weight and so on; a constant of the graph has a path with
+    slashes or a number.
+    """
     return "." in name and "/" not in name
 
 
 @cache
 def _core() -> Any:
-    """The process's one core.
+    """Return the process's one core.
 
     The package is imported without its telemetry: its tools use their own stub when that module cannot be imported.
 

@@ -29,12 +29,12 @@ RawFrame = tuple[int, bytes]
 
 
 def identifier(key: int) -> int:
-    """The identifier of a key without its kind bits."""
+    """Return the identifier of a key without its kind bits."""
     return key & (EXTENDED_MASK if key & EXTENDED else STANDARD_MASK)
 
 
 def describe(key: int) -> str:
-    """A key as candump writes it: three hex digits for 11-bit ids, eight for 29-bit ids and error frames."""
+    """Write a key as candump does: three hex digits for 11-bit ids, eight for 29-bit ids and error frames."""
     if key & (EXTENDED | ERROR):
         return f"{key & (EXTENDED_MASK | ERROR):08X}"
     return f"{key & STANDARD_MASK:03X}"

@@ -9,7 +9,7 @@ HEAD_BYTES: Final = 256
 
 
 def decoded(content: bytes, fallback: str) -> str:
-    """UTF-8 or UTF-16, with or without a byte order mark; bytes that are not UTF-8 are ``fallback``'s or replaced."""
+    """Decode UTF-8 or UTF-16, with or without byte order mark; bytes not in UTF-8 are ``fallback``'s or replaced."""
     if content.startswith(BOM_UTF8):
         return content[len(BOM_UTF8) :].decode("utf-8", "replace")
     if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):

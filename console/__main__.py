@@ -210,13 +210,13 @@ def _audit(path: Path | None) -> AuditLog | None:
 
 
 def _buses(texts: Sequence[str], profile: Profile) -> dict[str, str]:
-    found = dict(text.partition("=")[::2] for text in texts)
+    addresses = dict(text.partition("=")[::2] for text in texts)
     known = [bus for bus in (profile.crane_bus, profile.machine_bus) if bus]
-    for name, address in found.items():
+    for name, address in addresses.items():
         if name not in known or not address:
             sentence = f"--bus {name}={address} is not NAME=ADDRESS with a bus of {profile.name} ({', '.join(known)})"
             raise StartError("console.bus", sentence, 2)
-    return found
+    return addresses
 
 
 def _address(text: str | None, option: str) -> tuple[str, int] | None:
@@ -231,7 +231,7 @@ def _address(text: str | None, option: str) -> tuple[str, int] | None:
 
 
 def command_line() -> argparse.ArgumentParser:
-    """The command line of the process."""
+    """Build the parser of the process's command line."""
     parser = argparse.ArgumentParser(prog="python -m console", description="The operator's web page.")
     parser.add_argument("--port", type=int, default=8471, help="port of the page (default 8471)")
     parser.add_argument("--report-port", type=int, help="UDP port that receives the reports of controller and planner")

@@ -39,13 +39,13 @@ class ControlLease:
         self._heard_ns = 0
 
     def holder(self, now_ns: int) -> int:
-        """The page that has the lease."""
+        """Return the page that has the lease."""
         if self._page and now_ns - self._heard_ns >= LEASE_NS:
             self._page = 0
         return self._page
 
     def take(self, page: int, over: int, now_ns: int) -> bool:
-        """``page`` takes the lease, from nobody or from the page ``over``; whether it has it now."""
+        """Let ``page`` take the lease, from nobody or from the page ``over``; tell whether it has it now."""
         holder = self.holder(now_ns)
         if holder not in (0, page, over):
             return False
@@ -53,12 +53,12 @@ class ControlLease:
         return True
 
     def renew(self, page: int, now_ns: int) -> None:
-        """A sign of life of a page; it revives no lease that has ended."""
+        """Note a sign of life of a page; it revives no lease that has ended."""
         if page and self.holder(now_ns) == page:
             self._heard_ns = now_ns
 
     def give_back(self, page: int, now_ns: int) -> None:
-        """The page does not need it any more."""
+        """End the page's lease, which it does not need any more."""
         if self.holder(now_ns) == page:
             self._page = 0
 
@@ -116,19 +116,19 @@ class Access:
     # ---- persons
 
     def may_try(self) -> bool:
-        """Whether a password may be tried now."""
+        """Tell whether a password may be tried now."""
         full = len(self._failures) == MAX_FAILURES
         return not (full and self._clock() - self._failures[0] < FAILURES_NS)
 
     def signed_in(self, person: Person | None) -> str:
-        """A checked password: the new session of its person; a wrong one counts, and gives none."""
+        """Begin a session for the person of a checked password; a wrong one (None) counts, and gives none."""
         if person is None:
             self._failures.append(self._clock())
             return ""
         return self._begin(person)
 
     def enter(self, token: str) -> str:
-        """The new session of whoever has the console's token; empty for a wrong one, which cannot be guessed."""
+        """Begin a session for whoever has the console's token; empty for a wrong one, which cannot be guessed."""
         right = self.token and hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
         return self._begin(LOCAL) if right else ""
 
@@ -148,29 +148,29 @@ class Access:
             del self._pages[page.token]
 
     def person(self, session: str) -> Person | None:
-        """Who sends a request; None: nobody who has signed in, where that is needed to look."""
+        """Return who sends a request; None: nobody who has signed in, where that is needed to look."""
         self._forget()
-        found = self._sessions.get(session)
-        if found is None:
+        active_session = self._sessions.get(session)
+        if active_session is None:
             return VISITOR if self.accounts is None else None
-        return found.person
+        return active_session.person
 
     # ---- pages
 
     def page(self, token: str, session: str) -> Page | None:
-        """The page that a token names, if the request is of the session for which it was made."""
+        """Find the page that a token names, if the request is of the session for which it was made."""
         self._forget()
         page = self._pages.get(token)
         return page if page is not None and page.session == session else None
 
     def open_page(self, token: str, session: str) -> Page | None:
-        """The page with this token, or a new one; None: there is no such session.
+        """Return the page with this token, or a new one; None: there is no such session.
 
         A token that a page uses already is that of a duplicated tab, which becomes a page of its own.
         """
         known = self.page(token, session)
-        found = self._sessions.get(session)
-        if found is None:
+        active_session = self._sessions.get(session)
+        if active_session is None:
             return None
         if known is not None and known.number not in self._connected:
             return known
@@ -180,18 +180,18 @@ class Access:
             oldest = next(idle, None) or next(p for p in self._pages.values() if p.number != holder)
             del self._pages[oldest.token]
         self._number += 1
-        page = Page(self._number, secrets.token_urlsafe(TOKEN_BYTES), found.person, session)
+        page = Page(self._number, secrets.token_urlsafe(TOKEN_BYTES), active_session.person, session)
         self._pages[page.token] = page
         return page
 
     def is_connected(self, token: str) -> bool:
-        """Whether the page with this token has a websocket."""
+        """Tell whether the page with this token has a websocket."""
         page = self._pages.get(token)
         return page is not None and page.number in self._connected
 
     @contextlib.contextmanager
     def connected(self, page: Page | None) -> Iterator[None]:
-        """While it lasts the page has a websocket."""
+        """Count the page as one with a websocket while the context lasts."""
         number = 0 if page is None else page.number
         self._connected.add(number)
         try:
@@ -210,7 +210,7 @@ class Access:
         return f"{self._holder_words()} has control; look again, then take it over."
 
     def refusal(self, page: Page | None, role: Role, leased: bool) -> str:
-        """Why the page may not command something that needs a role, and the lease if ``leased``; empty: it may."""
+        """Say why the page may not command something that needs a role, and the lease if ``leased``; empty: it may."""
         if page is None or page.person.role < role:
             return f"This needs the role {role.name.lower()}."
         if leased and self.lease.holder(self._clock()) != page.number:
@@ -219,20 +219,20 @@ class Access:
         return ""
 
     def is_valid(self, page: Page | None) -> bool:
-        """Whether a page may go on; one that only looks, without a token, may."""
+        """Tell whether a page may go on; one that only looks, without a token, may."""
         self._forget()
         return page is None or page.token in self._pages
 
     def give_back(self, page: Page) -> None:
-        """The page does not need the lease any more."""
+        """End the page's lease, which it does not need any more."""
         self.lease.give_back(page.number, self._clock())
 
     def leads(self, page: Page | None) -> bool:
-        """Whether the page has the lease."""
+        """Tell whether the page has the lease."""
         return page is not None and self.lease.holder(self._clock()) == page.number
 
     def state(self, page: Page | None, person: Person) -> dict[str, Any]:
-        """For the page: who it is, and who has control."""
+        """Tell the page who it is, and who has control."""
         holder = self.lease.holder(self._clock())
         return {
             "role": person.role.name.lower(),
@@ -251,5 +251,5 @@ class Access:
 
     def _forget(self) -> None:
         now_ns = self._clock()
-        for session in [key for key, found in self._sessions.items() if now_ns >= found.until_ns]:
+        for session in [key for key, active_session in self._sessions.items() if now_ns >= active_session.until_ns]:
             self.sign_out(session)

@@ -43,7 +43,7 @@ MAX_SENTENCE_BYTES: Final = 300
 
 
 def cookie_of(headers: Headers) -> str:
-    """The name of the session's cookie: browsers share cookies between ports, consoles do not."""
+    """Name the session's cookie: browsers share cookies between ports, consoles do not."""
     port = headers.get("host", "").rpartition(":")[2]
     return f"{COOKIE}-{port if port.isdecimal() else 0}"
 
@@ -54,23 +54,23 @@ def set_session(answer: Response, headers: Headers, session: str, secure: bool) 
 
 
 def session_of(headers: Headers) -> str:
-    """The session's cookie; empty without one."""
+    """Return the session's cookie; empty without one."""
     try:
-        found = SimpleCookie(headers.get("cookie", "")).get(cookie_of(headers))
+        cookie = SimpleCookie(headers.get("cookie", "")).get(cookie_of(headers))
     except CookieError:
         return ""
-    return "" if found is None else found.value
+    return "" if cookie is None else cookie.value
 
 
 def person_of(request: HTTPConnection) -> Person:
-    """The person who sends a request."""
+    """Return the person who sends a request."""
     person = request.scope.get("person", VISITOR)
     assert isinstance(person, Person)
     return person
 
 
 def page_of(request: HTTPConnection) -> Page | None:
-    """The page that sends a request, None without a token."""
+    """Return the page that sends a request, None without a token."""
     page = request.scope.get("page")
     assert page is None or isinstance(page, Page)
     return page
@@ -113,11 +113,11 @@ class AccessGuards:
         await self._app(scope, receive, send)
 
     def _entered(self, scope: Scope, headers: Headers, token: str) -> Response:
-        """Whoever has a session already keeps it, and its pages theirs: the printed address may be opened again."""
-        kept = scope["session"] if scope["person"] is not VISITOR else ""
-        session = kept or self._access.enter(token)
+        """Let whoever has a session keep it, and its pages theirs: the printed address may be opened again."""
+        existing_session = scope["session"] if scope["person"] is not VISITOR else ""
+        session = existing_session or self._access.enter(token)
         answer = RedirectResponse("/" + scope["path"].lstrip("/") if session else "/sign-in", 303)
-        if session and not kept:
+        if session and not existing_session:
             set_session(answer, headers, session, secure=scope["scheme"] == "https")
         return answer
 
@@ -144,17 +144,17 @@ class AuditTrail:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        status, said = 0, b""
+        status, refusal = 0, b""
 
         async def watched(message: Message) -> None:
-            nonlocal status, said
+            nonlocal status, refusal
             match message["type"]:
                 case "http.response.start":
                     status = message["status"]
-                case "http.response.body" if status >= 400 and not said:
-                    said = message.get("body", b"")[:MAX_SENTENCE_BYTES]
+                case "http.response.body" if status >= 400 and not refusal:
+                    refusal = message.get("body", b"")[:MAX_SENTENCE_BYTES]
                 case "websocket.close" if not status:
-                    status, said = 403, message.get("reason", "").encode()
+                    status, refusal = 403, message.get("reason", "").encode()
                 case "websocket.accept":
                     status = 101
             await send(message)
@@ -162,9 +162,9 @@ class AuditTrail:
         try:
             await self._app(scope, receive, watched)
         finally:
-            self._record(scope, status, said.decode(errors="replace"))
+            self._record(scope, status, refusal.decode(errors="replace"))
 
-    def _record(self, scope: Scope, status: int, said: str) -> None:
+    def _record(self, scope: Scope, status: int, refusal: str) -> None:
         path, refused = scope["path"], status >= 400
         reads = scope["type"] == "websocket" or scope["method"] in ("GET", "HEAD")
         if not refused and (reads or path.startswith(QUIET_PREFIXES)):
@@ -180,8 +180,8 @@ class AuditTrail:
             "what": path if scope["type"] == "websocket" else f"{scope['method']} {path}",
             "result": status,
         }
-        if said:
-            fields["why"] = said
+        if refusal:
+            fields["why"] = refusal
         self._log.record(refused=refused, **fields)
 
 

@@ -41,8 +41,8 @@ class Take(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def access_routes(access: Access, secure: bool) -> list[Route]:
-    """``secure``: the page is served over TLS, and so is its cookie."""
-    one = asyncio.Lock()
+    """Make the routes of sign-in, sessions and lease; ``secure``: the page and its cookie use TLS."""
+    hash_lock = asyncio.Lock()
 
     async def form(_: Request) -> Response:
         return FileResponse(STATIC / "sign-in.html", media_type="text/html")
@@ -51,10 +51,10 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
         return JSONResponse({"by": "password" if access.accounts is not None else "token"})
 
     async def enter(request: Request) -> Response:
-        told = await _body(request, Entry)
-        if told is None:
+        entry = await _body(request, Entry)
+        if entry is None:
             return PlainTextResponse("Send the token that the console printed at its start.", 422)
-        return begun(request, access.enter(told.token), "This is not the token that the console printed at its start.")
+        return begun(request, access.enter(entry.token), "This is not the token that the console printed at its start.")
 
     def begun(request: Request, session: str, otherwise: str) -> Response:
         if not session:
@@ -66,14 +66,14 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
     async def sign_in(request: Request) -> Response:
         if access.accounts is None:
             return await enter(request)
-        told = await _body(request, SignIn)
-        if told is None:
+        credentials = await _body(request, SignIn)
+        if credentials is None:
             return PlainTextResponse("Send name and password.", 422)
-        request.scope["tried_name"] = told.name[:32]
-        async with one:  # one hash at a time, whoever asks; each may try when it is his turn
+        request.scope["tried_name"] = credentials.name[:32]
+        async with hash_lock:  # one hash at a time, whoever asks; each may try when it is his turn
             if not access.may_try():
                 return PlainTextResponse("Too many wrong passwords; wait half a minute.", 429)
-            person = await asyncio.to_thread(access.accounts.check, told.name, told.password)
+            person = await asyncio.to_thread(access.accounts.check, credentials.name, credentials.password)
             session = access.signed_in(person)
         return begun(request, session, "Name or password is wrong.")
 
@@ -92,16 +92,20 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
         page = access.open_page(token, request.scope["session"])
         if page is None and access.accounts is not None:
             return PlainTextResponse("Sign in first.", 401)
-        told: dict[str, Any] = {"token": page.token if page else "", "page": page.number if page else 0}
-        told |= {"person": person.name, "role": person.role.name.lower(), "signs_in": access.accounts is not None}
-        return JSONResponse(told)
+        session_facts: dict[str, Any] = {"token": page.token if page else "", "page": page.number if page else 0}
+        session_facts |= {
+            "person": person.name,
+            "role": person.role.name.lower(),
+            "signs_in": access.accounts is not None,
+        }
+        return JSONResponse(session_facts)
 
     async def take(request: Request) -> Response:
-        told, page = await _body(request, Take), page_of(request)
+        takeover, page = await _body(request, Take), page_of(request)
         assert page is not None
-        if told is None:
+        if takeover is None:
             return PlainTextResponse("Send the page from which control is taken over, or 0.", 422)
-        why = access.take(page, told.over)
+        why = access.take(page, takeover.over)
         return PlainTextResponse(why, 409) if why else Response(status_code=204)
 
     async def give_back(request: Request) -> Response:
@@ -122,7 +126,7 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
 
 
 async def _body(request: Request, kind: type[T]) -> T | None:
-    """The JSON of a small body; None when it is none of this kind."""
+    """Decode the JSON of a small body; None when it is none of this kind."""
     data = b""
     try:
         async for part in request.stream():

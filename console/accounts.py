@@ -51,7 +51,7 @@ class Accounts:
         self._hashes = hashes
 
     def check(self, name: str, password: str) -> Person | None:
-        """The person whose name and password these are; takes some 50 ms and 64 MiB, so ask for one at a time."""
+        """Find the person with this name and password; takes some 50 ms and 64 MiB, so ask for one at a time."""
         role, known = self._hashes.get(name, (Role.VIEWER, _nobody()))
         if len(password) > MAX_PASSWORD_CHARS:
             return None
@@ -68,7 +68,7 @@ class Accounts:
 
 
 def read_accounts(path: Path) -> Accounts:
-    """The accounts of a file.
+    """Read the accounts of a file.
 
     Raises:
         ConfigError: it cannot be read, others may read it, or a line is wrong.
@@ -83,7 +83,7 @@ def read_accounts(path: Path) -> Accounts:
     if mode & (stat.S_IROTH | stat.S_IWOTH | stat.S_IWGRP):
         sentence = f"{path} can be read or changed by others; run `chmod 600 {path}`"
         raise ConfigError("accounts.open-file", sentence)
-    found: dict[str, tuple[Role, str]] = {}
+    accounts: dict[str, tuple[Role, str]] = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -95,15 +95,15 @@ def read_accounts(path: Path) -> Accounts:
                 "write it anew with `timberhand operator password`"
             )
             raise ConfigError("accounts.line", sentence)
-        found[name] = Role[role.upper()], known
-    if not found:
+        accounts[name] = Role[role.upper()], known
+    if not accounts:
         sentence = f"{path} holds no account; add one with `timberhand operator password`"
         raise ConfigError("accounts.empty", sentence)
-    return Accounts(found)
+    return Accounts(accounts)
 
 
 def account_line(name: str, role: Role, password: str) -> str:
-    """The line of an account.
+    """Write the line of an account.
 
     Raises:
         ConfigError: the name or the password cannot be used.
@@ -118,10 +118,10 @@ def account_line(name: str, role: Role, password: str) -> str:
 
 
 def with_account(text: str, line: str) -> str:
-    """The text of a file with this line in it, in place of an earlier one of the same name."""
+    """Return the text of a file with this line in it, in place of an earlier one of the same name."""
     name = line.split()[0]
-    kept = [old for old in text.splitlines() if old.split()[:1] != [name]]
-    return "\n".join([*kept, line]) + "\n"
+    other_lines = [old for old in text.splitlines() if old.split()[:1] != [name]]
+    return "\n".join([*other_lines, line]) + "\n"
 
 
 def _is_hash(text: str) -> bool:

@@ -53,7 +53,7 @@ class CameraState:
         self._place: Place | None = None
 
     def request(self, now_ns: int) -> bytes:
-        """The next request to the detector: for a picture that is newer than this one."""
+        """Encode the next request to the detector: for a picture that is newer than this one."""
         self._begun_ns = self._begun_ns or now_ns
         return encode_picture_request(self.facts.measured_ns if self.facts else 0)
 
@@ -73,7 +73,7 @@ class CameraState:
             self.facts, self._place = facts, place
 
     def page(self, now_ns: int, grasp: dict[str, Any] | None, place: Place | None) -> dict[str, Any]:
-        """What the page shows: ``words`` say why there is no picture or no newer one, empty when all is well."""
+        """Return what the page shows: ``words`` say why there is no picture or no newer one, empty when all is well."""
         facts = self.facts
         if facts is None:
             return {"picture": 0, "words": self._why_none(now_ns)}
@@ -122,15 +122,15 @@ class CameraState:
 
 
 def _projected(facts: PictureFacts, points_m: list[list[float]]) -> list[list[float]] | None:
-    """Pixels of base-frame points [m]; None when one is not in front of the camera."""
-    found = []
+    """Project base-frame points [m] to pixels; None when one is not in front of the camera."""
+    pixels_px = []
     for point in points_m:
         d = [p - o for p, o in zip(point, facts.position_m, strict=True)]
         x, y, z = (sum(d[row] * facts.rotation[3 * row + axis] for row in range(3)) for axis in range(3))
         if z < MIN_DEPTH_M:
             return None
-        found.append([round(facts.fx_px * x / z + facts.cx_px, 1), round(facts.fy_px * y / z + facts.cy_px, 1)])
-    return found
+        pixels_px.append([round(facts.fx_px * x / z + facts.cx_px, 1), round(facts.fy_px * y / z + facts.cy_px, 1)])
+    return pixels_px
 
 
 # -- The camera's picture on the page
@@ -180,7 +180,7 @@ class Camera:
 
     @contextlib.asynccontextmanager
     async def connected(self) -> AsyncIterator[None]:
-        """While it lasts the detector can be asked."""
+        """Keep the link to the detector open while the context lasts."""
         if self._detector is None:
             yield
             return
@@ -191,7 +191,7 @@ class Camera:
         transport.close()
 
     async def newest(self) -> tuple[PictureFacts, bytes] | None:
-        """Facts and JPEG of the newest picture, after asking for a newer one; None before the first."""
+        """Return facts and JPEG of the newest picture, after asking for a newer one; None before the first."""
         if self._link is None:
             return None
         await self._link.ask()
@@ -199,7 +199,7 @@ class Camera:
         return None if state.facts is None else (state.facts, state.jpegs[state.facts.measured_ns])
 
     def routes(self) -> list[Route]:
-        """``/api/camera`` and the JPEG."""
+        """Make the routes of ``/api/camera`` and the JPEG."""
         return [Route("/api/camera", self._facts), Route("/api/camera/{number:int}", self._jpeg)]
 
     async def _facts(self, _: Request) -> Response:
@@ -208,8 +208,8 @@ class Camera:
         await self._link.ask()
         now_ns = self._clock()
         grasp = self._crane_state.grasp_state.shown(now_ns)
-        place = self._crane_state.mission_state.place
-        return JSONResponse(self._link.camera_state.page(now_ns, grasp, place))
+        vehicle_pose = self._crane_state.mission_state.place
+        return JSONResponse(self._link.camera_state.page(now_ns, grasp, vehicle_pose))
 
     async def _jpeg(self, request: Request) -> Response:
         state = None if self._link is None else self._link.camera_state

@@ -77,7 +77,7 @@ class CanTable:
                 _check(row, row.codec, data)
 
     def table(self, now_ns: int) -> dict[str, Any]:
-        """The table now, rows in the order of their identifiers."""
+        """Return the table now, rows in the order of their identifiers."""
         since_ns = now_ns - WINDOW_NS
         while self._bits and self._bits[0][0] <= since_ns:
             self._bits.popleft()
@@ -143,7 +143,7 @@ _STATUS_WORDS: Final = {
 
 
 def _values(codec: MessageCodec, data: bytes) -> list[list[str]]:
-    """Name, value and unit of every signal; an unavailable value is a dash, one with a label has its label."""
+    """List name, value and unit of every signal; an unavailable value is a dash, one with a label has its label."""
     if len(data) != codec.length:
         return [["", data.hex(" ").upper(), ""]]
     shown = []

@@ -26,13 +26,13 @@ IDENTITY: Final = "console"
 
 
 def databases_of(profile: Profile) -> dict[str, tuple[str, ...]]:
-    """The machine's buses, with the databases of their messages."""
-    found: dict[str, tuple[str, ...]] = {profile.crane_bus: ("crane",)}
-    return found | ({profile.machine_bus: ("machine", "gnss")} if profile.machine_bus else {})
+    """Name the machine's buses, with the databases of their messages."""
+    databases: dict[str, tuple[str, ...]] = {profile.crane_bus: ("crane",)}
+    return databases | ({profile.machine_bus: ("machine", "gnss")} if profile.machine_bus else {})
 
 
 def load_databases(profile: Profile) -> dict[str, tuple[Database, ...]]:
-    """The databases by the bus; reading them takes so long that it is done before anything is served."""
+    """Load the databases by the bus; reading takes so long that it is done before anything is served."""
     return {bus: tuple(map(load, names)) for bus, names in databases_of(profile).items()}
 
 
@@ -56,7 +56,7 @@ class CanTap:
 
     @contextlib.asynccontextmanager
     async def viewer(self) -> AsyncIterator[None]:
-        """While it lasts somebody looks."""
+        """Count one viewer more while the context lasts; listen to the buses while there is any."""
         self._viewers += 1
         if self._task is None:
             self._task = asyncio.create_task(self._listen())
@@ -70,20 +70,20 @@ class CanTap:
                 self._close()
 
     def tables(self) -> list[dict[str, Any]]:
-        """The tables now, the same for every page; of a bus that cannot be opened the sentence why."""
+        """Return the tables now, the same for every page; of a bus that cannot be opened the sentence why."""
         if self._told:
             return self._told
         self._drain()
-        found: list[dict[str, Any]] = []
+        bus_tables: list[dict[str, Any]] = []
         for name in self._addresses:
             if name in self._open:
                 bus, _, table = self._open[name]
                 stats = bus.stats
-                found.append(table.table(self._drained_ns) | {"state": stats.state.name, "dropped": stats.dropped})
+                bus_tables.append(table.table(self._drained_ns) | {"state": stats.state.name, "dropped": stats.dropped})
             else:
-                found.append({"bus": name, "refusal": self._refusal.get(name, "opening")})
-        self._told = found
-        return found
+                bus_tables.append({"bus": name, "refusal": self._refusal.get(name, "opening")})
+        self._told = bus_tables
+        return bus_tables
 
     async def _listen(self) -> None:
         while True:

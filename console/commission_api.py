@@ -55,7 +55,7 @@ class CommissionApi:
         self._work, self._access = work, access
 
     def routes(self) -> list[Route]:
-        """To be mounted by the server."""
+        """Make the routes, to be mounted by the server."""
         handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
             ("/commission", self._page, "GET"),
             ("/api/commission/settings", self._settings, "GET"),
@@ -89,26 +89,28 @@ class CommissionApi:
                 }
             )
         checks = [{"id": c.id, "title": c.title, "how": c.how, "value": c.value} for c in CHECKS]
-        told = {"machine": profile.title, "profile": profile.name, "folder": str(self._work.folder)}
-        return JSONResponse(told | {"joints": joints, "checks": checks, "hash": f"{self._work.profile_hash:08x}"})
+        machine_facts = {"machine": profile.title, "profile": profile.name, "folder": str(self._work.folder)}
+        return JSONResponse(
+            machine_facts | {"joints": joints, "checks": checks, "hash": f"{self._work.profile_hash:08x}"}
+        )
 
     async def _state(self, _: Request) -> Response:
         return JSONResponse(self._work.state())
 
     async def _step(self, request: Request) -> Response:
-        asked = await _body(request, 1024)
+        body = await _body(request, 1024)
         try:
-            told = msgspec.json.decode(asked or b"", type=Step)
-            which = Joint[told.joint.upper()]
+            step_request = msgspec.json.decode(body or b"", type=Step)
+            selected_joint = Joint[step_request.joint.upper()]
         except (msgspec.DecodeError, UnicodeDecodeError, KeyError):
             return PlainTextResponse("Send the joint's name and the amount.", 422)
-        return self._run(request, lambda work, goes_on: work.step_joint(which, told.amount, goes_on))
+        return self._run(request, lambda work, goes_on: work.step_joint(selected_joint, step_request.amount, goes_on))
 
     async def _calibrate(self, request: Request) -> Response:
-        asked = await _body(request, 1024)
+        body = await _body(request, 1024)
         try:
-            told = msgspec.json.decode(asked or b"", type=Chosen)
-            joints = [Joint[name.upper()] for name in told.joints] or list(JOINTS)
+            selection = msgspec.json.decode(body or b"", type=Chosen)
+            joints = [Joint[name.upper()] for name in selection.joints] or list(JOINTS)
         except (msgspec.DecodeError, UnicodeDecodeError, KeyError):
             return PlainTextResponse("Send the joints' names; none for all.", 422)
         # Planning takes a second: beside the server, so that STOP does not wait.
@@ -133,14 +135,14 @@ class CommissionApi:
         return Response(status_code=204)
 
     async def _plot(self, request: Request) -> Response:
-        found, name = self._work.found, request.path_params["name"]
-        if found is None or name not in found["plots"]:
+        result, name = self._work.found, request.path_params["name"]
+        if result is None or name not in result["plots"]:
             return PlainTextResponse("There is no such plot.", 404)
-        return FileResponse(self._work.folder / found["name"] / name, headers={"Cache-Control": "no-cache"})
+        return FileResponse(self._work.folder / result["name"] / name, headers={"Cache-Control": "no-cache"})
 
     async def _protocols(self, _: Request) -> Response:
-        found = (path.name.removesuffix(SUFFIX) for path in self._work.folder.glob(f"*{SUFFIX}"))
-        return JSONResponse(sorted(found))
+        names = (path.name.removesuffix(SUFFIX) for path in self._work.folder.glob(f"*{SUFFIX}"))
+        return JSONResponse(sorted(names))
 
     async def _open(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -169,14 +171,14 @@ class CommissionApi:
             "profile_hash": f"{self._work.profile_hash:08x}",
             "steps": {j: {"at": s["at"], "amount": s["amount"], **s["figures"]} for j, s in self._work.steps.items()},
         }
-        told = document(protocol, facts)
+        protocol_document = document(protocol, facts)
         try:
-            await asyncio.to_thread(_write_once, self._work.folder / f"{name}{SUFFIX}", told)
+            await asyncio.to_thread(_write_once, self._work.folder / f"{name}{SUFFIX}", protocol_document)
         except FileExistsError:
             return PlainTextResponse(f"There is a protocol {name} already; a protocol is never changed.", 409)
         except OSError as error:
             return PlainTextResponse(f"The protocol cannot be written: {error.strerror}.", 507)
-        return JSONResponse(told)
+        return JSONResponse(protocol_document)
 
 
 def _write_once(path: Path, told: dict[str, Any]) -> None:

@@ -116,18 +116,18 @@ class Commissioning:
             self._procedure.idle = self._procedure.idle or self._procedure.waiting is not None
 
     def state(self) -> dict[str, Any]:
-        """For the page."""
+        """Return the state for the page."""
         run, busy = self._procedure, self.busy
-        told: dict[str, Any] = {"doing": self._doing, "busy": busy, "said": self._said, "failure": self._failure}
-        told |= {"waiting": "", "share": 0.0, "left_s": None, "steps": self.steps, "found": self.found}
+        page_state: dict[str, Any] = {"doing": self._doing, "busy": busy, "said": self._said, "failure": self._failure}
+        page_state |= {"waiting": "", "share": 0.0, "left_s": None, "steps": self.steps, "found": self.found}
         if run is not None and busy:
-            told["waiting"] = run.waiting or ""
+            page_state["waiting"] = run.waiting or ""
             if isinstance(run, Calibration):
                 at, tasks = run.progress
-                told |= {"share": at / tasks, "left_s": round(run.remaining_s()), "said": task_name(run.task)}
+                page_state |= {"share": at / tasks, "left_s": round(run.remaining_s()), "said": task_name(run.task)}
             elif isinstance(run, StepTest):
-                told["share"] = round(run.progress, 3)
-        return told
+                page_state["share"] = round(run.progress, 3)
+        return page_state
 
     def _begin(
         self,
@@ -206,15 +206,15 @@ class Commissioning:
 
 
 def _before_and_after(source: Path, changed: Sequence[Change]) -> list[dict[str, Any]]:
-    """Each changed value with the one that the profile's file has; None where it has none."""
+    """List each changed value with the one that the profile's file has; None where it has none."""
     document = tomllib.loads(source.read_text(encoding="utf-8"))
-    told = []
+    comparisons = []
     for path, value, remark in changed:
         before: Any = document
         for key in path:
             before = before.get(key) if isinstance(before, dict) else None
-        told.append({"key": ".".join(path), "before": before, "after": value, "remark": remark})
-    return told
+        comparisons.append({"key": ".".join(path), "before": before, "after": value, "remark": remark})
+    return comparisons
 
 
 def _known(value: float) -> float | None:

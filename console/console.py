@@ -63,14 +63,14 @@ class PageWatch:
         self._beat_ns = -MIN_BEAT_NS
 
     def beat(self, answer: str, now_ns: int) -> int | None:
-        """The answer of a page: the stamp of the heartbeat that is to be sent to the controller now, None for none.
+        """Take the answer of a page; return the stamp of the heartbeat to send to the controller now, None for none.
 
         Nothing counts that is older than the limit, or was on its way while its page closed.
         """
-        found = _ANSWER.fullmatch(answer)
-        if found is None:
+        match = _ANSWER.fullmatch(answer)
+        if match is None:
             return None
-        page, left_ns = found[1], int(found[2]) * 1_000_000
+        page, left_ns = match[1], int(match[2]) * 1_000_000
         if page in self._closed or not 0 <= now_ns - left_ns < self._limit_ns:
             return None
         self._forget(now_ns)
@@ -81,12 +81,12 @@ class PageWatch:
         return left_ns
 
     def is_fresh(self, answer: str, now_ns: int) -> bool:
-        """Whether this is a page's answer to a state that left less than `FRESH_NS` ago."""
-        found = _ANSWER.fullmatch(answer)
-        return found is not None and 0 <= now_ns - int(found[2]) * 1_000_000 < FRESH_NS
+        """Tell whether this is a page's answer to a state that left less than `FRESH_NS` ago."""
+        match = _ANSWER.fullmatch(answer)
+        return match is not None and 0 <= now_ns - int(match[2]) * 1_000_000 < FRESH_NS
 
     def end(self, page: str, now_ns: int) -> bool:
-        """A page closes on purpose; whether the watch ends with it."""
+        """End a page that closes on purpose; tell whether the watch ends with it."""
         if not self._limit_ns or not _PAGE.fullmatch(page):
             return False
         self._forget(now_ns)
@@ -95,7 +95,7 @@ class PageWatch:
         return not self._heard_ns
 
     def _forget(self, now_ns: int) -> None:
-        """Pages that have been silent for the limit: the controller has held by now, or another page watches."""
+        """Forget pages that were silent for the limit: the controller has held by now, or another page watches."""
         for page in [p for p, heard_ns in self._heard_ns.items() if now_ns - heard_ns >= self._limit_ns]:
             del self._heard_ns[page]
 
@@ -185,7 +185,7 @@ class Console:
         operator_link.send(encode(message), self.operator)
 
     def watch(self, answer: str, page: Page | None) -> None:
-        """The answer of a page: it keeps its lease.  A page that may not command watches nothing."""
+        """Take the answer of a page: it keeps its lease.  A page that may not command watches nothing."""
         if page is None or page.person.role < Role.OPERATOR:
             return
         if self.page_watch.is_fresh(answer, self.clock()):
@@ -224,7 +224,7 @@ class Console:
         return self._sequence
 
     def state_for(self, page: Page | None, person: Person) -> dict[str, Any]:
-        """The page's state, and what this page may do."""
+        """Return the page's state, and what this page may do."""
         can, now_ns = self.operator is not None, self.clock()
         operates = page is not None and person.role >= Role.OPERATOR
         return {

@@ -30,16 +30,16 @@ class Exposure:
     audit: Path | None = None
 
     def with_credentials(self, environment: Mapping[str, str] = os.environ) -> Exposure:
-        """The same, with the service's credentials in place of what is not given."""
+        """Return the same, with the service's credentials in place of what is not given."""
         folder = environment.get("CREDENTIALS_DIRECTORY")
-        found = {name: getattr(self, name) for name in CREDENTIALS}
+        credential_paths = {name: getattr(self, name) for name in CREDENTIALS}
         for name, file in CREDENTIALS.items():
-            if folder and found[name] is None and (path := Path(folder, file)).exists():
-                found[name] = path
-        return Exposure(**found, audit=self.audit)
+            if folder and credential_paths[name] is None and (path := Path(folder, file)).exists():
+                credential_paths[name] = path
+        return Exposure(**credential_paths, audit=self.audit)
 
     def check(self, bind: str) -> Accounts | None:
-        """The accounts for serving on an address, None where nobody signs in.
+        """Return the accounts for serving on an address, None where nobody signs in.
 
         Raises:
             StartError: it may not be served there, or a file cannot be used.
@@ -81,7 +81,7 @@ class Exposure:
 
 
 def is_local(bind: str) -> bool:
-    """Whether an address is reached from this machine only."""
+    """Tell whether an address is reached from this machine only."""
     try:
         return ipaddress.ip_address(bind).is_loopback
     except ValueError:

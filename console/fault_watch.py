@@ -41,7 +41,7 @@ class FaultWatch:
         self._from: Tip | None = None
 
     def begin(self, title: str, said: str, at_ns: int) -> None:
-        """A fault has begun at ``at_ns``, now or some seconds ago."""
+        """Begin to watch a fault that has begun at ``at_ns``, now or some seconds ago."""
         before = [report for report in self._recent if report.stamp_ns < at_ns]
         last = before[-1] if before else None
         self._at_ns, self._reacted_ns = at_ns, 0
@@ -68,7 +68,7 @@ class FaultWatch:
         self._follow(report)
 
     def card(self) -> dict[str, Any] | None:
-        """The card for the page; None before the first fault."""
+        """Return the card for the page; None before the first fault."""
         return self._fault
 
     def _follow(self, report: StateReport) -> None:

@@ -101,7 +101,7 @@ class FoxgloveServer:
         self._send(self._topics.on_picture(camera, jpeg, time_ns), time_ns)
 
     def wants_pictures(self) -> bool:
-        """Whether a client is subscribed to a camera."""
+        """Tell whether a client is subscribed to a camera."""
         return any(c.has_sinks() for topic, c in self._channels.items() if topic.startswith("/camera/"))
 
     def _send(self, messages: list[Message], time_ns: int) -> None:

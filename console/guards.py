@@ -24,7 +24,7 @@ _INLINE: Final = re.compile(r"<script type=\"importmap\">(.*?)</script>", re.DOT
 
 
 def content_security_policy(page: str) -> str:
-    """The policy of a page: resources from this server only, and no inline script but the page's import map."""
+    """Write the policy of a page: resources from this server only, no inline script but the page's import map."""
     hashes = (hashlib.sha256(text.encode()).digest() for text in _INLINE.findall(page))
     allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
     return (
@@ -34,7 +34,7 @@ def content_security_policy(page: str) -> str:
 
 
 def is_loopback(host: str | None) -> bool:
-    """Whether a peer's address is of this machine."""
+    """Tell whether a peer's address is of this machine."""
     return host is not None and (host in ("::1", "testclient") or host.startswith("127."))
 
 
@@ -69,8 +69,8 @@ class RequestGuards:
 
     def _refusal(self, headers: Headers) -> str | None:
         host = headers.get("host", "")
-        found = _HOST.fullmatch(host)
-        if found is None or found[1].strip("[]").lower() not in self._names:
+        match = _HOST.fullmatch(host)
+        if match is None or match[1].strip("[]").lower() not in self._names:
             return "This console does not serve that host name; start it with --allow-host to add it."
         origin = headers.get("origin")
         # A browser always sends Origin with a websocket and with a POST; a tool such as curl sends none.

@@ -56,7 +56,7 @@ INPUT_NAMES: Final = dict(
 
 
 def describe_carrier(profile: Profile) -> dict[str, Any] | None:
-    """Dimensions for map and 3-D view [m, rad], and how much of its track is kept; None for a stationary machine."""
+    """Return dimensions for map and 3-D view [m, rad], and how much of its track is kept; None if stationary."""
     c = profile.carrier
     if c is None:
         return None
@@ -82,7 +82,7 @@ class MissionState:
     def __init__(
         self, profile: Profile, profile_hash: int, key: bytes | None = None, ground: MapProjection | None = None
     ) -> None:
-        """``ground`` is a projection to share, as the views of one recording do."""
+        """Share the projection ``ground`` where one is given, as the views of one recording do."""
         self.report_count = 0
         """Accepted mission reports: the mission is sent to the page when this has changed."""
         self.answer = (0, "", "")
@@ -113,13 +113,13 @@ class MissionState:
     def on_vehicle(self, report: VehicleReport, now_ns: int) -> None:
         """Accept a vehicle report."""
         self._vehicle, self._received_ns = report, now_ns
-        place = self._placed(report)
-        if place is None:
+        pose = self._placed(report)
+        if pose is None:
             return
-        self._place, self._placed_ns = place, now_ns
-        here = (place["x_m"], place["y_m"])
-        if not self.trail or math.dist(here, self.trail[-1]) >= TRAIL_M:
-            self.trail.append(here)
+        self._place, self._placed_ns = pose, now_ns
+        position_m = (pose["x_m"], pose["y_m"])
+        if not self.trail or math.dist(position_m, self.trail[-1]) >= TRAIL_M:
+            self.trail.append(position_m)
 
     @property
     def stamp_ns(self) -> int:
@@ -138,16 +138,16 @@ class MissionState:
         return self._mission
 
     def alive(self, now_ns: int) -> bool:
-        """Whether the planner is connected."""
+        """Tell whether the planner is connected."""
         return self._mission is not None and now_ns - self._report_ns < MISSION_TIMEOUT_NS
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """Part of every page state: the vehicle, and the age of the mission report."""
+        """Return the part of every page state: the vehicle, and the age of the mission report."""
         age_s = None if self._mission is None else round((now_ns - self._report_ns) * 1e-9, 1)
         return {"mission_age_s": age_s, "mission_alive": self.alive(now_ns), "vehicle": self._vehicle_state(now_ns)}
 
     def mission(self) -> dict[str, Any] | None:
-        """The newest mission report; None before the first."""
+        """Return the newest mission report; None before the first."""
         m = self._mission
         if m is None:
             return None
@@ -200,7 +200,7 @@ class MissionState:
         return self._ground.metres(*place)
 
     def _placed(self, r: VehicleReport) -> dict[str, float] | None:
-        """The articulation axis and the directions of both halves; None unless all of it is known."""
+        """Compute the articulation axis and the directions of both halves; None unless all of it is known."""
         known = (r.latitude_deg, r.longitude_deg, r.heading_rad, r.articulation_rad)
         if self._carrier is None or not all(map(math.isfinite, known)):
             return None

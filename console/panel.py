@@ -23,15 +23,15 @@ class Panel:
         self._due_ms = 0
 
     def choose(self, text: str) -> bool:
-        """A message of the page; whether it named a panel."""
-        found = _CHOICE.fullmatch(text)
-        if found is None:
+        """Take a message of the page; tell whether it named a panel."""
+        match = _CHOICE.fullmatch(text)
+        if match is None:
             return False
-        self.shown, self._due_ms = found[1], 0
+        self.shown, self._due_ms = match[1], 0
         return True
 
     def due(self, now_ms: int) -> bool:
-        """Whether the panel's data are to be sent now."""
+        """Tell whether the panel's data are to be sent now."""
         if not self.shown or now_ms < self._due_ms:
             return False
         self._due_ms = now_ms + PERIOD_MS
@@ -39,7 +39,7 @@ class Panel:
 
 
 def panel_data(shown: str, tap: CanTap, crane_state: CraneState) -> dict[str, Any]:
-    """The data of the panel that is shown."""
+    """Return the data of the panel that is shown."""
     match shown:
         case "can":
             return {"can": tap.tables()}
@@ -51,6 +51,13 @@ def panel_data(shown: str, tap: CanTap, crane_state: CraneState) -> dict[str, An
 
 
 def panels_of(tap: CanTap, timed: bool, faults: bool) -> list[str]:
-    """The panels that this console can fill."""
-    there = {"error": True, "camera": True, "timeline": True, "can": bool(tap.buses), "ticks": timed, "faults": faults}
-    return [name for name, so in there.items() if so]
+    """List the panels that this console can fill."""
+    available = {
+        "error": True,
+        "camera": True,
+        "timeline": True,
+        "can": bool(tap.buses),
+        "ticks": timed,
+        "faults": faults,
+    }
+    return [name for name, so in available.items() if so]

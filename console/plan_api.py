@@ -43,7 +43,7 @@ MAX_FINDINGS = 100
 
 
 def mission_of(body: bytes) -> ForwardingMission:
-    """The mission in a request.
+    """Decode the mission in a request.
 
     Raises:
         InputRefused: it is not JSON, or a field is unknown, missing or of the wrong type.
@@ -56,16 +56,16 @@ def mission_of(body: bytes) -> ForwardingMission:
 
 
 def site_of(carrier: Carrier) -> tuple[float, float]:
-    """Latitude and longitude [deg] of the machine's site."""
+    """Return latitude and longitude [deg] of the machine's site."""
     return carrier.site_lat_deg, carrier.site_lon_deg
 
 
 def reviewed(mission: ForwardingMission, profile: Profile) -> dict[str, Any]:
-    """Errors, warnings and, of a mission that can be driven, the estimate."""
+    """List errors, warnings and, of a mission that can be driven, the estimate."""
     assert profile.carrier is not None
-    found = problems_of(mission, True, site_of(profile.carrier))
-    answer: dict[str, Any] = {"errors": _told(found), "warnings": [], "estimate": None, "wood": wood(mission)}
-    if not found:
+    errors = problems_of(mission, True, site_of(profile.carrier))
+    answer: dict[str, Any] = {"errors": _told(errors), "warnings": [], "estimate": None, "wood": wood(mission)}
+    if not errors:
         figures = review(mission, profile)
         answer["warnings"] = _told(list(figures.warnings))
         answer["estimate"] = {
@@ -79,7 +79,7 @@ def reviewed(mission: ForwardingMission, profile: Profile) -> dict[str, Any]:
 
 
 def wood(mission: ForwardingMission) -> dict[str, Any]:
-    """Listed logs, their volume, how many have no size, and their kinds."""
+    """Count the listed logs and those without a size, sum their volume, and list their kinds."""
     volumes = [log.volume_m3 for log in mission.logs]
     return {
         "logs": len(volumes),
@@ -90,7 +90,7 @@ def wood(mission: ForwardingMission) -> dict[str, Any]:
 
 
 def imported(data: bytes, name: str) -> dict[str, Any]:
-    """The mission in a file of any format; its errors are found by the check that follows.
+    """Return the mission in a file of any format; its errors are found by the check that follows.
 
     Raises:
         MissionError: it cannot be read as a mission.
@@ -139,7 +139,7 @@ class PlanApi:
     _one: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def routes(self) -> list[Route]:
-        """To be mounted by the server."""
+        """Make the routes, to be mounted by the server."""
         handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
             ("/plan", self._page, "GET"),
             ("/api/plan/settings", self._settings, "GET"),
@@ -189,8 +189,8 @@ class PlanApi:
 
     async def _export(self, request: Request) -> Response:
         body, kind = await _body(request), request.path_params["kind"]
-        found = await self._alone(lambda: export(mission_of(body), kind))
-        return JSONResponse({"text": found.data.decode(), "left_out": found.left_out})
+        exported = await self._alone(lambda: export(mission_of(body), kind))
+        return JSONResponse({"text": exported.data.decode(), "left_out": exported.left_out})
 
     async def _save(self, request: Request) -> Response:
         body, name = await _body(request), request.path_params["name"]
@@ -207,9 +207,9 @@ class PlanApi:
         if why := self.access.refusal(page_of(request), Role.OPERATOR, leased=True):
             raise Refused(403, why)
         mission = await self._alone(lambda: mission_of(body))
-        found = await self._alone(lambda: reviewed(mission, self.profile))
-        if found["errors"]:
-            raise MissionError(found["errors"][0]["code"], found["errors"][0]["sentence"])
+        plan_review = await self._alone(lambda: reviewed(mission, self.profile))
+        if plan_review["errors"]:
+            raise MissionError(plan_review["errors"][0]["code"], plan_review["errors"][0]["sentence"])
         data = geojson.write(mission)
         await self._alone(lambda: folder.write(name, data, True))
         try:
@@ -244,7 +244,7 @@ class PlanApi:
 
 
 def _answering(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
-    """The handler, with its refusals as answers."""
+    """Wrap the handler so that its refusals become answers."""
 
     async def answer(request: Request) -> Response:
         try:
@@ -261,7 +261,7 @@ def _answering(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[R
 
 
 async def _body(request: Request) -> bytes:
-    """The body of a request of somebody who may plan."""
+    """Read the body of a request of somebody who may plan."""
     _only_planners(request)
     sentence = f"This is larger than {MAX_BODY_BYTES >> 20} MB; a mission has some kB."
     if request.headers.get("content-length", "0").isdigit() and (

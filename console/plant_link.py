@@ -48,7 +48,7 @@ class PlantLink(asyncio.DatagramProtocol):
             self._transport.close()
 
     async def request(self, query: dict[str, str]) -> bytes | None:
-        """The plant's response (JSON), None after a timeout."""
+        """Return the plant's response (JSON), None after a timeout."""
         assert self._transport is not None
         async with self._lock:
             self._waiting = asyncio.get_running_loop().create_future()
@@ -71,7 +71,7 @@ STATIC: Final = Path(__file__).with_name("static")
 
 
 def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starlette:
-    """The ASGI application of the plant's page."""
+    """Build the ASGI application of the plant's page."""
     page = (STATIC / "plant.html").read_text()
     links: list[PlantLink] = []
     silent = "The plant does not respond; check that it is running and that the request port is right."
@@ -146,14 +146,14 @@ class TrueLogs:
 
     @contextlib.asynccontextmanager
     async def connected(self) -> AsyncIterator[None]:
-        """While it lasts the plant can be asked."""
+        """Keep the link to the plant open while the context lasts."""
         loop = asyncio.get_running_loop()
         _, self._link = await loop.create_datagram_endpoint(PlantLink, remote_addr=self._plant)
         yield
         self._link.close()
 
     def routes(self) -> list[Route]:
-        """``/api/true-logs``."""
+        """Make the route of ``/api/true-logs``."""
         return [Route("/api/true-logs", self._answer)]
 
     async def _answer(self, _: Request) -> Response:
@@ -165,11 +165,11 @@ class TrueLogs:
 
     async def _ask(self) -> list[dict[str, Any]] | None:
         assert self._link is not None
-        told = await self._link.request({"op": "logs"})
-        if told is None:
+        response = await self._link.request({"op": "logs"})
+        if response is None:
             return None
         try:
-            logs = decode_logs(told)
+            logs = decode_logs(response)
         except InputRefused:
             return None
         return [asdict(log) for log in logs]

@@ -42,13 +42,13 @@ class Recording(Protocol):
     buses: tuple[str, ...]
 
     def reports(self, begin_ns: int, end_ns: int) -> Iterator[StateReport | VehicleReport]:
-        """The controller's reports of a time."""
+        """Read the controller's reports of a time."""
 
     def frames(self, bus: str, begin_ns: int, end_ns: int) -> list[Frame]:
-        """The frames of a bus."""
+        """Read the frames of a bus."""
 
     def timing(self, at_ns: int) -> dict[str, Any] | None:
-        """The newest state of the timing page."""
+        """Read the newest state of the timing page."""
 
 
 class Overview:
@@ -86,14 +86,14 @@ class ReplayView:
         self.seek(recording.begin_ns + BUILD_NS if at_ns is None else at_ns)
 
     def order(self, text: str) -> bool:
-        """A message of the page; whether it was understood."""
+        """Take a message of the page; tell whether it was understood."""
         if self.panel.choose(text):
             self._tables = {}
             return True
-        found = _ORDER.fullmatch(text)
-        if found is None or (found[2] is None) != (found[1] in ("play", "pause")):
+        order_match = _ORDER.fullmatch(text)
+        if order_match is None or (order_match[2] is None) != (order_match[1] in ("play", "pause")):
             return False
-        match found[1]:
+        match order_match[1]:
             case "play":
                 self.playing = True
                 if self.at_ns >= self._recording.end_ns:
@@ -101,9 +101,9 @@ class ReplayView:
             case "pause":
                 self.playing = False
             case "speed":
-                self.speed = min(SPEEDS, key=lambda speed: abs(speed - float(found[2])))
+                self.speed = min(SPEEDS, key=lambda speed: abs(speed - float(order_match[2])))
             case "seek":
-                self.seek(round(float(found[2]) * 1e9))
+                self.seek(round(float(order_match[2]) * 1e9))
         return True
 
     def seek(self, at_ns: int) -> None:
@@ -156,20 +156,20 @@ class ReplayView:
         return CanTable(bus, self._databases.get(bus, ()), BITRATES.get(bus, 0))
 
     def _timing(self) -> dict[str, Any] | None:
-        """The timing card, read again when the time is in another second."""
+        """Return the timing card, read again when the time is in another second."""
         second = self.at_ns // 1_000_000_000
         if self._timed[0] != second:
             self._timed = second, timing_of_recording(self._recording.timing(self.at_ns))
         return self._timed[1]
 
     def _errors(self) -> list[tuple[float, list[float | None]]]:
-        """The tracking errors of the time that the plot shows [mrad, mm]."""
-        found: list[tuple[float, list[float | None]]] = []
+        """List the tracking errors of the time that the plot shows [mrad, mm]."""
+        error_samples: list[tuple[float, list[float | None]]] = []
         due_ns = 0
         for report in self._recording.reports(self.at_ns - PLOT_NS, self.at_ns):
             if isinstance(report, StateReport) and report.stamp_ns >= due_ns:
                 due_ns = report.stamp_ns + PLOT_STEP_NS
                 pairs = zip(report.position, report.reference, strict=True)
                 errors = [round(1000.0 * (r - q), 3) for q, r in pairs]
-                found.append((report.stamp_ns / 1e9, [e if math.isfinite(e) else None for e in errors]))
-        return found
+                error_samples.append((report.stamp_ns / 1e9, [e if math.isfinite(e) else None for e in errors]))
+        return error_samples

@@ -43,7 +43,7 @@ def create_replay_app(
     allow_hosts: Collection[str] = (),
     clock: Callable[[], int] = time.monotonic_ns,
 ) -> Starlette:
-    """The ASGI application; ``name`` and ``note`` are shown, ``at_ns`` is where a page begins."""
+    """Build the ASGI application; ``name`` and ``note`` are shown, ``at_ns`` is where a page begins."""
     overview, databases = Overview(recording, profile), load_databases(profile)
     machine = describe_machine(profile) | {
         "panels": ["error", "timeline", "can"],
@@ -106,14 +106,14 @@ async def _hear(socket: WebSocket, orders: asyncio.Queue[str]) -> None:
 
 
 def _waiting(orders: asyncio.Queue[str]) -> list[str]:
-    """The orders that wait; of several seeks in a row only the last counts, or dragging would lag behind."""
-    found: list[str] = []
+    """Take the orders that wait; of several seeks in a row only the last counts, or dragging would lag behind."""
+    waiting_orders: list[str] = []
     while not orders.empty():
         order = orders.get_nowait()
-        if found and order.startswith("seek ") and found[-1].startswith("seek "):
-            found.pop()
-        found.append(order)
-    return found
+        if waiting_orders and order.startswith("seek ") and waiting_orders[-1].startswith("seek "):
+            waiting_orders.pop()
+        waiting_orders.append(order)
+    return waiting_orders
 
 
 def _next(view: ReplayView, orders: list[str], now_ns: int) -> dict[str, Any]:

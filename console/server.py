@@ -62,12 +62,12 @@ MAX_ANSWER_BYTES: Final = 65_536
 
 
 def fault_routes(desk: Path, watch: FaultWatch, access: Access) -> list[Route]:
-    """``/api/faults`` lists what can be tried; a POST to ``/api/faults/NAME`` tries it."""
+    """Make the routes of faults: ``/api/faults`` lists what can be tried; a POST to ``/api/faults/NAME`` tries it."""
     trying = asyncio.Lock()
 
     async def listed(_: Request) -> Response:
-        told = await _ask(desk, {"op": "list"})
-        return JSONResponse(told["faults"]) if "faults" in told else PlainTextResponse(_error(told), 502)
+        response = await _ask(desk, {"op": "list"})
+        return JSONResponse(response["faults"]) if "faults" in response else PlainTextResponse(_error(response), 502)
 
     async def inject(request: Request) -> Response:
         if why := access.refusal(page_of(request), Role.OPERATOR, leased=True):
@@ -75,10 +75,10 @@ def fault_routes(desk: Path, watch: FaultWatch, access: Access) -> list[Route]:
         if trying.locked():
             return PlainTextResponse("Another fault is being injected.", 409)
         async with trying:
-            told = await _ask(desk, {"op": "inject", "name": request.path_params["name"]})
-        if "at_ns" not in told:
-            return PlainTextResponse(_error(told), 409)
-        watch.begin(str(told["title"]), str(told["said"]), int(told["at_ns"]))
+            response = await _ask(desk, {"op": "inject", "name": request.path_params["name"]})
+        if "at_ns" not in response:
+            return PlainTextResponse(_error(response), 409)
+        watch.begin(str(response["title"]), str(response["said"]), int(response["at_ns"]))
         return Response(status_code=204)
 
     return [Route("/api/faults", listed), Route("/api/faults/{name}", inject, methods=["POST"])]
@@ -90,12 +90,12 @@ async def _ask(desk: Path, request: dict[str, str]) -> dict[str, Any]:
             reader, writer = await asyncio.open_unix_connection(str(desk), limit=MAX_ANSWER_BYTES)
             try:
                 writer.write(json.dumps(request).encode() + b"\n")
-                told = json.loads(await reader.readline())
+                response = json.loads(await reader.readline())
             finally:
                 writer.close()
     except (OSError, ValueError, TimeoutError) as error:
         return {"error": f"The run's desk of faults does not answer ({error})."}
-    return told if isinstance(told, dict) else {}
+    return response if isinstance(response, dict) else {}
 
 
 def _error(told: dict[str, Any]) -> str:
@@ -178,9 +178,9 @@ def _respond(send: Callable[[], None], who: str, where: str) -> Response:
 
 
 def _commission_routes(console: Console) -> list[Route]:
-    """Those of the commissioning page; its procedures are imported only where there is one."""
-    told, bus = console.commission, console.buses.get(console.profile.crane_bus)
-    if told is None or bus is None:
+    """Make the routes of the commissioning page; its procedures are imported only where there is one."""
+    options, bus = console.commission, console.buses.get(console.profile.crane_bus)
+    if options is None or bus is None:
         return []
     from console.commission_api import CommissionApi
     from console.commissioning import Commissioning
@@ -188,9 +188,9 @@ def _commission_routes(console: Console) -> list[Route]:
     work = Commissioning(
         console.profile,
         console.profile_hash,
-        told.source,
-        told.folder,
-        told.controller,
+        options.source,
+        options.folder,
+        options.controller,
         bus,
         console.key,
         lambda: console.crane_state.report,
@@ -199,7 +199,7 @@ def _commission_routes(console: Console) -> list[Route]:
 
 
 def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette:
-    """The ASGI application; ``allow_hosts`` are host names to serve in addition to this machine's."""
+    """Build the ASGI application; ``allow_hosts`` are host names to serve in addition to this machine's."""
     page = (STATIC / "index.html").read_text()
     machine = describe_machine(console.profile)
     plan = PlanApi(

@@ -96,7 +96,7 @@ class Shift:
             counts.volume_m3 += max(0.0, gained_m3)
 
     def numbers(self, now_ns: int) -> dict[str, Any] | None:
-        """The numbers for the page; None before the first report."""
+        """Return the numbers for the page; None before the first report."""
         if self._begun_ns is None:
             return None
         c, long_ns = self._counts, now_ns - self._begun_ns
@@ -134,17 +134,17 @@ _BARS: Final = tuple(_bar_of(i) if i < BINS - 1 else len(EDGES_US) for i in rang
 
 
 def histograms(timing: Timing) -> dict[str, Any]:
-    """Edges [us] and for each measured time its counts, median, 99.9 % and longest [us]."""
-    found = []
-    for name, words in SHOWN.items():
+    """Return edges [us] and for each measured time its counts, median, 99.9 % and longest [us]."""
+    time_histograms = []
+    for name, caption in SHOWN.items():
         durations = timing.durations[name]
         counts = [0] * (len(EDGES_US) + 1)
         for i, n in enumerate(durations.bins):
             if n:
                 counts[_BARS[i]] += n
         summary = durations.summary()
-        found.append({"name": name, "words": words, "counts": counts, **summary})
-    return {"edges_us": list(EDGES_US), "period_us": timing.facts.period_ns / 1e3, "of": found}
+        time_histograms.append({"name": name, "words": caption, "counts": counts, **summary})
+    return {"edges_us": list(EDGES_US), "period_us": timing.facts.period_ns / 1e3, "of": time_histograms}
 
 
 # -- The chosen grasp for the page, in the crane's base frame; pure, like `console.state`.
@@ -176,7 +176,7 @@ class GraspState:
         return True
 
     def shown(self, now_ns: int) -> dict[str, Any] | None:
-        """Hanger pin and both tips of the open jaws [m], logs and reason; None when no grasp is chosen."""
+        """Return hanger pin and both tips of the open jaws [m], logs and reason; None when no grasp is chosen."""
         g = self._grasp
         if g is None or now_ns - self._received_ns > TIMEOUT_NS:
             return None
@@ -208,8 +208,8 @@ _NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
 
 
 def describe_machine(profile: Profile) -> dict[str, Any]:
-    """Constant data of the machine: names, limits, geometry of bunk and surroundings."""
-    bunk, place = profile.bunk, profile.workspace
+    """Return the machine's constant data: names, limits, geometry of bunk and surroundings."""
+    bunk, workspace = profile.bunk, profile.workspace
     return {
         "name": profile.name,
         "title": profile.title,
@@ -219,9 +219,9 @@ def describe_machine(profile: Profile) -> dict[str, Any]:
         ],
         "hold_pressure_bar": profile.grapple.hold_pressure_bar,
         "bunk": {name: getattr(bunk, name) for name in bunk.__struct_fields__},
-        "ground_z_m": place.ground_z_m,
-        "pick_center_m": place.pick_center_m,
-        "pick_half_size_m": place.pick_half_size_m,
+        "ground_z_m": workspace.ground_z_m,
+        "pick_center_m": workspace.pick_center_m,
+        "pick_half_size_m": workspace.pick_half_size_m,
         "reach_m": round(kinematics.max_reach_m(profile), 2),
         "carrier": describe_carrier(profile),
     }
@@ -295,15 +295,15 @@ class CraneState:
         return self._report
 
     def histograms(self) -> dict[str, Any] | None:
-        """The histograms of the newest timing page; None before the first."""
+        """Return the histograms of the newest timing page; None before the first."""
         return None if self._newest_timing is None else histograms(self._newest_timing)
 
     def alive(self, now_ns: int) -> bool:
-        """Whether the controller is connected."""
+        """Tell whether the controller is connected."""
         return self._report is not None and now_ns - self._received_ns < REPORT_TIMEOUT_NS
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """The state for the page; without crane data before the controller's first report."""
+        """Return the state for the page; without crane data before the controller's first report."""
         r = self._report
         base = {"alive": self.alive(now_ns), "logs": [asdict(log) for log in self.logs], "timing": None}
         base["entries"] = self.timeline.count
@@ -364,23 +364,23 @@ class CraneState:
 
 
 def _timing_facts(timing: Timing) -> dict[str, Any]:
-    """Timing of the controller since its start: durations at the 99th percentile, and the oldest input used."""
-    facts, found = timing.facts, timing.durations
+    """Summarize the controller's timing since its start: durations at the 99th percentile, oldest input used."""
+    facts, durations = timing.facts, timing.durations
     inputs = {name: age.longest_ns for name, age in facts.inputs.items() if age.count}
     oldest = max(inputs, key=inputs.__getitem__, default="")
     return {
         "ticks": facts.ticks,
         "missed": facts.missed,
-        "wake_us": found["wake"].quantile_ns(0.99) / 1e3,
-        "cpu_us": found["cpu"].quantile_ns(0.99) / 1e3,
-        "sample_to_command_ms": found["sample_to_command"].quantile_ns(0.99) / 1e6,
+        "wake_us": durations["wake"].quantile_ns(0.99) / 1e3,
+        "cpu_us": durations["cpu"].quantile_ns(0.99) / 1e3,
+        "sample_to_command_ms": durations["sample_to_command"].quantile_ns(0.99) / 1e6,
         "oldest_input": oldest,
         "oldest_input_ms": inputs[oldest] / 1e6 if oldest else None,
     }
 
 
 def timing_of_recording(found: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The same from the timing page as a recording has it: without histograms."""
+    """Return the same from the timing page as a recording has it: without histograms."""
     if found is None:
         return None
     durations, inputs = found["durations"], found["inputs"]

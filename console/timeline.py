@@ -102,10 +102,10 @@ class Timeline:
 
 
 def stop_words(report: StateReport) -> tuple[str, str, str]:
-    """Code, sentence with what was measured, and remedy of a stop."""
+    """Return code, sentence with what was measured, and remedy of a stop."""
     if known(report.reason) is None:
         code = f"REASON_{report.reason & 0xFF}"
         return code, "A reason of another release.", "Run controller and console of one release."
-    found = explain(report.reason, report.numbers)
-    measured = "; ".join(quantity.text for quantity in found.quantities)
-    return found.code, found.sentence + (f" Measured: {measured}." if measured else ""), found.advice
+    explanation = explain(report.reason, report.numbers)
+    measured = "; ".join(quantity.text for quantity in explanation.quantities)
+    return explanation.code, explanation.sentence + (f" Measured: {measured}." if measured else ""), explanation.advice

@@ -30,11 +30,11 @@ class Signal:
     __slots__ = ("_index", "_state")
 
     def __init__(self, state: MessageState, name: str) -> None:
-        """Raises KeyError if the message has no such signal."""
+        """Find the signal in its message; raises KeyError if the message has no such signal."""
         self._state, self._index = state, state.codec.index[name]
 
     def value(self) -> Any:
-        """The value now; None when the message is unknown or stale, or the signal not available."""
+        """Return the value now; None when the message is unknown or stale, or the signal not available."""
         values = self._state.values
         return None if values is None else values[self._index]
 
@@ -96,7 +96,7 @@ class MessageState:
         self.forget()
 
     def forget(self) -> None:
-        """The values are unknown again; the next frames must qualify the message."""
+        """Make the values unknown again; the next frames must qualify the message."""
         self.values: tuple[Any, ...] | None = None
         self.fresh = False
         """A good frame came in this tick."""
@@ -104,7 +104,7 @@ class MessageState:
             self._checker.reset()
 
     def get(self, signal: str) -> Any:
-        """A signal's value; None when the message is unknown or stale, or the signal not available."""
+        """Return a signal's value; None when the message is unknown or stale, or the signal not available."""
         return None if self.values is None else self.values[self._index[signal]]
 
     def receive(self, frame: Frame, now_ns: int) -> None:
@@ -133,7 +133,7 @@ class MessageState:
 
 
 def or_nan(value: float | None) -> float:
-    """A received value, NaN when there is none."""
+    """Return a received value, NaN when there is none."""
     return math.nan if value is None else value
 
 
@@ -173,7 +173,7 @@ class PeriodicTimer:
         self._next_ns = 0
 
     def due(self, now_ns: int) -> bool:
-        """True at the first call and once per period."""
+        """Return True at the first call and once per period."""
         if now_ns < self._next_ns:
             return False
         if self._next_ns:
@@ -205,7 +205,7 @@ class ProtectedMessage:
 
 
 def safe_state(mode: Mode, reason: Reason, half_speed: bool) -> int:
-    """The safety state in `CtrlStatus` and `CtrlAlive`."""
+    """Give the safety state for `CtrlStatus` and `CtrlAlive`."""
     if mode is _STOP:
         return _CONTROLLED_STOP
     if mode is _FAULT:
@@ -288,7 +288,7 @@ class BusMonitor:
             self.reason = Reason.BUS_PASSIVE if state == _PASSIVE else _NONE
 
     def usable(self, now_ns: int) -> bool:
-        """Whether the machine may be armed on this bus."""
+        """Tell whether the machine may be armed on this bus."""
         return now_ns >= self._unusable_until_ns
 
     def _note_recoveries(self, recoveries: int, now_ns: int) -> None:

@@ -120,7 +120,7 @@ class JointWatch:
         self._was_armed = False
 
     def begin_session(self) -> None:
-        """An operator armed: what a joint did before does not count."""
+        """Forget what the joints did before an operator armed."""
         for j in range(N_JOINTS):
             self._monitors[j].reset()
             self._standstill[j].reset()
@@ -198,7 +198,7 @@ class JointWatch:
             supervisor.react_to(Reason.ENCODER_DRIFT, j, now_ns)
 
     def _frozen(self, j: int, monitor: MotionMonitor, tested: bool) -> bool:
-        """Whether the encoder stands still to the last count although its joint should have moved."""
+        """Tell whether the encoder stands still to the last count although its joint should have moved."""
         sensed = self._sensed[j]
         if sensed is None or not sensed.dithers or sensed.unchanged == 0:
             self._travel[j] = 0.0
@@ -207,7 +207,7 @@ class JointWatch:
         return sensed.unchanged >= self._frozen_ticks[tested] and self._travel[j] > self._frozen_travel[j]
 
     def shares(self, j: int) -> dict[str, float]:
-        """What was measured of a joint over what is a fault, 1 and more, by the fault."""
+        """Compute what was measured of a joint over what is a fault, 1 and more, by the fault."""
         reversed_, stuck, runaway = self._monitors[j].shares()
         shares = {"joint stuck": stuck, "joint too fast for its command": runaway}
         if not (j == _ROT and self._crane.grapple.at_work):

@@ -30,17 +30,17 @@ class OperatorLink:
         self.lost_from_ns = _NEVER_NS
 
     def beat(self, stamp_ns: int) -> None:
-        """A heartbeat that was sent at ``stamp_ns``: its way counts against the link."""
+        """Take a heartbeat that was sent at ``stamp_ns``: its way counts against the link."""
         if self.limit_ns and stamp_ns > self.stamp_ns:
             self.stamp_ns, self.lost_from_ns = stamp_ns, stamp_ns + self.limit_ns
 
     def end(self, stamp_ns: int) -> None:
-        """A person ended the watch on purpose at ``stamp_ns``."""
+        """End the watch as a person did on purpose at ``stamp_ns``."""
         if stamp_ns > self.stamp_ns:
             self.stamp_ns, self.lost_from_ns = stamp_ns, _NEVER_NS
 
     def state(self, now_ns: int) -> LinkWatch:
-        """For the state report."""
+        """Tell the state of the link for the state report."""
         if self.lost_from_ns == _NEVER_NS:
             return LinkWatch.OFF
         return LinkWatch.LOST if now_ns >= self.lost_from_ns else LinkWatch.WATCHED

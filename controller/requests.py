@@ -74,7 +74,7 @@ class SetpointGate:
         return max(self._stamp_ns, 0)
 
     def start_session(self) -> None:
-        """An operator armed: a planner may count from the beginning again.  Stamps must still grow."""
+        """Let a planner count from the beginning again, as an operator armed.  Stamps must still grow."""
         self._sequence = -1
 
     def count_refusal(self, reason: Reason, detail: int, now_ns: int) -> None:
@@ -90,12 +90,12 @@ class SetpointGate:
         self.refused += 1
 
     def clear_refusals(self) -> None:
-        """A motion begins: refusals from before it do not count against it."""
+        """Clear the refusals from before a motion that begins: they do not count against it."""
         for i in range(REFUSED_LIMIT_COUNT):
             self._refused_ns[i] = -REFUSED_WINDOW_NS
 
     def refused_too_often(self, now_ns: int) -> bool:
-        """Whether the last three refusals lie within one second."""
+        """Tell whether the last three refusals lie within one second."""
         oldest_ns = self._refused_ns[self._counted % REFUSED_LIMIT_COUNT]
         return now_ns - oldest_ns < REFUSED_WINDOW_NS
 
@@ -140,7 +140,7 @@ class RequestGate(SetpointGate):
     def accept(
         self, data: bytes, now_ns: int, late_ns: int, operator: bool = False
     ) -> CraneSetpoint | SpoolTest | DriveSetpoint | OperatorAction:
-        """The setpoint or operator action in a datagram, checked for form, profile, age and order.
+        """Return the setpoint or operator action in a datagram, checked for form, profile, age and order.
 
         ``operator``: it came from a person who may arm, and is no setpoint.  Order and lease of a drive setpoint are
         checked by the vehicle.

@@ -156,7 +156,7 @@ class Evidence:
             self.since_ns, self.numbers = 0, ()
 
     def _measure(self, reason: Reason, detail: int, inputs: Inputs, now_ns: int) -> Numbers:
-        """Measured value, limit, and one more; empty for a reason without numbers."""
+        """Return the measured value, limit, and one more; empty for a reason without numbers."""
         lost = self._lost_message(reason, detail)
         if lost is not None:
             age_ms = (now_ns - lost.stamp_ns) * _MS if lost.stamp_ns else _NAN
@@ -197,7 +197,7 @@ class Evidence:
         return self._carrier(reason, detail, self._vehicle)
 
     def _lost_message(self, reason: Reason, detail: int) -> MessageState | None:
-        """The message without values that has been silent for longest, where a reason is the loss of a message."""
+        """Find the message without values that is silent for longest, where a reason is the loss of a message."""
         if reason is Reason.ENCODER_LOST:
             return self._inputs.articulation if detail == ARTICULATION else self._inputs.encoders[detail]
         silent: MessageState | None = None
@@ -226,7 +226,7 @@ class Evidence:
         return ()
 
     def _frozen(self, detail: int) -> Numbers:
-        """A frozen encoder arrives: its last sample is no evidence, what its joint was told to do is."""
+        """Give what the joint of a frozen encoder was told to do: its last sample arrives, but is no evidence."""
         if detail == ARTICULATION:
             state = self._inputs.articulation
             commanded = _NAN if self._vehicle is None else self._vehicle.steering.rate_rad_s
@@ -354,7 +354,7 @@ class StateReporter:
         self.tick_ns = max(self.tick_ns, tick_ns)
 
     def report(self, stale_mask: int, missed_ticks: int, frames: int, now_ns: int) -> bytes | None:
-        """A state report when one is due, else None; ``frames`` counts the frames received since the start."""
+        """Build a state report when one is due, else None; ``frames`` counts the frames received since the start."""
         if not self._due.due(now_ns):
             return None
         supervisor, gate, crane, estimators = self._supervisor, self._gate, self._crane, self._estimators

@@ -144,7 +144,7 @@ class Controller:
         self._last_ns = 0
 
     def elapse(self, now_ns: int) -> int:
-        """Time since the previous tick [ns], bounded after a pause."""
+        """Return the time since the previous tick [ns], bounded after a pause."""
         elapsed_ns = min(now_ns - self._last_ns, MAX_ELAPSED_PERIODS * self._period_ns)
         self._last_ns = now_ns
         return elapsed_ns
@@ -252,7 +252,7 @@ class Controller:
                 self.vehicle.gate.start_session()
 
     def _refused_too_often(self, now_ns: int) -> bool:
-        """Whether requests to whatever moves now, crane or carrier, were refused too often."""
+        """Tell whether requests to whatever moves now, crane or carrier, were refused too often."""
         vehicle = self.vehicle
         drive = vehicle is not None and vehicle.setpoint is not None and vehicle.gate.refused_too_often(now_ns)
         return drive or (self.crane.leased and self.gate.refused_too_often(now_ns))
@@ -285,7 +285,7 @@ class Controller:
             self.crane.reset_laws()
 
     def _accept_drive_setpoint(self, setpoint: DriveSetpoint, now_ns: int, late_ns: int) -> None:
-        """Refusals of drive setpoints are counted by the vehicle and appear in its own report."""
+        """Accept a drive setpoint; the vehicle counts refusals, which appear in its own report."""
         vehicle = self.vehicle
         if vehicle is None:
             raise RequestRefused(Reason.CANNOT_DRIVE)
@@ -330,7 +330,7 @@ class Controller:
         self.evidence.update(inputs, now_ns)
 
     def _check_leases(self, now_ns: int) -> None:
-        """A lease that ends after its motion is done ends ACTIVE; one that ends before stops the machine."""
+        """End a lease ACTIVE that ends after its motion is done; stop the machine for one that ends before."""
         supervisor, crane, vehicle = self.supervisor, self.crane, self.vehicle
         if crane.leased and crane.lease_over(now_ns):
             if not crane.finished(now_ns):
@@ -358,7 +358,7 @@ class Controller:
             supervisor.coast_ns = int(vehicle.drive.stop_s * 1e9)
 
     def _ramp_share(self, now_ns: int) -> float:
-        """Share of the last command that is left during a stop's ramp."""
+        """Compute the share of the last command that is left during a stop's ramp."""
         supervisor = self.supervisor
         if not supervisor.ramping or now_ns >= supervisor.ramp_end_ns:
             return 0.0
@@ -410,7 +410,7 @@ class Controller:
         return self.crane_inputs.stale_mask | (bus.inputs.stale_mask if bus is not None else 0)
 
     def shutdown_frames(self) -> list[RawFrame]:
-        """The last frames on crane0 before the process ends: neutral commands without the arm key, and a status."""
+        """Build the last frames on crane0 before the process ends: neutral commands without arm key, and a status."""
         frames: list[RawFrame] = []
         grapple = self.crane.grapple
         grapple.release()
@@ -419,12 +419,12 @@ class Controller:
         return frames
 
     def carrier_shutdown_frames(self) -> list[RawFrame]:
-        """The last frames on mach0."""
+        """Build the last frames on mach0."""
         return self.carrier_bus.shutdown_frames() if self.carrier_bus is not None else []
 
 
 def _unmarked() -> None:
-    """Nothing measures the stages."""
+    """Do nothing: nothing measures the stages."""
 
 
 def step(state: Controller, inputs: Inputs, now_ns: int, mark: Callable[[], None] = _unmarked) -> Outputs:

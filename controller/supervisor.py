@@ -232,7 +232,7 @@ class Supervisor:
         return True
 
     def request_arm(self, now_ns: int) -> tuple[Reason, int]:
-        """The operator's ARM: NONE when the machine is armed now, else the reason why not."""
+        """Handle the operator's ARM: NONE when the machine is armed now, else the reason why not."""
         if self.mode in OPERATING:
             return Reason.NONE, 0
         if self.mode is Mode.FAULT:
@@ -246,7 +246,7 @@ class Supervisor:
         return blocker
 
     def request_reset(self, now_ns: int) -> None:
-        """The operator's RESET, by datagram or by the button on the safety module."""
+        """Handle the operator's RESET, by datagram or by the button on the safety module."""
         if not self.ramping:
             self.apply(Event.RESET, Reason.NONE, 0, now_ns)
             self._startup.reset(lambda node: self.crane_inputs.nodes.operational(node, now_ns))
@@ -254,12 +254,12 @@ class Supervisor:
                 self.carrier_inputs.address.restart()
 
     def request_disarm(self, now_ns: int) -> None:
-        """The operator's DISARM."""
+        """Handle the operator's DISARM."""
         if not self.ramping:
             self.apply(Event.DISARM, Reason.OPERATOR_DISARM, 0, now_ns)
 
     def arming_blocker(self, now_ns: int) -> tuple[Reason, int]:
-        """What prevents arming now."""
+        """Find what prevents arming now."""
         received = self.crane_inputs
         if not self._startup.complete:
             return self._startup.problem()
@@ -354,7 +354,7 @@ class Supervisor:
             self.reason, self.detail = _MOVES, moving_joint
 
     def reset_button_pressed(self) -> bool:
-        """Whether the reset button of the safety module went down in this tick."""
+        """Tell whether the reset button of the safety module went down in this tick."""
         pressed = self._reset_button.value()
         if pressed is None:
             return False
@@ -367,8 +367,9 @@ class Supervisor:
             self.worst, self.worst_detail = reason, detail
 
     def _check_lateness(self, late_ns: int, period_ns: int, now_ns: int) -> None:
-        """A tick later than two periods and 10 ms slows the machine; three within a second, or one beyond 50 ms, stop
-        it."""
+        """Slow the machine for a tick later than two periods and 10 ms; stop it for three within a second, or one
+        beyond 50 ms.
+        """
         if late_ns <= LATE_PERIODS * period_ns or late_ns <= LATE_NS:
             return
         stamps = self._late_stamps
@@ -394,7 +395,7 @@ class Supervisor:
             self._stall_end_ns = now_ns + STALL_MEMORY_NS
 
     def _lost_together(self, nodes: Sequence[Sequence[MessageState]], heard_ns: int, now_ns: int) -> Reason:
-        """The common cause of what is lost on one bus: this computer, or what several nodes share; else NONE.
+        """Find the common cause of what is lost on one bus: this computer, or what several nodes share; else NONE.
 
         The first of them to be missed may stand alone for a moment: then nothing else is heard either.
         """
@@ -429,7 +430,7 @@ class Supervisor:
             self._collect(Reason.GRAPPLE_STATUS_LOST)
 
     def _check_values(self, now_ns: int) -> None:
-        """Values that are known and bad; a stale value is not checked here."""
+        """Find values that are known and bad; a stale value is not checked here."""
         received = self.crane_inputs
         if received.guard.values is not None:
             if self._enable.value() != _ENABLED:
@@ -460,7 +461,7 @@ class Supervisor:
                 self._collect(Reason.POSITION_OUTSIDE, j)
 
     def _check_carrier(self, carrier: CarrierInputs, now_ns: int) -> None:
-        """The carrier's own frames arrive, and the controller owns its address on mach0."""
+        """Check that the carrier's own frames arrive, and that the controller owns its address on mach0."""
         if carrier.stale_mask:
             common = self._lost_together(self._carrier_nodes, carrier.heard_ns, now_ns)
             if common:
@@ -473,7 +474,7 @@ class Supervisor:
             self._collect(Reason.ADDRESS_LOST)
 
     def _advisory(self) -> Reason:
-        """A loss to report although the machine may work."""
+        """Find a loss to report although the machine may work."""
         carrier, latitude, heading, reference = self.carrier_inputs, self._latitude, self._heading, self._reference
         if carrier is None or latitude is None or heading is None or reference is None:
             return _NONE
@@ -482,7 +483,7 @@ class Supervisor:
         return Reason.ENGINE_LOST if carrier.engine.values is None else _NONE
 
     def _check_echo(self, period_ns: int) -> None:
-        """The valve node echoes the counter of the last accepted command; it must change."""
+        """Check that the counter of the last accepted command, which the valve node echoes, changes."""
         echo = self._echo_counter.value()
         self._echo_ticks = 0 if echo != self._echo else self._echo_ticks + 1
         self._echo = echo

@@ -41,7 +41,7 @@ _SLEW: Final = int(Joint.SLEW)
 
 
 def allowed_delay_s(spec: JointSpec) -> float:
-    """The dead time to allow for; without an encoder no calibration has measured it."""
+    """Return the dead time to allow for; without an encoder no calibration has measured it."""
     return spec.valve.delay_s if spec.encoder is not None else max(spec.valve.delay_s, LONGEST_DELAY_S)
 
 
@@ -86,7 +86,7 @@ class ValveWatch:
         ]
 
     def shares(self, j: int) -> dict[str, float]:
-        """What was measured of a valve and its joint over what is a fault, 1 and more, by the fault."""
+        """Compute what was measured of a valve and its joint over what is a fault, 1 and more, by the fault."""
         opened, shut, wrong = self._monitors[j].shares()
         fast, slow, stood = self._speeds[j].shares()
         return {

@@ -136,7 +136,7 @@ def run_lockstep(
 
 
 def _on_press(action: OperatorAction, report: StateReport) -> None:
-    """Button presses are not shown."""
+    """Ignore a button press: presses are not shown."""
 
 
 def _run(
@@ -179,15 +179,15 @@ RANGE_M: Final = (3.0, 8.0)
 
 
 def surveyed_profile(profile: Profile, truth: Any, name: str, seed: int) -> Profile:
-    """The profile with camera ``name`` as a survey before run ``seed`` finds it; ``truth`` is ``plant.world.truth``."""
+    """Return the profile with camera ``name`` as surveyed before run ``seed``; ``truth`` is ``plant.world.truth``."""
     camera, hidden = profile.cameras[name], truth.cameras[name]
     scale = StereoNoise(camera, hidden, f"{name} {seed}").scale  # the same as that of the camera rig
-    found = survey(camera, hidden, scale, random.Random(f"survey {seed}"))
-    return msgspec.structs.replace(profile, cameras={**profile.cameras, name: found})
+    surveyed_camera = survey(camera, hidden, scale, random.Random(f"survey {seed}"))
+    return msgspec.structs.replace(profile, cameras={**profile.cameras, name: surveyed_camera})
 
 
 def survey(camera: Camera, truth: Any, depth_scale: float, rng: random.Random) -> Camera:
-    """The camera with surveyed mount and depth scale.
+    """Return the camera with surveyed mount and depth scale.
 
     ``truth`` (``plant.world.truth.cameras``) holds the true mount errors and noise; the camera measures ``depth_scale``
     times the true depth.

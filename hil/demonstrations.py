@@ -70,8 +70,8 @@ class DemonstrationMotion:
 
 
 def script(profile: Profile, seed: int, targets: int, standing: Sequence[float]) -> list[DemonstrationMotion]:
-    """Motions from the present joints ``standing`` (5,) to ``targets`` positions beside the machine, each followed by
-    one to the bunk.
+    """Plan motions from the present joints ``standing`` (5,) to ``targets`` positions beside the machine, each
+    followed by one to the bunk.
 
     Raises:
         InputRefused: the crane cannot reach such positions.
@@ -81,24 +81,24 @@ def script(profile: Profile, seed: int, targets: int, standing: Sequence[float])
     over_bunk = arm.compact_pose_above(
         *bunk.center_m, bunk.floor_z_m + lowest_tip_below_pin_m(profile.grapple.jaws) + 0.3, high
     )
-    shown: list[DemonstrationMotion] = []
-    here = arm.pose(standing)
+    motions: list[DemonstrationMotion] = []
+    start_pose = arm.pose(standing)
     cx, cy = profile.workspace.pick_center_m
     for number in range(targets):
         side = -1.0 if number % 2 and profile.carrier is not None else 1.0
         x, y = cx + rng.uniform(-0.8, 0.8), side * (cy + rng.uniform(-0.8, 0.8))
         try:
             log = arm.compact_pose_above(x, y, ground + profile.grapple.jaws.tip_below_pin_m[0] + OVER_LOG_M, high)
-            shown.append(_motion(arm, here, log, high, rng))
-            shown.append(_motion(arm, log, over_bunk, high, rng))
-            here = over_bunk
+            motions.append(_motion(arm, start_pose, log, high, rng))
+            motions.append(_motion(arm, log, over_bunk, high, rng))
+            start_pose = over_bunk
         except Unreachable as error:
             raise InputRefused("demonstration.unreachable", f"the crane cannot demonstrate there: {error}") from None
-    return shown
+    return motions
 
 
 def _motion(arm: Arm, start: Pose, goal: Pose, high_m: float, rng: random.Random) -> DemonstrationMotion:
-    """A straight line in the plane with a quasi-parabola in height, somewhat higher than the stakes require."""
+    """Plan a straight line in the plane with a quasi-parabola in height, somewhat higher than the stakes require."""
     share = np.linspace(0.0, 1.0, _POINTS)
     ends = np.array(start), np.array(goal)
     poses = ends[0] + share[:, None] * (ends[1] - ends[0])
@@ -132,7 +132,7 @@ class LeverOperator:
         return self._count - len(self._left)
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """Every 20 ms: read the joints, move the levers.  Sends nothing."""
+        """Read the joints and move the levers every 20 ms; send nothing."""
         if now_ns < self._next_ns or now_ns < START_DELAY_S * 1e9:
             return None
         self._next_ns = now_ns + PERIOD_NS
@@ -141,7 +141,7 @@ class LeverOperator:
         return None
 
     def _proceed(self, dt_s: float) -> None:
-        seen = self._seen[0]
+        measured_position = self._seen[0]
         if self._now is None:
             if not self._left:
                 self.done = True
@@ -150,16 +150,20 @@ class LeverOperator:
             self._clock_s = -self._now.pause_s
             middle = self._rng.uniform(0.3, 0.7) * self._now.time_s
             self._hesitates = (middle, self._rng.choice((0.0, 0.0, 0.35)))
-        before = self._target(self._clock_s)
+        previous_target = self._target(self._clock_s)
         at, wait_s = self._hesitates
         self._clock_s += dt_s
         if wait_s > 0.0 and self._clock_s >= at:
             self._hesitates = (at, wait_s - dt_s)
             self._clock_s -= dt_s
-        wanted = self._target(self._clock_s)
+        target_position = self._target(self._clock_s)
         moving = self._clock_s > 0.0
-        speed = (wanted - before) / dt_s + GAIN_1_S * (wanted - seen) if moving else np.zeros(len(AXES))
-        close = np.abs(wanted - seen) < GOAL_TOLERANCE
+        speed = (
+            (target_position - previous_target) / dt_s + GAIN_1_S * (target_position - measured_position)
+            if moving
+            else np.zeros(len(AXES))
+        )
+        close = np.abs(target_position - measured_position) < GOAL_TOLERANCE
         over = self._clock_s > self._now.time_s
         if over:
             speed = np.where(close, 0.0, speed)
@@ -168,7 +172,7 @@ class LeverOperator:
             self._now = None
 
     def _target(self, clock_s: float) -> np.ndarray:
-        """The target point (4,) [rad, m]: along the path, faster in the middle."""
+        """Compute the target point (4,) [rad, m]: along the path, faster in the middle."""
         assert self._now is not None
         tau = min(max(clock_s / self._now.time_s, 0.0), 1.0)
         share = tau * tau * (3.0 - 2.0 * tau)

@@ -52,7 +52,7 @@ class BridgedPlant(PlcPlant):
         return self.tap.pass_on(now_ns, [(crane, key, data) for key, data in self.bridge.step(now_ns, frames)])
 
     def _arrive(self, now_ns: int) -> None:
-        """One slice of the cable: the answer reaches the bridge, the command reaches the PLC, a new command leaves."""
+        """Advance one slice of the cable: the answer reaches the bridge, the command the PLC, a new command leaves."""
         answer, self._answer = self._answer, None
         command, self._command = self._command, None
         shake = self.bridge.handshake
@@ -66,9 +66,11 @@ class BridgedPlant(PlcPlant):
             self._answer = self._serve(command, now_ns)
         if now_ns >= self._exchange_ns:
             self._exchange_ns = now_ns + EXCHANGE_NS
-            wanted = self.bridge.command(now_ns)
+            next_command = self.bridge.command(now_ns)
             self._command = (
-                shake.registers(wanted, now_ns) if self._transport == "modbus" else shake.datagram(wanted, now_ns)
+                shake.registers(next_command, now_ns)
+                if self._transport == "modbus"
+                else shake.datagram(next_command, now_ns)
             )
 
     def _serve(self, command: list[int] | bytes, now_ns: int) -> list[int] | bytes | None:

@@ -34,7 +34,7 @@ class CommandFailed(TimberhandError):
 
     @classmethod
     def from_error(cls, error: Exception, exit_code: ExitCode) -> Self:
-        """The same sentence, and the same error code where ``error`` carries one."""
+        """Make a failure with the same sentence, and the same error code where ``error`` carries one."""
         return cls(error.code if isinstance(error, TimberhandError) else "", str(error), exit_code)
 
     def __reduce__(self) -> tuple[Any, ...]:

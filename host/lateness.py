@@ -27,29 +27,29 @@ IDLE, IOWAIT, STEAL = 3, 4, 7
 
 
 def ticks() -> list[int]:
-    """User, nice, system, idle, iowait, irq, softirq, steal; guests are within user and nice."""
+    """Read user, nice, system, idle, iowait, irq, softirq, steal; guests are within user and nice."""
     with open(STAT) as stat:
         return [int(field) for field in stat.readline().split()[1:9]]
 
 
 def free(before: list[int], after: list[int], processors: int) -> float:
-    """How many processors idled between two readings of `ticks`."""
+    """Compute how many processors idled between two readings of `ticks`."""
     spent = [b - a for a, b in zip(before, after, strict=True)]
     return processors * (spent[IDLE] + spent[IOWAIT]) / max(sum(spent), 1)
 
 
 def stolen(since_start: list[int]) -> float:
-    """Share of the time in which the processors had work that the host of a virtual machine took away."""
+    """Compute the share of busy time that the host of a virtual machine took away from the processors."""
     return since_start[STEAL] / max(sum(since_start) - since_start[IDLE] - since_start[IOWAIT], 1)
 
 
 def work_ns(processors: int) -> int:
-    """The work of a child in each period [ns], where there are so many processors."""
+    """Compute the work of a child in each period [ns], where there are so many processors."""
     return int(PERIOD_NS * min(NEED / processors, MOST))
 
 
 def longest_ns(duration_ns: int, work_ns: int) -> int:
-    """The longest time from a deadline to the end of its work, less the work [ns]."""
+    """Measure the longest time from a deadline to the end of its work, less the work [ns]."""
     clock, used = time.monotonic_ns, time.thread_time_ns
     longest, deadline = 0, clock() + PERIOD_NS
     end = deadline + duration_ns
@@ -85,12 +85,12 @@ def main() -> None:
     time.sleep(COUNT_S)
     after = ticks()
     pipes = [on(cpu, duration_ns, work_ns(len(cpus))) for cpu in cpus]
-    found = {
+    result = {
         "longest_ns": max(int(os.read(pipe, 32)) for pipe in pipes),
         "free": free(before, after, os.cpu_count() or 1),
         "stolen": stolen(after),
     }
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ STANDS_STILL: Final = Finding(int(_TIMEOUT_S * 1e9), 0.0, 0.0)
 
 
 def obstacle(finding: Finding, more: float = 0.0) -> str:
-    """What stands in the way of a live run on this computer, as the beginning of a sentence; empty: nothing.
+    """Say what stands in the way of a live run on this computer, as the beginning of a sentence; empty: nothing.
 
     ``more``: processors that the run needs besides, as its detector does.
     """
@@ -91,5 +91,5 @@ def run_probe(file: str, seconds: float) -> dict[str, Any]:
         timeout=_TIMEOUT_S + seconds,
         start_new_session=True,
     )
-    found: dict[str, Any] = msgspec.json.decode(done.stdout)
-    return found
+    result: dict[str, Any] = msgspec.json.decode(done.stdout)
+    return result

@@ -14,36 +14,36 @@ def systemctl(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def show(unit: str, *names: str) -> dict[str, str]:
-    """Properties of one unit, by name."""
+    """Return properties of one unit, by name."""
     return next(iter(show_all([unit], *names)), {})
 
 
 def show_all(units: Sequence[str], *names: str) -> list[dict[str, str]]:
-    """Properties of several units, in the order of ``units``."""
+    """Return properties of several units, in the order of ``units``."""
     blocks = systemctl("show", *units, "--property", ",".join(names)).stdout.split("\n\n")
     return [dict(line.partition("=")[::2] for line in block.splitlines()) for block in blocks if block.strip()]
 
 
 def main_pid(unit: str) -> int:
-    """The main process of a unit; 0 when there is none."""
+    """Return the main process of a unit; 0 when there is none."""
     return int(show(unit, "MainPID").get("MainPID") or 0)
 
 
 def journal(unit: str) -> list[str]:
-    """Every journal line of the unit, including those of systemd about it."""
+    """Return every journal line of the unit, including those of systemd about it."""
     subprocess.run(["journalctl", "--sync"], check=False)
     command = ["journalctl", "--no-pager", "--output", "cat", "--unit", unit]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
 def last_journal_line(unit: str) -> str:
-    """The last journal line of the unit's processes; empty when this user may not read it."""
+    """Return the last journal line of the unit's processes; empty when this user may not read it."""
     command = ["journalctl", "--no-pager", "--quiet", "--output", "cat", "--lines", "1", f"_SYSTEMD_UNIT={unit}"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def process_facts(pid: int) -> dict[str, object]:
-    """Scheduling, rights and locked memory of a running process."""
+    """Return scheduling, rights and locked memory of a running process."""
     status = dict(line.partition(":\t")[::2] for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     return {
         "policy": {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo"}.get(os.sched_getscheduler(pid), "another"),

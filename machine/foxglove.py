@@ -69,7 +69,7 @@ FOREVER: Final = Duration(sec=0, nsec=0)
 
 
 def machine_scene(profile: Profile, stamp: Timestamp) -> SceneUpdate:
-    """Column, boom, stick, telescope, grapple and bunk, each as an entity of its own that stays; the same each time."""
+    """Draw column, boom, stick, telescope, grapple and bunk, each as an entity that stays; the same each time."""
     kin, bunk = profile.kinematics, profile.bunk
     longest_m = joint_limits(profile)[Joint.EXT][1]
     bodies = [
@@ -194,12 +194,12 @@ class LogMap:
         self._ground = MapProjection()
 
     def base_in_map(self, report: PlaceReport, stamp: Timestamp) -> FrameTransform | None:
-        """The crane's base frame in ``map``; None while position, heading or articulation is unknown."""
+        """Compute the crane's base frame in ``map``; None while position, heading or articulation is unknown."""
         known = (report.latitude_deg, report.longitude_deg, report.heading_rad, report.articulation_rad)
         if not all(map(isfinite, known)):
             return None
-        here = self._ground.metres(report.latitude_deg, report.longitude_deg)
-        east, north = axis_from_antenna(self._carrier, here, report.heading_rad)
+        antenna_m = self._ground.metres(report.latitude_deg, report.longitude_deg)
+        east, north = axis_from_antenna(self._carrier, antenna_m, report.heading_rad)
         heights = [height for height in report.heights_m if isfinite(height)] or [self._carrier.arm_transport_m]
         yaw = 0.5 * pi - report.heading_rad - report.articulation_rad
         x, y, z = rear_from_base(self._carrier, (0.0, 0.0, 0.0))
@@ -217,7 +217,7 @@ class LogMap:
         )
 
     def logs(self, report: LogsReport, stamp: Timestamp) -> SceneUpdate:
-        """All logs of the map in place of those of before: each an entity, the targets and those given up by colour."""
+        """Draw all logs of the map in place of those before: each an entity, targets and those given up by colour."""
         return SceneUpdate(
             deletions=[SceneEntityDeletion(timestamp=stamp, type=SceneEntityDeletionType.All, id="")],
             entities=[self._entity(log, log.number in report.targets, stamp) for log in report.logs],
@@ -309,7 +309,7 @@ class MachineTopics:
     @property
     def topics(self) -> tuple[Topic, ...]:
         """The topics of this machine."""
-        found = [
+        machine_topics = [
             Topic("/tf", FrameTransforms.get_schema()),
             Topic("/joints", JointStates.get_schema()),
             Topic("/reference", JointStates.get_schema()),
@@ -317,35 +317,38 @@ class MachineTopics:
             Topic("/mode", Log.get_schema()),
         ]
         if self._log_map is not None:
-            found.append(Topic("/position", LocationFix.get_schema()))
-            found.append(Topic("/logs", SceneUpdate.get_schema()))
-        return (*found, *(Topic(camera_topic(name), CompressedImage.get_schema()) for name in self._profile.cameras))
+            machine_topics.append(Topic("/position", LocationFix.get_schema()))
+            machine_topics.append(Topic("/logs", SceneUpdate.get_schema()))
+        return (
+            *machine_topics,
+            *(Topic(camera_topic(name), CompressedImage.get_schema()) for name in self._profile.cameras),
+        )
 
     def repeat(self) -> None:
-        """The next report says everything again: for a viewer that came later."""
+        """Make the next report say everything again: for a viewer that came later."""
         self._said = self._scene_ns = self._logs_ns = None
 
     def on_state(self, report: CraneReport, time_ns: int) -> list[Message]:
-        """The messages of a state report."""
-        stamp, found = timestamp(time_ns), list[Message]()
+        """Draw the messages of a state report."""
+        stamp, messages = timestamp(time_ns), list[Message]()
         if (report.mode, report.reason) != self._said:
             self._said = (report.mode, report.reason)
-            found.append(("/mode", _log(report, stamp).encode()))
+            messages.append(("/mode", _log(report, stamp).encode()))
         if _due(self._scene_ns, time_ns, SCENE_PERIOD_NS):
             self._scene_ns = time_ns
-            found.append(("/machine", machine_scene(self._profile, stamp).encode()))
+            messages.append(("/machine", machine_scene(self._profile, stamp).encode()))
         if _due(self._motion_ns, time_ns, MOTION_PERIOD_NS):
             self._motion_ns = time_ns
-            found.append(("/tf", self._transforms(report.position, stamp).encode()))
-            found.append(("/joints", _joints(report.position, report.velocity, stamp).encode()))
-            found.append(("/reference", _joints(report.reference, (), stamp).encode()))
-        return found
+            messages.append(("/tf", self._transforms(report.position, stamp).encode()))
+            messages.append(("/joints", _joints(report.position, report.velocity, stamp).encode()))
+            messages.append(("/reference", _joints(report.reference, (), stamp).encode()))
+        return messages
 
     def on_position(self, report: PositionReport, time_ns: int) -> list[Message]:
-        """The messages of a vehicle report; none while the position is unknown."""
-        stamp, found = timestamp(time_ns), list[Message]()
+        """Draw the messages of a vehicle report; none while the position is unknown."""
+        stamp, messages = timestamp(time_ns), list[Message]()
         if not (isfinite(report.latitude_deg) and isfinite(report.longitude_deg)):
-            return found
+            return messages
         if _due(self._position_ns, time_ns, POSITION_PERIOD_NS):
             self._position_ns = time_ns
             fix = LocationFix(
@@ -356,16 +359,16 @@ class MachineTopics:
                 altitude=report.altitude_m if isfinite(report.altitude_m) else 0.0,
                 heading=report.heading_rad if isfinite(report.heading_rad) else None,
             )
-            found.append(("/position", fix.encode()))
+            messages.append(("/position", fix.encode()))
         if self._log_map is not None and _due(self._base_ns, time_ns, MOTION_PERIOD_NS):
             base = self._log_map.base_in_map(report, stamp)
             if base is not None:
                 self._base_ns = time_ns
-                found.append(("/tf", FrameTransforms(transforms=[base]).encode()))
-        return found
+                messages.append(("/tf", FrameTransforms(transforms=[base]).encode()))
+        return messages
 
     def on_mission(self, report: LogsReport, time_ns: int) -> list[Message]:
-        """The message of a mission report: the logs on the planner's map."""
+        """Draw the message of a mission report: the logs on the planner's map."""
         shown = (
             tuple((log.number, log.place, log.bearing_deg, log.misses, log.given_up) for log in report.logs),
             tuple(report.targets),
@@ -376,7 +379,7 @@ class MachineTopics:
         return [("/logs", self._log_map.logs(report, timestamp(time_ns)).encode())]
 
     def on_picture(self, camera: str, jpeg: bytes, time_ns: int) -> list[Message]:
-        """The message of a measured picture; none of a camera that the machine does not have."""
+        """Draw the message of a measured picture; none of a camera that the machine does not have."""
         if camera not in self._profile.cameras:
             return []
         image = CompressedImage(timestamp=timestamp(time_ns), frame_id=f"camera_{camera}", data=jpeg, format="jpeg")
@@ -400,12 +403,12 @@ class MachineTopics:
 
 
 def camera_topic(camera: str) -> str:
-    """The topic of a camera's pictures."""
+    """Return the topic of a camera's pictures."""
     return f"/camera/{camera}"
 
 
 def timestamp(time_ns: int) -> Timestamp:
-    """A time in the library's form."""
+    """Convert a time to the library's form."""
     return Timestamp(sec=time_ns // 1_000_000_000, nsec=time_ns % 1_000_000_000)
 
 

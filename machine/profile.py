@@ -342,20 +342,20 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def joint(profile: Profile, which: Joint) -> JointSpec:
-    """The specification of one joint."""
+    """Return the specification of one joint."""
     return profile.joints[which.name.lower()]
 
 
 def encoders(profile: Profile) -> dict[int, Encoder]:
-    """Every encoder of the machine by the number of its joint, ``ARTICULATION`` for the carrier's."""
-    found = {int(j): spec for j in JOINTS if (spec := joint(profile, j).encoder) is not None}
+    """Return every encoder of the machine by the number of its joint, ``ARTICULATION`` for the carrier's."""
+    encoder_by_joint = {int(j): spec for j in JOINTS if (spec := joint(profile, j).encoder) is not None}
     if profile.carrier is not None:
-        found[ARTICULATION] = profile.carrier.articulation_encoder
-    return found
+        encoder_by_joint[ARTICULATION] = profile.carrier.articulation_encoder
+    return encoder_by_joint
 
 
 def joint_limits(profile: Profile) -> tuple[tuple[float, float], ...]:
-    """(lower, upper) of every joint, indexed by ``Joint`` [rad, m for EXT]."""
+    """Return (lower, upper) of every joint, indexed by ``Joint`` [rad, m for EXT]."""
     return tuple((spec.lower, spec.upper) for spec in (joint(profile, j) for j in JOINTS))
 
 

@@ -34,7 +34,7 @@ class EncoderScale:
         self._half = self._total // 2
 
     def position(self, counts: int) -> float:
-        """Joint position [rad, m for a linear encoder] of a raw position value."""
+        """Compute the joint position [rad, m for a linear encoder] of a raw position value."""
         delta = counts - self._zero
         if self._total:
             delta = (delta + self._half) % self._total - self._half
@@ -42,12 +42,12 @@ class EncoderScale:
 
 
 def position_from_counts(encoder: Encoder, counts: int) -> float:
-    """Joint position [rad, m for a linear encoder] of a raw position value."""
+    """Compute the joint position [rad, m for a linear encoder] of a raw position value."""
     return EncoderScale(encoder).position(counts)
 
 
 def counts_from_position(encoder: Encoder, position: float) -> int:
-    """The raw value nearest to a joint position: 0..total_counts-1 for a rotary encoder, signed for a linear one."""
+    """Compute the raw value nearest to a joint position: 0..total_counts-1 for rotary, signed for linear encoders."""
     counts = encoder.zero_counts + round(encoder.direction * position / encoder.unit_per_count)
     return counts % encoder.total_counts if encoder.kind == "rotary" else counts
 
@@ -64,7 +64,7 @@ MIN_LEVER_ARM_M: Final = 1.0
 
 
 def lever_share(valve: Valve, position: float) -> float:
-    """Lever arm of the cylinder at a joint position, as a share of the nominal one."""
+    """Compute the lever arm of the cylinder at a joint position, as a share of the nominal one."""
     at, lever = valve.lever_at, valve.lever
     if not at:
         return 1.0
@@ -76,14 +76,14 @@ def lever_share(valve: Valve, position: float) -> float:
 
 
 def lift_moment_nm(profile: Profile, lift_rad: float, a_bar: float, b_bar: float) -> float:
-    """Moment of the lift cylinder from the pressures of its two sides [Nm], + against the weight; A pushes upward."""
+    """Compute the lift cylinder's moment from its two pressures [Nm], + against the weight; A pushes upward."""
     valve = joint(profile, Joint.LIFT).valve
     load_bar = a_bar - b_bar * valve.flow_minus / valve.flow_plus
     return load_bar * PA_PER_BAR * valve.flow_plus * lever_share(valve, lift_rad)
 
 
 def empty_moment_nm(sag: Sag, kin: Kinematics, q: Sequence[float]) -> float:
-    """Moment of the crane with an empty grapple at the lift joint [Nm], as calibrated from its pressures."""
+    """Compute the moment of the crane with empty grapple at the lift joint [Nm], calibrated from its pressures."""
     head, pin, _ = distances(kin, q)
     return sag.head_nm_m * (head - kin.a1_m) + sag.pin_nm_m * (pin - kin.a1_m)
 
@@ -102,13 +102,13 @@ def hanging_load_kg(sag: Sag | None, kin: Kinematics, q: Sequence[float], moment
 
 
 def level_moment_nm(of: Stability, kin: Kinematics, q: Sequence[float], load_kg: float) -> float:
-    """Moment of the crane with a load in its grapple about the tipping line, on level ground [Nm]."""
+    """Compute the moment of the crane with a load in its grapple about the tipping line, on level ground [Nm]."""
     head_m, pin_m, _ = distances(kin, q)
     return GRAVITY_M_S2 * ((of.pin_kg + load_kg) * (pin_m - of.edge_m) + of.head_kg * (head_m - of.edge_m))
 
 
 def bearable_load_kg(of: Stability, kin: Kinematics, q: Sequence[float], falls_rad: float = 0.0) -> float:
-    """The greatest load that the machine bears with its joints at ``q`` [kg], 0 where it bears none.
+    """Compute the greatest load that the machine bears with its joints at ``q`` [kg], 0 where it bears none.
 
     ``falls_rad``: how much the ground falls in the direction of the boom.
     """

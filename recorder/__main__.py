@@ -52,7 +52,7 @@ _LENGTH: Final = struct.Struct("<Q")
 
 
 def encode(fields: Mapping[str, str]) -> bytes:
-    """The datagram of an entry."""
+    """Encode the datagram of an entry."""
     data = bytearray()
     for name, value in fields.items():
         text = value.encode()
@@ -64,7 +64,7 @@ def encode(fields: Mapping[str, str]) -> bytes:
 
 
 def send(fields: Mapping[str, str], path: Path = SOCKET) -> bool:
-    """Writes an entry without waiting; False where no journal takes it."""
+    """Write an entry without waiting; False where no journal takes it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         sender.setblocking(False)
         try:
@@ -75,7 +75,7 @@ def send(fields: Mapping[str, str], path: Path = SOCKET) -> bool:
 
 
 def stop_fields(stop: Stop, file: Path) -> dict[str, str]:
-    """The fields of a stop's entry; ``MESSAGE_ID`` finds the text of `journalctl -x` in timberhand.catalog."""
+    """Return the fields of a stop's entry; ``MESSAGE_ID`` finds the text of `journalctl -x` in timberhand.catalog."""
     fields = {
         "MESSAGE": f"{stop.mode}: {stop.text}",
         "PRIORITY": str(ERROR),
@@ -133,7 +133,7 @@ class InputCollector:
         self._receivers += [self._pictures(detector)] if detector else []
 
     def run(self) -> None:
-        """Receives until ``end``, then what still waits."""
+        """Receive until ``end``, then what still waits."""
         ended = False
         while not ended:
             ended = bool(select.select([self.wake], [], [], POLL_PERIOD_S)[0])
@@ -142,7 +142,7 @@ class InputCollector:
         self.items.put(None)
 
     def end(self) -> None:
-        """Makes ``run`` return; may be called from a signal handler."""
+        """Make ``run`` return; may be called from a signal handler."""
         self._ask.send(b"x")
 
     @property
@@ -230,7 +230,7 @@ class InputCollector:
 
 
 def write_all(recorder: Recorder, inputs: InputCollector) -> None:
-    """The writing thread: passes everything in the queue to the recorder, until None."""
+    """Pass everything in the queue to the recorder, until None: the writing thread."""
     reported, report_after_s = 0, 0.0
     flush_at = time.monotonic() + FLUSH_PERIOD_S
     while True:
@@ -240,18 +240,18 @@ def write_all(recorder: Recorder, inputs: InputCollector) -> None:
             item = ("", "", b"")
         if item is None:
             break
-        kind, name, what = item
-        if isinstance(what, list):
-            for frame in what:
+        kind, name, payload = item
+        if isinstance(payload, list):
+            for frame in payload:
                 recorder.on_frame(name, frame)
-        elif isinstance(what, Timing):
-            recorder.on_timing(what)
+        elif isinstance(payload, Timing):
+            recorder.on_timing(payload)
         elif kind == "tick":
-            recorder.on_tick(what)
+            recorder.on_tick(payload)
         elif kind == "report":
-            recorder.on_report(what)
+            recorder.on_report(payload)
         elif kind == "picture":
-            recorder.on_picture(what)
+            recorder.on_picture(payload)
         now = time.monotonic()
         if now >= flush_at:
             recorder.flush(time.monotonic_ns())
@@ -265,19 +265,19 @@ def write_all(recorder: Recorder, inputs: InputCollector) -> None:
 
 
 def report(sentence: str) -> None:
-    """Writes one line to stderr."""
+    """Write one line to stderr."""
     sys.stderr.write(f"recorder: {sentence}\n")
 
 
 def write_to_journal(stop: Stop, file: Path) -> None:
-    """Writes a stop to the journal, or to stderr where there is none."""
+    """Write a stop to the journal, or to stderr where there is none."""
     fields = stop_fields(stop, file)
     if not send(fields):
         report(f"{fields['MESSAGE']} {file}")
 
 
 def udp_socket(port: int) -> socket.socket:
-    """A non-blocking socket bound on loopback; raises OSError."""
+    """Open a non-blocking socket bound on loopback; raises OSError."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
     enlarge_receive_buffer(sock, 4 << 20)
@@ -286,7 +286,7 @@ def udp_socket(port: int) -> socket.socket:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the process; returns its exit code."""
+    """Run the process; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m recorder", description="Records buses, ticks and reports.")
     parser.add_argument("--out", type=Path, required=True, help="directory of the recording, without one so far")
     parser.add_argument(

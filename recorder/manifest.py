@@ -53,7 +53,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 def describe(profile: Profile, buses: tuple[str, ...], seed: int | None = None, live: bool = False) -> Manifest:
-    """The manifest of a recording that starts now; reads the clock only with ``live``."""
+    """Describe a recording that starts now; reads the clock only with ``live``."""
     shipped = {name for bus, names in databases(profile).items() if bus in buses for name in names}
     manifest = Manifest(
         timberhand=version("timberhand"),
@@ -76,13 +76,13 @@ def describe(profile: Profile, buses: tuple[str, ...], seed: int | None = None, 
 
 
 def databases(profile: Profile) -> dict[str, tuple[str, ...]]:
-    """Bus name to the databases of its messages."""
+    """Map each bus name to the databases of its messages."""
     buses = {profile.crane_bus: ("crane",)}
     return buses | ({profile.machine_bus: ("machine", "gnss")} if profile.machine_bus else {})
 
 
 def write(directory: Path, manifest: Manifest) -> None:
-    """Writes the manifest into the run's directory atomically; raises OSError."""
+    """Write the manifest into the run's directory atomically; raises OSError."""
     new = directory / (NAME + ".new")
     with new.open("wb") as file:
         file.write(msgspec.json.format(msgspec.json.encode(manifest)) + b"\n")
@@ -92,5 +92,5 @@ def write(directory: Path, manifest: Manifest) -> None:
 
 
 def read(directory: Path) -> Manifest:
-    """The manifest of a run; raises OSError or msgspec.MsgspecError."""
+    """Read the manifest of a run; raises OSError or msgspec.MsgspecError."""
     return msgspec.json.decode((directory / NAME).read_bytes(), type=Manifest)

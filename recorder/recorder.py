@@ -61,18 +61,18 @@ class BusSignals:
         self._found: dict[int, tuple[MessageCodec, tuple[str, ...]] | None] = {}
 
     def messages(self) -> list[MessageCodec]:
-        """Every message that can be decoded, in the order of the databases."""
+        """List every message that can be decoded, in the order of the databases."""
         return [codec for database in self._databases for codec in database.messages.values()]
 
     def decode(self, key: int, data: bytes) -> tuple[str, dict[str, Any]] | None:
-        """Message name and values of a frame; None for a foreign frame or a wrong length."""
+        """Decode message name and values of a frame; None for a foreign frame or a wrong length."""
         try:
-            found = self._found[key]
+            codec_and_names = self._found[key]
         except KeyError:
-            found = self._found[key] = self._find(key)
-        if found is None or len(data) != found[0].length:
+            codec_and_names = self._found[key] = self._find(key)
+        if codec_and_names is None or len(data) != codec_and_names[0].length:
             return None
-        codec, names = found
+        codec, names = codec_and_names
         return codec.name, dict(zip(names, codec.decode(data), strict=True))
 
     def _find(self, key: int) -> tuple[MessageCodec, tuple[str, ...]] | None:
@@ -83,7 +83,7 @@ class BusSignals:
 
 
 def json_schema(codec: MessageCodec) -> bytes:
-    """The JSON schema of a message's values, with units and value tables in the descriptions."""
+    """Write the JSON schema of a message's values, with units and value tables in the descriptions."""
     properties: dict[str, Any] = {}
     for signal in codec.signals:
         table = ", ".join(f"{raw} {label}" for raw, label in sorted(signal.choices.items()))
@@ -120,7 +120,7 @@ class Recorder:
         stops: Path | None = None,
         on_stop: Callable[[Stop, Path], None] | None = None,
     ) -> None:
-        """Starts a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
+        """Start a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
 
         ``stops`` is the directory of the stops' files, default ``directory/stops``; ``on_stop`` is called with every
         stop and the path that its file will have.
@@ -168,7 +168,7 @@ class Recorder:
         return self.dropped + self._stops.dropped
 
     def on_frame(self, bus: str, frame: Frame, sent_by: str = "") -> None:
-        """Records a frame on ``bus``; ``sent_by`` names the sender if it is known."""
+        """Record a frame on ``bus``; ``sent_by`` names the sender if it is known."""
         stamp_ns, key, data = frame
         self._at(stamp_ns)
         us = (stamp_ns + self._offset_ns) // 1000
@@ -180,7 +180,7 @@ class Recorder:
             self._add(f"/{bus}/{decoded[0]}", stamp_ns, _JSON.encode(decoded[1]))
 
     def on_tick(self, record: bytes) -> None:
-        """Records the controller's record of one tick, unchanged."""
+        """Record the controller's record of one tick, unchanged."""
         try:
             tick = tick_record.decode(record)
         except InputRefused:
@@ -191,7 +191,7 @@ class Recorder:
         self._stops.on_tick(tick, record)
 
     def on_report(self, datagram: bytes) -> None:
-        """Records the controller's state report or vehicle report, and the log map of the planner's mission report."""
+        """Record the controller's state report or vehicle report, and the log map of the planner's mission report."""
         try:
             report = datagrams.decode(datagram, self._key)
         except DatagramRefused:
@@ -212,7 +212,7 @@ class Recorder:
         self._add_drawing(on(report, time_ns), stamp_ns)  # type: ignore[arg-type]
 
     def _on_planner(self, datagram: bytes) -> bool:
-        """Records the log map of a mission report; False when the planner did not send the datagram."""
+        """Record the log map of a mission report; False when the planner did not send the datagram."""
         try:
             _, stamp_ns, mission = decode_mission(datagram, self._key)
         except DatagramRefused:
@@ -222,7 +222,7 @@ class Recorder:
         return True
 
     def on_picture(self, datagram: bytes) -> None:
-        """Records a log detector's reply to a request for its newest picture; a reply without one is not recorded."""
+        """Record a log detector's reply to a request for its newest picture; a reply without one is not recorded."""
         try:
             facts, jpeg = decode_picture(datagram)
         except InputRefused:
@@ -233,13 +233,13 @@ class Recorder:
             self._add_drawing(messages, facts.measured_ns)
 
     def on_timing(self, timing: Timing) -> None:
-        """Records the controller's timing, once per state of its page."""
+        """Record the controller's timing, once per state of its page."""
         stamp_ns = timing.facts.written_ns
         self._at(stamp_ns)
         self._add(TIMING, stamp_ns, _JSON.encode(timing.named()))
 
     def flush(self, now_ns: int) -> None:
-        """Ends the chunk and writes everything to the files; ``dropped`` counts what cannot be written."""
+        """End the chunk and write everything to the files; ``dropped`` counts what cannot be written."""
         self._now_ns = now_ns
         self._chunk_start_ns = self._chunk_end_ns = None
         self._stops.commit(now_ns)
@@ -260,7 +260,7 @@ class Recorder:
             self._abandon()
 
     def close(self) -> None:
-        """Completes the files."""
+        """Complete the files."""
         self._stops.close()
         self.flush(self._now_ns)
         if self._segment:
@@ -277,7 +277,7 @@ class Recorder:
             self.dropped += 1
 
     def _at(self, stamp_ns: int) -> None:
-        """Ends the chunk before a record that would make it longer than CHUNK_NS, in any order of records."""
+        """End the chunk before a record that would make it longer than CHUNK_NS, in any order of records."""
         start_ns = self._chunk_start_ns
         if start_ns is not None and start_ns <= stamp_ns < start_ns + CHUNK_NS:  # the usual case
             self._chunk_end_ns = max(self._chunk_end_ns or 0, stamp_ns)
@@ -296,13 +296,13 @@ class Recorder:
             self._segment.add(topic, stamp_ns + self._offset_ns, stamp_ns, data)
 
     def _add_drawing(self, messages: list[Message], stamp_ns: int) -> None:
-        """Adds what is drawn from a record that is kept anyway: a full disk does not count it as lost."""
+        """Add what is drawn from a record that is kept anyway: a full disk does not count it as lost."""
         if self._segment is not None:
             for topic, data in messages:
                 self._segment.add(topic, stamp_ns + self._offset_ns, stamp_ns, data, counted=False)
 
     def _open_segment(self) -> None:
-        """Opens the next file; its first chunk has every channel and the manifest, and is written immediately."""
+        """Open the next file; its first chunk has every channel and the manifest, and is written immediately."""
         name = f"run-{self._segments + 1:04d}.mcap" if self._segments else RUN_NAME
         segment = Segment(self._directory / name, self._durable)
         for bus, signals in self._signals.items():
@@ -328,7 +328,7 @@ class Recorder:
         self._segment = segment
 
     def _abandon(self) -> None:
-        """Closes a file that could not be written, readable up to its last commit; the next flush opens another."""
+        """Close a file that could not be written, readable up to its last commit; the next flush opens another."""
         if self._segment:
             self.dropped += self._segment.pending
             self._segment.close()
@@ -336,7 +336,7 @@ class Recorder:
 
 
 def _is_grasp(datagram: bytes, key: bytes | None) -> bool:
-    """Whether it is a chosen grasp, which the planner sends to all that it tells; it is not recorded."""
+    """Tell whether it is a chosen grasp, which the planner sends to all that it tells; it is not recorded."""
     try:
         decode_grasp(datagram, key)
     except DatagramRefused:

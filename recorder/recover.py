@@ -37,13 +37,13 @@ class Recovered(NamedTuple):
 
 
 def run_files(directory: Path) -> list[Path]:
-    """The MCAP files of a run in the order of recording: ``run.mcap``, ``run-0002.mcap`` and so on."""
+    """List the MCAP files of a run in the order of recording: ``run.mcap``, ``run-0002.mcap`` and so on."""
     first = directory / RUN_NAME
     return [first] * first.exists() + sorted(directory.glob("run-????.mcap"))
 
 
 def recover(directory: Path) -> list[Recovered]:
-    """Repairs the unfinished files in a run's directory; returns the repaired ones.
+    """Repair the unfinished files in a run's directory; returns the repaired ones.
 
     Raises:
         OSError: The directory cannot be written; nothing is lost.
@@ -73,7 +73,7 @@ def _trim_line(path: Path) -> None:
 
 
 def rewrite(path: Path) -> Recovered:
-    """Rewrites an unfinished MCAP file with an index, up to its last complete chunk; raises OSError."""
+    """Rewrite an unfinished MCAP file with an index, up to its last complete chunk; raises OSError."""
     new = path.with_suffix(".recovering")
     messages = 0
     with new.open("wb") as file:
@@ -123,7 +123,7 @@ class Stored(NamedTuple):
 
 
 def is_complete(path: Path) -> bool:
-    """Whether the file ends with a footer and the closing magic, that is, whether its writer finished."""
+    """Tell whether the file ends with a footer and the closing magic, that is, whether its writer finished."""
     with path.open("rb") as file:
         file.seek(0, 2)
         if file.tell() < 2 * len(MCAP0_MAGIC) + _FOOTER_BYTES:
@@ -135,8 +135,8 @@ def is_complete(path: Path) -> bool:
 def scan(
     path: Path, topics: Collection[str] | None = None, ended: Callable[[int], None] = lambda at_byte: None
 ) -> Iterator[Schema | Channel | Stored]:
-    """Every schema, channel and message (of ``topics``; None: all) up to the end of the valid part; ``ended`` is told
-    the byte of that end if it is not that of the recording.
+    """Yield every schema, channel and message (of ``topics``; None: all) up to the end of the valid part; ``ended`` is
+    told the byte of that end if it is not that of the recording.
 
     Raises:
         InputRefused: The file does not start like an MCAP file.
@@ -145,7 +145,7 @@ def scan(
         magic = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(magic):
             raise InputRefused("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
-        wanted: set[int] = set()
+        channel_ids: set[int] = set()
         while True:
             at_byte = file.tell()
             head = file.read(_RECORD.size)
@@ -159,14 +159,14 @@ def scan(
             body = file.read(length)
             try:
                 records = _chunk(body) if opcode == Opcode.CHUNK else head + body
-                found = list(_records(records, topics, wanted))
+                parsed_records = list(_records(records, topics, channel_ids))
             except _DAMAGED:
                 return ended(at_byte)
-            yield from found
+            yield from parsed_records
 
 
 def _chunk(body: bytes) -> bytes:
-    """The records in a chunk; raises one of `_DAMAGED`."""
+    """Read the records in a chunk; raises one of `_DAMAGED`."""
     chunk = Chunk.read(ReadDataStream(BytesIO(body)))
     if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
         raise ValueError("the chunk is too long")
@@ -175,7 +175,7 @@ def _chunk(body: bytes) -> bytes:
 
 
 def _records(data: bytes, topics: Collection[str] | None, wanted: set[int]) -> Iterator[Schema | Channel | Stored]:
-    """The records in ``data``; ``wanted`` collects the channels to yield messages of.  Raises one of `_DAMAGED`."""
+    """Yield the records in ``data``; ``wanted`` collects the channels to yield messages of.  Raises a `_DAMAGED`."""
     at = 0
     while at < len(data):
         opcode, length = _RECORD.unpack_from(data, at)

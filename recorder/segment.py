@@ -16,7 +16,7 @@ class Segment:
     """One MCAP file, locked (``flock``) while it is open; ``durable``: a commit survives a power cut."""
 
     def __init__(self, path: Path, durable: bool) -> None:
-        """Creates the file; raises OSError, also if it exists already."""
+        """Create the file; raises OSError, also if it exists already."""
         self.pending = 0
         """Counted messages since the last commit."""
         self._file = CommitFile(path, durable)
@@ -29,30 +29,30 @@ class Segment:
     def channel(
         self, topic: str, encoding: str, schema: str = "", text: bytes = b"", schema_encoding: str = "jsonschema"
     ) -> None:
-        """Adds a topic; ``text`` is the schema of the name ``schema``, in its encoding."""
+        """Add a topic; ``text`` is the schema of the name ``schema``, in its encoding."""
         schema_id = self._writer.register_schema(schema, schema_encoding, text) if schema else 0
         self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
 
     def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes, counted: bool = True) -> None:
-        """Adds a message to the open chunk; what is drawn from other records is not ``counted`` as one."""
+        """Add a message to the open chunk; what is drawn from other records is not ``counted`` as one."""
         self._writer.add_message(self._channels[topic], log_ns, data, publish_ns)
         self.pending += counted
 
     def commit(self) -> int:
-        """Ends the chunk and writes it; returns the size of the file [bytes]; raises OSError."""
+        """End the chunk and write it; returns the size of the file [bytes]; raises OSError."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._file.commit()
         self.pending = 0
         return self._file.tell()
 
     def finish(self) -> None:
-        """Writes the index and closes the file; raises OSError."""
+        """Write the index and close the file; raises OSError."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.commit()
         self._file.close()
 
     def close(self) -> None:
-        """Closes the file as it is."""
+        """Close the file as it is."""
         self._file.close()
 
 
@@ -69,30 +69,30 @@ class CommitFile:
     """
 
     def __init__(self, path: Path, durable: bool) -> None:
-        """Creates the file; raises OSError, also if it exists already."""
+        """Create the file; raises OSError, also if it exists already."""
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self._durable = durable
         self.buffer = bytearray()
         self._committed = 0
 
     def fileno(self) -> int:
-        """The descriptor, for ``flock``."""
+        """Return the descriptor, for ``flock``."""
         return self._fd
 
     def write(self, data: bytes) -> int:
-        """Appends to the buffer."""
+        """Append to the buffer."""
         self.buffer += data
         return len(data)
 
     def tell(self) -> int:
-        """Position of the next byte."""
+        """Return the position of the next byte."""
         return self._committed + len(self.buffer)
 
     def flush(self) -> None:
-        """Does nothing: only ``commit`` writes to the disk."""
+        """Do nothing: only ``commit`` writes to the disk."""
 
     def commit(self) -> None:
-        """Writes the buffer to the file; after an OSError the file is as before and the buffer is empty."""
+        """Write the buffer to the file; after an OSError the file is as before and the buffer is empty."""
         data, self.buffer = memoryview(bytes(self.buffer)), bytearray()
         if not data:
             return
@@ -109,5 +109,5 @@ class CommitFile:
         self._committed += at
 
     def close(self) -> None:
-        """Closes without committing."""
+        """Close without committing."""
         os.close(self._fd)

@@ -60,7 +60,7 @@ class StopRecorder:
         """Files and when they end [ns]."""
 
     def on_tick(self, tick: TickRecord, record: bytes) -> None:
-        """Takes a tick and its record."""
+        """Take a tick and its record."""
         now_ns = tick.now_ns
         self._remember(now_ns, record)
         for file, _ in self._open:
@@ -72,7 +72,7 @@ class StopRecorder:
             self._finish_oldest()
 
     def commit(self, now_ns: int) -> None:
-        """Writes what the open files have, and completes those whose time is over although no tick comes."""
+        """Write what the open files have, and complete those whose time is over although no tick comes."""
         while self._open and now_ns >= self._open[0][1]:
             self._finish_oldest()
         for entry in [entry for entry in self._open if entry[0].pending]:
@@ -82,7 +82,7 @@ class StopRecorder:
                 self._give_up(entry)
 
     def close(self) -> None:
-        """Completes the open files, with the time after the stop as far as it is there."""
+        """Complete the open files, with the time after the stop as far as it is there."""
         while self._open:
             self._finish_oldest()
 
@@ -163,12 +163,12 @@ class Stop(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def stop_from(report: StateReport, mode_before: str, number: int, utc_offset_ns: int | None) -> Stop:
-    """The record of a stop that begins with a report; ``utc_offset_ns`` is None in lockstep.
+    """Make the record of a stop that begins with a report; ``utc_offset_ns`` is None in lockstep.
 
     A reason of another release keeps its number; its words say so.
     """
     at_ns = report.since_ns or report.stamp_ns
-    found = None if known(report.reason) is None else explain(report.reason, report.numbers)
+    explanation = None if known(report.reason) is None else explain(report.reason, report.numbers)
     return Stop(
         number=number,
         at_ns=at_ns,
@@ -176,14 +176,14 @@ def stop_from(report: StateReport, mode_before: str, number: int, utc_offset_ns:
         mode_before=mode_before,
         mode=Mode(report.mode).name,
         reason=report.reason,
-        code=found.code if found else f"REASON_{report.reason & 0xFF}",
+        code=explanation.code if explanation else f"REASON_{report.reason & 0xFF}",
         numbers=tuple(None if value != value else value for value in report.numbers),
-        text=found.text if found else f"Unknown reason {report.reason & 0xFF}.",
+        text=explanation.text if explanation else f"Unknown reason {report.reason & 0xFF}.",
     )
 
 
 def report_of(tick: TickRecord) -> StateReport | None:
-    """The state report of a tick; None where it sent none.
+    """Decode the state report of a tick; None where it sent none.
 
     Raises:
         DatagramRefused: it is one of another release.
@@ -208,12 +208,12 @@ _OBJECT: Final = b'{"type":"object"}'
 
 
 def files_in(directory: Path) -> list[Path]:
-    """The complete files of a directory, oldest first."""
+    """List the complete files of a directory, oldest first."""
     return sorted(directory.glob("*-*.mcap"))
 
 
 def parts_in(directory: Path) -> list[Path]:
-    """The files that are being written, or that a killed writer left, oldest first."""
+    """List the files that are being written, or that a killed writer left, oldest first."""
     return sorted(directory.glob(f"*-*.mcap{_PART}"))
 
 
@@ -238,24 +238,24 @@ class StopFile:
         return self._segment.pending
 
     def add_stop(self, stop: Stop) -> None:
-        """Adds the record of this stop, or of a second reason while the machine is stopped."""
+        """Add the record of this stop, or of a second reason while the machine is stopped."""
         self._add(TOPIC, stop.at_ns, _JSON.encode(stop))
 
     def add_tick(self, now_ns: int, record: bytes) -> None:
-        """Adds the controller's record of a tick."""
+        """Add the controller's record of a tick."""
         self._add(TICK, now_ns, record)
 
     def commit(self) -> None:
-        """Writes what was added."""
+        """Write what was added."""
         self._segment.commit()
 
     def finish(self) -> None:
-        """Completes the file and gives it its name."""
+        """Complete the file and gives it its name."""
         self._segment.finish()
         _put_in_place(self._part, self.path, self._durable)
 
     def abandon(self) -> None:
-        """Closes a file that cannot be written; what was committed stays as a part."""
+        """Close a file that cannot be written; what was committed stays as a part."""
         self._segment.close()
 
     def _add(self, topic: str, at_ns: int, data: bytes) -> None:
@@ -274,13 +274,13 @@ class StopFiles:
         self.next_number = 1 + max(map(_number, [*files_in(directory), *parts_in(directory)]), default=0)
 
     def begin(self, stop: Stop, manifest: Manifest) -> StopFile:
-        """A file for a new stop; raises OSError."""
+        """Open a file for a new stop; raises OSError."""
         self.directory.mkdir(parents=True, exist_ok=True)
         self.next_number = max(self.next_number, stop.number + 1)
         return StopFile(self.directory, stop, manifest, self._durable)
 
     def remove_oldest(self) -> None:
-        """Removes the oldest files until the bounds hold; raises OSError."""
+        """Remove the oldest files until the bounds hold; raises OSError."""
         files = files_in(self.directory)
         sizes = [path.stat().st_size for path in files]
         while len(files) > 1 and (len(files) > MAX_FILES or sum(sizes) > MAX_BYTES):
@@ -290,7 +290,7 @@ class StopFiles:
 
 
 def repair(directory: Path) -> list[Path]:
-    """Completes the parts that a killed writer left; one without a stop is removed.  Returns the repaired files.
+    """Complete the parts that a killed writer left; one without a stop is removed.  Returns the repaired files.
 
     A part that another process still writes (``flock``) is not touched.
 

@@ -37,7 +37,7 @@ _FEEDBACK_INDEX: Final = {"jazzy": False, "kilted": True, "lyrical": True}
 
 
 def arguments(argv: list[str]) -> argparse.Namespace:
-    """The parsed command line; ends the process with code 2 when it is wrong."""
+    """Parse the command line; end the process with code 2 when it is wrong."""
     parser = argparse.ArgumentParser(prog="python -m ros2", description="The machine as a ROS 2 node.")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
     parser.add_argument("--report-port", type=int, required=True, help="local UDP port for state reports")

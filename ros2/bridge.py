@@ -82,7 +82,7 @@ class Bridge:
             self._execution.end(ENDED)
 
     def step(self, now_ns: int, wall_ns: int) -> None:
-        """One step: reports out, goals in, setpoints out.  ``wall_ns`` is the time since the epoch."""
+        """Do one step: reports out, goals in, setpoints out.  ``wall_ns`` is the time since the epoch."""
         report = self._link.newest()
         if report is not None:
             self._report, self._report_ns = report, now_ns
@@ -143,7 +143,7 @@ class Bridge:
         send(self._tf, moving_transforms(self._profile, report.position, articulation_rad, stamp_ns))
 
     def _publish_diagnostics(self, now_ns: int, wall_ns: int) -> None:
-        """Once a second, and at once when mode or reason change."""
+        """Publish diagnostics once a second, and at once when mode or reason change."""
         report = self._report if now_ns - self._report_ns < SILENT_NS else None
         shown = None if report is None else (report.mode, report.reason)
         if shown == self._shown and now_ns - self._diagnostics_ns < DIAGNOSTICS_NS:

@@ -66,16 +66,16 @@ class CameraNode:
 
 def _run(node: CameraNode, period_s: float, signals: list[int]) -> None:
     """Publish at most every ``period_s`` while somebody wants pictures, until a signal arrives."""
-    told = ""
+    reported_problem = ""
     while not signals:
         begin_s = time.monotonic()
         if not node.wanted:
             time.sleep(POLL_S)
             continue
         problem = node.publish()
-        if problem and problem != told:
+        if problem and problem != reported_problem:
             emit("trouble", reason=problem)
-        told = problem
+        reported_problem = problem
         time.sleep(max(POLL_S if problem else 0.0, begin_s + period_s - time.monotonic(), 0.0))
 
 

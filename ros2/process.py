@@ -19,14 +19,14 @@ INTERRUPTED: Final = 130
 
 
 def domain(text: str) -> int:
-    """A ROS 2 domain as a command line writes it."""
+    """Parse a ROS 2 domain as a command line writes it."""
     if not text.isdecimal() or int(text) > MAX_DOMAIN:
         raise argparse.ArgumentTypeError(f"{text!r} is no ROS 2 domain; write a number from 0 to {MAX_DOMAIN}")
     return int(text)
 
 
 def add_node_options(parser: argparse.ArgumentParser) -> None:
-    """The options of a process that is a ROS 2 node."""
+    """Add the options of a process that is a ROS 2 node."""
     parser.add_argument(
         "--domain",
         type=domain,
@@ -42,7 +42,7 @@ def add_node_options(parser: argparse.ArgumentParser) -> None:
 
 
 def open_node(name: str, options: argparse.Namespace) -> Node:
-    """The node of a process; warns when others can reach it.  Raises LinkError."""
+    """Open the node of a process; warn when others can reach it.  Raises LinkError."""
     node = Node(name, options.domain, options.interface)
     if options.interface != LOOPBACK:
         sys.stderr.write(
@@ -53,7 +53,7 @@ def open_node(name: str, options: argparse.Namespace) -> Node:
 
 
 def catch_signals() -> list[int]:
-    """A list in which SIGINT and SIGTERM appear when they arrive."""
+    """Return a list in which SIGINT and SIGTERM appear when they arrive."""
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))
@@ -67,5 +67,5 @@ def complain(sentence: str, code: int = CONFIGURATION) -> int:
 
 
 def exit_code(signals: list[int]) -> int:
-    """The exit code after these signals."""
+    """Return the exit code after these signals."""
     return INTERRUPTED if signal.SIGINT in signals else OK

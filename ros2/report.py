@@ -47,7 +47,7 @@ from ros2.interfaces.trajectory import JointTrajectoryPoint, MultiDOFJointTrajec
 
 
 def joint_state(report: StateReport, stamp_ns: int) -> JointState:
-    """The joints of a report with known positions; ``stamp_ns`` is the report's time since the epoch."""
+    """List the joints of a report with known positions; ``stamp_ns`` is the report's time since the epoch."""
     known = [j for j in JOINTS if isfinite(report.position[j]) and isfinite(report.velocity[j])]
     return JointState(
         Header(time_of(stamp_ns), ""),
@@ -71,13 +71,13 @@ REAR, FRONT = "rear_link", "front_link"
 
 
 def camera_frame(camera: str) -> str:
-    """The frame of a camera's pictures."""
+    """Name the frame of a camera's pictures."""
     return f"{camera}_optical_frame"
 
 
 def static_transforms(profile: Profile, stamp_ns: int) -> TFMessage:
-    """What does not move: the cameras on their links, and the crane on the carrier."""
-    found = [
+    """Return what does not move: the cameras on their links, and the crane on the carrier."""
+    transforms = [
         _stamped(
             stamp_ns,
             f"{camera.link}_link",
@@ -89,34 +89,34 @@ def static_transforms(profile: Profile, stamp_ns: int) -> TFMessage:
     if profile.carrier is not None:
         carrier = profile.carrier
         base = Pose(np.array(rear_from_base(carrier, (0.0, 0.0, 0.0))), _about_z(carrier.crane_yaw_rad))
-        found.append(_stamped(stamp_ns, REAR, BASE, base))
-    return TFMessage(found)
+        transforms.append(_stamped(stamp_ns, REAR, BASE, base))
+    return TFMessage(transforms)
 
 
 def moving_transforms(profile: Profile, q: Sequence[float], articulation_rad: float, stamp_ns: int) -> TFMessage:
-    """What moves, of joints ``q`` (`Joint` order, rad, EXT m); a transform with an unknown joint is left out."""
-    found = []
+    """Return what moves, of joints ``q`` (`Joint` order, rad, EXT m); a transform with an unknown joint is left out."""
+    transforms = []
     if profile.carrier is not None and isfinite(articulation_rad):
-        found.append(_stamped(stamp_ns, REAR, FRONT, Pose(np.zeros(3), _about_z(articulation_rad))))
+        transforms.append(_stamped(stamp_ns, REAR, FRONT, Pose(np.zeros(3), _about_z(articulation_rad))))
     if not all(map(isfinite, q[: Joint.ROT])):
-        return TFMessage(found)
+        return TFMessage(transforms)
     kin = profile.kinematics
     boom, stick = link_pose(profile, "boom", q), link_pose(profile, "stick", q)
     slew_rad = grapple_yaw(profile, (*q[: Joint.ROT], 0.0))
     hanger = Pose(np.array(pin_position(kin, q)), _about_z(slew_rad))
-    found += [
+    transforms += [
         _stamped(stamp_ns, BASE, BOOM, boom),
         _stamped(stamp_ns, BOOM, STICK, _relative(boom, stick)),
         _stamped(stamp_ns, STICK, HANGER, _relative(stick, hanger)),
     ]
     if isfinite(q[Joint.ROT]):
         below = Pose(np.array((0.0, 0.0, -pin_to_jaw_pivot_m(kin))), _about_z(q[Joint.ROT]))
-        found.append(_stamped(stamp_ns, HANGER, GRAPPLE, below))
-    return TFMessage(found)
+        transforms.append(_stamped(stamp_ns, HANGER, GRAPPLE, below))
+    return TFMessage(transforms)
 
 
 def quaternion(rotation: np.ndarray) -> Quaternion:
-    """The quaternion of a rotation matrix (3, 3), scalar positive (Shepperd 1978)."""
+    """Compute the quaternion of a rotation matrix (3, 3), scalar positive (Shepperd 1978)."""
     m = rotation
     squares = np.array(
         [
@@ -143,7 +143,7 @@ def _about_z(angle_rad: float) -> np.ndarray:
 
 
 def _relative(parent: Pose, child: Pose) -> Pose:
-    """The child in its parent's frame, both given in the base frame."""
+    """Compute the child in its parent's frame, both given in the base frame."""
     back = parent.rotation.T
     return Pose(back @ (child.position_m - parent.position_m), back @ child.rotation)
 
@@ -162,8 +162,9 @@ _LEVELS: Final = {Mode.STOP: WARN, Mode.FAULT: ERROR, Mode.BOOT: WARN}
 
 
 def diagnostics(machine: str, report: StateReport | None, refused: str, stamp_ns: int) -> DiagnosticArray:
-    """The state of the machine by its last ``report``, None when it is silent; ``refused`` is the sentence about the
-    last goal that was not executed, empty when there is none.
+    """Report the state of the machine by its last ``report``, None when it is silent.
+
+    ``refused`` is the sentence about the last goal that was not executed, empty when there is none.
     """
     if report is None:
         status = DiagnosticStatus(STALE, "timberhand: machine", "the controller is silent", machine, [])
@@ -172,11 +173,11 @@ def diagnostics(machine: str, report: StateReport | None, refused: str, stamp_ns
     name = str(report.mode) if mode is None else mode.name
     level = WARN if mode is None else _LEVELS.get(mode, WARN if report.reason else OK)
     text = f"{name}: {describe(report.reason, numbers=report.numbers)}" if report.reason else name
-    stale = [words for bit, words in sorted(STALE_INPUT_NAMES.items()) if report.stale_mask >> bit & 1]
+    stale_inputs = [input_name for bit, input_name in sorted(STALE_INPUT_NAMES.items()) if report.stale_mask >> bit & 1]
     values = {
         "mode": name,
         "reason": str(report.reason & 0xFF),
-        "stale inputs": ", ".join(stale) or "none",
+        "stale inputs": ", ".join(stale_inputs) or "none",
         "refused setpoints": str(report.refused),
         "load [kg]": _number(report.load_kg),
         "grapple opening [%]": _number(report.opening_pct),
@@ -198,7 +199,7 @@ def _number(value: float) -> str:
 def feedback_message(
     goal_id: bytes, progress: Progress, with_index: bool, stamp_ns: int
 ) -> FeedbackMessage | FeedbackMessageWithoutIndex:
-    """The message of a goal's progress; ``with_index`` as of control_msgs 6.3 and later."""
+    """Make the message of a goal's progress; ``with_index`` as of control_msgs 6.3 and later."""
     head = Header(time_of(stamp_ns), "")
     names = [j.name.lower() for j in progress.joints]
     error = (_difference(progress, 0), _difference(progress, 1))
@@ -213,7 +214,7 @@ def feedback_message(
 
 def _difference(progress: Progress, derivative: int) -> tuple[float, ...]:
     pairs = zip(progress.desired[derivative], progress.actual[derivative], strict=True)
-    return tuple(wanted - found for wanted, found in pairs)
+    return tuple(desired - actual for desired, actual in pairs)
 
 
 def _point(state: tuple[Sequence[float], Sequence[float]], time_s: float) -> JointTrajectoryPoint:
@@ -227,20 +228,20 @@ _DEPTH_MAX_MM = 65535
 
 
 def colour_image(frame: RgbdFrame, stamp_ns: int) -> Image:
-    """The picture; ``stamp_ns`` is its time since the epoch."""
+    """Make the message of the picture; ``stamp_ns`` is its time since the epoch."""
     height, width, _ = frame.rgb.shape
     return Image(_header(frame, stamp_ns), height, width, "rgb8", 0, 3 * width, frame.rgb.tobytes())
 
 
 def depth_image(frame: RgbdFrame, stamp_ns: int) -> Image:
-    """The depth of the same pixels."""
+    """Make the message of the depth of the same pixels."""
     height, width = frame.depth_m.shape
     millimetres = np.clip(np.nan_to_num(np.rint(frame.depth_m * MM_PER_M)), 0, _DEPTH_MAX_MM).astype("<u2")
     return Image(_header(frame, stamp_ns), height, width, "16UC1", 0, 2 * width, millimetres.tobytes())
 
 
 def camera_info(frame: RgbdFrame, stamp_ns: int) -> CameraInfo:
-    """The pinhole of both, which are rectified: no distortion is left."""
+    """Describe the pinhole of both, which are rectified: no distortion is left."""
     pin = frame.intrinsics
     k = [pin.fx_px, 0.0, pin.cx_px, 0.0, pin.fy_px, pin.cy_px, 0.0, 0.0, 1.0]
     p = [pin.fx_px, 0.0, pin.cx_px, 0.0, 0.0, pin.fy_px, pin.cy_px, 0.0, 0.0, 0.0, 1.0, 0.0]

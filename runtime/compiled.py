@@ -52,12 +52,12 @@ class Running:
 
 
 def source_root() -> Path:
-    """The folder that holds the packages."""
+    """Return the folder that holds the packages."""
     return Path(__file__).resolve().parents[1]
 
 
 def builds_folder(root: Path | None = None) -> Path:
-    """Where builds lie: beside the sources, so that whoever may change the one may change the other."""
+    """Tell where builds lie: beside the sources, so that whoever may change the one may change the other."""
     root = root or source_root()
     if (root / "pyproject.toml").is_file():
         return root / "build" / "compiled"
@@ -65,12 +65,12 @@ def builds_folder(root: Path | None = None) -> Path:
 
 
 def platform_tag() -> str:
-    """The Python and the platform that a build is for."""
+    """Return the Python and the platform that a build is for."""
     return f"{'.'.join(map(str, sys.version_info[:3]))}{EXTENSION_SUFFIXES[0]}"
 
 
 def hash_of(path: Path) -> str:
-    """SHA-256 of a file; empty when it cannot be read."""
+    """Compute the SHA-256 of a file; empty when it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
@@ -78,13 +78,13 @@ def hash_of(path: Path) -> str:
 
 
 def key_of(manifest: dict[str, Any]) -> str:
-    """The name of the build with this manifest: platform, compiler and sources."""
+    """Compute the name of the build with this manifest: platform, compiler and sources."""
     identity = [manifest["platform"], manifest["mypy"], manifest["modules"], sorted(manifest["sources"].items())]
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
 def mismatch(manifest: dict[str, Any], root: Path) -> str:
-    """Why a build with this manifest cannot be used with the sources below ``root``; empty when it can."""
+    """Tell why a build with this manifest cannot be used with the sources below ``root``; empty when it can."""
     if manifest["platform"] != platform_tag():
         return f"it was made for {manifest['platform']}, this is {platform_tag()}"
     changed = [path for path, made in manifest["sources"].items() if hash_of(root / path) != made]
@@ -95,7 +95,7 @@ def mismatch(manifest: dict[str, Any], root: Path) -> str:
 
 
 def find_build(root: Path | None = None, folder: Path | None = None) -> tuple[Build | None, str]:
-    """The build for the sources below ``root``, or None and the reason, which names the newest build."""
+    """Find the build for the sources below ``root``, or None and the reason, which names the newest build."""
     root = root or source_root()
     folder = folder or builds_folder(root)
     reason = "no build"
@@ -115,7 +115,7 @@ def find_build(root: Path | None = None, folder: Path | None = None) -> tuple[Bu
 
 
 def _age_key(manifest: Path) -> tuple[int, str]:
-    """Sorts the oldest manifest first."""
+    """Sort the oldest manifest first."""
     try:
         return manifest.stat().st_mtime_ns, str(manifest)
     except OSError:
@@ -182,14 +182,14 @@ def _activated(root: Path, folder: Path | None) -> Running:
 
 
 def running() -> Running:
-    """What runs the tick in this process."""
+    """Tell what runs the tick in this process."""
     if _running.kind == "interpreter" and _running.reason == "not activated" and _beside(source_root()):
         return Running("compiled", "installed")
     return _running
 
 
 def _beside(root: Path) -> list[str]:
-    """Modules whose extension module lies beside the source, as in a compiled wheel."""
+    """Find the modules whose extension module lies beside the source, as in a compiled wheel."""
     suffix = EXTENSION_SUFFIXES[0]
     if not root.joinpath(*TICK.split(".")).with_suffix(suffix).is_file():
         return []

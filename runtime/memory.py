@@ -19,7 +19,7 @@ _M_MMAP_MAX: Final = -4
 
 
 def keep_memory() -> None:
-    """Keeps glibc from returning memory to the system and requesting it again; no effect with another C library."""
+    """Keep glibc from returning memory to the system and requesting it again; no effect with another C library."""
     libc = ctypes.CDLL(None)
     with contextlib.suppress(AttributeError):  # musl has no mallopt
         libc.mallopt(_M_TRIM_THRESHOLD, -1)
@@ -46,17 +46,17 @@ def collapse_heap() -> int:
     """
     try:
         size = int(_HUGE_PAGE_BYTES.read_text())
-        places = list(huge_places(_MAPS.read_text().splitlines(), size))
+        page_addresses = list(huge_places(_MAPS.read_text().splitlines(), size))
     except (OSError, ValueError):
         return 0
     libc = ctypes.CDLL(None)
     libc.madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
     # One call for each page: where the kernel finds none free, the others are still worth it.
-    return sum(size for place in places if libc.madvise(place, size, _MADV_COLLAPSE) == 0)
+    return sum(size for page_address in page_addresses if libc.madvise(page_address, size, _MADV_COLLAPSE) == 0)
 
 
 def huge_places(maps: Iterable[str], size: int) -> Iterator[int]:
-    """Addresses of the huge pages of ``size`` bytes that fit into the process's own writable memory.
+    """Yield the addresses of the huge pages of ``size`` bytes that fit into the process's own writable memory.
 
     ``maps``: lines of /proc/PID/maps (proc_pid_maps(5)).  Left out are files, stacks and what cannot be written.
     """

@@ -34,7 +34,7 @@ class Notifier:
         self._alive_ns = self._status_ns = 0
 
     def tick_done(self, now_ns: int, good: bool) -> None:
-        """Called at the end of every tick."""
+        """Send the signs of life that are due; called at the end of every tick."""
         if self._socket is None or not good or now_ns < self._alive_ns:
             return
         self._alive_ns = now_ns + self.ALIVE_NS
@@ -48,7 +48,7 @@ class Notifier:
             self._alive_ns = self._status_ns = 0
 
     def stopping(self) -> None:
-        """Called on the way out, after the last frames."""
+        """Announce the end on the way out, after the last frames."""
         self._send(b"STOPPING=1\nSTATUS=Ending.")
 
     def _send(self, what: bytes) -> bool:

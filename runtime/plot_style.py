@@ -38,7 +38,7 @@ STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def sheet(path: Path, columns: int = 1, width: float = 8.0, height: float = 3.2) -> Iterator[Any]:
-    """Yields a row of axes (one Axes for a single column) and saves it to ``path`` at the end; sizes in inches."""
+    """Yield a row of axes (one Axes for a single column) and save it to ``path`` at the end; sizes in inches."""
     with pyplot.rc_context(STYLE):
         figure, axes = pyplot.subplots(1, columns, figsize=(width, height))
         try:
@@ -50,7 +50,7 @@ def sheet(path: Path, columns: int = 1, width: float = 8.0, height: float = 3.2)
 
 
 def limit_band(axis: Any, least: float | None, most: float | None) -> None:
-    """Shades the y values below ``least`` and above ``most``, which a result must not have."""
+    """Shade the y values below ``least`` and above ``most``, which a result must not have."""
     low, high = axis.get_ylim()
     if least is not None:
         axis.axhspan(min(low, least), least, color=RUST, alpha=0.08, lw=0)
@@ -62,7 +62,7 @@ def limit_band(axis: Any, least: float | None, most: float | None) -> None:
 
 @contextmanager
 def stack(path: Path, heights: Sequence[float], width: float = 8.0, height: float = 6.0) -> Iterator[Any]:
-    """Yields axes one below the other with a common x axis and saves them to ``path`` at the end.
+    """Yield axes one below the other with a common x axis and save them to ``path`` at the end.
 
     ``heights`` are the axes' shares of the figure; ``width`` and ``height`` are in inches.
     """

@@ -12,7 +12,7 @@ NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]*")
 
 
 def load_plugin(group: str, name: str, *arguments: Any) -> Any:
-    """What the factory of an entry point makes of the arguments; most take none.
+    """Return what the factory of an entry point makes of the arguments; most take none.
 
     Raises:
         ConfigError: no installed package has such an entry point, several have, or it cannot be loaded.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def shared_path(name: str) -> Path:
-    """Path of a shared file: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
+    """Return a shared file's path: in ``RUNTIME_DIRECTORY`` (of systemd), else in this user's directory in /dev/shm."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
     return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / name  # see make_own_folder  # nosec B108
 
@@ -34,7 +34,7 @@ class SharedFile:
     __slots__ = ("_inode", "_path", "map")
 
     def __init__(self, path: Path, size: int) -> None:
-        """Raises OSError if it cannot be created."""
+        """Create the file; raises OSError if it cannot be created."""
         make_own_folder(path.parent)
         # A new file each time: a reader of a former process's file keeps its mapping.
         with contextlib.suppress(FileNotFoundError):
@@ -50,7 +50,7 @@ class SharedFile:
         self._path = path
 
     def close(self) -> None:
-        """Removes the file, unless another process owns it by now; may be called twice."""
+        """Remove the file, unless another process owns it by now; may be called twice."""
         with contextlib.suppress(OSError):
             if self._path.stat().st_ino == self._inode:
                 self._path.unlink()

@@ -46,24 +46,27 @@ def _address(text: str) -> tuple[str, str]:
 
 
 def _check_buses(profile: Profile, given: Mapping[str, str]) -> None:
-    """Raises:
-    PlantError: the given buses are not exactly those of the machine.
+    """Check that all buses of the machine are given, and no other.
+
+    Raises:
+        PlantError: the given buses are not exactly those of the machine.
     """
-    wanted = [b for b in (profile.crane_bus, profile.machine_bus) if b]
+    required_buses = [b for b in (profile.crane_bus, profile.machine_bus) if b]
     for name in given:
-        if name not in wanted:
+        if name not in required_buses:
             raise PlantError(
-                "plant.unknown-bus", f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; change --bus"
+                "plant.unknown-bus",
+                f"{profile.name} has no bus {name}, only {' and '.join(required_buses)}; change --bus",
             )
-    for name in wanted:
+    for name in required_buses:
         if name not in given:
             raise PlantError(
-                "plant.missing-bus", f"{profile.name} needs {' and '.join(wanted)}; add --bus {name}=ADDRESS"
+                "plant.missing-bus", f"{profile.name} needs {' and '.join(required_buses)}; add --bus {name}=ADDRESS"
             )
 
 
 def _plant(profile: Profile, site: Site | None, options: argparse.Namespace) -> Plant:
-    """The plant that the command line describes.
+    """Make the plant that the command line describes.
 
     Raises:
         PlantError: the truth, scene or site cannot be used.

@@ -37,7 +37,7 @@ from sim.truth.load import Truth, load_truth
 
 
 def crane_urdf(profile: Profile, truth: Truth) -> str:
-    """The robot ``NAME``.  Its joints have the names and ranges of the profile's; ``hanger`` is the hanger pin."""
+    """Write the robot ``NAME``.  Its joints have the names and ranges of the profile; ``hanger`` is the hanger pin."""
     links, joints = crane_links(profile, truth)
     return urdf_text(profile.name, links, [_outward(profile, joint) for joint in joints])
 
@@ -99,7 +99,7 @@ SPREAD: Final = {
 
 
 def truth_text(answers: Answers, least_inertia: dict[str, float]) -> str:
-    """The truth; ``least_inertia`` by function."""
+    """Write the truth; ``least_inertia`` by function."""
     kin, home, wood, pump = answers.kinematics, answers.home, answers.wood, answers.pump
     hanging, moment = answers.masses.grapple_kg, answers.masses.lifting_moment_nm
     stiffness = STIFFNESS_PER_MOMENT_1_RAD * moment
@@ -189,7 +189,7 @@ def _beams(answers: Answers) -> list[tuple[float, float]]:
 
 
 def _links(answers: Answers) -> dict[str, list[Line]]:
-    """Masses, centres of mass and inertias of uniform beams; the tongs' as of the shipped grapples."""
+    """Compute masses, centres of mass and inertias of uniform beams; the tongs' as of the shipped grapples."""
     kin, masses = answers.kinematics, answers.masses
     (_, boom), (_, stick), (_, inner) = _beams(answers)
     column, height = COLUMN_SHARE * kin.a2_m, (1.0 - BEARING_SHARE) * kin.d1_m
@@ -237,7 +237,7 @@ def _link(mass: float, com: Sequence[float], inertia: Iterable[float]) -> list[L
 
 
 def _areas(drive: DriveAnswers) -> tuple[float, float]:
-    """Piston areas [m^2], or the displacement of a motor [m^3/rad]."""
+    """Return the piston areas [m^2], or the displacement of a motor [m^3/rad]."""
     if drive.displacement_m3_rad is not None:
         return drive.displacement_m3_rad, drive.displacement_m3_rad
     bore, rod = drive.bore_m or 0.0, drive.rod_m or 0.0
@@ -245,7 +245,7 @@ def _areas(drive: DriveAnswers) -> tuple[float, float]:
 
 
 def _levers(joint: JointAnswers) -> tuple[list[float], list[float]]:
-    """The lever arm from hard stop to hard stop: the table of the answers, straight on beyond its ends."""
+    """Tabulate the lever arm from hard stop to hard stop: the table of the answers, straight on beyond its ends."""
     low, high, drive = joint.lower - STOP_MARGIN, joint.upper + STOP_MARGIN, joint.drive
     if not drive.lever_at:
         return [round(low, 6), round(high, 6)], [drive.lever_m, drive.lever_m]
@@ -257,7 +257,7 @@ def _levers(joint: JointAnswers) -> tuple[list[float], list[float]]:
 
 
 def _on_line(at: Sequence[float], arms: Sequence[float], q: float) -> float:
-    """Straight interpolation; beyond the table its first or last value."""
+    """Interpolate straight; beyond the table return its first or last value."""
     if q <= at[0] or len(at) == 1:
         return arms[0]
     for (a, x), (b, y) in zip(zip(at, arms, strict=True), zip(at[1:], arms[1:], strict=True), strict=False):
@@ -315,7 +315,7 @@ def _function(answers: Answers, which: Joint, least_inertia: dict[str, float]) -
 
 
 def _grapple(answers: Answers, least_inertia: dict[str, float]) -> str:
-    """A positive command opens, so the arm is negative."""
+    """Write the grapple's part; a positive command opens, so the arm is negative."""
     grapple, relief = answers.grapple, answers.pump.relief_pa
     at = [-STOP_MARGIN, grapple.closed_rad + STOP_MARGIN]
     areas = (grapple.displacement_m3_rad, grapple.displacement_m3_rad)
@@ -365,7 +365,7 @@ TONGS: Final = ("tong_left", "tong_right")
 
 
 def least_inertia(profile: Profile, truth: Truth) -> dict[str, float]:
-    """By function [kg m^2, kg]; only the links of ``truth`` are used."""
+    """Compute the least inertia by function [kg m^2, kg]; only the links of ``truth`` are used."""
     client = new_client()
     try:
         client.setGravity(0.0, 0.0, 0.0)
@@ -389,7 +389,7 @@ def least_inertia(profile: Profile, truth: Truth) -> dict[str, float]:
 
 
 def _inertia(client: BulletClient, body: Body, pose: dict[str, float], joints: tuple[str, ...]) -> float:
-    """Torque over the mean acceleration of the joints that share it."""
+    """Compute the torque over the mean acceleration of the joints that share it."""
     body.place(pose)
     body.apply([body.index[j] for j in joints], [1.0 / len(joints)] * len(joints))
     client.stepSimulation()
@@ -404,7 +404,7 @@ _UNKNOWN: Final = dict.fromkeys(("slew", "lift", "tilt", "ext", "rot", "grapple"
 
 
 def truth_and_urdf(answers: Answers, profile: Profile) -> tuple[str, str]:
-    """The texts of the truth file and of the URDF file of the machine of these answers and this profile."""
+    """Write the texts of the truth file and of the URDF file of the machine of these answers and this profile."""
     links = msgspec.toml.decode(truth_text(answers, _UNKNOWN), type=Truth)
     return truth_text(answers, least_inertia(profile, links)), crane_urdf(profile, links)
 
@@ -416,7 +416,7 @@ FLOW_SHARE: Final = 0.15
 
 
 def truth_problems(profile: Profile, choice: str) -> list[Problem]:
-    """What is wrong with the truth of this choice (`sim.individual`) for the machine of ``profile``."""
+    """List what is wrong with the truth of this choice (`sim.individual`) for the machine of ``profile``."""
     try:
         truth = load_truth(choice, 0, profile.name)
     except PlantError as error:
@@ -428,8 +428,13 @@ def _parts(profile: Profile, truth: Truth) -> Iterator[Problem]:
     names = [j.name.lower() for j in JOINTS]
     links = ("mast", "boom", "stick", "telescope", "hanger", "fork", "rotator", "tong")
     sensed = {JOINTS[n].name.lower() for n in encoders(profile) if n < len(JOINTS)}
-    wanted = (("links", links), ("functions", (*names, "grapple")), ("encoders", sensed), ("cameras", profile.cameras))
-    for section, keys in wanted:
+    required_sections = (
+        ("links", links),
+        ("functions", (*names, "grapple")),
+        ("encoders", sensed),
+        ("cameras", profile.cameras),
+    )
+    for section, keys in required_sections:
         missing = [key for key in keys if key not in getattr(truth, section)]
         if missing:
             text = f"[{section}] has no {', '.join(missing)}; the profile has, so describe what is true of it"

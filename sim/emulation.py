@@ -192,7 +192,7 @@ class EmulatedMachine(ABC):
             self._tick(self._time_ns)
 
     def _spools(self, now_ns: int) -> list[float]:
-        """Commands of the nodes to the valves in this step, -1..1: `FUNCTIONS`, then steering and `ARMS`."""
+        """Return the commands of the nodes to the valves in this step, -1..1: `FUNCTIONS`, then steering and `ARMS`."""
         self.estop.decide(now_ns)
         self.valve.decide(now_ns)
         commands = [u / 100.0 for u in self.valve.outputs_pct]
@@ -213,7 +213,7 @@ class EmulatedMachine(ABC):
             self._measure_carrier()
 
     def _sense_valves(self) -> ValveInputs:
-        """Readings of the PLC's inputs."""
+        """Return the readings of the PLC's inputs."""
         w, h = self._surroundings, self._surroundings.hydraulics
         spools, (opening, closing) = h.spools, self._pressures()["grapple"]
         return ValveInputs(
@@ -231,19 +231,19 @@ class EmulatedMachine(ABC):
         return (*pressures[first], *pressures[second])
 
     def _pressures(self) -> dict[str, tuple[float, float]]:
-        """Chamber pressures of every function [Pa]; computed once per step because three nodes read them."""
+        """Return the chamber pressures of every function [Pa]; computed once per step because three nodes read them."""
         if self._pressures_of != self._steps:
             self._pressures_of, self._pressures_pa = self._steps, self._surroundings.hydraulics.pressures_pa
         return self._pressures_pa
 
     def _grapple_pressures(self) -> tuple[float, ...]:
-        """Pressures of pump, tank, closing and opening side of the grapple."""
+        """Return the pressures of pump, tank, closing and opening side of the grapple."""
         w = self._surroundings
         opening, closing = self._pressures()["grapple"]
         return (w.hydraulics.supply_pa, w.truth.supply.tank_pa, closing, opening)
 
     def _measure_carrier(self) -> None:
-        """The carrier's own sensors: wheel speeds, articulation, arm heights, inclination, hydraulic power."""
+        """Read the carrier's own sensors: wheel speeds, articulation, arm heights, inclination, hydraulic power."""
         w, spec = self._surroundings, self.profile.carrier
         vehicle, arms, engine = self.vehicle_node, self.arms, self.engine
         assert spec and w.carrier and vehicle and arms and engine

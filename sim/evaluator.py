@@ -114,13 +114,13 @@ class Evaluator:
             self._margin = min(self._margin, w.carrier.tip_margin_m)
 
     def _clearance(self, log: LogState) -> float:
-        """Air under the lowest point of the log's ends and middle [m]."""
+        """Compute the air under the lowest point of the log's ends and middle [m]."""
         height, fall = self._w.terrain.height, log.taper_m_m * log.length_m / 2
         places = zip((log.position_m, *log.ends_m), (0.0, fall, -fall), strict=True)
         return min(p[2] - (log.diameter_m + d) / 2 - height(p[0], p[1]) for p, d in places)
 
     def evaluate(self) -> Evaluation:
-        """The evaluation up to now."""
+        """Return the evaluation up to now."""
         w = self._w
         inward = w.client.invertTransform(*w.base_pose())
         logs = tuple(

@@ -43,8 +43,8 @@ class FrameTap:
 
     def repeat(self, bus: str, key: int) -> Callable[[], None]:
         """Send the last frame again and again: counter, time stamp and values stand still; returns what ends that."""
-        kept = self._last.get((bus, key))
-        return self.add(bus, key, lambda data, now_ns: data if kept is None else kept)
+        last_payload = self._last.get((bus, key))
+        return self.add(bus, key, lambda data, now_ns: data if last_payload is None else last_payload)
 
     def delay(self, bus: str, key: int, delay_ns: int) -> Callable[[], None]:
         """Send a frame ``delay_ns`` late; returns what ends that."""
@@ -55,7 +55,7 @@ class FrameTap:
         return self.add(bus, key, hold)
 
     def pass_on(self, now_ns: int, sent: list[Sent]) -> list[Sent]:
-        """The frames that reach the buses now."""
+        """Return the frames that reach the buses now."""
         for bus, key, data in sent:
             self._last[bus, key] = data
         if not self._effects and not self._late:
@@ -74,21 +74,21 @@ class FrameTap:
 
 
 def silent(data: bytes, now_ns: int) -> None:
-    """The frame is never sent."""
+    """Drop the frame: it is never sent."""
 
 
 def garbage(random: Random) -> Effect:
-    """Random bytes of the same length."""
+    """Send random bytes of the same length."""
     return lambda data, now_ns: random.randbytes(len(data))
 
 
 def intermittent(random: Random, probability: float) -> Effect:
-    """The frame is lost with a probability."""
+    """Lose the frame with a probability."""
     return lambda data, now_ns: None if random.random() < probability else data
 
 
 def every(count: int) -> Effect:
-    """Only every ``count``-th frame is sent: a node that is too slow."""
+    """Send only every ``count``-th frame: a node that is too slow."""
     seen = [0]
 
     def effect(data: bytes, now_ns: int) -> bytes | None:
@@ -99,23 +99,23 @@ def every(count: int) -> Effect:
 
 
 def rewritten(codec: MessageCodec, values: dict[str, Any]) -> Effect:
-    """Other values for some signals, correctly protected: a sensor that is wrong and does not know it."""
+    """Send other values for some signals, correctly protected: a sensor that is wrong and does not know it."""
 
     def effect(data: bytes, now_ns: int) -> bytes:
         try:
-            found = list(codec.receive(data))
+            signal_values = list(codec.receive(data))
         except FrameRefused:
             return data
         for name, value in values.items():
-            found[codec.index[name]] = value
-        payload = codec.encode(*found)
+            signal_values[codec.index[name]] = value
+        payload = codec.encode(*signal_values)
         return payload if codec.data_ids is None else protect(payload, data[1], codec.data_ids)
 
     return effect
 
 
 def masqueraded(foreign_ids: bytes) -> Effect:
-    """Another message's Data IDs under this identifier: a right checksum from a wrong sender."""
+    """Use another message's Data IDs under this identifier: a right checksum from a wrong sender."""
     return lambda data, now_ns: protect(data, data[1], foreign_ids)
 
 
@@ -140,7 +140,7 @@ class EncoderFault:
     noise_factor: float = 1.0
 
     def position(self, true: float, now_ns: int) -> float:
-        """The position that the faulty sensor sees."""
+        """Return the position that the faulty sensor sees."""
         drifted = self.drift_per_s * (now_ns - self.since_ns) * 1e-9
         return self.pivot + self.scale * (true - self.pivot) + self.offset + drifted
 
@@ -165,7 +165,7 @@ class SpoolFaults:
         return bool(self.stuck or self.bias or self.gain)
 
     def apply(self, names: Sequence[str], commands: Sequence[float]) -> list[float]:
-        """The commands that reach the spools; ``names`` in the order of ``commands``."""
+        """Return the commands that reach the spools; ``names`` in the order of ``commands``."""
         out = list(commands)
         for i, name in enumerate(names[: len(out)]):
             out[i] = self.stuck.get(name, out[i] * self.gain.get(name, 1.0) + self.bias.get(name, 0.0))

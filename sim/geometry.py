@@ -26,7 +26,7 @@ class Shape:
 
 
 def rpy_quaternion(roll: float, pitch: float, yaw: float = 0.0) -> Quaternion:
-    """Quaternion (x, y, z, w) of rotations about the fixed axes x, then y, then z [rad], as URDF's rpy."""
+    """Compute the quaternion (x, y, z, w) of rotations about the fixed axes x, then y, then z [rad], as URDF's rpy."""
     cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
     return (
@@ -38,7 +38,7 @@ def rpy_quaternion(roll: float, pitch: float, yaw: float = 0.0) -> Quaternion:
 
 
 def quaternion_rpy(q: Quaternion) -> Vector:
-    """Roll, pitch, yaw [rad] of a quaternion (x, y, z, w): the inverse of ``rpy_quaternion``."""
+    """Compute roll, pitch, yaw [rad] of a quaternion (x, y, z, w): the inverse of ``rpy_quaternion``."""
     x, y, z, w = q
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
@@ -79,7 +79,7 @@ class LocalFrame:
         )
 
     def geodetic(self, east_m: float, north_m: float, up_m: float) -> Geodetic:
-        """Latitude and longitude [deg] and height [m] of a local point."""
+        """Compute latitude and longitude [deg] and height [m] of a local point."""
         out = self._cos_lat * up_m - self._sin_lat * north_m
         x = self._origin[0] + self._cos_lon * out - self._sin_lon * east_m
         y = self._origin[1] + self._sin_lon * out + self._cos_lon * east_m

@@ -16,7 +16,7 @@ NAMES: Final = ("nominal", *DRAWN)
 
 
 def split(text: str) -> tuple[str, Path | None]:
-    """The kind of a choice (one of `NAMES`) and its file, None for a shipped one."""
+    """Split a choice into its kind (one of `NAMES`) and its file, None for a shipped one."""
     kind, colon, path = text.partition(":")
     if kind not in NAMES:
         return "nominal", Path(text)
@@ -24,7 +24,7 @@ def split(text: str) -> tuple[str, Path | None]:
 
 
 def beside(profile: str, machine: str, text: str) -> str:
-    """A choice that names no file, completed with the file beside the profile ``profile`` if there is one.
+    """Complete a choice that names no file with the file beside the profile ``profile`` if there is one.
 
     ``machine`` is the profile's name.  A shipped name as ``profile``, and a choice with a file, are left as they are.
     """
@@ -35,7 +35,7 @@ def beside(profile: str, machine: str, text: str) -> str:
 
 
 def another_for_every_seed(text: str) -> str:
-    """The choice itself, or the sampled one instead of a nominal one that was not given as a plain file."""
+    """Return the choice itself, or the sampled one instead of a nominal one that was not given as a plain file."""
     kind, path = split(text)
     if kind != "nominal" or (path is not None and not text.startswith("nominal:")):
         return text

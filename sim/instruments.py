@@ -33,7 +33,7 @@ class Detection:
 
 
 def detect(plant: Plant) -> list[Detection]:
-    """All logs of the plant, in scene order.  The base frame moves and leans with a carrier."""
+    """Detect all logs of the plant, in scene order.  The base frame moves and leans with a carrier."""
     logs = plant.logs()
     if plant.profile.carrier is None:
         return [Detection(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(logs)]
@@ -52,12 +52,12 @@ def detect(plant: Plant) -> list[Detection]:
 
 
 def detect_in_view(plant: Plant) -> list[Detection]:
-    """The logs that the cameras of a forwarder could see: around the crane, or in a quarter ahead of the front half."""
+    """Detect the logs that a forwarder's cameras see: around the crane, or in a quarter ahead of the front half."""
     return [log for log in detect(plant) if _in_view(*log.position_m[:2])]
 
 
 def _in_view(x_m: float, y_m: float) -> bool:
-    """Whether a place in the base frame, whose x axis points backwards, is in view."""
+    """Tell whether a place in the base frame, whose x axis points backwards, is in view."""
     return math.hypot(x_m, y_m) < AROUND_CRANE_M or (-AHEAD_OF_FRONT_M < x_m < 0.0 and abs(y_m) < -x_m)
 
 
@@ -78,17 +78,17 @@ class TotalStation:
         self._yaw_rng = random.Random(f"total station, direction {seed}")
 
     def read(self, pin_m: Vector) -> Vector:
-        """The reading [m] for a pin at ``pin_m``."""
+        """Take the reading [m] for a pin at ``pin_m``."""
         x, y, z = (axis + self._rng.gauss(0.0, POSITION_SIGMA_M) for axis in pin_m)
         return (x, y, z)
 
     def read_yaw(self, yaw_rad: float) -> float:
-        """The reading [rad] for a grapple that opens along ``yaw_rad``: 0..pi, because its two sides look alike."""
+        """Take the reading [rad] for a grapple opening along ``yaw_rad``: 0..pi, because its two sides look alike."""
         return (yaw_rad + self._yaw_rng.gauss(0.0, YAW_SIGMA_RAD)) % pi
 
 
 def grapple_yaw(plant: Plant) -> float:
-    """True direction along which the grapple opens, about the vertical, in the crane's base frame [rad]."""
+    """Return the true direction along which the grapple opens, about the vertical, in the crane's base frame [rad]."""
     grapple, base = plant.link_poses()["rotator"][1], plant.base_pose()[1]
     return quaternion_rpy(grapple)[2] - quaternion_rpy(base)[2]
 
@@ -97,7 +97,7 @@ def grapple_yaw(plant: Plant) -> float:
 
 
 def seen_with(truth: str, seed: int, machine: str) -> Any:
-    """The truth about a machine with its cameras, as ``plant.world.truth``, where the plant is in another process.
+    """Load the truth about a machine and its cameras, as ``plant.world.truth``, where another process has the plant.
 
     Raises:
         PlantError: the truth cannot be used.

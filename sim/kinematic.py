@@ -43,10 +43,10 @@ class RollingCarrier:
         self.x_m, self.y_m, self.heading_rad, self.speed_m_s = carrier.front_axle_m, 0.0, 0.0, 0.0
 
     def step(self, speed_m_s: float, brake: bool, step_s: float) -> None:
-        """One step towards the requested speed of the front axle."""
+        """Take one step towards the requested speed of the front axle."""
         change = (BRAKE_M_S2 if brake else ACCELERATION_M_S2) * step_s
-        wanted = 0.0 if brake else speed_m_s
-        self.speed_m_s += max(-change, min(change, wanted - self.speed_m_s))
+        target_speed_m_s = 0.0 if brake else speed_m_s
+        self.speed_m_s += max(-change, min(change, target_speed_m_s - self.speed_m_s))
         rate = heading_rate_rad_s(self._c, self.speed_m_s, self._q["articulation"], self._qd["articulation"])
         self.heading_rad += rate * step_s
         self.x_m += self.speed_m_s * math.cos(self.heading_rad) * step_s
@@ -68,15 +68,15 @@ class RollingCarrier:
         return tuple(height_from_arm_angle(self._c, self._q[arm]) for arm in ARMS)
 
     def front_axle(self) -> Vector:
-        """Middle of the front axle, between the hubs."""
+        """Return the middle of the front axle, between the hubs."""
         return self.x_m, self.y_m, self._c.wheel_radius_m
 
     def attitude(self, half: str) -> Vector:
-        """Roll, pitch and heading of ``rear`` or ``front``."""
+        """Return roll, pitch and heading of ``rear`` or ``front``."""
         return 0.0, 0.0, self.heading_rad - (self.articulation_rad if half == "rear" else 0.0)
 
     def pose(self, half: str) -> tuple[Vector, Quaternion]:
-        """Frame of ``rear`` or ``front`` in the world: both lie on the articulation's axis."""
+        """Return the frame of ``rear`` or ``front`` in the world: both lie on the articulation's axis."""
         ahead = self._c.front_axle_m
         up = pivot_height_m(self._c, sum(self.arm_heights_m) / len(ARMS))
         x, y = self.x_m - ahead * math.cos(self.heading_rad), self.y_m - ahead * math.sin(self.heading_rad)
@@ -114,7 +114,7 @@ class _ValveModel:
         self._line = deque([0.0] * max(1, round(valve.delay_s * 1e9 / step_ns)))
 
     def speed(self, command: float) -> float:
-        """Speed of the joint in this step; ``command`` is -1..1 of the spool."""
+        """Compute the speed of the joint in this step; ``command`` is -1..1 of the spool."""
         self._line.append(command * self._sign)
         spool = self._line.popleft()
         dead = self._dead[spool > 0.0]
@@ -200,5 +200,5 @@ class KinematicMachine(EmulatedMachine):
         self.world.step(spools, *drive)
 
     def joint_positions(self) -> tuple[float, ...]:
-        """In ``Joint`` order [rad, m]; the rotator's is not wrapped to one turn."""
+        """Return the positions in ``Joint`` order [rad, m]; the rotator's is not wrapped to one turn."""
         return tuple(self.world.q[j.name.lower()] for j in JOINTS)

@@ -77,7 +77,7 @@ class Plant(EmulatedMachine):
         self._evaluator.watch()
 
     def _decide(self, now_ns: int) -> tuple[list[float], Drive]:
-        """Commands of the nodes and hand levers to the valves and the drive in this step."""
+        """Return the commands of the nodes and hand levers to the valves and the drive in this step."""
         commands = self._spools(now_ns)
         drive = PARKED
         if self.vehicle_node is not None and self.arms is not None:
@@ -99,7 +99,7 @@ class Plant(EmulatedMachine):
             valves.float_front, valves.float_rear = wanted
 
     def _commanded(self) -> bool:
-        """Whether a controller moves the machine over the bus."""
+        """Tell whether a controller moves the machine over the bus."""
         carried = self.vehicle_node is not None and self.vehicle_node.active
         raised = self.arms is not None and self.arms.state is ArmState.ACTIVE
         return self.valve.valve_state is ValveState.ACTIVE or carried or raised
@@ -118,37 +118,37 @@ class Plant(EmulatedMachine):
         self._levers.pull(name, value, self._time_ns or 0)
 
     def levers(self) -> tuple[str, ...]:
-        """Names of the hand levers."""
+        """Return the names of the hand levers."""
         return self._levers.names
 
     def logs(self) -> list[LogState]:
-        """Ground truth of all logs, in the world frame."""
+        """Return the ground truth of all logs, in the world frame."""
         return self.world.log_bodies.states()
 
     def joint_positions(self) -> tuple[float, ...]:
-        """True joint positions in ``Joint`` order [rad, m]."""
+        """Return the true joint positions in ``Joint`` order [rad, m]."""
         return tuple(self.world.q[j.name.lower()] for j in JOINTS)
 
     def jaw_angle_rad(self) -> float:
-        """True mean angle of the jaws [rad], 0 open."""
+        """Return the true mean angle of the jaws [rad], 0 open."""
         return self.world.jaw_angle_rad
 
     def link_poses(self) -> dict[str, tuple[Vector, Quaternion]]:
-        """Link frames in the world frame: position [m] and quaternion (x, y, z, w)."""
+        """Return the link frames in the world frame: position [m] and quaternion (x, y, z, w)."""
         return self.world.link_poses()
 
     def base_pose(self) -> tuple[Vector, Quaternion]:
-        """The crane's base frame in the world frame; identity for a machine on a fixed base."""
+        """Return the crane's base frame in the world frame; identity for a machine on a fixed base."""
         return self.world.base_pose()
 
     def shapes(self) -> list[Shape]:
-        """Boxes to draw, in the frames of their links (crane, bunk, carrier)."""
+        """Return the boxes to draw, in the frames of their links (crane, bunk, carrier)."""
         under = carrier_links(self.profile, self.world.truth)[0] if self.world.carrier is not None else []
         crane = crane_shapes(self.profile, self.world.truth.steel)
         return [*(s for link in under for s in link.shapes), *crane, *bunk_shapes(self.profile)]
 
     def vehicle(self) -> VehicleState | None:
-        """Ground truth of the carrier; None on a machine without one."""
+        """Return the ground truth of the carrier; None on a machine without one."""
         c = self.world.carrier
         if c is None:
             return None
@@ -166,11 +166,11 @@ class Plant(EmulatedMachine):
         )
 
     def tip(self) -> Vector:
-        """True position of the hanger pin in the crane's base frame [m]."""
+        """Return the true position of the hanger pin in the crane's base frame [m]."""
         return self.world.tip()
 
     def evaluate(self) -> Evaluation:
-        """The evaluation of the run up to now."""
+        """Return the evaluation of the run up to now."""
         return self._evaluator.evaluate()
 
     def close(self) -> None:

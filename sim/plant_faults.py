@@ -65,7 +65,7 @@ def begin(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 
 
 def _encoder(**error: float | bool) -> Callable[[EmulatedMachine, PlantFault, int], End]:
-    """Errors of one encoder's reading; a value of NaN stands for the fault's size."""
+    """Make errors of one encoder's reading; a value of NaN stands for the fault's size."""
 
     def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
         encoder = plant.encoders.get(fault.part)
@@ -87,7 +87,7 @@ def _encoder(**error: float | bool) -> Callable[[EmulatedMachine, PlantFault, in
 
 
 def _identity(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """Another device answers under the node number; it boots."""
+    """Let another device answer under the node number; it boots."""
     encoder = plant.encoders[fault.part]
     encoder.spec = msgspec.structs.replace(encoder.spec, device_type=encoder.spec.device_type ^ 1)
     plant._deliver_crane(NMT_ID, bytes((NmtCommand.RESET_NODE, encoder.spec.node)), now_ns)
@@ -108,7 +108,7 @@ def _spool(kind: str) -> Callable[[EmulatedMachine, PlantFault, int], End]:
 
 
 def _burst(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """The chamber with the higher pressure loses its oil: that one carries the load."""
+    """Burst the hose of the chamber with the higher pressure, which loses its oil: that one carries the load."""
     hydraulics = _physical(plant, fault).world.hydraulics
     if fault.part not in hydraulics.names:
         raise PlantError("fault.no-function", f"{plant.profile.name} has no hydraulic function {fault.part!r}")
@@ -119,7 +119,7 @@ def _burst(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 
 
 def _overload(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """A mass [kg] hangs on the rotator, as from a log that is caught by another."""
+    """Hang a mass [kg] on the rotator, as from a log that is caught by another."""
     world = _physical(plant, fault).world
     body, link = world.crane.body, world.crane.link["rotator"]
     before = world.client.getDynamicsInfo(body, link)[0]
@@ -128,7 +128,7 @@ def _overload(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 
 
 def _tilt(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """The ground gives way on one side: roll [rad], + right side down."""
+    """Let the ground give way on one side: roll [rad], + right side down."""
     plant.tilt_rad = (fault.size, 0.0)
 
     def end() -> None:
@@ -138,7 +138,7 @@ def _tilt(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 
 
 def _node_reset(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """A node resets as after a drop of its supply: boot-up, and everything that it knew is gone."""
+    """Reset a node as after a drop of its supply: boot-up, and everything that it knew is gone."""
     node = CraneNode[fault.part.upper().replace("-", "_")]
     reset = bytes((NmtCommand.RESET_NODE, node))
     plant._deliver_crane(NMT_ID, reset, now_ns)
@@ -151,7 +151,7 @@ def _estop(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 
 
 def _estop_wire(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """The wire of one of the two normally closed contacts breaks."""
+    """Break the wire of one of the two normally closed contacts."""
     codec = message(plant.profile, "EstopStat")[1]
     channel = "ChannelA" if fault.seed % 2 else "ChannelB"
     return plant.tap.add(plant.profile.crane_bus, codec.key, faults.rewritten(codec, {channel: 0}))
@@ -168,7 +168,7 @@ def _lever(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
 
 
 def _turn(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
-    """The operator turns the mode switch to a position, and back at the end."""
+    """Turn the mode switch to a position as the operator does, and back at the end."""
     before = plant.estop.mode_switch
     try:
         plant.estop.turn(ModeSwitch[fault.part.upper().replace("-", "_")])
@@ -232,12 +232,12 @@ def _heading_frozen(gnss: GnssNode, fault: PlantFault) -> End:
 
 @cache
 def database(name: str) -> Database:
-    """A shipped database, compiled once per process."""
+    """Return a shipped database, compiled once per process."""
     return load(name)
 
 
 def message(profile: Profile, name: str) -> tuple[str, MessageCodec]:
-    """Bus and codec of a message of a machine.
+    """Find the bus and codec of a message of a machine.
 
     Raises:
         PlantError: no bus of this machine has it.
@@ -256,7 +256,7 @@ def message(profile: Profile, name: str) -> tuple[str, MessageCodec]:
 def _frames(
     make: Callable[[PlantFault, MessageCodec], faults.Effect],
 ) -> Callable[[EmulatedMachine, PlantFault, int], End]:
-    """An effect on the frames of one message."""
+    """Make an effect on the frames of one message."""
 
     def start(plant: EmulatedMachine, fault: PlantFault, now_ns: int) -> End:
         bus, codec = message(plant.profile, fault.part)
@@ -288,7 +288,7 @@ def _physical(plant: EmulatedMachine, fault: PlantFault) -> Plant:
 
 
 def _nothing() -> None:
-    """What has happened cannot be undone."""
+    """Do nothing: what has happened cannot be undone."""
 
 
 SIZE: Final = math.nan

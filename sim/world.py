@@ -42,7 +42,7 @@ JOINTS_OF_FUNCTION: Final = {"grapple": JAW_LINKS, "steer": ("articulation",)}
 
 
 def home_pose(profile: Profile, truth: str = "nominal") -> dict[str, float]:
-    """Joint positions in which the crane of a machine starts [rad, m].
+    """Return the joint positions in which the crane of a machine starts [rad, m].
 
     Raises:
         PlantError: there is no such truth for the machine.
@@ -141,7 +141,7 @@ class World:
         return body
 
     def _moments(self) -> tuple[float, float]:
-        """Moments of the weight about the column's hinges now [Nm]."""
+        """Compute the moments of the weight about the column's hinges now [Nm]."""
         above = CRANE_LINKS[CRANE_LINKS.index("mast") :]
         crane = self.crane
         return (
@@ -196,7 +196,7 @@ class World:
         self.hanging_n = magnitude(states[self._hanger][2])
 
     def _positions(self, q: Mapping[str, float]) -> list[float]:
-        """Joint positions (or velocities) in the order of ``functions``; the grapple's is the mean of its jaws."""
+        """Put joint positions (or velocities) in the order of ``functions``; the grapple's is the mean of its jaws."""
         out = [q[j] for j in self._driven]
         at = self._grapple
         out[at : at + 2] = [(out[at] + out[at + 1]) / 2]
@@ -246,7 +246,7 @@ class World:
             self.stowage.watch()
 
     def touched(self) -> list[bool]:
-        """For each log, whether the crane touches it; at most CONTACT_UPDATE_STEPS steps old."""
+        """Tell for each log whether the crane touches it; at most CONTACT_UPDATE_STEPS steps old."""
         return self._touched
 
     @property
@@ -260,15 +260,15 @@ class World:
         return max(0.0, min(1.0, 1.0 - self.jaw_angle_rad / self.profile.grapple.jaws.angle_rad[-1]))
 
     def link_poses(self) -> dict[str, Pose]:
-        """Frames of all links in the world."""
+        """Return the frames of all links in the world."""
         return self.crane.poses()
 
     def base_pose(self) -> Pose:
-        """The crane's base frame in the world."""
+        """Return the crane's base frame in the world."""
         return self.crane.pose("base")
 
     def tip(self) -> Vector:
-        """True position of the hanger pin in the crane's base frame [m]."""
+        """Return the true position of the hanger pin in the crane's base frame [m]."""
         pin, _ = self.crane.pose("hanger")
         if self.carrier is None:
             return pin
@@ -277,17 +277,17 @@ class World:
         return tip
 
     def rigid_tip(self) -> Vector:
-        """The hanger pin in the crane's base frame if the column were rigid: the reading of perfect encoders [m]."""
+        """Find the hanger pin in the crane's base frame with a rigid column: the reading of perfect encoders [m]."""
         return rigid_pin(self._chain, self.q)
 
     def load_kg(self) -> float:
-        """Reading of a load cell at the hanger pin, less the empty grapple."""
+        """Read a load cell at the hanger pin, less the empty grapple."""
         links = self.truth.links
         grapple = sum(links[n].mass_kg for n in ("hanger", "fork", "rotator")) + 2 * links["tong"].mass_kg
         return max(0.0, self.hanging_n / GRAVITY_M_S2 - grapple)
 
     def lean_rad(self) -> tuple[float, float]:
-        """Lean of the part above the rotator, which does not turn, from the vertical [rad].
+        """Measure the lean of the part above the rotator, which does not turn, from the vertical [rad].
 
         Outward of its pin in the crane's plane, and to the left.
         """
@@ -296,7 +296,7 @@ class World:
         return math.atan2(y, z), math.atan2(-x, z)
 
     def wheel_loads_n(self) -> tuple[float, ...]:
-        """Wheel loads fl fr rl rr [N]; none on a fixed machine."""
+        """Return the wheel loads fl fr rl rr [N]; none on a fixed machine."""
         return () if self.carrier is None else tuple(self.carrier.wheel_loads_n)
 
     def close(self) -> None:
@@ -314,5 +314,5 @@ def open_world(
     terrain: str = "flat",
     home: Mapping[str, float] | None = None,
 ) -> World:
-    """A World with a truth given by name (nominal, sampled, wide_valves or a TOML file)."""
+    """Open a World with a truth given by name (nominal, sampled, wide_valves or a TOML file)."""
     return World(profile, load_truth(truth, seed, profile.name), seed, scene, terrain, home)

@@ -75,7 +75,7 @@ def options(
         typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
     ] = False,
 ) -> None:
-    """Options of the whole command."""
+    """Take the options of the whole command."""
 
 
 app.command("demo")(demo.demo)
@@ -136,7 +136,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    """The command; one whose packages are not installed here says which.
+    """Run the command; one whose packages are not installed here says which.
 
     Raises:
         CommandFailed: an optional package is missing.
@@ -155,7 +155,7 @@ def _run() -> None:
 
 
 def _extra_with(module: str) -> str | None:
-    """The optional group of packages that brings a module, which is named as its package; None when none does."""
+    """Find the optional group of packages that brings a module, which is named as its package; None when none does."""
     from importlib import metadata
 
     from packaging.requirements import Requirement
@@ -170,7 +170,7 @@ def _extra_with(module: str) -> str | None:
 
 
 def _coded_errors() -> tuple[type[TimberhandError], type[GuardConfigError]]:
-    """Errors whose sentence is for the user; the guard, which shares no code with us, has one of its own."""
+    """Return the errors whose sentence is for the user; the guard, which shares no code with us, has its own."""
     from controller.guard.layout import GuardConfigError
 
     return TimberhandError, GuardConfigError

@@ -57,7 +57,7 @@ def draw(mission: ForwardingMission, review: Review | None, path: Path) -> None:
 
 
 def _size(span: np.ndarray) -> tuple[float, float]:
-    """Size of the sheet in inches, so that the map fills it."""
+    """Compute the size of the sheet in inches, so that the map fills it."""
     width = 8.0
     return width, float(np.clip(width * span[1] / span[0] * 0.92 + 1.3, 3.4, 11.0))
 

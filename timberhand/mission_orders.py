@@ -58,7 +58,7 @@ def exchange(port: int, order: bytes) -> Iterator[bytes]:
 
 
 def key_of(file: Path | None) -> bytes | None:
-    """The key in ``file``; by default that of the installed services, None where there is none.
+    """Read the key in ``file``; by default that of the installed services, None where there is none.
 
     Raises:
         CommandFailed: it cannot be read.
@@ -72,7 +72,7 @@ def key_of(file: Path | None) -> bytes | None:
 
 
 def checked(file: Path, machine: Profile) -> ForwardingMission:
-    """The mission of a file after the checks of ``timberhand plan check``.
+    """Return the mission of a file after the checks of ``timberhand plan check``.
 
     Raises:
         CommandFailed: it cannot be driven.
@@ -121,7 +121,7 @@ class PlannerOrders:
         return self.order(MissionAction.AUTO)
 
     def order(self, action: MissionAction) -> MissionReport:
-        """The mission's report after an order.
+        """Send an order; return the mission's report after it.
 
         Raises:
             CommandFailed: the planner refuses or does not answer.

@@ -32,14 +32,14 @@ def _print_options(*, name: str, params: list[Any], ctx: Any, markup_mode: Any, 
     entries: list[RenderableType] = []
     for param in params:
         entries.append(_names(param, ctx))
-        words = rich_utils._get_parameter_help(param=param, ctx=ctx, markup_mode=markup_mode)
-        entries.append(Padding(words, (0, 0, 0, INDENT)))
+        help_text = rich_utils._get_parameter_help(param=param, ctx=ctx, markup_mode=markup_mode)
+        entries.append(Padding(help_text, (0, 0, 0, INDENT)))
     border, align = rich_utils.STYLE_OPTIONS_PANEL_BORDER, rich_utils.ALIGN_OPTIONS_PANEL
     console.print(Panel(Group(*entries), border_style=border, title=name, title_align=align))
 
 
 def _names(param: Any, ctx: Any) -> Text:
-    """Every spelling of an option, and its values."""
+    """List every spelling of an option, and its values."""
     argument = param.param_type_name == "argument"
     shown = [param.display_name_raw if argument else ", ".join(param.opts)]
     if param.secondary_opts:

@@ -102,7 +102,7 @@ class Status:
         return self.timing is None or self.timing.age_ns > STALE_NS
 
     def named(self) -> dict[str, Any]:
-        """As plain values for JSON."""
+        """Return the status as plain values for JSON."""
         timing = None
         if self.timing is not None:
             timing = self.timing.named() | {"age_ns": self.timing.age_ns, "silent": self.silent}
@@ -110,12 +110,12 @@ class Status:
 
 
 def read_status(page: Path | None = None) -> Status:
-    """The status now; ``page`` is the controller's timing page (default: that of the service, else of this user)."""
+    """Read the status now; ``page`` is the controller's timing page (default: the service's, else this user's)."""
     notes = []
     units: tuple[Unit, ...] = ()
     if SYSTEMD.is_dir():
         names = [f"timberhand-{name}.service" for name in NAMES]
-        units = tuple(read_unit(found, time.monotonic()) for found in show_all(names, *PROPERTIES))
+        units = tuple(read_unit(properties, time.monotonic()) for properties in show_all(names, *PROPERTIES))
     else:
         notes.append("systemd does not run here, so no service is shown.")
     timing = None
@@ -127,17 +127,17 @@ def read_status(page: Path | None = None) -> Status:
 
 
 def read_unit(found: dict[str, str], now_s: float) -> Unit:
-    """A unit from its systemd properties; ``now_s`` is the monotonic clock."""
+    """Read a unit from its systemd properties; ``now_s`` is the monotonic clock."""
     name = found["Id"].removeprefix("timberhand-").removesuffix(".service")
     state = _state(found)
     changed_s = int(found.get("StateChangeTimestampMonotonic") or 0) * 1e-6
     ended = state in ("failed", "restarting", "stopped")
     why = ending(found.get("Result", ""), found.get("ExecMainStatus") or "0") if ended else ""
-    words = found.get("StatusText", "")
-    if state in ("failed", "restarting") and not words:
-        words = last_journal_line(found["Id"])
+    status_text = found.get("StatusText", "")
+    if state in ("failed", "restarting") and not status_text:
+        status_text = last_journal_line(found["Id"])
     since_s = now_s - changed_s if changed_s else None
-    return Unit(name, state, why, since_s, int(found.get("NRestarts") or 0), words)
+    return Unit(name, state, why, since_s, int(found.get("NRestarts") or 0), status_text)
 
 
 def _state(found: dict[str, str]) -> str:
@@ -150,12 +150,12 @@ def _state(found: dict[str, str]) -> str:
         return "not configured"
     if active == "inactive" and found.get("Result") == "success" and found.get("ExecMainExitTimestampMonotonic") != "0":
         return "done" if found.get("Type") == "oneshot" else "stopped"
-    words = {"active": "running", "activating": "starting", "deactivating": "ending", "inactive": "stopped"}
-    return words.get(active, active)
+    state_names = {"active": "running", "activating": "starting", "deactivating": "ending", "inactive": "stopped"}
+    return state_names.get(active, active)
 
 
 def ending(result: str, status: str) -> str:
-    """How a service ended, from systemd's result and the exit status or signal of its main process."""
+    """Say how a service ended, from systemd's result and the exit status or signal of its main process."""
     if result == "exit-code":
         known = status.isdecimal() and int(status) in set(ExitCode)
         return f"exit status {status}" + (f", {ExitCode(int(status)).words}" if known else "")
@@ -163,12 +163,12 @@ def ending(result: str, status: str) -> str:
 
 
 def oldest_first(inputs: Sequence[tuple[str, InputAge]]) -> list[tuple[str, InputAge]]:
-    """Inputs sorted by the longest age at which they were used."""
+    """Sort inputs by the longest age at which they were used."""
     return sorted(inputs, key=lambda item: -item[1].longest_ns)
 
 
 def screen(now: Status, before: Timing | None = None) -> RenderableType:
-    """The whole screen; with an earlier page ``before`` also the changes since."""
+    """Draw the whole screen; with an earlier page ``before`` also the changes since."""
     parts: list[RenderableType] = []
     if now.units:
         parts += [_units(now.units), Text()]
@@ -181,7 +181,7 @@ def screen(now: Status, before: Timing | None = None) -> RenderableType:
 
 
 def _table(*columns: str, title: str = "", words: int = 1) -> Table:
-    """A plain table; all columns but the first ``words`` hold numbers."""
+    """Make a plain table; all columns but the first ``words`` hold numbers."""
     table = Table(
         title=title or None, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1)
     )
@@ -242,15 +242,19 @@ def _durations(timing: Timing, before: Timing | None) -> RenderableType:
     columns = ["µs", "p50", "p99", "p99.9", "max"]
     table = _table(*columns, *(["now p99", "now max"] if before else []))
     for name, word in TABLE_ROWS.items():
-        found = timing.durations[name]
-        if not found.count:
+        distribution = timing.durations[name]
+        if not distribution.count:
             continue
-        row = [*(_us(found, share) for share in (0.5, 0.99, 0.999)), number(found.longest_ns // 1000)]
+        row = [*(_us(distribution, share) for share in (0.5, 0.99, 0.999)), number(distribution.longest_ns // 1000)]
         if before:
-            since = found - before.durations[name]
-            row += [_us(since, 0.99), number(since.longest_ns // 1000)] if since.count else ["", ""]
+            recent = distribution - before.durations[name]
+            row += [_us(recent, 0.99), number(recent.longest_ns // 1000)] if recent.count else ["", ""]
         table.add_row(word, *row)
-    stages = [f"{n} {_us(found, 0.99)}" for n, found in timing.durations.items() if n not in TABLE_ROWS and found.count]
+    stages = [
+        f"{n} {_us(distribution, 0.99)}"
+        for n, distribution in timing.durations.items()
+        if n not in TABLE_ROWS and distribution.count
+    ]
     return Group(table, Text("stages of the tick, p99: " + ", ".join(stages))) if stages else table
 
 
@@ -268,14 +272,14 @@ def _inputs(facts: Facts) -> RenderableType:
     if len(used) > INPUT_COUNT:
         table.add_row(Text(f"{len(used) - INPUT_COUNT} younger ones", style="dim"))
     refused = [(name, age.refused) for name, age in facts.inputs.items() if age.refused]
-    told: list[RenderableType] = [table]
+    renderables: list[RenderableType] = [table]
     if refused:
         counts = ", ".join(f"{name} {number(count)}" for name, count in sorted(refused, key=lambda item: -item[1]))
-        told.append(Text(f"refused frames (length, checksum, counter or value): {counts}", style="yellow"))
+        renderables.append(Text(f"refused frames (length, checksum, counter or value): {counts}", style="yellow"))
     silent = sorted(name for name, age in facts.inputs.items() if not age.count)
     if silent:
-        told.append(Text(f"never received: {', '.join(silent)}", style="yellow"))
-    return Group(*told)
+        renderables.append(Text(f"never received: {', '.join(silent)}", style="yellow"))
+    return Group(*renderables)
 
 
 def _buses(facts: Facts) -> Table:
@@ -295,27 +299,27 @@ def _process(facts: Facts, before: Timing | None) -> Text:
     minor, major = process.minor_faults, process.major_faults
     faults = f"page faults {number(minor)} minor, {number(major)} major"
     if before:
-        then = before.facts.process
-        since_ns, cpu_ns = facts.written_ns - before.facts.written_ns, cpu_ns - then.cpu_ns
-        faults = f"page faults +{number(minor - then.minor_faults)} minor, +{number(major - then.major_faults)} major"
+        prior = before.facts.process
+        since_ns, cpu_ns = facts.written_ns - before.facts.written_ns, cpu_ns - prior.cpu_ns
+        faults = f"page faults +{number(minor - prior.minor_faults)} minor, +{number(major - prior.major_faults)} major"
     share = 100.0 * cpu_ns / since_ns if since_ns > 0 else 0.0
-    words = (
+    figures = (
         f"memory {process.resident_kb / 1024:.0f} MB",
         f"CPU {share:.1f} %",
         faults,
         f"preempted {number(process.involuntary_switches)} times",
         f"garbage passes {number(process.gc_runs)}",
     )
-    return Text(" · ".join(words))
+    return Text(" · ".join(figures))
 
 
 def number(value: int) -> str:
-    """Grouped by thousands: 1 234 567."""
+    """Group by thousands: 1 234 567."""
     return f"{value:,}".replace(",", "\N{NO-BREAK SPACE}")
 
 
 def _rounded(value: int) -> str:
-    """Rounded to four digits from a million on: 12.35 M."""
+    """Round to four digits from a million on: 12.35 M."""
     if value < 1_000_000:
         return number(value)
     text = f"{value / 1e6:.2f} M" if value < 1_000_000_000 else f"{value / 1e9:.2f} G"
@@ -323,7 +327,7 @@ def _rounded(value: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A duration in its two largest units: 2 h 13 min."""
+    """Write a duration in its two largest units: 2 h 13 min."""
     if seconds < 10.0:
         return f"{max(seconds, 0.0):.1f} s"
     s = round(seconds)

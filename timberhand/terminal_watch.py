@@ -43,7 +43,7 @@ class TerminalWatch:
         self._answered = False
 
     def ask(self, now_ns: int) -> bool:
-        """Whether to ask now.
+        """Tell whether to ask now.
 
         Raises:
             InputRefused: it has never answered.
@@ -61,7 +61,7 @@ class TerminalWatch:
         return True
 
     def read(self, data: bytes, now_ns: int) -> int | None:
-        """The stamp of the newest heartbeat in what the terminal sent, None for none; keys are ignored."""
+        """Return the stamp of the newest heartbeat in what the terminal sent, None for none; keys are ignored."""
         text = self._rest + data
         part = _PART.search(text)
         self._rest = part[0] if part else b""

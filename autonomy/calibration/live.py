@@ -46,29 +46,29 @@ class SurveyInstrument:
         self._asked_ns = 0
 
     def read(self, now_ns: int) -> Point | None:
-        """The pin of the newest answer, or None; requests ten times a second."""
-        found = self._newest(now_ns)
-        return None if found is None else found.pin_m
+        """Return the pin of the newest answer, or None; send a request ten times a second."""
+        newest_answer = self._newest(now_ns)
+        return None if newest_answer is None else newest_answer.pin_m
 
     def read_yaw(self, now_ns: int) -> float | None:
-        """The direction of the newest answer, NaN where it has none, or None; requests as often."""
-        found = self._newest(now_ns)
-        return None if found is None else nan if found.yaw_rad is None else found.yaw_rad
+        """Return the direction of the newest answer, NaN where it has none, or None; send requests as often."""
+        newest_answer = self._newest(now_ns)
+        return None if newest_answer is None else nan if newest_answer.yaw_rad is None else newest_answer.yaw_rad
 
     def _newest(self, now_ns: int) -> SurveyAnswer | None:
-        found = None
+        newest_answer = None
         while True:
             try:
                 data = self._link.recv(4096)
             except (BlockingIOError, ConnectionRefusedError):
                 break
             with suppress(msgspec.DecodeError):
-                found = msgspec.json.decode(data, type=SurveyAnswer)
+                newest_answer = msgspec.json.decode(data, type=SurveyAnswer)
         if now_ns - self._asked_ns >= 100_000_000:
             self._asked_ns = now_ns
             with suppress(OSError):
                 self._link.sendto(SURVEY_REQUEST, self._address)
-        return found
+        return newest_answer
 
     def close(self) -> None:
         """Close the socket."""
@@ -79,14 +79,14 @@ class Surveyor(Protocol):
     """A source of the hanger pin and the grapple's direction, like `SurveyInstrument`; None: nothing yet."""
 
     def read(self, now_ns: int) -> Point | None:
-        """The pin, base frame, m."""
+        """Return the pin, base frame, m."""
 
     def read_yaw(self, now_ns: int) -> float | None:
-        """The direction along which the grapple opens, base frame, rad modulo pi; NaN where it cannot be read."""
+        """Return the direction along which the grapple opens, base frame, rad modulo pi; NaN where it is unreadable."""
 
 
 def first_report(link: ControllerLink, within_s: float, ready: tuple[int, ...]) -> StateReport | None:
-    """The first report of a controller in a ``ready`` mode; None when none arrives in time."""
+    """Wait for the first report of a controller in a ``ready`` mode; None when none arrives in time."""
     end_ns = time.monotonic_ns() + int(within_s * 1e9)
     while time.monotonic_ns() < end_ns and not link.foreign:
         link.wait(POLL_S)

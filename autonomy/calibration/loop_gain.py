@@ -30,7 +30,7 @@ _W_RAD_S: Final = np.geomspace(0.05, 60.0, 1200)
 
 
 def margins(kp_1_s: float, delay_s: float, lag_s: float, oil_s: float) -> tuple[float, float]:
-    """Phase margin [deg] and gain margin [dB] of a joint's loop."""
+    """Compute the phase margin [deg] and the gain margin [dB] of a joint's loop."""
     w = _W_RAD_S
     natural = 2.0 * SPOOL_ZETA / max(lag_s, 1e-3)
     spool = 1.0 - (w / natural) ** 2 + 2j * SPOOL_ZETA * w / natural
@@ -41,7 +41,7 @@ def margins(kp_1_s: float, delay_s: float, lag_s: float, oil_s: float) -> tuple[
 
 
 def borne_gain_1_s(spec: JointSpec, r: JointResult) -> float:
-    """The profile's gain, or the greatest below it that the measured valve bears, 1/s."""
+    """Return the profile's gain, or the greatest below it that the measured valve bears, 1/s."""
     kp = spec.law.kp_1_s
     if r.delay is None:
         return kp
@@ -57,7 +57,7 @@ def borne_gain_1_s(spec: JointSpec, r: JointResult) -> float:
         return kp
     kp = min(kp, BELOW_MOST * MAX_GAIN_DELAY / delay_s)
     step = 10.0**-DECIMALS
-    found = int(kp / step) * step
-    while found > step and not bears(found):
-        found -= step
-    return round(found, DECIMALS)
+    rounded_gain_1_s = int(kp / step) * step
+    while rounded_gain_1_s > step and not bears(rounded_gain_1_s):
+        rounded_gain_1_s -= step
+    return round(rounded_gain_1_s, DECIMALS)

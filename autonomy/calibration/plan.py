@@ -73,19 +73,19 @@ class CalibrationPlan:
 
 
 def free_range(spec: JointSpec) -> tuple[float, float]:
-    """The part of a joint's range that tests may use."""
+    """Return the part of a joint's range that tests may use."""
     margin = max(STOP_MARGIN_SHARE * (spec.upper - spec.lower), MIN_STOP_MARGIN)
     return spec.lower + margin, spec.upper - margin
 
 
 def clear_height_m(profile: Profile) -> float:
-    """Lowest height of the hanger pin at which the open grapple passes over everything, m."""
+    """Compute the lowest height of the hanger pin at which the open grapple passes over everything, m."""
     top = max(profile.workspace.ground_z_m, profile.bunk.floor_z_m + profile.bunk.stake_height_m)
     return top + max(profile.grapple.jaws.tip_below_pin_m) + TIP_CLEARANCE_M
 
 
 def required_range(spec: JointSpec) -> float:
-    """Greatest travel of the tests of both sides [rad, m]."""
+    """Compute the greatest travel of the tests of both sides [rad, m]."""
     ways = [
         abs(predicted_travel(program(spec, side), spec, side)) for program in (sweep, staircase) for side in (1, -1)
     ]
@@ -95,21 +95,23 @@ def required_range(spec: JointSpec) -> float:
 def make_plan(
     profile: Profile, position: Sequence[float], surveyed: bool, chosen: Collection[Joint] = JOINTS
 ) -> CalibrationPlan:
-    """The plan from the present joints (``Joint`` order, NaN without an encoder).
+    """Make the plan from the present joints (``Joint`` order, NaN without an encoder).
 
     With fewer joints ``chosen``, only these are tested, and not the grapple: enough after a valve was replaced.
 
     Raises:
         InputRefused: a joint has too little room, or nothing chosen can be tested.
     """
-    here = [0.0 if np.isnan(p) else float(p) for p in position]
+    present_pose = [0.0 if np.isnan(p) else float(p) for p in position]
     clear = clear_height_m(profile)
     blind = tuple(j for j in JOINTS if joint(profile, j).encoder is None)
     plans: list[JointPlan] = []
     for j in JOINTS:
         if j in chosen and j not in blind:
-            plans.append(_joint_plan(profile, j, plans[-1].pose if plans else here, here[Joint.SLEW], clear))
-    survey = _survey_poses(profile, here, clear) if surveyed else ()
+            plans.append(
+                _joint_plan(profile, j, plans[-1].pose if plans else present_pose, present_pose[Joint.SLEW], clear)
+            )
+    survey = _survey_poses(profile, present_pose, clear) if surveyed else ()
     turned = Joint.ROT if surveyed and Joint.ROT in blind and Joint.ROT in chosen else None
     if not plans and turned is None:
         names = ", ".join(j.name.lower() for j in chosen)
@@ -160,8 +162,9 @@ def _joint_plan(profile: Profile, which: Joint, before: Sequence[float], slew: f
 
 
 def _cost(profile: Profile, which: Joint, q: Sequence[float]) -> float:
-    """Cost of a test pose.  A slewing crane should be short and low, so that it rings fast; otherwise the tested joint
-    should be in the middle of its range, where a cylinder's lever changes least, and the others near the middle.
+    """Compute the cost of a test pose.  A slewing crane should be short and low, so that it rings fast; otherwise the
+    tested joint should be in the middle of its range, where a cylinder's lever changes least, and the others near the
+    middle.
     """
     off = 0.0
     for j in _BOOM_JOINTS:
@@ -175,7 +178,7 @@ def _cost(profile: Profile, which: Joint, q: Sequence[float]) -> float:
 
 
 def _travel_time_s(profile: Profile, start: Sequence[float], goal: Sequence[float]) -> float:
-    """Duration of a move at the speed limit of the slowest joint, s."""
+    """Compute the duration of a move at the speed limit of the slowest joint, s."""
     return max(abs(goal[j] - start[j]) / joint(profile, j).speed_limit for j in JOINTS)
 
 
@@ -186,7 +189,7 @@ def _with(q: Sequence[float], which: Joint, value: float) -> list[float]:
 
 
 def _survey_poses(profile: Profile, here: Sequence[float], clear_m: float) -> tuple[tuple[float, ...], ...]:
-    """Poses that separate offsets from lean, in the fastest order."""
+    """Choose the poses that separate offsets from lean, in the fastest order."""
     slew_low, slew_high = free_range(joint(profile, Joint.SLEW))
     slews = sorted({min(max(here[Joint.SLEW] + d, slew_low), slew_high) for d in SURVEY_SLEW})
     grids = []
@@ -200,7 +203,7 @@ def _survey_poses(profile: Profile, here: Sequence[float], clear_m: float) -> tu
 
 
 def _shortest_order(profile: Profile, poses: Sequence[list[float]]) -> list[tuple[float, ...]]:
-    """The poses in the order with the least total travel time."""
+    """Put the poses into the order with the least total travel time."""
 
     def time_s(order: Sequence[Sequence[float]]) -> float:
         return sum(_travel_time_s(profile, p, q) for p, q in pairwise(order))
@@ -209,7 +212,7 @@ def _shortest_order(profile: Profile, poses: Sequence[list[float]]) -> list[tupl
 
 
 def plan_summary(profile: Profile, plan: CalibrationPlan) -> list[str]:
-    """What will move and how far, a line per test, for the person who confirms."""
+    """List what will move and how far, a line per test, for the person who confirms."""
     lines = []
     for p in plan.joints:
         unit = "m" if p.joint is Joint.EXT else "rad"
@@ -315,7 +318,7 @@ class Findings:
 
 
 def build_tasks(plan: CalibrationPlan) -> list[Task]:
-    """All tasks in order; first the wiggle of every joint at the present pose."""
+    """List all tasks in order; first the wiggle of every joint at the present pose."""
     tasks: list[Task] = []
     for p in plan.joints:
         tasks += [SpoolTask(p.joint, +1, "wiggle"), SpoolTask(p.joint, -1, "wiggle")]
@@ -339,7 +342,7 @@ def build_tasks(plan: CalibrationPlan) -> list[Task]:
 
 
 def task_name(task: Task | None) -> str:
-    """A task in a few words; None: nothing has begun."""
+    """Name a task in a few words; None: nothing has begun."""
     match task:
         case SpoolTask(joint=j, side=side, kind=kind):
             return f"{j.name.lower()} {'+' if side > 0 else '-'} {kind}"

@@ -76,7 +76,7 @@ class Calibration(SpoolTasks):
     """
 
     def remaining_s(self) -> float:
-        """Expected duration of the rest, s."""
+        """Estimate the duration of the rest, s."""
         return sum(self._expected_s(task) for task in self._tasks[self._at :])
 
     def step(
@@ -152,7 +152,7 @@ class Calibration(SpoolTasks):
             self.idle = True
 
     def _may_go_on(self) -> bool:
-        """Whether the present stop, or the pause after one, leaves what was measured valid."""
+        """Tell whether the present stop, or the pause after one, leaves what was measured valid."""
         if self._failure is not None or self._report is None or isinstance(self.task, _UNREPEATABLE):
             return False
         paused = self._report.mode == Mode.STANDBY and self._interrupted_ns is not None

@@ -66,36 +66,36 @@ class RoughSide:
 
 
 def rough_side(test: SpoolTestRecord) -> RoughSide:
-    """What the search to one side tells."""
+    """Evaluate what the search to one side tells."""
     side = test.side
-    way = side * (test.position - float(np.mean(test.position[:10])))
+    travel = side * (test.position - float(np.mean(test.position[:10])))
     if test.spool is None:
-        best = min((_fit(side * test.command, way, delay_s) for delay_s in DELAYS_S), key=lambda found: found[0])
+        best = min((_fit(side * test.command, travel, delay_s) for delay_s in DELAYS_S), key=lambda found: found[0])
         return RoughSide(best[1], best[2], max(best[3] - OIL_S - SPOOL_LAG_S, 0.0))
     _, deadband, full_speed, _ = min(
-        (_fit(side * test.spool, way, s) for s in (0.0, OIL_S)), key=lambda found: found[0]
+        (_fit(side * test.spool, travel, s) for s in (0.0, OIL_S)), key=lambda found: found[0]
     )
     return RoughSide(deadband, full_speed, _spool_delay_s(test))
 
 
 def _fit(spool: np.ndarray, way: np.ndarray, delay_s: float) -> tuple[float, float, float, float]:
-    """Misfit, dead-band and full speed of the best parabola for a delay of ``way`` behind ``spool``; the delay."""
+    """Fit a parabola for a delay of ``way`` behind ``spool``; return misfit, dead-band, full speed and the delay."""
     shift = round(delay_s / GRID_S)
-    moved = np.concatenate([np.zeros(shift), spool])[: len(way)]
-    first = int(np.argmax(way > FOOT_SHARE * float(np.max(way))))
-    used = slice(max(0, first - round(USED_S / GRID_S)), None)
+    delayed_spool = np.concatenate([np.zeros(shift), spool])[: len(way)]
+    foot_index = int(np.argmax(way > FOOT_SHARE * float(np.max(way))))
+    used = slice(max(0, foot_index - round(USED_S / GRID_S)), None)
     edges = HALF_PLAY + DEADBANDS[:, None]
-    opening = np.clip(moved[None, :] - edges, 0.0, None) / (1.0 - edges)
-    ways = np.cumsum(opening, axis=1)[:, used] * GRID_S
-    wanted = way[used]
-    gains = np.maximum(ways @ wanted, 0.0) / np.maximum(np.sum(ways**2, axis=1), 1e-12)
-    misfits = np.sum((gains[:, None] * ways - wanted[None, :]) ** 2, axis=1)
+    opening = np.clip(delayed_spool[None, :] - edges, 0.0, None) / (1.0 - edges)
+    unit_travels = np.cumsum(opening, axis=1)[:, used] * GRID_S
+    measured_travel = way[used]
+    gains = np.maximum(unit_travels @ measured_travel, 0.0) / np.maximum(np.sum(unit_travels**2, axis=1), 1e-12)
+    misfits = np.sum((gains[:, None] * unit_travels - measured_travel[None, :]) ** 2, axis=1)
     best = int(np.argmin(misfits))
     return float(misfits[best]), float(DEADBANDS[best]), float(gains[best]), delay_s
 
 
 def _spool_delay_s(test: SpoolTestRecord) -> float:
-    """Dead time of a reported spool behind its command, s."""
+    """Measure the dead time of a reported spool behind its command, s."""
     assert test.spool is not None
     step_s = GRID_S / FINE_FACTOR
     time_s = np.arange(len(test.fine_command)) * step_s
@@ -106,7 +106,7 @@ def _spool_delay_s(test: SpoolTestRecord) -> float:
 
 
 def rough_spec(which: Joint, spec: JointSpec, plus: SpoolTestRecord, minus: SpoolTestRecord) -> JointSpec:
-    """The joint with the valve that the searches to both sides have shown; speeds where a lever has its nominal arm."""
+    """Return the joint with the valve that searches to both sides show; speeds where a lever has its nominal arm."""
     sides = (rough_side(plus), rough_side(minus))
     arm = lever_share(spec.valve, float(np.mean(plus.position)))
     known = (spec.valve.full_speed_plus, spec.valve.full_speed_minus)
@@ -125,7 +125,7 @@ def rough_spec(which: Joint, spec: JointSpec, plus: SpoolTestRecord, minus: Spoo
 
 
 def suits(profile: JointSpec, found: JointSpec) -> bool:
-    """Whether the profile's valve is near enough to the one that was found to move the joint by its map."""
+    """Tell whether the profile's valve is near enough to the one that was found to move the joint by its map."""
     a, b = profile.valve, found.valve
     deadbands = ((a.deadband_plus_pct, b.deadband_plus_pct), (a.deadband_minus_pct, b.deadband_minus_pct))
     fulls = ((a.full_speed_plus, b.full_speed_plus), (a.full_speed_minus, b.full_speed_minus))
@@ -147,19 +147,19 @@ class SpoolTasks(CalibrationState):
     """Joints, their programs and their travels by spools."""
 
     def _position(self) -> tuple[float, ...]:
-        """The measured joints; one without an encoder at 0."""
+        """Return the measured joints; one without an encoder at 0."""
         assert self._report is not None
         return tuple(p if isfinite(p) else 0.0 for p in self._report.position)
 
     def _spec(self, which: Joint) -> JointSpec:
-        """The joint as far as it is known: with the valve that its wiggles have shown, else with the profile's."""
+        """Return the joint as far as it is known: with the valve its wiggles have shown, else with the profile's."""
         return self.found.specs.get(which) or joint(self._profile, which)
 
     def _program(self, task: SpoolTask) -> SpoolProgram:
         return program_for(self._spec(task.joint), task, self._allowed[task.joint])
 
     def _travel_to(self, pose: Sequence[float]) -> SpoolTravel:
-        """The way to a pose by spools, in the order that keeps the pin clear."""
+        """Plan the way to a pose by spools, in the order that keeps the pin clear."""
         sensed = [j for j in JOINTS if joint(self._profile, j).encoder is not None]
         kinematics, start = self._profile.kinematics, self._position()
         order = best_order(kinematics, start, pose, sensed, self._plan.clear_z_m, MIN_REACH_M)
@@ -171,7 +171,7 @@ class SpoolTasks(CalibrationState):
         self.wants_reading = self.wants_yaw = False
 
     def _run_travel(self, task: MoveTask, now_ns: int) -> bytes | None:
-        """Leg after leg to the pose."""
+        """Travel leg after leg to the pose."""
         assert self._travel is not None
         if not isinstance(self._spool, Leg):
             leg = self._travel.next_leg(self._position(), [self._spec(j) for j in JOINTS], self._allowed)
@@ -192,7 +192,7 @@ class SpoolTasks(CalibrationState):
         return self._spool_datagram(leg, leg.joint, run_s, now_ns)
 
     def _run_s(self, now_ns: int) -> float:
-        """Time of the running spool program, s."""
+        """Return the time of the running spool program, s."""
         run_s = (now_ns - self._task_ns) * 1e-9 - LEAD_S
         assert self._spool is not None
         if run_s >= 0.0 and not self._spool.begun:
@@ -201,7 +201,7 @@ class SpoolTasks(CalibrationState):
         return run_s
 
     def _spool_datagram(self, run: SpoolRun, which: Joint, run_s: float, now_ns: int) -> bytes | None:
-        """A changed program is sent at once, and its end always, however late this tick is."""
+        """Send a changed program at once, and its end always, however late this tick is."""
         if run.is_silent(run_s) or not (self._stream.due(now_ns) or run.changed):
             return None
         return self._stream.spool(now_ns, which, run.window(run_s))
@@ -210,10 +210,10 @@ class SpoolTasks(CalibrationState):
         """Keep what both wiggles of a joint show of its valve."""
         plus, minus = self.found.wiggles[-2:]
         profile = joint(self._profile, which)
-        found = rough_spec(which, profile, plus, minus)
-        self.found.specs[which] = found
-        self._sweep_weak_sides_again(which, profile, found)
-        self.found.travelled_by_spool = self.found.travelled_by_spool or not suits(profile, found)
+        learned_spec = rough_spec(which, profile, plus, minus)
+        self.found.specs[which] = learned_spec
+        self._sweep_weak_sides_again(which, profile, learned_spec)
+        self.found.travelled_by_spool = self.found.travelled_by_spool or not suits(profile, learned_spec)
 
     def _sweep_weak_sides_again(self, which: Joint, profile: JointSpec, found: JointSpec) -> None:
         """Plan a second sweep of each side of which one alone leaves the dead-band too uncertain."""

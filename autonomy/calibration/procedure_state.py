@@ -186,7 +186,7 @@ class RotatorTurns:
         self._before_rad: float | None = None
 
     def program(self, task: PulseTask) -> SpoolProgram | None:
-        """The pulse of a task by all turns so far; None where the controller's count leaves too little of it."""
+        """Plan the pulse of a task by all turns so far; None where the controller's count leaves too little of it."""
         fit = fit_turns([*self.searched, *self.turns], self._spec)
         most = COUNTED_SHARE * min(self._spec.upper, -self._spec.lower)
         share = 1.0
@@ -201,13 +201,13 @@ class RotatorTurns:
         return None
 
     def search(self, task: TurnSearchTask) -> SpoolProgram:
-        """The next ramp of the search."""
+        """Plan the next ramp of the search."""
         program = turn_search(self._spec, task.side, task.top_pct, self._allowed)
         self._counted_rad += predicted_travel(program, self._spec, task.side)
         return program
 
     def is_found(self, side: int) -> bool:
-        """Whether the search to a side has turned the joint."""
+        """Tell whether the search to a side has turned the joint."""
         return side in self._found
 
     def pulse_finished(self, record: SpoolTestRecord) -> None:
@@ -215,14 +215,14 @@ class RotatorTurns:
         self._record = record
 
     def add_reading(self, yaw_rad: float, slew_rad: float) -> int:
-        """Add one reading of the direction at rest; returns how many there are at this rest."""
+        """Add one reading of the direction at rest; return how many there are at this rest."""
         direction = yaw_rad - slew_rad
         first = self._seen[0] if self._seen else direction
         self._seen.append(first + remainder(direction - first, pi))
         return len(self._seen)
 
     def finish_rest(self) -> Problem | None:
-        """Complete the turn before this rest; returns the problem when it was no proper turn."""
+        """Complete the turn before this rest; return the problem when it was no proper turn."""
         readings, direction = len(self._seen), sum(self._seen) / len(self._seen)
         record, before, self._before_rad = self._record, self._before_rad, direction
         self._seen = []

@@ -35,30 +35,30 @@ Change = tuple[tuple[str, ...], Any, str]
 
 
 def profile_changes(profile: Profile, result: CalibrationResult) -> list[Change]:
-    """The changes of a calibration to its profile: key path, value, remark."""
-    found: list[Change] = []
+    """List the changes of a calibration to its profile: key path, value, remark."""
+    changes: list[Change] = []
     for j, r in result.joints.items():
-        found += _joint_changes(("joints", j.name.lower()), joint(profile, j), r)
+        changes += _joint_changes(("joints", j.name.lower()), joint(profile, j), r)
     if result.turns is not None:
-        found += _turn_changes(("joints", "rot"), joint(profile, Joint.ROT), result.turns)
+        changes += _turn_changes(("joints", "rot"), joint(profile, Joint.ROT), result.turns)
     if result.survey is not None:
-        found += _survey_changes(profile, result.survey)
+        changes += _survey_changes(profile, result.survey)
     for command, key in ((GrappleCommand.CLOSE, "close_time_s"), (GrappleCommand.OPEN, "open_time_s")):
         if command in result.grapple_s:
-            found.append((("grapple", key), round(result.grapple_s[command], 2), "empty"))
-    return found
+            changes.append((("grapple", key), round(result.grapple_s[command], 2), "empty"))
+    return changes
 
 
 def _survey_changes(profile: Profile, survey: SurveyFit) -> list[Change]:
-    """Zeros and sag, all or none: they were fitted together and compensate each other."""
-    found: list[Change] = []
+    """List the changes of zeros and sag, all or none: they were fitted together and compensate each other."""
+    changes: list[Change] = []
     for j, offset in zip(OFFSETS, survey.offsets, strict=True):
         encoder = joint(profile, j).encoder
         if encoder is not None:
             zero = encoder.zero_counts + round(encoder.direction * offset / encoder.unit_per_count)
             zero = zero % encoder.total_counts if encoder.kind == "rotary" else zero
             remark = f"by survey, {offset:+.4f} {'m' if j is Joint.EXT else 'rad'}"
-            found.append((("joints", j.name.lower(), "encoder", "zero_counts"), zero, remark))
+            changes.append((("joints", j.name.lower(), "encoder", "zero_counts"), zero, remark))
     remarks = {
         "head_rad_m": "lean of the column per metre of the stick pin's reach",
         "pin_rad_m": "and per metre of the hanger pin's reach",
@@ -69,8 +69,8 @@ def _survey_changes(profile: Profile, survey: SurveyFit) -> list[Change]:
     }
     for name, remark in remarks.items():
         value = float(f"{getattr(survey.sag, name):.{SIGNIFICANT_SAG_DIGITS}g}")
-        found.append((("sag", name), value, remark))
-    return found
+        changes.append((("sag", name), value, remark))
+    return changes
 
 
 def _joint_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> list[Change]:
@@ -79,19 +79,19 @@ def _joint_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> li
     arm = lever_share(spec.valve, valve.at)
     fulls = [arm * full for full in valve.full_speeds]
     where = f"measured at {r.joint.name.lower()} {valve.at:+.2f} {unit}"
-    found = _valve_changes(path, valve.deadbands, fulls, ("middle of the hysteresis", f"{unit}/s {where}"))
+    changes = _valve_changes(path, valve.deadbands, fulls, ("middle of the hysteresis", f"{unit}/s {where}"))
     hysteresis, exponent = round(100.0 * valve.hysteresis, 2), round(valve.exponent, 3)
-    found.append(((*path, "valve", "hysteresis_pct"), hysteresis, "play of the spool, whole width"))
-    found.append(((*path, "valve", "exponent"), exponent, "metering curve from dead-band to full speed"))
-    found[:0] = _limit_changes(path, spec, fulls, unit)
+    changes.append(((*path, "valve", "hysteresis_pct"), hysteresis, "play of the spool, whole width"))
+    changes.append(((*path, "valve", "exponent"), exponent, "metering curve from dead-band to full speed"))
+    changes[:0] = _limit_changes(path, spec, fulls, unit)
     if r.delay is not None:
-        found.append(((*path, "valve", "delay_s"), round(r.delay.delay_s, 4), "dead time, command to spool"))
-        found.append(((*path, "valve", "lag_s"), round(r.delay.lag_s, 4), "of the spool"))
-    return found + _gain_changes(path, spec, r)
+        changes.append(((*path, "valve", "delay_s"), round(r.delay.delay_s, 4), "dead time, command to spool"))
+        changes.append(((*path, "valve", "lag_s"), round(r.delay.lag_s, 4), "of the spool"))
+    return changes + _gain_changes(path, spec, r)
 
 
 def _gain_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> list[Change]:
-    """A lower gain where the profile's would oscillate with the measured dead time."""
+    """Lower the gain where the profile's would oscillate with the measured dead time."""
     borne, given = borne_gain_1_s(spec, r), spec.law.kp_1_s
     if borne >= given:
         return []
@@ -101,7 +101,7 @@ def _gain_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> lis
 
 
 def lowered_gains(changed: Sequence[Change]) -> list[str]:
-    """A sentence for each joint whose loop gain a calibration has lowered."""
+    """Write a sentence for each joint whose loop gain a calibration has lowered."""
     return [
         f"{path[1]}: kp_1_s {value:g} 1/s, {remark}; it follows its path more slowly"
         for path, value, remark in changed
@@ -120,18 +120,18 @@ def _turn_changes(path: tuple[str, ...], spec: JointSpec, turns: TurnFit) -> lis
 def _valve_changes(
     path: tuple[str, ...], deadbands: Sequence[float], fulls: Sequence[float], remarks: tuple[str, str]
 ) -> list[Change]:
-    """Dead-bands [share of full command] and full speeds, plus and minus."""
+    """List the changes of dead-bands [share of full command] and full speeds, plus and minus."""
     sides = ("plus", "minus")
-    found: list[Change] = []
+    changes: list[Change] = []
     for side, deadband in zip(sides, deadbands, strict=True):
-        found.append(((*path, "valve", f"deadband_{side}_pct"), round(100.0 * deadband, 2), remarks[0]))
+        changes.append(((*path, "valve", f"deadband_{side}_pct"), round(100.0 * deadband, 2), remarks[0]))
     for side, full in zip(sides, fulls, strict=True):
-        found.append(((*path, "valve", f"full_speed_{side}"), round(full, 4), remarks[1]))
-    return found
+        changes.append(((*path, "valve", f"full_speed_{side}"), round(full, 4), remarks[1]))
+    return changes
 
 
 def _limit_changes(path: tuple[str, ...], spec: JointSpec, fulls: Sequence[float], unit: str) -> list[Change]:
-    """A lower speed limit where the valve cannot reach the profile's."""
+    """Lower the speed limit where the valve cannot reach the profile's."""
     slowest = min(fulls)
     if slowest >= spec.speed_limit:
         return []

@@ -23,7 +23,7 @@ SMALL_BELOW, SMALL_DECIMALS = 1e-3, 12
 
 
 def result_document(result: CalibrationResult, facts: dict[str, Any], changed: list[Change]) -> dict[str, Any]:
-    """The whole result as plain data."""
+    """Return the whole result as plain data."""
     joints = {j.name.lower(): _joint(r) for j, r in result.joints.items()}
     survey = None
     if (s := result.survey) is not None:
@@ -85,7 +85,7 @@ def _rotator(turns: TurnFit) -> dict[str, Any]:
 
 
 def _rounded(value: Any) -> Any:
-    """Numbers rounded to six decimals, small ones to twelve, to hide last bits; non-finite numbers become null."""
+    """Round numbers to six decimals, small ones to twelve, to hide last bits; non-finite numbers become null."""
     if isinstance(value, dict):
         return {k: _rounded(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -124,8 +124,9 @@ def _save(figure: Any, path: Path) -> None:
 
 
 def _draw_joint(path: Path, r: JointResult) -> None:
-    """Speed over spool with the fitted curve; sweeps (dead-band and hysteresis); staircases; spool after its
-    command."""
+    """Draw speed over spool with the fitted curve; sweeps (dead-band and hysteresis); staircases; spool after its
+    command.
+    """
     unit = "m" if r.joint is Joint.EXT else "rad"
     figure, (curve, sweep, stairs, delay) = _figure(4)
     for test, modelled in zip(r.tests, r.valve.modelled, strict=True):
@@ -160,7 +161,7 @@ def _draw_joint(path: Path, r: JointResult) -> None:
 
 
 def _draw_survey(path: Path, result: CalibrationResult) -> None:
-    """Distance between surveyed and computed pin at every pose, before and after the fit."""
+    """Draw the distance between surveyed and computed pin at every pose, before and after the fit."""
     s = result.survey
     assert s is not None
     figure, axis = _figure(1)

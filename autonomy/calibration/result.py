@@ -99,15 +99,17 @@ def identify(profile: Profile, found: Findings) -> CalibrationResult:
     problems += list(_grapple_problems(found.grapple_s))
     if survey is not None:
         problems += list(_survey_problems(survey))
-    turns, kept = None, []
+    turns, unchanged_valves = None, []
     if joint(profile, Joint.ROT).encoder is None:
         turned = [*found.searched, *found.turns]
         if found.turns and all(sum(t.record.side == side for t in turned) >= MIN_TURNS for side in SIDES):
             turns = fit_turns(turned, joint(profile, Joint.ROT))
             problems += list(_turn_problems(turns, joint(profile, Joint.ROT)))
         else:
-            kept.append("rot: its valve's values stay as they were, it has no encoder and no turn of it was surveyed")
-    return CalibrationResult(joints, dict(found.grapple_s), survey, tuple(problems), turns, tuple(kept))
+            unchanged_valves.append(
+                "rot: its valve's values stay as they were, it has no encoder and no turn of it was surveyed"
+            )
+    return CalibrationResult(joints, dict(found.grapple_s), survey, tuple(problems), turns, tuple(unchanged_valves))
 
 
 def _joint_result(
@@ -147,8 +149,8 @@ def _outside(
 def _side_problems(
     name: str, deadband: float, full_speed: float, errors: tuple[float, float], nominal: float, most: float
 ) -> Iterator[Problem]:
-    """Problems of one side of a valve; ``errors`` are the standard errors of its dead-band and, as a share, its speed;
-    ``most`` is the greatest of the dead-band.
+    """Find the problems of one side of a valve; ``errors`` are the standard errors of its dead-band and, as a share,
+    its speed; ``most`` is the greatest of the dead-band.
     """
     yield from _outside(name, "dead-band", deadband, DEADBAND_BOUNDS, 100.0, "%")
     yield from _outside(name, "full speed over the profile's", full_speed / nominal, FULL_SPEED_BOUNDS, 1.0, "")
@@ -185,8 +187,8 @@ def _joint_problems(r: JointResult, spec: JointSpec) -> Iterator[Problem]:
     for side, i in (("plus", 0), ("minus", 1)):
         nominal = spec.valve.full_speed_plus if i == 0 else spec.valve.full_speed_minus
         errors = (valve.errors[f"deadband_{side}"], valve.errors[f"speed_{side}"])
-        found = (valve.deadbands[i], valve.full_speeds[i], errors, nominal)
-        yield from _side_problems(f"{name} {side}", *found, MAX_DEADBAND_ERROR)
+        side_values = (valve.deadbands[i], valve.full_speeds[i], errors, nominal)
+        yield from _side_problems(f"{name} {side}", *side_values, MAX_DEADBAND_ERROR)
         if not abs(r.repeats[i]) <= MAX_REPEAT_DIFFERENCE:
             known = r.repeats[i] == r.repeats[i]
             off = f"differs by {100 * r.repeats[i]:.1f} % of the spool" if known else "cannot be told"

@@ -64,7 +64,7 @@ class SpoolProgram:
         return self.points[-1][0]
 
     def at(self, time_s: float) -> float:
-        """The command at a time."""
+        """Return the command at a time."""
         points = self.points
         if not points[0][0] <= time_s <= points[-1][0]:
             return 0.0
@@ -74,7 +74,7 @@ class SpoolProgram:
         return 0.0
 
     def window(self, time_s: float, horizon_s: float) -> tuple[SpoolKnot, ...]:
-        """Knots from ``time_s`` on; at the end of the window the program continues or is neutral."""
+        """Return the knots from ``time_s`` on; at the end of the window the program continues or is neutral."""
         if time_s > self.duration_s - END_GUARD_S:
             return (SpoolKnot(0, 0.0),)
         end_s = min(time_s + horizon_s, self.duration_s)
@@ -88,12 +88,12 @@ class SpoolProgram:
         return tuple(knots)
 
     def closing(self, time_s: float, closing_s: float) -> SpoolProgram:
-        """A program that goes straight to neutral from the command at ``time_s``."""
+        """Return a program that goes straight to neutral from the command at ``time_s``."""
         return SpoolProgram(((time_s, self.at(time_s)), (time_s + closing_s, 0.0)))
 
     def ending(self, time_s: float, closing_s: float, edge_pct: float = REST_PCT) -> SpoolProgram:
-        """A program that closes the valve from ``time_s`` on, down to a known edge of its dead-band, and ends as every
-        program does.
+        """Return a program that closes the valve from ``time_s`` on, down to a known edge of its dead-band, and ends as
+        every program does.
         """
         at, end_s = self.at(time_s), time_s + closing_s
         side = 1.0 if at > 0.0 else -1.0
@@ -104,18 +104,18 @@ class SpoolProgram:
 
 
 def deadband_pct(spec: JointSpec, side: int) -> float:
-    """The profile's dead-band of a side (+1, -1)."""
+    """Return the profile's dead-band of a side (+1, -1)."""
     return spec.valve.deadband_plus_pct if side > 0 else spec.valve.deadband_minus_pct
 
 
 def side_limit(spec: JointSpec, side: int) -> float:
-    """Greatest speed of a test to a side [rad/s, m/s]: the speed limit, or what the valve can reach."""
+    """Compute the greatest speed of a test to a side [rad/s, m/s]: the speed limit, or what the valve can reach."""
     full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
     return min(spec.speed_limit, REACHED_SHARE * full)
 
 
 def command_for(spec: JointSpec, side: int, speed: float) -> float:
-    """The command [%, without sign] that the profile's valve map gives for a speed on that side."""
+    """Compute the command [%, without sign] that the profile's valve map gives for a speed on that side."""
     full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
     deadband = deadband_pct(spec, side)
     return deadband + (100.0 - deadband) * min(1.0, speed / full)
@@ -133,16 +133,18 @@ class Allowed:
     rate_pct_s: float
 
     def deadband_pct(self, side: int) -> float:
-        """The dead-band of a side, inside which a command may step."""
+        """Return the dead-band of a side, inside which a command may step."""
         return self.deadbands_pct[0 if side > 0 else 1]
 
     def top_pct(self, side: int, percent: float) -> float:
-        """A command, cut to what is accepted."""
+        """Cut a command to what is accepted."""
         return min(percent, self.most_pct[0 if side > 0 else 1])
 
 
 def allowed_by(spec: JointSpec) -> Allowed:
-    """What a controller with this joint in its profile accepts (`controller.crane.spool_test_run`), less a margin."""
+    """Compute what a controller with this joint in its profile accepts (`controller.crane.spool_test_run`), less a
+    margin.
+    """
     fastest = max(spec.valve.full_speed_plus, spec.valve.full_speed_minus)
     most = [MOST_SHARE * command_for(spec, side, spec.speed_limit) for side in (1, -1)]
     rate_pct_s = 100.0 * OPENING_FACTOR * spec.acceleration_limit / fastest
@@ -150,7 +152,7 @@ def allowed_by(spec: JointSpec) -> Allowed:
 
 
 def _edge(side: int, low: float, allowed: Allowed) -> list[tuple[float, float]]:
-    """From neutral to ``low``, inside the dead-band: a step as far as the controller lets it be one, then a line."""
+    """Go from neutral to ``low``, inside the dead-band: a step as far as the controller lets it be one, then a line."""
     points = [(0.0, 0.0)]
     stepped = min(low, max(0.0, allowed.deadband_pct(side) - 0.5))
     if stepped > 0.0:
@@ -161,7 +163,7 @@ def _edge(side: int, low: float, allowed: Allowed) -> list[tuple[float, float]]:
 
 
 def _shut(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The end of a program: a step to rest, and neutral once the spool has followed."""
+    """Append the end of a program: a step to rest, and neutral once the spool has followed."""
     end_s = points[-1][0] + STEP_S
     return [*points, (end_s, REST_PCT), (end_s + REST_S, REST_PCT), (end_s + REST_S + STEP_S, 0.0)]
 
@@ -171,19 +173,19 @@ def _signed(side: int, points: Sequence[tuple[float, float]]) -> SpoolProgram:
 
 
 def wiggle(spec: JointSpec, side: int, allowed: Allowed | None = None) -> SpoolProgram:
-    """From neutral, slowly, until the joint moves; the run ends the program then."""
+    """Open the valve from neutral, slowly, until the joint moves; the run ends the program then."""
     top = (allowed or allowed_by(spec)).top_pct(side, WIGGLE_TOP_PCT)
     return _signed(side, _shut([(0.0, 0.0), (top / WIGGLE_PCT_S, top)]))
 
 
 def turn_search(spec: JointSpec, side: int, top_pct: float, allowed: Allowed | None = None) -> SpoolProgram:
-    """From neutral steadily up to a top, then closed."""
+    """Open the valve from neutral steadily up to a top, then close it."""
     top = (allowed or allowed_by(spec)).top_pct(side, top_pct)
     return _signed(side, _shut([(0.0, 0.0), (top / TURN_SEARCH_PCT_S, top)]))
 
 
 def sweep(spec: JointSpec, side: int, allowed: Allowed | None = None) -> SpoolProgram:
-    """Slowly out of the dead-band and back into it: both edges of the hysteresis and the foot of the metering curve."""
+    """Go slowly out of the dead-band and back: both edges of the hysteresis and the foot of the metering curve."""
     allowed = allowed or allowed_by(spec)
     low = max(0.0, deadband_pct(spec, side) - BELOW_DEADBAND_PCT)
     top = allowed.top_pct(side, deadband_pct(spec, side) + SWEEP_ABOVE_PCT)
@@ -194,12 +196,12 @@ def sweep(spec: JointSpec, side: int, allowed: Allowed | None = None) -> SpoolPr
 
 
 def rises(program: SpoolProgram, time_s: float) -> bool:
-    """Whether a sweep is on its slow way up."""
+    """Tell whether a sweep is on its slow way up."""
     return program.points[-6][0] < time_s < program.points[-5][0]
 
 
 def reversed_sweep(program: SpoolProgram, time_s: float) -> SpoolProgram:
-    """A sweep that reverses at ``time_s`` instead of at its top."""
+    """Make a sweep reverse at ``time_s`` instead of at its top."""
     *edge, begin, _, _, _, _, _ = program.points
     side = 1 if program.points[-2][1] > 0.0 else -1
     top, down_s = abs(program.at(time_s)), time_s - begin[0]
@@ -208,12 +210,12 @@ def reversed_sweep(program: SpoolProgram, time_s: float) -> SpoolProgram:
 
 
 def staircase(spec: JointSpec, side: int, allowed: Allowed | None = None) -> SpoolProgram:
-    """Three steady speeds, each long enough for the oil to settle, then closed."""
+    """Hold three steady speeds, each long enough for the oil to settle, then close the valve."""
     return steady(spec, side, STAIRCASE_SPEED_SHARES, HOLD_S, allowed)
 
 
 def pulse(spec: JointSpec, side: int, share: float, hold_s: float, allowed: Allowed | None = None) -> SpoolProgram:
-    """One steady speed for ``hold_s``, a ``share`` of the speed limit by the valve map, then closed."""
+    """Hold one steady speed for ``hold_s``, a ``share`` of the speed limit by the valve map, then close the valve."""
     return steady(spec, side, (share,), hold_s, allowed, PULSE_OPENING_FACTOR / OPENING_FACTOR)
 
 
@@ -225,8 +227,8 @@ def steady(
     allowed: Allowed | None = None,
     gentle: float = 1.0,
 ) -> SpoolProgram:
-    """Steady speeds, ``shares`` of the speed limit by the valve map, each for ``hold_s``; the opening grows ``gentle``
-    times as fast as usual.
+    """Hold steady speeds, ``shares`` of the speed limit by the valve map, each for ``hold_s``; the opening grows
+    ``gentle`` times as fast as usual.
     """
     allowed = allowed or allowed_by(spec)
     own = allowed_by(spec).rate_pct_s
@@ -243,11 +245,11 @@ def steady(
 
 
 def predicted_travel(program: SpoolProgram, spec: JointSpec, side: int) -> float:
-    """Travel of the joint by the profile's valve map [rad, m], with its sign."""
+    """Predict the travel of the joint by the profile's valve map [rad, m], with its sign."""
     full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
     deadband = deadband_pct(spec, side)
-    way, step_s = 0.0, 0.01
+    travel, step_s = 0.0, 0.01
     for i in range(int(program.duration_s / step_s) + 1):
         opening = max(0.0, abs(program.at(i * step_s)) - deadband) / (100.0 - deadband)
-        way += opening * full * step_s
-    return side * way
+        travel += opening * full * step_s
+    return side * travel

@@ -37,7 +37,7 @@ TRAVEL_UNCERTAINTY: Final = 1.3
 
 
 def program_for(spec: JointSpec, task: SpoolTask, allowed: Allowed) -> SpoolProgram:
-    """The program of a task before anything has moved."""
+    """Build the program of a task before anything has moved."""
     build = {"wiggle": spool_program.wiggle, "sweep": spool_program.sweep, "staircase": spool_program.staircase}[
         task.kind
     ]
@@ -53,7 +53,7 @@ class SpoolRun:
         self._sent: SpoolProgram | None = None
 
     def follow(self, run_s: float, position: float, velocity: float) -> Problem | None:
-        """Monitor the joint; returns the problem that ends the run.  Without an encoder, none."""
+        """Monitor the joint; return the problem that ends the run.  Without an encoder, none."""
         return None
 
     def final_check(self, position: float) -> Problem | None:
@@ -69,7 +69,7 @@ class SpoolRun:
         self.program = self.program.ending(run_s, close_s, edge_pct)
 
     def is_silent(self, run_s: float) -> bool:
-        """Whether there is nothing to send: before the start, and once the end has been sent."""
+        """Tell whether there is nothing to send: before the start, and once the end has been sent."""
         return run_s < 0.0 or (run_s > self.program.duration_s and self._sent_end)
 
     @property
@@ -78,7 +78,7 @@ class SpoolRun:
         return self._sent is not self.program
 
     def window(self, run_s: float) -> tuple[SpoolKnot, ...]:
-        """The knots to send now."""
+        """Return the knots to send now."""
         self._sent = self.program
         self._sent_end = run_s + HORIZON_S >= self.program.duration_s
         return self.program.window(run_s, HORIZON_S)
@@ -101,7 +101,7 @@ class MonitoredSpoolRun(SpoolRun):
         )
 
     def follow(self, run_s: float, position: float, velocity: float) -> Problem | None:
-        """Adapt the program to the joint's motion; returns a problem when the joint moves the wrong way."""
+        """Adapt the program to the joint's motion; return a problem when the joint moves the wrong way."""
         moved, enough = self._moved(position), _min_travel(self._spec)
         if moved < -enough * (1.0 if self._task.kind == "wiggle" else REBOUND_FACTOR):
             asked, seen = ("plus", "minus") if self._task.side > 0 else ("minus", "plus")
@@ -129,7 +129,7 @@ class MonitoredSpoolRun(SpoolRun):
         return None
 
     def final_check(self, position: float) -> Problem | None:
-        """At the end of the program: a problem when the joint has not moved."""
+        """Check at the end of the program that the joint has moved; return a problem when it has not."""
         if self._moved(position) >= _min_travel(self._spec):
             return None
         top = max(abs(percent) for _, percent in self.program.points)
@@ -146,5 +146,5 @@ class MonitoredSpoolRun(SpoolRun):
 
 
 def _min_travel(spec: JointSpec) -> float:
-    """Travel of a joint that certainly moves [rad, m]."""
+    """Compute the travel of a joint that certainly moves [rad, m]."""
     return max(MIN_MOVED, MIN_MOVED_S * spec.speed_limit)

@@ -58,7 +58,7 @@ class Leg(SpoolRun):
     def __init__(
         self, which: Joint, spec: JointSpec, allowed: Allowed, start: float, goal: float, stalled: int
     ) -> None:
-        """``stalled``: legs to the same goal that hardly moved the joint."""
+        """Plan the leg; ``stalled``: legs to the same goal that hardly moved the joint."""
         self.joint, self.goal, self.start = which, goal, start
         self.side = 1 if goal > start else -1
         far = abs(goal - start)
@@ -77,8 +77,8 @@ class Leg(SpoolRun):
 
     def follow(self, run_s: float, position: float, velocity: float) -> Problem | None:
         """Shut the valve ahead of the goal."""
-        left = self.side * (self.goal - position)
-        if not self.closed and left <= max(0.0, self.side * velocity) * self._after_s:
+        remaining = self.side * (self.goal - position)
+        if not self.closed and remaining <= max(0.0, self.side * velocity) * self._after_s:
             self.finish(run_s, self._close_s, self._edge_pct)
             self.closed = True
         return None
@@ -96,13 +96,13 @@ class SpoolTravel:
         """The joint that does not reach its place."""
 
     def next_leg(self, position: Sequence[float], specs: Sequence[JointSpec], allowed: Sequence[Allowed]) -> Leg | None:
-        """The next leg from the present joints (all in ``Joint`` order); None at the goal, or when a joint does not
-        reach it (`stuck`).
+        """Choose the next leg from the present joints (all in ``Joint`` order); None at the goal, or when a joint does
+        not reach it (`stuck`).
         """
         while self._order:
             j = self._order[0]
-            left, over = abs(self.goal[j] - position[j]), self._tries >= MAX_LEGS
-            if left <= TOLERANCES[j] * (NEAR_ENOUGH if over else 1.0):
+            remaining, over = abs(self.goal[j] - position[j]), self._tries >= MAX_LEGS
+            if remaining <= TOLERANCES[j] * (NEAR_ENOUGH if over else 1.0):
                 self._order.pop(0)
                 self._tries = self._stalled = 0
                 continue
@@ -124,7 +124,7 @@ def best_order(
     clear_z_m: float,
     least_reach_m: float,
 ) -> list[Joint]:
-    """The order of ``joints`` in which the pin comes least under ``clear_z_m`` or within ``least_reach_m``."""
+    """Find the order of ``joints`` in which the pin comes least under ``clear_z_m`` or within ``least_reach_m``."""
     orders = [list(order) for order in permutations(joints)]
     return min(orders, key=lambda order: _depth_m(kinematics, start, goal, order, clear_z_m, least_reach_m))
 
@@ -137,7 +137,7 @@ def _depth_m(
     clear_z_m: float,
     least_reach_m: float,
 ) -> float:
-    """How far the pin comes into what it should stay clear of, summed over the way, m."""
+    """Compute how far the pin comes into what it should stay clear of, summed over the way, m."""
     at, depth = list(start), 0.0
     for j in order:
         for i in range(1, _SAMPLES + 1):

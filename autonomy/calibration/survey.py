@@ -79,7 +79,7 @@ class SurveyFit:
 
 
 def _sag(p: Sequence[float]) -> Sag:
-    """The sag of the parameters after the offsets.
+    """Return the sag of the parameters after the offsets.
 
     Three parameters are the lean itself: head, pin, rest.  Four tie it to the moment: compliance
     [`USUAL_COMPLIANCE_RAD_NM`], rest, and head and pin of the moment.
@@ -98,13 +98,13 @@ def _corrected(position: Sequence[float], offsets: Sequence[float]) -> list[floa
 
 
 def _prior_sigma(weighed: bool) -> np.ndarray:
-    """Standard deviations of the parameters on an unsurveyed machine."""
+    """Return the standard deviations of the parameters on an unsurveyed machine."""
     lean = (1.0, REST_SIGMA, WEIGHT_SIGMA_N, WEIGHT_SIGMA_N) if weighed else (LEAN_SIGMA, LEAN_SIGMA, REST_SIGMA)
     return np.array([*OFFSET_SIGMA, *lean])
 
 
 def _misfit(kin: Kinematics, readings: Sequence[SurveyReading], p: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the pins (n, 3) [m] and of the moments [Nm]."""
+    """Compute the residuals of the pins (n, 3) [m] and of the moments [Nm]."""
     sag, shown = _sag(p[4:]), [_corrected(r.position, p[:4]) for r in readings]
     pins = np.array([r.pin_m for r in readings]) - np.array([true_pin(sag, kin, q) for q in shown])
     moments = [r.moment_nm - empty_moment_nm(sag, kin, q) for r, q in zip(readings, shown, strict=True)]
@@ -112,7 +112,7 @@ def _misfit(kin: Kinematics, readings: Sequence[SurveyReading], p: Sequence[floa
 
 
 def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | None = None) -> SurveyFit:
-    """Offsets and sag from at least `MIN_POSES` readings.
+    """Fit offsets and sag to at least `MIN_POSES` readings.
 
     ``known``: the sag in the present profile; only ``before_m`` depends on it.
 
@@ -135,14 +135,14 @@ def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | 
         parts = [pins.ravel() / PIN_SIGMA_M, (p - start) / spread]
         return np.concatenate([*parts, moments / MOMENT_SIGMA_NM] if weighed else parts)
 
-    found = least_squares(residuals, start, x_scale=spread)
-    errors = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
-    after, moments = _misfit(kin, readings, found.x.tolist())
+    solution = least_squares(residuals, start, x_scale=spread)
+    errors = np.sqrt(np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
+    after, moments = _misfit(kin, readings, solution.x.tolist())
     before = [dist(r.pin_m, true_pin(known, kin, r.position)) for r in readings]
-    a, b, c, d = found.x[:4].tolist()
+    a, b, c, d = solution.x[:4].tolist()
     return SurveyFit(
         (a, b, c, d),
-        _sag(found.x[4:].tolist()),
+        _sag(solution.x[4:].tolist()),
         (float(errors[0]), float(errors[1]), float(errors[2]), float(errors[3])),
         tuple(before),
         tuple(np.linalg.norm(after, axis=1).tolist()),
@@ -151,7 +151,7 @@ def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | 
 
 
 def most_informative_poses(kin: Kinematics, candidates: Sequence[Sequence[float]], count: int) -> list[int]:
-    """The candidate poses that, surveyed together, leave the least uncertainty of the pin at all of them (greedy)."""
+    """Choose the candidates that, surveyed together, leave the least uncertainty of the pin at all of them (greedy)."""
     usual = [*[0.0] * 4, *USUAL_PARAMETERS]
     spread = _prior_sigma(True)
     rows = []
@@ -166,15 +166,15 @@ def most_informative_poses(kin: Kinematics, candidates: Sequence[Sequence[float]
             columns.append(np.array([*pins[0] / PIN_SIGMA_M, moments[0] / MOMENT_SIGMA_NM]) / step)
         rows.append(np.array(columns).T)
     all_rows = np.array(rows)
-    wanted = np.einsum("nki,nkj->ij", all_rows[:, :3], all_rows[:, :3])
+    pin_sensitivity = np.einsum("nki,nkj->ij", all_rows[:, :3], all_rows[:, :3])
     information = np.diag(1.0 / spread**2)
     chosen: list[int] = []
     for _ in range(min(count, len(candidates))):
-        unknown = [
-            np.inf if i in chosen else float(np.trace(np.linalg.solve(information + r.T @ r, wanted)))
+        uncertainties = [
+            np.inf if i in chosen else float(np.trace(np.linalg.solve(information + r.T @ r, pin_sensitivity)))
             for i, r in enumerate(all_rows)
         ]
-        best = int(np.argmin(unknown))
+        best = int(np.argmin(uncertainties))
         chosen.append(best)
         information = information + all_rows[best].T @ all_rows[best]
     return chosen

@@ -26,7 +26,7 @@ class SurveyTargets:
 
 
 def load_targets(path: Path) -> SurveyTargets:
-    """The targets of a file with the columns ``COLUMNS`` and, where the camera measures depth, ``DEPTH_COLUMN``.
+    """Load the targets of a file with the columns ``COLUMNS`` and, where the camera measures depth, ``DEPTH_COLUMN``.
 
     Raises:
         InputRefused: the file cannot be read, a column is missing or a value is not a finite number.

@@ -41,7 +41,7 @@ class SignalColumn:
             self.values.append(value)
 
     def between(self, from_ns: int, to_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s after ``from_ns``] and values of a period."""
+        """Return times [s after ``from_ns``] and values of a period."""
         times = np.frombuffer(self.times_ns, np.int64)
         first, last = np.searchsorted(times, (from_ns, to_ns))
         values = np.frombuffer(self.values, float)[first:last].copy()
@@ -100,12 +100,12 @@ class BusTrace:
 
     def _read_valves(self, database: Database, message: str, prefix: str, columns: list[SignalColumn]) -> None:
         codec = database.message(message)
-        wanted = []
+        valve_signals = []
         for j in JOINTS:
             valve = joint(self._profile, j).valve
             if f"{prefix}{valve.signal}" in codec.index:
-                wanted.append((codec.index[f"{prefix}{valve.signal}"], 0.01 * valve.sign, columns[j]))
-        self._readers[codec.key] = (codec, wanted)
+                valve_signals.append((codec.index[f"{prefix}{valve.signal}"], 0.01 * valve.sign, columns[j]))
+        self._readers[codec.key] = (codec, valve_signals)
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -126,14 +126,14 @@ class BusTrace:
                         column.add(stamp_ns, scale * values[at])
 
     def lift_moment_nm(self, position: float, from_ns: int, to_ns: int) -> float:
-        """Mean moment at a resting lift joint at ``position`` [rad], by the pressures; NaN without any."""
+        """Compute the mean moment at a resting lift joint at ``position`` [rad], by the pressures; NaN without any."""
         a, b = (column.between(from_ns, to_ns)[1] for column in self.lift_bar)
         if not (len(a) and len(b)):
             return nan
         return lift_moment_nm(self._profile, position, float(np.mean(a)), float(np.mean(b)))
 
     def test(self, which: Joint, side: int, kind: str, from_ns: int, to_ns: int) -> SpoolTestRecord:
-        """The record of one joint between two times."""
+        """Return the record of one joint between two times."""
         grid = np.arange(0.0, (to_ns - from_ns) * _NS, GRID_S)
         times, commands = self.commands[which].between(from_ns, to_ns)
         # A command holds until the next one; a spool and a joint move between their samples.

@@ -78,18 +78,18 @@ class TurnFit:
         return sum(self.plus.turns_rad) - sum(self.minus.turns_rad)
 
     def side(self, side: int) -> SideFit:
-        """The fit of a side (+1, -1)."""
+        """Return the fit of a side (+1, -1)."""
         return self.plus if side > 0 else self.minus
 
 
 def fit_turns(turns: Sequence[Turn], spec: JointSpec) -> TurnFit:
-    """The fit of all turns so far; a side without turns keeps the profile's values."""
+    """Fit all turns so far; a side without turns keeps the profile's values."""
     plus, minus = (_fit_side([t for t in turns if t.record.side == side], spec, side) for side in SIDES)
     return TurnFit(plus, minus)
 
 
 def fitted_spec(spec: JointSpec, fit: TurnFit) -> JointSpec:
-    """The joint with the valve that a fit has found."""
+    """Return the joint with the valve that a fit has found."""
     valve = msgspec.structs.replace(
         spec.valve,
         deadband_plus_pct=100.0 * fit.plus.deadband,
@@ -103,7 +103,7 @@ def fitted_spec(spec: JointSpec, fit: TurnFit) -> JointSpec:
 def pulse_to(
     spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: float, allowed: Allowed | None = None
 ) -> SpoolProgram:
-    """The pulse that should end at an angle, counted as ``angle_rad``."""
+    """Plan the pulse that should end at an angle, counted as ``angle_rad``."""
     known, allowed = fit.side(side), allowed or allowed_by(spec)
     spec = fitted_spec(spec, fit)
 
@@ -114,10 +114,10 @@ def pulse_to(
         return known.full_speed * _full_speed_seconds(apply_backlash(spool, _half_backlash(spec)), spec, known.deadband)
 
     shut, held = turn_rad(0.0), turn_rad(1.0)
-    wanted = side * (to_rad - fit.angle_rad)
+    target_turn_rad = side * (to_rad - fit.angle_rad)
     least, most = HOLD_BOUNDS_S
     most = max(least, min(most, MAX_PULSE_S - pulse(spec, side, share, 0.0, allowed).duration_s))
-    hold_s = (wanted - shut) / (held - shut) if held > shut else most
+    hold_s = (target_turn_rad - shut) / (held - shut) if held > shut else most
     return pulse(spec, side, share, min(max(hold_s, least), most), allowed)
 
 
@@ -126,7 +126,7 @@ def _half_backlash(spec: JointSpec) -> float:
 
 
 def _full_speed_seconds(spool: np.ndarray, spec: JointSpec, deadband: float) -> float:
-    """Time at full speed for the turn of a spool behind its backlash, on the grid of a record, s."""
+    """Compute the time at full speed for the turn of a spool behind its backlash, on the grid of a record, s."""
     opening = np.clip((spool - deadband) / (1.0 - _half_backlash(spec) - deadband), 0.0, 1.0)
     return float(np.sum(opening**spec.valve.exponent)) * GRID_S
 
@@ -167,9 +167,9 @@ def _solve_side(
         least_squares(residuals, (start, 1.0), bounds=((0.0, 0.1), (0.6, 5.0)), x_scale=(0.01, 0.1))
         for start in sorted({deadband, *DEADBAND_STARTS})
     ]
-    found = min(fits, key=lambda fit: float(fit.cost))
-    error = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
-    p = found.x
+    best_fit = min(fits, key=lambda fit: float(fit.cost))
+    error = np.sqrt(np.diag(np.linalg.inv(best_fit.jac.T @ best_fit.jac)))
+    p = best_fit.x
     return SideFit(
         float(p[0]), float(p[1]) * full, (float(error[0]), float(error[1]) * full), tuple(seen), tuple(left(p).tolist())
     )

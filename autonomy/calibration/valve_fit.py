@@ -76,7 +76,7 @@ class ValveFit:
 
 
 def apply_backlash(spool: np.ndarray, half: float) -> np.ndarray:
-    """The spool behind a play of twice ``half``; it was neutral before."""
+    """Compute the spool behind a play of twice ``half``; it was neutral before."""
     out, at = [], 0.0
     for x in spool.tolist():
         if x - half > at:
@@ -101,7 +101,7 @@ class _TestModel:
         self._played: dict[float, np.ndarray] = {}
 
     def after_backlash(self, half: float) -> np.ndarray:
-        """The spool behind its play; cached, because most evaluations of a gradient share it."""
+        """Return the spool behind its play; cached, because most evaluations of a gradient share it."""
         if half not in self._played:
             if len(self._played) > 3:
                 self._played.clear()
@@ -109,30 +109,32 @@ class _TestModel:
         return self._played[half]
 
     def model(self, p: np.ndarray) -> np.ndarray:
-        """Positions for the parameters `_PARAMETER_NAMES`."""
-        first = 0 if self.side > 0 else 1
-        deadband, full, lag_s = p[first], p[4 + first], p[9 + first]
+        """Compute the positions for the parameters `_PARAMETER_NAMES`."""
+        side_index = 0 if self.side > 0 else 1
+        deadband, full, lag_s = p[side_index], p[4 + side_index], p[9 + side_index]
         half = 0.5 * p[2]
         opening = np.clip((self.after_backlash(half) - deadband) / (1.0 - half - deadband), 0.0, 1.0)
         speed = self.side * full * (1.0 + p[6] * self.along) * opening ** p[3]
-        way = np.cumsum(speed) * self.step_s
-        time = np.arange(len(way)) * self.step_s
+        travel = np.cumsum(speed) * self.step_s
+        time = np.arange(len(travel)) * self.step_s
         b, a = _second_order_lag(p[7], p[8], self.step_s)
-        result: np.ndarray = self.start + lfilter(b, a, np.interp(time - lag_s, time, way))
+        result: np.ndarray = self.start + lfilter(b, a, np.interp(time - lag_s, time, travel))
         return result
 
 
 def _second_order_lag(rad_s: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """A second-order lag as a digital filter (bilinear)."""
+    """Design a second-order lag as a digital filter (bilinear)."""
     k = 2.0 / step_s
-    first = k * k + 2.0 * zeta * rad_s * k + rad_s * rad_s
-    b = np.array([1.0, 2.0, 1.0]) * rad_s * rad_s / first
-    a = np.array([1.0, (2.0 * rad_s**2 - 2.0 * k * k) / first, (k * k - 2.0 * zeta * rad_s * k + rad_s**2) / first])
+    normalizer = k * k + 2.0 * zeta * rad_s * k + rad_s * rad_s
+    b = np.array([1.0, 2.0, 1.0]) * rad_s * rad_s / normalizer
+    a = np.array(
+        [1.0, (2.0 * rad_s**2 - 2.0 * k * k) / normalizer, (k * k - 2.0 * zeta * rad_s * k + rad_s**2) / normalizer]
+    )
     return b, a
 
 
 def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
-    """The valve of one joint from its tests (both sides, sweep and staircase each)."""
+    """Fit the valve of one joint to its tests (both sides, sweep and staircase each)."""
     joint = tests[0].joint
     at = float(np.mean([np.mean(t.position) for t in tests]))
     stretches = [_TestModel(t, at) for t in tests]
@@ -167,10 +169,10 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
         ]
         return np.concatenate([*((s.position - s.model(p)) / noise for s in stretches), np.array(prior) * PRIOR_WEIGHT])
 
-    found = least_squares(
+    solution = least_squares(
         residuals, start, bounds=(low, high), x_scale=scale, loss="soft_l1", max_nfev=_MAX_EVALUATIONS
     )
-    p = found.x
+    p = solution.x
     modelled = tuple(
         np.interp(t.time_s, t.time_s[::DECIMATION], s.model(p)) for t, s in zip(tests, stretches, strict=True)
     )
@@ -186,12 +188,14 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
         lags_s=(float(p[9]), float(p[10])),
         residual=float(np.sqrt(np.mean(errors**2))),
         modelled=modelled,
-        errors=_standard_errors(found, spec.speed_limit),
+        errors=_standard_errors(solution, spec.speed_limit),
     )
 
 
 def _standard_errors(found: Any, speed_limit: float) -> dict[str, float]:
-    """Standard errors of the parameters from the curvature of the cost, for correlated residuals, and of the speeds."""
+    """Compute standard errors of the parameters from the curvature of the cost, for correlated residuals, and of the
+    speeds.
+    """
     names = (*_PARAMETER_NAMES, *_SPEED_NAMES)
     try:
         covariance = np.linalg.inv(found.jac.T @ found.jac)
@@ -204,7 +208,7 @@ def _standard_errors(found: Any, speed_limit: float) -> dict[str, float]:
 
 
 def _speed_slopes(p: np.ndarray, first: int, speed_limit: float) -> np.ndarray:
-    """Derivatives of the logarithm of a side's speed by the parameters, at the spool that gives the speed limit."""
+    """Compute the derivatives of the logarithm of a side's speed by the parameters, at the spool of the speed limit."""
     deadband, half, exponent, full = p[first], 0.5 * p[2], p[3], p[4 + first]
     opening = min(1.0, (speed_limit / full) ** (1.0 / exponent))
     rest = 1.0 - half - deadband
@@ -215,17 +219,18 @@ def _speed_slopes(p: np.ndarray, first: int, speed_limit: float) -> np.ndarray:
 
 
 def deadband_difference(fit: ValveFit, test: SpoolTestRecord) -> float:
-    """Difference between the dead-band of another test of that side and the fit's [share of full]; NaN if unclear.
+    """Compute the difference between the dead-band of another test of that side and the fit's [share of full]; NaN if
+    unclear.
 
     The test is not one of the fitted ones; all other parameters are taken from the fit.
     """
     stretch = _TestModel(test, fit.at)
-    first = 0 if test.side > 0 else 1
+    side_index = 0 if test.side > 0 else 1
     p = np.array([*fit.deadbands, fit.hysteresis, fit.exponent, *fit.full_speeds, fit.lever, *fit.ringing, *fit.lags_s])
 
     def misfit(shift: float) -> float:
         q = p.copy()
-        q[first] += shift
+        q[side_index] += shift
         return float(np.sum((stretch.position - stretch.model(q)) ** 2))
 
     best = minimize_scalar(misfit, bounds=(-0.06, 0.06), method="bounded")
@@ -258,7 +263,7 @@ class DelayFit:
 
 
 def fit_delay(tests: Sequence[SpoolTestRecord]) -> DelayFit | None:
-    """The fit of the staircases of both sides; None where the valve node reports no spools."""
+    """Fit the staircases of both sides; None where the valve node reports no spools."""
     usable = [t for t in tests if t.spool is not None and float(np.ptp(t.spool)) > 0.02]
     if not usable:
         return None
@@ -268,7 +273,7 @@ def fit_delay(tests: Sequence[SpoolTestRecord]) -> DelayFit | None:
 
 
 def _fit(tests: Sequence[SpoolTestRecord]) -> tuple[float, float, float]:
-    """Dead time, lag, residual."""
+    """Fit dead time and lag; return them and the residual."""
     step_s = GRID_S / FINE_FACTOR
 
     def residuals(p: np.ndarray) -> np.ndarray:
@@ -305,26 +310,28 @@ def _fit(tests: Sequence[SpoolTestRecord]) -> tuple[float, float, float]:
 
 
 def _spool_filter(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """The spool's second-order response as a digital filter (bilinear)."""
+    """Design the spool's second-order response as a digital filter (bilinear)."""
     k = 2.0 / step_s
-    first = k * k + 2.0 * zeta * omega * k + omega * omega
-    b = np.array([1.0, 2.0, 1.0]) * omega * omega / first
-    a = np.array([1.0, (2.0 * omega**2 - 2.0 * k * k) / first, (k * k - 2.0 * zeta * omega * k + omega**2) / first])
+    normalizer = k * k + 2.0 * zeta * omega * k + omega * omega
+    b = np.array([1.0, 2.0, 1.0]) * omega * omega / normalizer
+    a = np.array(
+        [1.0, (2.0 * omega**2 - 2.0 * k * k) / normalizer, (k * k - 2.0 * zeta * omega * k + omega**2) / normalizer]
+    )
     return b, a
 
 
 def response_s(test: SpoolTestRecord, deadband: float) -> float:
-    """Time from the command that leaves the dead-band to the joint's first motion in a staircase, s; NaN if it never
-    moves.
+    """Measure the time from the command that leaves the dead-band to the joint's first motion in a staircase, s; NaN if
+    it never moves.
 
     The joint counts as moving once it has travelled `MOVED_SHARE` of its travel in the first 0.3 s of steady motion.
     """
     opened = np.flatnonzero(test.side * test.command > deadband)
     if not len(opened):
         return float("nan")
-    way = test.side * (test.position - float(np.mean(test.position[: max(1, opened[0])])))
-    settled = min(len(way) - 1, opened[0] + round(0.6 / GRID_S))
+    travel = test.side * (test.position - float(np.mean(test.position[: max(1, opened[0])])))
+    settled = min(len(travel) - 1, opened[0] + round(0.6 / GRID_S))
     before = max(opened[0], settled - round(0.3 / GRID_S))
-    threshold = MOVED_SHARE * (way[settled] - way[before])
-    moved = np.flatnonzero(way[opened[0] :] > threshold)
+    threshold = MOVED_SHARE * (travel[settled] - travel[before])
+    moved = np.flatnonzero(travel[opened[0] :] > threshold)
     return float(moved[0] * GRID_S) if len(moved) else float("nan")

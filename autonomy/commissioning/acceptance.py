@@ -93,33 +93,33 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_protocol(data: bytes) -> Protocol:
-    """The form in a document.
+    """Read the form in a document.
 
     Raises:
         InputRefused: it is none, or does not have every check once.
     """
     try:
-        found = msgspec.json.decode(data, type=Protocol)
+        protocol = msgspec.json.decode(data, type=Protocol)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InputRefused("acceptance.document", f"this is no acceptance protocol: {error}") from None
-    if sorted(entry.id for entry in found.entries) != sorted(IDS):
+    if sorted(entry.id for entry in protocol.entries) != sorted(IDS):
         sentence = f"the protocol has not every check once; it needs {', '.join(IDS)}"
         raise InputRefused("acceptance.checks", sentence)
-    return found
+    return protocol
 
 
 def judge(protocol: Protocol) -> tuple[Verdict, list[str]]:
-    """What a protocol comes to, and a sentence for each reason why it is not accepted."""
+    """Judge what a protocol comes to, and write a sentence for each reason why it is not accepted."""
     titles = {check.id: check.title for check in CHECKS}
     failed = [f"{titles[e.id]}: failed." for e in protocol.entries if e.result is Result.FAIL]
     missing = [f"{titles[e.id]}: not checked." for e in protocol.entries if e.result is Result.OPEN]
     missing += [
-        f"{what} is missing."
-        for what, words in (
+        f"{field_name} is missing."
+        for field_name, value in (
             ("The machine's serial number", protocol.machine),
             ("The inspector's name", protocol.inspector),
         )
-        if not words.strip()
+        if not value.strip()
     ]
     if failed:
         return Verdict.REFUSED, failed + missing
@@ -127,7 +127,7 @@ def judge(protocol: Protocol) -> tuple[Verdict, list[str]]:
 
 
 def document(protocol: Protocol, facts: dict[str, Any]) -> dict[str, Any]:
-    """The protocol as it is kept: with its verdict, and ``facts`` that the server knows."""
+    """Return the protocol as it is kept: with its verdict, and ``facts`` that the server knows."""
     verdict, reasons = judge(protocol)
-    told: dict[str, Any] = msgspec.to_builtins(protocol)
-    return {**facts, **told, "verdict": verdict.value, "reasons": reasons}
+    contents: dict[str, Any] = msgspec.to_builtins(protocol)
+    return {**facts, **contents, "verdict": verdict.value, "reasons": reasons}

@@ -110,7 +110,7 @@ class _ThereAndBack:
         self.duration_s = self._turn_s + back.duration_s + REST_S
 
     def at(self, time_s: float) -> tuple[Axes, Axes]:
-        """Positions and velocities."""
+        """Return positions and velocities."""
         return self._out.at(time_s) if time_s < self._turn_s else self._back.at(time_s - self._turn_s)
 
 
@@ -180,7 +180,7 @@ class StepTest:
             self.idle = self.idle or self.begun_ns is None
 
     def step(self, now_ns: int, report: StateReport | None, frames: Sequence[Frame] = ()) -> bytes | None:
-        """One step, 20 Hz or faster; the datagram to send now, or None."""
+        """Take one step, 20 Hz or faster; return the datagram to send now, or None."""
         self._trace.accept(frames)
         self._pressures.accept(frames)
         dt_s = min((now_ns - (self._last_ns or now_ns)) * _NS, _MAX_TICK_S)
@@ -199,7 +199,7 @@ class StepTest:
         return self._drive(now_ns, dt_s)
 
     def result(self) -> StepResult:
-        """What a done test showed."""
+        """Evaluate what a done test showed."""
         assert self.begun_ns is not None and self.done
         times = np.array([stamp_ns - self.begun_ns for stamp_ns, _, _ in self._seen]) * _NS
         reference, position = (np.array([s[i] for s in self._seen]) for i in (1, 2))
@@ -216,7 +216,7 @@ class StepTest:
         error = reference - position
         turn_s, end_s = self._motion.duration_s / 2, self._motion.duration_s
         rests = [(times > t - MEAN_S) & (times <= t) for t in (turn_s, end_s)]
-        way = (position - self._start) * np.sign(self.amount)
+        travel = (position - self._start) * np.sign(self.amount)
         out = times <= turn_s
         return StepResult(
             self.joint,
@@ -225,8 +225,8 @@ class StepTest:
             series,
             largest_error=float(np.nanmax(np.abs(error))),
             rest_error=float(max(np.nanmean(np.abs(error[r])) for r in rests)),
-            overshoot=float(max(0.0, np.nanmax(way[out]) - abs(self.amount), -np.nanmin(way))),
-            delay_s=_first(times, way, abs(self.amount))
+            overshoot=float(max(0.0, np.nanmax(travel[out]) - abs(self.amount), -np.nanmin(travel))),
+            delay_s=_first(times, travel, abs(self.amount))
             - _first(times, (reference - self._start) * np.sign(self.amount), abs(self.amount)),
             largest_command_pct=float(np.nanmax(np.abs(series["command"]))),
         )
@@ -291,18 +291,18 @@ class StepTest:
 
 
 def largest_step(profile: Profile, which: Joint) -> float:
-    """The largest step of a joint [rad, m]."""
+    """Return the largest step of a joint [rad, m]."""
     spec = joint(profile, which)
     return LARGEST_SHARE * (spec.upper - spec.lower)
 
 
 def profile_margins(profile: Profile, which: Joint) -> tuple[float, float]:
-    """Phase [deg] and gain margin [dB] of a joint's loop with the valve that the profile describes."""
+    """Compute phase [deg] and gain margin [dB] of a joint's loop with the valve that the profile describes."""
     spec = joint(profile, which)
     return margins(spec.law.kp_1_s, spec.valve.delay_s, spec.valve.lag_s, spec.valve.oil_s)
 
 
 def _first(times: np.ndarray, way: np.ndarray, whole: float) -> float:
-    """When a way has passed `BEGUN_SHARE` of the whole; NaN when it never has."""
+    """Find when a way has passed `BEGUN_SHARE` of the whole; NaN when it never has."""
     passed = np.flatnonzero(way >= BEGUN_SHARE * whole)
     return float(times[passed[0]]) if len(passed) else float("nan")

@@ -288,10 +288,10 @@ class Activity(ActivityState):
         tracker = self._tracker
         self._elapsed_s += 0.0 if self._is_halting else dt_s
         stops = self._is_halting or self.phase is Phase.FAILED or self._restart_phase is not None
-        wanted = 0.0 if stops else motion_rate(self.phase, self._elapsed_s, tracker, self._grapple, self.grasp)
+        target_rate = 0.0 if stops else motion_rate(self.phase, self._elapsed_s, tracker, self._grapple, self.grasp)
         if self.phase is Phase.LIFT and self._cycle.is_bundle:
-            wanted *= self._cycle.lift_rate(self._position())
-        tracker.advance(dt_s, wanted, self._position())
+            target_rate *= self._cycle.lift_rate(self._position())
+        tracker.advance(dt_s, target_rate, self._position())
         if self.phase is Phase.FAILED and tracker.is_stopped:
             tracker.hold_here()
 
@@ -363,7 +363,7 @@ class Activity(ActivityState):
         self._enter(Phase.OPEN, self._tracker.setpoint)
 
     def _next(self, now_ns: int) -> Phase | None:
-        """The phase after this one, whose motion is done; None while a condition is not met."""
+        """Choose the phase after this one, whose motion is done; None while a condition is not met."""
         seen = self._arrived_ns is not None and self._inbox.logs_ns >= self._arrived_ns
         match self.phase:
             case Phase.LOOK:
@@ -393,7 +393,7 @@ class Activity(ActivityState):
         return Phase(self.phase + 1)
 
     def _after_look(self, now_ns: int) -> Phase | None:
-        """To a grasp; with camera measurements, further detections may still find one for a while."""
+        """Go on to a grasp; with camera measurements, further detections may still find one for a while."""
         first_ns = self._ready_ns
         if first_ns is not None and self._inbox.logs_ns < now_ns <= first_ns + DETECTION_TIMEOUT_NS:
             return None  # no new detection
@@ -407,7 +407,7 @@ class Activity(ActivityState):
         return Phase.ABOVE
 
     def _after_above(self, now_ns: int) -> Phase | None:
-        """Down, or first above a better grasp: from above, a camera measures logs better than from the side."""
+        """Go down, or first above a better grasp: from above, a camera measures logs better than from the side."""
         assert self._arrived_ns is not None
         if not self._cycle.needs_reselection:
             return Phase.DESCEND
@@ -427,7 +427,7 @@ class Activity(ActivityState):
         return Phase.LOOK
 
     def _touches_down(self) -> bool:
-        """Whether the load already rests, close above its place: what lies there may lie higher than was known."""
+        """Tell whether the load already rests, close above its place: what lies there may lie higher than was known."""
         return self._grapple.load_rests and self._cycle.is_close_above_place(self._position())
 
     def _after_turn(self, now_ns: int) -> Phase | None:
@@ -439,7 +439,7 @@ class Activity(ActivityState):
         return None if now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS else Phase.OPEN
 
     def _after_open(self, now_ns: int) -> Phase | None:
-        """Up and away, or done here with the next log in view."""
+        """Go up and away, or be done here with the next log in view."""
         assert self.grasp is not None
         if not self._grapple.has_released(self.grasp, self._elapsed_s):
             higher = self._grapple.must_open_higher(self.grasp) and self._cycle.open_higher()
@@ -488,8 +488,8 @@ class Activity(ActivityState):
             self._tracker.motion = turned
 
     def _waits_for_load(self, now_ns: int) -> bool:
-        """Whether a load that no picture shows may be seen yet: during the motion while something hangs in the jaws,
-        and for a while when the crane stands.
+        """Tell whether a load that no picture shows may be seen yet: during the motion while something hangs in the
+        jaws, and for a while when the crane stands.
         """
         if not self._cycle.is_load_hidden(self._position()):
             return False
@@ -498,7 +498,7 @@ class Activity(ActivityState):
         return now_ns < self._arrived_ns + HIDDEN_LOAD_NS
 
     def _is_seen_in_grapple(self, now_ns: int) -> bool:
-        """Whether a recent log list shows the log in the grapple."""
+        """Tell whether a recent log list shows the log in the grapple."""
         return self._direct and self._ready_ns == self._inbox.logs_ns and self._inbox.is_fresh(now_ns)
 
     @property

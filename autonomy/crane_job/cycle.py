@@ -177,7 +177,7 @@ class Cycle:
         return self.is_bundle or self._stirred or part or not self._motion_planner.direct
 
     def reselect_grasp(self, q: Axes) -> bool:
-        """Select again by the detection from above the grasp; returns whether the crane must move above another one."""
+        """Select again by the detection from above the grasp; return whether the crane must move above another one."""
         before = self.grasp
         assert before is not None
         count = self._reselection_count + 1
@@ -200,7 +200,7 @@ class Cycle:
         return True
 
     def after_closing(self, grapple: GrappleSequence) -> Phase | None:
-        """The next phase, None while the jaws still move."""
+        """Choose the next phase, None while the jaws still move."""
         assert self.grasp is not None
         following, self.grasp = self._recovery.after_closing(self.grasp, grapple)
         if following is Phase.ABOVE:
@@ -208,7 +208,7 @@ class Cycle:
         return following
 
     def has_slipped_off(self, grapple: GrappleSequence, q: Axes) -> bool:
-        """Whether the rising jaws are measured empty; then the grasp restarts from above."""
+        """Tell whether the rising jaws are measured empty; then the grasp restarts from above."""
         assert self.grasp is not None
         if self.risen_m(q) < WEIGHABLE_RISE_M:
             return False
@@ -220,7 +220,7 @@ class Cycle:
         return True
 
     def lift_rate(self, q: Axes) -> float:
-        """The rate at which a bundle may be lifted on.
+        """Compute the rate at which a bundle may be lifted on.
 
         1, less where its load comes near what the machine bears, for a pile that comes loose springs up and weighs
         more, and 0 where it comes too near.
@@ -233,7 +233,7 @@ class Cycle:
         return 1.0 - (1.0 - HEAVY_LIFT_RATE) * heavy
 
     def drop_load(self, q: Axes) -> bool:
-        """The jaws open here, and the grasp restarts from above; False after too many times."""
+        """Let the jaws open here, and restart the grasp from above; False after too many times."""
         assert self.grasp is not None
         self.place = self._arm.pose(q)
         restarted = self._recovery.after_overload(self.grasp)
@@ -248,7 +248,7 @@ class Cycle:
         self._stirred = True
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
-        """The motion of a phase that begins at ``q``, with grasp and place updated by the newest log list.
+        """Plan the motion of a phase that begins at ``q``, with grasp and place updated by the newest log list.
 
         ``closing_s``: how long closing jaws have been closing.
 
@@ -296,14 +296,14 @@ class Cycle:
             case Phase.CARRY:
                 self.lifted_kg = arm.load_kg
                 logs = self._logs_with_load([q])
-                self.place = place = plan_place(
+                self.place = drop_pose = plan_place(
                     arm, self._job, grasp, logs, grapple_yaw(self._profile, q), q[Joint.ROT]
                 )
-                if grasp.thinnest_m < THICK_LOG_M and self._horizontal_distance_m(q, place) < COLUMN_RADIUS_M:
+                if grasp.thinnest_m < THICK_LOG_M and self._horizontal_distance_m(q, drop_pose) < COLUMN_RADIUS_M:
                     load = next((log for log in logs if log.seen and log.id == grasp.log.id), None)
                     if load is not None:
                         self._turn_count += 1
-                        return turn_motion(arm, start, place, self._target, load, LOOSE_TURN_S_RAD)
+                        return turn_motion(arm, start, drop_pose, self._target, load, LOOSE_TURN_S_RAD)
                 return carry_motion(arm, self._motion_planner, start, self.place, grasp, logs, hangs=True)
         assert self.place is not None
         if phase is Phase.LOWER:
@@ -311,30 +311,30 @@ class Cycle:
         return straight_line(arm, start, start.at_height(max(start.z_m, retreat_height_m(self._profile))))
 
     def _hanging_kg(self, phase: Phase) -> float:
-        """The load that bends the crane in a phase, kg: that of a lifted log, otherwise 0."""
+        """Return the load that bends the crane in a phase, kg: that of a lifted log, otherwise 0."""
         return plausible_load_kg(self._inbox.report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
 
     # ------------------------------------------------------------------ position of the crane
     def is_close_above_place(self, q: Axes) -> bool:
-        """Whether the crane is in the last part of its way down to the place."""
+        """Tell whether the crane is in the last part of its way down to the place."""
         if self.place is None or self._horizontal_distance_m(q, self.place) > COLUMN_RADIUS_M:
             return False
         return 0.0 < self._arm.pose(q).z_m - self.place.z_m < TOUCH_DOWN_M
 
     def is_off_column(self, phase: Phase, q: Axes) -> bool:
-        """Whether the crane is outside the column of the phase's grasp or place."""
+        """Tell whether the crane is outside the column of the phase's grasp or place."""
         assert self.grasp is not None
         column = self.grasp.pose if phase < Phase.CARRY else self.place
         assert column is not None
         return self._horizontal_distance_m(q, column) > COLUMN_RADIUS_M
 
     def is_over_grasp(self, q: Axes) -> bool:
-        """Whether the load would come down where it was gripped."""
+        """Tell whether the load would come down where it was gripped."""
         assert self.grasp is not None
         return self._horizontal_distance_m(q, self.grasp.pose) < COLUMN_RADIUS_M
 
     def _is_at_place(self, start: Pose, place: Pose) -> bool:
-        """Whether a log released here lies as well as at its place."""
+        """Tell whether a log released here lies as well as at its place."""
         apart_m = dist((*self._arm.xy(start), start.z_m), (*self._arm.xy(place), place.z_m))
         return apart_m < _AT_PLACE_M and abs(start.rot_rad - place.rot_rad) < _AT_PLACE_RAD
 
@@ -342,26 +342,26 @@ class Cycle:
         return dist(self._arm.xy(self._arm.pose(q)), self._arm.xy(column))
 
     def risen_m(self, q: Axes) -> float:
-        """Rise of the pin since the phase began, m."""
+        """Return the rise of the pin since the phase began, m."""
         return self._arm.pose(q).z_m - self._phase_start_z_m
 
     def is_between_stakes(self, q: Axes) -> bool:
-        """Whether opening the jaws further would stir the load at the target."""
+        """Tell whether opening the jaws further would stir the load at the target."""
         return is_between_stakes(self._arm, self._target, q)
 
     # ------------------------------------------------------------------ the newest log list
     def primary_log(self) -> LogObservation | None:
-        """The log that the grasp grips, as detected now; None when it is hidden."""
+        """Return the log that the grasp grips, as detected now; None when it is hidden."""
         assert self.grasp is not None
         return next((log for log in self._visible_grasped_logs() if log.id == self.grasp.log.id), None)
 
     def other_logs(self) -> list[LogObservation]:
-        """The logs outside the grasp."""
+        """List the logs outside the grasp."""
         taken = {log.id for log in self._visible_grasped_logs()}
         return [log for log in self._inbox.logs if log.id not in taken]
 
     def confirm_lift(self, positions: Iterable[Axes], grapple: GrappleSequence) -> bool:
-        """Whether the gripped logs hang below one of the joint positions, and restrict the grasp to them.
+        """Tell whether the gripped logs hang below one of the joint positions, and restrict the grasp to them.
 
         Hidden logs count as held where the jaws did not close on nothing, or the load cell reads a load; thick ones
         always weigh something.
@@ -375,7 +375,7 @@ class Cycle:
         return held is not None or hidden
 
     def is_load_hidden(self, q: Axes) -> bool:
-        """Whether the load is thin, so that it may lie askew in closed jaws or weigh too little to tell, and no
+        """Tell whether the load is thin, so that it may lie askew in closed jaws or weigh too little to tell, and no
         picture shows it.
         """
         assert self.grasp is not None
@@ -384,8 +384,8 @@ class Cycle:
         return not visible_grasped_logs(self.grasp, self._logs_with_load([q]))
 
     def _logs_with_load(self, positions: Iterable[Axes], remembered: bool = True) -> Sequence[LogObservation]:
-        """The newest list, with or without what it remembers; what hangs in the jaws at one of these positions has the
-        number of the gripped log, and is nowhere else.
+        """Return the newest list, with or without what it remembers; what hangs in the jaws at one of these positions
+        has the number of the gripped log, and is nowhere else.
         """
         assert self.grasp is not None
         pins, gripped = map(self._arm.pose, positions), self.grasp.log.id
@@ -395,7 +395,7 @@ class Cycle:
         return [log for log in logs if log.seen or log.id == gripped or log.id not in self._load_ids]
 
     def count_miss(self) -> Problem | None:
-        """Count a grasp that came up empty; returns why no other is tried, or None."""
+        """Count a grasp that came up empty; return why no other is tried, or None."""
         assert self.grasp is not None
         seen = self._visible_grasped_logs()
         lost = next((log for log in seen if lies_in_bunk(self._target, log)), None)
@@ -408,15 +408,15 @@ class Cycle:
         return Problem("activity.log-missed", f"log {number} was missed {MAX_ATTEMPTS} times")
 
     def rotator_correction(self, q: Axes) -> float | None:
-        """The further rotator turn [rad] during the running motion for the log as it hangs; None when a new path is
-        needed.
+        """Compute the further rotator turn [rad] during the running motion for the log as it hangs; None when a new
+        path is needed.
         """
         assert self.grasp is not None and self.place is not None
-        place = corrected_place(self._arm, self._job, self.grasp, self.place, self._logs_with_load([q]), q)
-        if place is None:
+        corrected_pose = corrected_place(self._arm, self._job, self.grasp, self.place, self._logs_with_load([q]), q)
+        if corrected_pose is None:
             return None
-        turn = place.rot_rad - self.place.rot_rad
-        self.place, self.lifted_kg = place, self._hanging_kg(Phase.CARRY)
+        turn = corrected_pose.rot_rad - self.place.rot_rad
+        self.place, self.lifted_kg = corrected_pose, self._hanging_kg(Phase.CARRY)
         return turn
 
     @property
@@ -425,19 +425,19 @@ class Cycle:
         return 0 < self._turn_count <= MAX_FURTHER_TURNS
 
     def shows_load(self, q: Axes) -> bool:
-        """Whether the newest picture shows the load, and not only the list, which remembers it as it hung before."""
+        """Tell whether the newest picture shows the load, not only the list, which remembers it as it hung before."""
         assert self.grasp is not None
         return bool(visible_grasped_logs(self.grasp, self._logs_with_load([q], remembered=False)))
 
     def has_spun_on(self, q: Axes) -> bool:
-        """Whether the newest picture shows the load askew above its place."""
+        """Tell whether the newest picture shows the load askew above its place."""
         assert self.grasp is not None and self.place is not None
         shown = self._logs_with_load([q], remembered=False)
-        place = corrected_place(self._arm, self._job, self.grasp, self.place, shown, q)
-        return place is None or abs(place.rot_rad - self.place.rot_rad) > _ASKEW_RAD
+        corrected_pose = corrected_place(self._arm, self._job, self.grasp, self.place, shown, q)
+        return corrected_pose is None or abs(corrected_pose.rot_rad - self.place.rot_rad) > _ASKEW_RAD
 
     def with_turn(self, motion: Trajectory, from_s: float, turn_rad: float) -> Trajectory | None:
-        """The running motion with a further turn of the rotator; None where it ends too soon for that."""
+        """Return the running motion with a further turn of the rotator; None where it ends too soon for that."""
         return with_rotation(self._arm, motion, from_s, turn_rad) if turn_rad else motion
 
     def plan_return(self) -> None:
@@ -457,7 +457,7 @@ class Cycle:
         return True
 
     def misplaced_log(self) -> Problem | None:
-        """Why a released log does not lie where it should, or None when all do."""
+        """Tell why a released log does not lie where it should, or None when all do."""
         seen = [log for log in self._inbox.logs if log.seen and log.id == self._load_id] or self._visible_grasped_logs()
         log = next((log for log in seen if not is_at_target(self._job, self._target, log)), None)
         if log is None:

@@ -69,29 +69,31 @@ _MAX_CLOSE_RATE: Final = 1.3
 
 
 def following_rate(ahead_s: float) -> float:
-    """Rate at which the pin follows the sweep of jaws that are ``ahead_s`` ahead of it; 1 where that is NaN."""
+    """Compute the rate at which the pin follows the sweep of jaws that are ``ahead_s`` ahead of it; 1 where that is
+    NaN.
+    """
     return min(max(1.0 + _CLOSE_GAIN_1_S * ahead_s, 0.0), _MAX_CLOSE_RATE) if isfinite(ahead_s) else 1.0
 
 
 def has_closed(report: StateReport, closing_s: float) -> bool:
-    """Whether the jaws have closed, on something or nothing, ``closing_s`` after the command."""
+    """Tell whether the jaws have closed, on something or nothing, ``closing_s`` after the command."""
     return closing_s > _MIN_CLOSING_S and report.grapple_state in (_STATE_CLOSED_EMPTY, _STATE_HOLDING)
 
 
 def is_closed_empty(report: StateReport) -> bool:
-    """Whether the jaws closed to the end of their stroke without holding anything."""
+    """Tell whether the jaws closed to the end of their stroke without holding anything."""
     return report.grapple_state == _STATE_CLOSED_EMPTY
 
 
 def is_open(profile: Profile, report: StateReport, opening_s: float) -> bool:
-    """Whether the jaws are open; without a sensor, by the time since the command."""
+    """Tell whether the jaws are open; without a sensor, by the time since the command."""
     if isfinite(report.opening_pct):
         return report.opening_pct >= _OPEN_FROM_PCT
     return opening_s > profile.grapple.open_time_s
 
 
 def has_released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: float) -> bool:
-    """Whether the jaws have left the logs that they held."""
+    """Tell whether the jaws have left the logs that they held."""
     grapple = profile.grapple
     angle = release_angle_rad(profile, max(log.diameter_m for log in grasp.logs))
     if grasp.others:
@@ -103,13 +105,13 @@ def has_released(profile: Profile, report: StateReport, grasp: Grasp, opening_s:
 
 
 def is_between_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
-    """Whether open jaws are so low over a bunk that opening them further would stir its load."""
+    """Tell whether open jaws are so low over a bunk that opening them further would stir its load."""
     pose, top_m = arm.pose(q), bunk.floor_z_m + bunk.stake_height_m
     return is_over_bunk(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.jaws, 0.0)
 
 
 def equivalent_closing_s(profile: Profile, report: StateReport) -> float:
-    """How long jaws of nominal speed would have been closing to be where they are measured, s; NaN if unknown."""
+    """Tell how long jaws of nominal speed would have been closing to be where they are measured, s; NaN if unknown."""
     opening = report.opening_pct
     if not isfinite(opening):
         return opening
@@ -184,22 +186,22 @@ class GrappleSequence:
         return is_open(self._profile, self._inbox.report, self._opening_s)
 
     def is_stalled_wide(self, grasp: Grasp) -> bool:
-        """Whether the jaws are measured too wide open to be under what they hold; False without a sensor."""
+        """Tell whether the jaws are measured too wide open to be under what they hold; False without a sensor."""
         wood_m = sum(log.diameter_m for log in grasp.logs)
         return self._inbox.report.opening_pct > _STALLED_WIDE_PCT or self._gap_m() > wood_m + _STALLED_EXCESS_M
 
     def has_missed(self, grasp: Grasp) -> bool:
-        """Whether the jaws are measured to have closed on nothing where thick logs were, or to pinch the upper half
-        of a log whose underside they should reach; False without a sensor.  What a load cell weighs was not missed: a
-        log may be thinner than it was measured.
+        """Tell whether the jaws are measured to have closed on nothing where thick logs were, or to pinch the upper
+        half of a log whose underside they should reach; False without a sensor.  What a load cell weighs was not
+        missed: a log may be thinner than it was measured.
         """
         if is_closed_empty(self._inbox.report):
             return grasp.thinnest_m > THICK_LOG_M and self.lifts_nothing
         return grasp.extracts and self._gap_m() > _UNDER_LOG_SHARE * grasp.thinnest_m
 
     def has_lost(self, grasp: Grasp) -> bool:
-        """Whether nothing has been weighed for a while although thick logs should hang in the jaws; False where the
-        load is not known.
+        """Tell whether nothing has been weighed for a while although thick logs should hang in the jaws; False where
+        the load is not known.
         """
         return grasp.thinnest_m > THICK_LOG_M and self._unladen_s > _UNLADEN_S
 
@@ -219,7 +221,7 @@ class GrappleSequence:
         return is_closed_empty(self._inbox.report) and self._inbox.report.load_kg < _EMPTY_ON_GROUND_KG
 
     def _gap_m(self) -> float:
-        """Gap between the tips, m; 0 without a sensor."""
+        """Compute the gap between the tips, m; 0 without a sensor."""
         opening, jaws = self._inbox.report.opening_pct, self._profile.grapple.jaws
         return 2.0 * half_gap_m(jaws, jaw_angle_from_opening_pct(jaws, opening)) if isfinite(opening) else 0.0
 
@@ -234,34 +236,34 @@ class GrappleSequence:
         return self._still_s > _STILL_S
 
     def has_closed(self, closing_s: float) -> bool:
-        """Whether the jaws have closed, on something or nothing, ``closing_s`` after the command."""
+        """Tell whether the jaws have closed, on something or nothing, ``closing_s`` after the command."""
         return has_closed(self._inbox.report, closing_s)
 
     def has_released(self, grasp: Grasp, opening_s: float) -> bool:
-        """Whether the jaws have left the logs of a grasp, ``opening_s`` after the command to open, or have opened until
-        they pushed against something, given way, and the crane has swung out.
+        """Tell whether the jaws have left the logs of a grasp, ``opening_s`` after the command to open, or have opened
+        until they pushed against something, given way, and the crane has swung out.
         """
         if self.is_obstructed:
             return self._since_push_s > _STILL_S and not self._encloses(grasp)
         return has_released(self._profile, self._inbox.report, grasp, opening_s)
 
     def must_open_higher(self, grasp: Grasp) -> bool:
-        """Whether jaws that gave way, and are at rest, still enclose the log: risen, they would take it with them."""
+        """Tell whether jaws that gave way, and are at rest, still enclose the log: risen, they would take it along."""
         return self.is_obstructed and self._since_push_s > _STILL_S and self._encloses(grasp)
 
     def _encloses(self, grasp: Grasp) -> bool:
-        """Whether the jaws are measured too far closed to leave the log of a grasp behind; the logs of a bundle roll
-        out of jaws that are half open.
+        """Tell whether the jaws are measured too far closed to leave the log of a grasp behind; the logs of a bundle
+        roll out of jaws that are half open.
         """
         report = self._inbox.report
         return isfinite(report.opening_pct) and not grasp.others and not has_released(self._profile, report, grasp, 0.0)
 
     def start_following(self) -> float:
-        """Let the pin follow the jaws from now on: returns how long they have been closing, s; 0 without a sensor."""
+        """Let the pin follow the jaws from now on: return how long they have been closing, s; 0 without a sensor."""
         measured_s = equivalent_closing_s(self._profile, self._inbox.report)
         self._close_from_s = measured_s if isfinite(measured_s) else 0.0
         return self._close_from_s
 
     def following_rate(self, clock_s: float) -> float:
-        """Rate at which the pin's motion goes on after ``clock_s`` of it."""
+        """Return the rate at which the pin's motion goes on after ``clock_s`` of it."""
         return following_rate(equivalent_closing_s(self._profile, self._inbox.report) - self._close_from_s - clock_s)

@@ -29,13 +29,17 @@ MAX_CORRECTION_RAD: Final = 0.4
 
 
 def visible_grasped_logs(grasp: Grasp, logs: Sequence[LogObservation]) -> list[LogObservation]:
-    """The logs of the grasp that are visible now; a hidden log is left out, as its remembered pose is out of date."""
-    wanted = [log.id for log in grasp.logs]
-    return [log for log in logs if log.seen and log.id in wanted]
+    """Return the logs of the grasp that are visible now; a hidden log is left out, as its remembered pose is out of
+    date.
+    """
+    grasped_ids = [log.id for log in grasp.logs]
+    return [log for log in logs if log.seen and log.id in grasped_ids]
 
 
 def lifted_part(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: Iterable[Pose]) -> Grasp | None:
-    """The grasp with the logs that hang below one of the pins, and the hidden ones; None when none is seen to hang."""
+    """Restrict the grasp to the logs that hang below one of the pins, and the hidden ones; None when none is seen to
+    hang.
+    """
     poses = list(pins)
     held = [log.id for log in seen if any(hangs_below(arm, log, pin) for pin in poses)]
     if not held:
@@ -45,8 +49,8 @@ def lifted_part(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: It
 
 
 def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose, margin_m: float = 0.0) -> bool:
-    """Whether a log lies on the centre line of closed jaws under a pin: only what they hold can.  A list may contain
-    the held log twice when it was measured wrongly during the motion and tracked as another one.
+    """Tell whether a log lies on the centre line of closed jaws under a pin: only what they hold can.  A list may
+    contain the held log twice when it was measured wrongly during the motion and tracked as another one.
 
     ``margin_m``: how far beside the jaws, and beyond its ends, it may be measured; never lower, where other logs lie.
     """
@@ -62,12 +66,12 @@ def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose, margin_m: float = 
 
 
 def is_part_of_load(arm: Arm, load: LogObservation, found: LogObservation, pin: Pose) -> bool:
-    """Whether a found log is a visible part of the load under the pin: grapple and crane hide the rest of it."""
+    """Tell whether a found log is a visible part of the load under the pin: grapple and crane hide the rest of it."""
     return is_between_jaws(arm, _made_whole(arm, load, found, pin), pin, LOAD_MARGIN_M)
 
 
 def _made_whole(arm: Arm, load: LogObservation, found: LogObservation, pin: Pose) -> LogObservation:
-    """What is found, as long as the load: its end away from the pin is a true end, the other one is hidden."""
+    """Make what is found as long as the load: its end away from the pin is a true end, the other one is hidden."""
     missing_m = load.length_m - found.length_m
     if missing_m <= 0.0:
         return found
@@ -81,7 +85,8 @@ def _made_whole(arm: Arm, load: LogObservation, found: LogObservation, pin: Pose
 def with_load_recognized(
     arm: Arm, grasp: Grasp, logs: Sequence[LogObservation], pins: Iterable[Pose]
 ) -> tuple[Sequence[LogObservation], int]:
-    """The list with the log that hangs in the jaws under the number of the gripped one, and its number in the list.
+    """Return the list with the log that hangs in the jaws under the number of the gripped one, and its number in the
+    list.
 
     A log that was hidden on its way is found again as another one: its track stayed where it was gripped.  Only a part
     of it may be visible, or both its ends as two logs, so its length stays that of the gripped log.  The newest picture
@@ -102,8 +107,8 @@ def with_load_recognized(
 
 
 def is_at_target(job: CraneJob, target: Bunk, log: LogObservation) -> bool:
-    """Whether a released log lies where it should: in the target and not across its stakes, or, where a job only clears
-    its source, low beside the source, for it may roll.
+    """Tell whether a released log lies where it should: in the target and not across its stakes, or, where a job only
+    clears its source, low beside the source, for it may roll.
     """
     if lies_in_bunk(target, log) or job.source is None:
         return lies_in_bunk(target, log) and not lies_across_stakes(target, log)
@@ -115,23 +120,23 @@ def is_at_target(job: CraneJob, target: Bunk, log: LogObservation) -> bool:
 def corrected_place(
     arm: Arm, job: CraneJob, grasp: Grasp, place: Pose, logs: Sequence[LogObservation], position: Sequence[float]
 ) -> Pose | None:
-    """The place with the rotator corrected for how the log is seen to hang; None when a new path is needed.
+    """Return the place with the rotator corrected for how the log is seen to hang; None when a new path is needed.
 
     ``position``: the measured joints, rad (EXT m).
     """
-    seen = next((log for log in visible_grasped_logs(grasp, logs) if log.id == grasp.log.id), None)
-    if seen is None:
+    visible_log = next((log for log in visible_grasped_logs(grasp, logs) if log.id == grasp.log.id), None)
+    if visible_log is None:
         return place
-    if 0.5 * seen.length_m * (abs(seen.axis[2]) - abs(grasp.log.axis[2])) > MAX_EXTRA_SAG_M:
+    if 0.5 * visible_log.length_m * (abs(visible_log.axis[2]) - abs(grasp.log.axis[2])) > MAX_EXTRA_SAG_M:
         return None
     try:
-        wanted = plan_place(arm, job, grasp, logs, grapple_yaw(arm.profile, position), place.rot_rad)
+        planned_pose = plan_place(arm, job, grasp, logs, grapple_yaw(arm.profile, position), place.rot_rad)
     except NoGrasp:
         return None  # planning the phase again reports why
-    turn = abs(wanted.rot_rad - place.rot_rad)
-    if turn > MAX_CORRECTION_RAD or dist(arm.xy(wanted), arm.xy(place)) > COLUMN_RADIUS_M:
+    turn = abs(planned_pose.rot_rad - place.rot_rad)
+    if turn > MAX_CORRECTION_RAD or dist(arm.xy(planned_pose), arm.xy(place)) > COLUMN_RADIUS_M:
         return None
-    return place._replace(rot_rad=wanted.rot_rad) if turn > MIN_CORRECTION_RAD else place
+    return place._replace(rot_rad=planned_pose.rot_rad) if turn > MIN_CORRECTION_RAD else place
 
 
 # -- Recovery from a failed grasp: what closed jaws tell before anything is lifted, and what is tried then.
@@ -162,7 +167,7 @@ class GraspRecovery:
     excluded_logs: tuple[int, ...] = ()
 
     def after_closing(self, grasp: Grasp, grapple: GrappleSequence) -> tuple[Phase | None, Grasp]:
-        """The next phase, None while the jaws still move, and the grasp as it is tried next."""
+        """Choose the next phase, None while the jaws still move, and the grasp as it is tried next."""
         if not is_camera_measured(grasp):
             return Phase.LIFT, grasp
         clasps = grapple.is_stalled_wide(grasp)
@@ -177,12 +182,12 @@ class GraspRecovery:
         return Phase.ABOVE, self._restarted(grasp)
 
     def after_rising(self, grasp: Grasp, grapple: GrappleSequence) -> Grasp | None:
-        """The grasp to restart where the rising jaws weigh nothing; None where they may hold something."""
+        """Return the grasp to restart where the rising jaws weigh nothing; None where they may hold something."""
         empty = is_camera_measured(grasp) and grapple.is_still and grapple.holds_nothing
         return self._restarted(grasp) if empty and self.restart_count < MAX_RESTARTS else None
 
     def after_overload(self, grasp: Grasp) -> Grasp | None:
-        """The grasp to restart where the load is too heavy; None after too many times."""
+        """Return the grasp to restart where the load is too heavy; None after too many times."""
         return self._restarted(grasp) if self.restart_count < MAX_RESTARTS else None
 
     def _restarted(self, grasp: Grasp) -> Grasp:
@@ -192,12 +197,12 @@ class GraspRecovery:
 
 
 def _inner_logs(grasp: Grasp) -> tuple[int, ...]:
-    """The numbers of the logs of a grasp that have others of it on both sides."""
+    """List the numbers of the logs of a grasp that have others of it on both sides."""
     ax, ay, _ = grasp.log.axis
     across = sorted(grasp.logs, key=lambda log: log.center_m[1] * ax - log.center_m[0] * ay)
     return tuple(log.id for log in across[1:-1])
 
 
 def is_camera_measured(grasp: Grasp) -> bool:
-    """Whether a camera measured one of its logs."""
+    """Tell whether a camera measured one of its logs."""
     return any(log.covariance is not None for log in grasp.logs)

@@ -49,14 +49,14 @@ class Inbox:
         return self._report
 
     def position(self, setpoint: Sequence[float]) -> tuple[float, ...]:
-        """The measured joints; one without an encoder counts as being at its ``setpoint``."""
+        """Return the measured joints; one without an encoder counts as being at its ``setpoint``."""
         return tuple(
             p if joint(self._profile, j).encoder is not None else q
             for j, p, q in zip(JOINTS, self.report.position, setpoint, strict=True)
         )
 
     def blocked_reason(self, now_ns: int, setpoint: Sequence[float]) -> Problem | None:
-        """Why the controller would execute no setpoint now."""
+        """Tell why the controller would execute no setpoint now."""
         if self._report is None:
             return Problem("activity.no-report", "the controller has not reported")
         if now_ns - self._report_ns > REPORT_TIMEOUT_NS:
@@ -69,5 +69,5 @@ class Inbox:
         return None
 
     def is_fresh(self, now_ns: int) -> bool:
-        """Whether the log list shows the present moment."""
+        """Tell whether the log list shows the present moment."""
         return now_ns - self.logs_ns < LOG_LIST_FRESH_NS

@@ -24,7 +24,7 @@ _SINKING_S: Final = 0.6
 def motion_rate(
     phase: Phase, elapsed_s: float, tracker: TrajectoryTracker, grapple: GrappleSequence, grasp: Grasp | None
 ) -> float:
-    """The wanted rate of the motion, seconds per second; 0 where it should stop and wait."""
+    """Compute the wanted rate of the motion, seconds per second; 0 where it should stop and wait."""
     match phase:
         case Phase.CLOSE if grasp is None or not grasp.dragging:
             return 0.0 if grapple.has_closed(elapsed_s) else grapple.following_rate(tracker.clock_s)
@@ -43,7 +43,7 @@ def is_motion_done(
     grasp: Grasp | None,
     position: Sequence[float],
 ) -> bool:
-    """Whether the motion is done and at rest, with the joints measured at ``position``, rad (EXT m)."""
+    """Tell whether the motion is done and at rest, with the joints measured at ``position``, rad (EXT m)."""
     if phase is Phase.CLOSE:
         held = tracker.is_stopped and not (grasp is not None and grasp.dragging)
         return grapple.has_closed(elapsed_s) and (held or tracker.left_s <= 0.0)
@@ -56,6 +56,6 @@ def is_motion_done(
 
 
 def _stopped_by_wood(elapsed_s: float, tracker: TrajectoryTracker) -> bool:
-    """Whether open jaws that penetrate a pile get no deeper; they sink further as they close."""
+    """Tell whether open jaws that penetrate a pile get no deeper; they sink further as they close."""
     late = elapsed_s > tracker.motion.duration_s + _SINKING_S
     return late or (tracker.is_stopped and elapsed_s > _SINKING_S)

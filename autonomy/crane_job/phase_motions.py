@@ -48,8 +48,8 @@ PILE_LIFT_S: Final = 6.0
 def approach_motion(
     arm: Arm, motion_planner: MotionPlanner, start: Pose, grasp: Grasp, logs: Sequence[LogObservation]
 ) -> Trajectory:
-    """With open jaws to where they close, or above it: among other logs, and on tyres, only a last vertical descent is
-    safe.
+    """Approach with open jaws to where they close, or above it: among other logs, and on tyres, only a last vertical
+    descent is safe.
     """
     # The enlarged log makes the open jaws come from above rather than from the side: both log and jaws may be off a
     # little.
@@ -69,7 +69,7 @@ def approach_motion(
 
 
 def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> Grasp:
-    """The grasp moved with its log, which the list now sees elsewhere: the machine leans, and a nearer view is better.
+    """Move the grasp with its log, which the list now sees elsewhere: the machine leans, and a nearer view is better.
 
     Unchanged where the shift is less than ``MIN_AIM_CORRECTION_M`` or more than ``MAX_AIM_CORRECTION_M``, or where the
     moved grasp is out of reach.  A log on known ground does not rise: it is only measured higher.
@@ -102,7 +102,7 @@ def carry_motion(
     logs: Sequence[LogObservation],
     hangs: bool,
 ) -> Trajectory:
-    """With the log to its place; ``hangs``: the log is seen in the grapple, otherwise it lies as it was gripped."""
+    """Carry the log to its place; ``hangs``: the log is seen in the grapple, otherwise it lies as it was gripped."""
     scene, held = _scene_of_load(arm, start, grasp, logs, hangs)
     high_m, free_m = travel_height_m(arm.profile), approach_length_m(arm.profile, grasp.log)
     try:
@@ -114,7 +114,7 @@ def carry_motion(
 
 
 def turn_motion(arm: Arm, start: Pose, place: Pose, bunk: Bunk, load: LogObservation, s_rad: float) -> Trajectory:
-    """At the place, a thin load turned by ``s_rad`` seconds per radian, as it spins when turned fast.
+    """Turn a thin load at its place by ``s_rad`` seconds per radian, as it spins when turned fast.
 
     A load whose ends reach among the stakes goes up as it came, turns above them, and comes down again: a stake may be
     inside of its turn.
@@ -129,7 +129,7 @@ def turn_motion(arm: Arm, start: Pose, place: Pose, bunk: Bunk, load: LogObserva
 
 
 def reaches_stakes(bunk: Bunk, log: LogObservation) -> bool:
-    """Whether an end of a log is as far out as the stakes, or a hand's breadth from it."""
+    """Tell whether an end of a log is as far out as the stakes, or a hand's breadth from it."""
     half_m = 0.5 * log.length_m
     ends = [[c + side * half_m * a for c, a in zip(log.center_m, log.axis, strict=True)] for side in (-1, 1)]
     most_m = 0.5 * bunk.width_m - STAKE_CLEARANCE_M
@@ -139,7 +139,7 @@ def reaches_stakes(bunk: Bunk, log: LogObservation) -> bool:
 def _scene_of_load(
     arm: Arm, start: Pose, grasp: Grasp, logs: Sequence[LogObservation], hangs: bool
 ) -> tuple[CollisionScene, HeldLog]:
-    """What the load may hit, and the load."""
+    """Return what the load may hit, and the load."""
     taken = {log.id for log in grasp.logs}
     taken |= {log.id for log in logs if is_part_of_load(arm, grasp.log, log, start)}
     scene = collision_scene(arm.profile, logs, without=taken)
@@ -149,7 +149,7 @@ def _scene_of_load(
 
 
 def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:
-    """The pin follows the sweep of jaws that have been closing for ``begin_s``."""
+    """Let the pin follow the sweep of jaws that have been closing for ``begin_s``."""
     height = closing_height_curve(arm.profile, grasp.support_z_m, grasp.thinnest_m)
 
     def path(time_s: float) -> Pose:
@@ -159,7 +159,7 @@ def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Traje
 
 
 def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
-    """Drags the pinched log out of its row along the ground; no motion where that is out of reach."""
+    """Drag the pinched log out of its row along the ground; no motion where that is out of reach."""
     (x, y), log = arm.xy(start), grasp.log
     offset = x - log.center_m[0], y - log.center_m[1]
     along = offset[0] * log.axis[0] + offset[1] * log.axis[1]
@@ -174,14 +174,14 @@ def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
 
 
 def bundle_lift_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
-    """Lifts a bundle slowly: its logs settle, and the jaws follow under them."""
+    """Lift a bundle slowly: its logs settle, and the jaws follow under them."""
     column = start if grasp.dragging else grasp.pose
     goal = column.at_height(travel_height_m(arm.profile))
     return slow_line(arm, start, goal, PILE_LIFT_S if grasp.penetrates and not grasp.dragging else BUNDLE_LIFT_S)
 
 
 def stow_motion(arm: Arm, motion_planner: MotionPlanner, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:
-    """Over the bunk, high enough for the open grapple to clear the stakes; no lateral motion where it is there."""
+    """Stow over the bunk, high enough for the open grapple to clear the stakes; no lateral motion where it is there."""
     bunk, high_m = arm.profile.bunk, retreat_height_m(arm.profile)
     if is_over_bunk(bunk, *arm.xy(start)):
         return straight_line(arm, start, start.at_height(max(start.z_m, high_m)))

@@ -81,7 +81,7 @@ RESUME_PHASE: Final = {
 
 
 def grapple_command(phase: Phase, is_bundle: bool, stow_only: bool) -> GrappleCommand:
-    """The grapple's command in a phase.
+    """Return the grapple's command in a phase.
 
     With a bundle the grapple keeps closing, for the logs settle and the jaws follow; at the end of a job that only
     stows the crane it does not open.

@@ -66,18 +66,18 @@ class RotatorEstimate:
         return min(aa, nn, pp) >= 0.0 and correlates and all(least <= pace <= most for pace in self.paces)
 
     def angle(self, sent_rad: float) -> float:
-        """The angle at a count, rad."""
+        """Return the angle at a count, rad."""
         turn = sent_rad - self.sent_rad
         return self.angle_rad + self.paces[turn > 0.0] * turn
 
     def sent(self, angle_rad: float) -> float:
-        """The count that leads to an angle, rad."""
+        """Return the count that leads to an angle, rad."""
         turn = angle_rad - self.angle_rad
         return self.sent_rad + turn / self.paces[turn > 0.0]
 
     def turned(self, sent_rad: float) -> RotatorEstimate:
-        """The estimate after a turn to one side, to a count.  A turn there and back is two of them: where the paces of
-        both sides differ, it does not end where it began.
+        """Return the estimate after a turn to one side, to a count.  A turn there and back is two of them: where the
+        paces of both sides differ, it does not end where it began.
         """
         turn = sent_rad - self.sent_rad
         if turn == 0.0:
@@ -91,7 +91,7 @@ class RotatorEstimate:
         return RotatorEstimate(sent_rad, self.angle(sent_rad), self.paces, (aa, an, ap, nn, np, pp))
 
     def corrected(self, sent_rad: float, angle_rad: float) -> RotatorEstimate:
-        """The estimate after the rotator was viewed at an angle, modulo pi, at this count."""
+        """Return the estimate after the rotator was viewed at an angle, modulo pi, at this count."""
         now = self.turned(sent_rad)
         aa, an, ap, nn, np, pp = now.covariance
         off, spread = remainder(angle_rad - now.angle_rad, pi), aa + VIEW_SIGMA_RAD**2
@@ -112,15 +112,15 @@ class RotatorEstimate:
         return RotatorEstimate(sent_rad, near, (minus, plus), left)
 
     def to_counts(self, q: Axes) -> Axes:
-        """Joints with the count in place of the rotator's angle."""
+        """Return the joints with the count in place of the rotator's angle."""
         return (*q[: Joint.ROT], self.sent(q[Joint.ROT]))
 
     def to_angles(self, q: Axes) -> Axes:
-        """Joints with the rotator's angle in place of the count."""
+        """Return the joints with the rotator's angle in place of the count."""
         return (*q[: Joint.ROT], self.angle(q[Joint.ROT]))
 
     def motion(self, motion: Motion) -> Motion:
-        """A motion of the angle as a motion of the count."""
+        """Convert a motion of the angle to a motion of the count."""
         return _CountMotion(motion, self)
 
 
@@ -140,12 +140,12 @@ class _CountMotion:
 
 
 def has_no_encoder(profile: Profile) -> bool:
-    """Whether the machine's rotator has no encoder."""
+    """Tell whether the machine's rotator has no encoder."""
     return joint(profile, Joint.ROT).encoder is None
 
 
 def planning_profile(profile: Profile, rotator: RotatorEstimate) -> Profile:
-    """The machine as motions are planned for it.
+    """Return the machine as motions are planned for it.
 
     A rotator without an encoder keeps its limits in counts and uses half of its range: the count may be off by a
     quarter turn and goes farther than the angle.
@@ -164,7 +164,7 @@ def planning_profile(profile: Profile, rotator: RotatorEstimate) -> Profile:
 
 
 def rotator_angle_of_hanging_log(profile: Profile, log: LogObservation, slew_rad: float) -> float:
-    """The rotator angle at which a log hangs in closed jaws as it is observed, rad, modulo pi."""
+    """Compute the rotator angle at which a log hangs in closed jaws as it is observed, rad, modulo pi."""
     straight = grapple_yaw(profile, (slew_rad, 0.0, 0.0, 0.0, 0.0))
     return atan2(log.axis[1], log.axis[0]) + pi / 2 - straight
 
@@ -202,11 +202,12 @@ class LoadView:
     articulation_rad: float
 
     def is_needed(self, rotator: RotatorEstimate, slew_rad: float) -> bool:
-        """Whether a load gripped at this slew should be shown."""
+        """Tell whether a load gripped at this slew should be shown."""
         return rotator.sigma_rad > (UNSURE_AHEAD_RAD if abs(slew_rad) > AHEAD_RAD else UNSURE_RAD)
 
     def pose(self, arm: Arm, start: Pose, diameter_m: float) -> Pose:
-        """The pose of the pin in which a load hangs in front of the camera, across its view and nearest to ``start``.
+        """Find the pose of the pin in which a load hangs in front of the camera, across its view and nearest to
+        ``start``.
 
         Raises:
             Unreachable: the crane does not reach there.
@@ -216,29 +217,29 @@ class LoadView:
         aside = np.array((-ahead[1], ahead[0]))
         height_m = float(mount.position_m[2]) - BELOW_CAMERA_M
         height_m += lowest_tip_below_pin_m(self.profile.grapple.jaws) - 0.5 * diameter_m
-        reached = []
+        reachable_poses = []
         for offset_m in sorted({side * m for m in ASIDE_M for side in (-1.0, 1.0)}):
             x, y = (mount.position_m[:2] + AHEAD_M * ahead + offset_m * aside).tolist()
             try:
                 pose = arm.pose_above(x, y, height_m, max(height_m, travel_height_m(self.profile)))
             except Unreachable:
                 continue
-            reached.append((abs(offset_m) + abs(pose.slew_rad - start.slew_rad), pose))
-        if not reached:
+            reachable_poses.append((abs(offset_m) + abs(pose.slew_rad - start.slew_rad), pose))
+        if not reachable_poses:
             raise Unreachable("the crane does not reach in front of the camera", "reach.camera")
-        pose = min(reached, key=lambda found: found[0])[1]
+        pose = min(reachable_poses, key=lambda found: found[0])[1]
         yaw = atan2(ahead[1], ahead[0])  # the jaws open along the view, so that the log lies across it
         return pose._replace(rot_rad=rotator_for_yaw(self.profile, pose.slew_rad, yaw, start.rot_rad))
 
 
 def load_in_view(arm: Arm, logs: Iterable[LogObservation], pin: Pose) -> LogObservation | None:
-    """What hangs in the jaws at a pin, of the logs of one picture; None where the picture shows no such log."""
+    """Find what hangs in the jaws at a pin, of the logs of one picture; None where the picture shows no such log."""
     hanging = (log for log in logs if is_between_jaws(arm, log, pin, VIEW_MARGIN_M))
     return max(hanging, key=lambda o: o.length_m, default=None)
 
 
 def load_view(profile: Profile, articulation_rad: float) -> LoadView | None:
-    """The view of the machine's camera ahead; None where it has none, or needs none for it has an encoder."""
+    """Return the view of the machine's camera ahead; None where it has none, or needs none for it has an encoder."""
     camera = next((c for c in profile.cameras.values() if c.link in VEHICLE_LINKS), None)
     if camera is None or not has_no_encoder(profile):
         return None

@@ -37,7 +37,7 @@ class TrajectoryTracker:
         self.motion, self.clock_s, self.rate, self._announced = motion, 0.0, 1.0, 0.0
 
     def announce(self) -> float:
-        """The rate that goes into a datagram now."""
+        """Return the rate that goes into a datagram now."""
         self._announced = self.rate
         return self.rate
 
@@ -68,7 +68,7 @@ class TrajectoryTracker:
         self.rate += min(max(wanted - self.rate, -most), most)
 
     def _following_rate(self, measured: Sequence[float]) -> float:
-        """1 while the joints follow, less while one lags by more than ``_MAX_LAG_S``, 0 at twice that."""
+        """Return 1 while the joints follow, less while one lags by more than ``_MAX_LAG_S``, 0 at twice that."""
         lags = [
             abs(q - p) / joint(self._profile, j).speed_limit
             for j, q, p in zip(JOINTS, self.setpoint, measured, strict=True)
@@ -76,14 +76,14 @@ class TrajectoryTracker:
         return min(max(2.0 - max(lags) / _MAX_LAG_S, 0.0), 1.0)
 
     def arrived(self, measured: Sequence[float], tolerance_factor: float) -> bool:
-        """Whether every joint is within ``tolerance_factor`` times ``ARRIVAL_TOLERANCE`` of its goal."""
+        """Tell whether every joint is within ``tolerance_factor`` times ``ARRIVAL_TOLERANCE`` of its goal."""
         return all(
             abs(p - g) <= tolerance_factor * near
             for p, g, near in zip(measured, self.motion.goal, ARRIVAL_TOLERANCE, strict=True)
         )
 
     def worst_joint(self, measured: Sequence[float]) -> str:
-        """The end of a sentence that names the joint farthest from its setpoint; empty when all are near."""
+        """Write the end of a sentence that names the joint farthest from its setpoint; empty when all are near."""
         errors = [
             (abs(p - w) / near, j, p - w)
             for j, p, w, near in zip(JOINTS, measured, self.setpoint, ARRIVAL_TOLERANCE, strict=True)

@@ -87,22 +87,22 @@ class BunkLoad:
         self._rest = self._bed[self._hollow]
 
     def place_at(self, across_m: float) -> RestingPlace:
-        """The resting place of a log released there; beyond the stakes it counts as beside them."""
+        """Return the resting place of a log released there; beyond the stakes it counts as beside them."""
         return self._place(int(np.argmin(np.abs(self._across - across_m))))
 
     def resting_point(self, across_m: float) -> tuple[float, float]:
-        """Where the axis of a log released there comes to rest: across the bunk and height, m."""
+        """Return where the axis of a log released there comes to rest: across the bunk and height, m."""
         i = int(self._hollow[np.argmin(np.abs(self._across - across_m))])
         return float(self._across[i]), float(self._bed[i])
 
     def lowest_place(self, reach_m: float) -> RestingPlace:
-        """The place at most ``reach_m`` from the middle where the log rests lowest.
+        """Find the place at most ``reach_m`` from the middle where the log rests lowest.
 
         Among equal places it prefers the one where the log rolls least, then the middle of an empty bunk or else the
         place nearest to the stakes: a log there cannot roll, and the middle fills by itself.
         """
-        places = np.flatnonzero(np.abs(self._across) <= reach_m + 0.5 * GRID_M).tolist()
-        found = [(i, self._place(i)) for i in places] or [(0, self.place_at(0.0))]
+        grid_indices = np.flatnonzero(np.abs(self._across) <= reach_m + 0.5 * GRID_M).tolist()
+        resting_places = [(i, self._place(i)) for i in grid_indices] or [(0, self.place_at(0.0))]
         sign = 1.0 if self._empty else -1.0
 
         def cost(item: tuple[int, RestingPlace]) -> tuple[int, int, float]:
@@ -112,7 +112,7 @@ class BunkLoad:
             rolls = abs(float(self._across[self._hollow[i]]) - rest.across_m)
             return round(cost / _COST_GRAIN_M), round(rolls / _ROLL_GRAIN_M), sign * abs(rest.across_m)
 
-        return min(found, key=cost)[1]
+        return min(resting_places, key=cost)[1]
 
     def _release_window(self, i: int, off_m: float = RELEASE_ERROR_M) -> slice:
         few = round(off_m / GRID_M)
@@ -122,7 +122,7 @@ class BunkLoad:
         return float(np.mean(self._rest[self._release_window(i)]))
 
     def _spread(self, i: int) -> float:
-        """How much more the resting places vary than the release places."""
+        """Compute how much more the resting places vary than the release places."""
         around = self._release_window(i, 2.0 * RELEASE_ERROR_M)
         return max(float(np.std(self._across[self._hollow[around]]) - np.std(self._across[around])), 0.0)
 
@@ -133,17 +133,17 @@ class BunkLoad:
 
 
 def log_in_bunk(bunk: Bunk, log: LogObservation) -> tuple[float, float]:
-    """Position of a log's centre along and across a bunk, from its middle, m."""
+    """Compute the position of a log's centre along and across a bunk, from its middle, m."""
     return point_in_bunk(bunk, log.center_m[0], log.center_m[1])
 
 
 def point_in_bunk(bunk: Bunk, x_m: float, y_m: float) -> tuple[float, float]:
-    """Position of a point along and across a bunk, from its middle, m."""
+    """Compute the position of a point along and across a bunk, from its middle, m."""
     return _rotated(bunk, x_m - bunk.center_m[0], y_m - bunk.center_m[1])
 
 
 def is_over_bunk(bunk: Bunk, x_m: float, y_m: float) -> bool:
-    """Whether a point is between the stakes, seen from above."""
+    """Tell whether a point is between the stakes, seen from above."""
     along, across = point_in_bunk(bunk, x_m, y_m)
     return abs(along) <= bunk.length_m / 2 and abs(across) <= bunk.width_m / 2
 
@@ -151,7 +151,7 @@ def is_over_bunk(bunk: Bunk, x_m: float, y_m: float) -> bool:
 def settled_in_bunk(
     bunk: Bunk, log: LogObservation, logs: Sequence[LogObservation], slope: tuple[float, float] = (0.0, 0.0)
 ) -> LogObservation:
-    """A log released over a bunk that holds others, as it then lies; a log beside the bunk stays as it is."""
+    """Return a log released over a bunk that holds others as it then lies; keep a log beside the bunk as it is."""
     if not is_over_bunk(bunk, *log.center_m[:2]):
         return log
     across = log_in_bunk(bunk, log)[1]
@@ -171,7 +171,7 @@ def _rotated(bunk: Bunk, x: float, y: float) -> tuple[float, float]:
 def _sections(
     bunk: Bunk, logs: Sequence[LogObservation], along: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lateral places and heights of the logs' axes, and their radii, in cross-sections through the bunk."""
+    """Compute lateral places and heights of the logs' axes, and their radii, in cross-sections through the bunk."""
     cuts = []
     for log in logs:
         middle = log_in_bunk(bunk, log)
@@ -188,7 +188,7 @@ def _sections(
 
 
 def _hollows(bed: np.ndarray) -> np.ndarray:
-    """For every place the index of the hollow that a log rolls down to from there; level ground keeps the log."""
+    """Find for every place the index of the hollow that a log rolls down to from there; level ground keeps the log."""
     last = len(bed) - 1
     to = np.full(len(bed), -1)
     for begin in np.argsort(bed, kind="stable"):  # from the lowest, so that the hollow next to each place is known
@@ -220,7 +220,7 @@ def plan_place(
     held_yaw_rad: float | None = None,
     stands_rad: float | None = None,
 ) -> Pose:
-    """The pose of the pin in which the grapple may open over the bunk.
+    """Plan the pose of the pin in which the grapple may open over the bunk.
 
     ``held_yaw_rad`` is the grapple's yaw while the log was seen to hang in it.  A thin log may lie askew in closed
     jaws: the rotator turns so that the log, not the grapple, lies along the bunk.  Of the turns that differ by half a
@@ -251,10 +251,10 @@ def plan_place(
     shift_m = out_m if grasp.along_m > 0.0 else -out_m
     log_yaw = atan2(grasp.log.axis[1], grasp.log.axis[0]) - grasp.pose.slew_rad - grasp.pose.rot_rad
     x, y = center_x, center_y
-    seen = next((o for o in logs if o.id == grasp.log.id), None)
+    observed_log = next((o for o in logs if o.id == grasp.log.id), None)
     skew, near = 0.0, grasp.pose.rot_rad if stands_rad is None else stands_rad
-    if seen is not None and held_yaw_rad is not None:
-        skew = remainder(atan2(seen.axis[1], seen.axis[0]) - (held_yaw_rad - pi / 2), pi)
+    if observed_log is not None and held_yaw_rad is not None:
+        skew = remainder(atan2(observed_log.axis[1], observed_log.axis[0]) - (held_yaw_rad - pi / 2), pi)
         log_yaw += skew
     try:
         for _ in range(2):  # the log's direction depends on the place
@@ -268,12 +268,12 @@ def plan_place(
 
 
 def lies_in_bunk(bunk: Bunk, log: LogObservation) -> bool:
-    """Whether the log's centre is between the stakes."""
+    """Tell whether the log's centre is between the stakes."""
     return is_over_bunk(bunk, *log.center_m[:2]) and log.center_m[2] < bunk.floor_z_m + bunk.stake_height_m
 
 
 def lies_across_stakes(bunk: Bunk, log: LogObservation) -> bool:
-    """Whether a log lies askew, with an end beyond the stakes by more than it may be measured wrongly."""
+    """Tell whether a log lies askew, with an end beyond the stakes by more than it may be measured wrongly."""
     across, skew = point_in_bunk(bunk, *log.center_m[:2])[1], atan2(log.axis[1], log.axis[0]) - bunk.yaw_rad
     aside_m = 0.5 * log.length_m * abs(sin(skew)) * hypot(*log.axis[:2])
     return abs(remainder(skew, pi)) > _SKEW_ERROR_RAD and abs(across) + aside_m > bunk.width_m / 2 + _END_ERROR_M

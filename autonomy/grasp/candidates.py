@@ -45,7 +45,7 @@ class CandidateArrays:
 
 
 def reachable_stations(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The indices of the topmost reachable logs (k,), and which of the stations ``ALONG_SHARES`` are in reach (k, s).
+    """Find the topmost reachable logs (k,), by index, and which of the stations ``ALONG_SHARES`` are in reach (k, s).
 
     ``stays`` (n,) marks logs that must not be gripped.
 
@@ -80,7 +80,7 @@ def reachable_stations(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarr
 
 
 def candidate_grid(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All candidates about the logs ``top`` (k,) at the stations ``reached`` (k, s): x, y [m] and opening axis
+    """List all candidates about the logs ``top`` (k,) at the stations ``reached`` (k, s): x, y [m] and opening axis
     [rad]."""
     center, axis, length = world.center[top], world.axis[top], world.length[top]
     flat = np.arctan2(axis[:, 1], axis[:, 0])[:, None, None, None]
@@ -96,7 +96,7 @@ def candidate_grid(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tu
 def finalists(
     at: tuple[np.ndarray, np.ndarray, np.ndarray], levels: np.ndarray, seen: BladeSections, found: GraspScores
 ) -> tuple[CandidateArrays, GraspScores]:
-    """The best candidates of every set of logs that can be captured, best first, with their scores."""
+    """Select the best candidates of every set of logs that can be captured, best first, with their scores."""
     where = np.nonzero(found.safe)
     safe = GraspScores(*(getattr(found, f.name)[where] for f in fields(GraspScores)))
     near = BladeSections(*(getattr(seen, f.name)[where[0]] for f in fields(BladeSections)))
@@ -107,7 +107,7 @@ def finalists(
 
 
 def centring(at: BladeSections, captured: np.ndarray) -> np.ndarray:
-    """How well centred between the jaws and how square to them the captured logs are, 0 to 1."""
+    """Compute how well centred between the jaws and how square to them the captured logs are, 0 to 1."""
     low = np.min(np.where(captured, at.low_u, np.inf), axis=-1)
     high = np.max(np.where(captured, at.high_u, -np.inf), axis=-1)
     askew = np.sum(np.where(captured, at.obliquity_sq, 0.0), axis=-1) / np.sum(captured, axis=-1)
@@ -116,11 +116,11 @@ def centring(at: BladeSections, captured: np.ndarray) -> np.ndarray:
 
 
 def _diverse_best(rough: np.ndarray, captured: np.ndarray) -> np.ndarray:
-    """Indices of the best candidates of every set of captured logs, so that no set crowds the others out."""
+    """Select the best candidates of every set of captured logs, by index, so that no set crowds the others out."""
     code = captured @ np.random.default_rng(SEED).random(captured.shape[1])
     order = np.argsort(-rough, kind="stable")
-    sets, first = np.unique(code[order], return_index=True)
+    sets, first_index = np.unique(code[order], return_index=True)
     each = max(2, FINALIST_COUNT // len(sets))
-    keep = [order[code[order] == s][:each] for s in sets[np.argsort(first)][: FINALIST_COUNT // 2]]
+    keep = [order[code[order] == s][:each] for s in sets[np.argsort(first_index)][: FINALIST_COUNT // 2]]
     chosen: np.ndarray = np.concatenate(keep)
     return chosen[np.argsort(-rough[chosen], kind="stable")]

@@ -68,7 +68,7 @@ class CnnPlanner:
         self._pictures, self._planned = pictures, 0
 
     def view(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> NetworkView:
-        """The virtual camera's image of a scene and the grasp in it.
+        """Render the virtual camera's image of a scene and find the grasp in it.
 
         Raises:
             InputRefused: there is no log to see, or the camera is not above the ground.
@@ -85,35 +85,37 @@ class CnnPlanner:
         return NetworkView(views[0], pictures[0], best_pixel(mean))
 
     def __call__(self, request: GraspRequest) -> GraspCandidate:
-        """The grasp of eq. 4; raises ``NoGrasp`` without a log."""
+        """Return the grasp of eq. 4; raise ``NoGrasp`` without a log."""
         arm = request.arm
-        places = [i for i in range(len(request.logs)) if i not in request.stay]
-        logs = [request.logs[i] for i in places]
+        free_indices = [i for i in range(len(request.logs)) if i not in request.stay]
+        logs = [request.logs[i] for i in free_indices]
         if not logs:
             raise NoGrasp("grasp.no-log-in-view", "no log is in view")
         world, jaws = as_cylinders(logs), jaws_of(arm.profile)
         ground = known_ground_m(arm.profile)
         ground = ground if math.isfinite(ground) else lowest_m(world)
         try:
-            seen = self.view(world, jaws, ground)
+            network_view = self.view(world, jaws, ground)
         except InputRefused as error:
             raise NoGrasp("grasp.no-network-input", f"the network has nothing to plan from: {error}") from None
-        found = seen.best
-        depth = float(seen.depth_m[round(found.v_px), round(found.u_px)])
-        x, y, surface = seen.camera.to_base(found.u_px, found.v_px, depth).tolist()
+        pixel_grasp = network_view.best
+        depth = float(network_view.depth_m[round(pixel_grasp.v_px), round(pixel_grasp.u_px)])
+        x, y, surface = network_view.camera.to_base(pixel_grasp.u_px, pixel_grasp.v_px, depth).tolist()
         # Seen from above, the image's y axis points against the base's.
-        yaw, level = -found.theta_rad, max(ground, surface - TIP_DEPTH_M)
+        yaw, level = -pixel_grasp.theta_rad, max(ground, surface - TIP_DEPTH_M)
         if self._by_rule:
             level = rule_level_m(jaws, world, x, y, yaw, ground, level)
-        taken = tuple(places[i] for i in logs_between_jaws(jaws, world, x, y, yaw, level))
-        quality = min(max(found.q, 0.0), 1.0)
-        reason = f"the network's best pixel ({found.u_px:.0f}, {found.v_px:.0f}) has quality {found.q:.2f}"
+        taken = tuple(free_indices[i] for i in logs_between_jaws(jaws, world, x, y, yaw, level))
+        quality = min(max(pixel_grasp.q, 0.0), 1.0)
+        reason = (
+            f"the network's best pixel ({pixel_grasp.u_px:.0f}, {pixel_grasp.v_px:.0f}) has quality {pixel_grasp.q:.2f}"
+        )
         if self._pictures is not None:
-            reason += self._draw(seen, 2.0 * jaws.half_gap_m * seen.camera.intrinsics.fx_px / depth)
+            reason += self._draw(network_view, 2.0 * jaws.half_gap_m * network_view.camera.intrinsics.fx_px / depth)
         return GraspCandidate(x, y, yaw, level, taken, quality, reason)
 
     def _draw(self, seen: NetworkView, opening_px: float) -> str:
-        """Draw a plan; returns what a reader of its reason is told, a full disk included."""
+        """Draw a plan and return what a reader of its reason is told, a full disk included."""
         assert self._pictures is not None
         self._planned += 1
         path = self._pictures / f"plan-{self._planned:03}.png"
@@ -125,7 +127,7 @@ class CnnPlanner:
 
 
 def logs_between_jaws(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level: float) -> tuple[int, ...]:
-    """Indices of the logs between the jaws of a grasp and above its tips; without any, of the nearest one."""
+    """Find the indices of the logs between the jaws of a grasp and above its tips; without any, of the nearest one."""
     at = blade_sections(jaws, world, np.array(x), np.array(y), np.array(yaw))
     middle = np.abs(at.low_u + at.high_u) / 2
     inside = at.inside & (middle < jaws.half_gap_m) & (at.middle > level)
@@ -136,33 +138,33 @@ def logs_between_jaws(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: flo
 
 
 def rule_level_m(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, ground: float, level: float) -> float:
-    """The height at which the capture rule takes most wood at a place; ``level`` where it takes none."""
+    """Find the height at which the capture rule takes most wood at a place; ``level`` where it takes none."""
     heights = np.append(world.center[:, 2] + world.radius, ground)
     at = blade_sections(jaws, world, *(np.full(len(heights), v) for v in (x, y, yaw)))
-    found = score_grasps(jaws, world, rests_upon(world), at, heights)
-    mass = np.where(found.safe, found.mass_kg, 0.0)
+    scores = score_grasps(jaws, world, rests_upon(world), at, heights)
+    mass = np.where(scores.safe, scores.mass_kg, 0.0)
     return float(heights[np.argmax(mass)]) if mass.any() else level
 
 
 def mean_maps(maps: Sequence[GraspMaps], cameras: Sequence[Camera], height_m: float) -> GraspMaps:
-    """Mean of the predictions of cameras that look straight down, shifted onto the first camera's image at a height.
+    """Average the predictions of cameras that look straight down, shifted onto the first camera's image at a height.
 
     Pixels that a camera does not see count as zero for it.
     """
-    first = cameras[0]
+    first_camera = cameras[0]
     sums = np.zeros((3, *maps[0].q.shape))
-    for found, camera in zip(maps, cameras, strict=True):
+    for camera_maps, camera in zip(maps, cameras, strict=True):
         away = float(camera.position_m[2]) - height_m
-        step = (camera.position_m - first.position_m)[:2] / away / found.scale_px
+        step = (camera.position_m - first_camera.position_m)[:2] / away / camera_maps.scale_px
         right, down = round(step[0] * camera.intrinsics.fx_px), round(-step[1] * camera.intrinsics.fy_px)
-        for total, layer in zip(sums, (found.q, found.cos2, found.sin2), strict=True):
+        for total, layer in zip(sums, (camera_maps.q, camera_maps.cos2, camera_maps.sin2), strict=True):
             total += _shifted(layer, down, right)
     sums /= len(maps)
     return GraspMaps(sums[0], sums[1], sums[2], maps[0].scale_px)
 
 
 def _shifted(layer: np.ndarray, down: int, right: int) -> np.ndarray:
-    """A map moved by whole entries, filled with zeros."""
+    """Move a map by whole entries, filled with zeros."""
     out = np.zeros_like(layer)
     height, width = layer.shape
     rows, columns = math.fabs(down), math.fabs(right)
@@ -210,7 +212,7 @@ def _rgb(coloured: np.ndarray) -> Image.Image:
 
 
 def _draw_grasp(draw: ImageDraw.ImageDraw, left_px: int, grasp: PixelGrasp, half_px: float) -> None:
-    """A dot in the middle, a thin line across the opening, a thick one for each jaw."""
+    """Draw a dot in the middle, a thin line across the opening, a thick one for each jaw."""
     u, v = left_px + ZOOM * grasp.u_px, ZOOM * grasp.v_px
     c, s, wide_px = math.cos(grasp.theta_rad), math.sin(grasp.theta_rad), _JAW_SHARE * half_px
     draw.line([(u - half_px * c, v - half_px * s), (u + half_px * c, v + half_px * s)], GRASP_RGB, 1)

@@ -46,25 +46,25 @@ class Cylinders:
         return int(self.length.shape[-1])
 
     def ends(self) -> np.ndarray:
-        """Both ends of every axis (..., n, 2, 3): paper A, eq. (1)."""
+        """Compute both ends of every axis (..., n, 2, 3): paper A, eq. (1)."""
         half = (self.axis * self.length[..., None] / 2)[..., None, :]
         ends: np.ndarray = self.center[..., None, :] + np.concatenate([-half, half], axis=-2)
         return ends
 
     def points(self) -> np.ndarray:
-        """Points of every axis from end to end (..., n, POINT_COUNT, 3)."""
+        """Compute points of every axis from end to end (..., n, POINT_COUNT, 3)."""
         part = self.length[..., None] * np.linspace(-0.5, 0.5, POINT_COUNT)
         points: np.ndarray = self.center[..., None, :] + part[..., None] * self.axis[..., None, :]
         return points
 
     def shortened(self, by_m: float, share: float) -> Cylinders:
-        """Every log shorter by ``by_m`` and then by a ``share`` of the rest, never shorter than it is thick."""
+        """Shorten every log by ``by_m`` and then by a ``share`` of the rest, never below its thickness."""
         length = np.maximum((self.length - by_m) * (1.0 - share), 2.0 * self.radius)
         return Cylinders(self.center, self.axis, np.minimum(length, self.length), self.radius)
 
 
 def as_cylinders(logs: Sequence[LogObservation]) -> Cylinders:
-    """The logs of a list, without samples."""
+    """Convert the logs of a list, without samples."""
     return Cylinders(
         np.array([log.center_m for log in logs], float).reshape(-1, 3),
         np.array([log.axis for log in logs], float).reshape(-1, 3),
@@ -74,13 +74,13 @@ def as_cylinders(logs: Sequence[LogObservation]) -> Cylinders:
 
 
 def lowest_m(world: Cylinders) -> float:
-    """Height of the lowest point of any log."""
+    """Compute the height of the lowest point of any log."""
     thick = world.radius * np.sqrt(np.maximum(1.0 - world.axis[..., 2] ** 2, 0.0))
     return float(np.min(np.min(world.ends()[..., 2], axis=-1) - thick))
 
 
 def axis_offsets(world: Cylinders) -> np.ndarray:
-    """From the nearest point of the axis of log i (first) to points of the axis of log j (n, n, POINT_COUNT, 3)."""
+    """Compute vectors from the nearest axis point of log i (first) to axis points of log j (n, n, POINT_COUNT, 3)."""
     away = world.points()[None] - world.center[:, None, None]
     half = world.length[:, None, None] / 2
     along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
@@ -89,12 +89,12 @@ def axis_offsets(world: Cylinders) -> np.ndarray:
 
 
 def log_covariance(log: LogObservation) -> np.ndarray:
-    """The covariance (7, 7) of ``LogEstimate``, or the default for a log that comes without one."""
+    """Return the covariance (7, 7) of ``LogEstimate``, or the default for a log that comes without one."""
     return default_covariance(log) if log.covariance is None else unpack_covariance(log.covariance)
 
 
 def default_covariance(log: LogObservation) -> np.ndarray:
-    """The covariance (7, 7) of a well-known pose: 1.5 cm across, 1 deg, 5 cm at the ends."""
+    """Return the covariance (7, 7) of a well-known pose: 1.5 cm across, 1 deg, 5 cm at the ends."""
     sigma = np.zeros(SIZE)
     sigma[[ACROSS_1, ACROSS_2]], sigma[[TILT_1, TILT_2]] = 0.015, 0.017
     sigma[[START, END]], sigma[RADIUS] = 0.05, 0.05 * log.diameter_m
@@ -102,7 +102,7 @@ def default_covariance(log: LogObservation) -> np.ndarray:
 
 
 def sample_cylinders(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -> Cylinders:
-    """``count`` samples of the logs (n) from covariances (n, 7, 7); the same seed gives the same samples.
+    """Draw ``count`` samples of the logs (n) from covariances (n, 7, 7); the same seed gives the same samples.
 
     Raises:
         InputRefused: a covariance is not finite.
@@ -118,7 +118,7 @@ def sample_cylinders(world: Cylinders, covariances: np.ndarray, count: int, seed
 
 
 def transverse_axes(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (n, 3) across unit axes (n, 3), the axes of the error states: the first level, the second upward."""
+    """Compute unit vectors (n, 3) across unit axes (n, 3), the axes of the error states: first level, second up."""
     level = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
     steep = np.hypot(level[:, 0], level[:, 1]) < 0.05
     level[steep] = (0.0, 1.0, 0.0)
@@ -127,7 +127,7 @@ def transverse_axes(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def perturbed(world: Cylinders, e: np.ndarray) -> Cylinders:
-    """The logs (n) with errors (..., n, 7) added, in the order of ``LogEstimate``'s covariance."""
+    """Add errors (..., n, 7) to the logs (n), in the order of ``LogEstimate``'s covariance."""
     level, up = transverse_axes(world.axis)
     axis = world.axis + e[..., TILT_1, None] * level + e[..., TILT_2, None] * up
     axis /= np.linalg.norm(axis, axis=-1)[..., None]

@@ -45,26 +45,26 @@ _STEP_S: Final = 0.02
 
 
 def travel_height_m(profile: Profile) -> float:
-    """Height of the pin at which a held log passes over the stakes, m."""
+    """Compute the height of the pin at which a held log passes over the stakes, m."""
     bunk = profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
     return top + lowest_tip_below_pin_m(profile.grapple.jaws) + TRAVEL_CLEARANCE_M
 
 
 def retreat_height_m(profile: Profile) -> float:
-    """Height of the pin at which the open grapple is clear of the stakes, m."""
+    """Compute the height of the pin at which the open grapple is clear of the stakes, m."""
     bunk = profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
     return top + tip_below_pin_m(profile.grapple.jaws, 0.0) + RETREAT_CLEARANCE_M
 
 
 def approach_length_m(profile: Profile, log: LogObservation) -> float:
-    """Distance before the place at which a carried log must be at its travel height, m."""
+    """Compute the distance before the place at which a carried log must be at its travel height, m."""
     return (log.length_m + profile.bunk.length_m) / 2 + HOVER_CLEARANCE_M
 
 
 def hover_height_m(profile: Profile, grasp: Grasp) -> float:
-    """Height of the pin from which the open grapple descends vertically, m."""
+    """Compute the height of the pin from which the open grapple descends vertically, m."""
     over = grasp.support_z_m + HOVER_CLEARANCE_M
     if grasp.top_z_m is not None:
         over = max(over, grasp.top_z_m + PASS_CLEARANCE_M)
@@ -72,24 +72,24 @@ def hover_height_m(profile: Profile, grasp: Grasp) -> float:
 
 
 def known_ground_m(profile: Profile) -> float:
-    """Height below which nothing lies, m; -inf on a machine on wheels, whose frame moves up and down."""
+    """Return the height below which nothing lies, m; -inf on a machine on wheels, whose frame moves up and down."""
     return profile.workspace.ground_z_m if profile.carrier is None else -inf
 
 
 def release_angle_rad(profile: Profile, thickest_m: float) -> float:
-    """Jaw angle [rad] at which the tips are clear of a log that lies between them."""
+    """Compute the jaw angle [rad] at which the tips are clear of a log that lies between them."""
     jaws = profile.grapple.jaws
     return float(np.interp(thickest_m / 2 + RELEASE_SIDE_CLEARANCE_M, jaws.half_gap_m[::-1], jaws.angle_rad[::-1]))
 
 
 def tip_clearance_m(diameter_m: float) -> float:
-    """Height of the tips over the support, m: midway between scraping the ground and pinching the log."""
+    """Compute the height of the tips over the support, m: midway between scraping the ground and pinching the log."""
     low, high = TIP_CLEARANCE_M
     return min(max((HALF_PLATE_M + SCOOP_SHARE * diameter_m) / 2, low), high)
 
 
 def closing_height_curve(profile: Profile, support_z_m: float, diameter_m: float) -> Callable[[float], float]:
-    """Height of the pin [m] over the closing time [s], smooth and at rest before 0.
+    """Return the height of the pin [m] as a function of the closing time [s], smooth and at rest before 0.
 
     The tips first sweep deeper and then rise while the jaws turn.  The pin keeps them ``tip_clearance_m`` above the
     support until they touch the log; from then on it stands still.
@@ -101,7 +101,7 @@ def closing_height_curve(profile: Profile, support_z_m: float, diameter_m: float
 
 @lru_cache(maxsize=64)
 def _sweep(jaws: JawTable, close_time_s: float, diameter_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and the depth of closing tips below the pin then [m]; cached, as logs repeat."""
+    """Compute times [s] and the depth of closing tips below the pin then [m]; cached, as logs repeat."""
     rate = jaws.angle_rad[-1] / close_time_s
     meet = float(np.interp(_CONTACT_SHARE * diameter_m, jaws.half_gap_m[::-1], jaws.angle_rad[::-1]))
     half = _SMOOTH_S / 2
@@ -123,7 +123,7 @@ def _sweep(jaws: JawTable, close_time_s: float, diameter_m: float) -> tuple[np.n
 def grasp_pose(
     arm: Arm, x_m: float, y_m: float, yaw_rad: float, support_z_m: float, thinnest_m: float, rot_rad: float
 ) -> Pose:
-    """The pose in which the grapple begins to close on logs over a support.
+    """Compute the pose in which the grapple begins to close on logs over a support.
 
     The jaws open along ``yaw_rad``; ``thinnest_m`` is the least diameter of the logs; the rotator turns from
     ``rot_rad``.

@@ -67,7 +67,7 @@ class PixelGrasp:
 
 
 def best_pixel(maps: GraspMaps) -> PixelGrasp:
-    """The grasp of eq. 4.
+    """Find the grasp of eq. 4.
 
     Maps at a third of the side give the same grasp as the full ones: bilinear interpolation by an odd factor keeps
     every sample and never exceeds it.
@@ -88,7 +88,7 @@ def _at(maps: GraspMaps, place: int) -> PixelGrasp:
 
 
 def normalized_relief(depth_m: np.ndarray) -> np.ndarray:
-    """The network's input (H, W) float32 from depth [m], NaN where unknown: the relief of things above the ground.
+    """Make the network's input (H, W) float32 from depth [m], NaN where unknown: the relief of things above the ground.
 
     The ground is the plane that most of the image lies on or before.  Relief is a share of the ground's distance, so
     that a scene and its copy at another scale and slant give the same image: what the network learned from hand-sized
@@ -108,7 +108,7 @@ def normalized_relief(depth_m: np.ndarray) -> np.ndarray:
 
 
 def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Inverse depth (H, W) float32 [1/m] of the ground: a plane is linear there.
+    """Estimate the inverse depth (H, W) float32 [1/m] of the ground: a plane is linear there.
 
     Reweighted least squares over every sixth pixel with a shrinking scale; nearer pixels lose weight sooner than
     farther ones, because things lie on the ground.
@@ -129,8 +129,8 @@ def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
             ground = plane @ terms
         miss = inverse / ground - 1.0
         weight = 1.0 / (1.0 + (miss / np.where(miss > 0.0, scale, FARTHER_FACTOR * scale)) ** 2)
-    found = (plane[0] + plane[1] * u)[None, :] + (plane[2] * v)[:, None]
-    ground_inverse: np.ndarray = np.maximum(found, 1e-3 * inverse.min()).astype(np.float32)
+    plane_inverse_depth = (plane[0] + plane[1] * u)[None, :] + (plane[2] * v)[:, None]
+    ground_inverse: np.ndarray = np.maximum(plane_inverse_depth, 1e-3 * inverse.min()).astype(np.float32)
     return ground_inverse
 
 
@@ -155,7 +155,7 @@ class GraspNet:
         self._infer = pixel_grasp_inference(self._weights, precision)
 
     def maps(self, depth_m: np.ndarray) -> GraspMaps:
-        """Maps of all pixels of a 300 x 300 depth image [m], f32.
+        """Compute the maps of all pixels of a 300 x 300 depth image [m], f32.
 
         Raises:
             InputRefused: another size, or no depth at all (``InputRefused``).
@@ -164,7 +164,7 @@ class GraspNet:
         return grasp_maps(self._full(_picture(depth_m))["maps"][0])
 
     def best(self, depth_m: np.ndarray) -> PixelGrasp:
-        """The grasp of eq. 4 in a 300 x 300 depth image [m].
+        """Find the grasp of eq. 4 in a 300 x 300 depth image [m].
 
         Raises:
             InputRefused: another size, or no depth at all (``InputRefused``).
@@ -173,7 +173,7 @@ class GraspNet:
 
 
 def pixel_grasp_inference(weights: Weights, precision: str = "f32") -> Callable[[np.ndarray], PixelGrasp]:
-    """A function from a prepared image (1, 1, 300, 300) to its grasp, by maps at a third of the side.
+    """Return a function from a prepared image (1, 1, 300, 300) to its grasp, by maps at a third of the side.
 
     "mixed" runs everything in bf16, in which neighbouring pixels of a flat quality become equal and the grasp would
     wander; the last convolution and the heads are therefore repeated in f32 at the best pixels, and these decide.
@@ -188,22 +188,22 @@ def pixel_grasp_inference(weights: Weights, precision: str = "f32") -> Callable[
     heads_bias = np.concatenate([arrays[f"{head}.bias"] for head in HEADS])
 
     def infer(picture: np.ndarray) -> PixelGrasp:
-        found = front(picture)
-        quality = found["heads"][0, 0]
+        outputs = front(picture)
+        quality = outputs["heads"][0, 0]
         if not np.isfinite(quality).all():
             raise InputRefused("grasp.quality-not-finite", NOT_FINITE)
         v, u = np.divmod(np.argpartition(quality, -CANDIDATE_COUNT, axis=None)[-CANDIDATE_COUNT:], quality.shape[1])
-        hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + arrays["conv7.bias"], 0.0)
-        again = hidden @ heads + heads_bias
+        hidden = np.maximum(_patches(outputs["norm6"][0], v, u) @ weight + arrays["conv7.bias"], 0.0)
+        refined_heads = hidden @ heads + heads_bias
         maps = np.full((len(HEADS), *quality.shape), -np.inf, np.float32)
-        maps[:, v, u] = again.T
+        maps[:, v, u] = refined_heads.T
         return _at(GraspMaps(maps[0], maps[1], maps[2], POOL), int(np.argmax(maps[0])))
 
     return infer
 
 
 def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Inputs of the last 5 x 5 convolution at places of the doubled features (C, H, W): (places, C * 25)."""
+    """Collect inputs of the last 5 x 5 convolution at places of the doubled features (C, H, W): (places, C * 25)."""
     sides = []
     for at, size in ((v, features.shape[1]), (u, features.shape[2])):
         places = at[:, None] + np.arange(-2, 3)
@@ -215,13 +215,13 @@ def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
     (v0, v1, a0, a1), (u0, u1, b0, b1) = sides
     rows = [(v0[:, :, None], a0[:, :, None]), (v1[:, :, None], a1[:, :, None])]
     columns = [(u0[:, None, :], b0[:, None, :]), (u1[:, None, :], b1[:, None, :])]
-    seen = sum(features[:, y, x] * (a * b) for y, a in rows for x, b in columns)
-    patches: np.ndarray = seen.transpose(1, 0, 2, 3).reshape(len(v), -1)
+    interpolated = sum(features[:, y, x] * (a * b) for y, a in rows for x, b in columns)
+    patches: np.ndarray = interpolated.transpose(1, 0, 2, 3).reshape(len(v), -1)
     return patches
 
 
 def grasp_maps(heads: np.ndarray) -> GraspMaps:
-    """The HEADS (3, h, w) by name, at whatever scale they are."""
+    """Return the HEADS (3, h, w) by name, at whatever scale they are."""
     return GraspMaps(heads[0], heads[1], heads[2], SIDE_PX // heads.shape[1])
 
 

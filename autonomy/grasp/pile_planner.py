@@ -75,7 +75,7 @@ class PilePlanner:
         self._failed_places: list[tuple[float, float]] = []
 
     def __call__(self, request: GraspRequest) -> GraspCandidate:
-        """The best penetration grasp, else the best grasp of ``single``; raises ``NoGrasp``."""
+        """Return the best penetration grasp, else the best grasp of ``single``; raise ``NoGrasp`` without one."""
         logs = request.logs
         if not logs:
             raise NoGrasp("grasp.no-log-in-view", "no log is in view")
@@ -101,10 +101,10 @@ class PilePlanner:
         """Record the place of the last candidate as failed if all its logs are still there."""
         if self._last_proposal is None:
             return
-        at, wanted = self._last_proposal
+        location_m, proposed_ids = self._last_proposal
         self._last_proposal = None
-        if wanted <= {log.id for log in logs}:
-            self._failed_places.append(at)
+        if proposed_ids <= {log.id for log in logs}:
+            self._failed_places.append(location_m)
         else:
             self._failed_places.clear()
 
@@ -113,7 +113,7 @@ class PilePlanner:
         return found
 
     def _candidates(self, arm: Arm, world: Cylinders, stay: Collection[int]) -> _PileCandidates:
-        """All candidates, with their utility."""
+        """List all candidates, with their utility."""
         jaws, bunk = jaws_of(arm.profile), arm.profile.bunk
         middle = np.average(world.center[:, :2], axis=0)
         # The common direction of the logs, whichever way each points.
@@ -141,7 +141,7 @@ class PilePlanner:
 
 
 def _utility(jaws: Jaws, world: Cylinders, at: BladeSections, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which logs are between the jaws of candidates (c, n), and the candidates' utility (c,)."""
+    """Find which logs are between the jaws of candidates (c, n), and compute the candidates' utility (c,)."""
     r, middle_u = world.radius, 0.5 * (at.low_u + at.high_u)
     over = at.inside & (at.top > level[:, None])
     between = (
@@ -171,5 +171,5 @@ def _proposal(at: _PileCandidates, i: int, logs: Sequence[LogObservation]) -> Gr
     taken = tuple(int(k) for k in np.flatnonzero(at.between[i]))
     names = ", ".join(str(logs[k].id) for k in taken)
     reason = f"penetrates the pile, {len(taken)} of {len(logs)} logs ({names}) between the jaws"
-    place = float(at.x[i]), float(at.y[i]), float(at.yaw[i]), float(at.level[i])
-    return GraspCandidate(*place, taken, SUCCESS_PROBABILITY, reason, penetrates=True)
+    grasp_geometry = float(at.x[i]), float(at.y[i]), float(at.yaw[i]), float(at.level[i])
+    return GraspCandidate(*grasp_geometry, taken, SUCCESS_PROBABILITY, reason, penetrates=True)

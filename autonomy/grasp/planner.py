@@ -65,7 +65,7 @@ class GraspPlanner(Protocol):
     """Proposes the best grasp of a log list."""
 
     def __call__(self, request: GraspRequest) -> GraspCandidate:
-        """The best candidate.
+        """Propose the best candidate.
 
         Raises:
             NoGrasp: there is none.
@@ -78,7 +78,7 @@ class GraspSelector(Protocol):
     def __call__(
         self, arm: Arm, job: CraneJob, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float
     ) -> Grasp:
-        """The grasp of the job from the present slew and rotator angles [rad].
+        """Choose the grasp of the job from the present slew and rotator angles [rad].
 
         Raises:
             NoGrasp: there is none.
@@ -128,20 +128,20 @@ class Grasp:
 
 
 def offset_along(point: tuple[float, float], log: LogObservation) -> float:
-    """Distance of a point from a log's centre along the log's axis, m."""
+    """Compute the distance of a point from a log's centre along the log's axis, m."""
     return (point[0] - log.center_m[0]) * log.axis[0] + (point[1] - log.center_m[1]) * log.axis[1]
 
 
 def restricted_to(arm: Arm, grasp: Grasp, held: Sequence[int]) -> Grasp:
-    """The grasp with only those of its logs whose numbers are in ``held``."""
+    """Return the grasp with only those of its logs whose numbers are in ``held``."""
     if all(log.id in held for log in grasp.logs):
         return grasp
-    first, *others = (log for log in grasp.logs if log.id in held)
-    return replace(grasp, log=first, others=tuple(others), along_m=offset_along(arm.xy(grasp.pose), first))
+    gripped_log, *others = (log for log in grasp.logs if log.id in held)
+    return replace(grasp, log=gripped_log, others=tuple(others), along_m=offset_along(arm.xy(grasp.pose), gripped_log))
 
 
 def hangs_below(arm: Arm, log: LogObservation, pin: Pose) -> bool:
-    """Whether the log hangs below a pin: horizontally near it, and as high as the jaws can hold it."""
+    """Tell whether the log hangs below a pin: horizontally near it, and as high as the jaws can hold it."""
     x, y = arm.xy(pin)
     reach = lowest_tip_below_pin_m(arm.profile.grapple.jaws) + 0.3
     near = hypot(log.center_m[0] - x, log.center_m[1] - y) < log.length_m / 2

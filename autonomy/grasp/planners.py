@@ -41,7 +41,7 @@ class PlannerChoice(NamedTuple):
     pictures: str = ""
 
     def check(self) -> PlannerChoice:
-        """The choice itself; nothing is loaded.
+        """Check the choice and return it; nothing is loaded.
 
         Raises:
             InputRefused: there is no such planner, it has no virtual camera, or the folder is none.
@@ -73,7 +73,7 @@ class PlannerChoice(NamedTuple):
         return self
 
     def make(self) -> GraspPlanner:
-        """The planner.
+        """Make the planner.
 
         Raises:
             InputRefused: as `check`.
@@ -91,11 +91,11 @@ class PlannerChoice(NamedTuple):
         return CnnPlanner(network(NETWORKS[self.name]), self.name == PHYSICAL, self.virtual_cameras, pictures=pictures)
 
     def arguments(self) -> tuple[str, ...]:
-        """The words that choose this planner on the command line of `autonomy`; none for the default."""
-        words = () if self.name == SEARCH else ("--planner", self.name)
+        """List the arguments that choose this planner on the command line of `autonomy`; none for the default."""
+        options = () if self.name == SEARCH else ("--planner", self.name)
         if self.virtual_cameras > 1:
-            words = (*words, "--virtual-cameras", str(self.virtual_cameras))
-        return (*words, "--plan-pictures", self.pictures) if self.pictures else words
+            options = (*options, "--virtual-cameras", str(self.virtual_cameras))
+        return (*options, "--plan-pictures", self.pictures) if self.pictures else options
 
 
 OUR_PLANNER: Final = PlannerChoice()
@@ -103,7 +103,7 @@ OUR_PLANNER: Final = PlannerChoice()
 
 @cache
 def network(weights: str) -> GraspNet:
-    """Paper A's network with shipped weights.
+    """Load paper A's network with shipped weights.
 
     Raises:
         InputRefused: they are missing or damaged.

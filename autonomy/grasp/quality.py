@@ -91,7 +91,7 @@ class GraspScores:
 
 
 def rests_upon(world: Cylinders) -> np.ndarray:
-    """Whether log j (last) lies on log i (n, n), by points of its axis above the other's."""
+    """Tell whether log j (last) lies on log i (n, n), by points of its axis above the other's."""
     off = axis_offsets(world)
     radii = (world.radius[:, None] + world.radius[None, :])[..., None]
     thicker = (world.radius[None, :] - world.radius[:, None])[..., None]
@@ -123,7 +123,7 @@ class BladeSections:
 
 
 def blade_sections(jaws: Jaws, world: Cylinders, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> BladeSections:
-    """The sections of candidates of one shape (...) with logs whose leading axes broadcast to it."""
+    """Compute the sections of candidates of one shape (...) with logs whose leading axes broadcast to it."""
     cu, su = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
     dx, dy = world.center[..., 0] - x[..., None], world.center[..., 1] - y[..., None]
     du, dv = cu * dx + su * dy, cu * dy - su * dx
@@ -157,7 +157,7 @@ def score_grasps(
     level: np.ndarray,
     rule: CaptureRule = STRICT_RULE,
 ) -> GraspScores:
-    """Scores of candidates with known sections (..., n) at heights ``level`` (...), which broadcast; ``upon`` is
+    """Score candidates with known sections (..., n) at heights ``level`` (...), which broadcast; ``upon`` is
     ``rests_upon``.
     """
     r, tip, gap = world.radius, level[..., None] + TIP_HEIGHT_M, jaws.half_gap_m
@@ -171,11 +171,11 @@ def score_grasps(
     clear = ~over | captured | (nearest > gap + jaws.plate_m)
     fits = (farthest < jaws.half_width_at(at.middle - tip)) & (at.top - tip < jaws.room_m) & at.good
     safe = np.all(clear & (fits | ~captured), axis=-1) & np.any(captured, axis=-1)
-    found = GraspScores(captured, safe, *(np.zeros(safe.shape) for _ in range(3)))
-    where = np.nonzero(safe)  # most candidates are excluded by now
+    scores = GraspScores(captured, safe, *(np.zeros(safe.shape) for _ in range(3)))
+    safe_index = np.nonzero(safe)  # most candidates are excluded by now
     parts = (at.bottom, at.low_u, at.high_u, at.along, world.length, r, level[..., None])
-    bottom, low_u, high_u, along, length, r, level = (np.broadcast_to(p, captured.shape)[where] for p in parts)
-    captured = captured[where]
+    bottom, low_u, high_u, along, length, r, level = (np.broadcast_to(p, captured.shape)[safe_index] for p in parts)
+    captured = captured[safe_index]
     share = captured.astype(float)
     below = np.sum((share @ upon.astype(float)) * (1.0 - share), axis=-1)
     wood = DENSITY_KG_M3 * pi * r * r * length * share
@@ -195,16 +195,16 @@ def score_grasps(
     )
     holds &= GRAVITY_M_S2 * tilt < FRICTION_COEFFICIENT * jaws.tip_force_n * jaws.blade_m
     farthest_m = np.max(share * np.abs(along), axis=-1)
-    safe[where] = (below == 0.0) & holds
-    found.balance[where] = np.exp(
+    safe[safe_index] = (below == 0.0) & holds
+    scores.balance[safe_index] = np.exp(
         -((tilt / np.maximum(total, 1e-6) / LEVER_SCALE_M) ** 2) - (farthest_m / OFF_CENTRE_SCALE_M) ** 2
     )
-    found.mass_kg[where], found.count[where] = total, np.sum(captured, axis=-1)
-    return found
+    scores.mass_kg[safe_index], scores.count[safe_index] = total, np.sum(captured, axis=-1)
+    return scores
 
 
 def _tip_clearance_m(diameter_m: np.ndarray) -> np.ndarray:
-    """``grapple_heights.tip_clearance_m`` for arrays."""
+    """Compute ``grapple_heights.tip_clearance_m`` for arrays."""
     low, high = TIP_CLEARANCE_M
     return np.clip((HALF_PLATE_M + SCOOP_SHARE * diameter_m) / 2.0, low, high)
 
@@ -256,13 +256,13 @@ class Jaws:
         return self.height_m[-1]
 
     def half_width_at(self, height_m: np.ndarray) -> np.ndarray:
-        """Inner half width at heights above the open tips; below the tips, their half gap."""
+        """Compute the inner half width at heights above the open tips; below the tips, their half gap."""
         width: np.ndarray = np.interp(height_m, self.height_m, self.half_width_m)
         return width
 
 
 def jaws_of(profile: Profile) -> Jaws:
-    """The grapple of a profile; the pivots follow from its table of tip positions."""
+    """Derive the grapple from a profile; the pivots follow from its table of tip positions."""
     table = profile.grapple.jaws
     angle, gap = np.array(table.angle_rad), np.array(table.half_gap_m)
     down = table.tip_below_pin_m[0] - pin_to_jaw_pivot_m(profile.kinematics)

@@ -70,7 +70,7 @@ def extract_end_log(
     lowest_m: float,
     rot_rad: float,
 ) -> GraspCandidate | None:
-    """The extraction of the thickest log at the end of a row on the ground, or None where there is none.
+    """Plan the extraction of the thickest log at the end of a row on the ground; None where there is none.
 
     The log is in reach, has free ground beside it at ``lowest_m``, is not marked in ``stays`` (n,), and neither lies on
     others nor carries any (``upon`` (n, n) of `quality.rests_upon`).  ``rot_rad`` is the present rotator angle.
@@ -149,19 +149,19 @@ class SamplingPlanner:
         self._rules = rules
 
     def __call__(self, request: GraspRequest) -> GraspCandidate:
-        """The best grasp in reach; raises ``NoGrasp``."""
+        """Return the best grasp in reach; raise ``NoGrasp`` without one."""
         arm, logs = request.arm, request.logs
         if not logs:
             raise NoGrasp("grasp.no-log-in-view", "no log is in view")
         lying = _supported_logs(arm, logs)
         if not lying:
             raise NoGrasp("grasp.no-supported-log", f"none of the {_log_count(logs)} in view lies on anything")
-        found = self._best(arm, [logs[i] for i in lying], np.isin(lying, list(request.stay)), request.rot_rad)
-        return replace(found, logs=tuple(lying[i] for i in found.logs))
+        candidate = self._best(arm, [logs[i] for i in lying], np.isin(lying, list(request.stay)), request.rot_rad)
+        return replace(candidate, logs=tuple(lying[i] for i in candidate.logs))
 
     def _best(self, arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray, rot_rad: float) -> GraspCandidate:
-        """The best grasp of logs that lie on something; those in ``stays`` (n,) must not be taken."""
-        wanted = _log_count(np.flatnonzero(~stays).tolist())
+        """Find the best grasp of logs that lie on something; those in ``stays`` (n,) must not be taken."""
+        log_count_text = _log_count(np.flatnonzero(~stays).tolist())
         ground = known_ground_m(arm.profile)
         jaws, world = jaws_of(arm.profile), as_cylinders(logs)
         sigma = np.stack([log_covariance(log) for log in logs])
@@ -170,8 +170,8 @@ class SamplingPlanner:
         upon = rests_upon(world)
         top, stations = reachable_stations(arm, logs, stays)
         at = candidate_grid(world, top, stations)
-        seen = blade_sections(jaws, world, *at)
-        floor = np.full(len(at[0]), ground) if isfinite(ground) else _ground_between_jaws(jaws, seen, upon)
+        sections = blade_sections(jaws, world, *at)
+        floor = np.full(len(at[0]), ground) if isfinite(ground) else _ground_between_jaws(jaws, sections, upon)
         tops = np.unique(np.round(world.center[:, 2] + world.radius, 3))
         levels = np.concatenate([floor[:, None], np.broadcast_to(tops, (len(floor), len(tops)))], axis=1)
         measured = np.array([log.covariance is not None for log in logs])
@@ -180,15 +180,19 @@ class SamplingPlanner:
         samples = sample_cylinders(world, sigma, DRAW_COUNT, SEED)
         plans: list[tuple[CandidateArrays, GraspScores, np.ndarray]] = []
         for rule, trust in self._rules:
-            reached = [float(np.max(plan[2])) for plan in plans]
-            if reached and (reached[0] >= RELAX_BELOW_PROBABILITY or max(reached) >= trust):
+            best_probabilities = [float(np.max(plan[2])) for plan in plans]
+            if best_probabilities and (
+                best_probabilities[0] >= RELAX_BELOW_PROBABILITY or max(best_probabilities) >= trust
+            ):
                 break
-            found = _without_excluded(score_grasps(jaws, world, upon, _with_height_axis(seen), levels, rule), stays)
-            if found.safe.any():
-                best, found = finalists(at, levels, seen, found)
-                share = self._probability(jaws, samples, upon, best, found.captured, rule, stays)
-                held = 1.0 - OFF_CENTRE_PENALTY * np.maximum(1.0 - found.balance / GOOD_LEVERAGE, 0.0)
-                plans.append((best, found, trust * held * share))
+            scores = _without_excluded(
+                score_grasps(jaws, world, upon, _with_height_axis(sections), levels, rule), stays
+            )
+            if scores.safe.any():
+                best, scores = finalists(at, levels, sections, scores)
+                share = self._probability(jaws, samples, upon, best, scores.captured, rule, stays)
+                balance_factor = 1.0 - OFF_CENTRE_PENALTY * np.maximum(1.0 - scores.balance / GOOD_LEVERAGE, 0.0)
+                plans.append((best, scores, trust * balance_factor * share))
         lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
         likely, topmost = max((float(np.max(plan[2])) for plan in plans), default=0.0), int(top[0])
         if measured.any() and likely < TRY_ABOVE_PROBABILITY:
@@ -200,13 +204,13 @@ class SamplingPlanner:
                 return self._topmost(arm, jaws, logs, world, topmost, stations[0], lowest, rot_rad)
             raise NoGrasp(
                 "grasp.none-safe",
-                f"no grasp of the {wanted} is safe: every one closes on a log that stays, takes one from under another "
-                "or takes more than the grapple holds",
+                f"no grasp of the {log_count_text} is safe: every one closes on a log that stays, takes one from under "
+                "another or takes more than the grapple holds",
             )
         trouble: list[Unreachable | NoGrasp] = []
-        for best, found, probability in sorted(plans, key=lambda plan: -float(np.max(plan[2]))):
-            captured = found.captured
-            for i in _rank(probability, found.count):
+        for best, scores, probability in sorted(plans, key=lambda plan: -float(np.max(plan[2]))):
+            captured = scores.captured
+            for i in _rank(probability, scores.count):
                 try:
                     self._check(arm, best, int(i), logs, captured[i], rot_rad)
                 except (Unreachable, NoGrasp) as error:
@@ -217,7 +221,7 @@ class SamplingPlanner:
                 return _penetrating(proposal, deep_m, lowest)
         heavy = next((error for error in trouble if isinstance(error, NoGrasp)), None)
         if heavy is None:
-            raise NoGrasp("grasp.none-in-reach", f"no grasp of the {wanted} is in reach: {trouble[-1]}")
+            raise NoGrasp("grasp.none-in-reach", f"no grasp of the {log_count_text} is in reach: {trouble[-1]}")
         if not measured.any():
             raise heavy
         return self._topmost(arm, jaws, logs, world, topmost, stations[0], lowest, rot_rad)
@@ -233,7 +237,7 @@ class SamplingPlanner:
         lowest_m: float,
         rot: float,
     ) -> GraspCandidate:
-        """A penetrating grasp of log ``i`` alone, the topmost, at the reachable station nearest to its middle."""
+        """Plan a penetrating grasp of log ``i`` alone, the topmost, at the reachable station nearest to its middle."""
         log = logs[i]
         along = log.length_m * float(min(ALONG_SHARES[stations], key=abs))
         x, y, _ = (c + along * a for c, a in zip(log.center_m, log.axis, strict=True))
@@ -263,7 +267,7 @@ class SamplingPlanner:
         rule: CaptureRule,
         stays: np.ndarray,
     ) -> np.ndarray:
-        """Share of the samples in which the rule holds and one of the wanted logs comes up."""
+        """Compute the share of the samples in which the rule holds and one of the captured logs comes up."""
         rng = np.random.default_rng(SEED + 1)
         error = rng.standard_normal((DRAW_COUNT, 4)) * (*CRANE_SIGMA_M, CRANE_SIGMA_RAD)
         world = Cylinders(
@@ -271,14 +275,14 @@ class SamplingPlanner:
         )
         moved = [c[None, :] + error[:, k, None] for k, c in enumerate((best.x, best.y, best.level, best.yaw))]
         at = blade_sections(jaws, world, moved[0], moved[1], moved[3])
-        found = _without_excluded(score_grasps(jaws, world, upon, at, moved[2], rule), stays)
-        share: np.ndarray = np.mean(found.safe & np.any(found.captured & captured, axis=-1), axis=0)
+        scores = _without_excluded(score_grasps(jaws, world, upon, at, moved[2], rule), stays)
+        share: np.ndarray = np.mean(scores.safe & np.any(scores.captured & captured, axis=-1), axis=0)
         return share
 
     def _check(
         self, arm: Arm, best: CandidateArrays, i: int, logs: Sequence[LogObservation], captured: np.ndarray, rot: float
     ) -> None:
-        """Raises ``Unreachable`` where a candidate is out of reach, ``NoGrasp`` where its logs are too heavy there."""
+        """Raise ``Unreachable`` where a candidate is out of reach, ``NoGrasp`` where its logs are too heavy there."""
         taken = [log for log, c in zip(logs, captured, strict=True) if c]
         x, y, yaw, level = (float(v[i]) for v in (best.x, best.y, best.yaw, best.level))
         pose = grasp_pose(arm, x, y, yaw, level, min(log.diameter_m for log in taken), rot)
@@ -290,11 +294,11 @@ class SamplingPlanner:
     ) -> GraspCandidate:
         taken = tuple(int(k) for k in np.flatnonzero(captured))
         names = ", ".join(str(logs[k].id) for k in taken)
-        left = len(logs) - len(taken)
+        remaining_count = len(logs) - len(taken)
         reason = (
             f"{_log_count(taken)} ({names}) of {len(logs)} at once, "
             f"{100 * probability:.0f} % of {DRAW_COUNT} draws hold it"
-            + (f"; {left} left lying" if left else "")
+            + (f"; {remaining_count} left lying" if remaining_count else "")
             + ("; nothing better is there" if probability < RELAX_BELOW_PROBABILITY else "")
         )
         return GraspCandidate(
@@ -303,7 +307,7 @@ class SamplingPlanner:
 
 
 def _penetration_m(jaws: Jaws, world: Cylinders, p: GraspCandidate) -> float:
-    """How much lower than planned the jaws may penetrate.
+    """Compute how much lower than planned the jaws may penetrate.
 
     Not at all where a log between them lies across the captured ones and would come along; little where nothing stops
     them; and never so far that they would clasp the logs that they have to pass over.
@@ -322,7 +326,7 @@ def _penetration_m(jaws: Jaws, world: Cylinders, p: GraspCandidate) -> float:
 
 
 def _least_level_m(jaws: Jaws, world: Cylinders, at: BladeSections, taken: list[int]) -> float:
-    """Height down to which jaws may penetrate that take some logs and pass over the others between them."""
+    """Compute the height down to which jaws may penetrate that take some logs and pass over the others between them."""
     passed = at.inside & (np.maximum(at.low_u, -at.high_u) < jaws.half_gap_m)
     passed[taken] = False
     bottom = world.center[:, 2] - world.radius
@@ -332,14 +336,14 @@ def _least_level_m(jaws: Jaws, world: Cylinders, at: BladeSections, taken: list[
 
 
 def _penetrating(p: GraspCandidate, deep_m: float, lowest_m: float) -> GraspCandidate:
-    """The candidate, penetrating where its jaws come down on a pile and unchanged on the ground."""
+    """Return the candidate, penetrating where its jaws come down on a pile and unchanged on the ground."""
     if deep_m == 0.0 or p.support_z_m < lowest_m + LOWEST_ROW_M:
         return p
     return replace(p, support_z_m=max(p.support_z_m - deep_m, lowest_m), penetrates=True)
 
 
 def _supported_logs(arm: Arm, logs: Sequence[LogObservation]) -> list[int]:
-    """Indices of the logs that lie on something: one that floats is a false detection, or hangs in a grapple."""
+    """Find the logs that lie on something, by index: one that floats is a false detection, or hangs in a grapple."""
     world, ground = as_cylinders(logs), known_ground_m(arm.profile)
     bottom = world.center[:, 2] - world.radius
     above = bottom - (ground if isfinite(ground) else bottom.min())
@@ -350,7 +354,7 @@ def _supported_logs(arm: Arm, logs: Sequence[LogObservation]) -> list[int]:
 
 
 def _without_excluded(found: GraspScores, stays: np.ndarray) -> GraspScores:
-    """The scores, where grasps that take a log of ``stays`` (n,) are not safe."""
+    """Return the scores, where grasps that take a log of ``stays`` (n,) are not safe."""
     if not stays.any():
         return found
     return replace(found, safe=found.safe & ~np.any(found.captured & stays, axis=-1))
@@ -361,17 +365,17 @@ def _log_count(logs: Sequence[object]) -> str:
 
 
 def _ground_between_jaws(jaws: Jaws, seen: BladeSections, upon: np.ndarray) -> np.ndarray:
-    """Height (c,) of the ground between the jaws of every candidate, by the logs that lie on it; -inf without any."""
+    """Find the ground's height (c,) between the jaws of every candidate by the logs on it; -inf without any."""
     between = seen.inside & (np.minimum(np.abs(seen.low_u), np.abs(seen.high_u)) < jaws.half_gap_m)
     return np.asarray(np.max(np.where(between & ~upon.any(axis=0), seen.bottom, -np.inf), axis=-1))
 
 
 def _with_height_axis(at: BladeSections) -> BladeSections:
-    """The sections of candidates (c, n) with an axis for the heights, (c, 1, n)."""
+    """Return the sections of candidates (c, n) with an axis for the heights, (c, 1, n)."""
     return BladeSections(*(getattr(at, f.name)[:, None, :] for f in fields(BladeSections)))
 
 
 def _rank(probability: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Best first: within ``PROBABILITY_TOLERANCE`` of the best, then more logs, then in the given order."""
+    """Sort best first: within ``PROBABILITY_TOLERANCE`` of the best, then more logs, then in the given order."""
     safe = probability >= np.max(probability) - PROBABILITY_TOLERANCE
     return np.lexsort((-np.where(safe, count, 0), -np.where(safe, 1.0, probability)))

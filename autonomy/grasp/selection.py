@@ -32,7 +32,7 @@ MAX_AXIS_SLOPE: Final = 0.5
 
 
 def select_direct(arm: Arm, job: CraneJob, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> Grasp:
-    """The grasp of the job's log; without one, of the topmost log outside the bunk, of these the nearest by slewing.
+    """Plan the grasp of the job's log; without one, of the topmost outside the bunk, of these the nearest by slewing.
 
     Raises:
         NoGrasp: no such log is in view, or none is in reach.
@@ -59,18 +59,18 @@ def select_direct(arm: Arm, job: CraneJob, logs: Sequence[LogObservation], slew_
 def pending_logs(
     profile: Profile, job: CraneJob, logs: Sequence[LogObservation]
 ) -> tuple[list[LogObservation], NoGrasp]:
-    """The logs that the job may still pick, and the error to raise when there is none."""
+    """Return the logs that the job may still pick, and the error to raise when there is none."""
     present, missing = _logs_at_source(profile, job, logs)
-    found = [log for log in present if log.id not in job.leave]
+    available_logs = [log for log in present if log.id not in job.leave]
     if present:
         missing = NoGrasp("grasp.all-logs-stay", "the job leaves every log that lies there")
-    return found, missing
+    return available_logs, missing
 
 
 def _logs_at_source(
     profile: Profile, job: CraneJob, logs: Sequence[LogObservation]
 ) -> tuple[list[LogObservation], NoGrasp]:
-    """The logs that lie at the job's source, including those that stay, and the error for when there is none."""
+    """Return the logs that lie at the job's source, including those that stay, and the error for when there is none."""
     if job.source is not None:
         missing = NoGrasp("grasp.source-empty", "no log is left at the source")
         return [log for log in logs if lies_in_bunk(job.source, log)], missing
@@ -80,7 +80,7 @@ def _logs_at_source(
 
 
 def plan_single_log_grasp(arm: Arm, log: LogObservation, rot_rad: float) -> Grasp:
-    """The grasp of one log.
+    """Plan the grasp of one log.
 
     Raises:
         NoGrasp: the log stands too steep, is out of reach, or is too heavy where it lies.
@@ -113,46 +113,50 @@ class PlannerSelection:
     def __call__(
         self, arm: Arm, job: CraneJob, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float
     ) -> Grasp:
-        """The planner's candidate as a grasp; ``select_direct`` serves a job that names its log."""
+        """Return the planner's candidate as a grasp; ``select_direct`` serves a job that names its log."""
         if job.log_id is not None:
             return select_direct(arm, job, logs, slew_rad, rot_rad)
-        wanted, missing = pending_logs(arm.profile, job, logs)
-        if not wanted:
+        available_logs, missing = pending_logs(arm.profile, job, logs)
+        if not available_logs:
             raise missing
         present, _ = _logs_at_source(arm.profile, job, logs)
         stay = {i for i, log in enumerate(present) if log.id in job.leave}
-        p = self._planner(GraspRequest(arm, present, rot_rad, stay))
-        first, *others = sorted((present[i] for i in p.logs), key=lambda log: -log.length_m)
-        thinnest = min(log.diameter_m for log in (first, *others))
+        candidate = self._planner(GraspRequest(arm, present, rot_rad, stay))
+        gripped_log, *others = sorted((present[i] for i in candidate.logs), key=lambda log: -log.length_m)
+        thinnest = min(log.diameter_m for log in (gripped_log, *others))
         try:
-            pose = grasp_pose(arm, p.x_m, p.y_m, p.yaw_rad, p.support_z_m, thinnest, rot_rad)
+            pose = grasp_pose(
+                arm, candidate.x_m, candidate.y_m, candidate.yaw_rad, candidate.support_z_m, thinnest, rot_rad
+            )
         except Unreachable as error:
             raise NoGrasp("grasp.candidate-out-of-reach", f"the planner's grasp is out of reach: {error}") from None
-        point = p.x_m, p.y_m
-        near = [log for log in present if log is not first and _horizontal_gap_m(point, log) < ISOLATION_DISTANCE_M]
+        point = candidate.x_m, candidate.y_m
+        neighbours = [
+            log for log in present if log is not gripped_log and _horizontal_gap_m(point, log) < ISOLATION_DISTANCE_M
+        ]
         # A log that lies alone cannot settle: the crane lifts it as it lifts one of `select_direct`.
-        top = _highest_point_m(present) if near or others else None
+        top = _highest_point_m(present) if neighbours or others else None
         return Grasp(
-            first,
+            gripped_log,
             pose,
-            p.support_z_m,
-            offset_along(point, first),
+            candidate.support_z_m,
+            offset_along(point, gripped_log),
             tuple(others),
             top,
-            p.reason,
-            p.probability,
-            p.penetrates,
-            p.extracts,
+            candidate.reason,
+            candidate.probability,
+            candidate.penetrates,
+            candidate.extracts,
         )
 
 
 def _highest_point_m(logs: Sequence[LogObservation]) -> float:
-    """The highest point of logs, m."""
+    """Compute the highest point of logs, m."""
     return max(log.center_m[2] + abs(log.axis[2]) * log.length_m / 2 + log.diameter_m / 2 for log in logs)
 
 
 def _horizontal_gap_m(point: tuple[float, float], log: LogObservation) -> float:
-    """Horizontal distance of a point from a log's surface, m; 0 over the log."""
+    """Compute the horizontal distance of a point from a log's surface, m; 0 over the log."""
     along = min(max(offset_along(point, log), -log.length_m / 2), log.length_m / 2)
     x, y = (c + along * a for c, a in zip(log.center_m[:2], log.axis[:2], strict=True))
     return max(hypot(point[0] - x, point[1] - y) - log.diameter_m / 2, 0.0)

@@ -31,7 +31,7 @@ ROUND_COUNT: Final = 3
 
 
 def settled_poses(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
-    """The corrected logs (n) and their covariances (n, 7, 7), on level ground at ``ground_z_m``."""
+    """Correct the logs (n) and their covariances (n, 7, 7), on level ground at ``ground_z_m``."""
     sigma, before = covariances.copy(), surface_gaps(world)
     common = float(np.min(sigma[:, ACROSS_2, ACROSS_2], initial=np.inf))  # the camera's own share of the variance
     lying, off, sure = np.zeros(world.count, bool), np.zeros(world.count), np.zeros(world.count)
@@ -68,8 +68,8 @@ def settled_poses(world: Cylinders, covariances: np.ndarray, ground_z_m: float) 
 
 
 def surface_gaps(world: Cylinders) -> np.ndarray:
-    """Least distance between the surfaces of every two logs (n, n) [m], by points along one axis; negative where they
-    overlap, infinite between a log and itself."""
+    """Compute the least distance between the surfaces of every two logs (n, n) [m], by points along one axis; negative
+    where they overlap, infinite between a log and itself."""
     off = np.linalg.norm(axis_offsets(world), axis=-1).min(axis=-1)
     gap: np.ndarray = np.minimum(off, off.T) - world.radius[:, None] - world.radius[None, :]
     np.fill_diagonal(gap, np.inf)
@@ -77,7 +77,7 @@ def surface_gaps(world: Cylinders) -> np.ndarray:
 
 
 def _undersides(world: Cylinders, i: int, ground_z_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (2,) of the undersides of both ends of log ``i`` over the ground, and their Jacobian (2, 7)."""
+    """Compute heights (2,) of the undersides of both ends of log ``i`` over the ground, and their Jacobian (2, 7)."""
     half = 0.5 * float(world.length[i])
     level = float(np.sqrt(max(1.0 - world.axis[i, 2] ** 2, 0.0)))
     middle = world.center[i, 2] - world.radius[i] * level - ground_z_m
@@ -89,7 +89,7 @@ def _undersides(world: Cylinders, i: int, ground_z_m: float) -> tuple[np.ndarray
 
 
 def _updated_covariance(covariance: np.ndarray, slope: np.ndarray, noise_m: float) -> np.ndarray:
-    """A covariance (7, 7) after a measurement with Jacobian (k, 7)."""
+    """Update a covariance (7, 7) by a measurement with Jacobian (k, 7)."""
     spread = slope @ covariance @ slope.T + noise_m**2 * np.eye(len(slope))
     known = covariance - covariance @ slope.T @ np.linalg.solve(spread, slope @ covariance)
     symmetric: np.ndarray = 0.5 * (known + known.T)
@@ -99,7 +99,7 @@ def _updated_covariance(covariance: np.ndarray, slope: np.ndarray, noise_m: floa
 def _updated_pose(
     world: Cylinders, sigma: np.ndarray, i: int, over_m: np.ndarray, slope: np.ndarray, noise_m: float
 ) -> Cylinders:
-    """The logs with log ``i`` moved to reduce the residual ``over_m`` (k,), weighted by its covariance."""
+    """Move log ``i`` to reduce the residual ``over_m`` (k,), weighted by its covariance."""
     spread = slope @ sigma[i] @ slope.T + noise_m**2 * np.eye(len(slope))
     error = np.zeros((world.count, SIZE))
     error[i] = -sigma[i] @ slope.T @ np.linalg.solve(spread, over_m)
@@ -107,7 +107,7 @@ def _updated_pose(
 
 
 def _separated(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
-    """The logs with logs ``i`` and ``j`` moved apart until they touch, each in proportion to its variance."""
+    """Move logs ``i`` and ``j`` apart until they touch, each in proportion to its variance."""
     level, up = transverse_axes(world.axis)
     points, away = world.points()[j], axis_offsets(world)[i, j]
     distance = np.linalg.norm(away, axis=1)
@@ -115,12 +115,12 @@ def _separated(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders
     reach = float(distance[k] - world.radius[i] - world.radius[j]) + CONTACT_OVERLAP_M
     if reach >= 0.0:
         return world
-    way = away[k] / max(float(distance[k]), 1e-6)
+    direction = away[k] / max(float(distance[k]), 1e-6)
     error, slopes = np.zeros((world.count, SIZE)), []
     for log, sense, point in ((i, -1.0, points[k] - away[k]), (j, 1.0, points[k])):
         at = (point - world.center[log]) @ world.axis[log]
         slope = np.zeros(SIZE)
-        slope[[ACROSS_1, ACROSS_2]] = sense * (way @ level[log]), sense * (way @ up[log])
+        slope[[ACROSS_1, ACROSS_2]] = sense * (direction @ level[log]), sense * (direction @ up[log])
         slope[[TILT_1, TILT_2]] = at * slope[[ACROSS_1, ACROSS_2]]
         slope[RADIUS] = -1.0
         slopes.append((log, slope))

@@ -49,19 +49,19 @@ class Camera:
     intrinsics: Intrinsics = D435
 
     def to_base(self, u_px: float, v_px: float, depth_m: float) -> np.ndarray:
-        """Base-frame point (3,) of a pixel at a depth [m]."""
-        seen = DOWNWARD_AXES @ self.intrinsics.deproject(u_px, v_px, depth_m)
-        point: np.ndarray = self.position_m + seen
+        """Compute the base-frame point (3,) of a pixel at a depth [m]."""
+        offset_m = DOWNWARD_AXES @ self.intrinsics.deproject(u_px, v_px, depth_m)
+        point: np.ndarray = self.position_m + offset_m
         return point
 
 
 def shortened_logs(world: Cylinders, grapple_m: float) -> Cylinders:
-    """The recreated logs: shorter by the grapple's width, then by 10 %."""
+    """Recreate the logs: shorter by the grapple's width, then by 10 %."""
     return world.shortened(grapple_m, TRIM_SHARE)
 
 
 def operational_area(world: Cylinders) -> OperationalArea:
-    """The operational area, from the ends of the axes (eq. 1).
+    """Compute the operational area, from the ends of the axes (eq. 1).
 
     Raises:
         InputRefused: there is no log, or a pose is not finite.
@@ -73,22 +73,22 @@ def operational_area(world: Cylinders) -> OperationalArea:
 
 
 def camera_above(box: OperationalArea, intrinsics: Intrinsics = D435) -> Camera:
-    """The paper's camera: 3 m above the centroid."""
+    """Place the paper's camera: 3 m above the centroid."""
     return Camera(box.centroid_m + np.array([0.0, 0.0, CAMERA_HEIGHT_M]), intrinsics)
 
 
 def cameras_along(
     box: OperationalArea, reach_m: float, count: int, intrinsics: Intrinsics = D435
 ) -> tuple[Camera, ...]:
-    """A moving camera: ``count`` places on a circle of ``reach_m`` about the paper's place, which comes first."""
-    first = camera_above(box, intrinsics)
+    """Place a moving camera: ``count`` places on a circle of ``reach_m`` about the paper's place, which comes first."""
+    first_camera = camera_above(box, intrinsics)
     turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[: max(0, count - 1)]
     circle = reach_m * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
-    return (first, *(Camera(first.position_m + step, intrinsics) for step in circle))
+    return (first_camera, *(Camera(first_camera.position_m + step, intrinsics) for step in circle))
 
 
 def render(world: Cylinders, camera: Camera, ground_z_m: float) -> np.ndarray:
-    """Depth (H, W) float32 [m], optical z, of cylinders and level ground.
+    """Render the depth (H, W) float32 [m], optical z, of cylinders and level ground.
 
     Raises:
         InputRefused: the camera is not above the ground, or is inside a log.
@@ -118,7 +118,7 @@ def _draw(
     half: float,
     r: float,
 ) -> None:
-    """Draws one cylinder into an image of inverse depths, within its bounding box."""
+    """Draw one cylinder into an image of inverse depths, within its bounding box."""
     side = np.cross(w, (0.0, 0.0, 1.0) if abs(w[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     across = np.stack([side, np.cross(w, side)]) * r

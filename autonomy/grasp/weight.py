@@ -23,12 +23,12 @@ than this times what was seen of them, up to 2.4 times; the lift watches its loa
 
 
 def wood_kg(logs: Iterable[LogObservation]) -> float:
-    """The weight of logs by their measured sizes [kg]."""
+    """Compute the weight of logs by their measured sizes [kg]."""
     return sum(DENSITY_KG_M3 * pi * (log.diameter_m / 2.0) ** 2 * log.length_m for log in logs)
 
 
 def bearable_kg(arm: Arm, q: Sequence[float]) -> float:
-    """The greatest load that the machine bears with its joints at ``q`` and as it stands [kg]; inf where unknown."""
+    """Compute the greatest load that the machine bears with joints ``q`` and as it stands [kg]; inf where unknown."""
     profile = arm.profile
     if profile.stability is None:
         return inf

@@ -36,11 +36,11 @@ class Frames:
         )
 
     def rear(self) -> Pose:
-        """The rear frame; its origin is on the articulation axis."""
+        """Return the rear frame; its origin is on the articulation axis."""
         return self._rear(self._values)
 
     def base(self) -> Pose:
-        """The crane's base frame."""
+        """Return the crane's base frame."""
         rear = self.rear()
         base_offset, *ends = (np.array(rear_from_base(self._carrier, tuple(p))) for p in (np.zeros(3), *np.eye(3)))
         turn = np.stack([end - base_offset for end in ends], axis=1)

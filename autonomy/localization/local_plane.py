@@ -33,7 +33,7 @@ class LocalPlane:
             )
 
     def local(self, latitude_deg: float, longitude_deg: float, altitude_m: float | None = None) -> Point:
-        """East, north and up [m]; a point without an altitude is at that of the origin."""
+        """Return east, north and up [m]; a point without an altitude is at that of the origin."""
         altitude = self.altitude_m if altitude_m is None else altitude_m
         e, n, u = pymap3d.geodetic2enu(
             latitude_deg, longitude_deg, altitude, self.latitude_deg, self.longitude_deg, self.altitude_m
@@ -41,7 +41,7 @@ class LocalPlane:
         return float(e), float(n), float(u)
 
     def geodetic(self, east_m: float, north_m: float, up_m: float = 0.0) -> Point:
-        """Latitude and longitude [deg] and altitude [m]."""
+        """Return latitude and longitude [deg] and altitude [m]."""
         lat, lon, altitude = pymap3d.enu2geodetic(
             east_m, north_m, up_m, self.latitude_deg, self.longitude_deg, self.altitude_m
         )
@@ -49,10 +49,10 @@ class LocalPlane:
 
 
 def wrapped(angle_rad: float) -> float:
-    """The same direction between -pi and pi."""
+    """Return the same direction between -pi and pi."""
     return math.remainder(angle_rad, 2.0 * math.pi)
 
 
 def yaw_from_heading(heading_rad: float) -> float:
-    """Yaw, counter-clockwise from east, of a heading, clockwise from north."""
+    """Convert a heading, clockwise from north, to a yaw, counter-clockwise from east."""
     return wrapped(0.5 * math.pi - heading_rad)

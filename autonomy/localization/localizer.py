@@ -79,7 +79,7 @@ class Localizer:
         self._z = (math.nan, math.inf)
 
     def step(self, report: VehicleReport) -> Location:
-        """The location at ``report.stamp_ns``."""
+        """Compute the location at ``report.stamp_ns``."""
         last = self._last
         if last is not None and report.stamp_ns <= last.stamp_ns:
             return self._location(last)
@@ -189,7 +189,7 @@ class Localizer:
             self._turned.clear()
 
     def _height(self, report: VehicleReport, reach_m: float) -> None:
-        """Height of the axle: the receiver's altitudes, smoothed by their scatter."""
+        """Estimate the height of the axle: the receiver's altitudes, smoothed by their scatter."""
         assert self.plane is not None
         if not math.isfinite(report.altitude_m):
             return
@@ -202,7 +202,7 @@ class Localizer:
         )
 
     def _update_status(self, report: VehicleReport, moving: bool) -> None:
-        """Status from the ages of the last accepted measurements."""
+        """Update the status from the ages of the last accepted measurements."""
         if self._status is Status.STARTING or not moving:
             self._status = Status.TRACKING if moving and self._fitting >= AGREEING_COUNT else Status.STARTING
             if not moving:
@@ -218,22 +218,22 @@ class Localizer:
             self._status = Status.TRACKING if age <= FRESH_NS else Status.DEAD_RECKONING
 
     def _reason(self, report: VehicleReport) -> str:
-        """Why the machine is not tracked."""
+        """Tell why the machine is not tracked."""
         if self._status is Status.TRACKING:
             return ""
         stamp = report.stamp_ns
         if stamp - report.motion_ns > MOTION_NS or not _finite(report.speed_m_s, report.articulation_rad):
             return "speed and articulation are not known"
-        for what, seen, fitted, value in (
+        for quantity, seen, fitted, value in (
             ("position", report.position_ns, self._position_ns, report.latitude_deg),
             ("heading", report.heading_ns, self._heading_ns, report.heading_rad),
         ):
             if not seen or not math.isfinite(value) or stamp - seen > FRESH_NS:
-                return f"no {what} from the receiver"
-            if what == "position" and report.fix not in self._noise.fixes:
+                return f"no {quantity} from the receiver"
+            if quantity == "position" and report.fix not in self._noise.fixes:
                 return "the receiver has no fix"
             if self._status is not Status.STARTING and stamp - fitted > FRESH_NS:
-                return f"the receiver's {what} does not match the wheels"
+                return f"the receiver's {quantity} does not match the wheels"
         return "not enough matching positions yet"
 
     def _location(self, report: VehicleReport) -> Location:
@@ -265,7 +265,7 @@ class Localizer:
         )
 
     def _front_roll_pitch(self, report: VehicleReport) -> tuple[float, float]:
-        """Roll and pitch of the front half; level while unknown."""
+        """Return roll and pitch of the front half; level while unknown."""
         if not _finite(report.roll_rad, report.pitch_rad):
             return 0.0, 0.0
         return front_attitude(report.roll_rad, report.pitch_rad, report.articulation_rad)

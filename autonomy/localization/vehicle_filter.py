@@ -63,7 +63,7 @@ class GaussMarkov:
     over: float
 
     def step(self, by: float) -> tuple[float, float]:
-        """Decay factor and added variance after ``by`` m or s."""
+        """Compute the decay factor and added variance after ``by`` m or s."""
         keep = math.exp(-by / self.over)
         return keep, self.sigma**2 * (1.0 - keep * keep)
 
@@ -114,7 +114,7 @@ class Odometry:
 
 
 def turned_without_slip(carrier: Carrier, odometry: Odometry, distance_m: float) -> float:
-    """Turn of the front half over a distance ``distance_m`` of its axle, without slip [rad]."""
+    """Compute the turn of the front half over a distance ``distance_m`` of its axle, without slip [rad]."""
     articulation = 0.5 * (odometry.articulation_before_rad + odometry.articulation_rad)
     swing = odometry.articulation_rad - odometry.articulation_before_rad
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
@@ -122,7 +122,7 @@ def turned_without_slip(carrier: Carrier, odometry: Odometry, distance_m: float)
 
 
 def predicted_state(carrier: Carrier, noise: NoiseModel, x: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
-    """State (12,), Jacobian (12, 12) and process noise (12, 12) one step later."""
+    """Predict state (12,), Jacobian (12, 12) and process noise (12, 12) one step later."""
     s, d = State, odometry
     distance = d.distance_m * (1.0 + x[s.SCALE])
     turned = turned_without_slip(carrier, d, distance) + x[s.CURVE] * distance
@@ -137,31 +137,31 @@ def predicted_state(carrier: Carrier, noise: NoiseModel, x: Array, odometry: Odo
     from_distance = (
         math.sin(articulation) / (carrier.front_axle_m * math.cos(articulation) + carrier.rear_axle_m) + x[s.CURVE]
     )
-    for place, of_turn, of_length in ((s.CURVE, distance, 0.0), (s.SCALE, from_distance * d.distance_m, d.distance_m)):
-        jacobian[s.YAW, place] = of_turn
-        jacobian[s.X, place] = c * of_length - 0.5 * distance * si * of_turn
-        jacobian[s.Y, place] = si * of_length + 0.5 * distance * c * of_turn
-    for place, of_course in ((s.YAW, 1.0), (s.SIDE, 1.0), (s.SLIDE, -d.roll_rad)):
-        jacobian[s.X, place], jacobian[s.Y, place] = -of_course * distance * si, of_course * distance * c
+    for index, of_turn, of_length in ((s.CURVE, distance, 0.0), (s.SCALE, from_distance * d.distance_m, d.distance_m)):
+        jacobian[s.YAW, index] = of_turn
+        jacobian[s.X, index] = c * of_length - 0.5 * distance * si * of_turn
+        jacobian[s.Y, index] = si * of_length + 0.5 * distance * c * of_turn
+    for index, of_course in ((s.YAW, 1.0), (s.SIDE, 1.0), (s.SLIDE, -d.roll_rad)):
+        jacobian[s.X, index], jacobian[s.Y, index] = -of_course * distance * si, of_course * distance * c
     driven = abs(d.distance_m)
     added = np.zeros(SIZE)
     added[[s.X, s.Y]] = noise.distance_m**2 * driven + noise.standstill_m**2 * d.seconds
     added[s.YAW] = noise.distance_yaw_rad**2 * driven
     added[s.HEADING] = noise.heading_rad**2 * d.seconds
-    for place, drift in ((s.CURVE, noise.curve), (s.SIDE, noise.side), (s.SCALE, noise.scale), (s.SLIDE, noise.slide)):
-        keep, added[place] = drift.step(driven)
-        out[place] *= keep
-        jacobian[place, place] = keep
+    for index, drift in ((s.CURVE, noise.curve), (s.SIDE, noise.side), (s.SCALE, noise.scale), (s.SLIDE, noise.slide)):
+        keep, added[index] = drift.step(driven)
+        out[index] *= keep
+        jacobian[index, index] = keep
     return out, jacobian, np.diag(added)
 
 
 def drift_rad(x: Array, roll_rad: float) -> float:
-    """Direction of the front axle's motion relative to the front half, + left [rad]."""
+    """Compute the direction of the front axle's motion relative to the front half, + left [rad]."""
     return float(x[State.SIDE] - x[State.SLIDE] * roll_rad)
 
 
 def tilt(roll_rad: float, pitch_rad: float) -> Array:
-    """Rotation (3, 3) of a half without its yaw: roll + right side down, pitch + nose up."""
+    """Return the rotation (3, 3) of a half without its yaw: roll + right side down, pitch + nose up."""
     cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
     roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     rotation: Array = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]]) @ roll
@@ -169,18 +169,20 @@ def tilt(roll_rad: float, pitch_rad: float) -> Array:
 
 
 def axle_m(carrier: Carrier, height_m: float) -> Point:
-    """Centre of the front axle, between the hubs, in the front frame."""
+    """Return the centre of the front axle, between the hubs, in the front frame."""
     return carrier.front_axle_m, 0.0, -(carrier.arm_drop_low_m + height_m)
 
 
 def antenna_reach(carrier: Carrier, roll_rad: float, pitch_rad: float, height_m: float) -> Array:
-    """From the centre of the front axle to the main antenna (3,): along the front's yaw, to its left, and up [m]."""
+    """Return the vector from the centre of the front axle to the main antenna (3,): along the front's yaw, to its left,
+    and up [m].
+    """
     lever = np.subtract(carrier.antenna_main_m, axle_m(carrier, height_m))
     return tilt(roll_rad, pitch_rad) @ lever
 
 
 def predicted_antenna(x: Array, reach: Array) -> tuple[Array, Array]:
-    """Predicted position of the main antenna (2,) and its Jacobian (2, 12)."""
+    """Predict the position of the main antenna (2,) and its Jacobian (2, 12)."""
     s = State
     c, si = math.cos(x[s.YAW]), math.sin(x[s.YAW])
     ahead, left = reach[0] + x[s.ANTENNA_X], reach[1] + x[s.ANTENNA_Y]
@@ -198,7 +200,7 @@ def predicted_antenna(x: Array, reach: Array) -> tuple[Array, Array]:
 
 
 def front_attitude(roll_rad: float, pitch_rad: float, articulation_rad: float) -> tuple[float, float]:
-    """Roll and pitch of the front half from those of the rear, for a rigid articulation axis."""
+    """Compute roll and pitch of the front half from those of the rear, for a rigid articulation axis."""
     down = tilt(roll_rad, pitch_rad)[2]
     c, s = math.cos(articulation_rad), math.sin(articulation_rad)
     ahead, left, up = c * down[0] + s * down[1], -s * down[0] + c * down[1], down[2]
@@ -264,7 +266,7 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         return math.sqrt(2.0) * self._noise.phase_m / base
 
     def heading_off(self, yaw_rad: float, stamp_ns: int) -> float:
-        """Innovation of a dual-antenna yaw at a time [rad]."""
+        """Compute the innovation of a dual-antenna yaw at a time [rad]."""
         then = self._state_before(self._motion_since(stamp_ns))
         return wrapped(yaw_rad - then[State.YAW] - then[State.HEADING])
 
@@ -274,10 +276,10 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         after, self.F, self.Q = predicted_state(self._carrier, self._noise, before, odometry)
         keep = math.exp(-odometry.seconds / self._noise.wander_s)
         sigma = self._noise.fixes.get(self._fix, (math.inf, 0.0))[1] * math.sqrt(0.5)
-        for place in (State.WANDER_X, State.WANDER_Y):
-            self.F[place, place] = keep
-            after[place] *= keep
-            self.Q[place, place] = sigma**2 * (1.0 - keep * keep)
+        for index in (State.WANDER_X, State.WANDER_Y):
+            self.F[index, index] = keep
+            after[index] *= keep
+            self.Q[index, index] = sigma**2 * (1.0 - keep * keep)
         self._next = after
         self.predict()
         self._motion = self._motion + (after - before)[[State.X, State.Y, State.YAW]]
@@ -322,7 +324,7 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         return self._update_gated(np.array([off]), h, np.array([[self._noise.turn_rad_s**2]]))
 
     def predicted_position(self, reach: Array, stamp_ns: int) -> Array:
-        """Predicted position of the antenna at ``stamp_ns`` (2,)."""
+        """Predict the position of the antenna at ``stamp_ns`` (2,)."""
         return predicted_antenna(self._state_before(self._motion_since(stamp_ns)), reach)[0]
 
     def _update_gated(self, off: Array, h: Array, r: Array) -> bool:
@@ -338,27 +340,27 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         return True
 
     def _set_fix(self, fix: int) -> None:
-        """Another kind of fix has another slowly varying error: reset it."""
+        """Reset the slowly varying error: another kind of fix has another one."""
         if fix == self._fix:
             return
         self._fix = fix
-        places = [State.WANDER_X, State.WANDER_Y]
-        self.x[places] = 0.0
-        self.P[places, :] = self.P[:, places] = 0.0
-        self.P[places, places] = 0.5 * self._noise.fixes[fix][1] ** 2
+        indices = [State.WANDER_X, State.WANDER_Y]
+        self.x[indices] = 0.0
+        self.P[indices, :] = self.P[:, indices] = 0.0
+        self.P[indices, indices] = 0.5 * self._noise.fixes[fix][1] ** 2
 
     def _store(self, stamp_ns: int) -> None:
         self._stamps.append(stamp_ns)
         self._motions.append(self._motion)
 
     def _state_before(self, since: Array) -> Array:
-        """The state before the motion ``since``."""
+        """Return the state before the motion ``since``."""
         x = self.x.copy()
         x[[State.X, State.Y, State.YAW]] -= since
         return x
 
     def _motion_since(self, stamp_ns: int) -> Array:
-        """Odometry displacement and turn (3,) since ``stamp_ns``, limited to the stored steps."""
+        """Return the odometry displacement and turn (3,) since ``stamp_ns``, limited to the stored steps."""
         stamps = self._stamps
         i = bisect_left(stamps, stamp_ns)
         if i == 0 or i == len(stamps):

@@ -177,7 +177,7 @@ class ActivityManager:
         return f"{text} (round {rounds + 1})" if self.state is State.SEARCH and rounds else text
 
     def progress(self) -> Checkpoint:
-        """A checkpoint of the mission."""
+        """Make a checkpoint of the mission."""
         world, sorting = self.world, self.world.sorting
         return Checkpoint(
             mission=self._digest,
@@ -193,13 +193,14 @@ class ActivityManager:
         )
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
-        """With memory: where the camera's next picture is taken; None while it must take none, because the crane works
-        in front of it and shows it no load, or the machine is not located."""
+        """Tell, with memory, where the camera's next picture is taken; None while it must take none, because the crane
+        works in front of it and shows it no load, or the machine is not located.
+        """
         works = RULES[self.state].crane and not self.shows_load
         if self.log_memory is None or works or self.state in FINAL_STATES:
             return None
-        found = self.world.standpoint(now_ns)
-        return replace(found, load=True) if found is not None and self.shows_load else found
+        standpoint = self.world.standpoint(now_ns)
+        return replace(standpoint, load=True) if standpoint is not None and self.shows_load else standpoint
 
     @property
     def shows_load(self) -> bool:
@@ -221,7 +222,7 @@ class ActivityManager:
         self._auto, self._idle_reason = False, reason
 
     def next_step(self) -> None:
-        """In single-step mode: release the next transition."""
+        """Release the next transition in single-step mode."""
         self._step_released = True
 
     def abort(self, reason: str) -> None:
@@ -238,7 +239,7 @@ class ActivityManager:
         logs: Sequence[LogObservation] = (),
         seen_ns: int | None = None,
     ) -> list[bytes]:
-        """The datagrams to send now.
+        """Return the datagrams to send now.
 
         Reports and log list are the newest since the last step; the list was observed at ``seen_ns`` (None: now).
         """
@@ -285,11 +286,11 @@ class ActivityManager:
             self.idle(hold.sentence)
 
     def _off(self) -> str:
-        """Why the mission is at Idle after it has been set so; empty while it is not, and once it has ended."""
+        """Tell why the mission is at Idle after it has been set so; empty while it is not, and once it has ended."""
         return "" if self._auto or self.state in FINAL_STATES else self._idle_reason
 
     def _danger(self) -> Problem | None:
-        """Why a driving machine must stop; None while it may drive."""
+        """Tell why a driving machine must stop; None while it may drive."""
         if (outside_fence_m := self.world.outside_fence_m) > MAX_OUTSIDE_M:
             return Problem(
                 "mission.outside-fence",
@@ -370,20 +371,20 @@ class ActivityManager:
             self.route.halt()
 
     def _drive(self, state: State) -> None:
-        here = self.world.location
-        assert here is not None
+        location = self.world.location
+        assert location is not None
         try:
             if state is State.HAUL:
                 landing, log_direction_rad = self.load.landing()
                 self.route.drive_to_landing(
-                    here, landing, log_direction_rad, partial(self.world.landing_stop_m, landing)
+                    location, landing, log_direction_rad, partial(self.world.landing_stop_m, landing)
                 )
                 return
             if not self._route_begun and not self.route.ended:
-                self.route.begin(here, self.world.plane)
+                self.route.begin(location, self.world.plane)
                 self._route_begun = True
             elif self._unloaded:
-                self.route.rejoin(here)
+                self.route.rejoin(location)
         except PathRefused as error:
             self._fail(Problem(error.code, f"the route cannot be driven: {error}"))
             return

@@ -77,12 +77,12 @@ class Checkpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def mission_digest(mission: ForwardingMission) -> str:
-    """Digest of a mission's content, independent of its file format."""
+    """Compute the digest of a mission's content, independent of its file format."""
     return hashlib.sha256(msgspec.json.encode(mission)).hexdigest()
 
 
 def copied_tally(tally: Tally, later_ns: int = 0) -> Tally:
-    """A deep copy of a tally with all times shifted."""
+    """Copy a tally deeply, with all times shifted."""
 
     def moved(logs: tuple[LoadedLog, ...] | list[LoadedLog]) -> list[LoadedLog]:
         return [msgspec.structs.replace(log, at_ns=log.at_ns + later_ns) for log in logs]
@@ -95,7 +95,7 @@ def copied_tally(tally: Tally, later_ns: int = 0) -> Tally:
 
 
 def fits_mission(progress: Checkpoint, mission: ForwardingMission) -> bool:
-    """Whether landings and waypoints of a checkpoint exist in this mission."""
+    """Tell whether landings and waypoints of a checkpoint exist in this mission."""
     landings = {*progress.served, *(load.landing for load in progress.tally.loads)}
     landings |= set() if progress.landing is None else {progress.landing}
     to_come = 0 if progress.left is None else progress.left.to_come
@@ -132,25 +132,25 @@ def read_checkpoint(path: Path, mission: ForwardingMission, now_ns: int, unix_ns
             "checkpoint.unreadable", f"the checkpoint cannot be read: {error.strerror}", str(path)
         ) from None
     try:
-        found = msgspec.json.decode(data, type=Checkpoint)
+        checkpoint = msgspec.json.decode(data, type=Checkpoint)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise MissionError(
             "checkpoint.damaged", f"is damaged or not a checkpoint ({error}); {_MOVE}", str(path)
         ) from None
-    if not found.rotator.is_possible:
+    if not checkpoint.rotator.is_possible:
         sentence = f"is damaged: its rotator cannot stand as it says; {_MOVE}"
         raise MissionError("checkpoint.damaged", sentence, str(path))
-    if found.mission != mission_digest(mission):
+    if checkpoint.mission != mission_digest(mission):
         sentence = f"is the checkpoint of another mission; start the planner with that one, or {_MOVE}"
         raise MissionError("checkpoint.other-mission", sentence, str(path))
-    if not fits_mission(found, mission):
+    if not fits_mission(checkpoint, mission):
         sentence = f"is damaged: it has a landing or waypoints that are not in the mission; {_MOVE}"
         raise MissionError("checkpoint.unknown-place", sentence, str(path))
-    if found.finished:
-        sentence = f"{path}: this mission is finished, {found.tally.loaded} logs were loaded; {_MOVE}"
+    if checkpoint.finished:
+        sentence = f"{path}: this mission is finished, {checkpoint.tally.loaded} logs were loaded; {_MOVE}"
         raise InputRefused("checkpoint.finished", sentence)
-    later_ns = (now_ns - unix_ns) - (found.clock_ns - found.unix_ns)
-    return msgspec.structs.replace(found, tally=copied_tally(found.tally, later_ns), clock_ns=0, unix_ns=0)
+    later_ns = (now_ns - unix_ns) - (checkpoint.clock_ns - checkpoint.unix_ns)
+    return msgspec.structs.replace(checkpoint, tally=copied_tally(checkpoint.tally, later_ns), clock_ns=0, unix_ns=0)
 
 
 class CheckpointFile:
@@ -162,7 +162,7 @@ class CheckpointFile:
         self._last: Checkpoint | None = None
 
     def due(self, now_ns: int) -> bool:
-        """Whether the next checkpoint is due."""
+        """Tell whether the next checkpoint is due."""
         return now_ns >= self._due_ns
 
     def write(self, progress: Checkpoint, now_ns: int, unix_ns: int) -> None:

@@ -121,18 +121,18 @@ class CraneExecutor:
         )
 
     def _view(self) -> LoadView | None:
-        """With a camera that only looks ahead: how it sees a load; paper B leaves its rotator as it is."""
+        """Return how a camera that only looks ahead sees a load; paper B leaves its rotator as it is."""
         vehicle = self._world.vehicle
         if self._log_memory is None or self._as_paper_b or vehicle is None:
             return None
         return load_view(self._profile, vehicle.articulation_rad)
 
     def _unloads_next(self, log: LogObservation) -> bool:
-        """Whether the next grasp from the bunk could be of such a log."""
+        """Tell whether the next grasp from the bunk could be of such a log."""
         return lies_in_bunk(self._profile.bunk, log)
 
     def _fetches_next(self, log: LogObservation) -> bool:
-        """Whether the next grasp on the ground could be of such a log."""
+        """Tell whether the next grasp on the ground could be of such a log."""
         number = self._world.map_number(log.id)
         return number is not None and not self._load.full and number in {g.number for g in self._world.graspable()}
 
@@ -140,7 +140,9 @@ class CraneExecutor:
     def step(
         self, now_ns: int, report: StateReport | None, logs: Sequence[LogObservation], halted: bool
     ) -> bytes | None:
-        """One step of the job: the datagram to send now, or None.  ``halted``: the operator has paused the crane."""
+        """Take one step of the job; return the datagram to send, or None.  ``halted``: the operator has paused the
+        crane.
+        """
         if self.job is None:
             return None
         self.job.halted = halted
@@ -164,12 +166,12 @@ class CraneExecutor:
             self.job.abort(reason)
 
     def on_interrupted(self) -> None:
-        """Setpoints are no longer executed; this is counted when the controller has stopped the machine."""
+        """Count that setpoints are no longer executed, if the controller has stopped the machine."""
         self._stops += self.job is not None and self._world.stopped
 
     def on_resumed(self) -> None:
-        """Setpoints are executed again; a job that was stopped too often is aborted, one with a log in the jaws later:
-        nobody else lays it down.
+        """Take note that setpoints are executed again; a job that was stopped too often is aborted, one with a log in
+        the jaws later: nobody else lays it down.
         """
         carries = self.job is not None and Phase.LIFT <= self.job.phase <= Phase.OPEN
         if self._stops >= (MAX_STOPS_WITH_LOAD if carries else MAX_STOPS):
@@ -177,7 +179,7 @@ class CraneExecutor:
 
     # ------------------------------------------------------------------ ending a job
     def collected(self, now_ns: int) -> bool:
-        """Whether a grasp was placed in the bunk; ends the job and books the logs."""
+        """Tell whether a grasp was placed in the bunk; if so, end the job and book the logs."""
         job = self.job
         if job is None or not job.idle or not job.done or job.grasp is None:
             return False
@@ -192,7 +194,7 @@ class CraneExecutor:
         return True
 
     def missed(self, target: int | None) -> bool:
-        """Whether a grasp failed; ends the job and gives the log up after too many failures."""
+        """Tell whether a grasp failed; if so, end the job and give the log up after too many failures."""
         job = self.job
         if job is None or not job.idle or job.failure is None:
             return False
@@ -201,7 +203,7 @@ class CraneExecutor:
         return True
 
     def unloaded(self) -> bool:
-        """Whether a grasp from the bunk is over, with or without logs; ends the job."""
+        """Tell whether a grasp from the bunk is over, with or without logs; if so, end the job."""
         job = self.job
         if job is None or not job.idle:
             return False
@@ -212,7 +214,7 @@ class CraneExecutor:
         return True
 
     def stowed(self) -> bool:
-        """Whether the crane is stowed for driving; ends the job."""
+        """Tell whether the crane is stowed for driving; end a job that is over."""
         job = self.job
         if job is None or not job.idle:
             return False

@@ -40,7 +40,7 @@ class EventConditions:
         self._height_m, self._progress_m = height_m, self._route.driven_m
 
     def has(self, event: Event, now_ns: int) -> bool:
-        """Whether an event has occurred."""
+        """Tell whether an event has occurred."""
         match event:
             case Event.AT_HEIGHT:
                 return self._settled(self._world.is_at_height(self._height_m), now_ns)
@@ -80,19 +80,19 @@ class EventConditions:
         return False
 
     def late(self, rule: Rule, now_ns: int) -> bool:
-        """Whether a state has timed out; for driving states the time counts from the last progress."""
+        """Tell whether a state has timed out; for driving states the time counts from the last progress."""
         if self._route.driven_m > self._progress_m + PROGRESS_M:
             self._progress_m, self._progress_ns = self._route.driven_m, now_ns
         begin_ns = max(self._since_ns, self._progress_ns) if rule.drives else self._since_ns
         return now_ns - begin_ns > rule.timeout_s * SECOND_NS
 
     def _settled(self, so: bool, now_ns: int) -> bool:
-        """Whether a condition has held for ``SETTLED_NS``."""
+        """Tell whether a condition has held for ``SETTLED_NS``."""
         self._settled_ns = (self._settled_ns or now_ns) if so else 0
         return so and now_ns - self._settled_ns >= SETTLED_NS
 
     def _emptied(self, now_ns: int) -> bool:
-        """Whether the bunk is empty; starts the next grasp while it is not."""
+        """Tell whether the bunk is empty; start the next grasp while it is not."""
         if self._crane.unloaded():
             self._since_ns = now_ns
         if self._crane.failure or self._crane.job is not None or self._world.counted_ns <= self._since_ns:

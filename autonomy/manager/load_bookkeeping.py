@@ -63,7 +63,7 @@ class FallenLogs:
         """Logs that were told as fallen."""
 
     def passes(self, base: Pose, next_number: int) -> None:
-        """The loaded machine is here; ``next_number`` is the first one that no mapped log has."""
+        """Record that the loaded machine is here; ``next_number`` is the first one that no mapped log has."""
         x, y = self._bunk.center_m
         middle = base.to_base(np.array([x, y, 0.0]))[:2]
         if self._places and math.dist(middle, self._places[-1].middle_m) < STEP_M:
@@ -73,17 +73,19 @@ class FallenLogs:
         self._places.append(_Place(middle, along / np.linalg.norm(along), next_number))
 
     def fallen(self, logs: Iterable[MappedLog]) -> list[MappedLog]:
-        """The logs that have fallen off, each once."""
-        found = [log for log in logs if log.hits >= MIN_HITS and log.number not in self._known and self._fell(log)]
-        self._known |= {log.number for log in found}
-        return found
+        """Find the logs that have fallen off, each once."""
+        fallen_logs = [
+            log for log in logs if log.hits >= MIN_HITS and log.number not in self._known and self._fell(log)
+        ]
+        self._known |= {log.number for log in fallen_logs}
+        return fallen_logs
 
     def forget(self) -> None:
-        """The bunk is empty."""
+        """Forget where the machine has been: the bunk is empty."""
         self._places.clear()
 
     def _fell(self, log: MappedLog) -> bool:
-        return any(log.number >= place.next_number and self._is_near(place, log) for place in self._places)
+        return any(log.number >= passed.next_number and self._is_near(passed, log) for passed in self._places)
 
     def _is_near(self, place: _Place, log: MappedLog) -> bool:
         off = log.center_m[:2] - place.middle_m
@@ -154,24 +156,24 @@ class LoadBookkeeping:
         return self.sorting.landing_name(self.sorting.landing)
 
     def landing(self) -> tuple[Point2, float | None]:
-        """The landing of the load: its centre in the plane and the direction of its logs [rad] (None: any)."""
-        here, places = self._world.location, self._world.landings
-        assert here is not None
-        which = self.sorting.choose_landing(places, (here.x_m, here.y_m))
-        return places[which], self._log_direction_rad[which] if self._log_direction_rad else None
+        """Return the landing of the load: its centre in the plane and the direction of its logs [rad] (None: any)."""
+        location, places = self._world.location, self._world.landings
+        assert location is not None
+        landing_index = self.sorting.choose_landing(places, (location.x_m, location.y_m))
+        return places[landing_index], self._log_direction_rad[landing_index] if self._log_direction_rad else None
 
     def logs_to_leave(self, logs: Sequence[LogObservation], target: int | None) -> tuple[int, ...]:
-        """List numbers of the logs that a grasp of the target must leave."""
+        """Return the list numbers of the logs that a grasp of the target must leave."""
         log_map, world = self._world.log_map, self._world
-        first = None if target is None else log_map.get(target)
-        found = []
+        target_log = None if target is None else log_map.get(target)
+        log_ids = []
         for log in logs:
             number = world.map_number(log.id)
             mapped = None if number is None else log_map.get(number)
-            kind, with_ = ("" if known is None else known.assortment for known in (mapped, first))
+            kind, with_ = ("" if known is None else known.assortment for known in (mapped, target_log))
             if not self.sorting.may_share_grasp(kind, with_) or (mapped is not None and world.is_on_landing(mapped)):
-                found.append(log.id)
-        return tuple(found)
+                log_ids.append(log.id)
+        return tuple(log_ids)
 
     def book_loaded(self, job: Activity, now_ns: int) -> None:
         """Book a grasp that was placed in the bunk."""
@@ -227,16 +229,16 @@ class LoadBookkeeping:
             self._differing = 0
 
     def check_fallen(self, now_ns: int) -> int:
-        """With a camera that only looks ahead: book the logs that it finds where they can only have fallen off the
-        machine, and say so; returns how many.
+        """Book, with a camera that only looks ahead, the logs that it finds where they can only have fallen off the
+        machine, and say so; return how many.
         """
         world, tally = self._world, self.tally
         if not tally.on_board:
             self._fallen.forget()
             return 0
         self._fallen.passes(world.base, world.log_map.next_number)
-        found = [log for log in self._fallen.fallen(world.log_map.logs) if not world.is_on_landing(log)]
-        lost = found[: tally.on_board]
+        fallen_logs = [log for log in self._fallen.fallen(world.log_map.logs) if not world.is_on_landing(log)]
+        lost = fallen_logs[: tally.on_board]
         for log in lost:
             tally.book_lost(1)
             tally.remark(
@@ -289,7 +291,7 @@ class LoadBookkeeping:
             tally.given_up[number] = job.failure
 
     def book_unloaded(self, job: Activity) -> bool:
-        """Book a finished grasp from the bunk; returns whether it failed."""
+        """Book a finished grasp from the bunk; return whether it failed."""
         failed = job.failure is not None
         self.tally.missed += failed
         if job.done and job.grasp is not None:

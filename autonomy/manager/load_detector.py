@@ -48,7 +48,7 @@ MAX_JUDGED: Final = 10
 
 
 def expected_kg(log: LogObservation) -> float:
-    """Weight of a log of green wood by its size."""
+    """Estimate the weight of a log of green wood by its size."""
     return GREEN_KG_M3 * volume_m3(log.length_m, log.diameter_m)
 
 
@@ -59,7 +59,7 @@ class WoodScale:
         self._shares: deque[float] = deque(maxlen=MAX_WEIGHED)
 
     def learn(self, read_kg: float, wood_kg: float) -> None:
-        """A single log of ``wood_kg`` expected weight was lifted and read ``read_kg``."""
+        """Learn from a single log of ``wood_kg`` expected weight that was lifted and read ``read_kg``."""
         if wood_kg >= MIN_WEIGHABLE_KG and math.isfinite(read_kg):
             self._shares.append(read_kg / wood_kg)
 
@@ -77,7 +77,7 @@ class WoodScale:
 def gripped_by_weight(
     read_kg: float, meant_kg: Mapping[int, float], beside_kg: Mapping[int, float], wood: WoodScale
 ) -> frozenset[int]:
-    """The logs that a reading is explained by best: those of a grasp, ``meant_kg``, less some, plus some that lie
+    """Find the logs that a reading is explained by best: those of a grasp, ``meant_kg``, less some, plus some that lie
     beside it; expected weights by number.  At least one log is gripped.
     """
     kg = dict(list({**meant_kg, **beside_kg}.items())[:MAX_JUDGED])
@@ -148,6 +148,6 @@ class LoadDetector:
         return gripped_by_weight(self.read_kg, self._meant_kg, self._beside_kg, self._wood)
 
     def learn(self) -> None:
-        """The load is that of one log, nothing lay beside it: learn what this wood weighs."""
+        """Learn what this wood weighs, if the load is that of one log and nothing lay beside it."""
         if self.is_weighed and len(self._meant_kg) == 1 and not self._beside_kg:
             self._wood.learn(self.read_kg, sum(self._meant_kg.values()))

@@ -64,8 +64,8 @@ class CraneReach:
         self.max_distance_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BEYOND_ARM_M
 
     def work_s(self, log: LogObservation, is_clear: bool = False) -> float:
-        """Rough duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped.  ``is_clear``:
-        the log is known to lie clear of the machine.
+        """Estimate the duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped.
+        ``is_clear``: the log is known to lie clear of the machine.
         """
         x, y, _ = log.center_m
         if (
@@ -88,7 +88,7 @@ class CraneReach:
 def best_stop(
     logs: Sequence[MappedLog], reach: CraneReach, base_at: BaseAt, begin_m: float, end_m: float
 ) -> LoadingStop | None:
-    """The best stop between two distances along the path [m]; None when no log can be grasped from there."""
+    """Find the best stop between two distances along the path [m]; None when no log can be grasped from there."""
     places = np.arange(begin_m, end_m + 1e-9, STEP_M)
     bases = [base_at(along_m) for along_m in places.tolist()]
 
@@ -115,7 +115,7 @@ def best_stop(
 
 
 def _at_ground_height(log: LogObservation, ground_z_m: float) -> LogObservation:
-    """The log at the ground height of the machine; the real height at the stop is not known yet."""
+    """Put the log at the ground height of the machine; the real height at the stop is not known yet."""
     x, y, _ = log.center_m
     return replace(log, center_m=(x, y, ground_z_m + 0.5 * log.diameter_m))
 
@@ -123,8 +123,8 @@ def _at_ground_height(log: LogObservation, ground_z_m: float) -> LogObservation:
 def base_on_path(
     carrier: Carrier, front: tuple[float, float, float], rear_m: tuple[float, float], height_m: float
 ) -> Pose:
-    """The crane's base when the centre of the front axle stands at ``front`` (x, y [m], direction [rad]) and that of
-    the rear axle at ``rear_m`` (x, y [m]), on level ground z = 0 with the frame at a height [m].
+    """Compute the crane's base when the centre of the front axle stands at ``front`` (x, y [m], direction [rad]) and
+    that of the rear axle at ``rear_m`` (x, y [m]), on level ground z = 0 with the frame at a height [m].
     """
     x, y, yaw = front
     joint = (x - carrier.front_axle_m * math.cos(yaw), y - carrier.front_axle_m * math.sin(yaw))
@@ -138,7 +138,7 @@ def base_on_path(
 
 @lru_cache(maxsize=8)
 def _base_in_rear(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
-    """The crane's base in the rear frame: position (3,) and rotation (3, 3)."""
+    """Compute the crane's base in the rear frame: position (3,) and rotation (3, 3)."""
     base_offset, *ends = (
         np.array(rear_from_base(carrier, (float(p[0]), float(p[1]), float(p[2])))) for p in (np.zeros(3), *np.eye(3))
     )

@@ -63,7 +63,7 @@ class MappedLog:
     """1-sigma of the axis direction on the ground."""
 
     def observation(self, base: Pose) -> LogObservation:
-        """The log in the crane's base frame."""
+        """Return the log in the crane's base frame."""
         x, y, z = base.to_optical(self.center_m).tolist()
         ax, ay, az = (self.axis @ base.rotation).tolist()
         return LogObservation(self.number, (x, y, z), (ax, ay, az), self.length_m, self.diameter_m)
@@ -106,11 +106,11 @@ class LogMap:
         self._next = max(self._next, free)
 
     def get(self, number: int) -> MappedLog | None:
-        """The log with this number, None if it is not mapped."""
+        """Return the log with this number, None if it is not mapped."""
         return self._logs.get(number)
 
     def observe(self, observations: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
-        """Merge a list of observations; returns the map number of each list number."""
+        """Merge a list of observations; return the map number of each list number."""
         observed = [_observed_log(o, base, now_ns) for o in observations if not lies_in_bunk(self._bunk, o)]
         names = [o.id for o in observations if not lies_in_bunk(self._bunk, o)]
         known = list(self._logs.values())
@@ -136,7 +136,7 @@ class LogMap:
         self._logs[number] = replace(self._logs[number], hits=0)
 
     def record_miss(self, number: int) -> int:
-        """Record a failed grasp; returns how many there were."""
+        """Record a failed grasp; return how many there were."""
         log = self._logs[number] = replace(self._logs[number], misses=self._logs[number].misses + 1, hits=0)
         return log.misses
 
@@ -146,12 +146,12 @@ class LogMap:
 
 
 def nearest(logs: Sequence[MappedLog], point_m: np.ndarray) -> MappedLog | None:
-    """The log whose centre is nearest to a point (2,) of the plane."""
+    """Return the log whose centre is nearest to a point (2,) of the plane."""
     return min(logs, key=lambda log: math.dist(log.center_m[:2], point_m), default=None)
 
 
 def listed_log(log: KnownLog, plane: LocalPlane, ground_m: float) -> MappedLog:
-    """A listed log in the plane, on ground at a height [m]."""
+    """Place a listed log in the plane, on ground at a height [m]."""
     d = log.diameter_m or DEFAULT_SIZE_M[1]
     x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
     yaw = 0.0 if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg)
@@ -178,7 +178,7 @@ def _observed_log(o: LogObservation, base: Pose, now_ns: int) -> MappedLog:
 
 
 def _sigma_m(o: LogObservation) -> float:
-    """1-sigma of the centre on the ground: the larger of across and along."""
+    """Compute the 1-sigma of the centre on the ground: the larger of across and along."""
     if o.covariance is None:
         return DEFAULT_SIGMA_M
     c = unpack_covariance(o.covariance)
@@ -187,7 +187,7 @@ def _sigma_m(o: LogObservation) -> float:
 
 
 def _distance_m(log: MappedLog, sighting: MappedLog) -> float:
-    """Distance between two observations [m]; `_BAR_COST` when they cannot be of one log."""
+    """Compute the distance between two observations [m]; `_BAR_COST` when they cannot be of one log."""
     off = sighting.center_m - log.center_m
     along = float(off @ log.axis)
     across = float(np.linalg.norm(off - along * log.axis))
@@ -201,7 +201,7 @@ def _distance_m(log: MappedLog, sighting: MappedLog) -> float:
 
 
 def _averaged(log: MappedLog, sighting: MappedLog) -> MappedLog:
-    """The running average, weighted by variance; restarted when the log has no hits."""
+    """Compute the running average, weighted by variance; it is restarted when the log has no hits."""
     if not log.hits:
         return replace(sighting, number=log.number, misses=log.misses, assortment=log.assortment)
     before, now = 1.0 / log.sigma_m**2, 1.0 / sighting.sigma_m**2

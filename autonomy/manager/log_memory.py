@@ -75,12 +75,12 @@ class LogMemory:
         return len(self._in_bunk)
 
     def lose(self, count: int) -> None:
-        """So many logs fell off the bunk: which ones is unknown, so those laid last, which lie on top."""
+        """Forget logs that fell off the bunk: which ones is unknown, so those laid last, which lie on top."""
         if count:
             del self._in_bunk[-count:]
 
     def correct(self, load: LogObservation, report: StateReport) -> None:
-        """The load hangs as a camera has seen it, in the base frame: what the jaws hold turns with it about the pin."""
+        """Let the load hang as a camera sees it, in the base frame: what the jaws hold turns with it about the pin."""
         if not self._held:
             return
         _, yaw = self._pin(report)
@@ -95,15 +95,15 @@ class LogMemory:
     def log_list(
         self, now_ns: int, log_map: LogMap, base: Pose, report: StateReport | None, job: Activity | None
     ) -> tuple[LogObservation, ...] | None:
-        """The remembered logs in the base frame; None when no new list is due."""
+        """Return the remembered logs in the base frame; None when no new list is due."""
         if job is not self._job:
             self._end()
             self._job = job
             self._arm = Arm(self._profile, slope=slope_of(base.rotation))  # as the job takes it
 
         def lying() -> list[LogObservation]:
-            here = base.position_m[:2]
-            return [log.observation(base) for log in log_map.logs if math.dist(log.center_m[:2], here) < RANGE_M]
+            base_xy_m = base.position_m[:2]
+            return [log.observation(base) for log in log_map.logs if math.dist(log.center_m[:2], base_xy_m) < RANGE_M]
 
         if job is not None and report is not None:
             self._follow(job, report, lying)
@@ -116,7 +116,7 @@ class LogMemory:
         return (*near, *hanging, *self._released, *(log for log in self._in_bunk if log.id not in gone))
 
     def _end(self) -> None:
-        """The job is over: logs placed in the bunk are on board, logs taken from it are not."""
+        """End the job: logs placed in the bunk are on board, logs taken from it are not."""
         moved = {log.id for log in self._released}
         self._in_bunk = [log for log in self._in_bunk if log.id not in moved]
         self._in_bunk += [log for log in self._released if lies_in_bunk(self._profile.bunk, log)]
@@ -153,14 +153,14 @@ class LogMemory:
             self._released, self._held, self._load_detector = laid, {}, None
 
     def _judge(self, detector: LoadDetector) -> None:
-        """Logs that the weight does not explain still lie where they lay."""
+        """Judge the load by its weight: logs that the weight does not explain still lie where they lay."""
         if detector.is_empty:
             self._held, self._load_detector, self._slipped = {}, None, True
-        elif kept := {number: log for number, log in self._held.items() if number in detector.gripped}:
-            self._held = kept
+        elif explained_logs := {number: log for number, log in self._held.items() if number in detector.gripped}:
+            self._held = explained_logs
 
     def _weigh(self, detector: LoadDetector) -> None:
-        """The load is released: what was in it, by its weight, is booked."""
+        """Record what was in the released load by its weight."""
         detector.learn()
         also = tuple(log for log in self._beside if log.id in detector.gripped)
         left = tuple(number for number in self._meant if number not in self._held)
@@ -174,7 +174,7 @@ class LogMemory:
         return [_absolute(log, pin, yaw) for log in self._held.values()]
 
     def _pin(self, report: StateReport) -> tuple[np.ndarray, float]:
-        """Hanger pin in the base frame and grapple yaw; joints without an encoder use their reference."""
+        """Return the hanger pin in the base frame and grapple yaw; joints without an encoder use their reference."""
         assert self._job is not None
         sent = self._job.last_setpoint
         q = tuple(
@@ -187,7 +187,7 @@ class LogMemory:
 
 
 def _relative(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservation:
-    """A log relative to the grapple: closing jaws centre it between them; along its axis it stays where it was."""
+    """Return a log relative to the grapple: closing jaws centre it between them; along its axis it stays put."""
     axis = np.asarray(log.axis)
     off = np.asarray(log.center_m) - pin
     level = axis * (1.0, 1.0, 0.0)
@@ -197,7 +197,7 @@ def _relative(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservatio
 
 
 def _aside_m(log: LogObservation, pin: np.ndarray) -> float:
-    """Distance on the ground from below a pin to the nearest point of a log's axis."""
+    """Compute the distance on the ground from below a pin to the nearest point of a log's axis."""
     center, axis = np.asarray(log.center_m)[:2], np.asarray(log.axis)[:2]
     along = float((pin[:2] - center) @ axis) / max(float(axis @ axis), 1e-9)
     along = min(max(along, -0.5 * log.length_m), 0.5 * log.length_m)

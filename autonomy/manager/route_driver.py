@@ -124,7 +124,7 @@ class RouteDriver:
         self.along_m, self.length_m, self._ended = 0.0, math.inf, False
 
     def remainder(self, plane: LocalPlane | None) -> RouteRemainder | None:
-        """The rest of the route for a checkpoint; None before the route was begun."""
+        """Return the rest of the route for a checkpoint; None before the route was begun."""
         if isinstance(self._active, WaypointDrive):
             return RouteRemainder(self._to_come - self._active.number, ended=self.ended)
         if self._path is None:
@@ -188,7 +188,7 @@ class RouteDriver:
         else_: list[list[Point2]],
         stop_on: StopFinder,
     ) -> list[tuple[float, Path]]:
-        """Paths past a landing in these directions; else the paths by ``else_``; else paths with a turn first."""
+        """Find paths past a landing in these directions; else the paths by ``else_``; else paths with a turn first."""
         candidates = self._drivable_paths(location, _lines_past(landing, directions), stop_on)
         candidates = candidates or self._drivable_paths(location, else_, stop_on)
         turned = ([*turn, *p] for p in _lines_past(landing, directions) for turn in self._turn_first(location, p))
@@ -197,10 +197,10 @@ class RouteDriver:
     def _drivable_paths(
         self, location: Location, candidates: Iterable[list[Point2]], stop_on: StopFinder
     ) -> list[tuple[float, Path]]:
-        """The drivable paths by these points from which the landing is reached, each with its stop [m].  Every path
-        starts at the machine: stopping is inaccurate before the machine is on its path.
+        """Find the drivable paths by these points from which the landing is reached, each with its stop [m].  Every
+        path starts at the machine: stopping is inaccurate before the machine is on its path.
         """
-        found = []
+        drivable_paths = []
         for points in candidates:
             try:
                 path = self._ahead_path(location, points)
@@ -208,8 +208,8 @@ class RouteDriver:
                 continue
             stop_m = stop_on(partial(self._base, path), path.length_m)
             if stop_m is not None:
-                found.append((stop_m, path))
-        return found
+                drivable_paths.append((stop_m, path))
+        return drivable_paths
 
     def rejoin(self, location: Location) -> None:
         """Plan the rest of the route from the landing back to where the route was left."""
@@ -233,11 +233,11 @@ class RouteDriver:
         Without room to return, skip the place where it was left, then a place too near to turn at; without room for
         that, try all of them with a turn first.
         """
-        here = (location.x_m, location.y_m)
+        position_m = (location.x_m, location.y_m)
         candidates = [[*back, *by, *rest]] if back else []
         candidates += [[*by, *rest]] if by else []
         candidates.append(list(rest))
-        past = [list(rest[1:])] if turn and len(rest) > 1 and math.dist(here, rest[0]) < NEAR_M else []
+        past = [list(rest[1:])] if turn and len(rest) > 1 and math.dist(position_m, rest[0]) < NEAR_M else []
         turned = (
             [*corners, *points]
             for points in (candidates if turn else ())
@@ -259,39 +259,39 @@ class RouteDriver:
         raise refused
 
     def _turn_first(self, location: Location, points: Sequence[Point2]) -> Iterator[list[Point2]]:
-        """Corner points that lead the machine to the first of these points in the direction of their first leg."""
+        """Yield corner points that lead the machine to the first of these points in their first leg's direction."""
         if not points:
             return
-        here, yaw = (location.x_m, location.y_m), location.yaw_rad
-        ahead = (here[0] + AHEAD_M * math.cos(yaw), here[1] + AHEAD_M * math.sin(yaw))
-        a, b = points[:2] if len(points) > 1 else (here, points[0])
+        position_m, yaw = (location.x_m, location.y_m), location.yaw_rad
+        ahead = (position_m[0] + AHEAD_M * math.cos(yaw), position_m[1] + AHEAD_M * math.sin(yaw))
+        a, b = points[:2] if len(points) > 1 else (position_m, points[0])
         leg = math.atan2(b[1] - a[1], b[0] - a[0])
         radius_m = TURN_RADIUS_FACTOR * turning_radius_m(self._carrier, self._carrier.articulation_limit_rad)
         yield from dubins_corners((*ahead, yaw), (*points[0], leg), radius_m)
 
     def _return_points(self) -> tuple[Point2, Point2]:
-        """A point shortly before the place where the route is left, and that place."""
+        """Return a point shortly before the place where the route is left, and that place."""
         assert self._path is not None
         return self._path.at(self.along_m - RETURN_BEFORE_M)[:2], self._path.at(self.along_m)[:2]
 
     def _points_ahead(self) -> tuple[list[Point2], list[Point2]]:
-        """The points still ahead: extra places first, then waypoints."""
+        """Return the points still ahead: extra places first, then waypoints."""
         ahead = [point for mark, point in self._marks if mark > self.along_m + REACHED_M]
         others = len(ahead) - min(len(ahead), self._to_come)
         return ahead[:others], ahead[others:]
 
     def update_distance(self, location: Location) -> None:
         """Update the driven distance."""
-        here = (location.x_m, location.y_m)
-        distance_m = 0.0 if self._last is None else math.dist(here, self._last)
-        self._last, self.driven_m = here, self.driven_m + distance_m
+        position_m = (location.x_m, location.y_m)
+        distance_m = 0.0 if self._last is None else math.dist(position_m, self._last)
+        self._last, self.driven_m = position_m, self.driven_m + distance_m
         if not isinstance(self._active, PathDrive):
             self.along_m += distance_m
         elif self._active.steer is not None:
             self.along_m = self._active.steer.s_m
 
     def base_at(self, along_m: float) -> Pose:
-        """The crane's base at a distance along the route, with the frame at its lowest."""
+        """Compute the crane's base at a distance along the route, with the frame at its lowest."""
         assert self._path is not None
         return self._base(self._path, along_m)
 
@@ -312,13 +312,13 @@ class RouteDriver:
             self._marks.append((low, point))
 
     def _ahead_path(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points that starts in the machine's own direction."""
-        here, yaw = (location.x_m, location.y_m), location.yaw_rad
-        ahead = (here[0] + AHEAD_M * math.cos(yaw), here[1] + AHEAD_M * math.sin(yaw))
-        return drivable_path([here, ahead, *points], self._carrier)
+        """Plan a path by these points that starts in the machine's own direction."""
+        position_m, yaw = (location.x_m, location.y_m), location.yaw_rad
+        ahead = (position_m[0] + AHEAD_M * math.cos(yaw), position_m[1] + AHEAD_M * math.sin(yaw))
+        return drivable_path([position_m, ahead, *points], self._carrier)
 
     def _aligned_path(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points whose first leg roughly has the machine's direction."""
+        """Plan a path by these points whose first leg roughly has the machine's direction."""
         path = self._direct_path(location, points)
         if abs(math.remainder(path.at(0.0)[2] - location.yaw_rad, math.tau)) > MAX_HEADING_ERROR_RAD:
             raise PathRefused(
@@ -328,7 +328,7 @@ class RouteDriver:
         return path
 
     def _direct_path(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points; the follower steers onto its first leg."""
+        """Plan a path by these points; the follower steers onto its first leg."""
         return drivable_path([(location.x_m, location.y_m), *points], self._carrier)
 
     def _base(self, path: Path, along_m: float) -> Pose:
@@ -355,7 +355,7 @@ _ALL_ROUND: Final = [2.0 * math.pi * k / DIRECTION_COUNT for k in range(DIRECTIO
 
 
 def _lines_past(landing: Point2, directions: Iterable[float]) -> Iterator[list[Point2]]:
-    """Straight lines past a landing in these directions, on both of its sides."""
+    """Yield straight lines past a landing in these directions, on both of its sides."""
     for angle in directions:
         c, s = math.cos(angle), math.sin(angle)
         for side in (LANDING_OFFSET_M, -LANDING_OFFSET_M):

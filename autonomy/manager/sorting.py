@@ -31,15 +31,15 @@ class Sorting:
         self._sorts = mission.options.sort_by_assortment and bool(mission.landings)
 
     def landing_of(self, assortment: str) -> int | None:
-        """The landing of an assortment when sorting: the first that names it, else the first that names none, else
-        None.
+        """Choose the landing of an assortment when sorting: the first that names it, else the first that names none,
+        else None.
         """
         named = (i for i, at in enumerate(self._landings) if assortment in at.assortments)
         takes_all = (i for i, at in enumerate(self._landings) if not at.assortments)
         return next(named, next(takes_all, None))
 
     def wants(self, assortment: str, landing: int | None = None) -> bool:
-        """Whether such a log belongs to the load on board; ``landing`` is where the load goes while undecided."""
+        """Tell whether such a log belongs to the load on board; ``landing`` is where the load goes while undecided."""
         if self._only and assortment not in self._only:
             return False
         if not self._sorts:
@@ -49,7 +49,7 @@ class Sorting:
         return goes_to is not None and bound in (None, goes_to)
 
     def may_share_grasp(self, assortment: str, first: str) -> bool:
-        """Whether such a log may share a grasp with ``first``."""
+        """Tell whether such a log may share a grasp with ``first``."""
         return self.wants(assortment, self.landing_of(first) if self._sorts else None)
 
     def book_loaded(self, assortments: Iterable[str]) -> None:
@@ -72,11 +72,11 @@ class Sorting:
         return self.landing
 
     def book_unloaded(self) -> None:
-        """The bunk is empty; the landing of the next load is undecided."""
+        """Book that the bunk is empty; the landing of the next load is undecided."""
         self.landing = None
 
     def needs_another_round(self, lying: Iterable[str]) -> bool:
-        """Whether the route is driven again for logs of these assortments that are left.
+        """Tell whether the route is driven again for logs of these assortments that are left.
 
         A log that fits the only load of the round cannot be reached from this route.
         """
@@ -90,7 +90,7 @@ class Sorting:
         self.served, self.rounds = set(), self.rounds + 1
 
     def landing_name(self, landing: int | None) -> str:
-        """Name of a landing; empty with a single landing."""
+        """Return the name of a landing; empty with a single landing."""
         if landing is None or len(self._landings) < 2:
             return ""
         return self._landings[landing].name or f"landing {landing + 1}"

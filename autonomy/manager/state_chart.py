@@ -27,7 +27,7 @@ INTRODUCTION: Final = (
 
 
 def page() -> str:
-    """The whole page as Markdown."""
+    """Return the whole page as Markdown."""
     parts = ["# The activity manager", "", INTRODUCTION, ""]
     for title, table in TITLES.items():
         parts += [f"## {title}", "", "```mermaid", diagram(table), "```", ""]
@@ -36,7 +36,7 @@ def page() -> str:
 
 
 def diagram(table: Table) -> str:
-    """A Mermaid state diagram; events between the same two states share an arrow."""
+    """Draw a Mermaid state diagram; events between the same two states share an arrow."""
     arrows: dict[tuple[State, State], list[str]] = defaultdict(list)
     for (begin, event), end in sorted(table.items()):
         arrows[begin, end].append(event.name.lower().replace("_", " "))
@@ -47,7 +47,7 @@ def diagram(table: Table) -> str:
 
 
 def states() -> list[str]:
-    """The table of states."""
+    """Return the table of states."""
     rows = ["| state | the machine | frame | timeout | reason after the timeout |", "|---|---|---|---|---|"]
     heights = {Height.KEEP: "as it is", Height.TRANSPORT: "transport", Height.LOADING: "loading"}
     for state, rule in RULES.items():
@@ -59,5 +59,9 @@ def states() -> list[str]:
 
 
 def events() -> list[str]:
-    """The table of events."""
-    return ["| event | meaning |", "|---|---|", *(f"| {e.name} | {words} |" for e, words in EVENT_DESCRIPTIONS.items())]
+    """Return the table of events."""
+    return [
+        "| event | meaning |",
+        "|---|---|",
+        *(f"| {e.name} | {description} |" for e, description in EVENT_DESCRIPTIONS.items()),
+    ]

@@ -17,7 +17,7 @@ PACKING_SHARE: Final = 0.60
 
 
 def volume_m3(length_m: float, diameter_m: float) -> float:
-    """Volume of a cylinder."""
+    """Compute the volume of a cylinder."""
     return 0.25 * math.pi * diameter_m**2 * length_m
 
 
@@ -99,7 +99,7 @@ class Tally:
             self.board += logs * [self.board[-1]]
 
     def full(self, bunk: Bunk, next_m3: float = 0.0) -> bool:
-        """Whether the bunk has no room for ``next_m3`` more wood [m3]."""
+        """Tell whether the bunk has no room for ``next_m3`` more wood [m3]."""
         room = PACKING_SHARE * bunk.length_m * bunk.width_m * bunk.stake_height_m
         return self.board_m3 + next_m3 > room
 

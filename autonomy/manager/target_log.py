@@ -50,8 +50,8 @@ class TargetLog:
         self._world.log_map.restart_average(self.number)
 
     def is_near(self, now_ns: int) -> bool:
-        """Whether to stop for a log: paper B stops for the nearest one, ours when the best stop is close.  With a full
-        bunk the machine does not stop.
+        """Tell whether to stop for a log: paper B stops for the nearest one, ours when the best stop is close.  With a
+        full bunk the machine does not stop.
         """
         if self._load.full:
             return False
@@ -70,7 +70,7 @@ class TargetLog:
         return True
 
     def is_in_the_way(self) -> bool:
-        """Whether to stop for a log before a wheel, because the crane can load it; once for each log."""
+        """Tell whether to stop for a log before a wheel, because the crane can load it; once for each log."""
         log = self._world.log_before_wheel(BRAKING_M + CLEARING_M)
         if log is None or log.number in self._stopped_for or self._load.full or not self._world.can_clear(log):
             return False
@@ -85,26 +85,28 @@ class TargetLog:
         return log is not None and log.hits >= AVERAGED_HITS
 
     def came_inside(self) -> bool:
-        """Whether the crane's base is, or was, in the circle round the target."""
+        """Tell whether the crane's base is, or was, in the circle round the target."""
         self._was_inside = self._was_inside or self._world.is_in_circle(self.log)
         return self._was_inside
 
     def is_past(self) -> bool:
-        """Whether the crane's base has left the circle on the far side."""
+        """Tell whether the crane's base has left the circle on the far side."""
         return self._world.has_passed(self.log)
 
     def is_graspable(self) -> bool:
-        """Whether a log can be grasped from here: for paper B only the target, for ours any log in the list."""
+        """Tell whether a log can be grasped from here: for paper B only the target, for ours any log in the list."""
         if self.clearing is not None and not self._load.full:
             log = self._world.log_map.get(self.clearing)
             if log is not None and self._world.list_number(log.number) is not None and self._world.can_clear(log):
                 self.number = log.number
                 return True
             self.clearing = None
-        found = [] if self._load.full else self._world.graspable(self.number if self._route.as_paper_b else None)
-        if found:
-            self.number = found[0].number
-        return bool(found)
+        graspable_logs = (
+            [] if self._load.full else self._world.graspable(self.number if self._route.as_paper_b else None)
+        )
+        if graspable_logs:
+            self.number = graspable_logs[0].number
+        return bool(graspable_logs)
 
     def record_unreachable(self) -> None:
         """Count a failure for a log that proves out of reach, so that the machine does not stop for it forever."""

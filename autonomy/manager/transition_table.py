@@ -208,12 +208,12 @@ FINAL_STATES: Final = frozenset({State.DONE, State.FAILED})
 
 
 def awaited_events(table: Table, state: State) -> tuple[Event, ...]:
-    """The events that a state reacts to, in the order in which they are tested."""
+    """List the events that a state reacts to, in the order in which they are tested."""
     return tuple(sorted(event for known, event in table if known is state))
 
 
 def next_state(table: Table, state: State, event: Event) -> State:
-    """The next state; a timeout without a transition leads to FAILED.
+    """Return the next state; a timeout without a transition leads to FAILED.
 
     Raises:
         KeyError: the state does not react to this event.

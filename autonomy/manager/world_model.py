@@ -128,7 +128,7 @@ class WorldModel:
         return slope_of(self.base.rotation) if self._bases else LEVEL
 
     def base_at(self, at_ns: int) -> Pose:
-        """The crane's base at a time: the nearest stored pose, extrapolated after the last one."""
+        """Return the crane's base at a time: the nearest stored pose, extrapolated after the last one."""
         stamp, last = self._bases[-1]
         if at_ns <= stamp or len(self._bases) < 2:
             return min(self._bases, key=lambda known: abs(known[0] - at_ns))[1]
@@ -143,15 +143,15 @@ class WorldModel:
         )
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
-        """Where the machine was at its newest report; None when it is not located now."""
+        """Tell where the machine was at its newest report; None when it is not located now."""
         if not self._bases:
             return None
-        stamp, here = self._bases[-1]
+        stamp, current_pose = self._bases[-1]
         at = next((k for k, (known, _) in enumerate(self._bases) if stamp - known <= STANDPOINT_NS), -1)
-        before_ns, before = self._bases[at]
+        before_ns, earlier_pose = self._bases[at]
         bends_rad = (self._bends_rad[at], self._bends_rad[-1])
-        found = standpoint(stamp, here, before, bends_rad, (stamp - before_ns) * 1e-9)
-        return found if now_ns - stamp <= MAX_AGE_NS else None
+        newest_standpoint = standpoint(stamp, current_pose, earlier_pose, bends_rad, (stamp - before_ns) * 1e-9)
+        return newest_standpoint if now_ns - stamp <= MAX_AGE_NS else None
 
     def update(self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None) -> None:
         """Accept the newest reports and update the location."""
@@ -188,7 +188,7 @@ class WorldModel:
         self.log_map.reserve_numbers(self._known.free)
 
     def known(self) -> LogKnowledge:
-        """Log knowledge to store in a checkpoint."""
+        """Return the log knowledge to store in a checkpoint."""
         if not self._bases:
             return self._known
         gone = tuple(n for n in range(1, len(self._listed) + 1) if self.log_map.get(n) is None)
@@ -198,31 +198,31 @@ class WorldModel:
 
     def _as_missed(self, log: MappedLog) -> MissedLog:
         x, y, _ = log.center_m.tolist()
-        place = Point(*self.plane.geodetic(x, y)[:2])
+        position = Point(*self.plane.geodetic(x, y)[:2])
         bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
-        known_log = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
+        known_log = KnownLog(position, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
         return MissedLog(log.number, known_log, log.misses)
 
     def log_before_wheel(self, braking_m: float = BRAKING_M) -> MappedLog | None:
-        """The first log that a front wheel would hit within a distance [m]; None without one."""
+        """Find the first log that a front wheel would hit within a distance [m]; None without one."""
         assert self.location is not None
-        here, c = self.location, self._carrier
-        cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
+        location, c = self.location, self._carrier
+        cos, sin = math.cos(location.yaw_rad), math.sin(location.yaw_rad)
         turn = np.array([[cos, -sin], [sin, cos]])
         for log in self.log_map.logs:
             spine = log.center_m + np.linspace(-0.5, 0.5, SPINE_POINTS)[:, None] * log.length_m * log.axis
-            ahead, lateral = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
+            ahead, lateral = ((spine[:, :2] - (location.x_m, location.y_m)) @ turn).T
             near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + braking_m)
             if np.any(near & (np.abs(np.abs(lateral) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
                 return log
         return None
 
     def can_clear(self, log: MappedLog) -> bool:
-        """Whether the crane can load a log that lies ahead of the front wheels from here."""
+        """Tell whether the crane can load a log that lies ahead of the front wheels from here."""
         assert self.location is not None
-        here, c = self.location, self._carrier
-        ahead = np.array([math.cos(here.yaw_rad), math.sin(here.yaw_rad)])
-        ahead_m = float((log.center_m[:2] - (here.x_m, here.y_m)) @ ahead)
+        location, c = self.location, self._carrier
+        ahead = np.array([math.cos(location.yaw_rad), math.sin(location.yaw_rad)])
+        ahead_m = float((log.center_m[:2] - (location.x_m, location.y_m)) @ ahead)
         if log.misses >= MAX_ATTEMPTS or not self.sorting.wants(log.assortment) or self.is_on_landing(log):
             return False
         clear = ahead_m > c.wheel_radius_m + JAWS_M
@@ -236,7 +236,7 @@ class WorldModel:
             self.list_ns = seen_ns
 
     def update_map(self, logs: Sequence[LogObservation], seen_ns: int) -> dict[int, int]:
-        """Merge a list into the log map only; returns the map number of each list number."""
+        """Merge a list into the log map only; return the map number of each list number."""
         if not logs or not self._bases:
             return {}
         return self.log_map.observe(logs, self.base_at(seen_ns), seen_ns)
@@ -260,13 +260,13 @@ class WorldModel:
             self.in_bunk, self.counted_ns = sum(lies_in_bunk(self._bunk, log) for log in logs), seen_ns
 
     def landing_stop_m(self, point: Point2, base_at: BaseAt, end_m: float) -> float | None:
-        """Distance along a path from which the crane reaches a landing best; None if there is none."""
+        """Find the distance along a path from which the crane reaches a landing best; None if there is none."""
         pile = MappedLog(0, np.array([*point, 0.0]), np.array([1.0, 0.0, 0.0]), 2.0, 0.3, 0.1, CONFIRMED_HITS, 0)
         stop = best_stop([pile], self._reach, base_at, 0.0, end_m)
         return None if stop is None else stop.along_m
 
     def landing_pile(self, point: Point2, log_direction_rad: float | None = None) -> Bunk:
-        """The landing as a bunk on the ground for the crane: beside the machine, parallel to it or to
+        """Return the landing as a bunk on the ground for the crane: beside the machine, parallel to it or to
         ``log_direction_rad`` [rad] in the plane.
         """
         x, y, _ = self.base.to_optical(np.array([*point, self.base.position_m[2]])).tolist()
@@ -275,7 +275,7 @@ class WorldModel:
         return Bunk((x, y), yaw, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
 
     def blocked_reason(self, now_ns: int) -> str:
-        """Why the machine cannot act on setpoints now; empty when it can."""
+        """Tell why the machine cannot act on setpoints now; empty when it can."""
         if self.report is None or self.vehicle is None:
             return "the controller has not reported"
         if now_ns - min(self._report_ns, self._vehicle_ns) > SILENT_NS:
@@ -292,26 +292,26 @@ class WorldModel:
         return self.report is not None and self.report.mode in (Mode.STOP, Mode.FAULT)
 
     def is_at_height(self, height_m: float) -> bool:
-        """Whether all four swing arms are at a height."""
+        """Tell whether all four swing arms are at a height."""
         assert self.vehicle is not None
         near = 1.5 * self._carrier.arm_in_band_m
         return all(abs(h - height_m) <= near for h in self.vehicle.heights_m)
 
     def is_standing(self) -> bool:
-        """Whether the machine is at standstill."""
+        """Tell whether the machine is at standstill."""
         return self.vehicle is not None and abs(self.vehicle.speed_m_s) < STANDSTILL_M_S
 
     # ------------------------------------------------------------------ logs
     def map_number(self, listed: int) -> int | None:
-        """The map number of a log of the newest list."""
+        """Return the map number of a log of the newest list."""
         return self._numbers.get(listed)
 
     def list_number(self, number: int | None) -> int | None:
-        """The newest list's number of a mapped log."""
+        """Return the newest list's number of a mapped log."""
         return next((k for k, n in self._numbers.items() if n == number), None)
 
     def record_miss(self, number: int, for_good: bool = False) -> bool:
-        """Record a failed grasp; returns whether the log is given up: it stays mapped but is no longer collected."""
+        """Record a failed grasp; return whether the log is given up: it stays mapped but is no longer collected."""
         if self.log_map.get(number) is None:
             return False
         while (misses := self.log_map.record_miss(number)) < MAX_ATTEMPTS and for_good:
@@ -319,63 +319,63 @@ class WorldModel:
         return misses >= MAX_ATTEMPTS
 
     def is_given_up(self, listed: int) -> bool:
-        """Whether a log of the newest list is given up."""
+        """Tell whether a log of the newest list is given up."""
         number = self._numbers.get(listed)
         log = None if number is None else self.log_map.get(number)
         return log is not None and log.misses >= MAX_ATTEMPTS
 
     def nearest_candidate(self) -> MappedLog | None:
-        """Paper B: the log nearest to the crane among those near enough to stop for.
+        """Find, for paper B, the log nearest to the crane among those near enough to stop for.
 
         These are logs a little ahead, and logs whose circle the crane's base is still inside: the machine may have
         passed a second log while it approached the first.
         """
         assert self.location is not None
-        here = self.location
-        ahead = np.array([math.cos(here.yaw_rad), math.sin(here.yaw_rad)])
+        location = self.location
+        ahead = np.array([math.cos(location.yaw_rad), math.sin(location.yaw_rad)])
         near = [
             g
             for g in self._relevant()
-            if self.is_in_circle(g) or 0.0 < float((g.center_m[:2] - (here.x_m, here.y_m)) @ ahead) <= NEAR_M
+            if self.is_in_circle(g) or 0.0 < float((g.center_m[:2] - (location.x_m, location.y_m)) @ ahead) <= NEAR_M
         ]
         return nearest(near, self.base.position_m[:2])
 
     def next_stop(self, base_at: BaseAt, along_m: float, end_m: float) -> LoadingStop | None:
-        """The best next place to stop along the path; None without one."""
+        """Find the best next place to stop along the path; None without one."""
         begin = along_m + AHEAD_M
         return best_stop(self._relevant(), self._reach, base_at, begin, min(begin + HORIZON_M, end_m))
 
     def is_in_circle(self, log: MappedLog | None) -> bool:
-        """Whether the crane's base is in the circle round a log."""
+        """Tell whether the crane's base is in the circle round a log."""
         return log is not None and math.dist(log.center_m[:2], self.base.position_m[:2]) < CIRCLE_M
 
     def has_passed(self, log: MappedLog | None) -> bool:
-        """Whether the crane's base has left the circle on the far side; noise at the near edge does not count."""
+        """Tell whether the crane's base has left the circle on the far side; noise at the near edge does not count."""
         if log is None:
             return True
         behind_m = float(self.base.to_optical(log.center_m)[0])  # the base looks backwards
         return behind_m > 0.0 and not self.is_in_circle(log)
 
     def graspable(self, only: int | None = None) -> list[MappedLog]:
-        """Logs of the newest list that the crane can grasp from here, best first; or only the log ``only``."""
+        """List the logs of the newest list that the crane can grasp from here, best first; or only the log ``only``."""
         seen = set(self._numbers.values()) if only is None else {only}
         logs = [g for g in self._wanted() if g.number in seen]
         work = sorted((self._reach.work_s(g.observation(self.base)), g.number, g) for g in logs)
         return [g for seconds, _, g in work if math.isfinite(seconds)]
 
     def collectable(self) -> list[MappedLog]:
-        """Logs that can be collected: not given up and not on a landing."""
+        """List the logs that can be collected: not given up and not on a landing."""
         return [g for g in self.log_map.logs if g.misses < MAX_ATTEMPTS and not self.is_on_landing(g)]
 
     def is_on_landing(self, log: MappedLog) -> bool:
-        """Whether a log lies on a landing."""
+        """Tell whether a log lies on a landing."""
         return any(math.dist(log.center_m[:2], at) <= PILE_LENGTH_M for at in self.landings)
 
     def _wanted(self) -> list[MappedLog]:
-        """Collectable logs that belong to the current load."""
+        """List the collectable logs that belong to the current load."""
         return [g for g in self.collectable() if self.sorting.wants(g.assortment)]
 
     def _relevant(self) -> list[MappedLog]:
-        """Wanted logs close enough to affect the next stop."""
+        """List the wanted logs close enough to affect the next stop."""
         base_position = self.base.position_m[:2]
         return [g for g in self._wanted() if math.dist(g.center_m[:2], base_position) < HORIZON_M]

@@ -21,7 +21,7 @@ class Area:
     keep_out: tuple[np.ndarray, ...] = ()
 
     def outside_m(self, points: np.ndarray) -> np.ndarray:
-        """Distance of each point (n, 2) outside the area [m]; 0 inside."""
+        """Compute the distance of each point (n, 2) outside the area [m]; 0 inside."""
         places = shapely.points(np.asarray(points, dtype=float).reshape(-1, 2))
         away = np.zeros(len(places))
         if self.keep_in:
@@ -33,8 +33,8 @@ class Area:
         return np.where(away <= ON_EDGE_M, 0.0, away)
 
     def leaves_m(self, start: np.ndarray, end: np.ndarray) -> float:
-        """Greatest distance outside the area along the straight line from ``start`` to ``end`` (2,) [m], at least; 0
-        when it stays inside.
+        """Compute the greatest distance outside the area along the straight line from ``start`` to ``end`` (2,) [m], at
+        least; 0 when it stays inside.
         """
         line = shapely.LineString([start, end])
         rings = (shapely.LinearRing(ring) for ring in (*self.keep_in, *self.keep_out))
@@ -44,27 +44,27 @@ class Area:
 
 
 def path_distance_m(path: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance of each point (n, 2) from a polyline (m, 2) [m]."""
+    """Compute the distance of each point (n, 2) from a polyline (m, 2) [m]."""
     line = shapely.LineString(path) if len(path) > 1 else shapely.Point(path[0])
     return np.asarray(shapely.distance(line, shapely.points(points)))
 
 
 def signed_area_m2(ring: np.ndarray) -> float:
-    """Area of a ring (n, 2), m^2; positive when its corners run counter-clockwise."""
+    """Compute the area of a ring (n, 2), m^2; positive when its corners run counter-clockwise."""
     x, y = (ring - ring[0]).T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def crossing(ring: np.ndarray) -> tuple[int, int] | None:
-    """The first two edges of a ring, by their first corners, that cross or touch without being neighbours.
+    """Find the first two edges of a ring, by their first corners, that cross or touch without being neighbours.
 
     Neighbours share a corner; they only cross if one turns back over the other.
     """
     count, corners = len(ring), shapely.points(ring)
     edges = shapely.linestrings(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
-    one, other = shapely.STRtree(edges).query(edges, "dwithin", TOUCHING_M)
-    far = (other - one > 1) & (other - one < count - 1)
-    met = sorted(zip(one[far].tolist(), other[far].tolist(), strict=True))
+    first_edges, second_edges = shapely.STRtree(edges).query(edges, "dwithin", TOUCHING_M)
+    far = (second_edges - first_edges > 1) & (second_edges - first_edges < count - 1)
+    met = sorted(zip(first_edges[far].tolist(), second_edges[far].tolist(), strict=True))
     back = shapely.dwithin(np.roll(corners, -2), edges, TOUCHING_M) | shapely.dwithin(
         corners, np.roll(edges, -1), TOUCHING_M
     )

@@ -23,5 +23,5 @@ class CraneJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     leave: tuple[int, ...] = ()
 
     def to(self, bunk: Bunk) -> Bunk:
-        """The target on a machine with this bunk."""
+        """Return the target on a machine with this bunk."""
         return self.target or bunk

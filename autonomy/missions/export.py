@@ -29,7 +29,7 @@ _NO_XML: Final = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 
 
 def write_gpx(mission: ForwardingMission) -> bytes:
-    """Name, route, landings and logs."""
+    """Write name, route, landings and logs."""
     root = Element("gpx", version="1.1", creator="timberhand", xmlns="http://www.topografix.com/GPX/1/1")
     if mission.name:
         _text(SubElement(root, "metadata"), "name", mission.name)
@@ -50,7 +50,7 @@ def _gpx_point(parent: Element, name: str, point: Point) -> Element:
 
 
 def write_kml(mission: ForwardingMission) -> bytes:
-    """Everything but options and heights."""
+    """Write everything but options and heights."""
     root = Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = SubElement(root, "Document")
     _text(document, "name", mission.name)
@@ -61,8 +61,8 @@ def write_kml(mission: ForwardingMission) -> bytes:
     for fence in mission.fences:
         _fence(document, fence)
     for landing in mission.landings:
-        told = {"bearing_deg": landing.bearing_deg, "assortments": ", ".join(landing.assortments)}
-        placed = _placemark(document, landing.name, role="landing", **told)
+        properties = {"bearing_deg": landing.bearing_deg, "assortments": ", ".join(landing.assortments)}
+        placed = _placemark(document, landing.name, role="landing", **properties)
         _coordinates(SubElement(placed, "Point"), (landing.position,))
     for log in mission.logs:
         _log(document, log)
@@ -76,8 +76,8 @@ def _fence(document: Element, fence: Fence) -> None:
 
 
 def _log(document: Element, log: KnownLog) -> None:
-    told = {name: getattr(log, name) for name in log.__struct_fields__ if name != "position"}
-    _coordinates(SubElement(_placemark(document, log.key, role="log", **told), "Point"), (log.position,))
+    properties = {name: getattr(log, name) for name in log.__struct_fields__ if name != "position"}
+    _coordinates(SubElement(_placemark(document, log.key, role="log", **properties), "Point"), (log.position,))
 
 
 def _placemark(document: Element, name: str, **properties: Any) -> Element:
@@ -91,13 +91,13 @@ def _placemark(document: Element, name: str, **properties: Any) -> Element:
 
 
 def _coordinates(owner: Element, points: tuple[Point, ...]) -> None:
-    """KML has longitude first."""
+    """Write positions; KML has longitude first."""
     text = " ".join(f"{_decimal(p.longitude_deg)},{_decimal(p.latitude_deg)}" for p in points)
     SubElement(owner, "coordinates").text = text
 
 
 def _decimal(degrees: float) -> str:
-    """All digits of a number, as XML schema's decimal: without an exponent."""
+    """Write all digits of a number, as XML schema's decimal: without an exponent."""
     return format(Decimal(repr(float(degrees))), "f")
 
 
@@ -127,7 +127,7 @@ class Exported(NamedTuple):
 
 
 def export(mission: ForwardingMission, kind: str) -> Exported:
-    """The mission as ``kind``, one of ``FORMATS``.
+    """Write the mission as ``kind``, one of ``FORMATS``.
 
     Raises:
         MissionError: there is no such format.
@@ -139,7 +139,7 @@ def export(mission: ForwardingMission, kind: str) -> Exported:
 
 
 def write_plan(mission: ForwardingMission) -> bytes:
-    """Route, speed and fences as a plan for a ground rover."""
+    """Write route, speed and fences as a plan for a ground rover."""
     items: list[dict[str, Any]] = []
     if mission.options.speed_m_s is not None:
         items.append(_item(DO_CHANGE_SPEED, [1, mission.options.speed_m_s, -1, 0, 0, 0, 0], 1))
@@ -187,7 +187,7 @@ def _lat_lon(point: Point) -> list[float]:
 
 
 def _left_out(mission: ForwardingMission, holds: frozenset[str]) -> tuple[str, ...]:
-    """What the mission has and the format does not hold."""
+    """List what the mission has and the format does not hold."""
     usual = Options()
     changed = [name for name in usual.__struct_fields__ if getattr(mission.options, name) != getattr(usual, name)]
     options = [name for name in changed if f"options.{name}" not in holds]
@@ -203,7 +203,7 @@ def _left_out(mission: ForwardingMission, holds: frozenset[str]) -> tuple[str, .
         "sizes, bearings and kinds of logs": any(log != KnownLog(log.position, log.key) for log in mission.logs),
         "heights": any(p.altitude_m is not None for p in all_points(mission)),
     }
-    left_out = [what for what, there in has.items() if there and what not in holds]
+    left_out = [item for item, present in has.items() if present and item not in holds]
     return (*left_out, *(f"option {name}" for name in options))
 
 

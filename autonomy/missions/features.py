@@ -76,7 +76,7 @@ class Draft:
 def assemble(
     shapes: Sequence[Shape], source: Source, kind: str, name: str = "", options: Options | None = None
 ) -> Draft:
-    """The mission made of shapes; coordinates are not validated yet (``autonomy.missions.validation``).
+    """Assemble the mission from shapes; coordinates are not validated yet (``autonomy.missions.validation``).
 
     Raises:
         MissionError: an unknown or unsuitable role, a property of the wrong type, or two routes.
@@ -126,7 +126,7 @@ def assemble(
 
 
 def merged(route: Draft, harvest: Draft) -> Draft:
-    """The route's mission with the logs of another file added."""
+    """Return the route's mission with the logs of another file added."""
     both = (*route.mission.logs, *harvest.mission.logs)
     fields = {name: getattr(route.mission, name) for name in ("name", "waypoints", "fences", "landings", "options")}
     return Draft(
@@ -140,7 +140,7 @@ def merged(route: Draft, harvest: Draft) -> Draft:
 
 
 def _role(shape: Shape, problems: list[tuple[Place, str, str]]) -> str:
-    """The role of a shape; "" for a point without one."""
+    """Return the role of a shape; "" for a point without one."""
     role = shape.properties.get("role")
     if role is None:
         return {"point": "", "line": "route", "polygon": "fence"}[shape.kind]
@@ -174,14 +174,14 @@ class _Reader:
         return Point(position.latitude_deg, position.longitude_deg, position.altitude_m)
 
     def fences(self, shape: Shape, keep_out: bool, first: int) -> list[Fence]:
-        found = []
+        fences = []
         for number, ring in enumerate(shape.rings, first):
             open_ring = ring[:-1] if len(ring) > 1 and _same(ring[0], ring[-1]) else ring
             ordered = _counter_clockwise(open_ring)
             corners = tuple(self.point(("corner", number, i), position) for i, position in enumerate(ordered))
             self.draft.places[("fence", number)] = shape.place
-            found.append(Fence(corners, keep_out or number > first, self.text(shape, "name")))
-        return found
+            fences.append(Fence(corners, keep_out or number > first, self.text(shape, "name")))
+        return fences
 
     def landing(self, shape: Shape, number: int) -> Landing:
         return Landing(
@@ -192,7 +192,7 @@ class _Reader:
         )
 
     def log(self, shape: Shape, number: int) -> KnownLog:
-        """A log from its centre or its two ends."""
+        """Make a log from its centre or its two ends."""
         ring = shape.rings[0]
         known = {name: self.number(shape, name) for name in _LOG_NUMBERS}
         at = self.point(("log", number), ring[0])
@@ -263,12 +263,12 @@ def _same(a: Position, b: Position) -> bool:
 
 
 def _far_from_sane(positions: Iterable[Position]) -> bool:
-    """Whether any coordinate is outside its range, so that nothing may be computed from it."""
+    """Tell whether any coordinate is outside its range, so that nothing may be computed from it."""
     return any(not (abs(p.latitude_deg) <= 90.0 and abs(p.longitude_deg) <= 180.0) for p in positions)
 
 
 def _counter_clockwise(ring: tuple[Position, ...]) -> tuple[Position, ...]:
-    """The ring, reversed if it runs clockwise; its first corner stays first."""
+    """Return the ring, reversed if it runs clockwise; its first corner stays first."""
     if len(ring) < 3 or _far_from_sane(ring):
         return ring
     frame = LocalFrame(ring[0].latitude_deg, ring[0].longitude_deg)
@@ -277,7 +277,7 @@ def _counter_clockwise(ring: tuple[Position, ...]) -> tuple[Position, ...]:
 
 
 def _from_ends(a: Position, b: Position) -> tuple[Point, float, float]:
-    """Centre, bearing [deg] and length [m] of a log between two ends."""
+    """Compute centre, bearing [deg] and length [m] of a log between two ends."""
     frame = LocalFrame(a.latitude_deg, a.longitude_deg, a.altitude_m or 0.0)
     end = frame.points_enu([Point(b.latitude_deg, b.longitude_deg, b.altitude_m)])[0]
     middle = frame.point(*(0.5 * end))

@@ -25,18 +25,18 @@ class MissionFolder:
     path: Path
 
     def names(self) -> list[str]:
-        """The missions, newest first."""
+        """List the missions, newest first."""
         try:
-            found = [
+            entries = [
                 e for e in os.scandir(self.path) if FILE_NAME.fullmatch(e.name) and e.is_file(follow_symlinks=False)
             ]
-            found.sort(key=lambda e: e.stat(follow_symlinks=False).st_mtime, reverse=True)
+            entries.sort(key=lambda e: e.stat(follow_symlinks=False).st_mtime, reverse=True)
         except OSError:
             return []
-        return [entry.name for entry in found[:MAX_FILES]]
+        return [entry.name for entry in entries[:MAX_FILES]]
 
     def read(self, name: str) -> bytes:
-        """The bytes of a mission.
+        """Read the bytes of a mission.
 
         Raises:
             MissionError: a bad name, no such file, or too large.

@@ -56,7 +56,7 @@ class Forwarder:
 
 
 def write_fpr(loads: Sequence[ForwardedLoad], forwarder: Forwarder, written: datetime, application: str) -> bytes:
-    """The report of loads as UTF-8 XML; ``application`` is the program's name and version.
+    """Write the report of loads as UTF-8 XML; ``application`` is the program's name and version.
 
     Raises:
         MissionError: a time without a time zone, an invalid volume, or an empty load.
@@ -101,12 +101,12 @@ def write_fpr(loads: Sequence[ForwardedLoad], forwarder: Forwarder, written: dat
     _user_id(site, "ObjectUserID", forwarder.site or UNKNOWN)
     _add(site, "ObjectName", forwarder.site or UNKNOWN)
     for landing, key in landings.items():
-        place = SubElement(machine, "LocationDefinition")
-        _user_id(place, "LocationUserID", landing.name or f"landing {key}")
-        _add(place, "LocationName", landing.name or f"landing {key}")
-        _coordinates(place, "LocationCoordinates", landing.position, None)
-        _add(place, "LocationKey", key)
-        _add(place, "ObjectKey", 1)
+        location = SubElement(machine, "LocationDefinition")
+        _user_id(location, "LocationUserID", landing.name or f"landing {key}")
+        _add(location, "LocationName", landing.name or f"landing {key}")
+        _coordinates(location, "LocationCoordinates", landing.position, None)
+        _add(location, "LocationKey", key)
+        _add(location, "ObjectKey", 1)
     for key in products.values():
         delivery = SubElement(machine, "DeliveryDefinition")
         _add(delivery, "DeliveryKey", key)
@@ -147,14 +147,14 @@ def _product(log: ForwardedLog) -> Product:
 
 
 def _products(loads: Sequence[ForwardedLoad]) -> dict[Product, int]:
-    """The key of every product: the harvester's own if it is still free."""
-    found: dict[Product, int] = {}
+    """Choose the key of every product: the harvester's own if it is still free."""
+    product_keys: dict[Product, int] = {}
     kinds = dict.fromkeys(_product(log) for load in loads for log in load.logs)
     for product in sorted(kinds, key=lambda p: (p[2] is None, p[2] or 0, p[:2])):
         key = product[2]
-        taken = set(found.values())
-        found[product] = key if key is not None and key > 0 and key not in taken else _free(taken)
-    return found
+        taken = set(product_keys.values())
+        product_keys[product] = key if key is not None and key > 0 and key not in taken else _free(taken)
+    return product_keys
 
 
 def _free(taken: set[int]) -> int:
@@ -185,7 +185,7 @@ def _log(load: Element, log: ForwardedLog, part: int, product: int, landing: int
 
 
 def _coordinates(parent: Element, name: str, at: Point, when: datetime | None) -> None:
-    """A position; the schema requires a height, so an unknown one is written as 0."""
+    """Add a position; the schema requires a height, so an unknown one is written as 0."""
     element = SubElement(parent, name, coordinateReferenceSystem="WGS84")
     latitude = _add(element, "Latitude", f"{abs(at.latitude_deg):.8f}")
     latitude.set("latitudeCategory", "South" if at.latitude_deg < 0.0 else "North")
@@ -207,5 +207,5 @@ def _add(parent: Element, name: str, value: object) -> Element:
 
 
 def _legal(text: str) -> Iterator[str]:
-    """The characters allowed in XML; a control character in a name would make the report invalid."""
+    """Yield the characters allowed in XML; a control character in a name would make the report invalid."""
     return (c for c in text if c in "\t\n\r" or " " <= c < "\ud800" or "\ue000" <= c < "\ufffe" or c > "\uffff")

@@ -22,7 +22,7 @@ Path = tuple[str | int, ...]
 
 
 def read(document: dict[str, Any], source: Source) -> Draft:
-    """The mission in a GeoJSON document.
+    """Read the mission in a GeoJSON document.
 
     Raises:
         MissionError: what is wrong, with its line.
@@ -37,7 +37,7 @@ def read(document: dict[str, Any], source: Source) -> Draft:
 
 
 def _check_crs(document: dict[str, Any], source: Source) -> None:
-    """GeoJSON is WGS84; the ``crs`` member of GeoJSON 2008 may only confirm that."""
+    """Check the coordinate system: GeoJSON is WGS84; the ``crs`` member of GeoJSON 2008 may only confirm that."""
     crs = document.get("crs")
     if crs is None:
         return
@@ -52,7 +52,7 @@ def _check_crs(document: dict[str, Any], source: Source) -> None:
 
 
 def _header(document: dict[str, Any], source: Source) -> tuple[str, Options]:
-    """Name and options of a mission from the member ``timberhand``, or the name of another program's file."""
+    """Read name and options of a mission from the member ``timberhand``, or the name of another program's file."""
     own = document.get(MEMBER)
     if own is None:
         name = document.get("name")
@@ -87,7 +87,7 @@ class _Reader:
         self.count = 0
 
     def anything(self, value: Any, path: Path) -> None:
-        """A FeatureCollection, a Feature or a geometry."""
+        """Read a FeatureCollection, a Feature or a geometry."""
         kind = value.get("type") if isinstance(value, dict) else None
         if kind == "FeatureCollection":
             features = self.listed(value.get("features"), (*path, "features"), "features")
@@ -124,9 +124,14 @@ class _Reader:
         elif kind in ("Polygon", "MultiPolygon"):
             many = self.listed(given, at, "coordinates") if kind == "MultiPolygon" else [given]
             for i, rings in enumerate(many):
-                here = (*at, i) if kind == "MultiPolygon" else at
-                listed = self.listed(rings, here, "a polygon")
-                self.add("polygon", tuple(self.positions(r, here, j) for j, r in enumerate(listed)), properties, owner)
+                polygon_path = (*at, i) if kind == "MultiPolygon" else at
+                listed = self.listed(rings, polygon_path, "a polygon")
+                self.add(
+                    "polygon",
+                    tuple(self.positions(r, polygon_path, j) for j, r in enumerate(listed)),
+                    properties,
+                    owner,
+                )
         elif kind in ("MultiLineString", "GeometryCollection"):
             sentence = f"a {kind} cannot be part of a mission; make the route one LineString"
             raise self.source.error("mission.geojson-geometry", path, sentence)
@@ -146,7 +151,7 @@ class _Reader:
         return value
 
     def positions(self, given: Any, path: Path, step: str | int, single: bool = False) -> tuple[Position, ...]:
-        """Positions, only checked to be numbers; their count is limited before any is read."""
+        """Read positions, only checked to be numbers; their count is limited before any is read."""
         at = (*path, step)
         listed = self.listed(given, at, "coordinates")
         self.count += len(listed)
@@ -167,7 +172,7 @@ class _Reader:
 
 
 def write(mission: ForwardingMission) -> bytes:
-    """The mission as GeoJSON, one feature per line, with all digits."""
+    """Write the mission as GeoJSON, one feature per line, with all digits."""
     header = {"schema": mission.schema, "name": mission.name, "options": _without_defaults(mission.options)}
     features: list[dict[str, Any]] = []
     if len(mission.waypoints) == 1:
@@ -214,7 +219,7 @@ def _position(point: Point) -> list[float]:
 
 
 def _with_values(properties: dict[str, Any]) -> dict[str, Any]:
-    """The properties that have a value."""
+    """Return the properties that have a value."""
     return {key: value for key, value in properties.items() if value not in (None, "", [])}
 
 

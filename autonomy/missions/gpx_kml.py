@@ -88,7 +88,7 @@ _WORD: Final = re.compile(r"\S+")
 
 
 def decimal(text: str, what: str) -> float:
-    """The number in a text.
+    """Read the number in a text.
 
     Raises:
         InputRefused: it is not a number.
@@ -102,7 +102,7 @@ def decimal(text: str, what: str) -> float:
 
 
 def read_gpx(data: bytes, name: str) -> Draft:
-    """The mission in a GPX file: its route, else its track, else its waypoints."""
+    """Read the mission in a GPX file: its route, else its track, else its waypoints."""
     root = tree(data, name, _GPX, _GPX_LIMITS)
     source = Source(name)
     routes = [([list(route.all("rtept"))], route) for route in root.all("rte")]
@@ -145,7 +145,7 @@ class Gaps:
         self.found: list[tuple[float, Place]] = []
 
     def joined(self, segments: Iterable[tuple[Position, ...]]) -> tuple[Position, ...]:
-        """One line of all segments."""
+        """Join all segments to one line."""
         line: list[Position] = []
         for segment in segments:
             if line and segment:
@@ -159,17 +159,17 @@ class Gaps:
         """Warn of the gaps, at the widest one."""
         if not self.found:
             return
-        widest_m, place = max(self.found, key=lambda gap: gap[0])
+        widest_m, location = max(self.found, key=lambda gap: gap[0])
         draft.warn(
             "mission.track-gap",
-            place,
+            location,
             f"the track has {len(self.found) + 1} pieces with up to {widest_m:.0f} m between them, which the machine "
             "drives straight; draw the way across, or delete what does not belong to the route",
         )
 
 
 def _distance_m(a: Position, b: Position) -> float:
-    """The distance of two positions; 0 where one is no place, which validation refuses."""
+    """Compute the distance of two positions; 0 where one is no place, which validation refuses."""
     if not all(abs(p.latitude_deg) <= 90.0 and abs(p.longitude_deg) <= 180.0 for p in (a, b)):
         return 0.0
     frame = LocalFrame(a.latitude_deg, a.longitude_deg)
@@ -189,7 +189,7 @@ def _gpx_position(point: Element, source: Source) -> Position:
 
 
 def read_kml(data: bytes, name: str) -> Draft:
-    """The mission in a KML file: lines, polygons and points of its placemarks."""
+    """Read the mission in a KML file: lines, polygons and points of its placemarks."""
     root = tree(data, name, _KML, _KML_LIMITS)
     reader = _Kml(Source(name))
     for placemark in _placemarks(root):
@@ -202,7 +202,7 @@ def read_kml(data: bytes, name: str) -> Draft:
     if link is not None and not reader.shapes:
         raise reader.source.error("kml.network-link", link.line, f"holds no place, only {_LINK}")
     draft = assemble(reader.shapes, reader.source, "KML", title)
-    draft.notes += [*reader.notes, *(f"{count} × {what} ignored" for what, count in reader.left_out.items())]
+    draft.notes += [*reader.notes, *(f"{count} × {item} ignored" for item, count in reader.left_out.items())]
     reader.gaps.tell(draft)
     if link is not None:
         draft.warn("kml.network-link", link.line, _LINK)
@@ -210,7 +210,7 @@ def read_kml(data: bytes, name: str) -> Draft:
 
 
 def _inside(element: Element) -> Iterator[Element]:
-    """Every kept element below one."""
+    """Yield every kept element below one."""
     for child in element.children:
         yield child
         yield from _inside(child)
@@ -274,8 +274,8 @@ class _Kml:
             self.notes.append(f"an empty {kind} ignored")
 
     def track(self, owner: Element) -> tuple[Position, ...]:
-        """The places of a gx:Track; its times are not used."""
-        found = []
+        """Read the places of a gx:Track; its times are not used."""
+        track_positions = []
         for element in owner.all("coord"):
             self.counted(element.line)
             parts = element.text.split()
@@ -284,8 +284,8 @@ class _Kml:
             if not 2 <= len(parts) <= 3:
                 sentence = f'"{element.text.strip()[:40]}" is not a position; write longitude latitude [height]'
                 raise self.source.error("kml.position", element.line, sentence)
-            found.append(self.position(parts, element.line))
-        return tuple(found)
+            track_positions.append(self.position(parts, element.line))
+        return tuple(track_positions)
 
     def counted(self, line: int) -> None:
         self.count += 1
@@ -304,7 +304,7 @@ class _Kml:
         element = owner.first("coordinates")
         if element is None:
             return ()
-        text, line, at, found = element.text, element.line, 0, []
+        text, line, at, line_positions = element.text, element.line, 0, []
         for word in _WORD.finditer(text):
             self.counted(line)
             line += text.count("\n", at, word.start())
@@ -313,5 +313,5 @@ class _Kml:
             if not 2 <= len(parts) <= 3 or not parts[0]:
                 sentence = f'"{word[0][:40]}" is not a position; write longitude,latitude[,height] without spaces'
                 raise self.source.error("kml.position", line, sentence)
-            found.append(self.position(parts, line))
-        return tuple(found)
+            line_positions.append(self.position(parts, line))
+        return tuple(line_positions)

@@ -63,7 +63,7 @@ _ENDS: Final = ("Butt ob", "Top ob")
 
 
 def read_hpr(data: bytes, name: str) -> Draft:
-    """The logs of a harvester's production, as a mission without a route.
+    """Read the logs of a harvester's production, as a mission without a route.
 
     Raises:
         MissionError: not an hpr, a coordinate system other than WGS84, or an invalid value.
@@ -88,12 +88,12 @@ def read_hpr(data: bytes, name: str) -> Draft:
         products = {p.value("ProductKey"): _product_name(p) for p in machine.all("ProductDefinition")}
         for stem in machine.all("Stem"):
             for processed in stem.children:
-                found = list(processed.all("Log"))
-                at = _position((stem, processed), source) if found else None
+                log_elements = list(processed.all("Log"))
+                at = _position((stem, processed), source) if log_elements else None
                 if at is None:
-                    lost += len(found)
+                    lost += len(log_elements)
                     continue
-                for log in found:
+                for log in log_elements:
                     several += len(list(log.all("LogMeasurement"))) > 1
                     places[("log", len(logs))] = log.line
                     logs.append(_log(log, stem, *at, species, products, source))
@@ -117,7 +117,7 @@ def _product_name(product: Element) -> str:
 
 
 def _position(owners: tuple[Element, ...], source: Source) -> tuple[Point, float] | None:
-    """Where a stem was felled and the position's sigma [m], or None; some makers write it at the processing."""
+    """Find where a stem was felled and the position's sigma [m], or None; some makers write it at the processing."""
     best: tuple[Point, float] | None = None
     for given in (given for owner in owners for given in owner.all("StemCoordinates", "Coordinates")):
         system = given.attributes.get("coordinateReferenceSystem", "WGS84")
@@ -173,19 +173,19 @@ def _log(
 
 
 def _species_key(stem: Element) -> str:
-    """Trees processed together carry their species themselves."""
+    """Read the key of the species: trees processed together carry their species themselves."""
     return next((child.value("SpeciesGroupKey") for child in stem.children if child.first("SpeciesGroupKey")), "")
 
 
 def _measurement(log: Element) -> Element | None:
-    """The harvester's own measurement of a log, else the first: values of two measurements are never mixed."""
+    """Choose the harvester's own measurement of a log, else the first: values of two measurements are never mixed."""
     measured = list(log.all("LogMeasurement"))
     own = (m for m in measured if m.attributes.get("logMeasurementCategory") == "Machine")
     return next(own, measured[0] if measured else None)
 
 
 def _diameter_m(log: Element, measurement: Element | None, length: Element | None, source: Source) -> float | None:
-    """The diameter at the middle over bark, else the mean of both ends, else that from the volume."""
+    """Return the diameter at the middle over bark, else the mean of both ends, else that from the volume."""
     given = {
         d.attributes.get("logDiameterCategory", ""): d
         for d in (() if measurement is None else measurement.all("LogDiameter"))

@@ -21,12 +21,12 @@ class LocalFrame(LocalPlane):
     """The local plane for arrays of positions."""
 
     def enu(self, latitude_deg: np.ndarray, longitude_deg: np.ndarray, altitude_m: np.ndarray) -> np.ndarray:
-        """Local points [m] (..., 3) of latitudes, longitudes [deg] and heights [m] of one shape."""
+        """Return the local points [m] (..., 3) of latitudes, longitudes [deg] and heights [m] of one shape."""
         origin = (self.latitude_deg, self.longitude_deg, self.altitude_m)
         return np.stack(pymap3d.geodetic2enu(latitude_deg, longitude_deg, altitude_m, *origin), axis=-1)
 
     def points_enu(self, points: Sequence[Point]) -> np.ndarray:
-        """Local points [m] (n, 3); a point without a height is placed at the origin's."""
+        """Return the local points [m] (n, 3); a point without a height is placed at the origin's."""
         if not points:
             return np.empty((0, 3))
         height = (self.altitude_m if p.altitude_m is None else p.altitude_m for p in points)
@@ -35,22 +35,22 @@ class LocalFrame(LocalPlane):
         return self.enu(latitude, longitude, altitude)
 
     def point(self, east_m: float, north_m: float, up_m: float = 0.0) -> Point:
-        """The position of local metres."""
+        """Return the position of local metres."""
         return Point(*self.geodetic(east_m, north_m, up_m))
 
 
 def yaw_from_bearing(bearing_deg: float) -> float:
-    """A bearing [deg, clockwise from north] as an angle in the local plane [rad, counter-clockwise from east]."""
+    """Convert a bearing [deg, clockwise from north] to a yaw in the local plane [rad, counter-clockwise from east]."""
     return math.radians(90.0 - bearing_deg)
 
 
 def bearing_from_yaw(yaw_rad: float) -> float:
-    """The inverse of ``yaw_from_bearing``, in [0, 360) deg."""
+    """Convert a yaw to a bearing in [0, 360) deg, the inverse of ``yaw_from_bearing``."""
     return (90.0 - math.degrees(yaw_rad)) % 360.0
 
 
 def site_frame(mission: ForwardingMission) -> LocalFrame:
-    """The local frame of a mission; its origin is the first waypoint, else the first place of any kind.
+    """Make the local frame of a mission; its origin is the first waypoint, else the first place of any kind.
 
     Raises:
         MissionError: the mission has no place.

@@ -28,7 +28,7 @@ def load_mission(
     route_wanted: bool | None = None,
     site: tuple[float, float] | None = None,
 ) -> Draft:
-    """The validated mission of a file, and notes on what was ignored.
+    """Load the validated mission of a file, and notes on what was ignored.
 
     ``logs`` is a second file whose logs are added, for example a harvester's hpr.  ``route_wanted`` None requires a
     route unless the file is an hpr.  ``site``: see ``autonomy.missions.validation.problems_of``.
@@ -52,7 +52,7 @@ def load_mission(
 
 
 def read(data: bytes, name: str) -> Draft:
-    """The mission in the bytes of a file, not yet validated; ``name`` is the file's name in errors."""
+    """Read the mission in the bytes of a file, not yet validated; ``name`` is the file's name in errors."""
     data, name, notes = unpacked(data, name)
     draft = _read_unpacked(utf_8(data, name), name)
     draft.notes += notes
@@ -78,8 +78,8 @@ def _read_json(data: bytes, name: str) -> Draft:
     document, source = json_document(data, name)
     if not isinstance(document, dict):  # pragma: no cover - an object begins with a brace
         raise source.error("mission.no-object", None, "is not a JSON object")
-    found: dict[str, Any] = document
-    return qgc_plan.read(found, source) if found.get("fileType") == "Plan" else geojson.read(found, source)
+    members: dict[str, Any] = document
+    return qgc_plan.read(members, source) if members.get("fileType") == "Plan" else geojson.read(members, source)
 
 
 def _read_xml(data: bytes, name: str) -> Draft:
@@ -105,10 +105,10 @@ def verify(draft: Draft, *, route_wanted: bool = True, site: tuple[float, float]
     Raises:
         MissionError: every problem, with its line in the file.
     """
-    found = problems_of(draft.mission, route_wanted, site)
-    if found:
+    problems = problems_of(draft.mission, route_wanted, site)
+    if problems:
         raise draft.source.errors(
-            (None if f.key is None else draft.places.get(f.key), f.code, f.sentence) for f in found
+            (None if f.key is None else draft.places.get(f.key), f.code, f.sentence) for f in problems
         )
 
 

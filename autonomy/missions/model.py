@@ -45,11 +45,11 @@ class MissionError(TimberhandError, ValueError):
 
     @classmethod
     def of(cls, problems: Iterable[Problem], more: str = "") -> MissionError:
-        """The error of several problems, with a last line on those that are not listed."""
-        found = tuple(problems)
-        error = cls(found[0].code, "")
-        error.args = ("\n".join([*map(str, found), *([more] if more else [])]),)
-        error.problems = found
+        """Make the error of several problems, with a last line on those that are not listed."""
+        listed_problems = tuple(problems)
+        error = cls(listed_problems[0].code, "")
+        error.args = ("\n".join([*map(str, listed_problems), *([more] if more else [])]),)
+        error.problems = listed_problems
         return error
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -148,7 +148,7 @@ class ForwardingMission(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 def all_points(mission: ForwardingMission) -> tuple[Point, ...]:
-    """Every position of a mission: waypoints, corners of fences, landings, logs."""
+    """List every position of a mission: waypoints, corners of fences, landings, logs."""
     corners = tuple(corner for fence in mission.fences for corner in fence.corners)
     landings = (landing.position for landing in mission.landings)
     return (*mission.waypoints, *corners, *landings, *(log.position for log in mission.logs))

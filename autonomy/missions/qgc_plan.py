@@ -47,7 +47,7 @@ Path = tuple[str | int, ...]
 
 
 def read(document: dict[str, Any], source: Source) -> Draft:
-    """The mission in a plan.
+    """Read the mission in a plan.
 
     Raises:
         MissionError: what is wrong, with its line.
@@ -70,7 +70,7 @@ def read(document: dict[str, Any], source: Source) -> Draft:
             "inside one of them, any of them, so draw the area as one fence"
         )
         draft.warn("plan.several-fences", ("geoFence",), sentence)
-    draft.notes += [f"{count} × {what} ignored" for what, count in reader.left_out.items()]
+    draft.notes += [f"{count} × {item} ignored" for item, count in reader.left_out.items()]
     rally = document.get("rallyPoints")
     if isinstance(rally, dict) and rally.get("points"):
         draft.notes.append("rally points ignored")
@@ -94,7 +94,7 @@ class _Reader:
         self.other_speed: Path | None = None
 
     def speed_m_s(self) -> float | None:
-        """The slowest speed that holds on a leg; None if none is given."""
+        """Return the slowest speed that holds on a leg; None if none is given."""
         return min((speed for speed in self.speeds_m_s if speed is not None), default=None)
 
     def tell(self, draft: Draft) -> None:
@@ -108,12 +108,12 @@ class _Reader:
         if self.other_speed is not None:
             sentence = "this speed is no ground speed (type 1) in m/s and is not used; set the ground speed"
             draft.warn("plan.speed-type", self.other_speed, sentence)
-        for what, paths in self.not_driven.items():
-            sentence = f"{len(paths)} × {what}: a mission does not have it, and the machine drives on without it"
+        for item, paths in self.not_driven.items():
+            sentence = f"{len(paths)} × {item}: a mission does not have it, and the machine drives on without it"
             draft.warn("plan.not-driven", paths[0], sentence)
 
     def items(self, items: list[Any]) -> None:
-        """The route: every waypoint item in its order."""
+        """Read the route: every waypoint item in its order."""
         if len(items) > 2 * MAX_WAYPOINTS:
             sentence = f"has {len(items)} items; a route has at most {MAX_WAYPOINTS} waypoints"
             raise self.source.error("mission.too-many-waypoints", ("mission", "items"), sentence)
@@ -162,7 +162,7 @@ class _Reader:
             self.shapes.append(Shape(kind, (tuple(route),), {}, ("mission", "items")))
 
     def fences(self, fence: dict[str, Any]) -> None:
-        """Polygons of version 2, the single one of version 1, and circles."""
+        """Read polygons of version 2, the single one of version 1, and circles."""
         if isinstance(fence.get("polygon"), list) and fence["polygon"]:
             self.polygon(fence["polygon"], True, ("geoFence", "polygon"))
         for kind, inner in (("polygons", "polygon"), ("circles", "circle")):
@@ -189,7 +189,7 @@ class _Reader:
         self.shapes.append(Shape("polygon", (ring,), {"role": _role(inclusion)}, path))
 
     def circle(self, circle: dict[str, Any], inclusion: bool, path: Path) -> None:
-        """A circle as a polygon on the safe side: inside a keep-in circle, round a keep-out circle."""
+        """Draw a circle as a polygon on the safe side: inside a keep-in circle, round a keep-out circle."""
         center = self.position(circle.get("center"), (*path, "center"))
         radius = circle.get("radius")
         if not isinstance(radius, int | float) or isinstance(radius, bool) or not 0.0 < radius < 1e5:

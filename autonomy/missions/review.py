@@ -89,9 +89,9 @@ def review(mission: ForwardingMission, profile: Profile) -> Review:
 
 
 def _wanted(mission: ForwardingMission) -> int:
-    """Number of known logs to collect; when searching as in paper B, the places are filled again for every lap."""
-    wanted = mission.options.assortments
-    logs = sum(1 for log in mission.logs if not wanted or log.assortment in wanted)
+    """Count the known logs to collect; when searching as in paper B, the places are filled again for every lap."""
+    collected_assortments = mission.options.assortments
+    logs = sum(1 for log in mission.logs if not collected_assortments or log.assortment in collected_assortments)
     if mission.options.logs == "search":
         logs *= mission.options.laps
     limit = mission.options.logs_wanted
@@ -101,17 +101,19 @@ def _wanted(mission: ForwardingMission) -> int:
 
 
 def _corners(at: np.ndarray, route_legs: list[tuple[int, int]], radius_m: float) -> tuple[Corner, ...]:
-    """Every waypoint between two legs."""
-    found = []
+    """List the corner at every waypoint between two legs."""
+    corners = []
     follows = list(pairwise(route_legs))
     if len(route_legs) > 1 and route_legs[-1][1] == route_legs[0][0]:
         follows.append((route_legs[-1], route_legs[0]))
     for (a, b), (_, c) in follows:
-        one, two = at[b] - at[a], at[c] - at[b]
-        turn = abs(math.atan2(one[0] * two[1] - one[1] * two[0], float(one @ two)))
+        leg_before, leg_after = at[b] - at[a], at[c] - at[b]
+        turn = abs(
+            math.atan2(leg_before[0] * leg_after[1] - leg_before[1] * leg_after[0], float(leg_before @ leg_after))
+        )
         switch = radius_m * math.tan(0.5 * turn) if turn < SHARPEST_RAD else math.inf
-        found.append(Corner(b, turn, max(switch, MIN_SWITCH_M)))
-    return tuple(found)
+        corners.append(Corner(b, turn, max(switch, MIN_SWITCH_M)))
+    return tuple(corners)
 
 
 def _site(mission: ForwardingMission, carrier: Carrier) -> list[Finding]:
@@ -128,25 +130,25 @@ def _site(mission: ForwardingMission, carrier: Carrier) -> list[Finding]:
 
 def _speed(mission: ForwardingMission, carrier: Carrier) -> list[Finding]:
     speed, height = mission.options.speed_m_s, mission.options.transport_height_m
-    found = []
+    findings = []
     if speed is not None and speed > carrier.speed_limit_m_s:
         sentence = f"speed_m_s is {speed:g}; the machine drives at most {carrier.speed_limit_m_s:g} m/s"
-        found.append(Finding(None, "mission.speed-limit", sentence))
+        findings.append(Finding(None, "mission.speed-limit", sentence))
     if height is not None and height > carrier.arm_travel_m:
         sentence = f"transport_height_m is {height:g}; the swing arms lift {carrier.arm_travel_m:g} m"
-        found.append(Finding(None, "mission.height-limit", sentence))
-    return found
+        findings.append(Finding(None, "mission.height-limit", sentence))
+    return findings
 
 
 def _tight(
     corners: tuple[Corner, ...], route_legs: list[tuple[int, int]], lengths: list[float], radius_m: float
 ) -> list[Finding]:
-    """Corners that the machine cannot drive as drawn: too sharp, or with legs too short for the bends."""
-    found = []
+    """Find corners that the machine cannot drive as drawn: too sharp, or with legs too short for the bends."""
+    findings = []
     room = {corner.waypoint: corner.switch_m for corner in corners if math.isfinite(corner.switch_m)}
     for corner in corners:
         if math.isinf(corner.switch_m):
-            found.append(
+            findings.append(
                 Finding(
                     ("waypoint", corner.waypoint),
                     "mission.turn-on-the-spot",
@@ -157,7 +159,7 @@ def _tight(
     for (i, j), length in zip(route_legs, lengths, strict=True):
         needed = room.get(i, 0.0) + room.get(j, 0.0)
         if length < needed:
-            found.append(
+            findings.append(
                 Finding(
                     ("waypoint", j),
                     "mission.short-leg",
@@ -165,11 +167,11 @@ def _tight(
                     f"radius of {radius_m:.1f} m; the machine will cut or overshoot them",
                 )
             )
-    return _few(found)
+    return _few(findings)
 
 
 def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> list[Finding]:
-    """Waypoints so close to the fence that a wheel would leave it."""
+    """Find waypoints so close to the fence that a wheel would leave it."""
     if not mission.fences:
         return [Finding(None, "mission.no-fence", "there is no fence; add one to keep the machine inside an area")]
     area = area_of(mission, frame)
@@ -192,7 +194,7 @@ def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> li
 def _logs(
     mission: ForwardingMission, frame: LocalFrame, at: np.ndarray, route_legs: list[tuple[int, int]], profile: Profile
 ) -> list[Finding]:
-    """Logs that the crane cannot reach from the route, or that lie on the route."""
+    """Find logs that the crane cannot reach from the route, or that lie on the route."""
     if not mission.logs or not len(at) or profile.carrier is None:
         return []
     path = at[[route_legs[0][0], *(j for _, j in route_legs)]] if route_legs else at
@@ -217,7 +219,7 @@ def _logs(
 
 
 def _unlisted(mission: ForwardingMission) -> list[Finding]:
-    """Assortments to collect that no listed log has."""
+    """Find assortments to collect that no listed log has."""
     listed = {log.assortment for log in mission.logs}
     return _few(
         [
@@ -229,7 +231,7 @@ def _unlisted(mission: ForwardingMission) -> list[Finding]:
 
 
 def _few(warnings: list[Finding]) -> list[Finding]:
-    """The first few of many warnings of one kind."""
+    """Return the first few of many warnings of one kind."""
     more = len(warnings) - MAX_SHOWN
     if more <= 0:
         return warnings

@@ -52,7 +52,7 @@ class Source:
     text: str = field(default="", repr=False)
 
     def at(self, place: Place) -> str:
-        """``name:line`` of a place, or ``name`` if the line is unknown."""
+        """Return ``name:line`` of a place, or ``name`` if the line is unknown."""
         if isinstance(place, tuple):
             line = line_of(self.text, place) if len(self.text) <= MAX_LINED_CHARS else None
         else:
@@ -60,22 +60,23 @@ class Source:
         return self.name if line is None else f"{self.name}:{line}"
 
     def error(self, code: str, place: Place, sentence: str) -> MissionError:
-        """The error of one problem."""
+        """Make the error of one problem."""
         return self.errors([(place, code, sentence)])
 
     def errors(self, found: Iterable[tuple[Place, str, str]]) -> MissionError:
-        """The error of several problems (place, code, sentence); those after the first few are only counted."""
+        """Make the error of several problems (place, code, sentence); those after the first few are only counted."""
         reasons = list(found)
         # Values from the file may contain line breaks; each problem is one line.
         problems = [
-            Problem(code, " ".join(sentence.split()), self.at(place)) for place, code, sentence in reasons[:MAX_SHOWN]
+            Problem(code, " ".join(sentence.split()), self.at(location))
+            for location, code, sentence in reasons[:MAX_SHOWN]
         ]
         more = f"{self.name}: and {len(reasons) - MAX_SHOWN} more of the kind" if len(reasons) > MAX_SHOWN else ""
         return MissionError.of(problems, more)
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """The bytes of a file.
+    """Read the bytes of a file.
 
     Raises:
         MissionError: it cannot be read, or is larger than any mission.
@@ -93,7 +94,8 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def unpacked(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
-    """The mission in a zip (``.kmz``, ``.hprz``) or gzip file, its name in errors, and notes; another file as it is.
+    """Return the mission in a zip (``.kmz``, ``.hprz``) or gzip file, its name in errors, and notes; another file as it
+    is.
 
     Raises:
         MissionError: damaged, encrypted, larger than any mission, an archive in an archive, or not one mission.
@@ -117,12 +119,14 @@ def _from_zip(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             named = [e for e in archive.infolist() if e.filename]  # is_dir fails without a name
             files = [e for e in named if not e.is_dir() and not e.filename.startswith("__MACOSX/")]
-            found = [e for e in files if e.filename.lower().endswith(_MISSION_NAMES)]
-            found = [e for e in found if e.filename.lower() == "doc.kml"] or found
-            if len(found) != 1:
-                sentence = f"is a zip file with {len(found) or 'no'} missions in it; unpack it and give one of them"
+            mission_entries = [e for e in files if e.filename.lower().endswith(_MISSION_NAMES)]
+            mission_entries = [e for e in mission_entries if e.filename.lower() == "doc.kml"] or mission_entries
+            if len(mission_entries) != 1:
+                sentence = (
+                    f"is a zip file with {len(mission_entries) or 'no'} missions in it; unpack it and give one of them"
+                )
                 raise MissionError("mission.archive", sentence, name)
-            entry = found[0]
+            entry = mission_entries[0]
             if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 sentence = "is a zip file that is encrypted or packed in an unusual way; unpack it and give the mission"
                 raise MissionError("mission.archive", sentence, name)
@@ -141,12 +145,12 @@ def _from_zip(data: bytes, name: str) -> tuple[bytes, str, list[str]]:
 
 
 def _from_gzip(data: bytes, name: str) -> bytes:
-    found = b""
+    unpacked_bytes = b""
     try:
         for _ in range(MAX_MEMBERS):
             unpacker = zlib.decompressobj(wbits=31)
-            found += unpacker.decompress(data, MAX_XML_BYTES + 1 - len(found))
-            if len(found) > MAX_XML_BYTES:
+            unpacked_bytes += unpacker.decompress(data, MAX_XML_BYTES + 1 - len(unpacked_bytes))
+            if len(unpacked_bytes) > MAX_XML_BYTES:
                 raise _too_large(name)
             if not unpacker.eof:
                 raise MissionError("mission.archive-damaged", "is a gzip file that is cut off; copy it anew", name)
@@ -154,7 +158,7 @@ def _from_gzip(data: bytes, name: str) -> bytes:
             if not data.startswith(_GZIP):
                 if data.strip(b"\0"):
                     break
-                return found
+                return unpacked_bytes
     except zlib.error as error:
         sentence = f"is a gzip file that is damaged ({error}); copy it anew"
         raise MissionError("mission.archive-damaged", sentence, name) from None
@@ -167,7 +171,7 @@ def _too_large(name: str, limit: int = MAX_XML_BYTES) -> MissionError:
 
 
 def utf_8(data: bytes, name: str) -> bytes:
-    """JSON in UTF-16 as UTF-8; everything else as it is: an XML file says itself what it is written in.
+    """Convert JSON in UTF-16 to UTF-8; leave everything else as it is: an XML file says itself what it is written in.
 
     Raises:
         MissionError: JSON in damaged UTF-16.
@@ -187,7 +191,7 @@ def utf_8(data: bytes, name: str) -> bytes:
 
 
 def json_document(data: bytes, name: str) -> tuple[Any, Source]:
-    """The JSON value in ``data`` (UTF-8, a byte order mark is ignored) and its source.
+    """Return the JSON value in ``data`` (UTF-8, a byte order mark is ignored) and its source.
 
     Raises:
         MissionError: not UTF-8, too large, nested too deeply, or not JSON; NaN and Infinity are not JSON (RFC 8259).
@@ -232,9 +236,9 @@ def _refuse_long_numbers(value: Any, source: Source) -> None:
 
 
 def _no_json(source: Source, complaint: str) -> MissionError:
-    """The error for text that the JSON reader refused, with its line."""
-    found = _BYTE.match(complaint)
-    if found is None:
+    """Make the error for text that the JSON reader refused, with its line."""
+    byte_match = _BYTE.match(complaint)
+    if byte_match is None:
         cut = "truncated" in complaint
         last = source.text.count("\n") + 1 if cut else None
         if "out of range" in complaint:
@@ -242,7 +246,7 @@ def _no_json(source: Source, complaint: str) -> MissionError:
             return source.error("mission.json-number", last, sentence)
         reason = "it ends too early; was the file cut off?" if cut else f"{complaint[0].lower()}{complaint[1:]}"
         return source.error("mission.not-json", last, f"this is not JSON: {reason}")
-    before = source.text.encode()[: int(found[2])]
+    before = source.text.encode()[: int(byte_match[2])]
     line = before.count(b"\n") + 1
     rest = source.text.encode()[len(before) : len(before) + 12].decode(errors="ignore")
     number = re.match(r"-?(NaN|nan|Infinity|inf)", before.decode(errors="ignore")[-1:] + rest) or re.match(
@@ -251,12 +255,12 @@ def _no_json(source: Source, complaint: str) -> MissionError:
     if number:
         sentence = f"{number[0]} is not a number in JSON; write the value, or leave the member out"
         return source.error("mission.json-number", line, sentence)
-    sentence = f"this is not JSON: {found[1].removeprefix('JSON is malformed: ')}"
+    sentence = f"this is not JSON: {byte_match[1].removeprefix('JSON is malformed: ')}"
     return source.error("mission.not-json", line, sentence)
 
 
 def line_of(text: str, path: tuple[str | int, ...]) -> int | None:
-    """The line, from 1, on which the value at a path of a JSON text begins; its nearest parent's if it is missing."""
+    """Find the line, from 1, on which the value at a path of a JSON text begins; if missing, its nearest parent's."""
     at = _skip(text, 0)
     for step in path:
         inner = _member(text, at, step)
@@ -267,18 +271,18 @@ def line_of(text: str, path: tuple[str | int, ...]) -> int | None:
 
 
 def _member(text: str, at: int, step: str | int) -> int | None:
-    """Position of the member ``step`` of the object or array at ``at``."""
+    """Find the position of the member ``step`` of the object or array at ``at``."""
     if at >= len(text) or text[at] != ("{" if isinstance(step, str) else "["):
         return None
     at = _skip(text, at + 1)
     count = 0
-    found = None
+    member_at = None
     while at < len(text) and text[at] not in "]}":
         if isinstance(step, str):
             key, at = _DECODER.raw_decode(text, at)
             at = _skip(text, _skip(text, at) + 1)
             if key == step:
-                found = at  # the last one of a repeated key counts
+                member_at = at  # the last one of a repeated key counts
         elif count == step:
             return at
         _, at = _DECODER.raw_decode(text, at)
@@ -286,9 +290,9 @@ def _member(text: str, at: int, step: str | int) -> int | None:
         if at < len(text) and text[at] == ",":
             at = _skip(text, at + 1)
         count += 1
-    return found
+    return member_at
 
 
 def _skip(text: str, at: int) -> int:
-    found = _SPACE.match(text, at)
-    return found.end() if found else at
+    space = _SPACE.match(text, at)
+    return space.end() if space else at

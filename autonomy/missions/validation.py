@@ -46,7 +46,7 @@ class Finding(NamedTuple):
 def problems_of(
     mission: ForwardingMission, route_wanted: bool = True, site: tuple[float, float] | None = None
 ) -> list[Finding]:
-    """All problems of a mission; empty when it can be driven.
+    """List all problems of a mission; empty when it can be driven.
 
     ``route_wanted`` is False where logs alone are useful.  ``site`` is the latitude and longitude [deg] where the
     machine works: it reveals a mission that is consistent in itself but has all its axes swapped.
@@ -54,23 +54,23 @@ def problems_of(
     counts = list(_counts(mission, route_wanted))
     if counts:
         return counts
-    found = [*_coordinates(mission), *_options(mission.options), *_sizes(mission)]
-    if found:
-        return found
-    found = list(_together(mission)) or list(_at_site(mission, site))
-    if found or not _named(mission):
-        return found
+    findings = [*_coordinates(mission), *_options(mission.options), *_sizes(mission)]
+    if findings:
+        return findings
+    findings = list(_together(mission)) or list(_at_site(mission, site))
+    if findings or not _named(mission):
+        return findings
     return [*_fences(mission), *_route(mission), *_assortments(mission)] or list(_within(mission))
 
 
 def area_of(mission: ForwardingMission, frame: LocalFrame) -> Area:
-    """The fences in local metres."""
+    """Return the fences in local metres."""
     rings = [(frame.points_enu(fence.corners)[:, :2], fence.keep_out) for fence in mission.fences]
     return Area(tuple(r for r, out in rings if not out), tuple(r for r, out in rings if out))
 
 
 def _named(mission: ForwardingMission) -> list[tuple[Key, Point]]:
-    """Every place with its key."""
+    """List every place with its key."""
     return [
         *((("waypoint", i), p) for i, p in enumerate(mission.waypoints)),
         *((("corner", i, j), p) for i, f in enumerate(mission.fences) for j, p in enumerate(f.corners)),
@@ -80,7 +80,7 @@ def _named(mission: ForwardingMission) -> list[tuple[Key, Point]]:
 
 
 def key_text(key: Key) -> str:
-    """A key as text, counted from 1."""
+    """Write a key as text, counted from 1."""
     name, *numbers = key
     if name == "corner":
         return f"corner {numbers[1] + 1} of fence {numbers[0] + 1}"
@@ -112,7 +112,7 @@ def _counts(mission: ForwardingMission, route_wanted: bool) -> Iterator[Finding]
 
 
 def _coordinates(mission: ForwardingMission) -> Iterator[Finding]:
-    """Each place alone."""
+    """Check each place alone."""
     for key, at in _named(mission):
         latitude, longitude, height = at.latitude_deg, at.longitude_deg, at.altitude_m
         if not (math.isfinite(latitude) and math.isfinite(longitude) and math.isfinite(height or 0.0)):
@@ -167,7 +167,7 @@ def _options(options: Options) -> Iterator[Finding]:
 
 
 def _sizes(mission: ForwardingMission) -> Iterator[Finding]:
-    """Properties of logs and landings other than their places."""
+    """Check the properties of logs and landings other than their places."""
     for i, log in enumerate(mission.logs):
         key: Key = ("log", i)
         for name, value, limits in (("length_m", log.length_m, LENGTHS_M), ("diameter_m", log.diameter_m, DIAMETERS_M)):
@@ -194,8 +194,8 @@ def _sizes(mission: ForwardingMission) -> Iterator[Finding]:
         ("log", [log.bearing_deg for log in mission.logs]),
         ("landing", [landing.bearing_deg for landing in mission.landings]),
     )
-    for name, found in bearings:
-        for i, bearing in enumerate(found):
+    for name, bearings_deg in bearings:
+        for i, bearing in enumerate(bearings_deg):
             if bearing is not None and not 0.0 <= bearing <= 360.0:
                 key = (name, i)
                 yield Finding(
@@ -206,7 +206,7 @@ def _sizes(mission: ForwardingMission) -> Iterator[Finding]:
 
 
 def _anchor(mission: ForwardingMission) -> tuple[str, Point] | None:
-    """Reference for the rest of the mission: the fence, else the route, else the first place."""
+    """Choose the reference for the rest of the mission: the fence, else the route, else the first place."""
     for fence in mission.fences:
         if fence.corners:
             return "the fence", fence.corners[0]
@@ -216,7 +216,7 @@ def _anchor(mission: ForwardingMission) -> tuple[str, Point] | None:
 
 
 def _together(mission: ForwardingMission) -> Iterator[Finding]:
-    """Places too far from the others to be right."""
+    """Find places too far from the others to be right."""
     anchor = _anchor(mission)
     if anchor is None:
         return
@@ -235,7 +235,7 @@ def _together(mission: ForwardingMission) -> Iterator[Finding]:
 
 
 def swapped_m(origin: LocalFrame, at: Point) -> float:
-    """Distance of a place from the origin with its axes exchanged [m]."""
+    """Compute the distance of a place from the origin with its axes exchanged [m]."""
     if abs(at.longitude_deg) > 90.0:
         return math.inf
     other = origin.points_enu([Point(at.longitude_deg, at.latitude_deg)])
@@ -314,7 +314,7 @@ def _route(mission: ForwardingMission) -> Iterator[Finding]:
 
 
 def _assortments(mission: ForwardingMission) -> Iterator[Finding]:
-    """Selecting and sorting: cameras do not see assortments, so the mission must name them.
+    """Check selecting and sorting: cameras do not see assortments, so the mission must name them.
 
     A mission without logs may get them from a harvester's file.
     """
@@ -345,8 +345,8 @@ def _assortments(mission: ForwardingMission) -> Iterator[Finding]:
     elif all(landing.assortments for landing in mission.landings):
         takers = {kind for landing in mission.landings for kind in landing.assortments}
         for i, log in enumerate(mission.logs):
-            wanted = not options.assortments or log.assortment in options.assortments
-            if log.assortment and wanted and log.assortment not in takers:
+            is_collected = not options.assortments or log.assortment in options.assortments
+            if log.assortment and is_collected and log.assortment not in takers:
                 yield Finding(
                     ("log", i),
                     "mission.assortment-without-landing",
@@ -355,7 +355,7 @@ def _assortments(mission: ForwardingMission) -> Iterator[Finding]:
 
 
 def _within(mission: ForwardingMission) -> Iterator[Finding]:
-    """Waypoints, legs and landings against the fence."""
+    """Check waypoints, legs and landings against the fence."""
     if not mission.fences:
         return
     frame = site_frame(mission)
@@ -398,9 +398,11 @@ def _inside_swapped(at: Point, frame: LocalFrame, area: Area) -> bool:
 
 
 def legs(mission: ForwardingMission) -> list[tuple[int, int]]:
-    """The straight lines between waypoints, by their indices; with several laps also the one that closes the route."""
+    """List the straight lines between waypoints, by their indices; with several laps also the one that closes the
+    route.
+    """
     count = len(mission.waypoints)
-    found = [(i, i + 1) for i in range(count - 1)]
+    index_pairs = [(i, i + 1) for i in range(count - 1)]
     if mission.options.laps > 1 and count > 1 and mission.waypoints[0] != mission.waypoints[-1]:
-        found.append((count - 1, 0))
-    return found
+        index_pairs.append((count - 1, 0))
+    return index_pairs

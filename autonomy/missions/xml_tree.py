@@ -57,20 +57,20 @@ class Element:
     children: list[Element] = _NO_CHILDREN
 
     def all(self, *names: str) -> Iterator[Element]:
-        """The children of these names."""
+        """Yield the children of these names."""
         return (child for child in self.children if child.name in names)
 
     def first(self, *path: str) -> Element | None:
-        """The first descendant along a path of names, or None."""
+        """Find the first descendant along a path of names, or None."""
         at: Element | None = self
         for name in path:
             at = next(at.all(name), None) if at is not None else None
         return at
 
     def value(self, *path: str) -> str:
-        """The stripped text of the first descendant along a path, "" without one."""
-        found = self.first(*path)
-        return "" if found is None else found.text.strip()
+        """Return the stripped text of the first descendant along a path, "" without one."""
+        element = self.first(*path)
+        return "" if element is None else element.text.strip()
 
 
 class _Builder:
@@ -91,11 +91,11 @@ class _Builder:
         self.line: Callable[[], int] = lambda: 0
 
     def excess(self, code: str, sentence: str) -> MissionError:
-        """The error of a file that has more than any mission needs."""
+        """Make the error of a file that has more than any mission needs."""
         return MissionError(code, f"{sentence}; thin it out, or split the mission", f"{self.name}:{self.line()}")
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Start of an element."""
+        """Handle the start of an element."""
         self.elements += 1
         if self.elements > MAX_ELEMENTS:
             raise self.excess("mission.too-many-elements", f"has more than {MAX_ELEMENTS} elements")
@@ -120,10 +120,10 @@ class _Builder:
             raise self.excess("mission.nesting", "is nested deeper than any mission")
         for counted in (name, ANY):
             if counted in self.limits:
-                limit, what = self.limits[counted]
+                limit, description = self.limits[counted]
                 self.counts[counted] = self.counts.get(counted, 0) + 1
                 if self.counts[counted] > limit:
-                    raise self.excess("mission.too-many-elements", f"has more than {limit} {what}")
+                    raise self.excess("mission.too-many-elements", f"has more than {limit} {description}")
         local = {key.rpartition("}")[2]: value for key, value in attributes.items()} or _NO_ATTRIBUTES
         element = Element(name, namespace.lstrip("{"), local, self.line())
         if self.open:
@@ -134,7 +134,7 @@ class _Builder:
         self.open.append(element)
 
     def end(self, _tag: str) -> None:
-        """End of an element."""
+        """Handle the end of an element."""
         if self.skipping:
             self.skipping -= 1
         elif not self.open:
@@ -144,7 +144,7 @@ class _Builder:
             self.open.pop()
 
     def data(self, text: str) -> None:
-        """Text of the open element."""
+        """Take the text of the open element."""
         if self.open and not self.skipping and not self.open[-1].children:
             self.parts.append(text)
             self.characters += len(text)
@@ -157,12 +157,12 @@ class _Builder:
             self.parts.clear()
 
     def close(self) -> Element | None:
-        """The tree."""
+        """Return the tree."""
         return self.root
 
 
 def root_name(data: bytes) -> str:
-    """The local name of the root element, "" if there is none in the first 64 kB."""
+    """Read the local name of the root element, "" if there is none in the first 64 kB."""
     builder = _Builder("", frozenset(), {})
     parser = DefusedXMLParser(target=builder, forbid_dtd=True)
     with suppress(ParseError, DefusedXmlException, ValueError, LookupError):
@@ -173,7 +173,7 @@ def root_name(data: bytes) -> str:
 def tree(
     data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]], inside: str = ""
 ) -> Element:
-    """The root of an XML document with the elements named ``wanted`` below it.
+    """Return the root of an XML document with the elements named ``wanted`` below it.
 
     ``limits`` has the greatest number of elements by name (``ANY``: of all kept ones), and their name in the error.
     ``inside`` is the name of the element to return instead of the root, where a document is an envelope round it.
@@ -207,42 +207,46 @@ def tree(
         sentence = f"its encoding cannot be read ({error}); save the file with UTF-8"
         raise MissionError("mission.encoding", sentence, name) from None
     if root is None:
-        what = f"has no <{inside}>" if inside else "is empty"
-        raise MissionError("mission.empty-file", what, name)
+        reason = f"has no <{inside}>" if inside else "is empty"
+        raise MissionError("mission.empty-file", reason, name)
     if builder.more:
         sentence = f"is an envelope of {builder.more + 1} <{inside}>; save each one as a file of its own"
         raise MissionError("mission.envelope", sentence, name)
-    found: Element = root
-    return found
+    root_element: Element = root
+    return root_element
 
 
 def _refusal(data: bytes, error: ParseError, at_byte: int, name: str) -> MissionError:
-    """Why the parser refused a document."""
-    place = f"{name}:{error.position[0]}"
+    """Tell why the parser refused a document."""
+    location = f"{name}:{error.position[0]}"
     reason = str(error).partition(":")[0]
     if error.code in _CUT:
-        return MissionError("mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?", place)
+        return MissionError(
+            "mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?", location
+        )
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_MISPLACED_XML_PI]:
         return MissionError(
             "mission.xml-start",
             "something stands before <?xml; delete what comes before it, blanks and lines too",
-            place,
+            location,
         )
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_UNBOUND_PREFIX]:
         sentence = "this element or attribute has a prefix that no xmlns: declares; declare it, or delete the element"
-        return MissionError("mission.xml-prefix", sentence, place)
+        return MissionError("mission.xml-prefix", sentence, location)
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_UNDEFINED_ENTITY]:
         sentence = "this contains an entity that XML does not know, such as &ntilde;; write the character itself"
-        return MissionError("mission.xml-entity", sentence, place)
+        return MissionError("mission.xml-entity", sentence, location)
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_INCORRECT_ENCODING]:
         return MissionError(
-            "mission.encoding", "the encoding in <?xml ...?> is not that of the file; save the file with UTF-8", place
+            "mission.encoding",
+            "the encoding in <?xml ...?> is not that of the file; save the file with UTF-8",
+            location,
         )
     if error.code == xml_errors.codes[xml_errors.XML_ERROR_INVALID_TOKEN]:
         try:
             data[: at_byte + 8].decode("utf-8")
-        except UnicodeDecodeError as found:
-            if found.start <= at_byte and not data.startswith(_UTF_16):
-                sentence = f"byte {found.start} is not UTF-8 text; save the file with the encoding UTF-8"
-                return MissionError("mission.encoding", sentence, place)
-    return MissionError("mission.not-xml", f"this is not well-formed XML: {reason}", place)
+        except UnicodeDecodeError as decode_error:
+            if decode_error.start <= at_byte and not data.startswith(_UTF_16):
+                sentence = f"byte {decode_error.start} is not UTF-8 text; save the file with the encoding UTF-8"
+                return MissionError("mission.encoding", sentence, location)
+    return MissionError("mission.not-xml", f"this is not well-formed XML: {reason}", location)

@@ -40,7 +40,7 @@ LEVEL: Final = (0.0, 0.0)
 
 
 def slope_of(rotation: np.ndarray) -> tuple[float, float]:
-    """How far what hangs from the pin is beside it, along the base's x and y, per metre below it [m/m].
+    """Compute how far what hangs from the pin is beside it, along the base's x and y, per metre below it [m/m].
 
     ``rotation`` (3, 3) turns the base's vectors into the level frame, z up.
     """
@@ -69,7 +69,7 @@ class ArmKinematics:
         self._pump_m3_s = FLOW_SHARE * profile.hydraulics.pump_flow_m3_s
 
     def pump_load(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Pump flow of joint velocities (n, 5) at positions (n, 5), as a share of what a plan may use, (n,)."""
+        """Compute pump flow of joint velocities (n, 5) at positions (n, 5), as a share of what a plan may use, (n,)."""
         flow = np.zeros(len(q))
         for j, valve in enumerate(self._valves):
             per_speed = np.where(velocity[:, j] >= 0.0, valve.flow_plus, valve.flow_minus)
@@ -78,17 +78,17 @@ class ArmKinematics:
         return flow / self._pump_m3_s
 
     def pose(self, q: Sequence[float]) -> Pose:
-        """The pose of a joint vector (5 elements, rad and m)."""
+        """Compute the pose of a joint vector (5 elements, rad and m)."""
         x, y, z = true_pin(self.profile.sag, self._kin, q, self.load_kg)
         return Pose(q[Joint.SLEW], hypot(x, y), z, q[Joint.EXT], q[Joint.ROT])
 
     def xy(self, pose: Pose) -> tuple[float, float]:
-        """Horizontal position of the jaws below a pose of the pin in the base frame, m."""
+        """Compute the horizontal position of the jaws below a pose of the pin in the base frame, m."""
         theta, (x, y) = pose.slew_rad + self._kin.theta1_offset_rad, self._aside_m
         return pose.r_m * cos(theta) + x, pose.r_m * sin(theta) + y
 
     def joints(self, poses: np.ndarray) -> np.ndarray:
-        """Joint vectors (n, 5) of poses (n, 5), with the sag compensated.
+        """Compute joint vectors (n, 5) of poses (n, 5), with the sag compensated.
 
         The first pose is where a motion begins: it may be at a stop, from which the others keep away.
 
@@ -99,7 +99,7 @@ class ArmKinematics:
         return self._joints_or_reason(poses) if np.any(outside) else q
 
     def _sag_compensated(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joints of all poses at once, and which are out of reach: `machine.geometry.sag.aim` for arrays."""
+        """Compute joints of all poses at once, and which are out of reach: `machine.geometry.sag.aim` for arrays."""
         q, outside = self.straight_column_joints(poses)
         if (sag := self.profile.sag) is None:
             return q, outside
@@ -119,7 +119,7 @@ class ArmKinematics:
         return q, outside
 
     def _joints_or_reason(self, poses: np.ndarray) -> np.ndarray:
-        """Joints pose by pose, which raises with the reason."""
+        """Compute joints pose by pose, which raises with the reason."""
         sag, out, limits = self.profile.sag, np.empty_like(poses), self._limits
         for i, (slew, r, z, ext, rot) in enumerate(poses.tolist()):
             theta = slew + self._kin.theta1_offset_rad
@@ -131,14 +131,14 @@ class ArmKinematics:
         return out
 
     def _joint_bounds(self, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest joints of a motion that begins at joints (5,)."""
+        """Return the least and greatest joints of a motion that begins at joints (5,)."""
         low, high = np.array(self._limits).T
         inner, outer = low + STOP_MARGIN, high - STOP_MARGIN
         at = np.where(np.isfinite(first), np.clip(first, low, high), inner)
         return np.minimum(inner, at), np.maximum(outer, at)
 
     def approximate_joints(self, poses: np.ndarray) -> np.ndarray:
-        """Joints of poses without sag, to compare many paths; raises ``Unreachable``."""
+        """Compute joints of poses without sag, to compare many paths; raise ``Unreachable`` for a pose out of reach."""
         q, outside = self.straight_column_joints(poses)
         if np.any(outside):
             self.joints(poses[np.argmax(outside)][None])  # raises with the reason
@@ -146,7 +146,7 @@ class ArmKinematics:
         return q
 
     def straight_column_joints(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joint vectors (n, 5) of poses (n, 5) without sag, and which of them are out of reach (n,)."""
+        """Compute joint vectors (n, 5) of poses (n, 5) without sag, and which of them are out of reach (n,)."""
         kin, (slew, r, z, ext, rot) = self._kin, poses.T
         boom, length = kin.a2_m, kin.d4_m + ext
         ahead, up = r - kin.a1_m, z - kin.d1_m
@@ -174,7 +174,7 @@ class Pose(NamedTuple):
     rot_rad: float
 
     def at_height(self, z_m: float) -> Pose:
-        """The same pose at another height of the pin."""
+        """Return the same pose at another height of the pin."""
         return self._replace(z_m=z_m)
 
 
@@ -196,14 +196,14 @@ END_RESERVE_M: Final = 0.03
 
 
 def candidate_extensions(arm: ArmKinematics) -> np.ndarray:
-    """The extensions to compare, m."""
+    """List the extensions to compare, m."""
     low, high = joint_limits(arm.profile)[Joint.EXT]
     return np.linspace(low + END_RESERVE_M, high - END_RESERVE_M, EXTENSION_COUNT)
 
 
 def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> float | None:
-    """The extension from which the crane gets up and over ``home`` fastest; None where none serves at both heights with
-    `OUTER_RESERVE_M` to spare.
+    """Find the extension from which the crane gets up and over ``home`` fastest; None where none serves at both heights
+    with `OUTER_RESERVE_M` to spare.
     """
     least, most = joint_limits(arm.profile)[Joint.EXT]
     free = np.linspace(least + END_RESERVE_M, most - OUTER_RESERVE_M, EXTENSION_COUNT)
@@ -220,7 +220,7 @@ def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> 
 
 
 def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Duration of a straight path at full speed, from every extension ``before`` (n,) to every ``after`` (m,), (n, m).
+    """Time a straight path at full speed, from every extension ``before`` (n,) to every ``after`` (m,), (n, m).
 
     Infinite where it leaves the crane's reach.
     """
@@ -239,7 +239,7 @@ def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.nda
 
 
 def with_fastest_extensions(arm: ArmKinematics, via: Sequence[Pose]) -> tuple[Pose, ...]:
-    """The via points with the fastest extensions between the ends; unchanged where none is in reach."""
+    """Return the via points with the fastest extensions between the ends; unchanged where none is in reach."""
     if len(via) < 3:
         return tuple(via)
     free = candidate_extensions(arm)
@@ -285,12 +285,12 @@ class Arm(ArmKinematics):
         self._extension_cache: dict[tuple[int, int, int], float | None] = {}
 
     def loaded(self, load_kg: float) -> Arm:
-        """The same machine with another load."""
+        """Return the same machine with another load."""
         return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope, self.slope)
 
     def pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
-        """The pose with the jaws above a point, the pin at ``low_z_m``, whose extension also serves at ``high_z_m``;
-        rotator at 0.
+        """Compute the pose with the jaws above a point, the pin at ``low_z_m``, whose extension also serves at
+        ``high_z_m``; rotator at 0.
 
         Raises:
             Unreachable: the point is out of reach at one of the heights.
@@ -306,7 +306,7 @@ class Arm(ArmKinematics):
             return self._compact_pose(x, y, low_z_m, high_z_m)
 
     def compact_pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
-        """The same with the telescope out only as far as leaves the arm speed in all directions there.
+        """Compute the same with the telescope out only as far as leaves the arm speed in all directions there.
 
         Raises:
             Unreachable: the point is out of reach at one of the heights.
@@ -314,7 +314,7 @@ class Arm(ArmKinematics):
         return self._compact_pose(x - self._aside_m[0], y - self._aside_m[1], low_z_m, high_z_m)
 
     def _compact_pose(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
-        """The pose with the pin above a point."""
+        """Compute the pose with the pin above a point."""
         r = hypot(x, y) - self._kin.a1_m
         stretch = max(hypot(r, z - self._kin.d1_m) for z in (low_z_m, high_z_m)) / DEXTEROUS_STRETCH
         return self._pose_with_extension(x, y, low_z_m, high_z_m, stretch - self._kin.a2_m - self._kin.d4_m)
@@ -332,7 +332,7 @@ class Arm(ArmKinematics):
         return pose
 
     def _fastest_extension(self, r_m: float, low_z_m: float, high_z_m: float) -> float:
-        """The extension from which the crane gets up and over the bunk fastest, from a horizontal distance, m."""
+        """Find the extension from which the crane gets up and over the bunk fastest, from a horizontal distance, m."""
         key = (
             round(r_m / _EXTENSION_CACHE_GRID_M),
             round(low_z_m / _EXTENSION_CACHE_GRID_M),
@@ -344,6 +344,6 @@ class Arm(ArmKinematics):
             self._extension_cache[key] = fastest_extension(
                 self, down, up, up._replace(r_m=hypot(*self.profile.bunk.center_m))
             )
-        if (found := self._extension_cache[key]) is None:
+        if (extension_m := self._extension_cache[key]) is None:
             raise Unreachable("no extension serves at both heights", "motion.no-common-extension")
-        return found
+        return extension_m

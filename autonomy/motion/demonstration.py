@@ -46,7 +46,7 @@ class JointTrack:
 
 
 def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -> JointTrack:
-    """The joints over time from the encoder frames of a crane bus, unsmoothed, every `GRID_S` from first to last.
+    """Read the joints over time from the encoder frames of a crane bus, unsmoothed, every `GRID_S` from first to last.
 
     Raises:
         InputRefused: an encoder is missing, or the recording is too short.
@@ -62,21 +62,21 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
     codecs = {database.messages[e.message].key: (i, e, database.messages[e.message]) for i, e in enumerate(encoders)}
     samples: list[tuple[list[int], list[float]]] = [([], []) for _ in AXES]
     received = [0 for _ in AXES]
-    heard, ends_ns = 0, (1 << 63, -1 << 63)
+    frame_count, ends_ns = 0, (1 << 63, -1 << 63)
     for stamp_ns, key, data in frames:
-        heard, ends_ns = heard + 1, (min(ends_ns[0], stamp_ns), max(ends_ns[1], stamp_ns))
-        found = codecs.get(key)
-        if found is None or len(data) != found[2].length:
+        frame_count, ends_ns = frame_count + 1, (min(ends_ns[0], stamp_ns), max(ends_ns[1], stamp_ns))
+        encoder_entry = codecs.get(key)
+        if encoder_entry is None or len(data) != encoder_entry[2].length:
             continue
-        i, encoder, codec = found
+        i, encoder, codec = encoder_entry
         received[i] += 1
         if samples[i][0] and stamp_ns <= samples[i][0][-1]:
             continue
         samples[i][0].append(stamp_ns)
         counts = int(codec.named(codec.decode(data))["Position"])
         samples[i][1].append(position_from_counts(encoder, counts))
-    if heard > 1 and ends_ns[0] == ends_ns[1]:
-        sentence = f"the recording has no time stamps at its {heard} frames; record it with them (candump -L)"
+    if frame_count > 1 and ends_ns[0] == ends_ns[1]:
+        sentence = f"the recording has no time stamps at its {frame_count} frames; record it with them (candump -L)"
         raise InputRefused("demonstration.no-stamps", sentence)
     for j, e, n, (stamps, _) in zip(AXES, encoders, received, samples, strict=True):
         if n > 1 and len(stamps) < 2:
@@ -100,14 +100,14 @@ def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -
 
 
 def _unwrapped(encoder: Encoder, positions: list[float]) -> np.ndarray:
-    """Encoder positions without the jump where a slew passes the end of its encoder's range."""
+    """Return encoder positions without the jump where a slew passes the end of its encoder's range."""
     if encoder.kind != "rotary":
         return np.array(positions)
     return np.unwrap(positions, period=encoder.total_counts * encoder.unit_per_count)
 
 
 def smoothed(positions: np.ndarray, sigma_s: float = SMOOTHING_SIGMA_S) -> np.ndarray:
-    """Positions (n, m) every `GRID_S` without tremor, noise and delay; the ends stay."""
+    """Smooth positions (n, m) every `GRID_S`, without tremor, noise and delay; the ends stay."""
     half = int(np.ceil(4.0 * sigma_s / GRID_S))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * GRID_S / sigma_s) ** 2)
     kernel /= kernel.sum()
@@ -116,7 +116,7 @@ def smoothed(positions: np.ndarray, sigma_s: float = SMOOTHING_SIGMA_S) -> np.nd
 
 
 def segment_motions(profile: Profile, whole: JointTrack) -> tuple[JointTrack, ...]:
-    """The point-to-point motions of a track, smoothed, each from rest to rest and from time 0."""
+    """Find the point-to-point motions of a track, smoothed, each from rest to rest and from time 0."""
     if len(whole.time_s) < MIN_DURATION_S / GRID_S:
         return ()
     y = smoothed(whole.position)
@@ -127,18 +127,18 @@ def segment_motions(profile: Profile, whole: JointTrack) -> tuple[JointTrack, ..
         return ()
     pieces = np.split(at, np.flatnonzero(np.diff(at) > PAUSE_S / GRID_S) + 1)
     spare = int(2.0 * SMOOTHING_SIGMA_S / GRID_S)
-    found = []
+    motions = []
     for piece in pieces:
-        first, last = max(0, piece[0] - spare), min(len(y) - 1, piece[-1] + spare)
-        motion = y[first : last + 1]
+        start_index, end_index = max(0, piece[0] - spare), min(len(y) - 1, piece[-1] + spare)
+        motion = y[start_index : end_index + 1]
         ends = [np.array(pin_position(profile.kinematics, q)) for q in (motion[0], motion[-1])]
         if float(np.linalg.norm(ends[1] - ends[0])) >= MIN_PIN_TRAVEL_M:
-            found.append(JointTrack(np.arange(len(motion)) * GRID_S, motion))
-    return tuple(found)
+            motions.append(JointTrack(np.arange(len(motion)) * GRID_S, motion))
+    return tuple(motions)
 
 
 def format_demonstrations(profile_name: str, motions: Sequence[JointTrack], every: int = 2) -> str:
-    """Demonstrations as the text of a file, with every ``every``-th sample."""
+    """Write demonstrations as the text of a file, with every ``every``-th sample."""
     lines = [f"# demonstrations of {profile_name}; joint positions as recorded, smoothed", ",".join(_CSV_HEADER)]
     for number, motion in enumerate(motions, 1):
         keep = sorted({*range(0, len(motion.time_s), every), len(motion.time_s) - 1})
@@ -148,7 +148,7 @@ def format_demonstrations(profile_name: str, motions: Sequence[JointTrack], ever
 
 
 def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
-    """Name of the machine and the motions of a file.
+    """Read the name of the machine and the motions of a file.
 
     Raises:
         InputRefused: the file cannot be read or is no file of demonstrations.
@@ -180,5 +180,5 @@ def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
 
 
 def joint_vectors(motion: JointTrack) -> np.ndarray:
-    """Joint vectors (n, 5) of a motion; the unmeasured rotator at 0."""
+    """Return joint vectors (n, 5) of a motion; the unmeasured rotator at 0."""
     return np.column_stack([motion.position, np.zeros((len(motion.position), len(JOINTS) - len(AXES)))])

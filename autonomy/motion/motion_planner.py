@@ -43,7 +43,7 @@ class MotionPlanner(Protocol):
         high_m: float,
         free_m: float,
     ) -> Trajectory:
-        """The motion.
+        """Plan the motion.
 
         ``high_m`` is the height at which `travel_over` would pass, reached ``free_m`` before the goal.
 
@@ -69,7 +69,7 @@ class TimeOptimalPlanner:
         high_m: float,
         free_m: float,
     ) -> Trajectory:
-        """The fastest clear motion."""
+        """Plan the fastest clear motion."""
         try:
             return plan_path(arm, start, goal, scene, held).motion
         except PathBlocked as error:
@@ -101,15 +101,15 @@ class MovementPrimitivePlanner:
         high_m: float,
         free_m: float,
     ) -> Trajectory:
-        """The primitive from start to goal."""
-        found, trouble = [], Unreachable("", "motion.primitive-blocked")
+        """Plan the primitive from start to goal."""
+        motions, trouble = [], Unreachable("", "motion.primitive-blocked")
         # The final extension decides how well the demonstrations fit; it may also stay as it is.
         for ext_m in (goal.ext_m, 0.5 * (start.ext_m + goal.ext_m), start.ext_m):
             try:
-                found.append(self._shown(arm, start, goal._replace(ext_m=ext_m)))
+                motions.append(self._shown(arm, start, goal._replace(ext_m=ext_m)))
             except Unreachable as error:
                 trouble = error
-        for motion in sorted(found, key=lambda m: m.duration_s)[:1]:
+        for motion in sorted(motions, key=lambda m: m.duration_s)[:1]:
             spare_m, why = clearance_reserve(arm, motion, scene, held)
             if spare_m >= -MARGIN_M:
                 return motion
@@ -120,7 +120,7 @@ class MovementPrimitivePlanner:
 def _at_full_height(
     arm: Arm, start: Pose, goal: Pose, high_m: float, free_m: float, trouble: Unreachable
 ) -> Trajectory:
-    """The motion at full height; raises ``trouble``, the failure of the better one, where it is out of reach."""
+    """Plan the motion at full height; raise ``trouble``, the failure of the better one, where it is out of reach."""
     try:
         return travel_over(arm, start, goal, max(high_m, start.z_m, goal.z_m), free_m)
     except Unreachable:

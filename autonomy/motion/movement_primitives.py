@@ -64,7 +64,7 @@ class Dmp:
     scaled: tuple[bool, ...]
 
     def rollout(self, start: np.ndarray, goal: np.ndarray) -> Rollout:
-        """The motion from rest at ``start`` (D,) to rest at ``goal`` (D,).
+        """Compute the motion from rest at ``start`` (D,) to rest at ``goal`` (D,).
 
         Raises:
             InputRefused: a number is not finite, or the number of coordinates differs.
@@ -98,7 +98,7 @@ class Rollout:
         return float(self.time_s[-1])
 
     def at(self, time_s: np.ndarray, duration_s: float | None = None) -> np.ndarray:
-        """Positions (m, D) at times (m,), cubics between the points; ``duration_s`` slows the motion down to that."""
+        """Interpolate positions (m, D) at times (m,), cubics between points; ``duration_s`` slows it down to that."""
         span = self.duration_s
         t = np.clip(np.asarray(time_s, dtype=float) * (span / (duration_s or span)), 0.0, span)
         step = self.time_s[1]
@@ -118,7 +118,7 @@ def learn(
     bases: int = BASIS_COUNT,
     least_way: float = 0.2,
 ) -> Dmp:
-    """A primitive from demonstrations (times (n,) [s], positions (n, D)), each from rest to rest.
+    """Learn a primitive from demonstrations (times (n,) [s], positions (n, D)), each from rest to rest.
 
     ``scaled`` coordinates learn only from demonstrations that move them by at least ``least_way``; by default none is
     scaled.  The duration is the mean of the demonstrations'.
@@ -140,13 +140,13 @@ def learn(
         velocity = np.gradient(y, share, axis=0)
         acceleration = np.gradient(velocity, share, axis=0)
         path = y[-1] - y[0]
-        wanted = (acceleration + ALPHA * velocity) / (ALPHA * BETA) - (y[-1] - y) + path * x[:, None]
+        target_forcing = (acceleration + ALPHA * velocity) / (ALPHA * BETA) - (y[-1] - y) + path * x[:, None]
         size = np.where(flags, path, 1.0)
         use = ~np.array(flags) | (np.abs(path) >= least_way)
-        wanted = wanted / np.where(use, size, 1.0)
+        target_forcing = target_forcing / np.where(use, size, 1.0)
         psi = _activations(x, bases)
         # demonstrations have equal weight, however many samples they have
-        above += np.where(use[:, None], (wanted * x[:, None]).T @ psi, 0.0) / len(x)
+        above += np.where(use[:, None], (target_forcing * x[:, None]).T @ psi, 0.0) / len(x)
         below += np.where(use[:, None], np.sum(psi * (x**2)[:, None], axis=0), 0.0) / len(x)
     if np.any(below <= 0.0):
         j = int(np.argmax(np.any(below <= 0.0, axis=1)))
@@ -158,14 +158,16 @@ def learn(
 
 
 def _ending_at_goal(y: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """The same motion (n, D) ending at rest at the goal, corrected by a polynomial over its last part."""
+    """Return the same motion (n, D) ending at rest at the goal, corrected by a polynomial over its last part."""
     last = int(CORRECTION_SHARE * _STEP_COUNT)
     h = 1.0 / last
     tail = y[-3:]
     speed, bend = (tail[2] - tail[1]) / h, (tail[2] - 2.0 * tail[1] + tail[0]) / h**2
-    left = goal - y[-1]
+    goal_error = goal - y[-1]
     # Position, speed and acceleration of the correction are 0 at its beginning and the residuals at its end.
-    a, b, c = np.linalg.solve([[1.0, 1.0, 1.0], [3.0, 4.0, 5.0], [6.0, 12.0, 20.0]], np.stack([left, -speed, -bend]))
+    a, b, c = np.linalg.solve(
+        [[1.0, 1.0, 1.0], [3.0, 4.0, 5.0], [6.0, 12.0, 20.0]], np.stack([goal_error, -speed, -bend])
+    )
     t = np.linspace(0.0, 1.0, last + 1)[:, None]
     out = y.copy()
     out[-last - 1 :] += t**3 * (a + t * (b + t * c))
@@ -196,14 +198,14 @@ def _normalized(
 
 
 def _centres(bases: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres in the phase, evenly in time, and widths that overlap by `BASIS_OVERLAP`."""
+    """Compute centres in the phase, evenly in time, and widths that overlap by `BASIS_OVERLAP`."""
     centres = np.exp(-ALPHA_X * np.linspace(0.0, 1.0, bases))
     gaps = np.diff(centres)
     return centres, -np.log(BASIS_OVERLAP) / np.append(gaps, gaps[-1]) ** 2
 
 
 def _activations(x: np.ndarray, bases: int) -> np.ndarray:
-    """psi (n, bases), each row summing to 1."""
+    """Compute psi (n, bases), each row summing to 1."""
     centres, widths = _centres(bases)
     psi = np.exp(-widths * (np.maximum(x, centres[-1])[:, None] - centres) ** 2)
     result: np.ndarray = psi / np.sum(psi, axis=1, keepdims=True)
@@ -211,14 +213,14 @@ def _activations(x: np.ndarray, bases: int) -> np.ndarray:
 
 
 def _design(x: np.ndarray, bases: int) -> np.ndarray:
-    """F(x) = _design(x) @ w."""
+    """Compute the matrix of F(x) = _design(x) @ w."""
     result: np.ndarray = x[:, None] * _activations(x, bases)
     return result
 
 
 def _filtered(pull: np.ndarray) -> np.ndarray:
-    """The solution of y'' + alpha y' + alpha beta y = alpha beta pull from rest at 0, for pull (n, D) every
-    1 / `_STEP_COUNT`, linear between: exact, as alpha = 4 beta makes the double pole p = -alpha / 2.
+    """Solve y'' + alpha y' + alpha beta y = alpha beta pull from rest at 0, for pull (n, D) every 1 / `_STEP_COUNT`,
+    linear between: exact, as alpha = 4 beta makes the double pole p = -alpha / 2.
     """
     h, p = 1.0 / _STEP_COUNT, -ALPHA / 2.0
     e = np.exp(p * h)
@@ -251,7 +253,7 @@ class Primitive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: list[list[float]]
 
     def dmp(self) -> Dmp:
-        """The primitive as equations."""
+        """Return the primitive as equations."""
         return Dmp(self.duration_s, np.array(self.weights), _SCALED_AXES)
 
 
@@ -265,12 +267,12 @@ class Primitives(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def pose_track(arm: Arm, motion: JointTrack) -> np.ndarray:
-    """A demonstration in the crane's plane: slew, r, z, ext (n, 4)."""
+    """Convert a demonstration to the crane's plane: slew, r, z, ext (n, 4)."""
     return np.array([arm.pose(q)[:4] for q in joint_vectors(motion)])
 
 
 def is_near_bunk(bunk: Bunk, xy: Sequence[float]) -> bool:
-    """Whether a point is over the bunk or next to it."""
+    """Tell whether a point is over the bunk or next to it."""
     x, y = xy[0] - bunk.center_m[0], xy[1] - bunk.center_m[1]
     c, s = np.cos(bunk.yaw_rad), np.sin(bunk.yaw_rad)
     along, across = x * c + y * s, y * c - x * s
@@ -278,7 +280,7 @@ def is_near_bunk(bunk: Bunk, xy: Sequence[float]) -> bool:
 
 
 def split_by_direction(arm: Arm, motions: Sequence[JointTrack]) -> tuple[list[JointTrack], list[JointTrack]]:
-    """Motions out of the bunk, and into it; others are left out."""
+    """Select the motions out of the bunk, and those into it; others are left out."""
     out: list[JointTrack] = []
     back: list[JointTrack] = []
     for motion in motions:
@@ -290,7 +292,7 @@ def split_by_direction(arm: Arm, motions: Sequence[JointTrack]) -> tuple[list[Jo
 
 
 def learn_primitives(profile: Profile, motions: Sequence[JointTrack], bases: int = BASIS_COUNT) -> Primitives:
-    """Primitives from demonstrations of the machine.
+    """Learn primitives from demonstrations of the machine.
 
     Raises:
         InputRefused: none of them leads between the bunk and another place.
@@ -304,9 +306,9 @@ def learn_primitives(profile: Profile, motions: Sequence[JointTrack], bases: int
             "demonstrate some from the bunk to a log and back",
         )
     shown = [[(m.time_s, pose_track(arm, m)) for m in group] for group in (out, back)]
-    for mine, other in ((0, 1), (1, 0)):
-        if not shown[mine]:
-            shown[mine] = [(t, poses[::-1]) for t, poses in shown[other]]
+    for direction_index, opposite_index in ((0, 1), (1, 0)):
+        if not shown[direction_index]:
+            shown[direction_index] = [(t, poses[::-1]) for t, poses in shown[opposite_index]]
     counts = len(out), len(back)
     made = [learn(group, _SCALED_AXES, bases) for group in shown]
     packed = [Primitive(d.duration_s, n, d.weights.tolist()) for d, n in zip(made, counts, strict=True)]
@@ -314,7 +316,7 @@ def learn_primitives(profile: Profile, motions: Sequence[JointTrack], bases: int
 
 
 def encode(primitives: Primitives) -> bytes:
-    """The file of primitives, weights to seven digits."""
+    """Encode the file of primitives, weights to seven digits."""
 
     def short(p: Primitive) -> Primitive:
         rows = [[float(f"{w:.7g}") for w in row] for row in p.weights]
@@ -325,7 +327,7 @@ def encode(primitives: Primitives) -> bytes:
 
 
 def load(profile: Profile, path: Path | None = None) -> Primitives:
-    """The primitives in a file, by default those shipped for the machine.
+    """Load the primitives in a file, by default those shipped for the machine.
 
     Raises:
         InputRefused: the file cannot be read or is not for this machine.
@@ -333,24 +335,25 @@ def load(profile: Profile, path: Path | None = None) -> Primitives:
     path = path or SHIPPED_FOLDER / f"{profile.name}.json"
     hint = "learn some with `timberhand plan learn LOG --out FILE`"
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=Primitives)
+        primitives = msgspec.json.decode(path.read_bytes(), type=Primitives)
     except OSError as error:
         raise InputRefused("primitives.unreadable", f"{path} cannot be read ({error.strerror}); {hint}") from None
     except msgspec.MsgspecError as error:
         raise InputRefused("primitives.malformed", f"{path} is no file of primitives ({error}); {hint}") from None
-    if found.schema != SCHEMA or found.profile != profile.name:
+    if primitives.schema != SCHEMA or primitives.profile != profile.name:
         raise InputRefused(
             "primitives.other-machine",
-            f"{path} is for {found.profile}, schema {found.schema}, not for {profile.name}, schema {SCHEMA}; {hint}",
+            f"{path} is for {primitives.profile}, schema {primitives.schema}, not for {profile.name}, schema {SCHEMA}; "
+            f"{hint}",
         )
-    for primitive in (found.out, found.back):
+    for primitive in (primitives.out, primitives.back):
         rows = primitive.weights
         good = len(rows) == len(_SCALED_AXES) and len({len(row) for row in rows}) == 1 and len(rows[0]) >= 2
         if not good or not 0.5 < primitive.duration_s < 120.0 or not np.all(np.isfinite(primitive.weights)):
             raise InputRefused(
                 "primitives.implausible", f"{path} holds a primitive with implausible weights or duration; {hint}"
             )
-    return found
+    return primitives
 
 
 class PrimitiveMotions:
@@ -363,7 +366,7 @@ class PrimitiveMotions:
         self._out, self._back = primitives.out.dmp(), primitives.back.dmp()
 
     def __call__(self, arm: Arm, start: Pose, goal: Pose, height_m: float = 0.0, free_m: float = 0.0) -> Trajectory:
-        """The back primitive where the goal is at the bunk, otherwise the out primitive.
+        """Plan the back primitive where the goal is at the bunk, otherwise the out primitive.
 
         Raises:
             machine.geometry.kinematics.Unreachable: the motion would leave the crane's reach.
@@ -373,7 +376,7 @@ class PrimitiveMotions:
 
 
 def primitive_motion(arm: Arm, dmp: Dmp, start: Pose, goal: Pose) -> Trajectory:
-    """The motion of a primitive from rest to rest, slowed down to the arm's limits; raises ``Unreachable``."""
+    """Plan a primitive's motion from rest to rest, slowed to the arm's limits; raise ``Unreachable`` out of reach."""
     path = dmp.rollout(np.array(start[:4]), np.array(goal[:4]))
 
     def sampled(duration_s: float) -> np.ndarray:
@@ -385,7 +388,7 @@ def primitive_motion(arm: Arm, dmp: Dmp, start: Pose, goal: Pose) -> Trajectory:
 
 
 def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
-    """Joints of poses; where the arm is too short or too long for a pose, its telescope gives way smoothly."""
+    """Compute joints of poses; where the arm is too short or too long for a pose, its telescope gives way smoothly."""
     try:
         return arm.joints(poses)
     except Unreachable:
@@ -403,15 +406,15 @@ def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
         low[i], high[i] = min(spans, key=lambda s: max(s[0] - pose.ext_m, pose.ext_m - s[1], 0.0))
     room = np.minimum(_LIMIT_RESERVE_M, (high - low) / 2)
     ext = poses[coarse, 3]
-    wanted = np.clip(ext, low + room, high - room) - ext
-    wanted[0] = wanted[-1] = 0.0
+    extension_change_m = np.clip(ext, low + room, high - room) - ext
+    extension_change_m[0] = extension_change_m[-1] = 0.0
     # A bump wide enough for every sample, at rest at both ends.
     share = coarse / coarse[-1]
     bump = np.maximum(np.sin(np.pi * share) ** 2, 1e-3)
     shape = np.zeros(len(coarse))
-    for i in np.flatnonzero(np.abs(wanted) > 0.0).tolist():
-        there = wanted[i] * np.minimum(bump / bump[i], 1.0)
-        shape = np.where(np.abs(there) > np.abs(shape), there, shape)
+    for i in np.flatnonzero(np.abs(extension_change_m) > 0.0).tolist():
+        local_change_m = extension_change_m[i] * np.minimum(bump / bump[i], 1.0)
+        shape = np.where(np.abs(local_change_m) > np.abs(shape), local_change_m, shape)
     kernel = np.hanning(9)[1:-1]
     shape = np.convolve(shape, kernel / kernel.sum(), mode="same") * (np.sin(np.pi * share) > 0.0)
     eased = poses.copy()
@@ -429,7 +432,7 @@ class Stage:
 
 
 def algorithm_1(arm: Arm, primitives: Primitives, start: Pose, target: Pose, bunk: Pose) -> tuple[Stage, Stage]:
-    """Paper B's Algorithm 1: from the bunk towards the log while the grapple opens, then it closes (lines 2 to 5);
+    """Plan paper B's Algorithm 1: from the bunk towards the log while the grapple opens, then it closes (lines 2 to 5);
     with the log to the bunk, then it opens (lines 6 to 9).
 
     The second stage begins when the first has reached its target and the grapple is closed (line 7).  Raises

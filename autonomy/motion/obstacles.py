@@ -74,13 +74,13 @@ class ObstacleArrays:
     radius: np.ndarray
 
     def near(self, low: np.ndarray, high: np.ndarray) -> ObstacleArrays:
-        """The obstacles without those wholly outside a range (3,) to (3,)."""
+        """Return the obstacles without those wholly outside a range (3,) to (3,)."""
         wide = np.hypot(self.half[:, 0], self.half[:, 1])
         box = np.column_stack([wide, wide, self.half[:, 2]])
         rod = np.abs(self.along) + self.radius[:, None]
         boxes = np.all((self.center - box < high) & (self.center + box > low), axis=1)
         capsules = np.all((self.middle - rod < high) & (self.middle + rod > low), axis=1)
-        names = tuple(n for n, kept in zip(self.names, [True, *boxes, *capsules], strict=True) if kept)
+        names = tuple(n for n, in_range in zip(self.names, [True, *boxes, *capsules], strict=True) if in_range)
         return ObstacleArrays(
             self.ground,
             names,
@@ -137,7 +137,7 @@ class HeldLog:
 
 
 def held_log(arm: Arm, pose: Pose, log: LogObservation) -> HeldLog:
-    """A log as the grapple holds it at a pose: seen hanging in it, or lying where it will be gripped."""
+    """Describe a log as the grapple holds it at a pose: seen hanging in it, or lying where it will be gripped."""
     yaw = grapple_yaw(arm.profile, (pose.slew_rad, 0.0, 0.0, 0.0, pose.rot_rad)) - pi / 2
     skew = remainder(atan2(log.axis[1], log.axis[0]) - yaw, pi)
     x, y = arm.xy(pose)
@@ -158,11 +158,11 @@ class SweptCapsules:
     hangs: np.ndarray = field(repr=False)
 
     def rows(self, at: list[int]) -> SweptCapsules:
-        """Some samples alone."""
+        """Select some samples alone."""
         return SweptCapsules(self.a[at], self.b[at], self.radius, self.names, self.hangs)
 
     def shifted(self, offset: np.ndarray, depth_m: float) -> SweptCapsules:
-        """The capsules with the hanging parts swung: ``offset`` (n, 2) moves a point ``depth_m`` below the pin."""
+        """Swing the hanging parts of the capsules: ``offset`` (n, 2) moves a point ``depth_m`` below the pin."""
         move = np.zeros((len(offset), 1, 3))
         move[:, 0, :2] = offset
         hanging = self.hangs[None, :, None]
@@ -172,14 +172,14 @@ class SweptCapsules:
         return SweptCapsules(top, low, self.radius, self.names, self.hangs)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """Depth of points (n, m, 3) below the pin, (n, m, 1)."""
+        """Compute the depth of points (n, m, 3) below the pin, (n, m, 1)."""
         pin_z = self.b[:, 1:2, 2:3]
         result: np.ndarray = np.maximum(pin_z - points[..., 2:3], 0.0)
         return result
 
 
 def bunk_boxes(bunk: Bunk) -> tuple[Box, ...]:
-    """The floor, and each row of stakes as a wall: a log passes over the whole row wherever the stakes are."""
+    """Return the floor, and each row of stakes as a wall: a log passes over the whole row wherever the stakes are."""
     x, y = bunk.center_m
     rows = zip(("left", "right"), stake_walls(bunk), strict=True)
     walls = tuple(Box(f"the {name} stakes", row.center_m, row.half_m, row.yaw_rad) for name, row in rows)
@@ -188,7 +188,7 @@ def bunk_boxes(bunk: Bunk) -> tuple[Box, ...]:
 
 
 def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
-    """Frames, hood and wheels of the carrier, straight and lowest; none on a machine without wheels."""
+    """Return frames, hood and wheels of the carrier, straight and lowest; none on a machine without wheels."""
     c = profile.carrier
     if c is None:
         return ()
@@ -213,7 +213,7 @@ def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
 
 
 def log_capsules(logs: Iterable[LogObservation]) -> tuple[Capsule, ...]:
-    """Logs as capsules; their round ends stay inside the logs."""
+    """Convert logs to capsules; their round ends stay inside the logs."""
     capsules = []
     for log in logs:
         half = max(log.length_m - log.diameter_m, 0.0) / 2
@@ -226,7 +226,7 @@ def log_capsules(logs: Iterable[LogObservation]) -> tuple[Capsule, ...]:
 def tree_capsule(
     x_m: float, y_m: float, radius_m: float, foot_z_m: float, height_m: float = 15.0, number: int = 1
 ) -> Capsule:
-    """A standing tree."""
+    """Return a standing tree."""
     return Capsule(f"tree {number}", (x_m, y_m, foot_z_m), (x_m, y_m, foot_z_m + height_m), radius_m)
 
 
@@ -237,7 +237,7 @@ def collision_scene(
     ground: Ground | None = None,
     without: Iterable[int] = (),
 ) -> CollisionScene:
-    """The machine's own obstacles, the logs except those of ``without``, the trees and the ground."""
+    """Collect the machine's own obstacles, the logs except those of ``without``, the trees and the ground."""
     left_out = set(without)
     capsules = (*log_capsules(log for log in logs if log.id not in left_out), *trees)
     level = profile.workspace.ground_z_m if ground is None else ground
@@ -247,7 +247,7 @@ def collision_scene(
 def swept_capsules(
     profile: Profile, q: np.ndarray, pin: np.ndarray, held: HeldLog | None, opened: bool = True
 ) -> SweptCapsules:
-    """The crane at joints (n, 5) with its true pin at (n, 3), and its load; ``opened``: the jaws are open."""
+    """Model the crane at joints (n, 5) with its true pin at (n, 3), and its load; ``opened``: the jaws are open."""
     kin, n = profile.kinematics, len(q)
     theta = q[:, Joint.SLEW] + kin.theta1_offset_rad
     c, s = np.cos(theta), np.sin(theta)

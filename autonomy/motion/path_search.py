@@ -89,7 +89,7 @@ class _Failure:
     late: bool
 
     def rules_out(self, other: _Candidate) -> bool:
-        """Whether another candidate is no farther away where this one was too near."""
+        """Tell whether another candidate is no farther away where this one was too near."""
         if (
             other.shape != self.candidate.shape
             or other.height_m > self.candidate.height_m + _PRUNE_SHARE * self.short_m
@@ -108,7 +108,7 @@ def plan_path(
     held: HeldLog | None = None,
     least_height_m: float = -np.inf,
 ) -> ClearMotion:
-    """The fastest clear motion from rest at ``start`` to rest at ``goal``.
+    """Plan the fastest clear motion from rest at ``start`` to rest at ``goal``.
 
     ``held`` is the log in the grapple; an empty grapple is open.  The path reaches at least ``least_height_m``.
 
@@ -120,17 +120,17 @@ def plan_path(
     planner = _PathSearch(arm, start, goal, scene, held)
     top = max(start.z_m, goal.z_m)
     line = _Candidate((start, goal), 1.0, 1.0, top, "straight")
-    if least_height_m <= top and planner.may_be_clear(line) and (found := planner.clear_motion(line)):
-        return found
+    if least_height_m <= top and planner.may_be_clear(line) and (clear_motion := planner.clear_motion(line)):
+        return clear_motion
     for reach in REACH_FACTORS:
         height = planner.least_height(max(top, least_height_m), top + MAX_RISE_M, reach)
         if height is None:
             continue
-        for more in HEIGHT_MARGINS_M:
+        for height_margin_m in HEIGHT_MARGINS_M:
             if planner.tried >= MAX_TRIES:
                 break
-            if found := planner.best(height + more, reach):
-                return found
+            if clear_motion := planner.best(height + height_margin_m, reach):
+                return clear_motion
     best = max(planner.failures, key=lambda f: -f.short_m, default=None)
     reason = best.why if best else "every path leaves the crane's reach"
     ends = f"from ({_coordinates(arm, start)}) to ({_coordinates(arm, goal)}) m"
@@ -158,7 +158,7 @@ class _PathSearch:
     extension_cache: dict[tuple[Pose, ...], tuple[Pose, ...]] = field(default_factory=dict)
 
     def least_height(self, low_m: float, high_m: float, reach: float | None) -> float | None:
-        """The least height, within a few cm, at which the path with sharp corners is clear; None where none is."""
+        """Find the least height, within a few cm, at which the path with sharp corners is clear; None where none is."""
         height = low_m
         while height <= high_m and self.tried < MAX_TRIES:
             sharp = self._candidate(height, reach, OVERLAP_SHARES[-1], OVERLAP_SHARES[-1])
@@ -173,7 +173,7 @@ class _PathSearch:
         return None
 
     def may_be_clear(self, candidate: _Candidate) -> bool:
-        """Whether some time law may make the candidate clear."""
+        """Tell whether some time law may make the candidate clear."""
         poses = self._poses(candidate)
         try:
             q = self.arm.approximate_joints(poses)
@@ -187,7 +187,7 @@ class _PathSearch:
         return False
 
     def clear_motion(self, candidate: _Candidate) -> ClearMotion | None:
-        """The motion of a candidate if it is clear as it swings."""
+        """Return the motion of a candidate if it is clear as it swings."""
         if any(failure.rules_out(candidate) for failure in self.failures):
             return None
         try:
@@ -204,15 +204,15 @@ class _PathSearch:
             return None
 
     def best(self, height_m: float, reach: float | None) -> ClearMotion | None:
-        """The fastest clear motion of a shape at this height."""
+        """Find the fastest clear motion of a shape at this height."""
         candidates = [self._candidate(height_m, reach, u, o) for u in OVERLAP_SHARES for o in OVERLAP_SHARES]
         seconds = self._estimated_durations(candidates)
         tries = self.tried + TRIES_PER_HEIGHT
         for i in np.argsort(seconds, kind="stable"):
             if not np.isfinite(seconds[i]) or self.tried >= tries:
                 break
-            if found := self.clear_motion(candidates[i]):
-                return found
+            if clear_motion := self.clear_motion(candidates[i]):
+                return clear_motion
         return self.clear_motion(candidates[-1])
 
     def _candidate(self, height: float, reach: float | None, up_left: float, over_left: float) -> _Candidate:
@@ -234,15 +234,17 @@ class _PathSearch:
         return np.array([slew, _ASSUMED_REACH_M_S, _ASSUMED_LIFT_M_S, ext, rot])
 
     def _spans(self, candidate: _Candidate) -> tuple[np.ndarray, list[tuple[float, float]]]:
-        """The legs (k, 5), and the approximate begin and end of each, s."""
+        """Compute the legs (k, 5), and the approximate begin and end of each, s."""
         via = np.array(candidate.via)
         legs = np.diff(via, axis=0)
         long = np.max(np.abs(legs) / self._speeds(), axis=1)
         spans, at = [], 0.0
         for i, seconds in enumerate(long):
             spans.append((at, at + seconds))
-            left = candidate.up_left if i == 0 else candidate.over_left if i == len(long) - 2 else OVERLAP_SHARES[-1]
-            at += seconds * (1.0 - left)
+            remaining_share = (
+                candidate.up_left if i == 0 else candidate.over_left if i == len(long) - 2 else OVERLAP_SHARES[-1]
+            )
+            at += seconds * (1.0 - remaining_share)
         if len(spans) > 2:
             # The descent begins only when the rise is done.
             begin = max(spans[-1][0], spans[0][1] if long[-1] > _TOLERANCE else 0.0)
@@ -250,7 +252,7 @@ class _PathSearch:
         return legs, spans
 
     def _legs(self, candidate: _Candidate) -> list[tuple[float, Leg]]:
-        """The legs of a candidate and when they begin; raises ``Unreachable``."""
+        """Return the legs of a candidate and when they begin; raise ``Unreachable`` for a leg out of reach."""
         key = candidate.height_m, candidate.shape
         if key not in self.leg_cache:
             legs = [
@@ -273,13 +275,13 @@ class _PathSearch:
         return timed
 
     def _sampled(self, legs: list[tuple[float, Leg]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times (n,), poses (n, 5) and joints (n, 5) of legs; raises ``Unreachable``."""
+        """Sample times (n,), poses (n, 5) and joints (n, 5) of legs; raise ``Unreachable`` for a pose out of reach."""
         time_s = np.linspace(0.0, max(max(at + part.duration_s for at, part in legs), _TOLERANCE), SAMPLE_COUNT)
         poses = np.array(self.start) + sum(part.progress_at(time_s - at)[:, None] * part.delta for at, part in legs)
         return time_s, poses, self.arm.approximate_joints(poses)
 
     def _estimated_durations(self, candidates: list[_Candidate]) -> np.ndarray:
-        """Approximate durations (n,) of candidates of the same legs, longer where the legs together exceed the limits;
+        """Estimate durations (n,) of candidates of the same legs, longer where the legs together exceed the limits;
         infinite where they are out of reach.
         """
         try:
@@ -302,7 +304,7 @@ class _PathSearch:
         return np.where(reached, end_s * np.maximum(load, 1.0), np.inf)
 
     def _poses(self, candidate: _Candidate) -> np.ndarray:
-        """Poses (n, 5) evenly along a candidate."""
+        """Sample poses (n, 5) evenly along a candidate."""
         legs, spans = self._spans(candidate)
         time_s = np.linspace(0.0, max(max(end for _, end in spans), _TOLERANCE), 2 * _POSE_COUNT)
         line = np.array(self.start) + np.zeros((len(time_s), 1))
@@ -326,16 +328,16 @@ class _PathSearch:
 
 
 def _is_on_descent(poses: np.ndarray, at: int) -> bool:
-    """Whether the descent decides about the clearance at a sample: it has begun, or its end is nearer."""
+    """Tell whether the descent decides about the clearance at a sample: it has begun, or its end is nearer."""
     top = int(np.argmax(poses[:, 2]))
     if poses[at, 2] < poses[top, 2] - _HEIGHT_STEP_M:
         return at > top
-    begun, left = (np.hypot(*(poses[at, :2] - poses[i, :2])) for i in (0, -1))
-    return bool(begun > left)
+    from_start, to_end = (np.hypot(*(poses[at, :2] - poses[i, :2])) for i in (0, -1))
+    return bool(from_start > to_end)
 
 
 def _ramp(tau: np.ndarray) -> np.ndarray:
-    """From 0 to 1 with a constant slope in the middle and smooth ends."""
+    """Rise from 0 to 1 with a constant slope in the middle and smooth ends."""
     t = np.clip(tau, 0.0, 1.0)
     full = 1.0 / (1.0 - _RAMP_SHARE)
     soft = 0.5 * full / _RAMP_SHARE

@@ -27,7 +27,7 @@ class Motion(Protocol):
         """Time of its end, at rest."""
 
     def at(self, time_s: float) -> tuple[Axes, Axes]:
-        """Positions and velocities [rad, m; per second] in ``Joint`` order at any time, at rest outside."""
+        """Return positions and velocities [rad, m; per second] in ``Joint`` order at any time, at rest outside."""
 
 
 class SetpointStream:
@@ -44,7 +44,7 @@ class SetpointStream:
         self._due_ns = 0
 
     def due(self, now_ns: int) -> bool:
-        """Whether to send a datagram now; if so, the next is due ``PERIOD_NS`` after this one was."""
+        """Tell whether to send a datagram now; if so, the next is due ``PERIOD_NS`` after this one was."""
         if now_ns < self._due_ns:
             return False
         on_time = self._due_ns > now_ns - PERIOD_NS // 2
@@ -52,8 +52,8 @@ class SetpointStream:
         return True
 
     def datagram(self, now_ns: int, motion: Motion, time_s: float, grapple: GrappleCommand, rate: float = 1.0) -> bytes:
-        """The datagram with the window of ``motion`` that starts now at its ``time_s``; ``rate`` is its seconds per
-        second.
+        """Encode the datagram with the window of ``motion`` that starts now at its ``time_s``; ``rate`` is its seconds
+        per second.
         """
         knots = []
         for index in range(HORIZON_KNOT_COUNT + 1):
@@ -73,7 +73,7 @@ class SetpointStream:
         return encode(setpoint, self._key)
 
     def spool(self, now_ns: int, function: int, knots: tuple[SpoolKnot, ...]) -> bytes:
-        """The datagram with a stretch of a spool program, from now on."""
+        """Encode the datagram with a stretch of a spool program, from now on."""
         test = SpoolTest(self._next(now_ns), self._profile_hash, now_ns, self._lease_ns, function, knots)
         return encode(test, self._key)
 

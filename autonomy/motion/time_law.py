@@ -88,7 +88,7 @@ class PathGeometry:
         self._cost_slope = np.diff(self._cost) * (len(poses) - 1)
 
     def cost(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Seconds per unit of progress that speeds and pump require, and its derivative by the progress."""
+        """Compute the seconds per unit of progress that speeds and pump require, and its derivative by the progress."""
         piece = np.minimum((at * len(self._cost_slope)).astype(int), len(self._cost_slope) - 1)
         return np.interp(at, self._share, self._cost), self._cost_slope[piece]
 
@@ -101,13 +101,13 @@ class SplineTimeLaw:
     coefficients: np.ndarray
 
     def progress(self, time_s: np.ndarray) -> np.ndarray:
-        """Progress (0 to 1) at times; 0 before and 1 after the motion."""
+        """Compute the progress (0 to 1) at times; 0 before and 1 after the motion."""
         share = np.clip(time_s / self.duration_s, 0.0, 1.0)
         result: np.ndarray = np.clip(BSpline(_KNOTS, self.coefficients, 3)(share), 0.0, 1.0)
         return result
 
     def slowed(self, duration_s: float) -> SplineTimeLaw:
-        """The same law, evenly slowed."""
+        """Return the same law, evenly slowed."""
         return SplineTimeLaw(duration_s, self.coefficients)
 
 
@@ -130,7 +130,7 @@ class _LinearizedLaw:
         )
 
     def limits(self, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and bounds (rows @ [dc, dT] <= bounds) of speeds, pump and accelerations, as shares of their limits."""
+        """Compute rows and bounds (rows @ [dc, dT] <= bounds) of speeds, pump, accelerations, as shares of limits."""
         v, a, ones = self.v[:, None], self._a[:, None], np.ones((_SAMPLE_COUNT + 1, 1))
         rows = [np.hstack([self._cost[:, None] * _B1 + self._cost_slope[:, None] * v * _B0, -ones]) / duration_s]
         bounds = [1.0 - self._cost * self.v / duration_s]
@@ -144,7 +144,7 @@ class _LinearizedLaw:
         return np.vstack(rows), np.concatenate(bounds)
 
     def swing(self, duration_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Complex swing [rad] in both directions for every pendulum (2, n), and its derivatives by c and T."""
+        """Compute complex swing [rad] in both directions for every pendulum (2, n), and its derivatives by c and T."""
         before = _TAU - 1.0
         wave = (
             np.exp(duration_s * np.outer(PENDULUM_POLES, before))
@@ -156,12 +156,12 @@ class _LinearizedLaw:
 
 
 def swing_free_law(path: PathGeometry, shaped: bool = True) -> SplineTimeLaw:
-    """A fast law of a path; ``shaped``: it leaves at most `SWING_RAD` of swing."""
+    """Find a fast law of a path; ``shaped``: it leaves at most `SWING_RAD` of swing."""
     shaped = shaped and path.sideways
     rise = np.clip((np.arange(_COEFFICIENT_COUNT) - 2) / (_COEFFICIENT_COUNT - 5), 0.0, 1.0)
     c = rise**3 * (10.0 - 15.0 * rise + 6.0 * rise**2)
     state = _LinearizedLaw(path, c)
-    duration_s, trust, found = state.shortest_s, _DURATION_TRUST, []
+    duration_s, trust, candidate_laws = state.shortest_s, _DURATION_TRUST, []
     for _ in range(_ROUND_COUNT):
         step = _solve_step(state, c, duration_s, trust, shaped)
         if step is None:
@@ -172,14 +172,14 @@ def swing_free_law(path: PathGeometry, shaped: bool = True) -> SplineTimeLaw:
         before_s, duration_s = duration_s, max(duration_s + float(step[-2]), state.shortest_s)
         trust *= _TRUST_SHRINK
         over = _residual_swing_rad(state, duration_s) / SWING_RAD if shaped else 0.0
-        found.append((max(over, _SWING_TOLERANCE), duration_s, c))
+        candidate_laws.append((max(over, _SWING_TOLERANCE), duration_s, c))
         if over <= _SWING_TOLERANCE and abs(duration_s - before_s) < _CONVERGED_SHARE * duration_s:
             break
-    return _best_law(path, found or [(np.inf, duration_s, c)], shaped)
+    return _best_law(path, candidate_laws or [(np.inf, duration_s, c)], shaped)
 
 
 def _best_law(path: PathGeometry, found: list[tuple[float, float, np.ndarray]], shaped: bool) -> SplineTimeLaw:
-    """The fastest law whose swing is small; where none is, the one with least swing, slowed until its swing is
+    """Select the fastest law whose swing is small; where none is, the one with least swing, slowed until its swing is
     small."""
     _, duration_s, c = min(found, key=lambda law: law[:2])
     state = _LinearizedLaw(path, c)
@@ -189,14 +189,14 @@ def _best_law(path: PathGeometry, found: list[tuple[float, float, np.ndarray]], 
 
 
 def _residual_swing_rad(state: _LinearizedLaw, duration_s: float) -> float:
-    """Greatest residual swing [rad]."""
+    """Compute the greatest residual swing [rad]."""
     return float(np.max(np.linalg.norm(np.abs(state.swing(duration_s)[0]), axis=0)))
 
 
 def _solve_step(
     state: _LinearizedLaw, c: np.ndarray, duration_s: float, trust: float, shaped: bool
 ) -> np.ndarray | None:
-    """The best change of coefficients and duration, and the excess swing in shares of its bound."""
+    """Find the best change of coefficients and duration, and the excess swing in shares of its bound."""
     rows, bounds = state.limits(duration_s)
     parts = [
         np.hstack([rows, np.zeros((len(rows), 1))]),
@@ -204,11 +204,11 @@ def _solve_step(
     ]
     most = [bounds, _DIFFERENCE @ c]
     if shaped:
-        left, by_c, by_t = (x / _DIRECTION_RAD for x in state.swing(duration_s))
+        residual_swing, by_c, by_t = (x / _DIRECTION_RAD for x in state.swing(duration_s))
         for side in _OCTAGON:
             change = np.concatenate([(by_c * side).real, (by_t * side).real[..., None]], axis=2)
-            parts.append(np.hstack([change.reshape(-1, _COEFFICIENT_COUNT + 1), -np.ones((left.size, 1))]))
-            most.append(1.0 - (left * side).real.ravel())
+            parts.append(np.hstack([change.reshape(-1, _COEFFICIENT_COUNT + 1), -np.ones((residual_swing.size, 1))]))
+            most.append(1.0 - (residual_swing * side).real.ravel())
     keep = np.r_[_FREE, _COEFFICIENT_COUNT, _COEFFICIENT_COUNT + 1]
     n = len(keep) - 2
     price = np.concatenate([np.zeros(n), [1.0, _SWING_PENALTY * duration_s]])

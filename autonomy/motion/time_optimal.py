@@ -77,7 +77,7 @@ class SampledTimeLaw:
         return (len(self.done) - 1) * STEP_S
 
     def progress(self, time_s: np.ndarray) -> np.ndarray:
-        """Progress (0 to 1) at times; 0 before and 1 after the motion."""
+        """Compute the progress (0 to 1) at times; 0 before and 1 after the motion."""
         at: np.ndarray = self._curve(np.clip(time_s, 0.0, self.duration_s))
         result: np.ndarray = np.clip(at, 0.0, 1.0)
         return result
@@ -99,15 +99,15 @@ class PathLimits:
         self.sideways = path.sideways
 
     def pin_at(self, progress: np.ndarray) -> np.ndarray:
-        """The pin (n, 2) at progress (n,)."""
+        """Interpolate the pin (n, 2) at progress (n,)."""
         return np.column_stack([np.interp(progress, self.fine, column) for column in self.pin.T])
 
     def pin_slope_at(self, progress: np.ndarray) -> np.ndarray:
-        """The pin's derivative by the progress (n, 2) there."""
+        """Interpolate the pin's derivative by the progress (n, 2) there."""
         return np.column_stack([np.interp(progress, self.fine, column) for column in self._pin_slope.T])
 
     def fastest(self, brake: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Times and speeds of the fastest law on the grid; ``brake`` (n,) lowers the speed there."""
+        """Compute times and speeds of the fastest law on the grid; ``brake`` (n,) lowers the speed there."""
         step = 1.0 / GRID_COUNT
         most = self.most
         slope = np.where(np.abs(self.slope) < 1e-6, 1e-6, self.slope)
@@ -141,7 +141,7 @@ class PathLimits:
 
 
 def _sampled(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Progress every `STEP_S` of a law given on the grid."""
+    """Sample the progress every `STEP_S` of a law given on the grid."""
     end = max(int(np.ceil(time[-1] / STEP_S)), 2)
     at = np.linspace(0.0, time[-1], end + 1)
     i = np.minimum(np.searchsorted(time, at, side="right") - 1, GRID_COUNT - 1)
@@ -154,8 +154,8 @@ def _sampled(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _weights(length: int) -> np.ndarray:
-    """Residual swing [rad] per place of a path with one place every `TAP_S`, from rest to rest: real and imaginary
-    parts for every pendulum, (2 n, length).
+    """Compute the residual swing [rad] per place of a path with one place every `TAP_S`, from rest to rest: real and
+    imaginary parts for every pendulum, (2 n, length).
     """
     late = _GAIN * _DECAY[:, : length - 1][:, ::-1]
     none = np.zeros((len(late), 1))
@@ -164,11 +164,11 @@ def _weights(length: int) -> np.ndarray:
 
 
 def _residual_swing(pin: np.ndarray) -> np.ndarray:
-    """Residual swing [rad] of paths (t, m), every `TAP_S` from rest to rest: real and imaginary part for every
-    pendulum, (2 n, m).
+    """Compute the residual swing [rad] of paths (t, m), every `TAP_S` from rest to rest: real and imaginary part for
+    every pendulum, (2 n, m).
     """
-    found: np.ndarray = _weights(len(pin)) @ pin
-    return found
+    swing_rad: np.ndarray = _weights(len(pin)) @ pin
+    return swing_rad
 
 
 def _max_swing_rad(left: np.ndarray) -> float:
@@ -177,7 +177,7 @@ def _max_swing_rad(left: np.ndarray) -> float:
 
 
 def time_optimal_law(arm: Arm, path: PathGeometry, shaped: bool = True) -> SampledTimeLaw:
-    """The fastest law of a path that keeps the limits and, if ``shaped``, leaves at most `SWING_RAD` of swing."""
+    """Find the fastest law of a path that keeps the limits and, if ``shaped``, leaves at most `SWING_RAD` of swing."""
     limits = PathLimits(arm, path)
     brake = np.ones(GRID_COUNT + 1)
     taps = None if shaped and limits.sideways else 0
@@ -195,7 +195,7 @@ def time_optimal_law(arm: Arm, path: PathGeometry, shaped: bool = True) -> Sampl
 
 
 def _shortest_window(limits: PathLimits, raw: np.ndarray, taps: int | None) -> tuple[int, SampledTimeLaw]:
-    """The law through a window of ``taps``; None: through the shortest window that leaves little swing."""
+    """Find the law through a window of ``taps``; None: through the shortest window that leaves little swing."""
     if taps is not None:
         return taps, _with_window(limits, raw, taps)
     low, high = 0, len(TAP_COUNTS) - 1
@@ -211,7 +211,7 @@ def _shortest_window(limits: PathLimits, raw: np.ndarray, taps: int | None) -> t
 
 
 def _with_window(limits: PathLimits, raw: np.ndarray, taps: int) -> SampledTimeLaw:
-    """The law averaged over the window of ``taps`` that leaves least swing."""
+    """Average the law over the window of ``taps`` that leaves least swing."""
     whole = len(raw) + taps * _TAP_STEPS
     whole += (whole + 1) % _TAP_STEPS
     impulses = np.full(taps + 1, 1.0 / (taps + 1))
@@ -219,26 +219,26 @@ def _with_window(limits: PathLimits, raw: np.ndarray, taps: int) -> SampledTimeL
         return SampledTimeLaw(_convolved(raw, impulses, whole), 0.0)
     # The raw law every `TAP_S` up to the common end, delayed by every impulse.
     at = np.arange((whole - 1) % _TAP_STEPS - taps * _TAP_STEPS, whole, _TAP_STEPS)
-    places = np.where(at < 0, 0.0, raw[np.clip(at, 0, len(raw) - 1)])
-    delayed = np.lib.stride_tricks.sliding_window_view(places, taps + 1)[:, ::-1]
-    left = _residual_swing(limits.pin_at(delayed @ impulses))
+    progress_samples = np.where(at < 0, 0.0, raw[np.clip(at, 0, len(raw) - 1)])
+    delayed = np.lib.stride_tricks.sliding_window_view(progress_samples, taps + 1)[:, ::-1]
+    residual_swing = _residual_swing(limits.pin_at(delayed @ impulses))
     for _ in range(REFINEMENT_COUNT if taps else 0):
-        if _max_swing_rad(left) <= _GOOD_SHARE * SWING_RAD:
+        if _max_swing_rad(residual_swing) <= _GOOD_SHARE * SWING_RAD:
             break
-        wish = _improved_impulses(limits, delayed, left, impulses)
+        improved = _improved_impulses(limits, delayed, residual_swing, impulses)
         for share in (1.0, 0.5, 0.25):  # paths are curved: half a step may be better than a whole one
-            tried = impulses + share * (wish - impulses)
-            then = _residual_swing(limits.pin_at(delayed @ tried))
-            if _max_swing_rad(then) < _max_swing_rad(left):
-                impulses, left = tried, then
+            tried = impulses + share * (improved - impulses)
+            tried_swing = _residual_swing(limits.pin_at(delayed @ tried))
+            if _max_swing_rad(tried_swing) < _max_swing_rad(residual_swing):
+                impulses, residual_swing = tried, tried_swing
                 break
         else:
             break
-    return SampledTimeLaw(_convolved(raw, impulses, whole), _max_swing_rad(left))
+    return SampledTimeLaw(_convolved(raw, impulses, whole), _max_swing_rad(residual_swing))
 
 
 def _convolved(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray:
-    """The raw law convolved with the impulses, ``length`` samples."""
+    """Convolve the raw law with the impulses, ``length`` samples."""
     kernel = np.zeros((len(impulses) - 1) * _TAP_STEPS + 1)
     kernel[::_TAP_STEPS] = impulses
     late = length - len(raw)
@@ -247,7 +247,7 @@ def _convolved(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray
 
 
 def _improved_impulses(limits: PathLimits, delayed: np.ndarray, left: np.ndarray, impulses: np.ndarray) -> np.ndarray:
-    """Impulses with the least swing, linearized about the present ones."""
+    """Compute impulses with the least swing, linearized about the present ones."""
     slope = limits.pin_slope_at(delayed @ impulses) / SWING_RAD
     weights = _weights(len(delayed))
     rows = np.vstack([weights * column for column in slope.T]) @ delayed
@@ -255,15 +255,15 @@ def _improved_impulses(limits: PathLimits, delayed: np.ndarray, left: np.ndarray
     size = _SUM_WEIGHT * max(1.0, float(np.max(np.abs(rows))))
     system = np.vstack([rows, np.full((1, len(impulses)), size)])
     try:
-        found, _ = nnls(system, np.append(wish, size))
+        solution, _ = nnls(system, np.append(wish, size))
     except RuntimeError:
         return impulses
-    total = float(found.sum())
-    return found / total if total > 0.0 else impulses
+    total = float(solution.sum())
+    return solution / total if total > 0.0 else impulses
 
 
 def _load(arm: Arm, limits: PathLimits, progress: np.ndarray) -> np.ndarray:
-    """Use of the limits at the samples, as a factor of time (1 = just within)."""
+    """Compute the use of the limits at the samples, as a factor of time (1 = just within)."""
     q = np.column_stack([np.interp(progress, limits.fine, column) for column in limits.table[:, :N_JOINTS].T])
     v = np.gradient(q, STEP_S, axis=0)
     a = np.gradient(v, STEP_S, axis=0)
@@ -273,7 +273,7 @@ def _load(arm: Arm, limits: PathLimits, progress: np.ndarray) -> np.ndarray:
 
 
 def _reduced_speeds(brake: np.ndarray, load: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Lower speed factors on the grid where a limit was violated."""
+    """Lower the speed factors on the grid where a limit was violated."""
     worst = np.ones(GRID_COUNT + 1)
     at = np.clip(np.rint(where * GRID_COUNT).astype(int), 0, GRID_COUNT)
     np.maximum.at(worst, at, load)
@@ -283,7 +283,7 @@ def _reduced_speeds(brake: np.ndarray, load: np.ndarray, where: np.ndarray) -> n
 
 
 def _slowed(limits: PathLimits, law: SampledTimeLaw, factor: float) -> SampledTimeLaw:
-    """The same law, evenly slowed."""
+    """Return the same law, evenly slowed."""
     n = max(int(np.ceil((len(law.done) - 1) * factor)), 2)
     n += n % _TAP_STEPS
     done = law.progress(np.linspace(0.0, law.duration_s, n + 1))

@@ -40,7 +40,7 @@ Axes = tuple[float, ...]
 
 
 def smooth_progress(tau: np.ndarray) -> np.ndarray:
-    """Progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends
+    """Compute the progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends
     (docs/reference/machines.md section 1.6)."""
     t = np.clip(tau, 0.0, 1.0)
     progress: np.ndarray = t**4 * (35.0 + t * (-84.0 + t * (70.0 - 20.0 * t)))
@@ -65,7 +65,7 @@ class Trajectory:
         return self.position[-1]
 
     def at(self, time_s: float) -> tuple[Axes, Axes]:
-        """Joint positions and velocities at a time; at rest before the start and past the end."""
+        """Interpolate joint positions and velocities at a time; at rest before the start and past the end."""
         i = int(time_s // STEP_S)
         if i < 0 or i >= len(self.position) - 1:
             return self.position[0 if i < 0 else -1], (0.0,) * len(self.goal)
@@ -80,7 +80,7 @@ class Trajectory:
 
 
 def _curve(position: np.ndarray) -> CubicSpline:
-    """Positions every ``STEP_S``, from rest to rest, as a curve with continuous acceleration."""
+    """Return positions every ``STEP_S``, from rest to rest, as a curve with continuous acceleration."""
     return CubicSpline(np.arange(len(position)) * STEP_S, position, bc_type="clamped")
 
 
@@ -90,8 +90,8 @@ def _sampled_trajectory(position: np.ndarray) -> Trajectory:
 
 
 def with_rotation(arm: Arm, motion: Trajectory, from_s: float, by_rad: float) -> Trajectory | None:
-    """The motion with the rotator turned by ``by_rad`` more between a time and its end; None where the rest of it is
-    too short for that.
+    """Return the motion with the rotator turned by ``by_rad`` more between a time and its end; None where the rest of
+    it is too short for that.
     """
     position, velocity = np.array(motion.position), np.array(motion.velocity)
     span_s = motion.duration_s - from_s
@@ -108,7 +108,7 @@ def with_rotation(arm: Arm, motion: Trajectory, from_s: float, by_rad: float) ->
 
 
 def with_quick_rotation(arm: Arm, motion: Trajectory) -> Trajectory:
-    """The motion with its rotator turn made in one quick move, at the time when half of it was due.
+    """Return the motion with its rotator turn made in one quick move, at the time when half of it was due.
 
     For a rotator without an encoder: the valve's opening is known to a few per mille of its stroke, which loses a third
     of a slow turn (measured on the plant: 6 deg of 23 over 6 s) and nothing of a quick one.
@@ -130,7 +130,7 @@ def with_quick_rotation(arm: Arm, motion: Trajectory) -> Trajectory:
 
 
 def hold(q: Sequence[float]) -> Trajectory:
-    """A hold at a joint position."""
+    """Return a hold at a joint position."""
     return _sampled_trajectory(np.array([q, q], dtype=float))
 
 
@@ -142,7 +142,7 @@ class TimeLaw(Protocol):
         """Time of its end."""
 
     def progress(self, time_s: np.ndarray) -> np.ndarray:
-        """Progress (0 to 1) at times; 0 before and 1 after the motion."""
+        """Compute the progress (0 to 1) at times; 0 before and 1 after the motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,21 +159,21 @@ class Leg:
         return self.law.duration_s if self.law else 0.0
 
     def progress_at(self, time_s: np.ndarray) -> np.ndarray:
-        """Progress at times from the leg's own start."""
+        """Compute the progress at times from the leg's own start."""
         return self.law.progress(time_s) if self.law else np.zeros_like(time_s)
 
     def times_left(self, *left: float) -> list[float]:
-        """The times from which on at most these shares of the progress are left."""
+        """Find the times from which on at most these shares of the progress are left."""
         done = self.progress_at(_PROGRESS_GRID * self.duration_s)
         return [float(_PROGRESS_GRID[np.argmax(done >= 1.0 - share)]) * self.duration_s for share in left]
 
 
 def make_leg(arm: Arm, start: Pose, goal: Pose, law: Callable[[PathGeometry], TimeLaw] = swing_free_law) -> Leg:
-    """The straight path from start to goal, driven by a time law."""
-    first, delta = np.array(start), np.array(goal) - np.array(start)
+    """Make the straight path from start to goal, driven by a time law."""
+    start_pose, delta = np.array(start), np.array(goal) - np.array(start)
     if np.max(np.abs(delta)) < _TOLERANCE:
-        return Leg(first, delta, None)
-    return Leg(first, delta, law(_path_geometry(arm, first, delta)))
+        return Leg(start_pose, delta, None)
+    return Leg(start_pose, delta, law(_path_geometry(arm, start_pose, delta)))
 
 
 def _path_geometry(arm: Arm, first: np.ndarray, delta: np.ndarray) -> PathGeometry:
@@ -181,7 +181,7 @@ def _path_geometry(arm: Arm, first: np.ndarray, delta: np.ndarray) -> PathGeomet
 
 
 def superposed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
-    """The sum of legs, each from its starting time, slowed down as a whole if their overlap exceeds the limits."""
+    """Sum up legs, each from its starting time, slowed down as a whole if their overlap exceeds the limits."""
     end_s = max(at + leg.duration_s for at, leg in legs)
 
     def sampled(duration_s: float) -> np.ndarray:
@@ -195,7 +195,7 @@ def superposed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
 def within_limits(
     arm: Arm, sampled: Callable[[float], np.ndarray], end_s: float, accelerations: np.ndarray | None = None
 ) -> Trajectory:
-    """A motion of ``end_s``, or longer if the arm's limits (or these ``accelerations``) require it.
+    """Return a motion of ``end_s``, or longer if the arm's limits (or these ``accelerations``) require it.
 
     ``sampled(duration_s)`` gives its joint vectors (n, 5) every ``STEP_S``, from rest to rest.
 
@@ -220,8 +220,8 @@ def within_limits(
 
 
 def _time_stretch(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:
-    """Factor by which a motion sampled every ``STEP_S`` must be stretched in time to keep the arm's limits and these
-    ``accelerations`` (1 = just within).
+    """Compute the factor by which a motion sampled every ``STEP_S`` must be stretched in time to keep the arm's limits
+    and these ``accelerations`` (1 = just within).
     """
     curve = _curve(position)
     velocity, acceleration = curve(curve.x, 1), curve(curve.x, 2)
@@ -230,7 +230,7 @@ def _time_stretch(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> 
 
 
 def straight_line(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Trajectory:
-    """A straight line in poses; vertical when only the height differs.
+    """Plan a straight line in poses; vertical when only the height differs.
 
     ``shaped=False``, for comparison, takes as long without regard to swing: it is the fastest law, evenly slowed.
     """
@@ -243,7 +243,7 @@ def straight_line(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Tra
 
 
 def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
-    """Up to ``height_m``, over, and down to the goal, with rounded corners.
+    """Travel up to ``height_m``, over, and down to the goal, with rounded corners.
 
     With ``free_m`` the pin may rise while it moves sideways, as long as it is up ``free_m`` before the goal; without,
     it moves sideways only when it is almost up.
@@ -252,18 +252,18 @@ def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: floa
     over = make_leg(arm, start.at_height(height_m), goal.at_height(height_m))
     down = make_leg(arm, goal.at_height(height_m), goal)
     rise, drop = abs(up.delta[2]), abs(down.delta[2])
-    way_m = float(np.hypot(over.delta[0] * max(start.r_m, goal.r_m), over.delta[1]))
+    travel_m = float(np.hypot(over.delta[0] * max(start.r_m, goal.r_m), over.delta[1]))
     over_at = up.times_left(_RISE_LEFT_M / rise)[0] if rise > _RISE_LEFT_M else 0.0
-    if 0.0 < free_m < way_m:
-        over_at = max(0.0, up.duration_s - over.times_left(free_m / way_m)[0])
-    down_at = over_at + (over.times_left(_APPROACH_LEFT_M / way_m)[0] if way_m > _APPROACH_LEFT_M else 0.0)
+    if 0.0 < free_m < travel_m:
+        over_at = max(0.0, up.duration_s - over.times_left(free_m / travel_m)[0])
+    down_at = over_at + (over.times_left(_APPROACH_LEFT_M / travel_m)[0] if travel_m > _APPROACH_LEFT_M else 0.0)
     down_at = max(down_at, up.duration_s if drop else 0.0)
     return superposed(arm, [(0.0, up), (over_at, over), (down_at, down)])
 
 
 def joint_motion(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Trajectory:
-    """Every joint straight from start to goal, synchronized and gentle, whatever the arm's reach."""
-    first, delta = np.array(start, dtype=float), np.array(goal, dtype=float) - np.array(start, dtype=float)
+    """Move every joint straight from start to goal, synchronized and gentle, whatever the arm's reach."""
+    start_position, delta = np.array(start, dtype=float), np.array(goal, dtype=float) - np.array(start, dtype=float)
     tau = np.linspace(0.0, 1.0, 121)
     done = smooth_progress(tau)
     speed = np.gradient(done, tau[1])
@@ -272,22 +272,22 @@ def joint_motion(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Tra
     pushed = float(np.sqrt(np.max(np.abs(delta) / (_GENTLE_SHARE * arm.acceleration)) * steepest))
     duration = max(MIN_DURATION_S, fastest, pushed)
     time = np.arange(int(np.ceil(duration / STEP_S)) + 2) * STEP_S
-    return _sampled_trajectory(first + smooth_progress(time / duration)[:, None] * delta)
+    return _sampled_trajectory(start_position + smooth_progress(time / duration)[:, None] * delta)
 
 
 def slow_line(arm: Arm, start: Pose, goal: Pose, least_s: float) -> Trajectory:
-    """A straight line in poses in ``least_s``, or longer if the arm's limits require it."""
-    first, delta = np.array(start), np.array(goal) - np.array(start)
+    """Plan a straight line in poses in ``least_s``, or longer if the arm's limits require it."""
+    start_pose, delta = np.array(start), np.array(goal) - np.array(start)
 
     def sampled(duration_s: float) -> np.ndarray:
         time = np.arange(int(np.ceil(duration_s / STEP_S)) + 1) * STEP_S
-        return arm.joints(first + smooth_progress(time / duration_s)[:, None] * delta)
+        return arm.joints(start_pose + smooth_progress(time / duration_s)[:, None] * delta)
 
     return within_limits(arm, sampled, least_s)
 
 
 def joined(*motions: Trajectory) -> Trajectory:
-    """Motions one after the other, each from where the one before ends, at rest between them."""
+    """Join motions one after the other, each from where the one before ends, at rest between them."""
     position, velocity = list(motions[0].position), list(motions[0].velocity)
     for motion in motions[1:]:
         position += motion.position[1:]
@@ -296,7 +296,7 @@ def joined(*motions: Trajectory) -> Trajectory:
 
 
 def follow_path(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:
-    """A motion along given poses over time; the initial offset of ``start`` from the path fades out within
+    """Plan a motion along given poses over time; the initial offset of ``start`` from the path fades out within
     ``blend_s``."""
     time = np.arange(int(np.ceil(end_s / STEP_S)) + 1) * STEP_S
     nominal = np.array([path(t) for t in time])

@@ -62,7 +62,7 @@ class Path:
         return float(self.s_m[-1])
 
     def at(self, s_m: float) -> tuple[float, float, float, float]:
-        """x, y [m], heading [rad] and curvature [1/m] at ``s_m``; the path continues straight past either end."""
+        """Return x, y [m], heading [rad] and curvature [1/m] at ``s_m``; the path goes on straight past either end."""
         s = min(max(s_m, 0.0), self.length_m)
         beyond = s_m - s
         i = min(bisect_right(self.s_m, s) - 1, len(self.s_m) - 2)  # called thousands of times: numpy would be slower
@@ -77,8 +77,8 @@ class Path:
         return x, y, heading, 0.0 if beyond else curve + part * (to_curve - curve)
 
     def nearest(self, x_m: float, y_m: float, low_m: float = -math.inf, high_m: float = math.inf) -> float:
-        """Distance along the path of the point nearest to (x, y) between ``low_m`` and ``high_m``; the path is extended
-        straight before its start and past its end.
+        """Find the distance along the path of the point nearest to (x, y) between ``low_m`` and ``high_m``; the path is
+        extended straight before its start and past its end.
         """
         first, last = np.searchsorted(self.s_m, (low_m, high_m))
         first, last = int(min(first, len(self.s_m) - 1)), int(max(first + 1, last))
@@ -93,14 +93,14 @@ class Path:
 
 
 def path_limits(carrier: Carrier, share: float = COMFORT_SHARE, rate_share: float = RATE_SHARE) -> Limits:
-    """Limits of the machine at its cruising speed."""
+    """Return the limits of the machine at its cruising speed."""
     sharpest = 1.0 / turning_radius_m(carrier, carrier.articulation_limit_rad)
     articulation_rad_m = rate_share * carrier.articulation_rate_limit_rad_s / carrier.cruise_speed_m_s
     return Limits(share * sharpest, articulation_rad_m / (carrier.front_axle_m + carrier.rear_axle_m))
 
 
 def drivable_path(points: Sequence[Point2], carrier: Carrier) -> Path:
-    """The path along ``points`` [m] in the plane.
+    """Plan the path along ``points`` [m] in the plane.
 
     Raises:
         PathRefused: fewer than two different points, a non-finite point, or corners too sharp for their legs.
@@ -127,7 +127,7 @@ class _Bend:
 
 
 def _needed(xy: np.ndarray) -> np.ndarray:
-    """The points without repetitions and without those close to the line."""
+    """Return the points without repetitions and without those close to the line."""
     apart = np.hypot(*np.diff(xy, axis=0).T) if len(xy) > 1 else np.empty(0)
     xy = xy[np.concatenate([[True], apart > 1e-3])]
     keep = np.zeros(len(xy), bool)
@@ -180,7 +180,7 @@ def _place(point: np.ndarray) -> str:
 
 
 def _profile(turn_rad: float, limits: Limits) -> tuple[float, float]:
-    """Length of each clothoid and of the arc between them [m]."""
+    """Compute the length of each clothoid and of the arc between them [m]."""
     size = abs(turn_rad)
     ramp = limits.curve_1_m / limits.change_1_m2
     if size < limits.curve_1_m * ramp:
@@ -189,7 +189,7 @@ def _profile(turn_rad: float, limits: Limits) -> tuple[float, float]:
 
 
 def _corner(turn_rad: float, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Distance, points, heading and curvature of a corner that starts at the origin along x."""
+    """Compute distance, points, heading and curvature of a corner that starts at the origin along x."""
     ramp, arc = _profile(turn_rad, limits)
     length = 2.0 * ramp + arc
     n = max(2, math.ceil(length / SPACING_M)) + 1
@@ -207,14 +207,14 @@ def _corner(turn_rad: float, limits: Limits) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _reach(turn_rad: float, limits: Limits) -> float:
-    """Distance from the start of a bend to the corner point [m]; it ends as far behind it."""
+    """Compute the distance from the start of a bend to the corner point [m]; it ends as far behind it."""
     if abs(turn_rad) < 1e-6:
         return 0.0
     return float(_corner(turn_rad, limits)[1][-1, 0]) / (1.0 + math.cos(turn_rad))
 
 
 def _sampled(xy: np.ndarray, bends: Sequence[_Bend]) -> Path:
-    """The samples of all legs and corners in order."""
+    """Compute the samples of all legs and corners in order."""
     s: list[np.ndarray] = []
     points: list[np.ndarray] = []
     headings: list[np.ndarray] = []

@@ -25,7 +25,7 @@ TURN_M_RAD: Final = 8.0
 
 
 def joining_path(here: Point2, yaw_rad: float, points: Sequence[Point2], carrier: Carrier) -> Path:
-    """A path from ``here`` [m], the centre of the front axle, along ``points``.
+    """Plan a path from ``here`` [m], the centre of the front axle, along ``points``.
 
     Raises:
         PathRefused: no path is drivable; the reason is that of the direct path.
@@ -45,7 +45,7 @@ def joining_path(here: Point2, yaw_rad: float, points: Sequence[Point2], carrier
 
 
 def _approaches(here: Point2, yaw_rad: float, points: Sequence[Point2]) -> Iterator[list[Point2]]:
-    """Candidate points to drive through before the first one."""
+    """Yield candidate points to drive through before the first one."""
     yield []
     if not points:
         return
@@ -72,7 +72,9 @@ Heading = tuple[float, float, float]
 
 
 def dubins_corners(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point2]]:
-    """Corner points of all manoeuvres from one heading to another with two arcs of a radius, the shortest first."""
+    """Yield the corner points of all manoeuvres from one heading to another with two arcs of a radius, the shortest
+    first.
+    """
     manoeuvres = []
     for first in (1.0, -1.0):
         for last in (1.0, -1.0):
@@ -92,26 +94,28 @@ def dubins_corners(start: Heading, goal: Heading, radius_m: float) -> Iterator[l
 
 
 def _circle_centre(at: Heading, side: float, radius_m: float) -> Point2:
-    """Centre of the turning circle to the left (1) or right (-1)."""
+    """Compute the centre of the turning circle to the left (1) or right (-1)."""
     x, y, yaw = at
     return x - side * radius_m * math.sin(yaw), y + side * radius_m * math.cos(yaw)
 
 
 def _angle(turn_rad: float) -> float:
-    """Angle of an arc, 0 to 2 pi; a rounding error does not become a full circle."""
+    """Compute the angle of an arc, 0 to 2 pi; a rounding error does not become a full circle."""
     angle = turn_rad % (2.0 * math.pi)
     return 0.0 if angle > 2.0 * math.pi - 1e-6 else angle
 
 
 def _corners(at: Heading, side: float, angle_rad: float, radius_m: float) -> list[Point2]:
-    """Corners round an arc from a heading to the left (1) or right (-1); none turns by more than a right angle."""
+    """Compute the corners round an arc from a heading to the left (1) or right (-1); none turns by more than a right
+    angle.
+    """
     x, y, yaw = at
     count = math.ceil(angle_rad / (0.5 * math.pi) - 1e-9)
-    found = []
+    corner_points = []
     for _ in range(count):
         reach_m = radius_m * math.tan(0.5 * angle_rad / count)
         x, y = x + reach_m * math.cos(yaw), y + reach_m * math.sin(yaw)
-        found.append((x, y))
+        corner_points.append((x, y))
         yaw += side * angle_rad / count
         x, y = x + reach_m * math.cos(yaw), y + reach_m * math.sin(yaw)
-    return found
+    return corner_points

@@ -89,7 +89,7 @@ class Navigator:
             self.phase, self.reason = Phase.STOPPED, reason
 
     def step(self, now_ns: int, report: VehicleReport, location: Location) -> DriveSetpoint | None:
-        """The setpoint to send now, or None."""
+        """Return the setpoint to send now, or None."""
         at_standstill = abs(report.speed_m_s) < STANDSTILL_M_S and report.driving != Driving.BRAKING
         self.is_standing = at_standstill and now_ns - self._rolled_ns >= REST_NS
         order = DriveRequest()

@@ -43,8 +43,8 @@ LOOK_AHEAD_STEP_M: Final = 0.25
 
 
 def tip_margin_m(carrier: Carrier, location: Location, acceleration_m_s2: float = 0.0) -> float:
-    """Distance of the weight's line of action inside the support polygon [m], from roll, pitch and articulation; 0 or
-    less means tipping.
+    """Compute the distance of the weight's line of action inside the support polygon [m], from roll, pitch and
+    articulation; 0 or less means tipping.
 
     ``acceleration_m_s2`` is positive to the left.  The masses are assumed, because the profile has none.
     """
@@ -72,7 +72,7 @@ class Rocking:
     _last: tuple[int, float, float] | None = None
 
     def step(self, location: Location) -> float:
-        """Update with a location; returns the rate [rad/s]."""
+        """Update with a location; return the rate [rad/s]."""
         now = location.stamp_ns, location.roll_rad, location.pitch_rad
         if self._last is not None and now[0] > self._last[0]:
             seconds = (now[0] - self._last[0]) * 1e-9
@@ -83,7 +83,7 @@ class Rocking:
 
 
 def terrain_speed_share(margin_m: float, rocking_rad_s: float) -> float:
-    """Share of the wanted speed that ground and slope allow; 0 means stop."""
+    """Compute the share of the wanted speed that ground and slope allow; 0 means stop."""
     if margin_m < MIN_MARGIN_M:
         return 0.0
     steady = min(1.0, (margin_m - MIN_MARGIN_M) / (FULL_MARGIN_M - MIN_MARGIN_M))
@@ -92,7 +92,7 @@ def terrain_speed_share(margin_m: float, rocking_rad_s: float) -> float:
 
 
 def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
-    """Greatest speed at which the articulation can follow the path ahead of ``s_m``."""
+    """Compute the greatest speed at which the articulation can follow the path ahead of ``s_m``."""
     fastest = math.inf
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
     limit = DRIVE_RATE_SHARE * carrier.articulation_rate_limit_rad_s
@@ -105,7 +105,7 @@ def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
 
 
 def stopping_speed_m_s(left_m: float) -> float:
-    """Speed with ``left_m`` to go: constant deceleration that ends in a creep."""
+    """Compute the speed with ``left_m`` to go: constant deceleration that ends in a creep."""
     return max(CREEP_M_S, math.sqrt(2.0 * BRAKING_M_S2 * max(0.0, left_m)))
 
 
@@ -162,13 +162,13 @@ class PathDrive:
         return self._stop_m - (self.steer.s_m if self.steer else 0.0)
 
     def step(self, location: Location) -> DriveRequest:
-        """The drive request for one location."""
+        """Compute the drive request for one location."""
         if stop_reason := self._stop_reason(location):
             self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
             self._correction = 0.0
             return DriveRequest(stop_reason=stop_reason)
-        wanted = self._wanted(location)
-        self._following, steer = follow_path(self._carrier, self.path, self._following, location, wanted)
+        target_speed_m_s = self._wanted(location)
+        self._following, steer = follow_path(self._carrier, self.path, self._following, location, target_speed_m_s)
         self.steer = steer
         self._on = self._on or (abs(steer.off_m) < ON_PATH_M and abs(steer.off_rad) < ON_PATH_RAD)
         if self._on and abs(steer.off_m) > MAX_OFF_PATH_M:
@@ -178,7 +178,7 @@ class PathDrive:
         if self.left_m <= STOP_M:
             return self._halt(location)
         self._halting_ns = 0
-        speed = self._corrected(min(wanted, stopping_speed_m_s(self.left_m - STOP_M)), location)
+        speed = self._corrected(min(target_speed_m_s, stopping_speed_m_s(self.left_m - STOP_M)), location)
         return DriveRequest(
             Steering.ARTICULATION, 0.0, 0.0, steer.articulation_rad, steer.articulation_rate_rad_s, speed, False
         )
@@ -214,17 +214,19 @@ class PathDrive:
         )
 
     def _wanted(self, location: Location) -> float:
-        """The speed allowed by bends and ground."""
+        """Compute the speed allowed by bends and ground."""
         share = terrain_speed_share(self._margin(location), self._rocking.rate_rad_s)
         if location.status is Status.DEAD_RECKONING:
             share *= RECKONING_SHARE
         s = self._following.s_m
         articulation = math.inf if s is None else bend_speed_m_s(self._carrier, self.path, s)
-        wanted = min(share * self._speed, articulation)
-        return wanted if self.steer is None else min(wanted, stopping_speed_m_s(self.left_m - STOP_M))
+        target_speed_m_s = min(share * self._speed, articulation)
+        return (
+            target_speed_m_s if self.steer is None else min(target_speed_m_s, stopping_speed_m_s(self.left_m - STOP_M))
+        )
 
     def _corrected(self, wanted_m_s: float, location: Location) -> float:
-        """The speed to request: compensates for wheel slip and drive droop."""
+        """Compute the speed to request: compensate for wheel slip and drive droop."""
         seconds = min(0.2, (location.stamp_ns - self._stamp_ns) * 1e-9) if self._stamp_ns else 0.0
         self._stamp_ns = location.stamp_ns
         error = wanted_m_s - location.speed_m_s
@@ -301,7 +303,7 @@ class FollowerState:
 def follow_path(
     carrier: Carrier, path: Path, state: FollowerState, location: Location, speed_m_s: float
 ) -> tuple[FollowerState, SteeringCommand]:
-    """One step at the location's stamp; ``speed_m_s`` is the speed about to be requested."""
+    """Take one step at the location's stamp; ``speed_m_s`` is the speed about to be requested."""
     articulation, speed = location.articulation_rad, location.speed_m_s
     turn_1_m = (
         math.sin(articulation) / (carrier.front_axle_m * math.cos(articulation) + carrier.rear_axle_m)
@@ -321,10 +323,10 @@ def follow_path(
         integral += max(0.0, min(FORTH_M, s - state.s_m)) * off / INTEGRAL_M
         integral = max(-INTEGRAL_LIMIT_M, min(INTEGRAL_LIMIT_M, integral))
     pull = LAMBDA_1_M * (off + integral)
-    wanted = max(-MAX_RETURN_RAD, min(MAX_RETURN_RAD, -math.atan(pull)))
+    target_course_rad = max(-MAX_RETURN_RAD, min(MAX_RETURN_RAD, -math.atan(pull)))
     course_change = -LAMBDA_1_M / (1.0 + pull**2) * math.sin(off_course)
     own = curve * math.cos(off_course) / max(0.3, 1.0 - curve * off)
-    kappa = own + course_change - GAMMA_1_M * wrapped(off_course - wanted) - location.slip_curve_1_m
+    kappa = own + course_change - GAMMA_1_M * wrapped(off_course - target_course_rad) - location.slip_curve_1_m
     angle, rate = _articulation(carrier, state, location, kappa, speed_m_s)
     return FollowerState(s, angle, rate, location.stamp_ns, integral), SteeringCommand(angle, rate, s, off, off_course)
 
@@ -332,7 +334,7 @@ def follow_path(
 def _articulation(
     carrier: Carrier, state: FollowerState, location: Location, kappa: float, speed_m_s: float
 ) -> tuple[float, float]:
-    """The wanted articulation at the location's stamp and its rate, within the machine's limits."""
+    """Compute the wanted articulation at the location's stamp and its rate, within the machine's limits."""
     angle = measured = location.articulation_rad
     if state.articulation_rad is not None:
         seconds = min(MAX_EXTRAPOLATION_S, (location.stamp_ns - state.stamp_ns) * 1e-9)

@@ -52,16 +52,16 @@ class WaypointDrive:
         self._from: tuple[float, float] | None = None
 
     def switch_m(self, number: int) -> float:
-        """Distance from a waypoint at which the next one becomes the goal [m]."""
+        """Compute the distance from a waypoint at which the next one becomes the goal [m]."""
         if self._from is None or number + 1 >= len(self._points):
             return MIN_SWITCH_M
         before = self._points[number - 1] if number else self._from
-        here, after = self._points[number], self._points[number + 1]
-        turn = wrapped(_bearing(here, after) - _bearing(before, here))
+        waypoint, after = self._points[number], self._points[number + 1]
+        turn = wrapped(_bearing(waypoint, after) - _bearing(before, waypoint))
         return min(MAX_SWITCH_M, max(MIN_SWITCH_M, self._radius_m * math.tan(min(abs(turn), 3.0) / 2.0)))
 
     def step(self, report: VehicleReport) -> DriveRequest:
-        """The drive request for one report."""
+        """Compute the drive request for one report."""
         has_position = report.position_ns and report.stamp_ns - report.position_ns <= FRESH_NS
         if not has_position or not math.isfinite(report.latitude_deg + report.longitude_deg):
             return DriveRequest(Steering.WAYPOINT, stop_reason="no position from the receiver")
@@ -82,11 +82,11 @@ class WaypointDrive:
         return self._order(self._speed)
 
     def _behind(self, at: tuple[float, float]) -> bool:
-        """Whether the machine has passed the current waypoint in the direction of its leg."""
+        """Tell whether the machine has passed the current waypoint in the direction of its leg."""
         assert self._from is not None
         before = self._points[self.number - 1] if self.number else self._from
-        here = self._points[self.number]
-        return (at[0] - here[0]) * (here[0] - before[0]) + (at[1] - here[1]) * (here[1] - before[1]) > 0.0
+        goal = self._points[self.number]
+        return (at[0] - goal[0]) * (goal[0] - before[0]) + (at[1] - goal[1]) * (goal[1] - before[1]) > 0.0
 
     def _order(self, speed_m_s: float, arrived: bool = False) -> DriveRequest:
         goal = self._waypoints[self.number]

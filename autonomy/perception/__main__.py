@@ -68,7 +68,7 @@ LOCALIZERS: Final[dict[str, Callable[[Profile], LogLocalizer]]] = {
 
 
 def open_source(address: str, camera: str, profile: Profile) -> CameraSource:
-    """The source that ``--frames`` names.
+    """Open the source that ``--frames`` names.
 
     Raises:
         LinkError: it cannot be opened.
@@ -129,7 +129,7 @@ class StatusText:
         self._lists, self._begin_ns = 0, now_ns()
 
     def __call__(self) -> str:
-        """One line."""
+        """Return the status in one line."""
         requests, now_ns = self._requests, self._clock_ns()
         rate_hz = 1e9 * (requests.lists - self._lists) / max(now_ns - self._begin_ns, 1)
         self._lists, self._begin_ns = requests.lists, now_ns
@@ -154,7 +154,7 @@ MASKS: Final = {"masks": "rgbd", "masks-depth": "depth", "masks-colour": "colour
 
 
 def command_line() -> argparse.ArgumentParser:
-    """The options."""
+    """Define the options."""
     parser = argparse.ArgumentParser(
         prog="python -m autonomy.perception", description="Detect logs in the pictures of a camera."
     )
@@ -170,7 +170,7 @@ def command_line() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run until a signal arrives; returns the exit code."""
+    """Run until a signal arrives and return the exit code."""
     options = command_line().parse_args(argv)
     keep_memory()
     try:

@@ -51,10 +51,10 @@ class LogLocalizer(Protocol):
     """A method that turns masks into logs in the frame in which ``pose`` is given."""
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """The logs of one picture."""
+        """Localize the logs of one picture."""
 
     def localize_load(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """The logs of a picture that shows a load of the crane, which must not be taken for one that lies."""
+        """Localize the logs of a picture that shows a load of the crane, which must not be taken for one that lies."""
 
 
 class CylinderLocalizer:
@@ -64,7 +64,7 @@ class CylinderLocalizer:
         self._perception = Perception(profile, errors)
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """The tracks that this picture shows, without those that may be cut off at the edge of the picture."""
+        """Return the tracks that this picture shows, without those that may be cut off at the edge of the picture."""
         tracks = self._perception.step(frame, pose, masks)
         fresh = [t for t in tracks if t.last_seen_ns == frame.stamp_ns]
         return [
@@ -74,12 +74,12 @@ class CylinderLocalizer:
         ]
 
     def localize_load(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """The cylinders of this picture alone."""
-        found = []
+        """Return the cylinders of this picture alone."""
+        logs = []
         for number, fit in enumerate(self._perception.level_fits(frame, pose, masks)):
             (x, y, z), (ax, ay, az) = pose.to_base(fit.body.center_m).tolist(), (pose.rotation @ fit.body.axis).tolist()
-            found.append(LogObservation(number, (x, y, z), (ax, ay, az), fit.body.length_m, 2.0 * fit.body.radius_m))
-        return [log for log in found if log.diameter_m < log.length_m]
+            logs.append(LogObservation(number, (x, y, z), (ax, ay, az), fit.body.length_m, 2.0 * fit.body.radius_m))
+        return [log for log in logs if log.diameter_m < log.length_m]
 
 
 class PaperBLocalizer:
@@ -90,14 +90,14 @@ class PaperBLocalizer:
     """
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """A log for every box whose middle has a depth."""
-        found = []
-        for number, one in enumerate(masks):
-            rows, columns = np.flatnonzero(one.mask.any(axis=1)), np.flatnonzero(one.mask.any(axis=0))
+        """Return a log for every box whose middle has a depth."""
+        logs = []
+        for number, instance in enumerate(masks):
+            rows, columns = np.flatnonzero(instance.mask.any(axis=1)), np.flatnonzero(instance.mask.any(axis=0))
             if not len(rows):
                 continue
             box = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
-            point, log = position_in_box(frame, box), log_from_mask(frame, one.mask)
+            point, log = position_in_box(frame, box), log_from_mask(frame, instance.mask)
             if point is None or log is None:
                 continue
             range_m = float(np.linalg.norm(point))
@@ -107,10 +107,10 @@ class PaperBLocalizer:
                 continue
             x, y, z = pose.to_base(point * (1.0 + 0.5 * PAPER_B_DIAMETER_M / range_m)).tolist()
             axis = (float(level[0]) / length, float(level[1]) / length, 0.0)
-            found.append(
+            logs.append(
                 LogObservation(number, (x, y, z), axis, PAPER_B_LENGTH_M, PAPER_B_DIAMETER_M, _PAPER_B_COVARIANCE)
             )
-        return found
+        return logs
 
     localize_load = localize
 
@@ -147,7 +147,7 @@ class DrivingLogDetector:
     def detect(
         self, base: Pose, q: Sequence[float], articulation_rad: float, load: bool = False
     ) -> tuple[LogObservation, ...] | None:
-        """The logs of a new picture in the crane's base frame; None when there is no usable picture.
+        """Detect the logs of a new picture in the crane's base frame; None when there is no usable picture.
 
         ``base`` is that frame in the plane, ``q`` the joints in ``Joint`` order [rad, m], both at the time of the
         picture.  ``load`` as for `detect_in_plane`.
@@ -158,7 +158,7 @@ class DrivingLogDetector:
     def detect_in_plane(
         self, standing: Callable[[], tuple[Pose, float] | None], q: Sequence[float], load: bool = False
     ) -> tuple[LogObservation, ...] | None:
-        """The logs of a new picture in the plane; None when there is no usable picture.
+        """Detect the logs of a new picture in the plane; None when there is no usable picture.
 
         ``standing`` is called after the picture and returns base and articulation at its time, None when unknown.
         ``load``: the picture shows a load that hangs in the crane, and its logs are measured for themselves.
@@ -177,7 +177,7 @@ class DrivingLogDetector:
             mount = optical_pose(self._profile, self._camera, q, articulation_rad)
             frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
-            masks = [one for one in self._segment(frame) if one.score >= MIN_SCORE]
+            masks = [instance for instance in self._segment(frame) if instance.score >= MIN_SCORE]
             localize = self._localizer.localize_load if load else self._localizer.localize
             logs = localize(frame, pose, masks)
         except (LinkError, InputRefused) as error:
@@ -189,7 +189,7 @@ class DrivingLogDetector:
 
 
 def in_base(o: LogObservation, base: Pose) -> LogObservation:
-    """From the plane into the base frame; the covariance refers to the axis and turns with it."""
+    """Transform a log from the plane into the base frame; the covariance refers to the axis and turns with it."""
     x, y, z = base.to_optical(np.asarray(o.center_m)).tolist()
     ax, ay, az = (np.asarray(o.axis) @ base.rotation).tolist()
     return replace(o, center_m=(x, y, z), axis=(ax, ay, az))

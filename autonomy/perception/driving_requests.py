@@ -30,11 +30,11 @@ class DetectorInPlane(Protocol):
     def detect_in_plane(
         self, standing: Callable[[], tuple[Pose, float] | None], q: tuple[float, ...], load: bool
     ) -> tuple[LogObservation, ...] | None:
-        """The logs of a new picture in the plane."""
+        """Detect the logs of a new picture in the plane."""
 
 
 def asked_ns(source: CameraSource) -> int | None:
-    """When a source was asked for its last picture; None when it does not know."""
+    """Return when a source was asked for its last picture; None when it does not know."""
     asked: int | None = getattr(source, "asked_ns", None)
     return asked
 
@@ -137,10 +137,10 @@ class StandingDetector(Protocol):
     logs: tuple[LogObservation, ...]
 
     def rests(self, q: Sequence[float], now_ns: int) -> bool:
-        """Whether the crane rests, by its joints now."""
+        """Tell whether the crane rests, by its joints now."""
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs of a new picture."""
+        """Detect the logs of a new picture."""
 
 
 class StandingRequests:
@@ -200,12 +200,12 @@ class StandingRequests:
         self._reported = problem
 
     def _waiting(self) -> list[tuple[bytes, Address]]:
-        found = []
+        datagrams = []
         self._link.setblocking(False)
         with suppress(BlockingIOError):
             while True:
-                found.append(self._link.recvfrom(MAX_REQUEST_BYTES))
-        return found
+                datagrams.append(self._link.recvfrom(MAX_REQUEST_BYTES))
+        return datagrams
 
     def _send(self, data: bytes, sender: Address) -> None:
         with suppress(OSError):  # who asked is gone; the next request gets an answer

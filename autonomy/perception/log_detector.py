@@ -60,7 +60,7 @@ class LogDetector:
         self._last_request_ns = 0
 
     def rests(self, q: Sequence[float], now_ns: int) -> bool:
-        """Whether the crane rests: its joints ``q`` at ``now_ns`` are those of the last call, not long ago."""
+        """Tell whether the crane rests: its joints ``q`` at ``now_ns`` are those of the last call, not long ago."""
         at = np.array(q, float)
         moved = np.abs(at - self._last_q)
         recent = now_ns - self._last_request_ns < MAX_REQUEST_GAP_NS
@@ -68,7 +68,7 @@ class LogDetector:
         return recent and bool(np.all(moved[np.isfinite(at)] < REST_TOLERANCE))
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs in the base frame from a picture that is newer than the request; None when there is none.
+        """Detect the logs in the base frame in a picture that is newer than the request; None when there is none.
 
         ``q`` are the joints in ``Joint`` order [rad, m] at ``now_ns``, NaN where there is no encoder.
         """
@@ -117,7 +117,7 @@ class Perception:
         """Of the last step."""
 
     def step(self, frame: RgbdFrame, pose: Pose, instances: Sequence[Masked]) -> tuple[Track, ...]:
-        """The confirmed logs after ``frame``, taken at ``pose``, in the frame in which the poses are given.
+        """Return the confirmed logs after ``frame``, taken at ``pose``, in the frame in which the poses are given.
 
         Raises:
             InputRefused: the frame is invalid, or from a camera that the profile does not have.
@@ -126,11 +126,11 @@ class Perception:
         return self._tracker.step(fits, pose, frame.stamp_ns, partial(is_displaced, frame, pose))
 
     def level_fits(self, frame: RgbdFrame, pose: Pose, instances: Sequence[Masked]) -> list[CylinderFit]:
-        """`fits` without what stands too steep at ``pose`` to be a log."""
+        """Return `fits` without what stands too steep at ``pose`` to be a log."""
         return [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < MAX_SINE_TO_LEVEL]
 
     def fits(self, frame: RgbdFrame, instances: Sequence[Masked]) -> list[CylinderFit]:
-        """The logs of one frame alone, in its optical frame; ``rejections`` holds the masks that gave none."""
+        """Fit the logs of one frame alone, in its optical frame; ``rejections`` holds the masks that gave none."""
         check_frame(frame)
         if frame.camera not in self._sensors:
             known = ", ".join(self._sensors) or "none"

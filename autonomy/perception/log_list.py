@@ -65,17 +65,17 @@ class LogEstimate:
     score: float = 1.0
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
-        """The two unit vectors (3,) across the axis to which the covariance refers: level, and up."""
+        """Return the two unit vectors (3,) across the axis to which the covariance refers: level, and up."""
         return across(self.axis)
 
     def position_sigma_m(self) -> np.ndarray:
-        """Standard deviation (3,) [m] of the centre: along ``frame``'s two directions and along the axis."""
+        """Compute standard deviations (3,) [m] of the centre: along ``frame``'s two directions and along the axis."""
         c = self.covariance
         along = 0.25 * (c[START, START] + c[END, END] + 2.0 * c[START, END])
         return np.sqrt(np.maximum([c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along], 0.0))
 
     def observation(self, number: int, seen: bool = True) -> LogObservation:
-        """The observation with this number; ``seen``: the newest picture shows the log."""
+        """Return the observation with this number; ``seen``: the newest picture shows the log."""
         x, y, z = (float(v) for v in self.center_m)
         ax, ay, az = (float(v) for v in self.axis)
         # Four digits suffice, and a reply about a hundred logs must fit into one datagram.
@@ -85,14 +85,14 @@ class LogEstimate:
 
 
 def unpack_covariance(triangle: tuple[float, ...]) -> np.ndarray:
-    """The covariance (7, 7) of a ``LogObservation``."""
+    """Unpack the covariance (7, 7) of a ``LogObservation``."""
     upper = np.zeros((SIZE, SIZE))
     upper[np.triu_indices(SIZE)] = triangle
     return np.asarray(upper + np.triu(upper, 1).T)
 
 
 def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across a unit axis (3,): the first level (to the left of the axis), the second upward."""
+    """Compute two unit vectors across a unit axis (3,): first level (to the left of the axis), second upward."""
     up = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.95 else np.array([1.0, 0.0, 0.0])
     level = np.cross(up, axis)
     level /= np.linalg.norm(level)
@@ -156,7 +156,7 @@ _REQUESTS: Final = msgspec.json.Decoder(_Request)
 
 
 def encode_request(q: Sequence[float], standpoint: Standpoint | None = None) -> bytes:
-    """A request for logs; ``q`` are the joint positions, empty when none are known."""
+    """Encode a request for logs; ``q`` are the joint positions, empty when none are known."""
     joints = " ".join(f"{value:.6g}" for value in q)
     if standpoint is None:
         return msgspec.json.encode(_Request("logs", joints))
@@ -165,7 +165,7 @@ def encode_request(q: Sequence[float], standpoint: Standpoint | None = None) -> 
 
 
 def decode_request(data: bytes) -> LogRequest:
-    """The request of a datagram; all joints are NaN when it holds none.
+    """Decode the request of a datagram; all joints are NaN when it holds none.
 
     Raises:
         InputRefused: the datagram is not a request for logs.
@@ -193,18 +193,18 @@ def decode_request(data: bytes) -> LogRequest:
 
 
 def encode_logs(logs: Iterable[LogObservation], in_plane: bool = False) -> bytes:
-    """A reply with a log list, in the crane's base frame or in the plane."""
+    """Encode a reply with a log list, in the crane's base frame or in the plane."""
     rows = [_Log(o.center_m, o.axis, o.length_m, o.diameter_m, o.id, o.covariance, o.seen) for o in logs]
     return msgspec.json.encode(_Answer(plane=rows) if in_plane else rows)
 
 
 def encode_error(sentence: str) -> bytes:
-    """A reply without a log list: ``sentence`` says why there is none."""
+    """Encode a reply without a log list: ``sentence`` says why there is none."""
     return msgspec.json.encode(_Answer(sentence))
 
 
 def decode_logs(data: bytes, in_plane: bool = False) -> tuple[LogObservation, ...]:
-    """The log list of a reply, axes normalised; in the crane's base frame or ``in_plane``.
+    """Decode the log list of a reply, axes normalised; in the crane's base frame or ``in_plane``.
 
     Raises:
         InputRefused: the reply is not a log list, is in the other frame, a log in it is impossible, or it is an error.
@@ -219,10 +219,12 @@ def decode_logs(data: bytes, in_plane: bool = False) -> tuple[LogObservation, ..
             raise InputRefused("log-list.detector-error", reply.error or "the detector's reply is empty")
         rows = reply.plane
     if isinstance(reply, _Answer) != in_plane:
-        wanted, camera = ("plane", "looks ahead of") if in_plane else ("crane's base frame", "stands still with")
+        expected_frame, camera = (
+            ("plane", "looks ahead of") if in_plane else ("crane's base frame", "stands still with")
+        )
         raise InputRefused(
             "log-list.other-frame",
-            f"the detector's list is not in the {wanted}; start a detector whose camera {camera} the machine",
+            f"the detector's list is not in the {expected_frame}; start a detector whose camera {camera} the machine",
         )
     assert isinstance(rows, list)
     logs = tuple(_checked(index if log.id is None else log.id, log) for index, log in enumerate(rows))

@@ -38,7 +38,7 @@ class LogCylinder:
 
 
 def log_from_mask(frame: RgbdFrame, mask: np.ndarray) -> LogCylinder | None:
-    """The log of a mask (H, W) bool; None with fewer than ``MIN_POINTS`` points of known depth."""
+    """Measure the log of a mask (H, W) bool; None with fewer than ``MIN_POINTS`` points of known depth."""
     v, u = np.nonzero(mask & np.isfinite(frame.depth_m))
     if len(u) < MIN_POINTS:
         return None
@@ -67,7 +67,7 @@ MAX_ASSOCIATION_M: Final = 1.5
 
 
 def box_in_picture(box_px: Box, picture: Intrinsics) -> Box:
-    """A box (left, top, right, bottom) of the 608 x 608 letterbox in pixels of the original picture."""
+    """Convert a box (left, top, right, bottom) of the 608 x 608 letterbox to pixels of the original picture."""
     letterbox = picture.letterbox(DETECTOR_PX)
     scale = letterbox.inner.width_px / picture.width_px
     left, top, right, bottom = box_px
@@ -76,7 +76,7 @@ def box_in_picture(box_px: Box, picture: Intrinsics) -> Box:
 
 
 def position_in_box(frame: RgbdFrame, box_px: Box) -> np.ndarray | None:
-    """Point (3,) [m] in the optical frame of the log in a box (left, top, right, bottom; edges of pixels).
+    """Compute the point (3,) [m] in the optical frame of the log in a box (left, top, right, bottom; edges of pixels).
 
     None when none of the 8 x 8 px has depth or the middle of the box is outside the picture.
     """
@@ -94,7 +94,7 @@ class RunningAverage:
     """The averaged positions of the logs so far."""
 
     def __init__(self, radius_m: float = 0.0, association_m: float = MAX_ASSOCIATION_M) -> None:
-        """``radius_m`` is added along the line of sight, from the surface to the middle (not in the paper)."""
+        """Start empty; ``radius_m`` is added along the line of sight, from surface to middle (not in the paper)."""
         self._radius_m, self._association_m = radius_m, association_m
         self._sums: list[np.ndarray] = []
         self._counts: list[int] = []
@@ -116,14 +116,14 @@ class RunningAverage:
                 self._counts.append(1)
 
     def positions_m(self) -> list[np.ndarray]:
-        """One position (3,) [m] for each log."""
+        """Return one position (3,) [m] for each log."""
         return [s / n for s, n in zip(self._sums, self._counts, strict=True)]
 
 
 def end_on_error_m(
     near_m: float, far_m: float, height_m: float, diameter_m: float, pitch_rad: float = 0.0
 ) -> tuple[float, float]:
-    """Distance [m] by which the box's middle lies short of a log's middle, and above it, when the log is seen end-on.
+    """Compute by how much [m] the box's middle lies short of a log's middle, and above it, when the log is seen end-on.
 
     Closed form.  The log lies on level ground along the line of sight, its ends ``near_m`` and ``far_m`` ahead of a
     camera ``height_m`` above the ground that is pitched down by ``pitch_rad``.  The box extends from the lower edge of
@@ -167,7 +167,7 @@ class BoxDetector:
         self._net = OpenVinoNet(read, (1, 3, SIZE_PX, SIZE_PX), precision)
 
     def detect(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,),
+        """Detect boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,),
         descending.
 
         Raises:
@@ -183,12 +183,12 @@ class BoxDetector:
 
 
 def network_input(rgb: np.ndarray) -> np.ndarray:
-    """The network's input (3, H, W) float32 from a picture (H, W, 3) uint8."""
+    """Make the network's input (3, H, W) float32 from a picture (H, W, 3) uint8."""
     return np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32) * np.float32(1.0 / 127.5) - np.float32(1.0)
 
 
 def decode_boxes(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (N, 4) [px] and scores (N,) of maps (5, h, w): local maxima after non-maximum suppression."""
+    """Decode boxes (N, 4) [px] and scores (N,) of maps (5, h, w): local maxima after non-maximum suppression."""
     score = 1.0 / (1.0 + np.exp(-maps[0]))
     peak = (score >= MIN_SCORE) & (score == ndimage.maximum_filter(score, 3, mode="constant"))
     y, x = np.nonzero(peak)
@@ -198,11 +198,11 @@ def decode_boxes(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sides = np.exp(np.clip(maps[1:, y, x].T, -4.0, 5.0)) * STRIDE
     boxes = np.concatenate([middle - sides[:, :2], middle + sides[:, 2:]], axis=1)
     boxes = np.clip(boxes, 0.0, (maps.shape[2] * STRIDE, maps.shape[1] * STRIDE) * 2)
-    kept: list[int] = []
+    selected_indices: list[int] = []
     for i in range(len(boxes)):
-        if not kept or _overlaps(boxes[i], boxes[kept]).max() < MAX_OVERLAP:
-            kept.append(i)
-    return boxes[kept], score[y[kept], x[kept]]
+        if not selected_indices or _overlaps(boxes[i], boxes[selected_indices]).max() < MAX_OVERLAP:
+            selected_indices.append(i)
+    return boxes[selected_indices], score[y[selected_indices], x[selected_indices]]
 
 
 def _overlaps(box: np.ndarray, others: np.ndarray) -> np.ndarray:

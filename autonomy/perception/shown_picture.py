@@ -50,7 +50,7 @@ class MeasuredPicture:
 
 
 def ignore_picture(picture: MeasuredPicture) -> None:
-    """Of a detector that nobody watches."""
+    """Ignore a picture, for a detector that nobody watches."""
 
 
 class NewestPicture:
@@ -67,7 +67,7 @@ class NewestPicture:
         self._measured, self._measured_ns, self._drawn = picture, now_ns, None
 
     def reply(self, request: bytes, problem: str) -> bytes | None:
-        """The reply to a request; None when the datagram is not a request for a picture.
+        """Return the reply to a request; None when the datagram is not a request for a picture.
 
         ``problem`` is why the detector has no newer one.
         """
@@ -85,7 +85,7 @@ class NewestPicture:
 
 
 def draw(picture: MeasuredPicture, now_ns: int) -> tuple[PictureFacts, bytes]:
-    """The facts and the JPEG of a picture without black bars; every ``step``-th pixel of the frame."""
+    """Draw a picture without black bars and return its facts and its JPEG; every ``step``-th pixel of the frame."""
     frame = picture.frame
     top, bottom, left, right = content_window(frame.rgb)
     step = -(-max(bottom - top, right - left) // SIDE_PX)
@@ -118,7 +118,7 @@ def draw(picture: MeasuredPicture, now_ns: int) -> tuple[PictureFacts, bytes]:
 
 
 def _outline(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels just outside a mask (H, W), and two wide just inside it, because JPEG blurs thinner lines."""
+    """Find the pixels just outside a mask (H, W), and two wide just inside it, because JPEG blurs thinner lines."""
     inside = mask & ~ndimage.binary_erosion(mask, iterations=2, border_value=1)
     outside = ndimage.binary_dilation(mask) & ~mask
     return outside, inside

@@ -40,7 +40,7 @@ class Standpoint:
     """Whether the crane holds a load in front of the camera."""
 
     def at(self, now_ns: int) -> tuple[Pose, float] | None:
-        """Base and articulation at another time; None when that is too far away."""
+        """Return base and articulation at another time; None when that is too far away."""
         if abs(now_ns - self.stamp_ns) > MAX_AGE_NS:
             return None
         seconds = (now_ns - self.stamp_ns) * 1e-9
@@ -49,7 +49,7 @@ class Standpoint:
         return base, self.articulation_rad + seconds * self.bending_rad_s
 
     def numbers(self) -> tuple[float, ...]:
-        """All but the stamp and ``load``, as `from_numbers` reads them."""
+        """Return all but the stamp and ``load``, as `from_numbers` reads them."""
         turn = Rotation.from_matrix(self.base.rotation).as_rotvec()
         vectors = (self.base.position_m, turn, self.velocity_m_s, self.turn_rad_s)
         moving = (self.articulation_rad, self.bending_rad_s)
@@ -57,14 +57,14 @@ class Standpoint:
 
 
 def from_numbers(stamp_ns: int, numbers: Sequence[float]) -> Standpoint:
-    """The standpoint with these `NUMBERS` numbers."""
+    """Make the standpoint with these `NUMBERS` numbers."""
     position, turn, velocity, turning = np.reshape(np.asarray(numbers[:12], float), (4, 3))
     base = Pose(position, Rotation.from_rotvec(turn).as_matrix())
     return Standpoint(stamp_ns, base, float(numbers[12]), velocity, turning, float(numbers[13]))
 
 
 def standpoint(now_ns: int, here: Pose, before: Pose, bends_rad: tuple[float, float], seconds: float) -> Standpoint:
-    """The standpoint of a machine that was ``before`` with the first of two articulations ``seconds`` ago."""
+    """Return the standpoint of a machine that was ``before`` with the first of two articulations ``seconds`` ago."""
     rate = 0.0 if seconds <= 0.0 else 1.0 / seconds
     turn = Rotation.from_matrix(here.rotation @ before.rotation.T).as_rotvec()
     return Standpoint(

@@ -19,7 +19,7 @@ Address = tuple[str, int]
 
 
 def arguments(argv: list[str]) -> argparse.Namespace:
-    """The parsed command line; ends the process with code 2 when it is wrong."""
+    """Parse the command line; end the process with code 2 when it is wrong."""
     parser = argparse.ArgumentParser(prog="python -m autonomy", description="Loads one log, or executes a mission.")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
     parser.add_argument("--controller", type=address_argument, required=True, help="HOST:PORT that accepts setpoints")

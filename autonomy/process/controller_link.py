@@ -21,7 +21,11 @@ class ControllerLink:
     """
 
     def __init__(self, controller: Address | None, report_port: int, profile_hash: int, key: bytes | None) -> None:
-        """Raises OSError when the port of the reports cannot be opened."""
+        """Open the link.
+
+        Raises:
+            OSError: the port of the reports cannot be opened.
+        """
         self.foreign = False
         self.vehicle: VehicleReport | None = None
         self._controller, self._hash, self._key = controller, profile_hash, key
@@ -34,7 +38,7 @@ class ControllerLink:
         select.select([self._socket], [], [], seconds)
 
     def newest(self) -> StateReport | None:
-        """The newest report that arrived since the last call."""
+        """Return the newest report that arrived since the last call."""
         newest = None
         while True:
             try:

@@ -24,7 +24,8 @@ from machine.profile import Profile
 
 
 def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: bytes | None) -> Job:
-    """The job of a command line; emits ``mission`` for what its file loses and ``resumed`` when a mission is resumed.
+    """Make the job of a command line; emit ``mission`` for what its file loses and ``resumed`` when a mission is
+    resumed.
 
     Raises:
         MissionError: the mission or its checkpoint cannot be used.
@@ -58,7 +59,7 @@ def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: 
 def uploaded_missions(
     options: argparse.Namespace, profile: Profile, lease_ns: int, key: bytes | None
 ) -> UploadedMissions | None:
-    """The missions that may be uploaded; None without a folder of them."""
+    """Return the missions that may be uploaded; None without a folder of them."""
     if options.missions is None or profile.carrier is None:
         return None
     site = (profile.carrier.site_lat_deg, profile.carrier.site_lon_deg)

@@ -65,35 +65,35 @@ class Job(Protocol):
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
-        """One step; call it at 20 Hz or faster."""
+        """Take one step; call it at 20 Hz or faster."""
 
     @property
     def drives(self) -> bool:
         """Whether the detector's camera looks ahead of a machine that drives: its lists are in the plane."""
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
-        """Of such a job: where the next picture is taken, None while none is wanted."""
+        """Tell where the next picture of such a job is taken, None while none is wanted."""
 
     def abort(self, reason: str) -> None:
         """Fail the job; the machine stops smoothly."""
 
     def events(self) -> Iterator[JobEvent]:
-        """The current status events."""
+        """Yield the current status events."""
 
     def outcome(self) -> dict[str, Any]:
-        """Fields of the final event."""
+        """Return the fields of the final event."""
 
     def execute(self, command: MissionCommand) -> str:
-        """Execute an operator command; returns why it is refused, empty otherwise."""
+        """Execute an operator command; return why it is refused, empty otherwise."""
 
     def report(self, now_ns: int) -> MissionReport | None:
-        """The mission report, None without a mission."""
+        """Return the mission report, None without a mission."""
 
     def chosen_grasp(self) -> ChosenGrasp | None:
-        """The grasp that the crane is about to make, None at other times."""
+        """Return the grasp that the crane is about to make, None at other times."""
 
     def progress(self) -> Checkpoint | None:
-        """The checkpoint from which the job can be resumed, None if it cannot."""
+        """Return the checkpoint from which the job can be resumed, None if it cannot."""
 
 
 class SingleLogJob:
@@ -123,7 +123,7 @@ class SingleLogJob:
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
-        """One step of the activity, which the operator's mode switch may hold; the carrier stands."""
+        """Take one step of the activity, which the operator's mode switch may hold; the carrier stands."""
         self._switch.take(report)
         if self._switch.started:
             self._held = ""
@@ -141,7 +141,7 @@ class SingleLogJob:
         return False
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
-        """None: the crane's joints say where its camera is."""
+        """Return None: the crane's joints say where its camera is."""
         return None
 
     def abort(self, reason: str) -> None:
@@ -149,31 +149,31 @@ class SingleLogJob:
         self._activity.abort(reason)
 
     def events(self) -> Iterator[JobEvent]:
-        """Grasp, phase and pause reason."""
+        """Yield grasp, phase and pause reason."""
         yield from _crane_events(self._activity.grasp, self._activity.phase.name)
         yield _pause_event(self._held or self._activity.paused)
 
     def outcome(self) -> dict[str, Any]:
-        """No fields."""
+        """Return no fields."""
         return {}
 
     def execute(self, command: MissionCommand) -> str:
-        """Only Abort is accepted."""
+        """Accept only Abort."""
         if command.action is not MissionAction.ABORT:
             return ONLY_ABORT
         self.abort(ABORTED)
         return ""
 
     def report(self, now_ns: int) -> MissionReport | None:
-        """None: there is no mission."""
+        """Return None: there is no mission."""
         return None
 
     def chosen_grasp(self) -> ChosenGrasp | None:
-        """The grasp of the activity."""
+        """Return the grasp of the activity."""
         return chosen_grasp(self._activity)
 
     def progress(self) -> Checkpoint | None:
-        """None: the job starts over with a new detection."""
+        """Return None: the job starts over with a new detection."""
         return None
 
 
@@ -213,7 +213,7 @@ class ForwardingJob:
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
-        """One step of the manager; with memory the logs are in the plane."""
+        """Take one step of the manager; with memory the logs are in the plane."""
         self._now_ns = now_ns
         if self.drives and logs:
             logs = self._in_base(now_ns, logs)
@@ -229,12 +229,13 @@ class ForwardingJob:
         return self._manager.log_memory is not None
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
-        """Where the next picture is taken."""
+        """Tell where the next picture is taken."""
         return self._manager.standpoint(now_ns)
 
     def _in_base(self, now_ns: int, logs: tuple[LogObservation, ...]) -> tuple[LogObservation, ...]:
-        """A list that was asked for while the machine drove; one that comes when the crane works already is dropped,
-        because a log in the grapple does not lie on the ground."""
+        """Return a list that was asked for while the machine drove; one that comes when the crane works already is
+        dropped, because a log in the grapple does not lie on the ground.
+        """
         if self.standpoint(now_ns) is None:
             return ()
         base = self._manager.world.base_at(now_ns)
@@ -245,7 +246,7 @@ class ForwardingJob:
         self._manager.abort(reason)
 
     def events(self) -> Iterator[JobEvent]:
-        """State, load, remarks on it, grasp, crane phase and pause reason."""
+        """Yield state, load, remarks on it, grasp, crane phase and pause reason."""
         manager, activity = self._manager, self._manager.activity
         yield "state", {"state": manager.state.name, "words": manager.description}
         yield "load", {"logs": manager.tally.loaded}
@@ -256,7 +257,7 @@ class ForwardingJob:
         yield _pause_event(manager.paused or None)
 
     def outcome(self) -> dict[str, Any]:
-        """Counts of the mission."""
+        """Return the counts of the mission."""
         tally = self._manager.tally
         given_up = [{"log": number, "reason": reason} for number, reason in tally.given_up.items()]
         return {
@@ -299,16 +300,16 @@ class ForwardingJob:
         return ""
 
     def report(self, now_ns: int) -> MissionReport:
-        """The mission report."""
+        """Return the mission report."""
         manager = self._manager
         return self._publisher.report(now_ns, manager.is_auto, self._command, self._refusal, self._refusal_code)
 
     def chosen_grasp(self) -> ChosenGrasp | None:
-        """The grasp of the present crane job."""
+        """Return the grasp of the present crane job."""
         return chosen_grasp(self._manager.activity)
 
     def progress(self) -> Checkpoint:
-        """The checkpoint of the mission."""
+        """Return the checkpoint of the mission."""
         return self._manager.progress()
 
 

@@ -83,7 +83,7 @@ class MissionPublisher:
     def report(
         self, now_ns: int, auto: bool, order: int = 0, refusal: str = "", refusal_code: str = ""
     ) -> MissionReport:
-        """The report; ``order``, ``refusal`` and ``refusal_code`` are those of the last command."""
+        """Make the report; ``order``, ``refusal`` and ``refusal_code`` are those of the last command."""
         manager, tally = self._manager, self._manager.tally
         given_up = list(tally.given_up.items())[-MAX_GIVEN_UP:]
         activity = manager.activity
@@ -119,7 +119,7 @@ class MissionPublisher:
         )
 
     def _targets(self) -> tuple[int, ...]:
-        """The logs of the grasp; without one, the log that the machine drives to."""
+        """Return the logs of the grasp; without one, the log that the machine drives to."""
         manager = self._manager
         if manager.activity is None or manager.activity.grasp is None:
             return () if manager.target is None else (manager.target,)
@@ -130,9 +130,9 @@ class MissionPublisher:
         location = self._manager.world.location
         if location is None or not location.usable:
             return None
-        (place,) = _degrees(self._manager.world.plane, [(location.x_m, location.y_m)])
+        (position,) = _degrees(self._manager.world.plane, [(location.x_m, location.y_m)])
         heading = round(bearing_from_yaw(location.yaw_rad), 2)
-        return MachinePose(place, heading, round(location.sigma_m, 3))
+        return MachinePose(position, heading, round(location.sigma_m, 3))
 
     def _logs(self, now_ns: int) -> tuple[KnownLog, ...]:
         world = self._manager.world
@@ -140,13 +140,13 @@ class MissionPublisher:
         if not logs:  # there may be no plane yet
             return ()
         if len(logs) > MAX_LOGS and location is not None and location.usable:
-            here = (location.x_m, location.y_m)
-            logs.sort(key=lambda log: math.dist(here, log.center_m[:2]))
+            position_m = (location.x_m, location.y_m)
+            logs.sort(key=lambda log: math.dist(position_m, log.center_m[:2]))
         logs = logs[:MAX_LOGS]
         return tuple(
             KnownLog(
                 log.number,
-                place,
+                position,
                 round(bearing_from_yaw(math.atan2(log.axis[1], log.axis[0])), 1),
                 round(log.length_m, 2),
                 round(log.diameter_m, 3),
@@ -154,12 +154,12 @@ class MissionPublisher:
                 log.misses,
                 log.misses >= MAX_ATTEMPTS,
             )
-            for log, place in zip(logs, _degrees(world.plane, [log.center_m[:2] for log in logs]), strict=True)
+            for log, position in zip(logs, _degrees(world.plane, [log.center_m[:2] for log in logs]), strict=True)
         )
 
 
 def _thinned(items: Sequence[T], limit: int) -> list[T]:
-    """At most ``limit`` items, evenly spaced, with the first and the last."""
+    """Return at most ``limit`` items, evenly spaced, with the first and the last."""
     if len(items) <= limit:
         return list(items)
     return [items[round(k * (len(items) - 1) / (limit - 1))] for k in range(limit)]
@@ -170,7 +170,9 @@ def _place(point: Point) -> LatLon:
 
 
 def _degrees(plane: LocalPlane, points: Sequence[Sequence[float] | np.ndarray]) -> list[LatLon]:
-    """WGS84 positions of points of the plane; converted together, because single conversions would take tens of ms."""
+    """Compute the WGS84 positions of points of the plane; converted together, because single conversions would take
+    tens of ms.
+    """
     if not points:
         return []
     east, north = np.array(points, dtype=float).T
@@ -183,7 +185,7 @@ def _degrees(plane: LocalPlane, points: Sequence[Sequence[float] | np.ndarray]) 
 
 
 def short_text(text: str) -> str:
-    """The text limited to the field's bytes; unprintable characters become spaces."""
+    """Limit the text to the field's bytes; unprintable characters become spaces."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     if len(plain.encode()) <= MAX_TEXT_CHARS:
         return plain
@@ -209,7 +211,7 @@ class CraneJobState(Protocol):
 
 
 def chosen_grasp(activity: CraneJobState | None) -> ChosenGrasp | None:
-    """The grasp of a crane job, None without one or when it is over; of None no crane job runs."""
+    """Return the grasp of a crane job, None without one or when it is over; of None no crane job runs."""
     if activity is None or activity.grasp is None or activity.phase not in SHOWN_PHASES:
         return None
     profile, grasp, pose = activity.profile, activity.grasp, activity.grasp.pose

@@ -28,7 +28,7 @@ class CommandReceiver:
         self._last = (-1, -1)
 
     def accept(self, data: bytes, now_ns: int) -> MissionCommand | MissionUpload:
-        """The command or upload in a datagram.
+        """Return the command or upload in a datagram.
 
         Raises:
             CommandRefused: it is not accepted and must not be executed.

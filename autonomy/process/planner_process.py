@@ -110,7 +110,7 @@ class PlannerProcess:
         self._write_or_emit(time.monotonic_ns())
 
     def step(self, now_ns: int) -> None:
-        """One step: request logs, receive, step the job, send, emit events, report."""
+        """Take one step: request logs, receive, step the job, send, emit events, report."""
         if now_ns >= self._request_ns:
             self._request_ns = now_ns + REQUEST_PERIOD_NS
             standpoint = self._job.standpoint(now_ns)
@@ -180,10 +180,10 @@ class PlannerProcess:
         emit("upload", name=upload.name, refused=refused or None, code=code or None)
 
     def _report_mission(self, now_ns: int) -> None:
-        told = [(self._link, watcher) for watcher in self._watchers]
-        told += [(self._commands, asker) for asker in self._askers]
+        recipients = [(self._link, watcher) for watcher in self._watchers]
+        recipients += [(self._commands, asker) for asker in self._askers]
         self._askers = []
-        if not told:
+        if not recipients:
             return
         self._sequence += 1
         sent = []
@@ -192,7 +192,7 @@ class PlannerProcess:
         if (report := self._job.report(now_ns)) is not None:
             report = msgspec.structs.replace(report, **self._answer)
             sent.append(encode_mission(report, self._sequence, self._hash, now_ns, self._key))
-        for link, to in told:
+        for link, to in recipients:
             for data in sent:
                 self._send(lambda d, link=link, to=to: link.sendto(d, to), data)  # type: ignore[misc]
 
@@ -252,11 +252,11 @@ def _received(link: socket.socket) -> list[bytes]:
 
 
 def _received_from(link: socket.socket) -> list[tuple[bytes, Address]]:
-    found = []
+    datagrams = []
     while True:
         try:
-            found.append(link.recvfrom(65535))
+            datagrams.append(link.recvfrom(65535))
         except BlockingIOError:
-            return found
+            return datagrams
         except ConnectionRefusedError:
             continue

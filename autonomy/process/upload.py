@@ -56,7 +56,7 @@ class MachineAtRest:
         return -1 if self.report is None else self.report.mode
 
     def check(self, now_ns: int) -> None:
-        """Whether a mission may be taken now.
+        """Check that a mission may be taken now.
 
         Raises:
             CommandRefused: it may not.
@@ -78,7 +78,7 @@ class UploadedMissions:
     job_of: Callable[[ForwardingMission], Job]
 
     def job(self, upload: MissionUpload) -> Job:
-        """The job of an uploaded mission.
+        """Make the job of an uploaded mission.
 
         Raises:
             CommandRefused: the file is not the one that was uploaded.
@@ -117,11 +117,11 @@ class WaitingJob:
     def step(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
     ) -> list[bytes]:
-        """Nothing."""
+        """Do nothing."""
         return []
 
     def standpoint(self, now_ns: int) -> Standpoint | None:
-        """None: no picture is wanted."""
+        """Return None: no picture is wanted."""
         return None
 
     def abort(self, reason: str) -> None:
@@ -129,20 +129,20 @@ class WaitingJob:
         self.failure = reason
 
     def events(self) -> Iterator[JobEvent]:
-        """That it waits."""
+        """Yield that it waits."""
         yield "state", {"state": "WAITING", "words": WAITING}
 
     def outcome(self) -> dict[str, Any]:
-        """No fields."""
+        """Return no fields."""
         return {}
 
     def execute(self, command: MissionCommand) -> str:
-        """Every command is refused."""
+        """Refuse every command."""
         self._command, self._refusal = command.sequence, NO_MISSION
         return NO_MISSION
 
     def report(self, now_ns: int) -> MissionReport:
-        """An empty report."""
+        """Return an empty report."""
         return MissionReport(
             schema=1,
             name="",
@@ -174,9 +174,9 @@ class WaitingJob:
         )
 
     def chosen_grasp(self) -> ChosenGrasp | None:
-        """None: the crane does not work."""
+        """Return None: the crane does not work."""
         return None
 
     def progress(self) -> Checkpoint | None:
-        """None."""
+        """Return None."""
         return None

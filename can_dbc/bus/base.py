@@ -80,14 +80,14 @@ class BusStats:
     rx_errors: int = 0
 
     def enter(self, state: BusState) -> bool:
-        """Changes the state; True if this is a recovery."""
+        """Change the state; True if this is a recovery."""
         recovered = state < BusState.OFF <= self.state
         self.recoveries += recovered
         self.state = state
         return recovered
 
     def note_error(self, key: int, data: bytes) -> bool:
-        """Updates the state with one error frame (linux/can/error.h: class in the key, 8 data bytes).
+        """Update the state with one error frame (linux/can/error.h: class in the key, 8 data bytes).
 
         True if the node has recovered; frames received before are then out of date.  Lost arbitration and time-outs of
         the driver's transmitter are counted and change no state: the former is normal, and the latter shows as frames
@@ -119,40 +119,41 @@ class Bus(Protocol):
     stats: BusStats
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when frames wait; -1 if the backend has none.  `reopen` changes it."""
+        """Return the descriptor that is readable when frames wait; -1 if the backend has none.  `reopen` changes it."""
 
     def drain(self, frames: list[Frame]) -> int:
-        """Appends every waiting frame, at most `DRAIN_LIMIT`; returns how many."""
+        """Append every waiting frame, at most `DRAIN_LIMIT`; returns how many."""
 
     def send(self, key: int, data: bytes) -> bool:
-        """Sends one frame of 0 to 8 bytes; False if it was not accepted."""
+        """Send one frame of 0 to 8 bytes; False if it was not accepted."""
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
-        """Sends (key, data) frames in order, with one system call if the backend can; returns how many were accepted.
+        """Send (key, data) frames in order, with one system call if the backend can; returns how many were accepted.
 
         The first frame that is not accepted and all frames behind it are refused.
         """
 
     def discard(self) -> int:
-        """Cancels own frames whose transmission has not begun, if the backend can; they count in `BusStats.refused`.
+        """Cancel own frames whose transmission has not begun, if the backend can; they count in `BusStats.refused`.
 
         Returns how many it cancelled, a few more while the backend does not know yet which have gone out; 0 if it
         cannot: SocketCAN has no way to empty the queue of an interface.
         """
 
     def flush(self) -> None:
-        """Discards the frames received so far (error frames still change the state) and, if the backend can, own frames
-        that are not on the bus yet."""
+        """Discard the frames received so far (error frames still change the state) and, if the backend can, own frames
+        that are not on the bus yet.
+        """
 
     def reopen(self) -> bool:
-        """One attempt to restore a lost link, a few milliseconds at most; True if the bus is usable.
+        """Make one attempt to restore a lost link, a few milliseconds at most; True if the bus is usable.
 
         Has an effect only in state DOWN: does nothing to a working bus (True) or to one that is bus-off or closed
         (False).  A restored link is a new one and holds no frames from before.  Cheap enough for every cycle.
         """
 
     def close(self) -> None:
-        """Leaves the bus; may be called twice."""
+        """Leave the bus; may be called twice."""
 
     def __enter__(self) -> Self: ...
 
@@ -170,15 +171,15 @@ class BaseBus:
         self._closed = False
 
     def _receive(self, frames: list[Frame]) -> None:
-        """Appends the waiting frames, without blocking."""
+        """Append the waiting frames, without blocking."""
         raise NotImplementedError
 
     def _reopen_link(self) -> bool:
-        """Releases the lost link and opens it again; True if it is usable."""
+        """Release the lost link and opens it again; True if it is usable."""
         return False
 
     def _release(self) -> None:
-        """Releases the backend's resources; never fails."""
+        """Release the backend's resources; never fails."""
 
     def drain(self, frames: list[Frame]) -> int:
         stats = self.stats
@@ -255,7 +256,7 @@ class Filter:
     __slots__ = ("_keys", "_masked", "pairs")
 
     def __init__(self, wanted: Iterable[int | Sequence[int]]) -> None:
-        """Raises TypeError or ValueError for an item that is neither a key nor a pair."""
+        """Sort the items into keys and masks; TypeError or ValueError for one that is neither a key nor a pair."""
         pairs: set[tuple[int, int]] = set()
         for item in wanted:
             key, mask = (item, EXTENDED_MASK) if isinstance(item, int) else item
@@ -267,10 +268,10 @@ class Filter:
 
     def __contains__(self, key: object) -> bool:
         return key in self._keys or (
-            isinstance(key, int) and any(key & mask == wanted for wanted, mask in self._masked)
+            isinstance(key, int) and any(key & mask == filter_key for filter_key, mask in self._masked)
         )
 
 
 def filter_of(wanted: Iterable[FilterItem] | None) -> Filter | None:
-    """The filter of a participant's items; None, which passes everything, for None."""
+    """Return the filter of a participant's items; None, which passes everything, for None."""
     return None if wanted is None else Filter(wanted)

@@ -67,7 +67,7 @@ class Batch(_Buffers):
         self._used = 0
 
     def receive(self, descriptor: int) -> int:
-        """Receives at most ``count`` waiting datagrams without blocking; 0 if none waits.  Raises OSError otherwise."""
+        """Receive at most ``count`` waiting datagrams without blocking; 0 if none waits.  Raises OSError otherwise."""
         used = self._used
         if used and self.ancillary:  # the kernel overwrites the offered sizes of control data with the received ones
             self._headers[: used * _HEADER.size] = self._fresh[: used * _HEADER.size]
@@ -83,17 +83,17 @@ class Batch(_Buffers):
         raise OSError(code, os.strerror(code))
 
     def length(self, i: int) -> int:
-        """Size in bytes of datagram i of the last `receive`."""
-        found: int = self._words[i * _HEADER_WORDS + _LENGTH_WORD]
-        return found
+        """Return the size in bytes of datagram i of the last `receive`."""
+        length_bytes: int = self._words[i * _HEADER_WORDS + _LENGTH_WORD]
+        return length_bytes
 
     def sender(self, i: int) -> tuple[str, int]:
-        """Address and port that datagram i of the last `receive` came from."""
+        """Return the address and port that datagram i of the last `receive` came from."""
         port, host = _NAME.unpack_from(self._names, i * _NAME.size)
         return socket.inet_ntoa(host), port
 
     def lengths(self) -> list[int]:
-        """Size in bytes of each datagram of the last `receive`."""
+        """Return the size in bytes of each datagram of the last `receive`."""
         return [self.length(i) for i in range(self._used)]
 
 
@@ -106,7 +106,7 @@ class Outbox(_Buffers):
         super().__init__(size, 0, count)
 
     def send(self, descriptor: int, count: int) -> int:
-        """Sends the first ``count`` datagrams without blocking; returns how many of them the kernel accepted.
+        """Send the first ``count`` datagrams without blocking; returns how many of them the kernel accepted.
 
         Raises OSError with the reason if it accepted none.
         """
@@ -118,7 +118,7 @@ class Outbox(_Buffers):
 
 
 def enlarge_receive_buffer(sock: socket.socket, size: int) -> None:
-    """Gives a socket a receive buffer of ``size`` bytes; only root can exceed the system's limit."""
+    """Give a socket a receive buffer of ``size`` bytes; only root can exceed the system's limit."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
     except PermissionError:

@@ -27,7 +27,7 @@ def open_bus(
     tx_queue: int = 10,
     participant: str | None = None,
 ) -> Bus:
-    """Opens the bus at `address`.
+    """Open the bus at `address`.
 
     Args:
         address: See the module docstring.
@@ -42,7 +42,7 @@ def open_bus(
         LinkError: The bus cannot be opened.
     """
     backend, _, channel = address.removeprefix(PYTHON_CAN).partition(":")
-    wanted = filter_of(filters)
+    bus_filter = filter_of(filters)
     if not backend or not channel:
         raise LinkError(
             "bus.address",
@@ -50,23 +50,26 @@ def open_bus(
             "interface and its channel, for example virtual:test.",
         )
     # Backends are imported on demand: the guard must not import python-can.
-    ours = not address.startswith(PYTHON_CAN)
-    if ours and backend == "wire":
+    own_backend = not address.startswith(PYTHON_CAN)
+    if own_backend and backend == "wire":
         from can_dbc.bus.wire_client import WireClient
 
-        return WireClient(channel, wanted, receive_own, tx_queue, participant)
-    if ours and backend == "socketcan":
+        return WireClient(channel, bus_filter, receive_own, tx_queue, participant)
+    if own_backend and backend == "socketcan":
         from can_dbc.bus.socketcan import SocketCanBus
 
-        return SocketCanBus(channel, wanted, receive_own)
+        return SocketCanBus(channel, bus_filter, receive_own)
     from can_dbc.bus.python_can_bus import PythonCanBus
 
-    return PythonCanBus(backend, channel, wanted, receive_own)
+    return PythonCanBus(backend, channel, bus_filter, receive_own)
 
 
 def default_address(logical_name: str, explicit: str | None = None) -> str:
-    """The address for ``crane0`` or ``mach0``: the explicit one, else ``TIMBERHAND_<NAME>`` from the environment, else
-    a SocketCAN interface of that name or its vcan stand-in where the kernel has one, else the wire."""
+    """Choose the address for ``crane0`` or ``mach0``.
+
+    It is the explicit one, else ``TIMBERHAND_<NAME>`` from the environment, else a SocketCAN interface of that name or
+    its vcan stand-in where the kernel has one, else the wire.
+    """
     chosen = explicit or os.environ.get(f"TIMBERHAND_{logical_name.upper()}")
     if chosen:
         return chosen
@@ -79,7 +82,7 @@ def default_address(logical_name: str, explicit: str | None = None) -> str:
 
 
 def kernel_has_can() -> bool:
-    """True when this kernel offers raw CAN sockets."""
+    """Return True when this kernel offers raw CAN sockets."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:

@@ -62,7 +62,7 @@ class FrameSocket:
         self._adapter_clock = HardwareClock()
 
     def receive(self, frames: list[Frame], limit: int, note_error: Callable[[int, bytes], bool]) -> None:
-        """Appends the waiting frames, at most `limit`; one system call unless more than a full batch waits.
+        """Append the waiting frames, at most `limit`; one system call unless more than a full batch waits.
 
         Error frames go to `note_error`; if it reports a recovery of the node, the frames appended before are removed.
         Raises OSError if the link is lost.
@@ -87,7 +87,7 @@ class FrameSocket:
                 return
 
     def send(self, frames: Sequence[tuple[int, bytes]]) -> int:
-        """Sends frames in order without blocking, up to the first that is invalid (more than 8 bytes) or finds no room.
+        """Send frames in order without blocking, up to the first that is invalid (more than 8 bytes) or finds no room.
 
         Returns how many the kernel accepted.  Raises OSError with the reason if it accepted none of a batch.
         """
@@ -132,7 +132,7 @@ class FrameSocket:
             yield stamp_ns
 
     def _count_dropped(self, waiting: int) -> None:
-        """The last frame carries the count of all frames lost before it; it is 32 bits wide and wraps."""
+        """Read from the last frame the count of all frames lost before it; it is 32 bits wide and wraps."""
         at = (waiting - 1) * _CONTROL_BYTES + 32
         control = self._batch.control
         if _KIND.unpack_from(control, at)[0] == _SO_TIMESTAMPING:

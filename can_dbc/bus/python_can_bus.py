@@ -69,7 +69,7 @@ class PythonCanBus(BaseBus):
         super().flush()
 
     def _receive(self, frames: list[Frame]) -> None:
-        stats, wanted, first = self.stats, self._wanted, len(frames)
+        stats, receive_filter, start_index = self.stats, self._wanted, len(frames)
         clock = self._clock
         for _ in range(DRAIN_LIMIT):
             try:
@@ -83,10 +83,10 @@ class PythonCanBus(BaseBus):
                 return
             if message.is_error_frame:
                 if stats.note_error(message.arbitration_id, bytes(message.data).ljust(8, b"\0")):
-                    del frames[first:]
+                    del frames[start_index:]
                 continue
             key = key_of(message)
-            if wanted is None or key in wanted:
+            if receive_filter is None or key in receive_filter:
                 frames.append(Frame(self._stamp_ns(message.timestamp), key, payload_of(message)))
 
     def _stamp_ns(self, stamp_s: float) -> int:
@@ -117,7 +117,7 @@ class PythonCanBus(BaseBus):
 
 
 def message_of(key: int, data: bytes, timestamp_s: float = 0.0) -> can.Message:
-    """The python-can message of a key and payload."""
+    """Make the python-can message of a key and payload."""
     return can.Message(
         timestamp=timestamp_s,
         arbitration_id=key & 0x1FFF_FFFF if key & ERROR else identifier(key),
@@ -130,7 +130,7 @@ def message_of(key: int, data: bytes, timestamp_s: float = 0.0) -> can.Message:
 
 
 def key_of(message: can.Message) -> int:
-    """The key of a python-can data or remote message."""
+    """Return the key of a python-can data or remote message."""
     return (
         message.arbitration_id
         | (EXTENDED if message.is_extended_id else 0)
@@ -139,5 +139,5 @@ def key_of(message: can.Message) -> int:
 
 
 def payload_of(message: can.Message) -> bytes:
-    """The payload of a message; for a remote frame as many zeros as it requests bytes."""
+    """Return the payload of a message; for a remote frame as many zeros as it requests bytes."""
     return bytes(message.dlc) if message.is_remote_frame else bytes(message.data)

@@ -24,12 +24,12 @@ class ReceiveClock:
         self.offset_ns = self._offset_when_empty_ns = 0
 
     def begin(self, now_ns: int, wall_ns: int) -> None:
-        """Frames were taken; both clocks [ns], read after that."""
+        """Note that frames were taken; both clocks [ns], read after that."""
         self._previous_ns, self.now_ns = self.now_ns, now_ns
         self.offset_ns = now_ns - wall_ns
 
     def emptied(self) -> None:
-        """The queue was found empty between the last two calls of `begin`: later frames came after the former."""
+        """Note that the queue was empty between the last two calls of `begin`: later frames came after the former."""
         self.since_ns, self._offset_when_empty_ns = self._previous_ns, self.offset_ns
 
     def doubtful_ns(self, stamp_ns: int) -> int:

@@ -22,7 +22,7 @@ class Reconnector:
         self._try_ns = 0
 
     def watch(self, now_ns: int) -> None:
-        """To be called once per cycle; cheap while the bus is up."""
+        """Watch the bus; to be called once per cycle, cheap while the bus is up."""
         if self._bus.stats.state is not _DOWN:
             self._try_ns = 0
         elif not self._try_ns:

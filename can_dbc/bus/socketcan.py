@@ -96,7 +96,7 @@ class SocketCanBus(BaseBus):
         self._link.close()
 
     def _open(self, needed: int) -> FrameSocket:
-        """A socket bound to the interface; OSError if the interface is missing or lacks one of the flags ``needed``.
+        """Bind a socket to the interface; OSError if the interface is missing or lacks one of the flags ``needed``.
 
         An interface that is bus-off is up but not running.  The kernel needs up to a second to mark a new interface as
         running, so only a link that was lost has to be running.

@@ -42,8 +42,9 @@ _DOWN: Final = BusState.DOWN
 
 
 def wire_directory() -> Path:
-    """Directory of the socket files: ``TIMBERHAND_WIRE_DIR``, else the user's runtime directory, else a directory of
-    this user in the temporary one."""
+    """Return the directory of the socket files: ``TIMBERHAND_WIRE_DIR``, else the user's runtime directory, else a
+    directory of this user in the temporary one.
+    """
     if explicit := os.environ.get("TIMBERHAND_WIRE_DIR"):
         return Path(explicit)
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
@@ -130,7 +131,7 @@ class WireClient(BaseBus):
         self._read(frames, first)
 
     def _read(self, frames: list[Frame], first: int) -> None:
-        """Appends the frames waiting in the socket; at a recovery removes all from `first` on."""
+        """Append the frames waiting in the socket; at a recovery remove all from `first` on."""
         stats = self.stats
         counters = read(self._batch, self._sock.fileno(), frames, first, stats, self._error_frames)
         if counters is None:
@@ -143,7 +144,7 @@ class WireClient(BaseBus):
             self._dropped = dropped
 
     def _bound_backlog(self) -> None:
-        """Bounds the backlog of a client that only sends."""
+        """Bound the backlog of a client that only sends."""
         surplus = len(self._backlog) - _MAX_BACKLOG_FRAMES
         if surplus > 0:
             self.stats.dropped += surplus
@@ -160,7 +161,7 @@ class WireClient(BaseBus):
         return True
 
     def _reopen_link(self) -> bool:
-        """Sends one hello to a slow daemon; later calls only check for its answer."""
+        """Send one hello to a slow daemon; later calls only check for its answer."""
         timeout_s = 0.0
         try:
             if self._opening is None:
@@ -190,7 +191,7 @@ class WireClient(BaseBus):
 
 
 def control(name: str, message: dict[str, Any]) -> dict[str, Any]:
-    """Sends a request to the daemon of bus `name` (see `hil.wire.daemon`) without joining the bus; returns its answer.
+    """Send a request to the daemon of bus `name` (see `hil.wire.daemon`) without joining the bus; returns its answer.
 
     Raises:
         LinkError: There is no daemon, it does not answer, or it refuses; the sentence has its reason.
@@ -201,7 +202,7 @@ def control(name: str, message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[str, Any]]:
-    """A connection to the daemon, and its answer to the first message; raises `LinkError`."""
+    """Connect to the daemon; returns the socket and the answer to the first message; raises `LinkError`."""
     sock = None
     try:
         sock = _connect_and_send(name, message, _OPEN_TIMEOUT_S)
@@ -219,7 +220,7 @@ def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[st
 
 
 def _connect_and_send(name: str, message: dict[str, Any], timeout_s: float) -> socket.socket:
-    """A connection to the daemon, with the first control packet sent; raises OSError."""
+    """Connect to the daemon and send the first control packet; raises OSError."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         sock.settimeout(timeout_s)
@@ -232,7 +233,7 @@ def _connect_and_send(name: str, message: dict[str, Any], timeout_s: float) -> s
 
 
 def _receive_answer(name: str, sock: socket.socket) -> dict[str, Any]:
-    """The daemon's answer to a control packet; raises OSError if none comes, LinkError for a refusal."""
+    """Receive the daemon's answer to a control packet; raises OSError if none comes, LinkError for a refusal."""
     reply: dict[str, Any] = json.loads(sock.recv(MAX_CONTROL_BYTES)[RECORD.size :])
     if "error" in reply:
         raise LinkError("wire.refused", f"The wire daemon of {name} refuses: {reply['error']}.")
@@ -240,6 +241,6 @@ def _receive_answer(name: str, sock: socket.socket) -> dict[str, Any]:
 
 
 def _program() -> str:
-    """The name of the running program; for ``python -m package`` that of the package."""
+    """Return the name of the running program; for ``python -m package`` that of the package."""
     path = Path(sys.argv[0])
     return path.parent.name if path.stem == "__main__" else path.stem or "python"

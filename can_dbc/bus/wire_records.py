@@ -70,7 +70,7 @@ def _unpack(
 
 
 def pack(frames: Sequence[tuple[int, bytes]], first: int, most: int) -> bytes:
-    """A packet of at most ``most`` frames from ``first`` on; it ends before a frame of more than 8 bytes."""
+    """Pack at most ``most`` frames from ``first`` on; the packet ends before a frame of more than 8 bytes."""
     records: list[bytes] = []
     for key, data in frames[first : first + most]:
         if len(data) > 8:

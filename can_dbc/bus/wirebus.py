@@ -39,7 +39,7 @@ class WireBus(can.BusABC):
         tx_queue: int = 10,
         **_: object,
     ) -> None:
-        """Ignores other python-can options (bitrate, fd, ...), which belong to the daemon.
+        """Ignore other python-can options (bitrate, fd, ...), which belong to the daemon.
 
         Raises:
             can.CanInitializationError: The bus cannot be opened.
@@ -57,7 +57,7 @@ class WireBus(can.BusABC):
         return self._client.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Waits for room in the transmit queue up to `timeout` seconds (None: for ever, 0: not at all).
+        """Wait for room in the transmit queue up to `timeout` seconds (None: for ever, 0: not at all), and send.
 
         Raises:
             can.CanOperationError: There is no room, the bus is off or down, or the message is not classical CAN.
@@ -99,7 +99,7 @@ class WireBus(can.BusABC):
         self._waiting.extend(frames)
 
     def flush_tx_buffer(self) -> None:
-        """Cancels the own frames whose transmission has not begun."""
+        """Cancel the own frames whose transmission has not begun."""
         with self._lock:
             self._client.discard()
 

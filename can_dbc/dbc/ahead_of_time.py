@@ -48,7 +48,7 @@ def _rounded(value: float) -> int:
 
 
 def module_source(codecs: Iterable[MessageCodec]) -> str:
-    """The module: one class per text, and ``CODECS`` from the key of the text to its class."""
+    """Write the module: one class per text, and ``CODECS`` from the key of the text to its class."""
     classes: dict[str, str] = {}
     for codec in codecs:
         key = key_of(codec.source)
@@ -109,7 +109,7 @@ def _receive_lines(codec: MessageCodec) -> list[str]:
 
 
 def _sentinel_lines(signals: Sequence[SignalInfo]) -> list[str]:
-    """A frame whose values are in range or not available, the usual reason to leave the fast path."""
+    """Write the lines for values in range or not available, the usual reason to leave the fast path."""
     checks, values = [], []
     for i, s in enumerate(signals):
         raw = f"r{i}"
@@ -134,7 +134,7 @@ def _encode_lines(codec: MessageCodec) -> list[str]:
     signals = codec.signals
     names = parameters(signals)
     lines = [f"    def encode(self, {', '.join(f'{name}: object' for name in names)}) -> bytes:"]
-    checks, words = [], []
+    checks, shifted_fields = [], []
     for i, (s, name) in enumerate(zip(signals, names, strict=True)):
         low, high = fast_limits(s)
         lines.append(f"        v{i}_ = _number({name})")
@@ -147,11 +147,11 @@ def _encode_lines(codec: MessageCodec) -> list[str]:
         elif s.scaling is Scaling.LINEAR:
             value = f"({value} - {s.offset!r}) / {s.scale!r}" if s.offset else f"{value} / {s.scale!r}"
         lines.append(f"            x{i}_: i64 = _rounded({value})")
-        words.append(f"(x{i}_ & {(1 << s.bits) - 1}) << {s.shift}")
+        shifted_fields.append(f"(x{i}_ & {(1 << s.bits) - 1}) << {s.shift}")
     cut = "" if codec.length == 8 else f"[:{codec.length}]"
     return [
         *lines,
-        f"            word: i64 = {' | '.join(words) or '0'}",
+        f"            word: i64 = {' | '.join(shifted_fields) or '0'}",
         f"            made: bytes = _pack(word){cut}",
         "            return made",
         f"        slow: bytes = self._slow_encode({', '.join(names)})",

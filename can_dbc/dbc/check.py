@@ -49,7 +49,7 @@ class Report:
 
 
 def check(name_or_path: str, frames: int, seed: int) -> Report:
-    """Loads, lints and compares one file over ``frames`` random payloads and value sets per message."""
+    """Load, lint and compare one file over ``frames`` random payloads and value sets per message."""
     try:
         path = resolve(name_or_path)
     except ConfigError as error:
@@ -59,10 +59,10 @@ def check(name_or_path: str, frames: int, seed: int) -> Report:
         pairs = [(message, usable(message, path)) for message in database.messages]
     except ConfigError as error:
         try:
-            found = lint(parse(path, strict=False))
+            findings = lint(parse(path, strict=False))
         except ConfigError:
-            found = ()
-        return Report(str(path), str(error), 0, 0, 0, 0, 0, (), found)
+            findings = ()
+        return Report(str(path), str(error), 0, 0, 0, 0, 0, (), findings)
     rng = random.Random(seed)
     differences: list[str] = []
     decoded = encoded = 0
@@ -92,7 +92,7 @@ def check(name_or_path: str, frames: int, seed: int) -> Report:
 
 
 def _refusals() -> tuple[type[Exception], ...]:
-    """The exceptions of cantools for data that it refuses."""
+    """Return the exceptions of cantools for data that it refuses."""
     import bitstruct  # type: ignore[import-untyped]
     from cantools.database.errors import Error
 
@@ -100,7 +100,7 @@ def _refusals() -> tuple[type[Exception], ...]:
 
 
 def random_payload(rng: random.Random, codec: MessageCodec) -> bytes:
-    """Random bytes, in three of four cases with known multiplexer values."""
+    """Draw random bytes, in three of four cases with known multiplexer values."""
     payload = rng.randbytes(codec.length)
     if rng.random() < 0.25 or not any(s.is_multiplexer for s in codec.signals):
         return payload
@@ -116,7 +116,7 @@ def random_payload(rng: random.Random, codec: MessageCodec) -> bytes:
 
 
 def random_values(rng: random.Random, codec: MessageCodec, payload: bytes) -> list[Any] | None:
-    """Values around those of a payload: unchanged, off the grid, at and beyond the limits; None if unreadable."""
+    """Draw values around those of a payload: unchanged, off the grid, at and beyond the limits; None if unreadable."""
     try:
         values = list(codec.decode(payload))
     except FrameRefused:
@@ -143,7 +143,7 @@ def _near(rng: random.Random, s: SignalInfo, value: float) -> float:
 
 
 def compare_decode(message: Any, codec: MessageCodec, payload: bytes) -> list[str]:
-    """Differences (none or one) between cantools and the codec for one payload."""
+    """Find the differences (none or one) between cantools and the codec for one payload."""
     try:
         want = message.decode(payload, decode_choices=False)
     except _refusals():
@@ -162,7 +162,7 @@ def _same(a: float, b: float) -> bool:
 
 
 def compare_encode(message: Any, codec: MessageCodec, values: Sequence[Any]) -> list[str]:
-    """Differences (none or one) between cantools and the codec for one set of values.
+    """Find the differences (none or one) between cantools and the codec for one set of values.
 
     The codec may refuse more: values that are not finite, and values out of range that the value table labels as no
     measurement.
@@ -194,7 +194,7 @@ def compare_encode(message: Any, codec: MessageCodec, values: Sequence[Any]) -> 
 
 
 def lint(database: Any) -> tuple[Finding, ...]:
-    """The warnings for a cantools database that can be read (loaded with ``strict=False`` if necessary)."""
+    """List the warnings for a cantools database that can be read (loaded with ``strict=False`` if necessary)."""
     findings: list[Finding] = []
     ids = Counter((m.frame_id, m.is_extended_frame) for m in database.messages)
     for message in database.messages:
@@ -231,7 +231,7 @@ def _signal_findings(where: str, s: Any) -> list[Finding]:
 
 
 def _bits(s: Any) -> set[int]:
-    """The payload bits of a signal, numbered 8 * byte + significance."""
+    """Return the payload bits of a signal, numbered 8 * byte + significance."""
     if s.byte_order == "little_endian":
         return set(range(s.start, s.start + s.length))
     first = 8 * (s.start // 8) + 7 - s.start % 8
@@ -239,14 +239,14 @@ def _bits(s: Any) -> set[int]:
 
 
 def _together(a: Any, b: Any, parents: dict[str, Any]) -> bool:
-    """Whether two signals can be present in the same frame: no common multiplexer separates them."""
+    """Tell whether two signals can be present in the same frame: no common multiplexer separates them."""
 
     def selections(s: Any) -> dict[str, set[int]]:
-        found: dict[str, set[int]] = {}
+        ids_by_multiplexer: dict[str, set[int]] = {}
         while s is not None and s.multiplexer_signal is not None:
-            found[s.multiplexer_signal] = set(s.multiplexer_ids or ())
+            ids_by_multiplexer[s.multiplexer_signal] = set(s.multiplexer_ids or ())
             s = parents.get(s.multiplexer_signal)
-        return found
+        return ids_by_multiplexer
 
     ours, theirs = selections(a), selections(b)
     return all(ours[mux] & theirs[mux] for mux in ours.keys() & theirs.keys())

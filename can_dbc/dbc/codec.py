@@ -76,7 +76,7 @@ class MessageCodec:
     source: str = field(repr=False, compare=False)
 
     def named(self, values: Values) -> dict[str, Any]:
-        """A value tuple as a dictionary without the absent signals."""
+        """Return a value tuple as a dictionary without the absent signals."""
         return {s.name: v for s, v in zip(self.signals, values, strict=True) if v is not None}
 
 
@@ -90,24 +90,24 @@ class Database:
     by_pgn: Mapping[int, MessageCodec]
 
     def message(self, name: str) -> MessageCodec:
-        """The codec of a message; raises ConfigError if the file has no such message."""
+        """Return the codec of a message; raises ConfigError if the file has no such message."""
         codec = self.messages.get(name)
         if codec is None:
             raise ConfigError("dbc.unknown-message", f"{self.path}: there is no message {name}")
         return codec
 
     def find(self, key: int) -> MessageCodec | None:
-        """The codec for a received key: an exact match first, then by PGN; None for a foreign frame."""
+        """Find the codec for a received key: an exact match first, then by PGN; None for a foreign frame."""
         return self.by_key.get(key) or (self.by_pgn.get(pgn_key(key)) if key & EXTENDED else None)
 
 
 def pgn_key(key: int) -> int:
-    """An extended key without priority, source address and (for PDU1 formats) destination address."""
+    """Strip an extended key of priority, source address and (for PDU1 formats) destination address."""
     return key & (PDU2_MASK if key >> 16 & 0xFF >= 240 else PDU1_MASK)
 
 
 def resolve(name_or_path: str | Path) -> Path:
-    """The path of a shipped database (a name without suffix) or of a file; raises ConfigError if there is none."""
+    """Find the path of a shipped database (a name without suffix) or of a file; raises ConfigError if there is none."""
     path = Path(name_or_path)
     if str(name_or_path) in SHIPPED:
         return Path(__file__).parents[1] / f"{name_or_path}.dbc"
@@ -131,13 +131,13 @@ def _read(path: Path) -> Database:
     messages = [usable(message, path) for message in database.messages]
     if _is_j1939(database):
         messages = [replace(m, by_pgn=True) if m.key & EXTENDED else m for m in messages]
-    for what, counts in (
+    for field_name, counts in (
         ("name", Counter(m.name for m in messages)),
         ("identifier", Counter(describe(m.key) for m in messages)),
     ):
-        twice = [value for value, n in counts.items() if n > 1]
-        if twice:
-            raise ConfigError("dbc.duplicate", f"{path}: two messages share the {what} {twice[0]}")
+        duplicates = [value for value, n in counts.items() if n > 1]
+        if duplicates:
+            raise ConfigError("dbc.duplicate", f"{path}: two messages share the {field_name} {duplicates[0]}")
     pgns = Counter(pgn_key(m.key) for m in messages if m.by_pgn)
     return Database(
         path,
@@ -149,7 +149,7 @@ def _read(path: Path) -> Database:
 
 
 def _is_j1939(database: Any) -> bool:
-    """Whether a database is of J1939 as a whole: it says so, and not of each message with ``VFrameFormat``."""
+    """Tell whether a database is of J1939 as a whole: it says so, and not of each message with ``VFrameFormat``."""
     if database.dbc is None:  # a KCD
         return False
     given, known = database.dbc.attributes, database.dbc.attribute_definitions
@@ -159,7 +159,7 @@ def _is_j1939(database: Any) -> bool:
 
 
 def usable(message: Any, path: Path) -> MessageCodec:
-    """`compile_one`, also for numbers that cantools accepts and no codec can use, such as an infinite scale."""
+    """Compile as `compile_one`, also for numbers that cantools accepts but no codec can use (infinite scale)."""
     try:
         return compile_one(message, path)
     except ConfigError:
@@ -169,7 +169,7 @@ def usable(message: Any, path: Path) -> MessageCodec:
 
 
 def parse(path: Path, *, strict: bool = True) -> Any:
-    """The cantools database of a file; raises ConfigError, with the line if known."""
+    """Read the cantools database of a file; raises ConfigError, with the line if known."""
     import cantools
     from cantools.database.errors import Error
 
@@ -198,7 +198,7 @@ def parse(path: Path, *, strict: bool = True) -> Any:
 
 
 def _line_of(reason: str, text: str) -> str:
-    """``:line`` of a cantools error: the line it gives, or that of the message it names."""
+    """Write ``:line`` of a cantools error: the line it gives, or that of the message it names."""
     given = re.search(r"line (\d+)", reason)
     if given:
         return f":{given[1]}"
@@ -211,10 +211,10 @@ def _line_of(reason: str, text: str) -> str:
 
 
 def compile_one(message: Any, path: Path) -> MessageCodec:
-    """The codec of one cantools message; ``path`` is named in errors."""
+    """Compile the codec of one cantools message; ``path`` is named in errors."""
     if not message.name or not all(signal.name for signal in message.signals):  # possible in KCD
-        what = f"message {message.name} has a signal" if message.name else f"message {message.frame_id:#x} is"
-        raise ConfigError("dbc.invalid", f"{path}: {what} without a name")
+        subject = f"message {message.name} has a signal" if message.name else f"message {message.frame_id:#x} is"
+        raise ConfigError("dbc.invalid", f"{path}: {subject} without a name")
     signals = _signals(message)
     for s in signals:
         if s.shift < 0 or s.shift + s.bits > 8 * message.length:
@@ -253,7 +253,7 @@ def _data_ids(name: str, attributes: Mapping[str, Any], path: Path) -> bytes | N
 
 
 def _signals(message: Any) -> tuple[SignalInfo, ...]:
-    """The signals in cantools' order (by start bit), with multiplexers as indices into the result."""
+    """List the signals in cantools' order (by start bit), with multiplexers as indices into the result."""
     positions = {s.name: i for i, s in enumerate(message.signals) if s.is_multiplexer}
     result = []
     for s in message.signals:

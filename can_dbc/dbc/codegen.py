@@ -46,7 +46,7 @@ STRUCT_FLOATS: Final = {16: "e", 32: "f", 64: "d"}
 
 
 def compile_message(name: str, length: int, signals: Sequence[SignalInfo]) -> tuple[Decoder, Decoder, Encoder, str]:
-    """(decode, receive, encode, source) of a message of ``length`` bytes."""
+    """Generate (decode, receive, encode, source) of a message of ``length`` bytes."""
     signals = tuple(signals)
     multiplexed = any(s.parent is not None for s in signals)
     space: dict[str, Any] = {
@@ -87,12 +87,12 @@ def compile_message(name: str, length: int, signals: Sequence[SignalInfo]) -> tu
 
 
 def key_of(source: str) -> str:
-    """The key of a message's generated text among the functions that were compiled ahead of time."""
+    """Compute the key of a message's generated text among the functions that were compiled ahead of time."""
     return hashlib.sha256(source.encode()).hexdigest()[:32]
 
 
 def _ahead_of_time() -> Mapping[str, Any]:
-    """Classes with compiled ``receive`` and ``encode`` by `key_of`; empty on the interpreter."""
+    """Load the classes with compiled ``receive`` and ``encode`` by `key_of`; empty on the interpreter."""
     try:
         codecs: Mapping[str, Any] = importlib.import_module("can_dbc.dbc.compiled_codecs").CODECS
     except ImportError:
@@ -107,7 +107,7 @@ AHEAD_OF_TIME: Final = _ahead_of_time()
 
 
 def _struct_layout(length: int, signals: Sequence[SignalInfo]) -> struct.Struct | None:
-    """A struct for a message whose signals are all whole aligned integers or floats of one byte order."""
+    """Find a struct for a message whose signals are all whole aligned integers or floats of one byte order."""
     if not signals or len({s.big_endian for s in signals if s.bits > 8}) > 1:
         return None
     big = any(s.big_endian for s in signals if s.bits > 8)
@@ -187,7 +187,7 @@ def _flat_decode(
 
 
 def receive_checks(s: SignalInfo, raw: str) -> list[str]:
-    """Conditions under which the fast path may use a raw value."""
+    """List the conditions under which the fast path may use a raw value."""
     if s.is_float:
         low = -math.inf if s.minimum is None else min(s.physical(s.convert(s.minimum)), s.minimum)
         high = math.inf if s.maximum is None else max(s.physical(s.convert(s.maximum)), s.maximum)
@@ -233,7 +233,7 @@ def parameters(signals: Sequence[SignalInfo]) -> list[str]:
 
 
 def fast_limits(s: SignalInfo) -> tuple[float, float]:
-    """The physical interval in which rounding provably stays within range and bits; empty if none is found."""
+    """Find the physical interval in which rounding provably stays within range and bits; empty if none is found."""
     tolerance = abs(s.scale) * 1e-6
     low = -math.inf if s.minimum is None else s.minimum - tolerance
     high = math.inf if s.maximum is None else s.maximum + tolerance
@@ -265,14 +265,14 @@ def _encode_expression(s: SignalInfo, value: str) -> str:
 
 def _flat_encode(length: int, signals: Sequence[SignalInfo]) -> list[str]:
     names = parameters(signals)
-    words = {False: ["0"], True: ["0"]}
+    bit_fields = {False: ["0"], True: ["0"]}
     checks = []
     for s, name in zip(signals, names, strict=True):
         low, high = fast_limits(s)
         checks.append(f"{low!r} <= {name} <= {high!r}")
         bits = _encode_expression(s, name)
-        words[s.big_endian].append(f"{bits} << {s.shift}" if s.shift else bits)
-    little, big = (" | ".join(words[order][1:] or ["0"]) for order in (False, True))
+        bit_fields[s.big_endian].append(f"{bits} << {s.shift}" if s.shift else bits)
+    little, big = (" | ".join(bit_fields[order][1:] or ["0"]) for order in (False, True))
     if not any(s.big_endian for s in signals):
         result = f"({little}).to_bytes({length}, 'little')"
     elif all(s.big_endian for s in signals):
@@ -324,7 +324,7 @@ def _children(signals: Sequence[SignalInfo], parent: int | None, mux: int | None
 
 
 def _mux_ids(signals: Sequence[SignalInfo], parent: int) -> set[int]:
-    """Valid multiplexer values: those with signals of their own, and those of the value table."""
+    """Collect the valid multiplexer values: those with signals of their own, and those of the value table."""
     ids = {mux for s in signals if s.parent == parent for mux in s.parent_ids}
     return ids | set(signals[parent].choices)
 
@@ -362,8 +362,8 @@ def _multiplexed_decode(length: int, signals: Sequence[SignalInfo]) -> list[str]
 
 def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]) -> Encoder:
     def active(values: Sequence[Value], parent: int | None, mux: int | None) -> list[int]:
-        found = members = _children(signals, parent, mux)
-        for i in members:
+        active_indices = child_indices = _children(signals, parent, mux)
+        for i in child_indices:
             if signals[i].is_multiplexer:
                 value = values[i]
                 if not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -374,8 +374,8 @@ def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]
                     raise InputRefused(
                         "codec.multiplexer", f"{name}.{signals[i].name} = {value} is not a known multiplexer value"
                     )
-                found = found + active(values, i, int(value))
-        return found
+                active_indices = active_indices + active(values, i, int(value))
+        return active_indices
 
     def encode(*values: Value) -> bytes:
         if len(values) != len(signals):

@@ -111,7 +111,7 @@ class SignalInfo:
             object.__setattr__(self, name, limit)
 
     def physical(self, raw: int | float) -> int | float:
-        """Raw to physical value [unit], as cantools computes it."""
+        """Convert a raw to a physical value [unit], as cantools computes it."""
         if self.scaling is Scaling.IDENTITY:
             return raw
         if self.scaling is Scaling.INTEGER:
@@ -119,7 +119,7 @@ class SignalInfo:
         return raw * self.scale + self.offset
 
     def convert(self, value: int | float) -> int | float:
-        """Physical to raw value without any check; integers round half to even."""
+        """Convert a physical to a raw value without any check; integers round half to even."""
         if self.scaling is Scaling.IDENTITY:
             return value if self.is_float else round(value)
         if self.scaling is Scaling.INTEGER:
@@ -128,14 +128,14 @@ class SignalInfo:
         return raw if self.is_float else round(raw)
 
     def inside(self, value: int | float) -> bool:
-        """Whether a physical value lies in the declared range, with cantools' tolerance of 1e-6 steps."""
+        """Tell whether a physical value lies in the declared range, with cantools' tolerance of 1e-6 steps."""
         tolerance = abs(self.scale) * 1e-6
         return (self.minimum is None or value >= self.minimum - tolerance) and (
             self.maximum is None or value <= self.maximum + tolerance
         )
 
     def valid(self, raw: int | float) -> Value:
-        """The physical value of a received raw value, None for a sentinel; raises FrameRefused if out of range."""
+        """Return the physical value of a received raw value, None for a sentinel; FrameRefused if out of range."""
         if raw in self.sentinels:
             return None
         value = self.physical(raw)
@@ -145,7 +145,7 @@ class SignalInfo:
         raise FrameRefused(Refusal.RANGE, self.name)
 
     def encode(self, value: Value) -> int:
-        """The bits (unsigned, ``bits`` wide) of a physical value or None; raises InputRefused."""
+        """Encode a physical value or None as bits (unsigned, ``bits`` wide); raises InputRefused."""
         if value is None:
             raw: int | float | None = self.not_available
             if raw is None:
@@ -170,7 +170,7 @@ class SignalInfo:
             ) from None
 
     def extract(self, little: int, big: int) -> int | float:
-        """The raw value out of the payload read as a little-endian and as a big-endian number."""
+        """Extract the raw value from the payload read as a little-endian and as a big-endian number."""
         bits = (big if self.big_endian else little) >> self.shift & ((1 << self.bits) - 1)
         if self.is_float:
             return unpack_float(bits, self.bits)
@@ -200,17 +200,17 @@ class SignalInfo:
 
 
 def integer_raw(value: int | float, scale: int) -> int:
-    """``value / scale`` rounded half to even; exact for integers of any size."""
+    """Compute ``value / scale`` rounded half to even; exact for integers of any size."""
     quotient, remainder = divmod(value, scale)
     return round(quotient if remainder == 0 else value / scale)
 
 
 def pack_float(value: float, bits: int) -> int:
-    """The IEEE 754 bits of a number; raises OverflowError if it is too large for the width."""
+    """Return the IEEE 754 bits of a number; raises OverflowError if it is too large for the width."""
     return int.from_bytes(struct.pack(FLOAT_FORMATS[bits], value), "little")
 
 
 def unpack_float(raw: int, bits: int) -> float:
-    """The number of IEEE 754 bits."""
+    """Return the number of IEEE 754 bits."""
     value: float = struct.unpack(FLOAT_FORMATS[bits], raw.to_bytes(bits // 8, "little"))[0]
     return value

@@ -186,24 +186,24 @@ class StateReport:
 
 
 def crane_body(m: CraneSetpoint) -> bytes:
-    """The body of a crane setpoint; times are truncated to 1 us."""
+    """Encode the body of a crane setpoint; times are truncated to 1 us."""
     head = _CRANE.pack(m.lease_ns // 1000, m.grapple, int(m.final), len(m.knots), N_AXES)
     return head + b"".join(_KNOT.pack(k.after_ns // 1000, *k.position, *k.velocity) for k in m.knots)
 
 
 def spool_body(m: SpoolTest) -> bytes:
-    """The body of a spool test; times are truncated to 1 us."""
+    """Encode the body of a spool test; times are truncated to 1 us."""
     head = _SPOOL.pack(m.lease_ns // 1000, m.function, len(m.knots))
     return head + b"".join(_SPOOL_KNOT.pack(k.after_ns // 1000, k.percent) for k in m.knots)
 
 
 def operator_body(m: OperatorCommand) -> bytes:
-    """The body of an operator command."""
+    """Encode the body of an operator command."""
     return _OPERATOR.pack(m.action | m.profile_check << 8)
 
 
 def report_body(m: StateReport) -> bytes:
-    """The body of a state report; counters wrap at their width."""
+    """Encode the body of a state report; counters wrap at their width."""
     body = _REPORT.pack(
         m.mode,
         m.grapple_state,
@@ -269,13 +269,13 @@ def spool_from(common: Common, body: bytes) -> SpoolTest:
 
 
 def operator_from(common: Common, body: bytes) -> OperatorCommand:
-    """The operator command in a body; raises struct.error for a wrong length and ValueError for an unknown action."""
+    """Decode an operator command; raises struct.error for a wrong length and ValueError for an unknown action."""
     (word,) = _OPERATOR.unpack(body)
     return OperatorCommand(*common, OperatorAction(word & 0xFF), word >> 8)
 
 
 def report_from(common: Common, body: bytes) -> StateReport:
-    """The report in a body, with or without evidence, link and switch; raises struct.error for a wrong length."""
+    """Decode a report, with or without evidence, link and switch; raises struct.error for a wrong length."""
     values = _REPORT.unpack(body[: _REPORT.size])
     more = body[_REPORT.size :]
     since_ns, link, switch = 0, 0, 0

@@ -51,13 +51,13 @@ Datagram = CraneSetpoint | SpoolTest | DriveSetpoint | OperatorCommand | StateRe
 
 
 def encode(message: Datagram, key: bytes | None = None) -> bytes:
-    """The bytes of a datagram; times are truncated to 1 us.  With ``key`` it is authenticated."""
+    """Encode the bytes of a datagram; times are truncated to 1 us.  With ``key`` it is authenticated."""
     kind, body = _body(message)
     return sealed(kind, (message.sequence, message.profile_hash, message.stamp_ns), body, key)
 
 
 def decode(data: bytes, key: bytes | None = None) -> Datagram:
-    """The message in a datagram.
+    """Decode the message in a datagram.
 
     Raises:
         DatagramRefused: with the reason; nothing of a refused datagram is used.
@@ -87,7 +87,7 @@ def decode(data: bytes, key: bytes | None = None) -> Datagram:
 
 
 def stop_in(data: bytes) -> bytes:
-    """The operator's STOP in a datagram that is whole by its checksum, without its authenticator, if it has one.
+    """Return the operator's STOP in a datagram that is whole by its checksum, without any authenticator.
 
     STOP is heard from anyone, whatever key he has.  Empty: the datagram is something else.
     """

@@ -73,7 +73,7 @@ class DatagramRefused(ValueError):
 
 
 def sealed(kind: Kind, common: Common, body: bytes, key: bytes | None) -> bytes:
-    """The datagram with a body."""
+    """Make the datagram with a body."""
     data = _HEADER.pack(MAGIC, VERSION, kind, *common) + body
     if key is not None:
         data += _mac(data, key)
@@ -81,7 +81,7 @@ def sealed(kind: Kind, common: Common, body: bytes, key: bytes | None) -> bytes:
 
 
 def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
-    """Kind, common fields and body of a datagram; raises DatagramRefused."""
+    """Read kind, common fields and body of a datagram; raises DatagramRefused."""
     trailer = _CRC.size + (MAC_BYTES if key is not None else 0)
     if len(data) < _HEADER.size + trailer:
         raise DatagramRefused(DatagramFault.LENGTH)
@@ -99,14 +99,14 @@ def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
 
 
 def signed(data: bytes, key: bytes) -> bytes:
-    """A datagram without an authenticator, with one."""
+    """Add an authenticator to a datagram without one."""
     covered = data[: -_CRC.size]
     covered += _mac(covered, key)
     return covered + _CRC.pack(zlib.crc32(covered))
 
 
 def opened(data: bytes, key: bytes | None) -> bytes:
-    """A datagram whose authenticator is right, without it; with no ``key`` as it is, unchecked.
+    """Remove the authenticator, if it is right, from a datagram; with no ``key`` return it as it is, unchecked.
 
     Raises:
         DatagramRefused: it is not whole, or was not made with this key.
@@ -118,7 +118,7 @@ def opened(data: bytes, key: bytes | None) -> bytes:
 
 
 def without_mac(data: bytes) -> bytes:
-    """A datagram that is whole by its checksum, without its authenticator, which is not checked; or DatagramRefused."""
+    """Remove its authenticator, unchecked, from a datagram that is whole by its checksum; or DatagramRefused."""
     unsealed(data, None)
     if len(data) < _HEADER.size + MAC_BYTES + _CRC.size:
         raise DatagramRefused(DatagramFault.LENGTH)
@@ -131,12 +131,12 @@ def _without_mac(data: bytes) -> bytes:
 
 
 def kind_of(data: bytes) -> int:
-    """The kind that a datagram says it is, 0 if it is too short; nothing of it is checked."""
+    """Read the kind that a datagram says it is, 0 if it is too short; nothing of it is checked."""
     return int(_HEADER.unpack_from(data)[2]) if len(data) >= _HEADER.size else 0
 
 
 def is_operator_command(data: bytes) -> bool:
-    """Whether a datagram says that it is an operator's command; nothing of it is checked."""
+    """Tell whether a datagram says that it is an operator's command; nothing of it is checked."""
     return kind_of(data) == Kind.OPERATOR
 
 
@@ -145,7 +145,7 @@ def _mac(data: bytes, key: bytes) -> bytes:
 
 
 def finite(values: tuple[float, ...]) -> tuple[float, ...]:
-    """`values` when all of them are finite, else DatagramRefused."""
+    """Return `values` when all of them are finite, else DatagramRefused."""
     if not all(map(math.isfinite, values)):
         raise DatagramRefused(DatagramFault.NOT_FINITE)
     return values
@@ -159,7 +159,7 @@ SERVICE_KEY: Final = Path("/etc/timberhand/key")
 
 
 def read_key(path: Path) -> bytes:
-    """The key in a file, without white space around it; raises ConfigError."""
+    """Read the key in a file, without white space around it; raises ConfigError."""
     try:
         key = path.read_bytes().strip()
     except OSError as error:
@@ -178,7 +178,7 @@ def write_key(path: Path) -> Path:
 
 
 def service_key() -> bytes | None:
-    """The key of the services that are installed here; None where there is none, or this user may not read it."""
+    """Read the key of the services that are installed here; None if there is none, or this user may not read it."""
     try:
         return read_key(SERVICE_KEY)
     except ConfigError:

@@ -11,7 +11,7 @@ _SIMPLE: Final = {int: "integer", float: "number", bool: "boolean", str: "string
 
 
 def flat_schema(report: type[Any]) -> bytes:
-    """The schema of a dataclass whose fields are numbers, texts and tuples of numbers.
+    """Write the schema of a dataclass whose fields are numbers, texts and tuples of numbers.
 
     Viewers do not follow references, so there are none, and a number that is unknown (null) counts as a number.
 

@@ -150,13 +150,13 @@ _JSON: Final = msgspec.json.Encoder()
 
 
 def encode_mission_command(command: MissionCommand, key: bytes | None = None) -> bytes:
-    """The bytes of a command."""
+    """Encode the bytes of a command."""
     common = (command.sequence, command.profile_hash, command.stamp_ns)
     return sealed(Kind.ORDER, common, _COMMAND.pack(command.action), key)
 
 
 def decode_mission_command(data: bytes, key: bytes | None = None) -> MissionCommand:
-    """The command in a datagram.
+    """Decode the command in a datagram.
 
     Raises:
         DatagramRefused: it is not a valid command.
@@ -175,7 +175,7 @@ def decode_mission_command(data: bytes, key: bytes | None = None) -> MissionComm
 def encode_mission(
     report: MissionReport, sequence: int, profile_hash: int, stamp_ns: int, key: bytes | None = None
 ) -> bytes:
-    """The bytes of a report; raises ValueError if it is longer than ``MAX_BYTES``."""
+    """Encode the bytes of a report; raises ValueError if it is longer than ``MAX_BYTES``."""
     data = sealed(Kind.MISSION, (sequence, profile_hash, stamp_ns), _JSON.encode(report), key)
     if len(data) > MAX_BYTES:
         raise ValueError(f"a mission report of {len(data)} bytes does not fit; one datagram holds at most {MAX_BYTES}")
@@ -183,7 +183,7 @@ def encode_mission(
 
 
 def decode_mission(data: bytes, key: bytes | None = None) -> tuple[int, int, MissionReport]:
-    """Profile hash, stamp [ns] and report in a datagram; raises DatagramRefused."""
+    """Decode profile hash, stamp [ns] and report in a datagram; raises DatagramRefused."""
     kind, (_, profile_hash, stamp_ns), body = unsealed(data, key)
     if kind != Kind.MISSION:
         raise DatagramRefused(DatagramFault.KIND)
@@ -220,13 +220,13 @@ class MissionUpload:
 
 
 def encode_mission_upload(upload: MissionUpload, key: bytes | None = None) -> bytes:
-    """The bytes of an upload."""
+    """Encode the bytes of an upload."""
     common = (upload.sequence, upload.profile_hash, upload.stamp_ns)
     return sealed(Kind.UPLOAD, common, upload.digest + upload.name.encode(), key)
 
 
 def decode_mission_upload(data: bytes, key: bytes | None = None) -> MissionUpload:
-    """The upload in a datagram.
+    """Decode the upload in a datagram.
 
     Raises:
         DatagramRefused: it is not a valid upload.
@@ -268,12 +268,12 @@ _GRASP: Final = msgspec.json.Decoder(ChosenGrasp)
 def encode_grasp(
     grasp: ChosenGrasp, sequence: int, profile_hash: int, stamp_ns: int, key: bytes | None = None
 ) -> bytes:
-    """The bytes of a grasp."""
+    """Encode the bytes of a grasp."""
     return sealed(Kind.GRASP, (sequence, profile_hash, stamp_ns), msgspec.json.encode(grasp), key)
 
 
 def decode_grasp(data: bytes, key: bytes | None = None) -> tuple[int, int, ChosenGrasp]:
-    """Profile hash, stamp [ns] and grasp in a datagram.
+    """Decode profile hash, stamp [ns] and grasp in a datagram.
 
     Raises:
         DatagramRefused: it is not a valid grasp.

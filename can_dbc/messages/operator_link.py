@@ -24,36 +24,37 @@ CREDENTIAL_BYTES: Final = 32
 
 
 def default_path() -> Path:
-    """Path of the controller's socket for operators."""
+    """Return the path of the controller's socket for operators."""
     return shared_path("controller.operator")
 
 
 def guard_path(path: Path) -> Path:
-    """The guard's socket beside the controller's: of another user, so in a folder of its own."""
+    """Return the guard's socket beside the controller's: of another user, so in a folder of its own."""
     return path.parent.with_name(f"{path.parent.name}-guard") / path.name
 
 
 def credential_path(path: Path) -> Path:
-    """Path of the credential that belongs to a socket."""
+    """Return the path of the credential that belongs to a socket."""
     return path.with_name(f"{path.name}.key")
 
 
 def draw_credential(path: Path) -> bytes:
     """Draw the credential of the socket at ``path`` and leave it beside it; raises OSError if that cannot be done."""
-    drawn, place = secrets.token_bytes(CREDENTIAL_BYTES), credential_path(path)
-    beside = place.with_name(f"{place.name}.new")
-    beside.unlink(missing_ok=True)
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    credential, credential_file = secrets.token_bytes(CREDENTIAL_BYTES), credential_path(path)
+    new_file = credential_file.with_name(f"{credential_file.name}.new")
+    new_file.unlink(missing_ok=True)
+    descriptor = os.open(new_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     with open(descriptor, "wb") as out:
-        out.write(drawn)
+        out.write(credential)
         os.fchmod(descriptor, 0o640)  # independent of the umask
-    beside.replace(place)
-    return drawn
+    new_file.replace(credential_file)
+    return credential
 
 
 def admitted(data: bytes, key: bytes | None) -> bytes:
-    """A datagram as its listener sees it: without its authenticator; STOP whatever that is, anything else empty if
-    wrong.
+    """Return a datagram as its listener sees it, without its authenticator.
+
+    STOP passes whatever that is; anything else is empty if it is wrong.
 
     An empty datagram stands for whatever was not made with the key.
     """

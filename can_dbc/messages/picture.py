@@ -68,12 +68,12 @@ _FACTS: Final = msgspec.json.Decoder(PictureFacts)
 
 
 def encode_picture_request(since_ns: int = 0) -> bytes:
-    """A request for the newest picture; its JPEG only if it was measured after ``since_ns``."""
+    """Encode a request for the newest picture; its JPEG only if it was measured after ``since_ns``."""
     return msgspec.json.encode(_Request("picture", str(since_ns)))
 
 
 def picture_request(data: bytes) -> int | None:
-    """``since_ns`` of a request for a picture; None when the datagram is something else."""
+    """Decode ``since_ns`` of a request for a picture; None when the datagram is something else."""
     try:
         return int(_REQUEST.decode(data).since_ns)
     except (msgspec.DecodeError, UnicodeDecodeError, ValueError):
@@ -81,13 +81,13 @@ def picture_request(data: bytes) -> int | None:
 
 
 def encode_picture(facts: PictureFacts, jpeg: bytes = b"") -> bytes:
-    """A reply, with the JPEG or without."""
+    """Encode a reply, with the JPEG or without."""
     head = msgspec.json.encode(facts)
     return head + b"\n" + jpeg if jpeg else head
 
 
 def decode_picture(data: bytes) -> tuple[PictureFacts, bytes]:
-    """Facts and JPEG (empty without a newer picture) of a reply.
+    """Decode the facts and JPEG (empty without a newer picture) of a reply.
 
     Raises:
         InputRefused: it is not such a reply.

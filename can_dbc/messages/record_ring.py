@@ -34,7 +34,7 @@ _RECORD: Final = struct.Struct("<II")
 
 
 def default_path() -> Path:
-    """Path of the controller's ring."""
+    """Return the path of the controller's ring."""
     return shared_path("controller.ticks")
 
 
@@ -96,17 +96,17 @@ class RingReader:
             self._tail, self._next = written, None
 
     def read(self) -> list[bytes]:
-        """The records since the last call, in order."""
-        found: list[bytes] = []
+        """Read the records since the last call, in order."""
+        records: list[bytes] = []
         if self._map is None and not self._open():
-            return found
+            return records
         while self._tail != self._word(_WRITTEN):
             record = self._record()
             if record is not None:
-                found.append(record)
-        if not found and self._replaced():
+                records.append(record)
+        if not records and self._replaced():
             self._open()
-        return found
+        return records
 
     def close(self) -> None:
         """Unmap the ring; may be called twice."""
@@ -115,7 +115,7 @@ class RingReader:
             self._map = None
 
     def _record(self) -> bytes | None:
-        """The record at the tail; None if there is none, or it was overwritten meanwhile."""
+        """Read the record at the tail; None if there is none, or it was overwritten meanwhile."""
         assert self._map is not None
         at = self._tail % self._capacity
         room = self._capacity - at

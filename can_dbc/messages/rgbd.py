@@ -61,13 +61,13 @@ class AnswerHeader:
 
 
 def encode_request(camera: str) -> bytes:
-    """The bytes of a request for the newest frame of ``camera``."""
+    """Encode the bytes of a request for the newest frame of ``camera``."""
     name = _name(camera)
     return REQUEST_HEADER.pack(MAGIC, VERSION, len(name)) + name
 
 
 def request_name_bytes(start: bytes) -> int:
-    """Length of the name that follows a request's header; raises InputRefused if the bytes are not a request."""
+    """Read the length of the name that follows a request's header; InputRefused if the bytes are no request."""
     magic, version, length = REQUEST_HEADER.unpack(start)
     if magic != MAGIC or version != VERSION or not 0 < length <= MAX_NAME_BYTES:
         raise InputRefused(
@@ -78,7 +78,7 @@ def request_name_bytes(start: bytes) -> int:
 
 
 def encode(frame: RgbdMessage) -> bytes:
-    """The bytes of a frame; raises InputRefused if its sizes are inconsistent."""
+    """Encode the bytes of a frame; raises InputRefused if its sizes are inconsistent."""
     pixels = frame.width_px * frame.height_px
     if not (0 < frame.width_px <= MAX_SIDE_PX and 0 < frame.height_px <= MAX_SIDE_PX):
         raise InputRefused(
@@ -99,12 +99,12 @@ def encode(frame: RgbdMessage) -> bytes:
 
 
 def encode_refusal(camera: str, why: str) -> bytes:
-    """The bytes of an answer that refuses a request."""
+    """Encode the bytes of an answer that refuses a request."""
     return _packed(REFUSAL, _name(camera), 0, 0, 0, (0.0, 0.0, 0.0, 0.0), why.encode()[:1000])
 
 
 def decode_header(data: bytes) -> AnswerHeader:
-    """The fixed part of an answer, ``HEADER_BYTES`` long; raises InputRefused if it is invalid, before more is read."""
+    """Decode the fixed part of an answer, ``HEADER_BYTES`` long; InputRefused if it is invalid, before more is read."""
     magic, version, kind, name, stamp_ns, width, height, fx, fy, cx, cy, body = HEADER.unpack_from(data)
     if magic != MAGIC:
         raise InputRefused("rgbd.magic", "the bytes are not a frame; is the other side a camera server?")
@@ -122,7 +122,7 @@ def decode_header(data: bytes) -> AnswerHeader:
 
 
 def decode(data: bytes) -> RgbdMessage:
-    """The frame of a complete answer; raises InputRefused for a refusal, with its sentence, and a damaged answer."""
+    """Decode the frame of a complete answer; InputRefused for a refusal, with its sentence, and a damaged answer."""
     if len(data) < HEADER_BYTES:
         raise InputRefused("rgbd.length", f"{len(data)} bytes are too short for a frame")
     head = decode_header(data)

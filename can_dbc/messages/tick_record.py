@@ -57,7 +57,7 @@ class BusReading:
     """Number of recoveries from OFF or DOWN."""
 
     def copy_from(self, stats: BusStats) -> None:
-        """Copies state and counters of a bus."""
+        """Copy state and counters of a bus."""
         self.state, self.dropped, self.refused = stats.state, stats.dropped, stats.refused
         self.errors, self.recoveries = stats.error_frames, stats.recoveries
 
@@ -112,7 +112,7 @@ class RecordWriter:
         vehicle_report: bytes,
         operator: Sequence[bytes],
     ) -> memoryview:
-        """The bytes of a tick (the fields of `TickRecord`), valid until the next call.
+        """Write the bytes of a tick (the fields of `TickRecord`), valid until the next call.
 
         Raises:
             InputRefused: it is longer than `MAX_BYTES`.
@@ -179,7 +179,7 @@ class RecordWriter:
 
 
 def encode(tick: TickRecord) -> bytes:
-    """The bytes of a tick; raises InputRefused when they are more than `MAX_BYTES`."""
+    """Encode the bytes of a tick; raises InputRefused when they are more than `MAX_BYTES`."""
     return bytes(
         RecordWriter().write(
             tick.now_ns,
@@ -201,7 +201,7 @@ def encode(tick: TickRecord) -> bytes:
 
 
 def decode(data: bytes) -> TickRecord:
-    """The tick in a record; raises InputRefused."""
+    """Decode the tick in a record; raises InputRefused."""
     if len(data) < _VERSION.size + _CRC.size:
         raise InputRefused("tick-record.length", f"a tick record of {len(data)} bytes is too short")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, len(data) - _CRC.size)[0]:

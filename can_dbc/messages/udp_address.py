@@ -9,7 +9,7 @@ from runtime.errors import InputRefused
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """HOST:PORT as a numeric address, so that sending never waits for a name server; raises InputRefused."""
+    """Parse HOST:PORT as a numeric address, so that sending never waits for a name server; raises InputRefused."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InputRefused("address.malformed", f"{text}: write HOST:PORT, for example 127.0.0.1:5006")
@@ -21,7 +21,7 @@ def udp_address(text: str) -> tuple[str, int]:
 
 
 def address_argument(text: str) -> tuple[str, int]:
-    """`udp_address` as the ``type`` of a command-line option: raises ArgumentTypeError with the sentence."""
+    """Parse as `udp_address`, the ``type`` of a command-line option: raises ArgumentTypeError with the sentence."""
     try:
         return udp_address(text)
     except InputRefused as error:

@@ -124,7 +124,7 @@ VEHICLE_INPUTS: Final = (
 
 
 def drive_body(m: DriveSetpoint) -> bytes:
-    """The body of a drive setpoint."""
+    """Encode the body of a drive setpoint."""
     flags = _FLOAT_FRONT * m.float_front | _FLOAT_REAR * m.float_rear | _LEVEL * m.level
     return _DRIVE.pack(
         m.lease_ns // 1000,
@@ -140,8 +140,11 @@ def drive_body(m: DriveSetpoint) -> bytes:
 
 
 def drive_from(common: Common, body: bytes) -> DriveSetpoint:
-    """The drive setpoint in a body; raises struct.error for a wrong length, ValueError for an
-    illegal value and DatagramRefused for one that is not finite."""
+    """Decode the drive setpoint in a body.
+
+    Raises struct.error for a wrong length, ValueError for an illegal value and DatagramRefused for one that is not
+    finite.
+    """
     lease_us, steering, flags, latitude, longitude, angle, rate, speed, *heights = _DRIVE.unpack(body)
     if flags & ~_FLAGS:
         raise ValueError("unknown flags")
@@ -166,7 +169,7 @@ def drive_from(common: Common, body: bytes) -> DriveSetpoint:
 
 
 def vehicle_body(m: VehicleReport) -> bytes:
-    """The body of a vehicle report."""
+    """Encode the body of a vehicle report."""
     return _VEHICLE.pack(
         m.drive_sequence,
         m.driving,
@@ -193,7 +196,7 @@ def vehicle_body(m: VehicleReport) -> bytes:
 
 
 def vehicle_from(common: Common, body: bytes) -> VehicleReport:
-    """The vehicle report in a body; raises struct.error for a wrong length."""
+    """Decode the vehicle report in a body; raises struct.error for a wrong length."""
     values = _VEHICLE.unpack(body)
     sequence, driving, refusal, refused, fix, satellites, stale, position_ns, heading_ns, motion_ns = values[:10]
     latitude, longitude, altitude, sigma, heading, yaw_rate, speed, angle, roll, pitch, *heights = values[10:]

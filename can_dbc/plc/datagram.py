@@ -65,7 +65,7 @@ class Header:
 
 
 def encode_command(header: Header, command: Command, key: bytes | None = None) -> bytes:
-    """The datagram of a command; raises MapError for a value that does not fit."""
+    """Encode the datagram of a command; raises MapError for a value that does not fit."""
     c = command
     body = [v for pair in zip(_micros(c.reference, "reference"), _micros(c.rate, "rate"), strict=True) for v in pair]
     grapple_pct = plc.whole(c.grapple_pct, 1, 0, 100, "the grapple percentage")
@@ -75,7 +75,7 @@ def encode_command(header: Header, command: Command, key: bytes | None = None) -
 
 
 def decode_command(data: bytes, key: bytes | None = None) -> tuple[Header, Command]:
-    """Header and command of a datagram; raises MapError for an undefined value, so that the PLC can name the fault."""
+    """Decode header and command of a datagram; MapError for an undefined value, so that the PLC can name the fault."""
     header, mode, arm, values = _opened(data, _COMMAND, COMMAND_TYPE, key)
     *body, grapple, grapple_pct, speed_pct, reset = values
     if mode not in set(Mode) or arm not in (0, ARM_KEY) or grapple not in set(Grapple):
@@ -89,7 +89,7 @@ def decode_command(data: bytes, key: bytes | None = None) -> tuple[Header, Comma
 
 
 def encode_reply(header: Header, feedback: Feedback, key: bytes | None = None) -> bytes:
-    """The datagram of a reply; ``feedback.heartbeat`` and ``accepted`` are sent as sequence and echo."""
+    """Encode the datagram of a reply; ``feedback.heartbeat`` and ``accepted`` are sent as sequence and echo."""
     f = feedback
     body = [
         v for pair in zip(_micros(f.position, "position"), _micros(f.velocity, "velocity"), strict=True) for v in pair
@@ -104,7 +104,7 @@ def encode_reply(header: Header, feedback: Feedback, key: bytes | None = None) -
 
 
 def decode_reply(data: bytes, key: bytes | None = None) -> tuple[Header, Feedback]:
-    """Header and feedback of a datagram."""
+    """Decode the header and feedback of a datagram."""
     header, state, _, values = _opened(data, _REPLY, REPLY_TYPE, key)
     position, velocity = _halves(values[: 2 * N_AXES])
     pressures = values[2 * N_AXES : 2 * N_AXES + N_PRESSURES]

@@ -31,7 +31,7 @@ class Machine(Protocol):
         """
 
     def observe(self) -> Feedback:
-        """What the machine measures now.
+        """Return what the machine measures now.
 
         ``heartbeat`` counts its cycles: the machine is alive while it grows.  ``sampled_us`` is the time of the sample:
         the same time again is the same sample.  ``estop_frame`` is the safety module's own EstopStat.  ``accepted`` is

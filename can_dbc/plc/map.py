@@ -174,7 +174,7 @@ class Bounds:
 
     @classmethod
     def references(cls, joints: Sequence[tuple[float, float, float]]) -> Bounds:
-        """Limits of role REFERENCES, from (lower, upper, greatest rate) of every joint."""
+        """Build the limits of role REFERENCES, from (lower, upper, greatest rate) of every joint."""
         spare = N_AXES - N_JOINTS
         return cls(
             Role.REFERENCES,
@@ -184,11 +184,11 @@ class Bounds:
 
     @classmethod
     def valves(cls) -> Bounds:
-        """Limits of role VALVES: full opening in both directions."""
+        """Build the limits of role VALVES: full opening in both directions."""
         return cls(Role.VALVES, ((-1.0, 1.0),) * N_JOINTS + ((0.0, 0.0),) * (N_AXES - N_JOINTS))
 
     def check(self, command: Command) -> None:
-        """Raises MapError for a command that this machine cannot execute."""
+        """Check a command; raises MapError for one that this machine cannot execute."""
         if command.mode not in (Mode.NEUTRAL, int(self.role)):
             raise MapError("plc.role", f"mode {command.mode} is not of role {self.role.name}")
         if command.mode is Mode.NEUTRAL:
@@ -205,7 +205,7 @@ class Bounds:
 
 
 def whole(value: float, scale: float, lowest: int, highest: int, what: str) -> int:
-    """``value * scale`` as a whole number in lowest..highest; raises MapError."""
+    """Compute ``value * scale`` as a whole number in lowest..highest; raises MapError."""
     scaled = value * scale
     if not math.isfinite(scaled):
         raise MapError("plc.not-finite", f"{what} is not a finite number")
@@ -218,12 +218,12 @@ def whole(value: float, scale: float, lowest: int, highest: int, what: str) -> i
 
 
 def micro(value: float, what: str) -> int:
-    """A value in units of 1e-6, 32 bits signed."""
+    """Convert a value to units of 1e-6, 32 bits signed."""
     return whole(value, _MICRO, -(1 << 31), (1 << 31) - 1, what)
 
 
 def signed16(value: float, scale: float, what: str) -> int:
-    """``value * scale``, 16 bits signed."""
+    """Compute ``value * scale``, 16 bits signed."""
     return whole(value, scale, -(1 << 15), (1 << 15) - 1, what)
 
 
@@ -243,16 +243,16 @@ def _short(register: int) -> int:
 
 
 def command_registers(command: Command, heartbeat: int, sequence: int, order: WordOrder) -> list[int]:
-    """The command block, registers 100 to 131; raises MapError."""
+    """Encode the command block, registers 100 to 131; raises MapError."""
     if len(command.reference) != N_AXES or len(command.rate) != N_AXES:
         raise MapError("plc.axis-count", f"a command has {N_AXES} axes")
-    words = [heartbeat & _U16, sequence & _U16, command.mode, ARM_KEY if command.armed else 0]
+    registers = [heartbeat & _U16, sequence & _U16, command.mode, ARM_KEY if command.armed else 0]
     for axis, value in enumerate(command.reference):
-        words += _pair(micro(value, f"reference of axis {axis}"), order)
-    words += [signed16(r, _MILLI, f"rate of axis {i}") & _U16 for i, r in enumerate(command.rate)]
+        registers += _pair(micro(value, f"reference of axis {axis}"), order)
+    registers += [signed16(r, _MILLI, f"rate of axis {i}") & _U16 for i, r in enumerate(command.rate)]
     grapple_pct = whole(command.grapple_pct, 1, 0, 100, "the grapple percentage")
     speed_pct = whole(command.max_speed_pct, 1, 0, 100, "the maximum speed")
-    return [*words, command.grapple, grapple_pct, speed_pct, int(command.reset), 0, 0, 0]
+    return [*registers, command.grapple, grapple_pct, speed_pct, int(command.reset), 0, 0, 0]
 
 
 _CHOICES: Final = {
@@ -269,14 +269,14 @@ _CHOICES: Final = {
 
 
 def check_single(address: int, value: int) -> None:
-    """Raises MapError for a register of the command block with an undefined value."""
+    """Check one register of the command block; raises MapError for an undefined value."""
     allowed = _CHOICES.get(address)
     if allowed is not None and value not in allowed:
         raise MapError("plc.illegal-value", f"register {address} is {value}, which is not defined")
 
 
 def read_command(registers: Sequence[int], order: WordOrder) -> Command:
-    """The command in the 32 registers from `COMMAND_AT`; raises MapError."""
+    """Read the command from the 32 registers from `COMMAND_AT`; raises MapError."""
     if len(registers) != COMMAND_COUNT:
         raise MapError("plc.block-size", f"a command block has {COMMAND_COUNT} registers, not {len(registers)}")
     for offset, value in enumerate(registers):
@@ -295,30 +295,30 @@ def read_command(registers: Sequence[int], order: WordOrder) -> Command:
 
 
 def estop_words(frame: bytes) -> tuple[int, ...]:
-    """EstopStat as four registers, its first byte the high half of the first; raises MapError."""
+    """Split EstopStat into four registers, its first byte the high half of the first; raises MapError."""
     if len(frame) != ESTOP_BYTES:
         raise MapError("plc.estop-frame", f"EstopStat has {ESTOP_BYTES} bytes, not {len(frame)}")
     return struct.unpack(">4H", frame)
 
 
 def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> list[int]:
-    """The status block, registers 0 to 55; raises MapError."""
+    """Encode the status block, registers 0 to 55; raises MapError."""
     f = feedback
-    words = [MAGIC, MAP_VERSION, *_pair(WORD_TEST, order)]
-    words += [f.heartbeat & _U16, f.state, f.fault & _U16, f.fault_axis & _U16]
-    words += [f.estop & _U16, f.accepted & _U16, min(f.longest_cycle_us, _U16), watchdog_ms]
+    registers = [MAGIC, MAP_VERSION, *_pair(WORD_TEST, order)]
+    registers += [f.heartbeat & _U16, f.state, f.fault & _U16, f.fault_axis & _U16]
+    registers += [f.estop & _U16, f.accepted & _U16, min(f.longest_cycle_us, _U16), watchdog_ms]
     for axis, value in enumerate(f.position):
-        words += _pair(micro(value, f"position of axis {axis}"), order)
-    words += [signed16(v, _MILLI, f"velocity of axis {i}") & _U16 for i, v in enumerate(f.velocity)]
-    words += [signed16(p, 10.0, f"pressure {i}") & _U16 for i, p in enumerate(f.pressure_bar)]
-    words += [whole(f.opening, _MILLI, 0, 1000, "the opening"), whole(f.load_kg, 1, 0, _U16, "the load")]
-    words += [*estop_words(f.estop_frame), f.sampled_us & _U16]
-    words += [signed16(u, _MILLI, f"output of axis {i}") & _U16 for i, u in enumerate(f.output)]
-    return [*words, 0]
+        registers += _pair(micro(value, f"position of axis {axis}"), order)
+    registers += [signed16(v, _MILLI, f"velocity of axis {i}") & _U16 for i, v in enumerate(f.velocity)]
+    registers += [signed16(p, 10.0, f"pressure {i}") & _U16 for i, p in enumerate(f.pressure_bar)]
+    registers += [whole(f.opening, _MILLI, 0, 1000, "the opening"), whole(f.load_kg, 1, 0, _U16, "the load")]
+    registers += [*estop_words(f.estop_frame), f.sampled_us & _U16]
+    registers += [signed16(u, _MILLI, f"output of axis {i}") & _U16 for i, u in enumerate(f.output)]
+    return [*registers, 0]
 
 
 def check_identity(registers: Sequence[int], order: WordOrder) -> None:
-    """Raises MapError unless the block is of this map, this version and this word order."""
+    """Check the block; raises MapError unless it is of this map, this version and this word order."""
     if len(registers) != STATUS_COUNT:
         raise MapError("plc.block-size", f"a status block has {STATUS_COUNT} registers, not {len(registers)}")
     if registers[0] != MAGIC:
@@ -345,7 +345,7 @@ def check_identity(registers: Sequence[int], order: WordOrder) -> None:
 
 
 def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, int]:
-    """Feedback and watchdog [ms] in the 56 registers from `STATUS_AT`; raises MapError."""
+    """Read the feedback and watchdog [ms] in the 56 registers from `STATUS_AT`; raises MapError."""
     check_identity(registers, order)
     try:
         state = State(registers[5])
@@ -372,5 +372,5 @@ def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, i
 
 
 def advances(sequence: int, last: int) -> bool:
-    """Whether a 16-bit sequence number lies ahead of the last one."""
+    """Tell whether a 16-bit sequence number lies ahead of the last one."""
     return 0 < (sequence - last) & _U16 < 1 << 15

@@ -57,16 +57,16 @@ class Registers(Protocol):
     """The registers of a server; reading and writing raise RegisterRefused, and then change nothing."""
 
     def read(self, address: int, count: int) -> list[int]:
-        """Registers from ``address`` on."""
+        """Read registers from ``address`` on."""
 
     def write(self, client: int, address: int, values: Sequence[int]) -> None:
-        """A write by the connection with this number."""
+        """Take a write by the connection with this number."""
 
     def commands(self, client: int) -> bool:
-        """Whether this connection is the one that commands now."""
+        """Tell whether this connection is the one that commands now."""
 
     def closed(self, client: int) -> None:
-        """This connection has ended."""
+        """Note that this connection has ended."""
 
 
 # -- client ------------------------------------------------------------------------------------------------------------
@@ -85,7 +85,7 @@ class ModbusClient:
         return self._client is not None and self._client.connected
 
     async def connect(self) -> None:
-        """Connects, after closing an existing connection; raises LinkError."""
+        """Connect, after closing an existing connection; raises LinkError."""
         self.close()
         client = AsyncModbusTcpClient(
             self._host, port=self._port, timeout=self._timeout_s, retries=0, reconnect_delay=0
@@ -104,7 +104,7 @@ class ModbusClient:
         self._client = client
 
     async def exchange(self, command: Sequence[int]) -> list[int]:
-        """Writes the command block and reads the status block in one request (FC 23).
+        """Write the command block and read the status block in one request (FC 23).
 
         Raises:
             RegisterRefused: The PLC refused the write; the connection stays open.
@@ -121,7 +121,7 @@ class ModbusClient:
         )
 
     async def status(self) -> list[int]:
-        """Reads the status block (FC 3); raises as `exchange` does."""
+        """Read the status block (FC 3); raises as `exchange` does."""
         return await self._request(lambda c: c.read_holding_registers(STATUS_AT, count=STATUS_COUNT, device_id=UNIT))
 
     async def _request(self, request: Any) -> list[int]:
@@ -143,7 +143,7 @@ class ModbusClient:
         return list(response.registers)
 
     def close(self) -> None:
-        """Ends the connection; may be called twice."""
+        """End the connection; may be called twice."""
         if self._client is not None:
             self._client.close()
             self._client = None
@@ -204,7 +204,7 @@ class _Connection:
         self._framer = FramerSocket(self._decoder)
 
     async def answer(self, transaction: int, unit: int, pdu: bytes) -> tuple[bytes, bool]:
-        """The answer to a request, and whether it is a refusal."""
+        """Return the answer to a request, and whether it is a refusal."""
         response = await self._respond(unit, pdu)
         response.transaction_id, response.dev_id = transaction, unit
         return self._framer.buildFrame(response), isinstance(response, ExceptionResponse)
@@ -233,7 +233,7 @@ class ModbusServer:
         self._connections: dict[int, _Connection] = {}
 
     async def start(self) -> None:
-        """Listens; raises LinkError.  ``port`` is then the port in use (0 chooses a free one)."""
+        """Listen; raises LinkError.  ``port`` is then the port in use (0 chooses a free one)."""
         try:
             self._server = await asyncio.start_server(
                 self._serve, self._host, self.port, limit=2 * _MAX_PDU, backlog=MAX_CONNECTIONS
@@ -245,7 +245,7 @@ class ModbusServer:
         self.port = self._server.sockets[0].getsockname()[1]
 
     def close(self) -> None:
-        """Ends listening and every connection."""
+        """End listening and every connection."""
         if self._server is not None:
             self._server.close()
         for connection in list(self._connections.values()):
@@ -270,7 +270,7 @@ class ModbusServer:
             writer.transport.abort()
 
     def _evict(self) -> None:
-        """Ends the connection without a request for longest, never the commanding one."""
+        """End the connection without a request for longest, never the commanding one."""
         others = [c for c in self._connections.values() if not self._registers.commands(c.number)]
         victim = min(others, key=lambda c: (c.active, c.number))
         self.counts.evicted += 1
@@ -301,7 +301,7 @@ class ModbusServer:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is a loopback address of this machine."""
+    """Tell whether an address is a loopback address of this machine."""
     with contextlib.suppress(OSError):
         return socket.gethostbyname(host).startswith("127.")
     return False

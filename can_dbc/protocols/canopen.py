@@ -44,27 +44,27 @@ class NodeState(IntEnum):
 
 
 def nmt_frame(command: NmtCommand, node: int = 0) -> RawFrame:
-    """The NMT command for a node, or for all nodes with 0."""
+    """Build the NMT command for a node, or for all nodes with 0."""
     return NMT_ID, bytes((command, node))
 
 
 def sync_frame(counter: int) -> RawFrame:
-    """SYNC with its counter, 1 to 240; see ``next_sync``."""
+    """Build the SYNC with its counter, 1 to 240; see ``next_sync``."""
     return SYNC_ID, bytes((counter,))
 
 
 def next_sync(counter: int) -> int:
-    """The SYNC counter after ``counter``: 1 to 240, then 1 again (1019h = 240)."""
+    """Return the SYNC counter after ``counter``: 1 to 240, then 1 again (1019h = 240)."""
     return counter % 240 + 1
 
 
 def heartbeat_frame(node: int, state: NodeState) -> RawFrame:
-    """The heartbeat of a node; BOOT_UP is the boot-up message."""
+    """Build the heartbeat of a node; BOOT_UP is the boot-up message."""
     return HEARTBEAT_BASE + node, bytes((state,))
 
 
 def parse_heartbeat(key: int, data: bytes) -> tuple[int, int] | None:
-    """(node, state byte without the toggle bit) of a heartbeat frame."""
+    """Parse (node, state byte without the toggle bit) from a heartbeat frame."""
     node = key - HEARTBEAT_BASE
     return (node, data[0] & 0x7F) if 0 < node <= MAX_NODE and len(data) == 1 else None
 
@@ -118,7 +118,7 @@ EMERGENCY_CLASSES: Final = {
 
 
 def parse_emergency(key: int, data: bytes) -> Emergency | None:
-    """The emergency message in a frame."""
+    """Parse the emergency message in a frame."""
     node = key - EMCY_BASE
     if not 0 < node <= MAX_NODE or len(data) != 8:
         return None
@@ -126,7 +126,7 @@ def parse_emergency(key: int, data: bytes) -> Emergency | None:
 
 
 def emergency_frame(emergency: Emergency) -> RawFrame:
-    """The frame of an emergency message; the manufacturer bytes are padded with zeros."""
+    """Build the frame of an emergency message; the manufacturer bytes are padded with zeros."""
     data = struct.pack("<HB5s", emergency.code, emergency.register, emergency.manufacturer)
     return EMCY_BASE + emergency.node, data
 
@@ -162,12 +162,12 @@ class HeartbeatMonitor:
         self.boots = dict.fromkeys(self._timeouts_ns, 0)
 
     def forget(self) -> None:
-        """Returns to the state before the first heartbeat; keeps the counts of boots."""
+        """Return to the state before the first heartbeat; keeps the counts of boots."""
         self._seen_ns.clear()
         self.states.clear()
 
     def receive(self, key: int, data: bytes, now_ns: int) -> bool:
-        """Accepts a frame; False if it is not a heartbeat of a monitored node."""
+        """Accept a frame; False if it is not a heartbeat of a monitored node."""
         parsed = parse_heartbeat(key, data)
         if parsed is None or parsed[0] not in self._timeouts_ns:
             return False
@@ -179,22 +179,22 @@ class HeartbeatMonitor:
         return True
 
     def presence(self, node: int, now_ns: int) -> Presence:
-        """The presence of a monitored node at ``now_ns``."""
+        """Return the presence of a monitored node at ``now_ns``."""
         seen_ns = self._seen_ns.get(node)
         if seen_ns is None:
             return Presence.WAITING if now_ns < self._boot_deadline_ns else Presence.NEVER_SEEN
         return Presence.ALIVE if now_ns - seen_ns <= self._timeouts_ns[node] else Presence.LOST
 
     def age_ns(self, node: int, now_ns: int) -> int:
-        """Time since the last heartbeat of a node; since the clock's zero for a node that sent none."""
+        """Return the time since the last heartbeat of a node; since the clock's zero for a node that sent none."""
         return now_ns - self._seen_ns.get(node, 0)
 
     def operational(self, node: int, now_ns: int) -> bool:
-        """Whether a node is alive and OPERATIONAL."""
+        """Tell whether a node is alive and OPERATIONAL."""
         return self.states.get(node) == NodeState.OPERATIONAL and self.presence(node, now_ns) is Presence.ALIVE
 
     def next_loss_ns(self) -> int:
-        """The time until which every node seen so far stays ALIVE without further heartbeats."""
+        """Compute the time until which every node seen so far stays ALIVE without further heartbeats."""
         timeouts_ns, first_ns = self._timeouts_ns, 0
         for node, seen_ns in self._seen_ns.items():
             loss_ns = seen_ns + timeouts_ns[node]
@@ -203,7 +203,7 @@ class HeartbeatMonitor:
         return first_ns
 
     def missing(self, now_ns: int) -> tuple[int, ...]:
-        """Nodes that are LOST or NEVER_SEEN."""
+        """List the nodes that are LOST or NEVER_SEEN."""
         return tuple(n for n in self._timeouts_ns if self.presence(n, now_ns) >= Presence.LOST)
 
 
@@ -237,37 +237,37 @@ class Sdo:
 
 
 def upload_request(node: int, index: int, sub: int) -> RawFrame:
-    """Client: request an object of a node."""
+    """Build a client's request for an object of a node."""
     return SDO_TO_SERVER + node, struct.pack("<BHB4x", 0x40, index, sub)
 
 
 def download_request(node: int, index: int, sub: int, data: bytes) -> RawFrame:
-    """Client: write 1 to 4 bytes, little-endian, to an object of a node."""
+    """Build a client's request to write 1 to 4 bytes, little-endian, to an object of a node."""
     return SDO_TO_SERVER + node, _expedited(0x23, index, sub, data)
 
 
 def upload_response(node: int, index: int, sub: int, data: bytes) -> RawFrame:
-    """Server: answer an upload with 1 to 4 bytes."""
+    """Build a server's frame to answer an upload with 1 to 4 bytes."""
     return SDO_TO_CLIENT + node, _expedited(0x43, index, sub, data)
 
 
 def download_response(node: int, index: int, sub: int) -> RawFrame:
-    """Server: confirm a download."""
+    """Build a server's frame to confirm a download."""
     return SDO_TO_CLIENT + node, struct.pack("<BHB4x", 0x60, index, sub)
 
 
 def abort_frame(base: int, node: int, index: int, sub: int, code: int) -> RawFrame:
-    """Either side ends a transfer; ``base`` is SDO_TO_CLIENT or SDO_TO_SERVER."""
+    """Build the abort with which either side ends a transfer; ``base`` is SDO_TO_CLIENT or SDO_TO_SERVER."""
     return base + node, struct.pack("<BHBI", 0x80, index, sub, code)
 
 
 def parse_response(key: int, data: bytes) -> Sdo | None:
-    """Client: a server's response; UPLOAD carries the value, DOWNLOAD is the confirmation."""
+    """Parse a server's response for a client; UPLOAD carries the value, DOWNLOAD is the confirmation."""
     return _parse(key - SDO_TO_CLIENT, data, SdoKind.UPLOAD, carrying=2, bare=3)
 
 
 def parse_request(key: int, data: bytes) -> Sdo | None:
-    """Server: a client's request; DOWNLOAD carries the value, UPLOAD requests it."""
+    """Parse a client's request for a server; DOWNLOAD carries the value, UPLOAD requests it."""
     return _parse(key - SDO_TO_SERVER, data, SdoKind.DOWNLOAD, carrying=1, bare=2)
 
 
@@ -278,7 +278,7 @@ def _expedited(command: int, index: int, sub: int, data: bytes) -> bytes:
 
 
 def _parse(node: int, data: bytes, value_kind: SdoKind, carrying: int, bare: int) -> Sdo | None:
-    """``carrying`` and ``bare`` are the command specifiers with a value (of ``value_kind``) and without one."""
+    """Parse an SDO; ``carrying`` and ``bare``: the specifiers with a value (of ``value_kind``) and without one."""
     if not 0 < node <= MAX_NODE or len(data) != 8:
         return None
     command, index, sub, value = struct.unpack("<BHB4s", data)
@@ -308,7 +308,7 @@ _NO_OBJECT, _READ_ONLY, _WRONG_LENGTH, _NO_SEGMENTS = 0x0602_0000, 0x0601_0002, 
 
 
 def identity_objects(node: int) -> Objects:
-    """The objects that CiA 301 demands of every node: device type, error register, heartbeat period, identity."""
+    """List the objects that CiA 301 demands of every node: device type, error register, heartbeat period, identity."""
     return {
         (0x1000, 0): bytes(4),
         (0x1001, 0): bytes(1),
@@ -342,7 +342,7 @@ class CanopenSlave:
         return self.state == NodeState.OPERATIONAL
 
     def receive_nmt(self, data: bytes) -> None:
-        """Accepts the payload of an NMT command frame; ignores it when it is malformed or for another node."""
+        """Accept the payload of an NMT command frame; ignore it when it is malformed or for another node."""
         if len(data) != 2 or data[1] not in (0, self.node):
             return
         match data[0]:
@@ -357,10 +357,10 @@ class CanopenSlave:
                 self.restart()
 
     def restart(self) -> None:
-        """Called after an NMT reset; the owner discards its run-time state here."""
+        """Discard the owner's run-time state, in an override; called after an NMT reset."""
 
     def sdo_answer(self, key: int, data: bytes) -> RawFrame | None:
-        """The answer to an SDO request to this node; None for any other frame and for an abort."""
+        """Answer an SDO request to this node; None for any other frame and for an abort."""
         request = parse_request(key, data)
         if request is None or request.node != self.node or request.kind is SdoKind.ABORT:
             return None

@@ -32,7 +32,7 @@ TABLE: Final = _table()
 
 
 def crc8(data: bytes, start: int = 0xFF) -> int:
-    """CRC-8H2F of ``data``; ``start`` is the register before the first byte."""
+    """Compute the CRC-8H2F of ``data``; ``start`` is the register before the first byte."""
     table, crc = TABLE, start
     for byte in data:
         crc = table[crc ^ byte]
@@ -40,7 +40,7 @@ def crc8(data: bytes, start: int = 0xFF) -> int:
 
 
 def frame_crc(data: bytes, data_ids: bytes) -> int:
-    """The CRC for byte 0 of a frame whose counter is set."""
+    """Compute the CRC for byte 0 of a frame whose counter is set."""
     t, crc = TABLE, 0xFF
     if len(data) == 8:  # the usual length; unrolled, this takes three quarters of the loop's time
         _, a, b, c, d, e, f, g = data
@@ -51,7 +51,7 @@ def frame_crc(data: bytes, data_ids: bytes) -> int:
 
 
 def protect(payload: bytes, counter: int, data_ids: bytes) -> bytes:
-    """``payload`` (a whole frame of at least 2 bytes) with counter and CRC filled in.
+    """Fill counter and CRC into ``payload`` (a whole frame of at least 2 bytes).
 
     ``data_ids`` are the 16 Data IDs of the message; the high nibble of byte 1 is unchanged.
     """
@@ -73,7 +73,7 @@ class Sender:
         self.counter = counter & 0x0F
 
     def protect(self, payload: bytes) -> bytes:
-        """The frame to send for a payload; increments the counter."""
+        """Build the frame to send for a payload; increments the counter."""
         counter = self.counter
         self.counter = (counter + 1) & 0x0F
         return protect(payload, counter, self.data_ids)
@@ -118,7 +118,7 @@ class Checker:
         self.reset()
 
     def reset(self) -> None:
-        """Resets the stream: the next two frames must qualify it again."""
+        """Reset the stream: the next two frames must qualify it again."""
         self.counter = -1
         self.trusted = False
         self._good = 0
@@ -126,7 +126,7 @@ class Checker:
         self._last_bad = False
 
     def check(self, data: bytes) -> Status:
-        """Checks one received frame and updates the stream's state."""
+        """Check one received frame and update the stream's state."""
         if len(data) < 2 or frame_crc(data, self.data_ids) != data[0]:
             self._bad = (self._bad << 1 | 1) & WINDOW_MASK
             if self._last_bad or self._bad.bit_count() >= BAD_IN_WINDOW:
@@ -156,7 +156,7 @@ class Checker:
         return _OK if delta == 1 else _OK_SOME_LOST
 
     def accepts(self, data: bytes) -> bool:
-        """Checks one received frame as `check` does; whether it may be used."""
+        """Check one received frame as `check` does, and tell whether it may be used."""
         status = self.check(data)
         return status is _OK or status is _OK_SOME_LOST
 

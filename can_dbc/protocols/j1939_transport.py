@@ -52,7 +52,7 @@ class Transport:
         self.lost = self.extended = self.unopened = 0
 
     def receive(self, key: int, data: bytes, now_ns: int) -> Transported | None:
-        """The message that this frame completes; a frame that is none of the transport's changes nothing."""
+        """Return the message that this frame completes; a frame that is none of the transport's changes nothing."""
         if not key & EXTENDED or key & (ERROR | REMOTE):
             return None
         _, pgn, source, destination = split_id(key)
@@ -65,7 +65,7 @@ class Transport:
         return None
 
     def end(self) -> None:
-        """No more frames will come: what is still under way is lost."""
+        """End the reception: no more frames will come, what is still under way is lost."""
         self.lost += len(self._open)
         self._open.clear()
 

@@ -36,7 +36,7 @@ class Identifier(NamedTuple):
 
 
 def split_id(key: int) -> Identifier:
-    """The parts of a key or bare identifier."""
+    """Split a key or bare identifier into its parts."""
     pgn = key >> 8 & 0x3FFFF
     destination = BROADCAST
     if pgn >> 8 & 0xFF < 240:
@@ -45,7 +45,7 @@ def split_id(key: int) -> Identifier:
 
 
 def join_id(priority: int, pgn: int, source: int, destination: int = BROADCAST) -> int:
-    """The extended key of a PGN; raises ValueError for a destination or low byte that the PGN's format excludes."""
+    """Build the extended key of a PGN; ValueError for a destination or low byte that the PGN's format excludes."""
     if pgn >> 8 & 0xFF < 240:
         if pgn & 0xFF:
             raise ValueError(f"PGN {pgn} is addressed, its low byte must be 0")
@@ -66,7 +66,7 @@ class _Assembly:
         self.parts: list[bytes] = []
 
     def continues(self, index: int, now_ns: int) -> bool:
-        """Whether a frame may be of this message: a later one, not stamped before its newest nor after 750 ms."""
+        """Tell whether a frame may be of this message: a later one, not stamped before its newest nor after 750 ms."""
         return index >= self.next_index and self.newest_ns <= now_ns <= self.started_ns + MAX_FAST_PACKET_AGE_NS
 
 
@@ -83,7 +83,7 @@ class Reassembler:
         self.lost = 0
 
     def add(self, key: int, data: bytes, now_ns: int) -> bytes | None:
-        """Adds one frame; returns the payload if it completes a packet.  Raises FrameRefused for an invalid frame."""
+        """Add one frame; returns the payload if it completes a packet.  Raises FrameRefused for an invalid frame."""
         if len(data) < 2:
             raise FrameRefused(Refusal.LENGTH, f"fast packet frame of PGN {split_id(key).pgn}")
         index, slot = data[0] & 0x1F, (key & 0x03FF_FFFF, data[0] >> 5)
@@ -115,7 +115,7 @@ class Reassembler:
         return b"".join(assembly.parts) + part[: assembly.missing]
 
     def end(self) -> None:
-        """No more frames will come: what is still open is lost."""
+        """End the reception: no more frames will come, what is still open is lost."""
         for assembly in self._open.values():
             self._lose(assembly)
         self._open.clear()
@@ -128,14 +128,14 @@ class Reassembler:
         return assembly
 
     def _lose(self, assembly: _Assembly | None) -> None:
-        """Counts a message as lost, once."""
+        """Count a message as lost, once."""
         if assembly is not None and not assembly.lost:
             assembly.lost = True
             self.lost += 1
 
 
 def fast_packet(payload: bytes, sequence: int) -> Iterator[bytes]:
-    """The frames of a fast packet, padded with ones; ``sequence`` 0 to 7 distinguishes packets of one PGN."""
+    """Yield the frames of a fast packet, padded with ones; ``sequence`` 0 to 7 distinguishes packets of one PGN."""
     if len(payload) > MAX_FAST_PACKET_BYTES:
         raise ValueError(f"a fast packet carries at most {MAX_FAST_PACKET_BYTES} bytes, not {len(payload)}")
     head = (sequence & 7) << 5
@@ -166,7 +166,7 @@ class Receiver:
         self.reassembler = Reassembler()
 
     def receive(self, key: int, data: bytes, now_ns: int) -> Reading | None:
-        """A reading if this frame is or completes a message, else None; raises FrameRefused if it must not be used."""
+        """Return a reading if this frame is or completes a message, else None; FrameRefused if it must not be used."""
         if not key & EXTENDED or key & (ERROR | REMOTE):
             return None
         codec = self.database.find(key)
@@ -181,12 +181,12 @@ class Receiver:
 
 
 def decode(codec: MessageCodec, payload: bytes) -> Values:
-    """Checked values of a PGN; a fast packet may be longer than described (repeated groups, later fields)."""
+    """Decode a PGN to checked values; a fast packet may be longer than described (repeated groups, later fields)."""
     return codec.receive(payload[: codec.length] if codec.length > 8 else payload)
 
 
 def encode(codec: MessageCodec, **fields: Any) -> bytes:
-    """The payload of a PGN; fields not given are "not available".  Raises InputRefused for an invalid value."""
+    """Encode the payload of a PGN; fields not given are "not available".  Raises InputRefused for an invalid value."""
     unknown = fields.keys() - codec.index.keys()
     if unknown:
         raise InputRefused("codec.unknown-field", f"{codec.name} has no field {', '.join(sorted(unknown))}")
@@ -194,7 +194,7 @@ def encode(codec: MessageCodec, **fields: Any) -> bytes:
 
 
 def frames(codec: MessageCodec, payload: bytes, source: int, sequence: int = 0) -> list[tuple[int, bytes]]:
-    """The frames that carry a payload: one, or those of a fast packet; the priority is that of the database."""
+    """List the frames that carry a payload: one, or those of a fast packet; the priority is that of the database."""
     if not codec.by_pgn:
         raise ConfigError("dbc.not-by-pgn", f"{codec.name} is not matched by PGN; its source address cannot be chosen")
     key = codec.key & ~0xFF | source

@@ -25,11 +25,11 @@ class Punctuality:
         self.reset()
 
     def reset(self) -> None:
-        """The next command begins the stream."""
+        """Begin the stream again with the next command."""
         self._due_ns = self._last_ns = self._counter = -1
 
     def late(self, counter: int, stamp_ns: int) -> bool:
-        """Whether the command with this counter (0 to 15), received at ``stamp_ns``, is too late."""
+        """Tell whether the command with this counter (0 to 15), received at ``stamp_ns``, is too late."""
         gap_ns, steps = stamp_ns - self._last_ns, (counter - self._counter) & 0x0F
         begins = self._counter < 0 or gap_ns > self._silence_ns
         self._last_ns, self._counter = stamp_ns, counter

@@ -21,7 +21,7 @@ QUANTILES: Final = {"p50_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
 
 
 def bin_of(duration_ns: int) -> int:
-    """The bin of a duration; a negative one counts as 0."""
+    """Return the bin of a duration; a negative one counts as 0."""
     if duration_ns < _FINE_END:
         return duration_ns // _US if duration_ns > 0 else 0
     if duration_ns < _MIDDLE_END:
@@ -32,7 +32,7 @@ def bin_of(duration_ns: int) -> int:
 
 
 def edge_ns(i: int) -> int:
-    """Upper edge of bin i; meaningless for the last one (use ``longest_ns``)."""
+    """Return the upper edge of bin i; meaningless for the last one (use ``longest_ns``)."""
     if i < _MIDDLE_AT:
         return (i + 1) * _US
     if i < _COARSE_AT:
@@ -50,7 +50,7 @@ class Durations:
         self.longest_ns, self.total_ns = longest_ns, total_ns
 
     def add(self, duration_ns: int) -> None:
-        """Counts one duration."""
+        """Count one duration."""
         if 0 <= duration_ns < _FINE_END:  # as `bin_of`, without the call: this runs a dozen times per tick
             self.bins[duration_ns // _US] += 1
         else:
@@ -65,31 +65,31 @@ class Durations:
         return sum(self.bins)
 
     def over(self, limit_ns: int) -> int:
-        """Number of durations in bins above that of ``limit_ns``."""
+        """Count the durations in bins above that of ``limit_ns``."""
         return sum(self.bins[bin_of(limit_ns) + 1 :])
 
     def periods(self, period_ns: int) -> int:
-        """Number of whole periods in the durations: those that a loop skipped if it was late by them."""
+        """Count the whole periods in the durations: those that a loop skipped if it was late by them."""
         first = bin_of(period_ns)
         within = sum(n * (edge_ns(i - 1) // period_ns) for i, n in enumerate(self.bins[first:_REST], first) if n)
         return within + self.bins[_REST] * (self.longest_ns // period_ns)
 
     def quantile_ns(self, share: float) -> int:
-        """Upper edge of the bin at which ``share`` of the durations are reached; 0 if empty."""
-        wanted, seen = share * self.count, 0
+        """Return the upper edge of the bin at which ``share`` of the durations are reached; 0 if empty."""
+        target_count, cumulative_count = share * self.count, 0
         for i, n in enumerate(self.bins):
-            seen += n
-            if n and seen >= wanted:
+            cumulative_count += n
+            if n and cumulative_count >= target_count:
                 return self.longest_ns if i == _REST else min(edge_ns(i), max(self.longest_ns, 0))
         return 0
 
     def summary(self) -> dict[str, float]:
-        """Median, p99, p99.9 and longest in microseconds, and the count."""
-        found = {name: self.quantile_ns(share) / 1000 for name, share in QUANTILES.items()}
-        return found | {"max_us": self.longest_ns / 1000, "count": self.count}
+        """Compute median, p99, p99.9 and longest in microseconds, and the count."""
+        quantiles_us = {name: self.quantile_ns(share) / 1000 for name, share in QUANTILES.items()}
+        return quantiles_us | {"max_us": self.longest_ns / 1000, "count": self.count}
 
     def __sub__(self, earlier: Self) -> Durations:
-        """The durations after ``earlier``, a former state of the same histogram; the longest is then a bin's edge."""
+        """Return the durations after ``earlier``, a former state of the same histogram; the longest is a bin's edge."""
         bins = array("Q", [a - b for a, b in zip(self.bins, earlier.bins, strict=True)])
         last = max((i for i, n in enumerate(bins) if n), default=-1)
         longest_ns = 0 if last < 0 else self.longest_ns if last == _REST else min(edge_ns(last), self.longest_ns)

@@ -129,15 +129,17 @@ class Timing:
         return time.monotonic_ns() - self.facts.written_ns
 
     def named(self) -> dict[str, Any]:
-        """The whole page as plain values for JSON: the facts, and of each histogram the summary."""
+        """Return the whole page as plain values for JSON: the facts, and of each histogram the summary."""
         facts: dict[str, Any] = msgspec.to_builtins(self.facts)
         for name in ("longest_ns", "total_ns"):  # part of the histograms
             del facts[name]
-        return facts | {"durations": {METRIC_KEYS[name]: found.summary() for name, found in self.durations.items()}}
+        return facts | {
+            "durations": {METRIC_KEYS[name]: histogram.summary() for name, histogram in self.durations.items()}
+        }
 
 
 def default_path() -> Path:
-    """Path of the controller's page."""
+    """Return the path of the controller's page."""
     return shared_path("controller.timing")
 
 
@@ -153,7 +155,7 @@ class TimingWriter:
         _HEAD.pack_into(self._map, 0, _MAGIC, _VERSION, 0, 0)
 
     def publish(self, facts: Facts, durations: Mapping[str, Durations]) -> None:
-        """Writes facts and histograms."""
+        """Write facts and histograms."""
         text = msgspec.json.encode(facts)
         page, size = self._map, len(text)
         if size > _FACTS_BYTES:
@@ -169,12 +171,12 @@ class TimingWriter:
         _SEQUENCE.pack_into(page, _SEQUENCE_AT, self._sequence)
 
     def close(self) -> None:
-        """Removes the page, unless another process owns it by now; may be called twice."""
+        """Remove the page, unless another process owns it by now; may be called twice."""
         self._file.close()
 
 
 def read_timing(path: Path | None = None) -> Timing:
-    """A copy of the page at ``path`` (default: `default_path`); raises InputRefused."""
+    """Copy the page at ``path`` (default: `default_path`); raises InputRefused."""
     path = path or default_path()
     try:
         with path.open("rb", buffering=0) as file:

@@ -47,7 +47,7 @@ class _Damaged(Exception):
 
 
 def read_blf(content: bytes, notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
-    """The frames of a file up to the first damage; a record says where that is, ``notes`` what else is not read."""
+    """Read a file's frames up to the first damage; a record says where that is, ``notes`` what else is not read."""
     return _Reader(content, notes).records()
 
 
@@ -96,15 +96,15 @@ class _Reader:
             self.notes.append(f"{self.other_types.total()} objects are no CAN frames (object types {types})")
 
     def _file(self, at: int) -> Iterator[TraceFrame | MalformedRecord]:
-        """Containers, and objects beside them."""
+        """Read containers, and objects beside them."""
         content = self.content
         while True:
-            found = content.find(b"LOBJ", at, at + 8)
-            if found < 0:
+            object_at = content.find(b"LOBJ", at, at + 8)
+            if object_at < 0:
                 if content[at:].strip(b"\0"):
                     raise _Damaged(f"damaged from byte {at} on: no object starts there")
                 return
-            at = found
+            at = object_at
             if at + blf.OBJ_HEADER_BASE_STRUCT.size > len(content):
                 raise _Damaged(f"the file ends inside the object at byte {at}")
             _, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack_from(content, at)
@@ -127,16 +127,16 @@ class _Reader:
 
     def _container(self, at: int, body: int, end: int) -> Iterator[TraceFrame | MalformedRecord]:
         method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(self.content, body)
-        first = body + blf.LOG_CONTAINER_STRUCT.size
+        data_at = body + blf.LOG_CONTAINER_STRUCT.size
         if method == blf.NO_COMPRESSION:
-            yield from self._objects(self.content[first:end], "damaged", first)
+            yield from self._objects(self.content[data_at:end], "damaged", data_at)
         elif method == blf.ZLIB_DEFLATE:
-            place = f"damaged inside the container at byte {at}"
+            damage_text = f"damaged inside the container at byte {at}"
             try:
-                for data in self._unpacked(first, end, at):
-                    yield from self._objects(data, place)
+                for data in self._unpacked(data_at, end, at):
+                    yield from self._objects(data, damage_text)
             except zlib.error as error:
-                raise _Damaged(f"{place}: it cannot be unpacked ({error})") from error
+                raise _Damaged(f"{damage_text}: it cannot be unpacked ({error})") from error
         else:
             yield MalformedRecord(0, f"the container at byte {at} has the unknown compression {method}")
 
@@ -156,7 +156,7 @@ class _Reader:
                 yield data
 
     def _objects(self, data: bytes, place: str, origin: int | None = None) -> Iterator[TraceFrame | MalformedRecord]:
-        """The frames of the whole objects; what is left waits for the next container."""
+        """Yield the frames of the whole objects; what is left waits for the next container."""
         waiting = self.waiting
         offset = None if origin is None else origin - len(waiting)
         waiting += data
@@ -166,15 +166,15 @@ class _Reader:
         damage: _Damaged | None = None
         try:
             while True:
-                found = waiting.find(b"LOBJ", at, at + 8)
-                if found < 0 and len(waiting) - at < 8:
+                object_at = waiting.find(b"LOBJ", at, at + 8)
+                if object_at < 0 and len(waiting) - at < 8:
                     break
                 where = place if offset is None else f"damaged from byte {offset + at} on"
-                if found < 0:
+                if object_at < 0:
                     raise _Damaged(f"{where}: no object starts there")
-                if found + blf.OBJ_HEADER_BASE_STRUCT.size > len(waiting):
+                if object_at + blf.OBJ_HEADER_BASE_STRUCT.size > len(waiting):
                     break
-                at = found
+                at = object_at
                 size = self._size(at, where if offset is None else f"damaged from byte {offset + at} on")
                 if at + size > len(waiting):
                     break
@@ -199,7 +199,7 @@ class _Reader:
         return size
 
     def _wanted(self, at: int, size: int, where: str) -> int | None:
-        """The stamp of a CAN object; None for an object that is none or has an unknown header."""
+        """Read the stamp of a CAN object; None for an object that is none or has an unknown header."""
         _, head_bytes, version, _, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack_from(self.waiting, at)
         if kind not in NEEDED:
             self.other_types[kind] += 1
@@ -223,11 +223,11 @@ class _Reader:
 
 
 def _frames(batch: list[tuple[int, bytes]]) -> Iterator[TraceFrame | MalformedRecord]:
-    """The frames of whole objects: all at once, one by one if an object among them is damaged."""
+    """Convert the frames of whole objects: all at once, one by one if an object among them is damaged."""
     can_objects = [data for _, data in batch if not _is_plain_error(data)]
     messages = _messages(can_objects) if can_objects else []
     if messages is None:
-        messages = [found[0] if (found := _messages([data])) else None for data in can_objects]
+        messages = [parsed[0] if (parsed := _messages([data])) else None for data in can_objects]
     rest = iter(messages)
     for stamp_ns, data in batch:
         if _is_plain_error(data):
@@ -249,7 +249,7 @@ def _plain_error(stamp_ns: int, data: bytes) -> TraceFrame:
 
 
 def _messages(objects: list[bytes]) -> list[Any] | None:
-    """python-can's message of each object; None if there is not one of each."""
+    """Read python-can's message of each object; None if there is not one of each."""
     data = b"".join(objects)
     size = blf.OBJ_HEADER_BASE_STRUCT.size + blf.LOG_CONTAINER_STRUCT.size + len(data)
     head = blf.FILE_HEADER_STRUCT.pack(b"LOGG", blf.FILE_HEADER_SIZE, *[0] * 28).ljust(blf.FILE_HEADER_SIZE, b"\0")
@@ -257,14 +257,14 @@ def _messages(objects: list[bytes]) -> list[Any] | None:
     file = io.BytesIO(head + container + blf.LOG_CONTAINER_STRUCT.pack(blf.NO_COMPRESSION, len(data)) + data)
     try:
         with blf.BLFReader(file) as reader:
-            found = list(reader)
+            messages = list(reader)
     except (blf.BLFParseError, struct.error, ValueError, IndexError, OverflowError):
         return None
-    return found if len(found) == len(objects) else None
+    return messages if len(messages) == len(objects) else None
 
 
 def converted(message: Any, stamp_ns: int) -> TraceFrame:
-    """A python-can message as a frame; its channel is that of the file less one."""
+    """Convert a python-can message to a frame; its channel is that of the file less one."""
     key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
     key |= (REMOTE if message.is_remote_frame else 0) | (ERROR if message.is_error_frame else 0)
     data = b"" if message.is_remote_frame else bytes(message.data)

@@ -66,7 +66,7 @@ ASC_OTHER: Final = re.compile(
 
 
 def read_trace(path: Path) -> Trace:
-    """The records of a trace in file order; raises OSError if the file cannot be opened."""
+    """Read the records of a trace in file order; raises OSError if the file cannot be opened."""
     content = path.read_bytes()
     if path.suffix.lower() == ".blf" or content.startswith(b"LOGG"):
         from can_dbc.trace.blf import read_blf
@@ -84,13 +84,13 @@ def read_trace(path: Path) -> Trace:
 
 def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
     pcan = Pcan()
-    error_frame, found = False, False
+    error_frame, frame_found = False, False
     added_ns = 0 if _are_differences(lines) else None
     for number, raw in enumerate(lines, 1):
         line = raw.strip()
         if not line or line[0] == "#":
             continue
-        if number > MAX_OTHER_LINES and not found:
+        if number > MAX_OTHER_LINES and not frame_found:
             yield MalformedRecord(number, f"no frame in the {number - 1} lines before; the rest is not read")
             break
         if line[0] == ";":
@@ -100,7 +100,7 @@ def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | Malformed
         elif len(line) > MAX_LINE:
             yield MalformedRecord(number, line[:MAX_LINE])
         elif (frame := parse_line(line) or pcan.frame(line)) is not None:
-            error_frame, found = bool(frame.key & ERROR), True
+            error_frame, frame_found = bool(frame.key & ERROR), True
             if added_ns is not None:
                 added_ns += frame.stamp_ns
                 frame = TraceFrame(added_ns, frame.key, frame.data, frame.interface)
@@ -115,14 +115,14 @@ def _text(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | Malformed
 
 
 def _are_differences(lines: list[str]) -> bool:
-    """Whether stamps are those of ``candump -td``: the first is 0, and of the others more than a fifth do not rise."""
-    found = (ZERO_BASED.match(line) for line in islice(lines, MAX_STAMPS_COMPARED))
-    stamps = [float(match[1]) for match in found if match is not None]
+    """Tell whether stamps are those of ``candump -td``: the first is 0, more than a fifth of the others do not rise."""
+    matches = (ZERO_BASED.match(line) for line in islice(lines, MAX_STAMPS_COMPARED))
+    stamps = [float(match[1]) for match in matches if match is not None]
     return stamps[:1] == [0.0] and sum(b <= a for a, b in pairwise(stamps[1:])) * 5 > len(stamps)
 
 
 def parse_line(line: str) -> TraceFrame | None:
-    """The frame in one line of any of the text formats; None if the line is of another format or damaged."""
+    """Parse the frame in one line of any of the text formats; None if the line is of another format or damaged."""
     try:
         return _parsed(line)
     except ValueError:  # a number too long to convert, or blanks that are none to `bytes.fromhex`
@@ -130,17 +130,17 @@ def parse_line(line: str) -> TraceFrame | None:
 
 
 def _parsed(line: str) -> TraceFrame | None:
-    if found := CANDUMP.match(line):
-        return _candump(found[1], found[2], found[3], found[4])
-    if found := CANDUMP_SCREEN.match(line):
-        remote = found[5].startswith("remote")
-        data, length = ("", None) if remote else (found[5], int(found[4]))
-        return _frame(found[1] or "0", found[3], data, length, remote, found[2])
-    if found := PCAN_VIEW.match(line):
-        return _frame(_milliseconds(found[1]), found[2], found[4], int(found[3]))
-    if found := YACHT_DEVICES.match(line):
-        seconds = int(found[1]) * 3600 + int(found[2]) * 60 + int(found[3])
-        return _frame(f"{seconds}.{found[4]}", found[5], found[6])
+    if match := CANDUMP.match(line):
+        return _candump(match[1], match[2], match[3], match[4])
+    if match := CANDUMP_SCREEN.match(line):
+        remote = match[5].startswith("remote")
+        data, length = ("", None) if remote else (match[5], int(match[4]))
+        return _frame(match[1] or "0", match[3], data, length, remote, match[2])
+    if match := PCAN_VIEW.match(line):
+        return _frame(_milliseconds(match[1]), match[2], match[4], int(match[3]))
+    if match := YACHT_DEVICES.match(line):
+        seconds = int(match[1]) * 3600 + int(match[2]) * 60 + int(match[3])
+        return _frame(f"{seconds}.{match[4]}", match[5], match[6])
     return None
 
 
@@ -170,7 +170,7 @@ def _frame(
 
 
 def _nanoseconds(text: str) -> int:
-    """Decimal seconds as ns, exactly; the date and time of ``candump -tA``, which names no time zone, as UTC."""
+    """Convert decimal seconds to ns, exactly; date and time of ``candump -tA``, which names no time zone, as UTC."""
     if text[4:5] == "-":
         day, _, clock = text.partition(" ")
         hour, minute, second = clock.split(":")
@@ -195,7 +195,7 @@ class Pcan:
         self.others: Counter[str] = Counter()
 
     def header(self, line: str) -> None:
-        """Takes the version and the columns out of a comment line."""
+        """Take the version and the columns out of a comment line."""
         key, _, value = line[1:].replace(" ", "").partition("=")
         if key == "$FILEVERSION":
             self.columns = PCAN_COLUMNS.get(value, self.columns)
@@ -203,14 +203,14 @@ class Pcan:
             self.columns = value.replace(",", "")
 
     def frame(self, line: str) -> TraceFrame | None:
-        """The frame of a row: data, remote, or an error frame for a bus error or warning; None for another row."""
+        """Parse a row's frame: data, remote, or an error frame for a bus error or warning; None for another row."""
         try:
             return self._parsed(self._cells(line))
         except (KeyError, ValueError):
             return None
 
     def other(self, line: str) -> bool:
-        """Whether a row is of a kind that holds no frame; counts it."""
+        """Tell whether a row is of a kind that holds no frame; counts it."""
         kind = self._cells(line).get("T", "")
         self.others.update([kind] if kind in PCAN_OTHERS else [])
         return kind in PCAN_OTHERS
@@ -245,15 +245,15 @@ class Pcan:
 
 
 def _asc(lines: list[str], notes: list[str]) -> Iterator[TraceFrame | MalformedRecord]:
-    """Reads ASC line by line, so that a damaged line affects only itself.
+    """Read ASC line by line, so that a damaged line affects only itself.
 
     The stamp is read here: python-can takes neither a negative nor a relative one.
     """
     base, relative, stamp_ns, others = "hex", False, 0, 0
     for number, raw in enumerate(lines, 1):
         line = raw.strip()
-        if found := ASC_BASE.match(line):
-            base, relative = found[1].lower(), (found[2] or "").lower() == "relative"
+        if match := ASC_BASE.match(line):
+            base, relative = match[1].lower(), (match[2] or "").lower() == "relative"
         timed = ASC_TIMED.match(line)
         if timed is None:
             if line[:1].isdigit() or re.match(r"-\d", line):

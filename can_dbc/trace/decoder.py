@@ -39,7 +39,7 @@ class DecodedMessage:
     interface: str = ""
 
     def text(self) -> str:
-        """The values in one line: ``Name=value unit``, labels where the database has them."""
+        """Write the values in one line: ``Name=value unit``, labels where the database has them."""
         parts = []
         for name, value in self.values.items():
             shown = self.labels.get(name) or (f"{value:.10g}" if isinstance(value, float) else str(value))
@@ -48,7 +48,7 @@ class DecodedMessage:
         return "  ".join(parts)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; a float that is not finite becomes null."""
+        """Return a dictionary for JSON; a float that is not finite becomes null."""
         finite = {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in self.values.items()
@@ -85,7 +85,7 @@ class Decoder:
         self.broken_examples: list[str] = []
 
     def run(self, records: Iterable[Frame | MalformedRecord]) -> Iterator[DecodedMessage]:
-        """Yields the decoded messages of a trace; ``summary`` is complete at the end."""
+        """Yield the decoded messages of a trace; ``summary`` is complete at the end."""
         for record in records:
             if isinstance(record, MalformedRecord):
                 self.counts["broken"] += 1
@@ -104,7 +104,7 @@ class Decoder:
             bus.transport.end()
 
     def summary(self) -> dict[str, Any]:
-        """Counts of the records, by kind and by message."""
+        """Count the records, by kind and by message."""
         names = (
             "frames",
             "decoded",
@@ -171,7 +171,7 @@ class Decoder:
         return None if data is None else self._checked(frame, codec, data, bus)
 
     def _checked(self, frame: Frame, codec: MessageCodec, data: bytes, bus: _Bus) -> DecodedMessage:
-        """A message with all its bytes; those of a PGN may be more than the database describes, or fewer in J1939."""
+        """Decode a message with all its bytes; a PGN may have more than the database describes, or fewer in J1939."""
         if codec.by_pgn and codec.length > 8:
             data = data[: codec.length]
         fault = ""
@@ -189,7 +189,7 @@ class Decoder:
 
     @staticmethod
     def _unchecked(codec: MessageCodec, data: bytes) -> dict[str, Any]:
-        """The values of a refused frame, as far as they can be decoded."""
+        """Decode the values of a refused frame, as far as they can be decoded."""
         try:
             return codec.named(codec.decode(data))
         except FrameRefused:
@@ -197,27 +197,28 @@ class Decoder:
 
 
 def _is_fast_packet(codec: MessageCodec) -> bool:
-    """Whether a message travels as a fast packet; a long message of J1939 uses the transport protocol instead."""
+    """Tell whether a message travels as a fast packet; a long message of J1939 uses the transport protocol instead."""
     return codec.by_pgn and codec.length > 8 and split_id(codec.key).pgn >= FIRST_FAST_PACKET_PGN
 
 
 def _present(codec: MessageCodec, data: bytes) -> dict[str, Any]:
-    """The values whose bits a message of J1939 holds that is shorter than the database describes; raises
-    FrameRefused.
+    """Decode the values whose bits a message of J1939 holds that is shorter than the database describes.
+
+    Raises FrameRefused.
     """
     padded = data.ljust(codec.length, b"\xff")
     little, big = int.from_bytes(padded, "little"), int.from_bytes(padded, "big")
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     raws: dict[int, int | float] = {}
-    for place, s in enumerate(codec.signals):
+    for index, s in enumerate(codec.signals):
         last_byte = codec.length - 1 - s.shift // 8 if s.big_endian else (s.shift + s.bits - 1) // 8
         if last_byte >= len(data) or (s.parent is not None and raws.get(s.parent) not in s.parent_ids):
             continue
-        raws[place] = raw = s.extract(little, big)
+        raws[index] = raw = s.extract(little, big)
         value = s.valid(raw)
         if value is not None:
-            found[s.name] = value
-    return found
+            values[s.name] = value
+    return values
 
 
 def _decoded(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str, bus: _Bus) -> DecodedMessage:

@@ -14,7 +14,7 @@ class TraceFrame(Frame):
     interface: str
 
     def __new__(cls, stamp_ns: int, key: int, data: bytes, interface: str = "") -> Self:
-        """As a ``Frame``, which it equals."""
+        """Make the record as a ``Frame``, which it equals."""
         frame = super().__new__(cls, stamp_ns, key, data)
         frame.interface = interface
         return frame

@@ -86,7 +86,7 @@ class AddressClaim:
             self._due = True
 
     def frame(self) -> RawFrame | None:
-        """The claim when one is due: at most one per tick, however many requests came."""
+        """Return the claim when one is due: at most one per tick, however many requests came."""
         if not self._due:
             return None
         self._due = False
@@ -124,13 +124,13 @@ class CarrierInputs:
         self.unknown = self.count = 0
 
     def filters(self) -> list[int | tuple[int, int]]:
-        """Keys to receive, for the bus's filter, with masks where the source address does not matter."""
+        """List the keys to receive, for the bus's filter, with masks where the source address does not matter."""
         by_pgn = [(key, PDU2_MASK) for key in self._by_pgn]
         addresses = [(EXTENDED | form << 16, EXTENDED | 0xFF << 16) for form in FORMATS]
         return [*self._by_key, *self._own, *by_pgn, *addresses]
 
     def forget(self) -> None:
-        """All values are unknown again, and the address must be claimed anew."""
+        """Make all values unknown again, and the address must be claimed anew."""
         for state in self.messages:
             state.forget()
         self._reassembler = Reassembler()
@@ -167,7 +167,7 @@ class CarrierInputs:
         age_out(self._helpful, now_ns)
 
     def _receive_part(self, state: MessageState, frame: Frame, now_ns: int) -> None:
-        """One frame of a fast packet; the packet may continue beyond the part that the DBC describes."""
+        """Take one frame of a fast packet; the packet may continue beyond the part that the DBC describes."""
         try:
             payload = self._reassembler.add(frame.key, frame.data, frame.stamp_ns)
         except FrameRefused:
@@ -297,7 +297,7 @@ class CarrierBus:
         self._writer.encode(self.command, mode, reason, half_speed, now_ns, frames)
 
     def shutdown_frames(self) -> list[RawFrame]:
-        """The last frames before the process ends: brake on, arms held, and an alive sign with the reason."""
+        """Build the last frames before the process ends: brake on, arms held, and an alive sign with the reason."""
         frames: list[RawFrame] = []
         if not self.inputs.address.lost:
             self._writer.commands(STANDING, frames)

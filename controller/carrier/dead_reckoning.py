@@ -134,14 +134,14 @@ class DeadReckoning:
         return heading if self._reference.value() == TRUE_REFERENCE else None
 
     def offset_m(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """(east, north) [m] from the front axle to a geodetic position; NaN while its own position is unknown."""
+        """Compute (east, north) [m] from the front axle to a position; NaN while its own position is unknown."""
         if self.east_m != self.east_m:
             return math.nan, math.nan
         east, north = east_north_m(self.latitude_deg, self.longitude_deg, latitude_deg, longitude_deg)
         return east - self.east_m, north - self.north_m
 
     def step(self, elapsed_s: float) -> None:
-        """One tick, after frames are decoded and the articulation is estimated."""
+        """Run one tick, after frames are decoded and the articulation is estimated."""
         inputs, steering = self._inputs, self.steering
         self.finding = _NONE
         self._update_carrier()
@@ -200,7 +200,7 @@ class DeadReckoning:
             self.east_m, self.north_m = east, north
 
     def _axle_from_antenna(self) -> tuple[float, float]:
-        """(east, north) [m] from the antenna to the middle of the front axle; the mast leans with roll and pitch."""
+        """Compute (east, north) [m] from antenna to middle of the front axle; the mast leans with roll and pitch."""
         ahead, left, up = self._axle_m
         roll, pitch = self.tilt_rad
         if roll == roll:

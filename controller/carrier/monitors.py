@@ -91,7 +91,7 @@ class VehicleMonitor:
         self.reset(0)
 
     def reset(self, now_ns: int) -> None:
-        """The machine is not armed."""
+        """Start over: the machine is not armed."""
         self._recent_command_m_s = 0.0
         self._steering.reset()
         self._overspeed_ns = self._stuck_ns = self._disagree_ns = self._tilt_ns = now_ns
@@ -99,7 +99,7 @@ class VehicleMonitor:
             self._arm_since_ns[i] = now_ns
 
     def ready(self, waypoint: bool) -> Reason:
-        """The reason that prevents driving now, to a waypoint or by articulation angles, or NONE."""
+        """Give the reason that prevents driving now, to a waypoint or by articulation angles, or NONE."""
         reckoning = self._reckoning
         reason = self._reported()
         if reason:
@@ -120,7 +120,7 @@ class VehicleMonitor:
         now_ns: int,
         elapsed_s: float,
     ) -> tuple[Reason, int]:
-        """One tick with the commanded speed and articulation rate.
+        """Run one tick with the commanded speed and articulation rate.
 
         ``drives``: the carrier drives or slows down; ``waypoint``: it steers to a waypoint.
         """
@@ -161,7 +161,7 @@ class VehicleMonitor:
         return self._check_arms(arms, now_ns)
 
     def shares(self, now_ns: int) -> dict[str, float]:
-        """What was measured of the carrier over what is a fault, 1 and more, by the fault."""
+        """Compute what was measured of the carrier over what is a fault, 1 and more, by the fault."""
         reckoning = self._reckoning
         reversed_, stuck, runaway = self._steering.shares()
         return {
@@ -177,7 +177,7 @@ class VehicleMonitor:
         }
 
     def _reported(self) -> Reason:
-        """A fault that carrier or arms report, or that they cannot say whether there is one."""
+        """Find a fault that carrier or arms report, or that they cannot say whether there is one."""
         inputs = self._inputs
         if inputs.vehicle.values is not None and self._fault.value() != _NO_FAULT:
             return Reason.CARRIER_FAULT
@@ -186,7 +186,7 @@ class VehicleMonitor:
         return Reason.NONE
 
     def _tilt_unknown(self) -> bool:
-        """Whether the arms' node is heard and says that it does not know roll or pitch."""
+        """Tell whether the arms' node is heard and says that it does not know roll or pitch."""
         roll, pitch = self._reckoning.tilt_rad
         return self._inputs.arms_b.values is not None and (roll != roll or pitch != pitch)
 
@@ -195,7 +195,7 @@ class VehicleMonitor:
         return max(abs(roll), abs(pitch)) > self._carrier.tilt_limit_rad
 
     def _lost(self, reckoning: DeadReckoning) -> Reason:
-        """An input that driving to a waypoint needs and that is missing."""
+        """Find an input that driving to a waypoint needs and that is missing."""
         if reckoning.yaw_rad != reckoning.yaw_rad:
             return Reason.HEADING_LOST
         if reckoning.east_m != reckoning.east_m:

@@ -171,7 +171,7 @@ class Vehicle:
                 raise RequestRefused(Reason.DRIVE_HEIGHT, i)
 
     def lease_over(self, now_ns: int) -> bool:
-        """Whether the lease of the setpoint is over; True without a setpoint."""
+        """Tell whether the lease of the setpoint is over; True without a setpoint."""
         return self.setpoint is None or now_ns >= self._lease_end_ns
 
     @property
@@ -180,13 +180,13 @@ class Vehicle:
         return self.setpoint is not None and self.setpoint.speed_m_s == 0.0 and self.drive.brake
 
     def drop_setpoint(self) -> None:
-        """No setpoint is in force any more."""
+        """Drop the setpoint: none is in force any more."""
         self.setpoint = None
 
     # -- supervise
 
     def check(self, armed: bool, now_ns: int) -> tuple[Reason, int]:
-        """The fault of this tick, (NONE, 0) without one."""
+        """Return the fault of this tick, (NONE, 0) without one."""
         if not armed:
             self.monitor.reset(now_ns)
             return Reason.NONE, 0
@@ -264,7 +264,7 @@ class Vehicle:
     # -- encode
 
     def stale_mask(self) -> int:
-        """Stale inputs: one bit per message of `VEHICLE_INPUTS`."""
+        """Collect the stale inputs: one bit per message of `VEHICLE_INPUTS`."""
         mask = 0
         for bit, state in enumerate(self._inputs):
             if state.values is None:
@@ -272,7 +272,7 @@ class Vehicle:
         return mask
 
     def report(self, now_ns: int) -> bytes | None:
-        """A vehicle report when one is due."""
+        """Build a vehicle report when one is due."""
         if not self._report_due.due(now_ns):
             return None
         inputs, reckoning, gate = self.bus.inputs, self.reckoning, self.gate

@@ -86,12 +86,12 @@ class NodeMonitor:
         self._finding = (Reason.NONE, 0)
 
     def forget(self) -> None:
-        """No heartbeat is known any more.  Emergencies stay: a node reports one once and clears it once."""
+        """Forget all heartbeats.  Emergencies stay: a node reports one once and clears it once."""
         self._heartbeats.forget()
         self._changed = True
 
     def begin_tick(self) -> None:
-        """A tick begins: a boot-up counts in one tick only."""
+        """Begin a tick: a boot-up counts in one tick only."""
         if self.booted:
             for number in self.booted:
                 self.by_number[number].booted = False
@@ -99,7 +99,7 @@ class NodeMonitor:
             self._changed = True
 
     def receive(self, frame: Frame, now_ns: int) -> bool:
-        """Whether the frame is a heartbeat or emergency message of a monitored node."""
+        """Tell whether the frame is a heartbeat or emergency message of a monitored node."""
         _, key, data = frame
         if self._heartbeats.receive(key, data, now_ns):
             self._changed = True
@@ -113,26 +113,26 @@ class NodeMonitor:
         return True
 
     def operational(self, number: int, now_ns: int) -> bool:
-        """Whether a node is alive and OPERATIONAL."""
+        """Tell whether a node is alive and OPERATIONAL."""
         return self._heartbeats.operational(number, now_ns)
 
     def heartbeat_age_ns(self, number: int, now_ns: int) -> int:
-        """Time since the last heartbeat of a node; since the clock's zero for a node that sent none."""
+        """Return the time since the last heartbeat of a node; since the clock's zero for a node that sent none."""
         return self._heartbeats.age_ns(number, now_ns)
 
     def nmt_state(self, number: int) -> int:
-        """State of a node in its last heartbeat; -1 without one."""
+        """Return the state of a node in its last heartbeat; -1 without one."""
         return self._heartbeats.states.get(number, -1)
 
     def not_ready(self, now_ns: int) -> int:
-        """A required node that is not operational; 0 when all are."""
+        """Find a required node that is not operational; 0 when all are."""
         for number in self.by_number:
             if number not in PRESSURE_NODES and not self._heartbeats.operational(number, now_ns):
                 return number
         return 0
 
     def worst_finding(self, now_ns: int) -> tuple[Reason, int]:
-        """The worst finding of all nodes, and the node's number."""
+        """Return the worst finding of all nodes, and the node's number."""
         if self._changed or now_ns > self._good_until_ns:
             self._changed = False
             self._good_until_ns = self._heartbeats.next_loss_ns()
@@ -167,8 +167,8 @@ class NodeMonitor:
                 self.booted.append(number)
 
     def _emergency(self, node: NodeHealth, message: Emergency, now_ns: int) -> None:
-        """docs/reference/can-bus.md section 9: 0000 clears, 81xx counts to three in 10 s, 5xxx, 6xxx and FFxx stop the
-        machine, the rest warns.
+        """Take an emergency as docs/reference/can-bus.md section 9 says: 0000 clears, 81xx counts to three in 10 s,
+        5xxx, 6xxx and FFxx stop the machine, the rest warns.
         """
         code = message.code
         node.code = code or node.code
@@ -186,7 +186,7 @@ class NodeMonitor:
 
 
 def _own_report(node: NodeHealth) -> Reason:
-    """What a node reports about itself."""
+    """Return what a node reports about itself."""
     if node.emergency:
         return Reason.EMERGENCY_MESSAGE
     return Reason.EMERGENCY_WARNING if node.warning else _NONE
@@ -201,7 +201,10 @@ _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "
 
 
 def sample_timeout_ns(profile: Profile) -> int:
-    """An encoder behind a PLC is lost after this long without a new sample; 0: no PLC, the DBC's time-out counts."""
+    """Return the time without a new sample after which an encoder behind a PLC is lost.
+
+    0: no PLC, the DBC's time-out counts.
+    """
     return 0 if profile.plc is None else LOST_SAMPLES * round(profile.plc.sample_ms * 1e6)
 
 
@@ -224,7 +227,10 @@ class CraneInputs:
         self.plc_states = [self.plc] if self.plc_outputs is None else [self.plc, self.plc_outputs]
         specs = encoders(profile)
         lost_ns = sample_timeout_ns(profile)
-        sensed = {place: state(spec.message, ENCODER_BIT + place, lost_ns) for place, spec in specs.items()}
+        sensed = {
+            joint_number: state(spec.message, ENCODER_BIT + joint_number, lost_ns)
+            for joint_number, spec in specs.items()
+        }
         self.encoders = [sensed.get(j) for j in JOINTS]
         """By joint; None where the machine has none."""
         self.articulation = sensed.get(ARTICULATION)
@@ -246,12 +252,12 @@ class CraneInputs:
         self.unknown = self.count = 0
 
     def filters(self) -> list[int]:
-        """Keys to receive, for the bus's filter; the controller's own are among them, to notice a foreign sender."""
+        """List the keys for the bus's filter; the controller's own are among them, to notice a foreign sender."""
         services = (EMCY_BASE, SDO_TO_CLIENT, HEARTBEAT_BASE)
         return [*self._by_key, *self._own, *(base + node for base in services for node in self.nodes.by_number)]
 
     def forget(self) -> None:
-        """All values are unknown again, as after a time without reception."""
+        """Make all values unknown again, as after a time without reception."""
         for state in self.messages:
             state.forget()
         self.nodes.forget()
@@ -282,8 +288,8 @@ class CraneInputs:
 
 
 def spool_signals(inputs: CraneInputs) -> list[Signal]:
-    """Positions of the spools [%], in ``Joint`` order: measured, or as a PLC reports its outputs to them; without a
-    value where neither is known.
+    """List the positions of the spools [%], in ``Joint`` order: measured, or as a PLC reports its outputs to them;
+    without a value where neither is known.
     """
     outputs = inputs.plc_outputs
     if outputs is not None:

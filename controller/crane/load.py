@@ -68,7 +68,7 @@ class LoadEstimator:
 
 
 def _carrying_joints_known(position: Sequence[float]) -> bool:
-    """Whether the joints that carry the load are known; the rotator does not matter."""
+    """Tell whether the joints that carry the load are known; the rotator does not matter."""
     return not any(math.isnan(position[j]) for j in range(N_JOINTS - 1))
 
 
@@ -101,7 +101,7 @@ class LoadChange:
         self._until_ns = 0
 
     def step(self, load_kg: float, now_ns: int) -> None:
-        """The estimated load (NaN: not known, which is no change)."""
+        """Take the estimated load (NaN: not known, which is no change)."""
         if load_kg == load_kg:
             off_kg = load_kg - self._mean_kg
             if abs(off_kg) > max(CHANGE_KG, CHANGE_SHARE * self._mean_kg):
@@ -109,7 +109,7 @@ class LoadChange:
             self._mean_kg += self._gain * off_kg
 
     def recent(self, now_ns: int) -> bool:
-        """Whether the load changed up to `CHANGE_REST_NS` ago."""
+        """Tell whether the load changed up to `CHANGE_REST_NS` ago."""
         return now_ns < self._until_ns
 
 
@@ -210,7 +210,7 @@ class LoadMoment:
         self._prepare(position, roll_rad, pitch_rad)
 
     def _prepare(self, position: Sequence[float], roll_rad: float, pitch_rad: float) -> None:
-        """What the pressures' judgements until the next call need of the geometry; it changes by 5 mm meanwhile."""
+        """Compute what judging the pressures needs of the geometry until the next call; it changes 5 mm meanwhile."""
         kin, of = self._kinematics, self._stability
         head_m, pin_m, _ = distances(kin, position)
         ahead_m = pin_m - kin.a1_m
@@ -242,7 +242,7 @@ class LoadMoment:
         self.overloaded = self._heavy or self._pressed
 
     def moment_nm(self, position: Sequence[float], load_kg: float, roll_rad: float, pitch_rad: float) -> float:
-        """Moment about the tipping line [Nm]; NaN while a joint is unknown."""
+        """Compute the moment about the tipping line [Nm]; NaN while a joint is unknown."""
         level_nm = level_moment_nm(self._stability, self._kinematics, position, load_kg if load_kg > 0.0 else 0.0)
         if roll_rad != roll_rad or pitch_rad != pitch_rad:
             return level_nm
@@ -251,18 +251,18 @@ class LoadMoment:
         return level_nm + self._stability.slope_nm_rad * falls_rad
 
     def raised_by_motion(self, position: Sequence[float], velocity: Sequence[float]) -> bool:
-        """Whether a motion leads outward or up [rad, m; per second]."""
+        """Tell whether a motion leads outward or up [rad, m; per second]."""
         ahead = self._ahead
         for j in range(N_JOINTS):
             ahead[j] = position[j] + AHEAD_S * velocity[j]
         return self.raised(position, ahead, AHEAD_TOLERANCE_M)
 
     def refuses(self, start: Sequence[float], end: Sequence[float]) -> bool:
-        """Whether the machine is overloaded and a trajectory between two joint positions would add to it."""
+        """Tell whether the machine is overloaded and a trajectory between two joint positions would add to it."""
         return self.overloaded and self.raised(start, end)
 
     def raised(self, start: Sequence[float], end: Sequence[float], tolerance_m: float = TOLERANCE_M) -> bool:
-        """Whether the pin goes outward between two joint positions, or rises by more than it comes nearer."""
+        """Tell whether the pin goes outward between two joint positions, or rises by more than it comes nearer."""
         _, start_m, start_z_m = distances(self._kinematics, start)
         _, end_m, end_z_m = distances(self._kinematics, end)
         out_m = end_m - start_m

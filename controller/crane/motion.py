@@ -140,11 +140,11 @@ class Crane:
             moment.update(position, self.load_kg, roll_rad, pitch_rad)
 
     def pressed(self, now_ns: int) -> bool:
-        """Whether jaws that work, or a load that comes or goes, move every joint now or did a moment ago."""
+        """Tell whether jaws that work, or a load that comes or goes, move every joint now or did a moment ago."""
         return self.grapple.presses(now_ns) or self._load_change.recent(now_ns)
 
     def slew_is_pushed(self) -> bool:
-        """Whether something from outside turns the column: no weight loads it, and its oil resists the motion.
+        """Tell whether something from outside turns the column: no weight loads it, and its oil resists the motion.
 
         A valve that drives it has the pressure on the side of the motion (docs/reference/safety.md section 5).
         """
@@ -169,7 +169,7 @@ class Crane:
     # -- accept
 
     def keeps_in_place(self, setpoint: CraneSetpoint) -> bool:
-        """Whether a setpoint only keeps the crane where it is."""
+        """Tell whether a setpoint only keeps the crane where it is."""
         reference = self.governor.position
         for knot in setpoint.knots:
             for j in JOINTS:
@@ -178,7 +178,7 @@ class Crane:
         return True
 
     def is_moving(self, now_ns: int) -> bool:
-        """Whether the reference or a spool test moves the crane."""
+        """Tell whether the reference or a spool test moves the crane."""
         return self.leased and (self.spool_run.running or not self.governor.at_rest(now_ns))
 
     def accept(self, setpoint: CraneSetpoint, now_ns: int) -> bool:
@@ -238,7 +238,7 @@ class Crane:
         self._grapple_request = GrappleCommand.NEUTRAL
 
     def reset_laws(self) -> None:
-        """The laws begin from neutral valves."""
+        """Begin the laws again from neutral valves."""
         self.law.reset()
         if self.sway is not None:
             self.sway.reset()
@@ -246,7 +246,7 @@ class Crane:
     # -- supervise
 
     def lease_over(self, now_ns: int) -> bool:
-        """Whether the setpoint is no longer valid: its lease is over, or its last knot still moves."""
+        """Tell whether the setpoint is no longer valid: its lease is over, or its last knot still moves."""
         if now_ns >= self.lease_end_ns:
             return True
         if self.spool_run.running:
@@ -254,13 +254,13 @@ class Crane:
         return self.governor.ended_moving(now_ns)
 
     def finished(self, now_ns: int) -> bool:
-        """Whether the requested motion is done, so that its lease may end without a fault."""
+        """Tell whether the requested motion is done, so that its lease may end without a fault."""
         if self.spool_run.running:
             return self.spool_run.ends_neutral(now_ns)
         return self._final and self.governor.at_rest(now_ns)
 
     def overloads(self) -> bool:
-        """Whether the machine is overloaded and the crane moves outward or up all the same."""
+        """Tell whether the machine is overloaded and the crane moves outward or up all the same."""
         moment = self.load_moment
         if moment is None or not moment.overloaded or not self.leased:
             return False
@@ -332,5 +332,5 @@ class Crane:
         self.grapple.release()
 
     def opening_pct(self) -> float:
-        """Measured opening of the grapple; NaN on a machine without the sensor, whatever the bus carries."""
+        """Return the measured opening of the grapple; NaN on a machine without the sensor, whatever the bus carries."""
         return or_nan(self._inputs.grapple.get("Opening")) if self._opening_sensed else math.nan

@@ -31,7 +31,7 @@ _MAX_FLOW_PCT: Final = 100.0
 
 
 def _ranges(profile: Profile, codec: MessageCodec) -> list[tuple[int, float, float, float]]:
-    """(joint, lowest and highest position, greatest speed) that a reference frame can carry; raises ConfigError."""
+    """List (joint, lowest, highest position, greatest speed) that a reference frame can carry; raises ConfigError."""
     ranges = []
     signals = {s.name: s for s in codec.signals}
     for j in JOINTS:
@@ -158,5 +158,5 @@ class CraneWriter:
         return sync_frame(self._sync)
 
     def status_due(self, now_ns: int) -> bool:
-        """Whether CtrlStatus is due in this tick."""
+        """Tell whether CtrlStatus is due in this tick."""
         return self._status_due.due(now_ns)

@@ -146,14 +146,14 @@ class Trajectory:
 
 
 def hermite(p0: float, v0: float, p1: float, v1: float, h: float, s: float) -> tuple[float, float]:
-    """Position and velocity at the fraction ``s`` of a cubic from (p0, v0) to (p1, v1) in ``h`` seconds."""
+    """Compute position and velocity at the fraction ``s`` of a cubic from (p0, v0) to (p1, v1) in ``h`` seconds."""
     c2 = 3.0 * (p1 - p0) - h * (2.0 * v0 + v1)
     c3 = h * (v0 + v1) - 2.0 * (p1 - p0)
     return p0 + s * (h * v0 + s * (c2 + s * c3)), v0 + s * (2.0 * c2 + 3.0 * s * c3) / h
 
 
 def peak_speed(p0: float, v0: float, p1: float, v1: float, h: float) -> float:
-    """Greatest speed on the cubic: its velocity is a parabola, so the ends or the vertex have it."""
+    """Compute the greatest speed on the cubic: its velocity is a parabola, so the ends or the vertex have it."""
     c2 = 3.0 * (p1 - p0) - h * (2.0 * v0 + v1)
     c3 = h * (v0 + v1) - 2.0 * (p1 - p0)
     peak = max(abs(v0), abs(v1))
@@ -165,7 +165,7 @@ def peak_speed(p0: float, v0: float, p1: float, v1: float, h: float) -> float:
 
 
 def extremes(p0: float, v0: float, p1: float, v1: float, h: float) -> tuple[float, float]:
-    """Least and greatest position on the cubic: the ends or where its velocity is zero."""
+    """Find the least and greatest position on the cubic: the ends or where its velocity is zero."""
     c2 = 3.0 * (p1 - p0) - h * (2.0 * v0 + v1)
     c3 = h * (v0 + v1) - 2.0 * (p1 - p0)
     low, high = min(p0, p1), max(p0, p1)
@@ -215,13 +215,13 @@ class TimeScaling:
         self.reset()
 
     def reset(self) -> None:
-        """The trajectory is on time."""
+        """Put the trajectory on time."""
         self.rate = 1.0
         self.behind_ns = 0
 
     def step(self, lead_velocity: Sequence[float], valves: Sequence[ValveMap], cap: float, elapsed_ns: int) -> None:
-        """One tick with the reference's velocities at rate 1, one delay ahead; ``cap`` scales the speed limits."""
-        wanted, flow = 1.0, 0.0
+        """Run one tick with the reference's velocities at rate 1, one delay ahead; ``cap`` scales the speed limits."""
+        target_rate, flow = 1.0, 0.0
         for j, velocity in enumerate(lead_velocity):
             if velocity >= 0.0:
                 speed = velocity
@@ -230,14 +230,14 @@ class TimeScaling:
                 speed = -velocity
                 flow += speed * self._flow_minus[j] * valves[j].arm
             limit = min(cap * self._speed[j], self._fastest[j])
-            if speed * wanted > limit:
-                wanted = limit / speed
-        if flow * wanted > self._flow:
-            wanted = self._flow / flow
+            if speed * target_rate > limit:
+                target_rate = limit / speed
+        if flow * target_rate > self._flow:
+            target_rate = self._flow / flow
         if self.behind_ns >= MAX_BEHIND_NS:
-            wanted = 1.0
+            target_rate = 1.0
         change = RATE_CHANGE_1_S * elapsed_ns * 1e-9
-        self.rate = min(max(wanted, self.rate - change), self.rate + change, 1.0)
+        self.rate = min(max(target_rate, self.rate - change), self.rate + change, 1.0)
         self.behind_ns += int((1.0 - self.rate) * elapsed_ns)
 
 
@@ -319,7 +319,7 @@ class ReferenceGovernor:
         self._off = False
 
     def planned(self, now_ns: int) -> tuple[Sequence[float], Sequence[float]]:
-        """Position and velocity that the planner gave for now; a new setpoint continues them."""
+        """Return the position and velocity that the planner gave for now; a new setpoint continues them."""
         self.trajectory.fill(JOINTS, now_ns, self._plan, self._plan_velocity)
         return self._plan, self._plan_velocity
 
@@ -351,7 +351,7 @@ class ReferenceGovernor:
             scaling.reset()
 
     def _leave_tick(self, elapsed_s: float) -> None:
-        """The present reference becomes that of the tick before, ``elapsed_s`` ago."""
+        """Make the present reference that of the tick before, ``elapsed_s`` ago."""
         before_s, self._elapsed_s = self._elapsed_s, elapsed_s
         for j in range(N_JOINTS):
             travel = self.position[j] - self._before[j]
@@ -374,7 +374,7 @@ class ReferenceGovernor:
         self.lead_velocity[j] = min(max(lead, -limit), limit)
 
     def _caught_up(self, now_ns: int) -> bool:
-        """Whether reference and plan rest at the same place, so that nothing is left to catch up with."""
+        """Tell whether reference and plan rest at the same place, so that nothing is left to catch up with."""
         plan, velocity = self.planned(now_ns)
         return (
             not any(self.velocity)
@@ -383,9 +383,9 @@ class ReferenceGovernor:
         )
 
     def at_rest(self, now_ns: int) -> bool:
-        """Whether the trajectory's last knot is reached, or nothing moves."""
+        """Tell whether the trajectory's last knot is reached, or nothing moves."""
         return not self._off and (now_ns - self._scaling.behind_ns >= self.trajectory.end_ns or not any(self.velocity))
 
     def ended_moving(self, now_ns: int) -> bool:
-        """Whether the trajectory ended with a velocity."""
+        """Tell whether the trajectory ended with a velocity."""
         return now_ns - self._scaling.behind_ns > self.trajectory.end_ns and not self.trajectory.ends_at_rest

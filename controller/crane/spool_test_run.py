@@ -55,13 +55,13 @@ class SpoolTestLimits:
         self.rate_pct_s = 100.0 * ACCELERATION_FACTOR * spec.acceleration_limit / max(self._full)
 
     def opening_pct(self, percent: float) -> float:
-        """The command beyond the dead-band [% of the rest], with its sign."""
+        """Compute the command beyond the dead-band [% of the rest], with its sign."""
         side = 0 if percent >= 0.0 else 1
         deadband = self._deadband[side]
         return math.copysign(max(0.0, abs(percent) - deadband) * 100.0 / (100.0 - deadband), percent)
 
     def too_fast(self, before: float, after: float, elapsed_ns: int) -> bool:
-        """Whether a change of the command opens the valve further than it may in this time.
+        """Tell whether a change of the command opens the valve further than it may in this time.
 
         Closing is unlimited, and so is a step inside the dead-band.  A line (elapsed time) is judged by its slope: one
         that begins inside the dead-band opens the valve with the whole of it.
@@ -74,7 +74,7 @@ class SpoolTestLimits:
         return widened > self.rate_pct_s * (elapsed_ns * 1e-9 + RATE_SLACK_S)
 
     def speed(self, percent: float) -> float:
-        """The joint velocity that the profile's valve map expects of a command [rad/s, m/s]."""
+        """Compute the joint velocity that the profile's valve map expects of a command [rad/s, m/s]."""
         opening = self.opening_pct(percent)
         return opening / 100.0 * self._full[0 if opening >= 0.0 else 1]
 
@@ -114,7 +114,7 @@ class SpoolTestRun:
         return self.function != NO_FUNCTION
 
     def tested(self, j: int, now_ns: int) -> bool:
-        """Whether a test drives the valve of a joint, or drove it a moment ago."""
+        """Tell whether a test drives the valve of a joint, or drove it a moment ago."""
         return now_ns - self._tested_ns[j] < TESTED_NS
 
     def end(self) -> None:
@@ -160,7 +160,7 @@ class SpoolTestRun:
             raise RequestRefused(Reason.TEST_SPOOL, test.function)
 
     def percent(self, now_ns: int) -> float:
-        """The command now [%, + is positive joint motion]; neutral without a test and after its last knot."""
+        """Compute the command now [%, + is positive joint motion]; neutral without a test and after its last knot."""
         times, percents, n = self._times_ns, self._percents, self._n
         if not self.running or now_ns > times[n - 1]:
             return 0.0
@@ -173,11 +173,11 @@ class SpoolTestRun:
         return percents[k - 1] + share * (percents[k] - percents[k - 1])
 
     def opened(self, now_ns: int) -> bool:
-        """Whether a test holds a valve open now."""
+        """Tell whether a test holds a valve open now."""
         return self.running and self.percent(now_ns) != 0.0
 
     def drive(self, share: float, now_ns: int) -> tuple[float, float]:
-        """Spool command [%, with the profile's sign] and the joint velocity that the profile expects of it.
+        """Compute the spool command [%, with the profile's sign] and the joint velocity that the profile expects of it.
 
         ``share`` is 1 while the test runs; below 1 it scales the last command, which fades.
         """
@@ -193,15 +193,15 @@ class SpoolTestRun:
         return limits.sign * percent, speed
 
     def ends_neutral(self, now_ns: int) -> bool:
-        """Whether the program is over and its last command was neutral, so that its lease may end without a fault."""
+        """Tell whether the program is over and ended with a neutral command: its lease may end without a fault."""
         return now_ns >= self._times_ns[self._n - 1] and self._percents[self._n - 1] == 0.0
 
     def cut_short(self, now_ns: int) -> bool:
-        """Whether the knots are over while the valve was open."""
+        """Tell whether the knots are over while the valve was open."""
         return now_ns > self._times_ns[self._n - 1] and self._percents[self._n - 1] != 0.0
 
     def check(self, position: float, velocity: float, cap: float, now_ns: int) -> Reason:
-        """What is wrong with the tested joint now, or NONE; ``cap`` scales the speed limit.
+        """Find what is wrong with the tested joint now, or NONE; ``cap`` scales the speed limit.
 
         Unknown values (NaN) are left to the supervisor.  A joint without an encoder is checked by its integrated angle.
         """

@@ -52,7 +52,7 @@ class Request(NamedTuple):
 
 
 def sequence(encoder: Encoder) -> tuple[Request, ...]:
-    """The SDO requests that set up one encoder, in order."""
+    """Build the SDO requests that set up one encoder, in order."""
     cob = TPDO1 + encoder.node
     if encoder.kind == "rotary":
         scale = Request(0x6001, 0, encoder.total_counts)
@@ -105,7 +105,7 @@ class EncoderSetup:
         self._step = self._tries = self._deadline_ns = 0
 
     def frame(self, now_ns: int) -> RawFrame | None:
-        """The next frame to this node, if one is due."""
+        """Return the next frame to this node, if one is due."""
         if self.phase is Phase.SILENCING:
             self.phase = Phase.CONFIGURING
             return nmt_frame(NmtCommand.ENTER_PRE_OPERATIONAL, self.node)
@@ -166,12 +166,12 @@ class Startup:
         return all(s.phase is Phase.READY for s in self._setups)
 
     def problem(self) -> tuple[Reason, int]:
-        """Why it is not complete: the worst reason and its node."""
+        """Tell why it is not complete: the worst reason and its node."""
         worst = max(self._setups, key=lambda s: s.reason, default=None)
         return (worst.reason, worst.node) if worst is not None and worst.reason else (Reason.NONE, 0)
 
     def reset(self, operational: Callable[[int], bool]) -> None:
-        """An operator's reset: set up failed nodes, and those that left OPERATIONAL by themselves, again."""
+        """Set up failed nodes, and those that left OPERATIONAL by themselves, again: an operator's reset."""
         self._released = False
         for setup in self._setups:
             if setup.phase is Phase.FAILED or (setup.phase is Phase.READY and not operational(setup.node)):
@@ -193,7 +193,7 @@ class Startup:
         return True
 
     def node_booted(self, node: int) -> None:
-        """A boot-up frame: the node lost its set-up and waits for START."""
+        """Note a boot-up frame: the node lost its set-up and waits for START."""
         self._released = False
         setup = self._by_node.get(node)
         if setup is not None:
@@ -221,11 +221,15 @@ def check_nodes(database: Database, profile: Profile) -> None:
     Raises:
         ConfigError: a node of the profile does not fit its message.
     """
-    for place, encoder in encoders(profile).items():
+    for joint_number, encoder in encoders(profile).items():
         key = database.message(encoder.message).key
         if key != TPDO1 + encoder.node:
-            jointed = place < N_JOINTS
-            where = f"joints.{JOINTS[place].name.lower()}.encoder" if jointed else "carrier.articulation_encoder"
+            is_crane_joint = joint_number < N_JOINTS
+            where = (
+                f"joints.{JOINTS[joint_number].name.lower()}.encoder"
+                if is_crane_joint
+                else "carrier.articulation_encoder"
+            )
             raise ConfigError(
                 "config.encoder-node",
                 f"{where}.node: node {encoder.node} does not send {encoder.message} ({key:03X}); "

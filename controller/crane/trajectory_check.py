@@ -166,7 +166,7 @@ class WorkspaceCheck:
             at -= step
 
     def _box_at(self, x: float, y: float, z: float) -> int:
-        """Number of the box that the tip at this pin position [m] is in, or -1."""
+        """Return the number of the box that the tip at this pin position [m] is in, or -1."""
         low = z - self._hang_m
         for i, (bx, by, c, s, half_x, half_y, bottom, top) in enumerate(self._boxes):
             if low > top or z < bottom:

@@ -97,7 +97,7 @@ class NoiseMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """The estimator starts again; what is usual stays known."""
+        """Start the estimator again; what is usual stays known."""
         self._mean = self._scatter = self._before = self._before_that = 0.0
         self._limit = self._max_innovation
         self.noisy = False
@@ -121,7 +121,7 @@ class NoiseMonitor:
         self.noisy = unusual or self._mean > self._max_innovation
 
     def share(self) -> float:
-        """What was measured over what is noise; 1 and more is noisy."""
+        """Compute what was measured over what is noise; 1 and more is noisy."""
         scatter = self._scatter / self._limit if self._punctual and self._share <= _LEARNING_SHARE else 0.0
         return max(scatter, self._mean / self._max_innovation)
 
@@ -152,17 +152,17 @@ class TrackedJoint(Protocol):
 
 
 def measurement_variance(encoder: Encoder) -> float:
-    """Variance of one sample [rad^2, m^2]: noise and rounding to whole counts."""
+    """Compute the variance of one sample [rad^2, m^2]: noise and rounding to whole counts."""
     return encoder.noise**2 + encoder.unit_per_count**2 / 12.0
 
 
 def acceleration_density(spec: TrackedJoint) -> float:
-    """Spectral density of the joint's acceleration [(rad/s^2)^2 s, (m/s^2)^2 s]."""
+    """Compute the spectral density of the joint's acceleration [(rad/s^2)^2 s, (m/s^2)^2 s]."""
     return (ACCELERATION_SHARE * spec.acceleration_limit) ** 2 * ACCELERATION_S
 
 
 def steady_gains(period_s: float, density: float, variance: float) -> tuple[float, float]:
-    """Gains of position and velocity [-, 1/s] of the steady-state Kalman filter.
+    """Compute the gains of position and velocity [-, 1/s] of the steady-state Kalman filter.
 
     Model: position += velocity T per period, driven by a white acceleration of spectral ``density``; a position is
     measured with ``variance`` every period.  The second differences of the measurements are a moving average of order
@@ -230,7 +230,7 @@ class JointEstimator:
         return self._noise is not None and self._noise.noisy
 
     def noise_share(self) -> float:
-        """How noisy the encoder is, over what is a fault."""
+        """Tell how noisy the encoder is, over what is a fault."""
         return 0.0 if self._noise is None else self._noise.share()
 
     def predict(self, now_ns: int) -> None:

@@ -116,7 +116,7 @@ class MotionMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """At rest with a neutral valve."""
+        """Start at rest with a neutral valve."""
         self._at = 0
         self._early = self._late = self._recent_command = 0.0
         self.expected_velocity = 0.0
@@ -127,12 +127,12 @@ class MotionMonitor:
             self._line[i] = 0.0
 
     def forgive(self) -> None:
-        """What the joint has done so far is no evidence: its command was a spool's, and the map is being measured."""
+        """Drop the joint's motion so far as evidence: its command was a spool's, and the map is being measured."""
         self._expected = self._behind = self._overspeed = self._against = 0.0
 
     def step(self, command: float, velocity: float, yields: bool = False) -> Reason:
-        """One period with the commanded and the measured velocity [rad/s or m/s]; ``yields``: whether the joint is one
-        that gives way to what it carries, and something presses on it now.
+        """Take one period with the commanded and the measured velocity [rad/s or m/s]; ``yields``: whether the joint is
+        one that gives way to what it carries, and something presses on it now.
         """
         line, at = self._line, self._at
         line[at] = command
@@ -163,7 +163,7 @@ class MotionMonitor:
         return _NONE
 
     def shares(self) -> tuple[float, float, float]:
-        """What was measured over what is a fault: joint reversed, stuck, running away.  1 and more is the fault."""
+        """Compute what was measured over what is a fault: joint reversed, stuck, running away.  1 and more is one."""
         expected = self._expected
         behind = self._behind / (_STUCK_SHARE * expected) if expected > 0.0 else 0.0
         return (
@@ -250,7 +250,7 @@ class StandstillMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing is known of the joint."""
+        """Reset as if nothing were known of the joint."""
         self._started = self.moves = False
         self._low = self._high = self._peak = self._gone_to = 0.0
         self._out = self._out_s = self._neutral_s = self._calm_s = self._rest_s = 0.0
@@ -259,7 +259,7 @@ class StandstillMonitor:
         """How long the joint has not moved."""
 
     def step(self, neutral: bool, shaken: bool, position: float, slack: float = 0.0, pressed: bool = False) -> bool:
-        """One period: whether the valve is ``neutral``, whether something else shakes the joint, its position, how
+        """Take one period: whether the valve is ``neutral``, whether something else shakes the joint, its position, how
         much farther it may yield to a slope (`SlopeYield`), and whether jaws press on it.
         """
         if not self._started or not neutral:
@@ -302,12 +302,12 @@ class StandstillMonitor:
         return self.moves
 
     def share(self) -> float:
-        """What was measured over what is a motion; 1 and more is one."""
+        """Compute what was measured over what is a motion; 1 and more is one."""
         out = self._out / self._far
         return min(out, out * self._out_s / HOLD_S)
 
     def _absorb(self, position: float) -> None:
-        """The joint is inside its range, has turned back, or its valve is still closing: extend the range to it."""
+        """Extend the range to the joint: it is inside, has turned back, or its valve is still closing."""
         self._low, self._high = min(self._low, self._peak, position), max(self._high, self._peak, position)
         self._peak = self._gone_to = position
         self._out_s = self._rest_s = 0.0
@@ -343,7 +343,7 @@ class SlopeYield:
         self.rad = 0.0
 
     def step(self, pressed: bool, roll_rad: float, pitch_rad: float) -> None:
-        """Whether jaws or a load press on the boom, or did lately; the inclination of its base (NaN: not known)."""
+        """Tell whether jaws or a load press on the boom, or did lately; the inclination of its base (NaN: unknown)."""
         turned = self._range(0, roll_rad) + self._range(1, pitch_rad)
         if pressed:
             turned += self._beyond_level(abs(roll_rad)) + self._beyond_level(abs(pitch_rad))
@@ -353,7 +353,7 @@ class SlopeYield:
         return angle_rad - LEVEL_RAD if angle_rad > LEVEL_RAD else 0.0
 
     def _range(self, axis: int, angle_rad: float) -> float:
-        """How far the machine has leaned to and fro about an axis lately."""
+        """Tell how far the machine has leaned to and fro about an axis lately."""
         if angle_rad != angle_rad:
             return 0.0
         low, high, forget = self._low, self._high, self._forget
@@ -415,12 +415,12 @@ class DriftMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing has moved yet."""
+        """Reset as if nothing had moved yet."""
         self._alone = self._commanded = self._before = self._shut_s = self._open_s = self._calm_s = 0.0
 
     def step(self, neutral: bool, expected_velocity: float, position: float, calm: bool) -> bool:
-        """One period: is the valve ``neutral``, the velocity that the command lets expect, the position, and whether
-        nothing else moves the joint.
+        """Take one period: is the valve ``neutral``, the velocity that the command lets expect, the position, and
+        whether nothing else moves the joint.
         """
         self._shut_s = self._shut_s + self._period_s if neutral else 0.0
         self._calm_s = self._calm_s + self._period_s if calm else 0.0
@@ -437,7 +437,7 @@ class DriftMonitor:
         return abs(alone) > self._limit and against > COMMANDED_SHARE * abs(alone)
 
     def share(self) -> float:
-        """What was measured over what is a drift; 1 and more is one."""
+        """Compute what was measured over what is a drift; 1 and more is one."""
         alone = abs(self._alone)
         against = -self._commanded if self._alone > 0.0 else self._commanded
         return max(0.0, min(alone / self._limit, against / (COMMANDED_SHARE * alone))) if alone > 0.0 else 0.0

@@ -60,7 +60,7 @@ class CylinderMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing is known of the pressures."""
+        """Reset as if nothing were known of the pressures."""
         self._a1 = self._a2 = self._a3 = self._b1 = self._b2 = self._b3 = 0.0
         self._lost = _NEITHER
         self._last_ns = self._since_ns = 0
@@ -104,7 +104,7 @@ class PressureMonitor:
         )
 
     def reset(self) -> None:
-        """An operator armed: what the pressures did before, by a hand lever or with the pump off, does not count."""
+        """Forget what the pressures did before an operator armed, by a hand lever or with the pump off."""
         for cylinder in self.cylinders:
             cylinder.reset()
 

@@ -52,14 +52,14 @@ class RecentRange:
         self.reset(0.0)
 
     def reset(self, value: float) -> None:
-        """The value has always been this."""
+        """Fill the window with this value, as if it had always been this."""
         self._low_now = self._low_1 = self._low_2 = self._low_3 = value
         self._high_now = self._high_1 = self._high_2 = self._high_3 = value
         self._older_low = self._older_high = self.low = self.high = value
         self._left = self._ticks
 
     def add(self, value: float) -> None:
-        """The value of this tick."""
+        """Add the value of this tick."""
         if self._left == 0:
             self._begin_part(value)
         self._left -= 1
@@ -114,7 +114,7 @@ _SPOOL_WRONG: Final = Reason.SPOOL_WRONG
 
 
 def spool_window_s(delay_s: float) -> float:
-    """The window for a valve with this dead time by its profile, s."""
+    """Compute the window for a valve with this dead time by its profile, s."""
     return max(SPOOL_WINDOW_S, (delay_s + SPOOL_S) / CERTAIN_SHARE)
 
 
@@ -131,14 +131,14 @@ class SpoolMonitor:
         self._open_s = self._shut_s = self._wrong_s = 0.0
 
     def follow(self, command_pct: float) -> None:
-        """One period in which the spool is not judged; it may still be on its way from former commands."""
+        """Take one period in which the spool is not judged; it may still be on its way from former commands."""
         self._commands.add(command_pct)
         self._in_tests.add(command_pct)
         self._open_s = self._shut_s = self._wrong_s = 0.0
 
     def step(self, command_pct: float, spool_pct: float, tested: bool = False) -> Reason:
-        """One period with the command and the measured position [% of the stroke]; ``tested``: a spool test drives this
-        valve, or did a moment ago.
+        """Take one period with the command and the measured position [% of the stroke]; ``tested``: a spool test drives
+        this valve, or did a moment ago.
         """
         dt = self._period_s
         self._commands.add(command_pct)
@@ -169,7 +169,7 @@ class SpoolMonitor:
         return _SPOOL_WRONG if self._wrong_s >= WRONG_S else _NONE
 
     def shares(self) -> tuple[float, float, float]:
-        """How long the spool has been too far open, shut, and otherwise wrong, over what is a fault."""
+        """Tell how long the spool has been too far open, shut, and otherwise wrong, over what is a fault."""
         return self._open_s / OPEN_S, self._shut_s / SHUT_S, self._wrong_s / WRONG_S
 
 
@@ -226,7 +226,7 @@ _RUNAWAY: Final = Reason.JOINT_RUNAWAY
 
 
 def command_window_s(valve: Valve) -> float:
-    """The window of a valve whose spool no sensor measures, s."""
+    """Compute the window of a valve whose spool no sensor measures, s."""
     return COMMAND_WINDOW_S + max(0.0, valve.delay_s - USUAL_DELAY_S)
 
 
@@ -272,13 +272,13 @@ class SpeedMonitor:
         self._backwards_most_s, self._stood_most_s = BACKWARDS_S, STOOD_S
 
     def reset(self) -> None:
-        """The valve has been shut; what was learned of it stays."""
+        """Begin with the valve shut; what was learned of it stays."""
         self._range.reset(0.0)
         self._stood_s = self._fast_s = self._slow_s = self._backwards_s = 0.0
 
     def step(self, expected: float, velocity: float, pressed: bool = False, pushed: bool = False) -> Reason:
-        """One period with the speed that belongs to the valve and the measured one [rad/s or m/s], whether the jaws
-        press on the joint, and whether it moves against the pressure of its own oil, which no valve does.
+        """Take one period with the speed that belongs to the valve and the measured one [rad/s or m/s], whether the
+        jaws press on the joint, and whether it moves against the pressure of its own oil, which no valve does.
         """
         recent, dt = self._range, self._period_s
         recent.add(expected)
@@ -323,7 +323,7 @@ class SpeedMonitor:
         return _STUCK if self._stood_s >= self._stood_most_s else _NONE
 
     def shares(self) -> tuple[float, float, float]:
-        """How long the joint has been too fast, backwards or too slow, and standing, over what is a fault."""
+        """Tell how long the joint has been too fast, backwards or too slow, and standing, over what is a fault."""
         wrong = max(self._backwards_s / self._backwards_most_s, self._slow_s / self._slow_most_s)
         return self._fast_s / self._fast_most_s, wrong, self._stood_s / self._stood_most_s
 
@@ -363,13 +363,13 @@ class DirectionMonitor:
         self._against = 0.0
 
     def reset(self) -> None:
-        """No test has been lately."""
+        """Reset as if no test had been lately."""
         self._against = 0.0
         self._commands.reset(0.0)
 
     def step(self, command: float, velocity: float) -> bool:
-        """One period with the spool's command (+ moves the joint in its positive direction) and the joint's velocity
-        [rad/s, m/s].
+        """Take one period with the spool's command (+ moves the joint in its positive direction) and the joint's
+        velocity [rad/s, m/s].
         """
         commands = self._commands
         commands.add(command)

@@ -60,13 +60,13 @@ def build(profile: Path, databases: Path = DATABASES, rate_hz: int = 0, latched:
 
 
 def profile_path(name: str) -> Path:
-    """Path of a shipped profile by its name, else ``name`` as a path."""
+    """Return the path of a shipped profile by its name, else ``name`` as a path."""
     shipped = SHIPPED / f"{name}.toml"
     return shipped if shipped.is_file() else Path(name)
 
 
 def open_link(address: str, keys: Iterable[int]) -> Bus:
-    """The bus at an address: a kernel's interface by the guard's own socket, the wire by that of its emulation.
+    """Open the bus at an address: a kernel's interface by the guard's own socket, the wire by that of its emulation.
 
     Also where the other processes use python-can's socket: guard and controller must not share a fault.
     """
@@ -75,7 +75,7 @@ def open_link(address: str, keys: Iterable[int]) -> Bus:
 
 
 def split(frames: list[RawFrame]) -> tuple[list[RawFrame], list[RawFrame]]:
-    """The guard's frames for crane0 (11-bit identifiers) and for mach0 (29 bits)."""
+    """Split the guard's frames into those for crane0 (11-bit identifiers) and for mach0 (29 bits)."""
     return [f for f in frames if not f[0] & EXTENDED], [f for f in frames if f[0] & EXTENDED]
 
 

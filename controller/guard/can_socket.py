@@ -39,7 +39,7 @@ _UP, _RUNNING = 0x1, 0x40
 
 
 def _clocks() -> tuple[int, int]:
-    """The monotonic time, and what must be added to the wall clock to get it; both read without a pause between."""
+    """Read the monotonic time, and what must be added to the wall clock to get it, without a pause between."""
     for _ in range(3):
         before_ns, wall_ns, now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         if now_ns - before_ns < _PAUSE_NS:
@@ -68,7 +68,7 @@ class GuardSocket:
             ) from error
 
     def fileno(self) -> int:
-        """The socket's descriptor, -1 while the link is lost."""
+        """Return the socket's descriptor, -1 while the link is lost."""
         return -1 if self._socket is None else self._socket.fileno()
 
     def drain(self, frames: list[Frame]) -> int:
@@ -122,7 +122,7 @@ class GuardSocket:
         return sent
 
     def discard(self) -> int:
-        """Cancels nothing: the queue of an interface cannot be emptied from outside."""
+        """Cancel nothing: the queue of an interface cannot be emptied from outside."""
         return 0
 
     def flush(self) -> None:
@@ -131,7 +131,7 @@ class GuardSocket:
             pass
 
     def reopen(self) -> bool:
-        """One attempt to open a lost link again; True if the bus is usable."""
+        """Make one attempt to open a lost link again; True if the bus is usable."""
         if self._socket is None and self.stats.state is BusState.DOWN:
             try:
                 self._socket = self._open(_UP | _RUNNING)
@@ -152,7 +152,7 @@ class GuardSocket:
         self.close()
 
     def _open(self, needed: int) -> socket.socket:
-        """A bound socket; OSError unless the interface is there with the flags ``needed``."""
+        """Open a bound socket; OSError unless the interface is there with the flags ``needed``."""
         link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         try:
             flags = struct.unpack("16sH14x", fcntl.ioctl(link, _GET_FLAGS, struct.pack("16s16x", self.name.encode())))[

@@ -99,7 +99,7 @@ class Envelope(NamedTuple):
 
 
 def digest(body: bytes) -> bytes:
-    """The digest of an envelope file without its last line."""
+    """Compute the digest of an envelope file without its last line."""
     return hashlib.sha256(body).hexdigest().encode()
 
 
@@ -137,7 +137,7 @@ def read_envelope(path: Path) -> Envelope:
 
 
 def _number(value: object) -> float:
-    """A limit; a NaN would switch its rule off."""
+    """Check a limit; a NaN would switch its rule off."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{value!r} is not a finite number")
     return float(value)
@@ -148,7 +148,7 @@ def _numbers(table: dict[str, Any]) -> dict[str, float]:
 
 
 def _within(table: dict[str, Any], ranges: dict[str, tuple[float, float]]) -> dict[str, float]:
-    """The numbers of a table that ``ranges`` names; ValueError for one outside its range."""
+    """Read the numbers of a table that ``ranges`` names; ValueError for one outside its range."""
     found = {key: _number(table[key]) for key in ranges}
     for key, (low, high) in ranges.items():
         if not low <= found[key] <= high:
@@ -169,7 +169,7 @@ def _corner(values: list[Any]) -> Corner:
 
 
 def _find(profile: Path, machine: str) -> Path:
-    """The envelope beside the profile, else the shipped one of the machine."""
+    """Find the envelope beside the profile, else the shipped one of the machine."""
     beside = profile.with_name(f"{machine}.envelope.toml")
     return beside if beside.is_file() else SHIPPED / beside.name
 

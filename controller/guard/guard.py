@@ -149,7 +149,7 @@ class Guard:
         return out
 
     def hear(self, action: int, now_ns: int) -> None:
-        """What a person asks for, heard from the person and not from the controller; nothing moves without an ARM."""
+        """Take what a person asks for, heard from that person and not the controller; nothing moves without an ARM."""
         if action == _ARM:
             self._armed, self._operated_ns = self.enabled, now_ns
         elif action in _ENDS and self._armed:
@@ -192,7 +192,7 @@ class Guard:
         return (Verdict.STALE if late else Verdict.GOOD), NO_AXIS
 
     def _reset_pressed(self) -> bool:
-        """Whether the reset button went down, as the safety module itself reports it."""
+        """Tell whether the reset button went down, as the safety module itself reports it."""
         before = self._reset_seen
         self._reset_seen = not self._estop.trusted or self._estop.raw("ResetReq") == _PRESSED
         return self._reset_seen and not before and self._estop.trusted
@@ -239,7 +239,7 @@ class Guard:
         return FINE if neutral else self._check_commanded(now_ns)
 
     def _check_motion(self, heard: bool, now_ns: int, elapsed_s: float) -> Finding:
-        """Motion that nobody commands, or too fast a one; the valve node obeys only what is heard, and in its mode."""
+        """Find motion that nobody commands, or too fast a one; the valve node obeys only what is heard, in its mode."""
         words = {message: None if message.old(now_ns) else message.word for message in self._feedback}
         follows = heard and self._a.raw("Mode") == _SPOOL
         first = FINE
@@ -257,7 +257,7 @@ class Guard:
         return first
 
     def _check_commanded(self, now_ns: int) -> Finding:
-        """Rules on a crane that is commanded to move."""
+        """Check the rules on a crane that is commanded to move."""
         if self._b.raw("ArmKey") != ARM_KEY:
             return Verdict.NOT_ARMED, NO_AXIS
         if now_ns - self._clear_ns > PERSON_NS:
@@ -273,7 +273,7 @@ class Guard:
         return found if self._beyond >= BEYOND_STEPS else FINE
 
     def _check_place(self) -> Finding:
-        """Rules on where the crane is and whereto its commands lead."""
+        """Check the rules on where the crane is and whereto its commands lead."""
         for joint in self.joints.values():
             outward = self._commands[joint.axis.number].percent * joint.axis.sign
             beyond = joint.position - joint.axis.upper if outward > 0.0 else joint.axis.lower - joint.position
@@ -289,11 +289,11 @@ class Guard:
         return self._b.raw("Grapple") == 0 and all(command.percent == 0.0 for command in self._commands)
 
     def _opening_pct(self) -> float:
-        """How far the spools are commanded to open past their dead-bands, all together."""
+        """Tell how far the spools are commanded to open past their dead-bands, all together."""
         return sum(abs(command.opening) for command in self._commands)
 
     def _stopping(self, now_ns: int) -> bool:
-        """Whether the spools go to neutral as after a person's STOP."""
+        """Tell whether the spools go to neutral as after a person's STOP."""
         since_ns, most_pct = now_ns - self._stopped_ns, max(STOP_SHARE * self._open_pct, STOP_PCT)
         return since_ns <= STOP_NS or (since_ns <= RAMP_NS and self._opening_pct() <= most_pct)
 
@@ -301,7 +301,7 @@ class Guard:
         return any(abs(command.opening) > HELD_PCT for command in self._commands)
 
     def _settle(self, verdict: Verdict, axis: int, pressed: bool, now_ns: int) -> bool:
-        """A broken rule counts at once; the return needs a while of neutral commands, and a person if it latches.
+        """Count a broken rule at once; the return needs a while of neutral commands, and a person if it latches.
 
         Returns whether there is something new to tell.
         """

@@ -37,7 +37,7 @@ class RateCredit:
         self._last = 0.0
 
     def spent(self, percent: float, elapsed_s: float) -> bool:
-        """Whether a command that came ``elapsed_s`` after the last one has grown faster than allowed."""
+        """Tell whether a command that came ``elapsed_s`` after the last one has grown faster than allowed."""
         size, last = abs(percent), self._last
         growth = size if percent * last <= 0.0 else max(0.0, size - abs(last))
         self._last = percent
@@ -109,23 +109,23 @@ class MeasuredJoint:
         self._fast = self._fast + 1 if abs(self.position - self._place) > self._slack else 0
 
     def expect(self, speed: float) -> None:
-        """The speed that the valve is asked to give [rad/s, m/s]; a rotator that goes on without it follows a log."""
+        """Set the speed asked of the valve [rad/s, m/s]; a rotator that goes on without it follows a log."""
         follows = self.axis.number == ROTATOR_AXIS and abs(speed) <= ASKED_SHARE * self.axis.speed_limit
         self._slack = ROTATOR_MOVED_RAD if follows else SPEED_SLACK_S * self.axis.speed_limit
 
     def share(self) -> float:
-        """How far it was too fast, over what is too far."""
+        """Tell how far it was too fast, over what is too far."""
         return abs(self.position - self._place) / self._slack
 
     def too_fast(self) -> bool:
-        """Whether it has moved faster than it may; told once, and its place is then where it is."""
+        """Tell whether it has moved faster than it may; told once, and its place is then where it is."""
         if self._fast < FAST_FRAMES:
             return False
         self._place, self._fast = self.position, 0
         return True
 
     def silent(self, now_ns: int) -> bool:
-        """Whether its encoder has been silent for too long to move the joint."""
+        """Tell whether its encoder has been silent for too long to move the joint."""
         return now_ns - self.stamp_ns > ENCODER_TIMEOUT_NS
 
 
@@ -165,13 +165,14 @@ class MotionWatch:
         self._away = 0
 
     def share(self) -> float:
-        """How far the joint has moved without a command, over what is too far."""
+        """Tell how far the joint has moved without a command, over what is too far."""
         joint, place = self._joint, self._place
         return 0.0 if joint is None or place is None else abs(joint.position - place) / self._far
 
     def check(self, command: float, word: int | None, now_ns: int, elapsed_s: float, pressed: bool = False) -> Finding:
-        """One step; ``command``: what the valve node may follow now; ``word``: its feedback, or None.
-        ``pressed``: the jaws work or hold, or did a moment ago; where the joint is at the end of that is its place."""
+        """Check one step; ``command``: what the valve node may follow now; ``word``: its feedback, or None.
+        ``pressed``: the jaws work or hold, or did a moment ago; where the joint is at the end of that is its place.
+        """
         opened_ns = self._opened_ns
         if command != 0.0:
             opened_ns[command > 0.0] = now_ns

@@ -15,7 +15,7 @@ from runtime.shared_file import make_own_folder, shared_path
 
 
 def default_path() -> Path:
-    """In the folder that systemd keeps for the service, else in this user's directory in shared memory."""
+    """Choose the path: in the folder that systemd keeps for the service, else in this user's one in shared memory."""
     kept = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     return Path(kept, "latched") if kept else shared_path("guard.latched")
 

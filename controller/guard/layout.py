@@ -29,16 +29,16 @@ class Field:
         self.scale, self.minimum, self.maximum = scale, minimum, maximum
 
     def raw(self, word: int) -> int:
-        """The raw value in a payload that was read as a little-endian number."""
+        """Extract the raw value from a payload that was read as a little-endian number."""
         value = word >> self._shift & self._mask
         return value - 2 * self._sign if value & self._sign else value
 
     def put(self, value: int) -> int:
-        """The bits of an unsigned raw value at their position."""
+        """Put the bits of an unsigned raw value at their position."""
         return (value & self._mask) << self._shift
 
     def inside(self, raw: int) -> bool:
-        """Whether a raw value lies in the range that the DBC declares."""
+        """Tell whether a raw value lies in the range that the DBC declares."""
         return self.minimum - 1e-9 <= raw * self.scale <= self.maximum + 1e-9
 
 

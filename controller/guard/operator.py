@@ -20,7 +20,7 @@ AGE_NS: Final = 1_000_000_000
 
 
 def action_of(command: bytes, after_ns: int, now_ns: int, profile_check: int | None = None) -> tuple[int, int]:
-    """Action and stamp [ns] of a command, (0, ``after_ns``) where it is worth nothing; each is newer than the last.
+    """Read action and stamp [ns] of a command, (0, ``after_ns``) if it is worth nothing; each is newer than the last.
 
     ``profile_check``: of the file that an ARM must be meant for; None: any, in virtual time.
     """
@@ -54,7 +54,7 @@ class OperatorActions:
             ) from error
 
     def receive(self, now_ns: int) -> list[int]:
-        """The actions that have come, 0 for what is worth nothing."""
+        """Return the actions that have come, 0 for what is worth nothing."""
         commands: list[bytes] = []
         self._socket.receive(commands, [])
         heard = []

@@ -25,7 +25,7 @@ class Reach:
         self._ground_m, self._boxes = envelope.ground_m, envelope.boxes
 
     def pin(self, slew: float, lift: float, tilt: float, ext: float) -> tuple[float, float, float]:
-        """Position of the hanger pin [m]."""
+        """Compute the position of the hanger pin [m]."""
         k = self._k
         boom = lift + k.boom_offset_rad
         stick = boom + tilt + k.stick_offset_rad
@@ -36,7 +36,7 @@ class Reach:
         return r * cos(plane), r * sin(plane), z
 
     def depth_m(self, q: list[float]) -> float:
-        """How far the pin is below the ground or inside a box; negative outside."""
+        """Tell how far the pin is below the ground or inside a box; negative outside."""
         point = self.pin(*q)
         deepest = self._ground_m - point[2]
         for low, high in self._boxes:
@@ -45,6 +45,6 @@ class Reach:
         return deepest
 
     def deeper(self, q: list[float], speeds: list[float]) -> bool:
-        """Whether the commanded ``speeds`` bring the pin into a forbidden place, or further into one."""
+        """Tell whether the commanded ``speeds`` bring the pin into a forbidden place, or further into one."""
         after_m = self.depth_m([at + v * AHEAD_S for at, v in zip(q, speeds, strict=True)])
         return after_m > 0.0 and after_m > self.depth_m(q)

@@ -33,7 +33,7 @@ _CRC: Final = _crc_table()
 
 
 def checksum(data: bytes, data_id: int) -> int:
-    """CRC-8H2F of a frame from byte 1 on and its Data ID (AUTOSAR E2E Profile 2)."""
+    """Compute the CRC-8H2F of a frame from byte 1 on and its Data ID (AUTOSAR E2E Profile 2)."""
     crc = 0xFF
     for i in range(1, len(data)):
         crc = _CRC[crc ^ data[i]]
@@ -94,7 +94,7 @@ class WatchedMessage:
         return FrameEffect.NEW_WORD
 
     def old(self, now_ns: int) -> bool:
-        """Whether no trusted frame came within the time-out; then the stream must qualify again."""
+        """Tell whether no trusted frame came within the time-out; then the stream must qualify again."""
         if self.trusted and now_ns - self.stamp_ns <= self.layout.timeout_ns:
             return False
         if self.trusted:
@@ -102,7 +102,7 @@ class WatchedMessage:
         return True
 
     def raw(self, name: str) -> int:
-        """Raw value of a signal in the newest good frame."""
+        """Return the raw value of a signal in the newest good frame."""
         return self.layout.fields[name].raw(self.word)
 
 
@@ -119,7 +119,7 @@ class Punctuality:
         self._due_ns = self._last_ns = 0
 
     def late(self, stamp_ns: int, steps: int, silence_ns: int) -> bool:
-        """Whether a command is too late that came at ``stamp_ns``, ``steps`` after the one before."""
+        """Tell whether a command is too late that came at ``stamp_ns``, ``steps`` after the one before."""
         gap_ns = stamp_ns - self._last_ns
         self._last_ns = stamp_ns
         due_ns = self._due_ns + steps * self._period_ns + int(gap_ns * DELAY_FORGIVEN_PER_S)
@@ -138,7 +138,7 @@ class SentMessage:
         self._counter = self._next_ns = 0
 
     def due(self, now_ns: int, changed: bool) -> bool:
-        """Whether to send it now."""
+        """Tell whether to send it now."""
         if not changed and now_ns < self._next_ns:
             return False
         late = changed or now_ns - self._next_ns >= self._period_ns
@@ -146,7 +146,7 @@ class SentMessage:
         return True
 
     def frame(self, values: dict[str, int]) -> RawFrame:
-        """The next frame; signals that are not in ``values`` are 0, and values without a signal are left out."""
+        """Build the next frame; signals that are not in ``values`` are 0, and values without a signal are left out."""
         layout, counter = self.layout, self._counter
         self._counter = (counter + 1) & 0xF
         word = layout.fields["Counter"].put(counter)

@@ -45,7 +45,7 @@ class CraneLaw:
             self.commands[j] = 0.0
 
     def load_pressure_bar(self, j: int, push_bar: float | None, against_bar: float | None) -> float:
-        """Pressure [bar] in the pushing chamber that alone would carry the load; NaN where a pressure is unknown."""
+        """Compute the pressure [bar] in the pushing chamber that alone carries the load; NaN where one is unknown."""
         if push_bar is None or against_bar is None:
             return math.nan
         return push_bar - against_bar * self._areas[j]
@@ -61,7 +61,7 @@ class CraneLaw:
         elapsed_s: float,
         sway: SwayDamping | None = None,
     ) -> None:
-        """One tick; all sequences are in ``Joint`` order.
+        """Run one tick; all sequences are in ``Joint`` order.
 
         Reference, its velocity now and ``lead_ns`` of each law ahead, estimates, and load pressures.  ``cap`` scales
         the speed limits (1, or 0.5 when degraded); ``sway`` adds a motion to the reference while it is active.

@@ -43,7 +43,7 @@ class DriveLaw:
         self.reset()
 
     def reset(self) -> None:
-        """The carrier stands with its brake on."""
+        """Start from a carrier that stands with its brake on."""
         self.speed_m_s = 0.0
         self.brake = True
         self._standing_s = 0.0
@@ -54,13 +54,13 @@ class DriveLaw:
         return 0.0 if self.brake else abs(self.speed_m_s) / STOP_M_S2 + SETTLE_S
 
     def step(self, reference_m_s: float, measured_m_s: float, cap: float, elapsed_s: float) -> None:
-        """One tick towards ``reference_m_s``; ``cap`` scales the speed limit; an unknown measured speed is NaN."""
+        """Run one tick towards ``reference_m_s``; ``cap`` scales the speed limit; an unknown measured speed is NaN."""
         limit = cap * self._limit
         self._approach(min(max(reference_m_s, -limit), limit), self._acceleration * elapsed_s)
         self._set_brake(reference_m_s == 0.0, measured_m_s, elapsed_s)
 
     def stop(self, measured_m_s: float, elapsed_s: float) -> None:
-        """One tick of a stop."""
+        """Run one tick of a stop."""
         self._approach(0.0, STOP_M_S2 * elapsed_s)
         self._set_brake(True, measured_m_s, elapsed_s)
 
@@ -97,7 +97,7 @@ _E2: Final = 6.69437999014e-3
 
 
 def east_north_m(from_lat_deg: float, from_lon_deg: float, lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """(east, north) [m] between two positions a few hundred metres apart; error 1 cm over 500 m up to 80 deg
+    """Compute (east, north) [m] between two positions a few hundred metres apart; error 1 cm over 500 m up to 80 deg
     latitude.
     """
     middle = math.radians(0.5 * (from_lat_deg + lat_deg))
@@ -118,11 +118,11 @@ class WaypointLaw:
         self._bearing_rad = math.nan
 
     def reset(self) -> None:
-        """A new drive begins."""
+        """Begin a new drive."""
         self._bearing_rad = math.nan
 
     def step(self, east_m: float, north_m: float, yaw_rad: float) -> float:
-        """``east_m`` and ``north_m`` to the waypoint, ``yaw_rad`` of the front half; 0 where they are unknown (NaN)."""
+        """Run a tick: ``east_m``, ``north_m`` to the waypoint, ``yaw_rad`` of the front half; 0 if unknown (NaN)."""
         far = math.hypot(east_m, north_m) > MIN_BEARING_M
         if far or self._bearing_rad != self._bearing_rad:
             self._bearing_rad = math.atan2(north_m, east_m)
@@ -142,12 +142,12 @@ class AngleLaw:
         self._resting = False
 
     def reset(self) -> None:
-        """A new drive begins."""
+        """Begin a new drive."""
         self._flight.reset()
         self._resting = False
 
     def step(self, reference_rad: float, reference_rate_rad_s: float, angle_rad: float) -> float:
-        """One tick with the reference angle and rate now and the measured angle; 0 where one is NaN."""
+        """Run one tick with the reference angle and rate now and the measured angle; 0 where one is NaN."""
         error = reference_rad - angle_rad
         if error != error:
             return 0.0

@@ -43,7 +43,7 @@ class Feedback(Protocol):
         """Clear the integrals."""
 
     def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
-        """Velocity correction [unit/s] for an error [unit]; ``frozen``: the command is limited, so integrals stop."""
+        """Return the correction [unit/s] of an error [unit]; ``frozen``: the command is limited, so integrals stop."""
 
 
 class Pd:
@@ -55,7 +55,7 @@ class Pd:
         self._kp, self._kd = law.kp_1_s, law.kd
 
     def reset(self) -> None:
-        """A PD law has no state."""
+        """Do nothing: a PD law has no state."""
 
     def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
         return self._kp * error + self._kd * error_rate
@@ -73,7 +73,7 @@ class PlainPd:
         self.reset()
 
     def reset(self) -> None:
-        """The next step computes."""
+        """Make the next step compute."""
         self._held = self._left_s = 0.0
 
     def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
@@ -192,7 +192,7 @@ LAWS: Final[dict[str, type[Pd] | type[PlainPd] | type[Pid] | type[SlidingMode] |
 
 
 def law_of(law: Law) -> Pd | PlainPd | Pid | SlidingMode | SuperTwisting | Foreign:
-    """The law that a profile names.
+    """Make the law that a profile names.
 
     Raises:
         ConfigError: no installed package has such a law, or it cannot be loaded.

@@ -100,7 +100,7 @@ class GrappleLaw:
         self.mode = GrappleCommand.NEUTRAL
 
     def presses(self, now_ns: int) -> bool:
-        """Whether the jaws move, or did until `_PRESSES_NS` ago: what they press on or let go moves every joint."""
+        """Tell whether the jaws move, or did until `_PRESSES_NS` ago: what they press or let go moves every joint."""
         return now_ns < self._presses_until_ns
 
     @property
@@ -111,7 +111,7 @@ class GrappleLaw:
     def step(
         self, wanted: GrappleCommand, clamp_bar: float, opening_pct: float, release_bar: float, now_ns: int
     ) -> None:
-        """One tick in which the planner's command ``wanted`` is valid."""
+        """Run one tick in which the planner's command ``wanted`` is valid."""
         state = self.state
         if wanted is GrappleCommand.OPEN and state not in (GrappleState.OPEN, GrappleState.OPENING):
             self._begin(GrappleState.OPENING, opening_pct, now_ns)
@@ -184,7 +184,7 @@ class GrappleLaw:
         self.state = GrappleState.CLOSED if full_stroke and certain else GrappleState.HOLDING
 
     def _pressure_persists(self, bar: float, now_ns: int) -> bool:
-        """Whether the pressure has been at its end value for a while."""
+        """Tell whether the pressure has been at its end value for a while."""
         if not bar >= self._hold_bar:
             self._high_ns = -1
             return False
@@ -193,8 +193,8 @@ class GrappleLaw:
         return now_ns - self._high_ns >= _PERSISTS_NS
 
     def _should_close(self, bar: float, now_ns: int) -> bool:
-        """Whether closing begins: from every state but CLOSED and CLOSING, and from HOLDING when the pressure [bar]
-        that ended the closing has been low for a while.
+        """Tell whether closing begins: from every state but CLOSED and CLOSING, and from HOLDING when the pressure
+        [bar] that ended the closing has been low for a while.
         """
         if self.state is not GrappleState.HOLDING:
             return self.state not in (GrappleState.CLOSING, GrappleState.CLOSED)

@@ -34,7 +34,7 @@ class DelayCompensation:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing is in flight."""
+        """Reset with nothing in flight."""
         self._at = 0
         self.travel = 0.0
         for i in range(len(self._line)):
@@ -79,19 +79,19 @@ class CommandBound:
         self.reset()
 
     def reset(self) -> None:
-        """The valve is at neutral: the joint may stand anywhere, and nothing is in flight."""
+        """Begin with the valve at neutral: the joint may stand anywhere, and nothing is in flight."""
         self._flight.reset()
         self._place = math.nan
         self._ahead = 0.0
 
     def limit(self, desired: float) -> float:
-        """The greatest speed to command in the direction of ``desired`` [rad/s, m/s]."""
+        """Compute the greatest speed to command in the direction of ``desired`` [rad/s, m/s]."""
         most = MOST_SHARE * self._speed
         ahead = self._ahead if desired >= 0.0 else -self._ahead
         return min(max(most - ahead / RETURN_S, LEAST_SHARE * self._speed), most)
 
     def add(self, command: float, position: float, elapsed_s: float) -> None:
-        """One tick with the commanded velocity [rad/s, m/s] and the measured position [rad, m]."""
+        """Run one tick with the commanded velocity [rad/s, m/s] and the measured position [rad, m]."""
         self._flight.add(command * elapsed_s)
         predicted = position + self._flight.travel
         if self._place != self._place:
@@ -135,17 +135,17 @@ class ValveGain:
         self.reset()
 
     def reset(self) -> None:
-        """The valve is at neutral, and nothing is in flight."""
+        """Begin with the valve at neutral, and nothing in flight."""
         self._line.reset()
         self._arrived = self._moved = 0.0
         self._position = math.nan
 
     def of(self, velocity: float) -> float:
-        """Speed of the joint over the commanded one, in the direction of ``velocity``."""
+        """Return the speed of the joint over the commanded one, in the direction of ``velocity``."""
         return self._gain[velocity > 0.0]
 
     def add(self, command: float, position: float, elapsed_s: float) -> None:
-        """One tick with the commanded velocity [rad/s, m/s] and the measured position [rad, m]."""
+        """Run one tick with the commanded velocity [rad/s, m/s] and the measured position [rad, m]."""
         arrived = self._line.add(command * elapsed_s)
         moved = 0.0 if self._position != self._position else position - self._position
         self._position = position
@@ -253,7 +253,7 @@ class EndPositioning:
         self.reset()
 
     def reset(self) -> None:
-        """Resting with a neutral valve; what was learned is kept."""
+        """Reset to resting with a neutral valve; what was learned is kept."""
         self._phase = _Phase.RESTING
         self._direction = self._inches = 0
         self._left_s = self._settling_s = self._still_s = self._fast = self._slow = 0.0
@@ -265,12 +265,12 @@ class EndPositioning:
         return self._phase >= _Phase.SETTLING
 
     def follow(self) -> None:
-        """The reference moves: the law controls the joint."""
+        """Follow the moving reference: the law controls the joint."""
         self._phase = _Phase.FOLLOWING
         self._inches = 0
 
     def step(self, error: float, predicted: float, wanted: float, elapsed_s: float) -> float:
-        """Velocity to command while the reference stands still [rad/s, m/s].
+        """Compute the velocity to command while the reference stands still [rad/s, m/s].
 
         ``error``: reference less position; ``predicted``: the same once all commands in flight have come through;
         ``wanted``: the law's command.
@@ -298,12 +298,12 @@ class EndPositioning:
         return 0.0
 
     def _reach(self, error: float) -> float:
-        """Distance that an inch may cover."""
+        """Compute the distance that an inch may cover."""
         side = error > 0.0
         return REACH_S * INCH_SHARE * self._full[side]
 
     def _far(self, error: float) -> bool:
-        """Whether so much is left that the joint need not settle before the first inch."""
+        """Tell whether so much is left that the joint need not settle before the first inch."""
         left = min(self._slow, self._fast, error) if error > 0.0 else -max(self._slow, self._fast, error)
         return self._settling_s > FAR_WAIT_S and left > FAR_BANDS * self._band
 
@@ -317,7 +317,7 @@ class EndPositioning:
         self._fast = self._slow = error
 
     def _stands_still(self, for_s: float, elapsed_s: float) -> bool:
-        """Whether the error has not changed for this time."""
+        """Tell whether the error has not changed for this time."""
         self._settling_s += elapsed_s
         still = abs(self._fast - self._slow) < SETTLED_SHARE * self._band and self._settling_s > SLOW_MEAN_S
         self._still_s = self._still_s + elapsed_s if still else 0.0
@@ -335,7 +335,7 @@ class EndPositioning:
         return self._inch(error, 0.0)
 
     def _inch_speed(self) -> float:
-        """Expected speed of the present inch."""
+        """Compute the expected speed of the present inch."""
         side = self._direction > 0
         return self._gain[side] * self._open[side] * self._full[side]
 
@@ -352,7 +352,7 @@ class EndPositioning:
         return direction * self._open[side] * self._full[side]
 
     def _covered(self, error: float) -> bool:
-        """Whether a joint that shows the inch reaches its goal with what is still to come, or passes it."""
+        """Tell whether a joint that shows the inch reaches its goal with what is still to come, or passes it."""
         coming = self._direction * (self._fast - error) * self._reaction_s / FAST_MEAN_S
         return self._opened_s > self._reaction_s and coming > max(0.0, self._direction * error)
 
@@ -392,12 +392,12 @@ class VibrationFilter:
         self.reset()
 
     def reset(self) -> None:
-        """The next value becomes the mean."""
+        """Make the next value the mean."""
         self.known = False
         self._mean = self._smooth = 0.0
 
     def step(self, bar: float, elapsed_s: float) -> float:
-        """The vibration [bar] in a pressure; 0 for an unknown pressure (NaN)."""
+        """Return the vibration [bar] in a pressure; 0 for an unknown pressure (NaN)."""
         if bar != bar:
             self.known = False
             return 0.0
@@ -491,7 +491,7 @@ class JointLaw:
         damping: float = 0.0,
         displaced: float = 0.0,
     ) -> float:
-        """The velocity that this joint alone would command [rad/s, m/s]; also kept in ``velocity_desired``.
+        """Compute the velocity that this joint alone would command [rad/s, m/s]; also kept in ``velocity_desired``.
 
         ``q_ref`` and ``v_ref``: reference now; ``v_lead``: its velocity ``lead_ns`` ahead; ``q`` and ``v``: estimates;
         ``load_bar``: load pressure, NaN where there is none.  ``damping`` and ``displaced``: velocity and displacement
@@ -527,13 +527,13 @@ class JointLaw:
         return command
 
     def _surplus(self, command: float) -> float:
-        """How much faster than commanded the joint is known to go, at least 1: that a valve gives too little may be the
-        word of a wrong encoder, and loosens no bound.
+        """Tell how much faster than commanded the joint is known to go, at least 1: that a valve gives too little may
+        be the word of a wrong encoder, and loosens no bound.
         """
         return 1.0 if self._gain is None else max(1.0, self._gain.of(command))
 
     def feasible_share(self, cap: float) -> float:
-        """Share of the desired velocity within valve and speed limit; ``cap`` scales the speed limit."""
+        """Compute the share of the desired velocity within valve and speed limit; ``cap`` scales the speed limit."""
         desired = self.velocity_desired
         limit = min(self._speed * cap, self._valve.full_plus if desired >= 0.0 else self._valve.full_minus)
         if self.has_encoder:
@@ -541,7 +541,7 @@ class JointLaw:
         return limit / abs(desired) if abs(desired) > limit else 1.0
 
     def command(self, share: float, elapsed_s: float) -> float:
-        """The velocity to command when all joints get this ``share`` of their desired velocities."""
+        """Compute the velocity to command when all joints get this ``share`` of their desired velocities."""
         change = self._max_rate * elapsed_s
         last = self.velocity_command
         command = min(max(share * self.velocity_desired, last - change), last + change)

@@ -28,7 +28,7 @@ _FRONT: Final = (1.0, 1.0, -1.0, -1.0)
 
 
 def spool_pct(valve: CarrierValve, speed: float) -> float:
-    """Spool command [%] of a carrier's valve for a speed [unit/s]: the inverse of its dead-band, 0 for 0."""
+    """Compute the spool command [%] of a carrier's valve for a speed [unit/s]: its dead-band inverted, 0 for 0."""
     if speed == 0.0:
         return 0.0
     plus = speed > 0.0
@@ -48,11 +48,11 @@ class Levelling:
         self.roll_m = self.pitch_m = 0.0
 
     def reset(self) -> None:
-        """No correction."""
+        """Reset to no correction."""
         self.roll_m = self.pitch_m = 0.0
 
     def step(self, wanted: bool, roll_rad: float, pitch_rad: float, elapsed_s: float) -> None:
-        """One tick; roll is + right side down, pitch + nose up, NaN while unknown.
+        """Run one tick; roll is + right side down, pitch + nose up, NaN while unknown.
 
         Raising the left arms by h and lowering the right ones by h rolls by 2 h over the track, to the right.
         """
@@ -108,7 +108,7 @@ class Suspension:
         cap: float,
         elapsed_s: float,
     ) -> None:
-        """One tick with wanted and measured heights (an arm of unknown height, NaN, stays).
+        """Run one tick with wanted and measured heights (an arm of unknown height, NaN, stays).
 
         ``level``: whether to level by ``tilt_rad`` (roll, pitch); ``floats``: which axles float now; ``cap`` scales the
         speed limit.

@@ -61,22 +61,22 @@ class DirectionalDamper:
         self.reset()
 
     def reset(self) -> None:
-        """No damping."""
+        """Reset to no damping."""
         self._on = False
         self._share = self._wanted = self.velocity_m_s = 0.0
 
     def step(self, lean: float, rate: float, age_s: float, elapsed_s: float) -> None:
-        """One tick in which the swing may be damped; ``velocity_m_s`` is the pin's."""
+        """Run one tick in which the swing may be damped; ``velocity_m_s`` is the pin's."""
         w = self._angular
         swing = hypot(lean, rate / w)
         self._on = swing > (self._dead_zone if self._on else START_ZONES * self._dead_zone)
         phase = w * (self._lead_s + age_s)
-        wanted = self._per_rad * (lean * cos(phase) + rate / w * sin(phase))
-        self._wanted = min(max(wanted, -self._limit), self._limit)
+        pin_velocity_m_s = self._per_rad * (lean * cos(phase) + rate / w * sin(phase))
+        self._wanted = min(max(pin_velocity_m_s, -self._limit), self._limit)
         self._fade(self._on, elapsed_s)
 
     def stop(self, elapsed_s: float) -> None:
-        """One tick in which it may not, or without a measurement: the last velocity fades."""
+        """Run one tick in which it may not, or without a measurement: the last velocity fades."""
         self._on = False
         if self._share:
             self._fade(False, elapsed_s)
@@ -114,7 +114,7 @@ class SwayDamping:
             self.velocity[j] = self.displacement[j] = 0.0
 
     def step(self, swing: Swing | None, age_s: float, stands: bool, q: Sequence[float], elapsed_s: float) -> None:
-        """One tick with the swing measured ``age_s`` ago (None while stale), whether the reference ``stands``, and
+        """Run one tick with the swing measured ``age_s`` ago (None while stale), whether the reference ``stands``, and
         joint positions (NaN while unknown).
         """
         self._stood_s = self._stood_s + elapsed_s if stands else 0.0
@@ -139,10 +139,10 @@ class SwayDamping:
         if not reach_m > 0.0:  # unknown
             self.reset()
             return
-        wanted = (tangential_m_s / reach_m, radial_m_s * ext[1] / det, -radial_m_s * tilt[1] / det)
+        joint_velocities = (tangential_m_s / reach_m, radial_m_s * ext[1] / det, -radial_m_s * tilt[1] / det)
         self.active = radial_m_s != 0.0 or tangential_m_s != 0.0
         velocity, displacement = self.velocity, self.displacement
-        for (j, over), v in zip(self._over, wanted, strict=True):
+        for (j, over), v in zip(self._over, joint_velocities, strict=True):
             velocity[j] = v - RETURN_1_S * displacement[j]
             displacement[j] += velocity[j] * elapsed_s
             if abs(displacement[j]) > over:

@@ -75,7 +75,7 @@ class ValveMap:
         self.full_plus, self.full_minus = self._nominal_plus / arm, self._nominal_minus / arm
 
     def velocity(self, spool_pct: float) -> float:
-        """Joint velocity [rad/s or m/s] of an open valve whose spool is measured at this position [%]."""
+        """Compute the joint velocity [rad/s or m/s] of an open valve whose spool is measured at this position [%]."""
         share = spool_pct * self._sign / 100.0
         opening = share if share > 0.0 else -share
         deadband = self._deadband_plus if share > 0.0 else self._deadband_minus
@@ -85,7 +85,7 @@ class ValveMap:
         return metered * (self.full_plus if share > 0.0 else -self.full_minus)
 
     def spool_pct(self, velocity: float) -> float:
-        """Spool command [%] in -100..100 of this tick for a joint velocity [rad/s or m/s]; saturates at full speed."""
+        """Compute the tick's spool command [%], -100..100, for a joint velocity [rad/s, m/s]; limited to full speed."""
         if velocity == 0.0:
             self._last = self._ahead = 0.0
             return 0.0

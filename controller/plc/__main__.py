@@ -62,7 +62,7 @@ class ExchangeTimer:
         self._due = asyncio.get_running_loop().time()
 
     async def wait(self) -> None:
-        """Until the next period begins."""
+        """Wait until the next period begins."""
         now = asyncio.get_running_loop().time()
         self._due = max(self._due + _PERIOD_S, now)
         await asyncio.sleep(self._due - now)
@@ -187,7 +187,7 @@ TX_QUEUE: Final = 64
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Build the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="python -m controller.plc",
         description="Connects crane0 to a machine PLC over Modbus/TCP or cyclic UDP.",
@@ -225,7 +225,7 @@ class Process:
         self._link.send(self._bridge.step(time.monotonic_ns(), frames))
 
     def status_text(self) -> str:
-        """State in one line."""
+        """Describe the state in one line."""
         shake, bus = self._bridge.handshake, self._bus
         answers = shake.problem or f"The PLC has answered {shake.answers} times."
         refused = f" {shake.replayed} old datagrams were refused." if shake.replayed else ""
@@ -260,7 +260,7 @@ class Process:
 
 
 def summary(bridge: Bridge) -> str:
-    """Statistics of the exchange as one JSON line."""
+    """Return the statistics of the exchange as one JSON line."""
     shake = bridge.handshake
     return json.dumps(
         {

@@ -51,7 +51,7 @@ _PLC_RUNS, _PLC_HOLDS = 2, 1
 
 
 def role_of(profile: Profile) -> Role:
-    """The PLC's role on this machine.
+    """Return the PLC's role on this machine.
 
     Raises:
         ConfigError: the machine has no PLC, or has a carrier.
@@ -96,7 +96,7 @@ class Bridge:
         self._last = Command()
 
     def command(self, now_ns: int) -> Command:
-        """The command for the PLC now."""
+        """Compute the command for the PLC now."""
         shake = self.handshake
         if shake.sessions != self._sessions:
             self._sessions = shake.sessions
@@ -133,7 +133,7 @@ class Bridge:
             self._new_sample, self._sampled_ns = True, now_ns
 
     def _receive(self, frame: Frame, now_ns: int, out: list[RawFrame] | None) -> None:
-        """``out`` is None while nothing may be sent; then only the gate uses the frame."""
+        """Take a frame; ``out`` is None while nothing may be sent: then only the gate uses the frame."""
         key = frame.key
         if key == SYNC_ID:
             self.gate.sync(now_ns)
@@ -214,7 +214,7 @@ class Bridge:
         )
 
     def _grapple_state(self, opening: float) -> int:
-        """0 unknown, 1 open, 2 opening, 3 closing, 4 closed, 5 holding: by the last command and the opening."""
+        """Judge by the last command and the opening: 0 unknown, 1 open, 2 opening, 3 closing, 4 closed, 5 holding."""
         closed, opened = opening < _CLOSED_SHARE, opening > _OPEN_SHARE
         match self._last.grapple:
             case Grapple.OPEN:
@@ -252,7 +252,7 @@ class EmulatedNode(CanopenSlave):
         self._heartbeat = PeriodicTimer(HEARTBEAT_NS)
 
     def boot(self) -> None:
-        """As after power-on."""
+        """Start as after power-on."""
         self.state = NodeState.BOOT_UP
         self.restart()
 
@@ -302,8 +302,8 @@ class EmulatedEncoder(EmulatedNode):
         self._mapping = TPDO1_MAPPINGS[spec.kind]
 
     def answer(self, position: float, velocity: float, sampled_us: int) -> RawFrame | None:
-        """TPDO1 of a sample that the PLC read at ``sampled_us`` by its own clock; None unless it is configured as in
-        crane.dbc.
+        """Build the TPDO1 of a sample that the PLC read at ``sampled_us`` by its own clock; None unless it is
+        configured as in crane.dbc.
         """
         if not self.operational or not self._mapped():
             return None

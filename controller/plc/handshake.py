@@ -59,26 +59,26 @@ class Handshake:
         self._alive_ns = self._acknowledged_ns = 0
 
     def fresh(self, now_ns: int) -> bool:
-        """Whether the PLC is alive and has read its inputs: a good answer with a new heartbeat, at most 50 ms ago."""
+        """Tell whether the PLC lives and has read its inputs: a good answer with a new heartbeat, at most 50 ms ago."""
         feedback = self.feedback
         return feedback is not None and feedback.state is not State.INIT and now_ns - self._alive_ns <= FRESH_NS
 
     def acknowledged(self, now_ns: int) -> bool:
-        """Whether the PLC accepts the commands: it echoed a newer one at most 50 ms ago."""
+        """Tell whether the PLC accepts the commands: it echoed a newer one at most 50 ms ago."""
         return now_ns - self._acknowledged_ns <= FRESH_NS and self._acknowledged_ns > 0
 
     def connected(self) -> None:
-        """A connection has been made."""
+        """Count a connection that has been made."""
         self.sessions += 1
 
     def registers(self, command: Command, now_ns: int) -> list[int]:
-        """The command block of the next Modbus exchange; raises MapError."""
+        """Build the command block of the next Modbus exchange; raises MapError."""
         block = plc.command_registers(command, self._sequence + 1, self._sequence + 1, self.order)
         self._note_sent(now_ns)
         return block
 
     def datagram(self, command: Command, now_ns: int) -> bytes:
-        """The next UDP command, a hello while there is no session; raises MapError."""
+        """Build the next UDP command, a hello while there is no session; raises MapError."""
         if self._session and now_ns - self._alive_ns > SESSION_NS:
             self._session = self._echo = 0
         self._hellos = 0 if self._session else self._hellos + 1
@@ -88,7 +88,7 @@ class Handshake:
         return data
 
     def exchange(self, machine: Machine, command: Command, now_ns: int) -> bool:
-        """One exchange with a machine in this process, which takes every command; raises what it raises."""
+        """Make one exchange with a machine in this process, which takes every command; raises what it raises."""
         self._note_sent(now_ns)
         machine.act(command)
         return self._accept(replace(machine.observe(), accepted=self._sequence & 0xFFFF), now_ns)
@@ -125,12 +125,12 @@ class Handshake:
         return self._accept(feedback, now_ns)
 
     def exchange_failed(self, why: str) -> None:
-        """The exchange failed."""
+        """Count an exchange that failed, and note the reason."""
         self.dropped += 1
         self.problem = f"{why}."
 
     def command_refused(self, code: int) -> None:
-        """The PLC answered with a Modbus exception."""
+        """Count a command that the PLC answered with a Modbus exception."""
         self.refused += 1
         self.problem = f"The PLC refused a command with Modbus exception {code}."
 
@@ -140,7 +140,7 @@ class Handshake:
         self._sent_ns[self._sequence % _SENT_COUNT] = now_ns
 
     def _is_new(self, header: Header, now_ns: int) -> bool:
-        """Whether a reply answers a command of the last 50 ms, in this session or to begin one."""
+        """Tell whether a reply answers a command of the last 50 ms, in this session or to begin one."""
         behind = (self._sequence - header.echo) & _U32
         sent_ns = self._sent_before_ns(behind)
         if sent_ns is None or now_ns - sent_ns > FRESH_NS:
@@ -150,7 +150,7 @@ class Handshake:
         return header.session != 0 and behind < self._hellos
 
     def _sent_before_ns(self, behind: int) -> int | None:
-        """When the command was sent that is ``behind`` the newest one; None for one never sent, or long ago."""
+        """Tell when the command was sent that is ``behind`` the newest one; None for one never sent, or long ago."""
         known = behind < min(self.sent, _SENT_COUNT)
         return self._sent_ns[(self._sequence - behind) % _SENT_COUNT] if known else None
 

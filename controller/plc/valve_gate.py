@@ -101,7 +101,7 @@ class ValveGate:
         return self._a.get("Counter") or 0
 
     def command(self, now_ns: int, feedback: Feedback | None, sampling: bool) -> Command:
-        """The command for the PLC now; ``sampling``: the PLC has measured the joints lately."""
+        """Compute the command for the PLC now; ``sampling``: the PLC has measured the joints lately."""
         age_out(self._states, now_ns)
         missing = self._missing(now_ns) or (ExitCode.OK if sampling else ExitCode.FUNCTION_FAULT)
         if missing and self._armed:
@@ -122,7 +122,7 @@ class ValveGate:
         return command
 
     def _missing(self, now_ns: int) -> int:
-        """What prevents passing a command on, as an exit code; 0 when nothing does."""
+        """Find what prevents passing a command on, as an exit code; 0 when nothing does."""
         needed = (self._a, self._b, *self._references)
         if any(state.values is None for state in needed) or now_ns - self._sync_ns > SYNC_NS:
             return ExitCode.COMMAND_TIMEOUT
@@ -133,7 +133,7 @@ class ValveGate:
         return 0
 
     def _wanted(self) -> Command:
-        """The controller's command; a reference that is not available means that nothing may move."""
+        """Build the controller's command; a reference that is not available means that nothing may move."""
         b, spare = self._b, (0.0,) * (N_AXES - N_JOINTS)
         mode, reference, rate = Mode.NEUTRAL, (0.0,) * N_AXES, (0.0,) * N_AXES
         if self._a.get("Mode") == _MODE_SPOOL and self._role is Role.VALVES:
@@ -155,7 +155,7 @@ class ValveGate:
         )
 
     def _wants_reset(self, now_ns: int, feedback: Feedback | None) -> bool:
-        """A pulse while the PLC is latched and the controller is not, because an operator has reset the controller.
+        """Give a pulse while the PLC is latched and the controller is not, because an operator has reset the latter.
 
         A reset moves nothing; a human must still arm through the controller.
         """
@@ -167,12 +167,12 @@ class ValveGate:
 
 
 def state_of(feedback: Feedback, gate: ValveGate) -> int:
-    """ValveFbA.State: 0 neutral, 1 active, 3 pilot off, 4 fault."""
+    """Return ValveFbA.State: 0 neutral, 1 active, 3 pilot off, 4 fault."""
     if gate.locked:
         return 4
     return {State.EXECUTE: 1, State.SAFE: 3}.get(feedback.state, 0)
 
 
 def fault_bits(feedback: Feedback) -> int:
-    """PlcStatus.FaultBits: one bit per fault of the map."""
+    """Encode PlcStatus.FaultBits: one bit per fault of the map."""
     return 0 if feedback.fault == plc.Fault.NONE else 1 << (feedback.fault - 1) & 0xFFFF

@@ -41,7 +41,7 @@ PRIORITY: Final = 80
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Build the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="python -m controller",
         description="Closes the joint and grapple loops of the machine over CAN.",
@@ -120,7 +120,7 @@ def operator_socket(path: Path) -> OperatorSocket:
 
 
 def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
-    """Name -> address of the machine's buses in the loop's order; raises ConfigError."""
+    """Map each name to the address of the machine's buses in the loop's order; raises ConfigError."""
     profile = settings.profile
     buses = [name for name in (profile.crane_bus, profile.machine_bus) if name]
     for name in given:
@@ -149,7 +149,7 @@ def open_buses(where: dict[str, str], controller: Controller, settings: Settings
 
 
 def timing_writer(path: Path | None) -> TimingWriter | None:
-    """The timing page; without one the controller runs as well, and reports that on stderr."""
+    """Open the timing page; without one the controller runs as well, and reports that on stderr."""
     path = path or default_path()
     try:
         return TimingWriter(path)
@@ -159,7 +159,7 @@ def timing_writer(path: Path | None) -> TimingWriter | None:
 
 
 def record_ring(path: Path | None) -> RecordRing | None:
-    """The ring of tick records; without one the controller runs as well, and reports that on stderr."""
+    """Open the ring of tick records; without one the controller runs as well, and reports that on stderr."""
     path = path or ring_path()
     try:
         return RecordRing(path)
@@ -169,7 +169,7 @@ def record_ring(path: Path | None) -> RecordRing | None:
 
 
 def summary(loop: Loop) -> str:
-    """Statistics of the loop as one JSON line."""
+    """Return the statistics of the loop as one JSON line."""
     supervisor = loop.controller.supervisor
     return json.dumps(
         {

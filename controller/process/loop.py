@@ -134,7 +134,7 @@ class Loop:
         return outputs
 
     def status_text(self) -> str:
-        """State in one line: mode, reason, buses that are not OK, missed ticks."""
+        """Describe the state in one line: mode, reason, buses that are not OK, missed ticks."""
         supervisor = self.controller.supervisor
         reason = describe(supervisor.reason, supervisor.detail, self.controller.evidence.numbers)
         buses = "".join(f"{bus.name} is {bus.stats.state.name}. " for bus in self.buses if bus.stats.state)
@@ -162,7 +162,7 @@ class Loop:
         self.timing.close()
 
     def _receive_datagrams(self, inputs: Inputs) -> None:
-        """The operator's commands, and the setpoints that fit into a tick."""
+        """Receive the operator's commands, and the setpoints that fit into a tick."""
         datagrams = inputs.datagrams
         inputs.operator.clear()
         datagrams.clear()
@@ -196,7 +196,9 @@ class Loop:
 
 
 def _connected(address: Address) -> socket.socket:
-    """A socket that never blocks and sends to one address: the kernel looks for its way once and not in every tick.
+    """Make a socket that never blocks and sends to one address.
+
+    The kernel looks for its way once and not in every tick.
 
     Raises:
         LinkError: there is no way to the address.
@@ -214,7 +216,7 @@ def _connected(address: Address) -> socket.socket:
 
 
 def _send(receiver: socket.socket, data: bytes) -> bool:
-    """Whether the system took a datagram; not while nobody listens."""
+    """Tell whether the system took a datagram; not while nobody listens."""
     try:
         return receiver.send(data) == len(data)
     except OSError:

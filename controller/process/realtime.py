@@ -41,7 +41,7 @@ def sleep_until(deadline_ns: int) -> None:
 
 
 def make_sleep(spin_ns: int) -> Callable[[int], None]:
-    """`sleep_until`, or the same with a spin on the clock for the last ``spin_ns``.
+    """Return `sleep_until`, or the same with a spin on the clock for the last ``spin_ns``.
 
     Spinning wakes a few microseconds late instead of tens and costs ``spin_ns`` per wake-up on a processor that should
     be its own (docs/reference/real-time.md section 2).
@@ -99,5 +99,5 @@ def _fill_tuple_lists() -> None:
     the heap would grow by them for half an hour, with page faults.  A garbage collection would empty the lists.
     """
     for length in range(1, 21):
-        kept = [tuple(range(length)) for _ in range(2000)]
-        del kept
+        tuples = [tuple(range(length)) for _ in range(2000)]
+        del tuples

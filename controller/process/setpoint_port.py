@@ -23,7 +23,7 @@ DATAGRAM_BYTES: Final = 2048
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on a UDP port of loopback that no other has; raises LinkError."""
+    """Open a socket on a UDP port of loopback that no other has; raises LinkError."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         made.bind(("127.0.0.1", port))
@@ -60,7 +60,7 @@ class SetpointPort:
         self._receive(self._open, datagrams)
 
     def strangers_text(self) -> str:
-        """How many datagrams were made without the key, and the port that sent the last one; empty: none."""
+        """Tell how many datagrams were made without the key, and the port that sent the last one; empty: none."""
         if not self._strangers:
             return ""
         return f"Datagrams without the right key: {self._strangers}, the last from UDP port {self._stranger}. "

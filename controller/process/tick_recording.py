@@ -33,7 +33,7 @@ def write(writer: RecordWriter, inputs: Inputs, outputs: Outputs, now_ns: int) -
 
 
 def record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:
-    """The record of the tick that was just run, to keep."""
+    """Write the record of the tick that was just run, to keep."""
     return bytes(write(RecordWriter(), inputs, outputs, now_ns))
 
 
@@ -46,6 +46,6 @@ def restore_inputs(inputs: Inputs, tick: TickRecord) -> None:
 
 
 def transmitted(outputs: Outputs) -> tuple[tuple[RawFrame, ...], tuple[RawFrame, ...], bytes, bytes]:
-    """What a tick transmitted: frames on crane0 with SYNC last, frames on mach0, both reports."""
+    """Return what a tick transmitted: frames on crane0 with SYNC last, frames on mach0, both reports."""
     frames = (*outputs.frames, outputs.sync)
     return frames, tuple(outputs.machine_frames), outputs.report or b"", outputs.vehicle_report or b""

@@ -87,26 +87,26 @@ class LoopTiming:
         self._sync_ns = self._previous_sync_ns = 0
 
     def sync_sent(self, late_ns: int) -> None:
-        """SYNC was sent: the encoders sample now."""
+        """Note that SYNC was sent: the encoders sample now."""
         self._previous_sync_ns, self._sync_ns = self._sync_ns, self._clock_ns()
         self.sync.add(late_ns)
 
     def begin(self, late_ns: int) -> None:
-        """A tick begins."""
+        """Begin a tick."""
         self._cpu_begin_ns = self._cpu_ns()
         self._begin_ns = self._last_ns = self._clock_ns()
         self._at = 0
         self.wake.add(late_ns)
 
     def lap(self) -> None:
-        """A stage ends."""
+        """End a stage."""
         now_ns = self._clock_ns()
         self._laps[self._at].add(now_ns - self._last_ns)
         self._last_ns = now_ns
         self._at += 1
 
     def command_sent(self) -> None:
-        """The valve commands were sent: measure the age of their samples, from the SYNC of the oldest encoder
+        """Measure the age of the samples of the valve commands that were sent, from the SYNC of the oldest encoder
         sample.
         """
         oldest_ns = self._last_ns
@@ -122,7 +122,7 @@ class LoopTiming:
         self.sample_to_command.add(self._clock_ns() - oldest_ns)
 
     def end(self) -> int:
-        """A tick ends; returns its duration."""
+        """End a tick; returns its duration."""
         begin_ns, newest_ns, longest_ns, uses = self._begin_ns, self._newest_ns, self._longest_ns, self._uses
         for i, state in enumerate(self._states):
             if state.fresh:
@@ -197,7 +197,7 @@ class ProcessReader:
         self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
 
     def read(self) -> ProcessCounters:
-        """The counters now."""
+        """Read the counters now."""
         used = resource.getrusage(resource.RUSAGE_SELF)
         resident_pages = int(os.pread(self._statm, 128, 0).split()[1])
         return ProcessCounters(

@@ -74,14 +74,14 @@ class _MessageSource:
     """One message at zero, or as near to it as its range allows; its time stamp changes."""
 
     def __init__(self, codec: MessageCodec) -> None:
-        wanted = VALUES.get(codec.name, {})
-        self._values = [_nearest(wanted.get(s.name, 0), s.minimum, s.maximum) for s in codec.signals]
+        signal_values = VALUES.get(codec.name, {})
+        self._values = [_nearest(signal_values.get(s.name, 0), s.minimum, s.maximum) for s in codec.signals]
         self._codec, self._alive = codec, codec.index.get("TimeStamp", -1)
         self._sender = Sender(codec.data_ids) if codec.data_ids else None
         self._count = 0
 
     def frames(self, now_ns: int) -> list[Frame]:
-        """The message at ``now_ns``; a long message is a fast packet of several frames."""
+        """Encode the message at ``now_ns``; a long message is a fast packet of several frames."""
         self._count += 1
         if self._alive >= 0:
             self._values[self._alive] = self._count

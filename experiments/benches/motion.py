@@ -56,7 +56,7 @@ class Bench:
     no_grasp: int = 0
 
     def metrics(self) -> dict[str, float]:
-        """Metrics by name."""
+        """Compute the metrics by name."""
         return {
             "motions": len(self.cpu_ms),
             "blocked": len(self.blocked),
@@ -88,7 +88,7 @@ def run(profile: Profile, seeds: int, progress: Callable[[int, int], None] = lam
 
 
 def observed(profile: Profile, number: int, spec: LogSpec) -> LogObservation:
-    """A log of a scene as an ideal detection in the crane's base frame, with the machine at its lowest."""
+    """Turn a log of a scene into an ideal detection in the crane's base frame, with the machine at its lowest."""
     x, y, yaw, c = spec.x_m, spec.y_m, spec.yaw_rad, profile.carrier
     if c is not None:
         dx, dy, turn = x - c.crane_base_m[0], y - c.crane_base_m[1], -c.crane_yaw_rad
@@ -101,29 +101,34 @@ def observed(profile: Profile, number: int, spec: LogSpec) -> LogObservation:
 def _cycle(bench: Bench, arm: Arm, home: Pose, logs: list[LogObservation]) -> None:
     profile, top = arm.profile, travel_height_m(arm.profile)
     log = max(logs, key=lambda o: o.center_m[2])
-    rest = [o for o in logs if o is not log]
+    other_logs = [o for o in logs if o is not log]
     try:
         grasp = plan_single_log_grasp(arm, log, home.rot_rad)
-        place = plan_place(arm, CraneJob(), grasp, logs)
+        drop_pose = plan_place(arm, CraneJob(), grasp, logs)
     except NoGrasp:
         bench.no_grasp += 1
         return
     motions, free_m = TimeOptimalPlanner(), approach_length_m(profile, log)
-    around, held = collision_scene(profile, rest), held_log(arm, grasp.pose, log)
+    around, held = collision_scene(profile, other_logs), held_log(arm, grasp.pose, log)
     over = grasp.pose.at_height(hover_height_m(profile, grasp))
     clear = Task(collision_scene(profile, logs), None, top, 0.0)
     laden = Task(around, held, top, free_m)
     _measure(bench, arm, home, over, clear, partial(approach_motion, arm, motions, home, grasp, logs))
     _measure(
-        bench, arm, grasp.pose, place, laden, partial(carry_motion, arm, motions, grasp.pose, place, grasp, logs, False)
+        bench,
+        arm,
+        grasp.pose,
+        drop_pose,
+        laden,
+        partial(carry_motion, arm, motions, grasp.pose, drop_pose, grasp, logs, False),
     )
     _measure(
         bench,
         arm,
-        place,
+        drop_pose,
         over,
         Task(around, None, top, 0.0),
-        partial(approach_motion, arm, motions, place, grasp, rest),
+        partial(approach_motion, arm, motions, drop_pose, grasp, other_logs),
     )
 
 

@@ -30,7 +30,7 @@ class PoolCost:
 
 
 def waits(job: Job) -> dict[str, Any]:
-    """A trial that only waits."""
+    """Wait for the length of a trial and do nothing else."""
     time.sleep(WAIT_S)
     return {"number": job.seed}
 
@@ -39,8 +39,8 @@ def measure(workers: int, console: Console) -> PoolCost:
     """Perform the trials with so many workers."""
     trials: list[Trial] = []
     jobs = [Job(f"wait/{i}", "wait", i, {}) for i in range(TRIALS)]
-    with tempfile.TemporaryDirectory() as folder, Checkpoint(Path(folder) / "trials.jsonl", "bench") as kept:
-        pool.run(waits, jobs, kept, Workers(workers, trials=trials), f"trials by {workers}", console)
+    with tempfile.TemporaryDirectory() as folder, Checkpoint(Path(folder) / "trials.jsonl", "bench") as trial_store:
+        pool.run(waits, jobs, trial_store, Workers(workers, trials=trials), f"trials by {workers}", console)
     costs = [t.cost for t in trials if t.cost is not None]
     begun_s = min(c.begin_s for c in costs)
     ended_s = max(c.begin_s + c.seconds for c in costs)

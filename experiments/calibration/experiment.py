@@ -42,19 +42,19 @@ def run(options: Options, console: Console) -> Result:
     """Calibrate every machine; write ``options.out`` and, if requested, the docs."""
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     truth, machines = sampled_unless_given(options.truth), machines_of(options.profile)
-    first = FIRST_SEED + SEEDS_PER_RUN * options.seed
+    first_seed = FIRST_SEED + SEEDS_PER_RUN * options.seed
     jobs = [
-        Job(f"{short}/{i}", "calibration", first + i, {"profile": name, "truth": truth})
+        Job(f"{short}/{i}", "calibration", first_seed + i, {"profile": name, "truth": truth})
         for i in range(trials)
         for short, name in machines.items()
     ]
-    with checkpoint(options, (), machines.values(), truth, LOCKSTEP_SOURCES) as kept:
-        outcomes = pool.run(calibrated, jobs, kept, options.workers, "calibrations", console)
+    with checkpoint(options, (), machines.values(), truth, LOCKSTEP_SOURCES) as trial_store:
+        outcomes = pool.run(calibrated, jobs, trial_store, options.workers, "calibrations", console)
         by_machine = {m: [o for n, o in outcomes.items() if n.startswith(f"{m}/")] for m in machines}
         metrics: dict[str, float] = {}
-        for short, found in by_machine.items():
-            metrics |= metrics_of(short, machines[short], found)
-            draw(options.out / f"errors_{short}.png", found)
+        for short, machine_outcomes in by_machine.items():
+            metrics |= metrics_of(short, machines[short], machine_outcomes)
+            draw(options.out / f"errors_{short}.png", machine_outcomes)
         result = make_result(
             "calibration",
             metrics_in(metrics),
@@ -64,8 +64,8 @@ def run(options: Options, console: Console) -> Result:
             trials=trials,
             more={"truth": truth},
         )
-        for short, found in by_machine.items():
-            for outcome in found:
+        for short, machine_outcomes in by_machine.items():
+            for outcome in machine_outcomes:
                 if outcome["failure"] or outcome.get("implausible"):
                     why = outcome["failure"] or "; ".join(outcome["implausible"])
                     console.print(f"{machines[short]} seed {outcome['seed']}: {why}", highlight=False)
@@ -74,7 +74,7 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Calibration experiment", conclusion(result.metrics), INTRODUCTION, sections(result.metrics))
 
 
@@ -84,11 +84,11 @@ def draw(path: Path, outcomes: Sequence[dict[str, Any]]) -> None:
     names = list(dict.fromkeys(n for o in ended for n in o["joints"]))
     with sheet(path, 3, 9.0, 3.0) as (deadband, gain, delay):
         for x, name in enumerate(names):
-            found = [o["joints"][name] for o in ended]
+            joint_errors = [o["joints"][name] for o in ended]
             for axis, values in (
-                (deadband, [r["deadband_pct"] for r in found]),
-                (gain, [[100.0 * e for e in r["gain"]] for r in found]),
-                (delay, [[r["delay_ms"]] for r in found]),
+                (deadband, [r["deadband_pct"] for r in joint_errors]),
+                (gain, [[100.0 * e for e in r["gain"]] for r in joint_errors]),
+                (delay, [[r["delay_ms"]] for r in joint_errors]),
             ):
                 for i, color in ((0, OIL), (-1, MOSS)):
                     axis.plot(

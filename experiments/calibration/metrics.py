@@ -34,17 +34,17 @@ INTRODUCTION: Final = (
 
 
 def machines_of(profile: str) -> dict[str, str]:
-    """The machines to calibrate, by the prefix of their metrics: the shipped ones, or the one of a user's profile."""
+    """Name the machines to calibrate by the prefix of their metrics: the shipped ones, or a user's profile."""
     return SHIPPED if profile in SHIPPED.values() else {profile_named(profile).name: profile}
 
 
 def metrics_in(found: Mapping[str, float]) -> tuple[Metric, ...]:
-    """The metrics that a result has, of every machine in it."""
+    """List the metrics that a result has, of every machine in it."""
     return tuple(m for section in sections(found) for m in section.metrics)
 
 
 def conclusion(found: Mapping[str, float]) -> tuple[str, ...]:
-    """The conclusion of a result, as templates."""
+    """Write the conclusion of a result, as templates."""
     if all(f"{short}_complete" in found for short in SHIPPED):
         return _CONCLUSION
     return tuple(
@@ -56,7 +56,7 @@ def conclusion(found: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def sections(found: Mapping[str, float]) -> tuple[Section, ...]:
-    """One section for every machine in a result."""
+    """Make one section for every machine in a result."""
     return tuple(
         Section(
             _TITLES.get(s, s),
@@ -69,7 +69,7 @@ def sections(found: Mapping[str, float]) -> tuple[Section, ...]:
 
 
 def _prefixes(found: Mapping[str, float]) -> list[str]:
-    """The machines of a result, the shipped ones in their order."""
+    """List the machines of a result, the shipped ones in their order."""
     names = [name.removesuffix("_complete") for name in found if name.endswith("_complete")]
     return [*(s for s in SHIPPED if s in names), *(n for n in names if n not in SHIPPED)]
 
@@ -190,12 +190,12 @@ def _metrics(short: str, blind_rotator: bool) -> tuple[Metric, ...]:
 
 
 def rotator_is_blind(profile: str) -> bool:
-    """Whether the rotator of the machine has no encoder."""
+    """Tell whether the rotator of the machine has no encoder."""
     return joint(profile_named(profile), Joint.ROT).encoder is None
 
 
 def _rotator_metrics(m: Callable[..., Metric]) -> tuple[Metric, ...]:
-    """Metrics of a rotator without an encoder."""
+    """Define the metrics of a rotator without an encoder."""
     return (
         m(
             "rot_deadband_max",
@@ -245,7 +245,7 @@ _TEXT: Final = (
 
 
 def metrics_of(short: str, profile: str, outcomes: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Metrics of all trials of one kind of machine; their names begin with ``short``."""
+    """Compute the metrics of all trials of one kind of machine; their names begin with ``short``."""
     ended = [o for o in outcomes if not o["failure"]]
     good = [o for o in ended if not o["implausible"]]
     joints = [r for o in ended for r in o["joints"].values()]

@@ -39,8 +39,8 @@ HANG_S, REST_S, LOOK_S = 1.0, 4.0, 2.0
 
 
 def tip_errors(job: Job, shipped: Profile, calibrated: Profile) -> dict[str, Any]:
-    """Distances of the true pin [mm] and errors of the load [kg] at every goal that the crane reaches, by name."""
-    found: dict[str, list[float]] = {"before": [], "empty": [], "loaded": [], "loaded_before": [], "load_kg": []}
+    """Compute distances of the true pin [mm] and errors of the load [kg] at every goal within reach, by name."""
+    errors: dict[str, list[float]] = {"before": [], "empty": [], "loaded": [], "loaded_before": [], "load_kg": []}
     turn = calibrated.kinematics.theta1_offset_rad
     for i, (ahead, aside, z) in enumerate(GOALS):
         x, y = ahead * math.cos(turn) - aside * math.sin(turn), ahead * math.sin(turn) + aside * math.cos(turn)
@@ -60,17 +60,17 @@ def tip_errors(job: Job, shipped: Profile, calibrated: Profile) -> dict[str, Any
                     break
                 shown, true, moment_nm = _look(world, shipped)
                 corrected = _read_by(shown, shipped, calibrated)
-                found[before].append(1e3 * math.dist(pin_position(shipped.kinematics, shown), true))
+                errors[before].append(1e3 * math.dist(pin_position(shipped.kinematics, shown), true))
                 pin = true_pin(calibrated.sag, calibrated.kinematics, corrected, kg)
-                found[after].append(1e3 * math.dist(pin, true))
-                found["load_kg"].append(
+                errors[after].append(1e3 * math.dist(pin, true))
+                errors["load_kg"].append(
                     hanging_load_kg(calibrated.sag, calibrated.kinematics, corrected, moment_nm) - kg
                 )
-    return found
+    return errors
 
 
 def touches(world: World) -> bool:
-    """Whether the grapple stands on something, such as a stake of the bunk: it then carries what the crane should."""
+    """Tell whether the grapple stands on something, as a stake of the bunk: it then carries what the crane should."""
     body, links = world.crane.body, {world.crane.link[name] for name in GRAPPLE_LINKS}
     contacts = world.client.getContactPoints(bodyA=body)
     return any(c[3] in links or (c[2] == body and c[4] in links) for c in contacts)
@@ -92,7 +92,7 @@ def _hang_slowly(world: World, kg: float) -> None:
 
 
 def _look(world: World, profile: Profile) -> tuple[list[float], Sequence[float], float]:
-    """Means over an interval: encoder readings through a profile, the true pin, and the moment by the pressures."""
+    """Average over an interval: encoder readings through a profile, the true pin, and the moment by the pressures."""
     names = [j.name.lower() for j in Joint]
     steps = round(LOOK_S / STEP_S)
     q, tip, bar = [0.0] * len(names), [0.0] * 3, [0.0] * 2
@@ -108,7 +108,7 @@ def _look(world: World, profile: Profile) -> tuple[list[float], Sequence[float],
 
 
 def _read_by(shown: Sequence[float], shipped: Profile, calibrated: Profile) -> list[float]:
-    """The same encoder counts with the zeros of the calibrated profile."""
+    """Read the same encoder counts with the zeros of the calibrated profile."""
     out = list(shown)
     for j in Joint:
         a, b = joint(shipped, j).encoder, joint(calibrated, j).encoder

@@ -87,7 +87,7 @@ class _Turner:
 
 
 def turn_errors(job: Job, path: Path) -> list[float]:
-    """Relative error of the true angle of every commanded turn in `TURNS_RAD`, with the profile in a file.
+    """Measure the relative error of the true angle of every commanded turn in `TURNS_RAD`, with the profile in a file.
 
     Raises:
         InputRefused: the machine did not make all turns.
@@ -118,7 +118,7 @@ def turn_errors(job: Job, path: Path) -> list[float]:
 
 
 def _pressed(action: OperatorAction, report: StateReport) -> None:
-    """The emulated operator prints nothing."""
+    """Print nothing: the operator is emulated."""
 
 
 # -- One calibration of one individual machine in lockstep, compared with the hidden ground truth
@@ -145,24 +145,24 @@ def calibrated(job: Job) -> dict[str, Any]:
     joints = {}
     for j, r in result.joints.items():
         joints[j.name.lower()] = _joint_errors(job, profile, outcome.plan, truth, j, r)
-    found = {
+    error_report = {
         **facts,
         "implausible": [problem.sentence for problem in result.implausible],
         "joints": joints,
         **_survey_errors(truth, result),
     }
     if result.implausible:
-        return found
+        return error_report
     with TemporaryDirectory() as folder:
         out = Path(folder) / "calibrated.toml"
         write_profile(profile_path(name), out, profile_changes(profile, result), "today")
         if result.turns is not None:
-            found["rotator"] = _rotator_errors(job, profile, truth, result.turns, out)
-        return {**found, "tip": tip_errors(job, profile, load_profile(out))}
+            error_report["rotator"] = _rotator_errors(job, profile, truth, result.turns, out)
+        return {**error_report, "tip": tip_errors(job, profile, load_profile(out))}
 
 
 def _rotator_errors(job: Job, profile: Profile, truth: Any, turns: TurnFit, calibrated: Path) -> dict[str, Any]:
-    """Errors of a rotator without an encoder against its true valve, and of commanded quarter turns."""
+    """Compute the errors of a rotator without an encoder against its true valve, and of commanded quarter turns."""
     valve, known = truth.functions["rot"].valve, profile.joints["rot"].valve
     deadbands, fulls = (valve.deadband_plus, valve.deadband_minus), (valve.full_speed_plus, valve.full_speed_minus)
     sides = (turns.plus, turns.minus)
@@ -186,11 +186,11 @@ def _joint_errors(
     real = [real_full_speed(job, profile, plan, valve, which, side, r.valve.at) for side in (+1, -1)]
     return {
         "deadband_pct": [
-            100.0 * (found - true)
-            for found, true in zip(r.valve.deadbands, (valve.deadband_plus, valve.deadband_minus), strict=True)
+            100.0 * (identified - true)
+            for identified, true in zip(r.valve.deadbands, (valve.deadband_plus, valve.deadband_minus), strict=True)
         ],
         "hysteresis_pct": 100.0 * (r.valve.hysteresis - valve.hysteresis),
-        "gain": [found / true - 1.0 for found, true in zip(r.valve.full_speeds, real, strict=True)],
+        "gain": [identified / true - 1.0 for identified, true in zip(r.valve.full_speeds, real, strict=True)],
         "delay_ms": math.nan if r.delay is None else 1e3 * (r.delay.delay_s - valve.delay_s),
         "repeat_pct": [100.0 * x for x in r.repeats],
         "residual": r.valve.residual,
@@ -200,7 +200,7 @@ def _joint_errors(
 
 
 def _profile_errors(profile: Profile, valve: Any, which: Joint, real: list[float]) -> dict[str, list[float]]:
-    """Errors of the profile before calibration."""
+    """Compute the errors of the profile before calibration."""
     known = profile.joints[which.name.lower()].valve
     return {
         "deadband_pct": [
@@ -215,7 +215,8 @@ def _profile_errors(profile: Profile, valve: Any, which: Joint, real: list[float
 def real_full_speed(
     job: Job, profile: Profile, plan: CalibrationPlan, valve: Any, which: Joint, side: int, at: float
 ) -> float:
-    """Full speed of the plant where the calibration states it, measured without bus, controller and sensors.
+    """Measure the full speed of the plant where the calibration states it, measured without bus, controller and
+    sensors.
 
     The plant is driven past that place with a constant spool and timed; the true metering curve converts the speed to
     full spool.  A load that pushes the joint is included, as on a machine.
@@ -231,19 +232,19 @@ def real_full_speed(
     begin = at - side * guess * (RUN_S + TIMED_S / 2.0 - valve.delay_s)
     home[name] = min(max(begin, spec.lower), spec.upper)
     with trial_world(job.options["profile"], job.options["truth"], job.seed, home=home) as world:
-        place = world.functions.index(name)
+        function_index = world.functions.index(name)
 
         def run(seconds: float, spool: float) -> None:
             commands = [0.0] * len(world.functions)
-            commands[place] = spool
+            commands[function_index] = spool
             for _ in range(round(seconds / STEP_S)):
                 world.step(commands)
 
         run(REST_S, 0.0)
         run(RUN_S, side * TESTED_SPOOL)
-        first = world.q[name]
+        start_position = world.q[name]
         run(TIMED_S, side * TESTED_SPOOL)
-        return float(abs(world.q[name] - first) / TIMED_S / share)
+        return float(abs(world.q[name] - start_position) / TIMED_S / share)
 
 
 def _survey_errors(truth: Any, result: CalibrationResult) -> dict[str, Any]:

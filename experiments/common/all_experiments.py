@@ -43,7 +43,7 @@ def perform(
     A quick pass leaves out those that measure this computer in real time.
     """
     run = call or _run
-    found = []
+    passes = []
     for name, entry in EXPERIMENTS.items():
         if quick and entry.live:
             continue
@@ -51,10 +51,10 @@ def perform(
         begun_s, before_s = time.monotonic(), _processor_s()
         console.print(f"[bold]{name}[/bold]", highlight=False)
         code = run([*command, "--quick"] if quick else command)
-        found.append(Pass(name, code, round(time.monotonic() - begun_s, 2), round(_processor_s() - before_s, 2)))
+        passes.append(Pass(name, code, round(time.monotonic() - begun_s, 2), round(_processor_s() - before_s, 2)))
         out.mkdir(parents=True, exist_ok=True)
-        (out / SUMMARY).write_text(json.dumps([asdict(one) for one in found], indent=2) + "\n")
-    return found
+        (out / SUMMARY).write_text(json.dumps([asdict(finished) for finished in passes], indent=2) + "\n")
+    return passes
 
 
 def _run(command: list[str]) -> int:
@@ -67,7 +67,7 @@ def _processor_s() -> float:
 
 
 def estimate_h(quick: Sequence[Pass], workers: int) -> dict[str, float]:
-    """Estimated hours of every full run: its quick processor time, scaled; a live one takes its fixed time."""
+    """Estimate the hours of every full run: its quick processor time, scaled; a live one takes its fixed time."""
     scaled = {p.name: p.processor_s * EXPERIMENTS[p.name].scale / workers / HOUR_S for p in quick}
     live = {name: entry.live_s / HOUR_S for name, entry in EXPERIMENTS.items() if entry.live}
     return scaled | live
@@ -75,11 +75,11 @@ def estimate_h(quick: Sequence[Pass], workers: int) -> dict[str, float]:
 
 def show(found: Sequence[Pass], console: Console) -> None:
     """Print what every experiment took and how it ended."""
-    words = {0: "all limits met", 6: "limits missed"}
+    end_texts = {0: "all limits met", 6: "limits missed"}
     table = Table("experiment", "duration", "processor time", "end")
-    for one in found:
-        end = words.get(one.code, f"failed, exit code {one.code}")
-        table.add_row(one.name, f"{one.wall_s:.0f} s", f"{one.processor_s:.0f} s", end)
+    for finished in found:
+        end = end_texts.get(finished.code, f"failed, exit code {finished.code}")
+        table.add_row(finished.name, f"{finished.wall_s:.0f} s", f"{finished.processor_s:.0f} s", end)
     table.add_row("all", f"{sum(p.wall_s for p in found):.0f} s", f"{sum(p.processor_s for p in found):.0f} s", "")
     console.print(table)
 

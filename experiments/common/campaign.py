@@ -100,9 +100,9 @@ def run(name: str, options: Options, recordings: int, console: Console) -> tuple
 
 
 def line_of(name: str, outcome: Any, clocked: Sequence[str]) -> str:
-    """The line of a trial in the table: name and outcome, without what depends on the speed of the host."""
-    kept = {k: v for k, v in outcome.items() if k not in clocked} if isinstance(outcome, Mapping) else outcome
-    return json.dumps([name, kept], sort_keys=True)
+    """Write the line of a trial in the table: name and outcome, without what depends on the speed of the host."""
+    comparable = {k: v for k, v in outcome.items() if k not in clocked} if isinstance(outcome, Mapping) else outcome
+    return json.dumps([name, comparable], sort_keys=True)
 
 
 def record(
@@ -111,20 +111,22 @@ def record(
     """Perform trials again with a recording each; those that have one already are not performed."""
     folders = {t.job.name: options.out / RECORDINGS / t.job.name for t in failed}
     jobs = [replace(t.job, options=t.job.options | {RECORD: str(folders[t.job.name].resolve())}) for t in failed]
-    again: dict[str, Any] = {}
-    with Checkpoint(options.out / "recordings.jsonl", "recordings", stays=True) as kept:
+    repeated_outcomes: dict[str, Any] = {}
+    with Checkpoint(options.out / "recordings.jsonl", "recordings", stays=True) as trial_store:
         for function in dict.fromkeys(t.function for t in failed):
-            its = [job for job, t in zip(jobs, failed, strict=True) if t.function is function]
-            for job in its:
-                if kept.find(job.digest()) is None:
+            function_jobs = [job for job, t in zip(jobs, failed, strict=True) if t.function is function]
+            for job in function_jobs:
+                if trial_store.find(job.digest()) is None:
                     shutil.rmtree(folders[job.name], ignore_errors=True)  # the rest of an interrupted recording
             local = Workers(options.workers.count)
-            again |= pool.run(function, its, kept, local, "recordings of failed trials", console)
+            repeated_outcomes |= pool.run(
+                function, function_jobs, trial_store, local, "recordings of failed trials", console
+            )
     return tuple(
         FailedTrial(
             t.job.name,
             str(folders[t.job.name]),
-            line_of(t.job.name, again[t.job.name], clocked) == line_of(t.job.name, t.outcome, clocked),
+            line_of(t.job.name, repeated_outcomes[t.job.name], clocked) == line_of(t.job.name, t.outcome, clocked),
         )
         for t in failed
     )
@@ -141,5 +143,5 @@ def _figures(costs: Sequence[TrialCost]) -> dict[str, Any]:
 
 
 def recording_of(trial: Path) -> Path:
-    """The first recorded run in the folder of a failed trial: a trial may run several."""
+    """Find the first recorded run in the folder of a failed trial: a trial may run several."""
     return min((path.parent for path in trial.rglob("run.mcap")), default=trial)

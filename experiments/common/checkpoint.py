@@ -83,7 +83,7 @@ class Checkpoint:
                     self._write([name, outcome, origin])
 
     def find(self, digest: str) -> Kept | None:
-        """The finished trial of the job with this digest."""
+        """Find the finished trial of the job with this digest."""
         return self._kept.get(digest)
 
     def add(self, name: str, outcome: Any, digest: str = "", cost: TrialCost | None = None) -> None:
@@ -140,7 +140,7 @@ class Checkpoint:
 
 
 def read_published(path: Path) -> dict[str, Any]:
-    """The outcomes of a published file by the names of their jobs, whichever run made them.
+    """Read the outcomes of a published file by the names of their jobs, whichever run made them.
 
     Raises:
         InputRefused: the file is missing or damaged.
@@ -153,7 +153,7 @@ def read_published(path: Path) -> dict[str, Any]:
 
 
 def _unpacked(path: Path) -> bytes:
-    """The lines of a published file; nothing where it is missing or damaged, and the trials run again."""
+    """Unpack the lines of a published file; nothing where it is missing or damaged, and the trials run again."""
     try:
         return lzma.decompress(path.read_bytes())
     except (OSError, lzma.LZMAError):
@@ -161,7 +161,7 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _lines(data: bytes) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Name, outcome and origin of every whole line; up to the first that is not one."""
+    """Yield name, outcome and origin of every whole line; up to the first that is not one."""
     for text in data.splitlines():
         try:
             line: Sequence[Any] | dict[str, Any] = json.loads(text)
@@ -173,7 +173,7 @@ def _lines(data: bytes) -> Iterator[tuple[str, Any, dict[str, Any]]]:
 
 
 def source_hash(*more: str) -> str:
-    """Hash over the content of ``SOURCES`` and of further folders or files of the checkout.
+    """Compute the hash over the content of ``SOURCES`` and of further folders or files of the checkout.
 
     One that does not exist counts as empty: a run after a move starts anew.
     """
@@ -186,10 +186,10 @@ def source_hash(*more: str) -> str:
 
 
 def libraries() -> str:
-    """The libraries that compute, with their versions."""
+    """List the libraries that compute, with their versions."""
     return ", ".join(f"{name} {number}" for name, number in versions(LIBRARIES).items())
 
 
 def installation() -> str:
-    """Sources and libraries of this process in words; the same words mean the same outcomes."""
+    """Describe sources and libraries of this process; the same words mean the same outcomes."""
     return f"sources {source_hash(*ALL_SOURCES)}, {libraries()}"

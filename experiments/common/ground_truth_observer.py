@@ -130,7 +130,7 @@ class GroundTruthObserver:
             note["end_s"] = round(self._seconds(), 2)
 
     def _shortest(self, activity: Activity) -> float:
-        """Shortest time [s] for the path of the phase's motion by speeds, accelerations and the pump's flow.
+        """Compute the shortest time [s] for the path of the phase's motion by speeds, accelerations and pump flow.
 
         0 if the motion continues that of the phase before, apart from a turn of the rotator.
         """
@@ -143,7 +143,7 @@ class GroundTruthObserver:
         return round(float(minimum_time_s(position, self._limits)), 3)
 
     def _offset(self, activity: Activity) -> dict[str, Any]:
-        """True offset of the open grapple from the middle of the log that it is about to grasp."""
+        """Compute the true offset of the open grapple from the middle of the log that it is about to grasp."""
         plant, grasp = self._run.plant, activity.grasp
         assert grasp is not None
         origin, turn = plant.base_pose()

@@ -44,19 +44,19 @@ class Sample:
 
 
 def sample() -> Sample:
-    """The totals now."""
+    """Read the totals now."""
     pressure = pressure_us(_read("/proc/pressure/cpu"))
     return Sample(time.monotonic_ns(), steal_ms(_read("/proc/stat")), pressure, os.getloadavg()[0])
 
 
 def steal_ms(stat: str) -> float:
-    """Steal of all processors since boot, from the text of /proc/stat; 0 where it is not reported."""
-    words = stat.partition("\n")[0].split()
-    return float(words[_STEAL]) * 1e3 / os.sysconf("SC_CLK_TCK") if len(words) > _STEAL else 0.0
+    """Read the steal of all processors since boot, from the text of /proc/stat; 0 where it is not reported."""
+    fields = stat.partition("\n")[0].split()
+    return float(fields[_STEAL]) * 1e3 / os.sysconf("SC_CLK_TCK") if len(fields) > _STEAL else 0.0
 
 
 def pressure_us(text: str) -> int | None:
-    """The total of the line ``some`` of a pressure file."""
+    """Read the total of the line ``some`` of a pressure file."""
     for line in text.splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "some":
@@ -76,7 +76,7 @@ class HostActivity:
 
 
 def between(first: Sample, last: Sample) -> HostActivity:
-    """Activity between two samples."""
+    """Compute the activity between two samples."""
     seconds = (last.at_ns - first.at_ns) * 1e-9
     waited = None
     if first.pressure_us is not None and last.pressure_us is not None:
@@ -85,29 +85,29 @@ def between(first: Sample, last: Sample) -> HostActivity:
 
 
 def cpu_s(pid: int) -> float:
-    """Processor time of a process so far [s]; 0 once it has ended."""
-    words = _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK") if words else 0.0
+    """Read the processor time of a process so far [s]; 0 once it has ended."""
+    fields = _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0
 
 
 def describe() -> dict[str, str]:
-    """Kernel, preemption model, frequency governors, isolated processors, clock, hypervisor, real-time throttling."""
-    found = facts.read(Path("/"))
+    """Describe kernel, preemption, governors, isolated processors, clock, hypervisor and real-time throttling."""
+    host_facts = facts.read(Path("/"))
     return {
-        "kernel": found.release,
-        "preemption": found.preemption or "unknown",
-        "governor": ", ".join(sorted(set(found.governors.values()))) or "none reported",
-        "isolated": ", ".join(map(str, sorted(found.isolated))) or "none",
-        "clock": found.clock_source or "unknown",
-        "hypervisor": "no" if found.machine in ("", "a container") else "yes",
-        "rt_runtime_us": "unknown" if found.rt_runtime_us is None else str(found.rt_runtime_us),
+        "kernel": host_facts.release,
+        "preemption": host_facts.preemption or "unknown",
+        "governor": ", ".join(sorted(set(host_facts.governors.values()))) or "none reported",
+        "isolated": ", ".join(map(str, sorted(host_facts.isolated))) or "none",
+        "clock": host_facts.clock_source or "unknown",
+        "hypervisor": "no" if host_facts.machine in ("", "a container") else "yes",
+        "rt_runtime_us": "unknown" if host_facts.rt_runtime_us is None else str(host_facts.rt_runtime_us),
     }
 
 
 def sentence(environment: Mapping[str, str]) -> str:
-    """The host that measured, for a page; facts that a result does not hold are left out."""
-    told = (words.format(environment[name]) for name, words in FACTS.items() if name in environment)
-    return f"Host: {', '.join(told)}."
+    """Describe the host that measured, for a page; facts that a result does not hold are left out."""
+    fact_texts = (template.format(environment[name]) for name, template in FACTS.items() if name in environment)
+    return f"Host: {', '.join(fact_texts)}."
 
 
 def _read(path: str) -> str:

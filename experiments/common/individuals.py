@@ -46,8 +46,9 @@ def calibrated(job: Job) -> dict[str, Any]:
 
 @contextmanager
 def controller_profile(name: str, text: str | None) -> Iterator[str]:
-    """Path of the profile for controller, guard and planner: the shipped one, or a file with the calibrated
-    ``text``."""
+    """Return the path of the profile for controller, guard and planner: the shipped one, or a file with the calibrated
+    ``text``.
+    """
     source = profile_path(name)
     if text is None:
         yield str(source)

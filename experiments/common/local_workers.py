@@ -23,7 +23,7 @@ DEATHS: Final = 3
 
 
 def completed(work: Mapping[str, Callable[[], Any]], count: int) -> Iterator[tuple[str, Any]]:
-    """Name and result of every piece of work as it is done, by ``count`` processes.
+    """Yield name and result of every piece of work as it is done, by ``count`` processes.
 
     Raises:
         InputRefused: workers are killed again and again.

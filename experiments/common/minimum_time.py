@@ -44,7 +44,7 @@ class Limits:
     pump_m3_s: float
 
     def flow(self, q: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        """Flow [m^3] per unit of the path's parameter at positions and slopes (n, joints), (n,)."""
+        """Compute the flow [m^3] per unit of the path's parameter at positions and slopes (n, joints), (n,)."""
         per_unit = np.where(slope >= 0.0, self.flow_plus, self.flow_minus)
         arms = [
             np.interp(c, at, share) if at else np.ones(len(q)) for c, (at, share) in zip(q.T, self.levers, strict=True)
@@ -54,7 +54,7 @@ class Limits:
 
 
 def full_limits(profile: Profile) -> Limits:
-    """The full limits of the profile, without the margins that a planner leaves to the law."""
+    """Return the full limits of the profile, without the margins that a planner leaves to the law."""
     specs = [joint(profile, j) for j in JOINTS]
     return Limits(
         np.array([s.speed_limit for s in specs]),
@@ -67,7 +67,7 @@ def full_limits(profile: Profile) -> Limits:
 
 
 def minimum_time_s(path: np.ndarray, limits: Limits) -> float:
-    """The shortest time [s] from rest to rest along joint positions (n, joints); 0 for a path without motion."""
+    """Compute the shortest time [s] from rest to rest along joint positions (n, joints); 0 for one without motion."""
     q, slope, bend, step = _resampled(path, limits.speed)
     if not step:
         return 0.0
@@ -93,22 +93,22 @@ def minimum_time_s(path: np.ndarray, limits: Limits) -> float:
 
 
 def _resampled(path: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Positions, first and second derivatives at even steps of s (time at the joints' speed limits), and the step."""
-    ways = np.concatenate([[0.0], np.cumsum(np.sqrt(np.sum((np.diff(path, axis=0) / speed) ** 2, axis=1)))])
-    end = float(ways[-1])
+    """Return positions, first and second derivatives at even steps of s (time at the speed limits), and the step."""
+    path_times_s = np.concatenate([[0.0], np.cumsum(np.sqrt(np.sum((np.diff(path, axis=0) / speed) ** 2, axis=1)))])
+    end = float(path_times_s[-1])
     if end <= 0.0:
         return path[:1], path[:1], path[:1], 0.0
-    kept = [0]
-    for i, way in enumerate(ways):
-        if way - ways[kept[-1]] > MIN_SPACING_SHARE * end:
-            kept.append(i)
-    curve = CubicSpline(ways[kept], path[kept])
-    s = np.linspace(0.0, float(ways[kept[-1]]), POINT_COUNT + 1)
+    node_indices = [0]
+    for i, path_time_s in enumerate(path_times_s):
+        if path_time_s - path_times_s[node_indices[-1]] > MIN_SPACING_SHARE * end:
+            node_indices.append(i)
+    curve = CubicSpline(path_times_s[node_indices], path[node_indices])
+    s = np.linspace(0.0, float(path_times_s[node_indices[-1]]), POINT_COUNT + 1)
     return curve(s), curve(s, 1), curve(s, 2), float(s[1])
 
 
 def _largest(q: np.ndarray, slope: np.ndarray, limits: Limits) -> np.ndarray:
-    """Largest x allowed by speeds and flow, (n,)."""
+    """Compute the largest x allowed by speeds and flow, (n,)."""
     by_speed = np.max(np.abs(slope) / limits.speed, axis=1)
     by_flow = limits.flow(q, slope) / limits.pump_m3_s
     greatest: np.ndarray = np.maximum(np.maximum(by_speed, by_flow), EPSILON) ** -2
@@ -116,20 +116,20 @@ def _largest(q: np.ndarray, slope: np.ndarray, limits: Limits) -> np.ndarray:
 
 
 def _bounds(slope: np.ndarray, bend: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of the control as lines (at x = 0, per x), one per joint that moves along s."""
+    """Compute lower and upper bounds of the control as lines (at x = 0, per x), one per joint that moves along s."""
     moves = np.abs(slope) > EPSILON
     size, lean = most[moves] / np.abs(slope[moves]), -bend[moves] / slope[moves]
     return np.column_stack([-size, lean]), np.column_stack([size, lean])
 
 
 def _at_zero_slope(slope: np.ndarray, bend: np.ndarray, most: np.ndarray) -> float:
-    """Largest x allowed by joints whose slope is zero here: their acceleration is q'' x."""
+    """Compute the largest x allowed by joints whose slope is zero here: their acceleration is q'' x."""
     still = (np.abs(slope) <= EPSILON) & (np.abs(bend) > EPSILON)
     return float(np.min(most[still] / np.abs(bend[still]))) if np.any(still) else float("inf")
 
 
 def _crossing(low: np.ndarray, high: np.ndarray) -> float:
-    """Largest x at which no lower line is above an upper one; all hold at x = 0."""
+    """Compute the largest x at which no lower line is above an upper one; all hold at x = 0."""
     rise = low[:, None, 1] - high[None, :, 1]
     room = high[None, :, 0] - low[:, None, 0]
     rising = rise > EPSILON

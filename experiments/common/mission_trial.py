@@ -85,7 +85,7 @@ def run_mission(
 
 
 def summary_of(summary: MissionSummary) -> dict[str, Any]:
-    """The summary of the run as plain data."""
+    """Return the summary of the run as plain data."""
     return {
         "finished": summary.finished,
         "failure": summary.failure,
@@ -101,7 +101,7 @@ def summary_of(summary: MissionSummary) -> dict[str, Any]:
 
 
 def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:
-    """The same mission with every log shifted and turned; one seed gives one field."""
+    """Shift and turn every log of a mission; one seed gives one field."""
     rng = random.Random(f"field {seed}")
     first = mission.waypoints[0]
     plane = LocalPlane(first.latitude_deg, first.longitude_deg)

@@ -36,13 +36,13 @@ def write(docs: Path) -> Path:
 
 
 def results_in(docs: Path) -> dict[str, Result]:
-    """The saved results of the folder by name, in the order of the registry."""
+    """Read the saved results of the folder by name, in the order of the registry."""
     paths = {name: docs / "results" / f"{name}.json" for name in EXPERIMENTS}
     return {name: read(path) for name, path in paths.items() if path.exists()}
 
 
 def read(path: Path) -> Result:
-    """A saved result; a metric without a number is NaN, and "inf" is infinite.
+    """Read a saved result; a metric without a number is NaN, and "inf" is infinite.
 
     Raises:
         ValueError: the file is not a result.
@@ -53,7 +53,7 @@ def read(path: Path) -> Result:
 
 
 def page(results: Mapping[str, Result], pages: Collection[str], standings: Mapping[str, Standing]) -> str:
-    """The page as Markdown; an experiment without one of the ``pages`` is linked to its numbers."""
+    """Write the page as Markdown; an experiment without one of the ``pages`` is linked to its numbers."""
     links = {n: f"[{n}]({f'{n}.md' if n in pages else f'results/{n}.json'})" for n in results}
     lines = [f"# {TITLE}", "", _conclusion(results, standings), "", INTRODUCTION, ""]
     lines += ["| experiment | question | limits met | commit | |", "|---|---|---|---|---|"]
@@ -89,7 +89,7 @@ def _command(name: str) -> str:
 
 
 def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]:
-    """The section on later published systems, with our figure that comes nearest to each."""
+    """Write the section on later published systems, with our figure that comes nearest to each."""
     by_name = {(name, metric.name): metric for name, _, metric in metrics_of(results)}
     lines = [
         "## Later published systems",
@@ -101,12 +101,12 @@ def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]
         "| system | setting | measure | published | nearest here | command |",
         "|---|---|---|---|---|---|",
     ]
-    for one in LATER:
-        name, metric = one.nearest[0], by_name.get(one.nearest)
+    for entry in LATER:
+        name, metric = entry.nearest[0], by_name.get(entry.nearest)
         if metric is not None:
-            here = f"{links[name]}: {metric.title}, {_here(results[name], metric)}"
+            figure = f"{links[name]}: {metric.title}, {_here(results[name], metric)}"
             lines.append(
-                f"| [{one.system}]({one.source}) | {one.setting} | {one.measure} | {one.text()} | {here} "
+                f"| [{entry.system}]({entry.source}) | {entry.setting} | {entry.measure} | {entry.text()} | {figure} "
                 f"| {_command(name)} |"
             )
     return [*lines, ""]
@@ -123,7 +123,7 @@ def _conclusion(results: Mapping[str, Result], standings: Mapping[str, Standing]
 
 
 def _currency(standings: Mapping[str, Standing]) -> str:
-    """How many results are of today's sources."""
+    """Tell how many results are of today's sources."""
     old, unsure = (sum(s is each for s in standings.values()) for each in (Standing.STALE, Standing.UNVERIFIABLE))
     if not old and not unsure:
         return "All results are of the present sources."
@@ -134,7 +134,7 @@ def _currency(standings: Mapping[str, Standing]) -> str:
 
 
 def metrics_of(results: Mapping[str, Result]) -> Iterator[tuple[str, Result, Metric]]:
-    """All metrics that are in a result, in the order of their pages."""
+    """List all metrics that are in a result, in the order of their pages."""
     for name, result in results.items():
         module = import_module(EXPERIMENTS[name].module)
         for metric in module.page_of(result, {}).metrics:

@@ -35,11 +35,11 @@ class LogPictureDetector(Protocol):
     """Finds the logs of one picture with depth; it has no memory."""
 
     def __call__(self, frame: RgbdFrame) -> Sequence[SeenLog]:
-        """The logs in this picture."""
+        """Detect the logs in this picture."""
 
 
 def identity(group: str, name: str) -> tuple[str, ...]:
-    """What decides the outcome of a foreign method: package, version and the module's content; nothing for none."""
+    """Tell what decides a foreign method's outcome: package, version and the module's content; nothing for none."""
     its = [point for point in entry_points(group=group) if point.name == name]
     if len(its) != 1:
         return ()
@@ -50,7 +50,7 @@ def identity(group: str, name: str) -> tuple[str, ...]:
 
 
 def load(group: str, name: str) -> Any:
-    """What the entry point's factory makes.
+    """Load an entry point and return what its factory makes.
 
     Raises:
         InputRefused: no installed package has such an entry point, several have, or it cannot be loaded.

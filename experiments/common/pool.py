@@ -39,7 +39,7 @@ class Job:
     options: dict[str, Any]
 
     def digest(self) -> str:
-        """Hash of the whole content."""
+        """Compute the hash of the whole content."""
         text = json.dumps([self.name, self.kind, self.seed, self.options], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -52,11 +52,15 @@ def run(
     title: str,
     console: Console,
 ) -> dict[str, Any]:
-    """Outcome of every job by name, in the order of ``jobs``; an exception in a trial names the trial in a note."""
+    """Return every job's outcome by name, in the order of ``jobs``; an exception in a trial names it in a note."""
     digests = {job.name: job.digest() for job in jobs}
-    kept = {job.name: found for job in jobs if (found := checkpoint.find(digests[job.name])) is not None}
-    checkpoint.done.update({name: trial.outcome for name, trial in kept.items()})
-    work = {job.name: partial(measured, partial(_named, function), job) for job in jobs if job.name not in kept}
+    stored_trials = {
+        job.name: stored_trial for job in jobs if (stored_trial := checkpoint.find(digests[job.name])) is not None
+    }
+    checkpoint.done.update({name: trial.outcome for name, trial in stored_trials.items()})
+    work = {
+        job.name: partial(measured, partial(_named, function), job) for job in jobs if job.name not in stored_trials
+    }
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -65,28 +69,30 @@ def run(
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True, speed_estimate_period=SPEED_PERIOD_S) as progress:
-        task = progress.add_task(title, total=len(jobs), completed=len(kept))
-        begun_s = told_s = time.monotonic()
+        task = progress.add_task(title, total=len(jobs), completed=len(stored_trials))
+        begun_s = reported_s = time.monotonic()
         for count, (name, (outcome, cost)) in enumerate(_completed(work, workers), 1):
             checkpoint.add(name, outcome, digests[name], cost)
             progress.advance(task)
             now_s = time.monotonic()
-            if not console.is_terminal and now_s - told_s > TOLD_EVERY_S:
-                told_s = now_s
+            if not console.is_terminal and now_s - reported_s > TOLD_EVERY_S:
+                reported_s = now_s
                 left_min = (now_s - begun_s) / count * (len(work) - count) / 60.0
-                console.print(f"{title}: {len(kept) + count} of {len(jobs)}, {left_min:.0f} min left", highlight=False)
+                console.print(
+                    f"{title}: {len(stored_trials) + count} of {len(jobs)}, {left_min:.0f} min left", highlight=False
+                )
     if workers.trials is not None:
         for job in jobs:
-            found = checkpoint.find(digests[job.name])
-            assert found is not None
-            workers.trials.append(Trial(function, job, found.outcome, found.cost))
+            stored_trial = checkpoint.find(digests[job.name])
+            assert stored_trial is not None
+            workers.trials.append(Trial(function, job, stored_trial.outcome, stored_trial.cost))
     return {job.name: checkpoint.done[job.name] for job in jobs}
 
 
 def _completed(
     work: Mapping[str, Callable[[], tuple[Any, TrialCost]]], workers: Workers
 ) -> Iterator[tuple[str, tuple[Any, TrialCost]]]:
-    """Name, outcome and cost of every trial as it is done."""
+    """Yield name, outcome and cost of every trial as it is done."""
     if workers.ray and work:
         from experiments.common import ray_workers
 

@@ -27,7 +27,7 @@ class Published:
     nearest: tuple[str, str]
 
     def text(self) -> str:
-        """The share in percent, with its interval where the number of trials is known."""
+        """Write the share in percent, with its interval where the number of trials is known."""
         shown = f"{100.0 * self.share:.4g}%"
         if not self.trials:
             return shown

@@ -25,7 +25,8 @@ NO_USAGE_REPORT: Final = ("RAY_USAGE_STATS_ENABLED", "0")
 def completed(
     work: Mapping[str, Callable[[], Any]], address: str, identity: Callable[[], str]
 ) -> Iterator[tuple[str, Any]]:
-    """Name and result of every piece of work as it is done on the cluster at ``address`` ("auto": that of this node).
+    """Yield name and result of every piece of work as it is done on the cluster at ``address`` ("auto": that of this
+    node).
 
     ``identity`` names the sources and libraries of the process that calls it: workers must name the same as we do.
 
@@ -65,7 +66,7 @@ def completed(
 
 
 def connected(address: str) -> Any:
-    """Ray, connected to the cluster.
+    """Connect Ray to the cluster and return it.
 
     Raises:
         InputRefused: Ray is not installed, or no cluster answers there.
@@ -104,13 +105,13 @@ def _on_node(do: Callable[[], Any], identity: Callable[[], str], ours: str) -> A
 
 @functools.cache
 def _own(identity: Callable[[], str]) -> str:
-    """Read once per process: hashing the sources takes longer than a short trial."""
+    """Name the Python version and identity, once per process: hashing the sources takes longer than a short trial."""
     return f"Python {platform.python_version()}, {identity()}"
 
 
 @functools.cache
 def begin_worker() -> None:
-    """What every worker process does first: keep its memory, as the local ones do."""
+    """Prepare a worker process before anything else: keep its memory, as the local ones do."""
     from runtime.memory import keep_memory
 
     keep_memory()

@@ -20,7 +20,7 @@ RECORD: Final = "record"
 
 @contextmanager
 def recorder_of(job: Job, profile: Profile, file: str | Path) -> Iterator[Recorder | None]:
-    """The recorder of a trial, closed at the end; None unless the job asks for a recording.
+    """Open the recorder of a trial, closed at the end; None unless the job asks for a recording.
 
     ``file``: of the profile, which is kept beside the recording: that of a calibrated machine is nowhere else.
     """

@@ -190,6 +190,6 @@ EXPERIMENTS: Final = {
 
 
 def load(name: str) -> Callable[[Options, Console], Result]:
-    """The ``run`` function of an experiment."""
+    """Load the ``run`` function of an experiment."""
     runner: Callable[[Options, Console], Result] = import_module(EXPERIMENTS[name].module).run
     return runner

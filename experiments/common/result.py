@@ -63,25 +63,25 @@ class Metric:
         return self.scale if self.scale is not None else factor if named else 1.0
 
     def holds(self, value: float) -> bool:
-        """Whether a value is finite and within the limits."""
+        """Tell whether a value is finite and within the limits."""
         low = self.least is None or value >= self.least
         high = self.most is None or value <= self.most
         return math.isfinite(value) and low and high
 
     def limit_text(self) -> str:
-        """The limit in the printed unit."""
+        """Write the limit in the printed unit."""
         low, high = (None if v is None else _digits(v * self.factor) for v in (self.least, self.most))
         if low and high:
             return f"{low} to {high}" if low != high else f"exactly {low}"
         return f"at least {low}" if low else f"at most {high}" if high else ""
 
     def text(self, value: float) -> str:
-        """The value in the printed unit."""
+        """Write the value in the printed unit."""
         return f"{_digits(value * self.factor)}{' ' if self.unit and self.unit != '%' else ''}{self.unit}"
 
 
 def _digits(value: float) -> str:
-    """Four significant digits; a large whole number in full."""
+    """Write four significant digits; a large whole number in full."""
     return f"{value:.0f}" if value >= 1e4 and value.is_integer() else f"{value:.4g}"
 
 
@@ -102,12 +102,12 @@ class Result:
     inconclusive: tuple[str, ...] = ()
 
     def as_judged(self, metric: Metric) -> Metric:
-        """The metric with the limits against which this result was evaluated; those of today may differ."""
+        """Give the metric the limits against which this result was evaluated; those of today may differ."""
         least, most = self.limits.get(metric.name, (None, None))
         return replace(metric, least=least, most=most)
 
     def interval_text(self, metric: Metric) -> str:
-        """The interval of a rate with its number of trials; empty for other metrics."""
+        """Write the interval of a rate with its number of trials; empty for other metrics."""
         low, high = (self.metrics.get(f"{metric.name}_{end}") for end in ("low", "high"))
         if low is None or high is None:
             return ""
@@ -120,21 +120,21 @@ class Result:
         path.write_text(self.json() + "\n")
 
     def json(self) -> str:
-        """result.json as text; a metric without a number is null, and one that never ended is "inf"."""
+        """Return result.json as text; a metric without a number is null, and one that never ended is "inf"."""
         document = asdict(self)
         document["metrics"] = {k: _written(v) for k, v in sorted(self.metrics.items())}
         return json.dumps(document, indent=2)
 
 
 def _written(value: float) -> float | str | None:
-    """JSON knows neither infinity nor NaN, and they say different things."""
+    """Write infinity and NaN differently: JSON knows neither, and they say different things."""
     return value if math.isfinite(value) else None if math.isnan(value) else str(value)
 
 
 def evaluate(
     definitions: Iterable[Metric], metrics: Mapping[str, float], noisy: bool, undecided: Collection[str] = ()
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the metrics that miss their limit, and of the inconclusive ones.
+    """List the names of the metrics that miss their limit, and of the inconclusive ones.
 
     Inconclusive are clocked metrics that miss theirs on a noisy host, and the ``undecided``, whatever their value.
     """
@@ -161,7 +161,7 @@ def make_result(
     noisy: bool = False,
     undecided: Mapping[str, str] | None = None,
 ) -> Result:
-    """The result of an experiment, evaluated against its limits; ``more`` is added to the host's environment.
+    """Make the result of an experiment, evaluated against its limits; ``more`` is added to the host's environment.
 
     ``undecided``: metrics that this run cannot decide, with the reason, which is added as ``open: NAME``.
     """
@@ -183,12 +183,12 @@ def make_result(
 
 
 def limits_of(definitions: Iterable[Metric]) -> dict[str, tuple[float | None, float | None]]:
-    """(least, most) of every metric that has a limit."""
+    """Return (least, most) of every metric that has a limit."""
     return {m.name: (m.least, m.most) for m in definitions if m.least is not None or m.most is not None}
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a rate; (0, 1) for no trials."""
+    """Compute Wilson's 95 % score interval of a rate; (0, 1) for no trials."""
     if n == 0:
         return 0.0, 1.0
     p, z2 = hits / n, Z_95 * Z_95
@@ -198,18 +198,18 @@ def wilson(hits: int, n: int) -> tuple[float, float]:
 
 
 def rate(name: str, hits: int, n: int) -> dict[str, float]:
-    """A rate and its interval as metrics."""
+    """Return a rate and its interval as metrics."""
     low, high = wilson(hits, n)
     return {name: hits / n if n else math.nan, f"{name}_low": low, f"{name}_high": high, f"{name}_n": float(n)}
 
 
 def mean(values: Sequence[float]) -> float:
-    """Arithmetic mean; NaN without values."""
+    """Compute the arithmetic mean; NaN without values."""
     return sum(values) / len(values) if values else math.nan
 
 
 def commit() -> str:
-    """Short hash of the checkout, ``+changes`` when tracked files beside docs/ differ; ``unknown`` outside git."""
+    """Read the short hash of the checkout; ``+changes``: tracked files beside docs/ differ; ``unknown`` outside git."""
     try:
         head = _git("rev-parse", "--short=12", "HEAD")
         return head + ("+changes" if _git("status", "--porcelain", "--untracked-files=no", ":(exclude)docs") else "")
@@ -223,7 +223,7 @@ def _git(*arguments: str) -> str:
 
 
 def environment() -> dict[str, str]:
-    """The host and the packages that measured."""
+    """Describe the host and the packages that measured."""
     return {
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -234,14 +234,14 @@ def environment() -> dict[str, str]:
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """The installed versions of packages; ``missing`` for one that is not installed."""
-    found = {}
+    """Read the installed versions of packages; ``missing`` for one that is not installed."""
+    installed = {}
     for name in packages:
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "missing"
-    return found
+            installed[name] = "missing"
+    return installed
 
 
 def _processor() -> str:
@@ -253,7 +253,7 @@ def _processor() -> str:
 
 
 def sealed_seed(commit: str, experiment: str) -> int:
-    """The seed of an experiment, drawn from the commit that is measured, so that nobody can have tuned on it.
+    """Draw the seed of an experiment from the commit that is measured, so that nobody can have tuned on it.
 
     The rule is part of the commit, and its hash is not known before the commit is made: each change of the code brings
     other trials, and anyone with the checkout can draw the same.

@@ -84,7 +84,7 @@ def write(result: Result, page: Page, plots: Path, docs: Path) -> None:
 
 
 def markdown(result: Result, page: Page) -> str:
-    """The page as Markdown."""
+    """Write the page as Markdown."""
     first = next((plot for section in page.sections for plot in section.plots), None)
     out = [f"# {page.title}", "", conclusion(result, page), ""]
     out += [*_plot(result, *first), ""] if first else []
@@ -107,25 +107,24 @@ def markdown(result: Result, page: Page) -> str:
 
 
 def _measured(metrics: Sequence[Metric]) -> list[str]:
-    """How the metrics are measured; neighbours that are measured alike share a line."""
+    """Tell how the metrics are measured; neighbours that are measured alike share a line."""
     lines = []
     for how, group in groupby(metrics, lambda m: m.how):
         titles = [f"*{m.title}*" for m in group]
-        which = "; ".join(titles) if len(titles) <= MAX_TITLES else f"{titles[0]} to {titles[-1]}"
-        lines += [f"- {which}: {how}"] if how else []
+        title_list = "; ".join(titles) if len(titles) <= MAX_TITLES else f"{titles[0]} to {titles[-1]}"
+        lines += [f"- {title_list}: {how}"] if how else []
     return ["", "How each is measured:", "", *lines, ""] if lines else [""] if metrics else []
 
 
 def conclusion(result: Result, page: Page) -> str:
-    """The conclusion in one paragraph: the sentences of the page, then the number of limits met and those that are
-    not."""
+    """Write the conclusion in one paragraph: the page's sentences, the number of limits met and those that are not."""
     by_name = {m.name: m for m in page.metrics}
-    said = [_sentence(result, by_name, template) for template in page.conclusion]
-    return " ".join(s for s in (*said, limits_sentence(result, page.metrics)) if s)
+    sentences = [_sentence(result, by_name, template) for template in page.conclusion]
+    return " ".join(s for s in (*sentences, limits_sentence(result, page.metrics)) if s)
 
 
 def _sentence(result: Result, metrics: dict[str, Metric], template: str) -> str:
-    """The template with its values; empty when one of them is missing."""
+    """Fill the template with its values; return nothing when one of them is missing."""
     for paper, name in _FIELD.findall(template):
         value = (result.paper if paper else result.metrics).get(name, math.nan)
         if name not in metrics or math.isnan(value):
@@ -136,7 +135,7 @@ def _sentence(result: Result, metrics: dict[str, Metric], template: str) -> str:
 
 
 def limits_sentence(result: Result, metrics: Iterable[Metric]) -> str:
-    """How many limits are met, and every metric that is missed or inconclusive."""
+    """Tell how many limits are met, and every metric that is missed or inconclusive."""
     total, missed, unsure = len(result.limits), len(result.missed), len(result.inconclusive)
     if not total:
         return ""

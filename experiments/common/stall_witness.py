@@ -61,9 +61,13 @@ class Witness:
         self.end()
 
     def stalls(self) -> list[Stall]:
-        """The stalls so far."""
-        words = os.pread(self._out.fileno(), os.fstat(self._out.fileno()).st_size, 0).decode()
-        return [Stall(**json.loads(line)) for line in words.splitlines() if line.startswith("{") and line.endswith("}")]
+        """Read the stalls so far."""
+        output_text = os.pread(self._out.fileno(), os.fstat(self._out.fileno()).st_size, 0).decode()
+        return [
+            Stall(**json.loads(line))
+            for line in output_text.splitlines()
+            if line.startswith("{") and line.endswith("}")
+        ]
 
     def end(self) -> None:
         """End the process; its stalls can still be read."""
@@ -72,7 +76,7 @@ class Witness:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.common.stall_witness", description="Tell when a processor stood still."
     )

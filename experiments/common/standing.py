@@ -44,7 +44,7 @@ class Verdict:
 
 
 def judge(commit: str, entry: Entry, root: Path = ROOT) -> Verdict:
-    """The standing of a result measured at ``commit``, by the git history of the checkout ``root``."""
+    """Judge the standing of a result measured at ``commit``, by the git history of the checkout ``root``."""
     if commit.endswith(CHANGES):
         return Verdict(Standing.UNVERIFIABLE, f"It was measured at `{commit}`, with changes that nobody committed.")
     changed = changed_since(commit, entry.sources, root)
@@ -57,7 +57,7 @@ def judge(commit: str, entry: Entry, root: Path = ROOT) -> Verdict:
 
 @cache
 def changed_since(commit: str, sources: tuple[str, ...], root: Path) -> tuple[str, ...] | None:
-    """Files of ``sources`` whose meaning differs from that at ``commit``; None if the history does not hold it."""
+    """List files of ``sources`` whose meaning differs from that at ``commit``; None if the history does not hold it."""
     if _git(root, "merge-base", "--is-ancestor", commit, "HEAD") is None:
         return None
     listed = _git(root, "diff", "--name-only", "--no-renames", "-z", commit, "--", *sources)
@@ -67,19 +67,19 @@ def changed_since(commit: str, sources: tuple[str, ...], root: Path) -> tuple[st
 
 
 def _contents(root: Path, commit: str, names: Sequence[str]) -> list[bytes | None]:
-    """The files as they were at a commit; None for one that it does not hold."""
-    wanted = "".join(f"{commit}:{name}\n" for name in names).encode()
-    told = _git(root, "cat-file", "--batch", given=wanted) or b""
-    found: list[bytes | None] = []
+    """Read the files as they were at a commit; None for one that it does not hold."""
+    object_names = "".join(f"{commit}:{name}\n" for name in names).encode()
+    batch_output = _git(root, "cat-file", "--batch", given=object_names) or b""
+    contents: list[bytes | None] = []
     for _ in names:
-        head, _, told = told.partition(b"\n")
+        head, _, batch_output = batch_output.partition(b"\n")
         if head.endswith(b" missing"):
-            found.append(None)
+            contents.append(None)
             continue
         size = int(head.rsplit(b" ", 1)[1])
-        found.append(told[:size])
-        told = told[size + 1 :]
-    return found
+        contents.append(batch_output[:size])
+        batch_output = batch_output[size + 1 :]
+    return contents
 
 
 def _differs(name: str, then: bytes | None, path: Path) -> bool:
@@ -91,7 +91,7 @@ def _differs(name: str, then: bytes | None, path: Path) -> bool:
 
 @cache
 def meaning(source: bytes) -> str:
-    """The syntax tree of Python code without docstrings and positions, as text."""
+    """Return the syntax tree of Python code without docstrings and positions, as text."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -107,7 +107,7 @@ def _is_text(statement: ast.stmt) -> bool:
 
 
 def _git(root: Path, *arguments: str, given: bytes = b"") -> bytes | None:
-    """What git prints for the standard input ``given``; None when it fails or is missing."""
+    """Run git with the standard input ``given`` and return what it prints; None when it fails or is missing."""
     command = ["git", "-C", str(root), *arguments]
     try:
         return subprocess.run(command, input=given, capture_output=True, check=True).stdout
@@ -116,7 +116,7 @@ def _git(root: Path, *arguments: str, given: bytes = b"") -> bytes | None:
 
 
 def marked(page: str, verdict: Verdict) -> str:
-    """The page with a sentence on its standing below the title; without one when it is current.
+    """Put a sentence on its standing below the title of the page; none when it is current.
 
     The sentence does not name the files that changed, so that a page is written anew once and not with every commit.
     """
@@ -128,8 +128,8 @@ def marked(page: str, verdict: Verdict) -> str:
 
 
 def has_history(root: Path = ROOT) -> bool:
-    """Whether the checkout has its git history, without which nothing can be said: neither cut off, nor a copy of the
-    files in a commit of their own.
+    """Tell whether the checkout has its git history, without which nothing can be said: neither cut off, nor a copy of
+    the files in a commit of their own.
     """
     whole = (_git(root, "rev-parse", "--is-shallow-repository") or b"").strip() == b"false"
     return whole and _git(root, "rev-parse", "--verify", "-q", "HEAD^") is not None

@@ -20,7 +20,7 @@ LOCKSTEP_SOURCES: Final = ("autonomy", "controller", "hil")
 
 
 def sampled_unless_given(truth: str) -> str:
-    """The truth for trials that each use another individual machine: sampled, unless the caller chose one."""
+    """Choose the truth for trials that each use another individual machine: sampled, unless the caller chose one."""
     return another_for_every_seed(truth)
 
 
@@ -45,7 +45,7 @@ def checkpoint(
     sources: Sequence[str] = (),
     published: str = "",
 ) -> Checkpoint:
-    """The checkpoint of a run in its folder.  It uses every trial again that has the same fingerprint and job.
+    """Open the checkpoint of a run in its folder.  It uses every trial again that has the same fingerprint and job.
 
     The fingerprint covers the profiles, the truth, the content of `fingerprint.SOURCES` and of ``sources``, further
     folders and files of the checkout, weights included, the versions of the libraries that compute, and ``besides``:

@@ -48,7 +48,7 @@ class TrialCost:
 
 
 def measured(function: Callable[[Any], Any], job: Any) -> tuple[Any, TrialCost]:
-    """The outcome of ``function(job)`` and its cost, measured in the process that runs it."""
+    """Return the outcome of ``function(job)`` and its cost, measured in the process that runs it."""
     begin_s, begun_ns = time.time(), time.monotonic_ns()
     outcome = function(job)
     seconds = (time.monotonic_ns() - begun_ns) * 1e-9
@@ -57,7 +57,8 @@ def measured(function: Callable[[Any], Any], job: Any) -> tuple[Any, TrialCost]:
 
 
 def overhead_s(costs: Sequence[TrialCost]) -> float:
-    """Mean time between the end of a trial and the begin of the next one on the same worker; NaN without a pair.
+    """Compute the mean time between the end of a trial and the begin of the next one on the same worker; NaN without a
+    pair.
 
     It holds the dispatch, the way of the outcome to the disk, and what a worker waited for others.
     """

@@ -21,12 +21,12 @@ ARM: Final = ("slew", "lift", "tilt", "ext")
 
 @cache
 def profile_named(name: str) -> Profile:
-    """The profile of that name or file, read once per process."""
+    """Load the profile of that name or file, once per process."""
     return load_profile(name)
 
 
 def carrier_profile(name: str) -> str:
-    """The profile itself if it has a carrier, otherwise the shipped machine with one."""
+    """Return the profile itself if it has a carrier, otherwise the shipped machine with one."""
     return name if profile_named(name).carrier is not None else CARRIER_PROFILE
 
 
@@ -39,7 +39,7 @@ def trial_world(
     logs: int = 1,
     home: dict[str, float] | None = None,
 ) -> Iterator[World]:
-    """A world for one trial, closed at the end; the same arguments give the same world.
+    """Open a world for one trial, closed at the end; the same arguments give the same world.
 
     A scene given by name is an arrangement of that many logs (`sim.scenes.arrangements`).
     """
@@ -54,13 +54,13 @@ def trial_world(
 
 @cache
 def wood_of(profile: str, truth: str) -> Any:
-    """Properties of the logs of a truth; the same for every individual machine."""
+    """Return the properties of the logs of a truth; the same for every individual machine."""
     with trial_world(profile, truth, 0) as world:
         return world.truth.wood
 
 
 def home_at(profile: str, reach_m: float, height_m: float, ext_m: float | None = None) -> dict[str, float]:
-    """Joint positions with slew 0 and the hanger pin at this reach and height in the base frame."""
+    """Compute joint positions with slew 0 and the hanger pin at this reach and height in the base frame."""
     p = profile_named(profile)
     turn = p.kinematics.theta1_offset_rad
     point = (reach_m * math.cos(turn), reach_m * math.sin(turn), height_m)
@@ -77,7 +77,7 @@ def to_base(world: World, point: Sequence[float]) -> Point:
 
 
 def yaw_in_base(world: World, axis: Sequence[float]) -> float:
-    """Direction [rad] of a horizontal axis, given in the world frame, in the crane's base frame."""
+    """Compute the direction [rad] of a horizontal axis, given in the world frame, in the crane's base frame."""
     foot, tip = to_base(world, (0.0, 0.0, 0.0)), to_base(world, axis)
     return math.atan2(tip[1] - foot[1], tip[0] - foot[0])
 

@@ -55,11 +55,11 @@ def run(options: Options, console: Console) -> Result:
         Job(f"{i}/calibration", "calibration", s, {"profile": name, "truth": truth}) for i, s in enumerate(seeds)
     ]
     asked = (options.quick, options.repetitions)
-    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
-        texts = pool.run(perform, calibrations, kept, options.workers, "calibrations", console)
+    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as trial_store:
+        texts = pool.run(perform, calibrations, trial_store, options.workers, "calibrations", console)
         jobs = motions(calibrations, texts, variants(own_law), *asked)
-        outcomes = texts | pool.run(perform, jobs, kept, options.workers, "runs with motions", console)
-        often = str(options.repetitions or REPETITIONS)
+        outcomes = texts | pool.run(perform, jobs, trial_store, options.workers, "runs with motions", console)
+        repetition_count = str(options.repetitions or REPETITIONS)
         result = make_result(
             "crane-accuracy",
             METRICS,
@@ -67,7 +67,7 @@ def run(options: Options, console: Console) -> Result:
             profile=name,
             seed=options.seed,
             trials=machines,
-            more={"truth": truth, "law": own_law, "repetitions": often},
+            more={"truth": truth, "law": own_law, "repetitions": repetition_count},
             paper=PAPER,
         )
         draw(outcomes, profile_named(name).kinematics, options.out)
@@ -77,7 +77,7 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     introduction = INTRODUCTION.format(repetitions=result.environment["repetitions"])
     return Page("Crane accuracy", CONCLUSION, introduction, SECTIONS)
 
@@ -85,26 +85,26 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
 def motions(
     calibrations: list[Job], texts: Mapping[str, Any], names: tuple[str, ...], quick: bool, own: int | None
 ) -> list[Job]:
-    """One job for every variant on every machine with a calibrated profile, the longest first.
+    """Make one job for every variant on every machine with a calibrated profile, the longest first.
 
     ``own``: repetitions with the law of the profile; None: as many as paper B made.
     """
     jobs = []
     for variant in names:
-        often = own if own and variant == OWN else repetitions(variant)
-        made = visits(min(often, QUICK_REPETITIONS), QUICK_GOALS) if quick else visits(often)
+        repetition_count = own if own and variant == OWN else repetitions(variant)
+        made = visits(min(repetition_count, QUICK_REPETITIONS), QUICK_GOALS) if quick else visits(repetition_count)
         pairs = [(v.goal, v.load_kg) for v in made]
         for machine in calibrations:
             text = texts[machine.name]["profile"]
             if text is None:
                 continue
-            what: dict[str, Any] = {
+            job_options: dict[str, Any] = {
                 **machine.options,
                 "variant": variant,
                 "visits": pairs,
                 "text": None if variant == UNCALIBRATED else text,
             }
             if machine is calibrations[0] and variant in TRACED:
-                what["trace"] = next((i for i, (g, load) in enumerate(pairs) if g == TRACED_GOAL and load), None)
-            jobs.append(Job(machine.name.replace("calibration", variant), "motions", machine.seed, what))
+                job_options["trace"] = next((i for i, (g, load) in enumerate(pairs) if g == TRACED_GOAL and load), None)
+            jobs.append(Job(machine.name.replace("calibration", variant), "motions", machine.seed, job_options))
     return jobs

@@ -35,7 +35,7 @@ class Trace:
 
 
 def motion_metrics(trace: Trace, commanded_m: Any, goal_m: Any, reference_end_s: float) -> dict[str, Any]:
-    """Metrics of one motion as plain data.
+    """Compute the metrics of one motion as plain data.
 
     Vectors [m]: encoder error (reached less commanded), encoders and true pin relative to the goal.  ``motion_s`` is
     None if the pin did not stay near its end.  ``shut`` of ``commands`` valve commands after settling were zero.
@@ -63,6 +63,6 @@ def motion_metrics(trace: Trace, commanded_m: Any, goal_m: Any, reference_end_s:
 
 
 def _within(time_s: np.ndarray, from_s: float, interval: tuple[float, float]) -> np.ndarray:
-    """Samples in an interval after a time; the last half second if the trace is too short."""
-    found = (time_s >= from_s + interval[0]) & (time_s <= from_s + interval[1])
-    return found if found.any() else time_s >= time_s[-1] - 0.5
+    """Select samples in an interval after a time; the last half second if the trace is too short."""
+    in_interval = (time_s >= from_s + interval[0]) & (time_s <= from_s + interval[1])
+    return in_interval if in_interval.any() else time_s >= time_s[-1] - 0.5

@@ -208,7 +208,7 @@ METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 
 def accuracy(motions: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Metrics of the motions of one variant; empty without motions."""
+    """Compute the metrics of the motions of one variant; empty without motions."""
     if not motions:
         return {}
     error, true = (np.array([m[key] for m in motions]) for key in ("encoder_m", "true_m"))
@@ -218,7 +218,7 @@ def accuracy(motions: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     swing = np.array([m["swing_deg"] for m in motions])
     commands = sum(m["commands"] for m in motions)
     loaded = np.array([m["load_kg"] > 0.0 for m in motions])
-    found = {
+    metrics = {
         "encoder_error_mean_m": size.mean(),
         "encoder_error_xy_mean_m": np.hypot(error[:, 0], error[:, 1]).mean(),
         "encoder_error_z_mean_m": np.abs(error[:, 2]).mean(),
@@ -232,28 +232,28 @@ def accuracy(motions: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     }
     for name, chosen in (("empty", ~loaded), ("loaded", loaded)):
         if chosen.any():
-            found[f"encoder_error_{name}_mean_m"] = size[chosen].mean()
-            found[f"tip_error_{name}_mean_m"] = off[chosen].mean()
+            metrics[f"encoder_error_{name}_mean_m"] = size[chosen].mean()
+            metrics[f"tip_error_{name}_mean_m"] = off[chosen].mean()
     if ended:
-        found["time_ratio"], found["time_ratio_p95"] = ratios.mean(), np.percentile(ratios, 95.0)
-        found["motion_s"] = np.mean([m["motion_s"] for m in ended])
+        metrics["time_ratio"], metrics["time_ratio_p95"] = ratios.mean(), np.percentile(ratios, 95.0)
+        metrics["motion_s"] = np.mean([m["motion_s"] for m in ended])
     if commands:
-        found["limit_cycle_share"] = 1.0 - sum(m["shut"] for m in motions) / commands
-    return {name: float(value) for name, value in found.items()} | rate("ended", len(ended), len(motions))
+        metrics["limit_cycle_share"] = 1.0 - sum(m["shut"] for m in motions) / commands
+    return {name: float(value) for name, value in metrics.items()} | rate("ended", len(ended), len(motions))
 
 
 def gather(outcomes: Mapping[str, Any], own_law: str) -> dict[str, float]:
-    """All metrics from the outcomes by name (MACHINE/VARIANT, and MACHINE/calibration)."""
+    """Compute all metrics from the outcomes by name (MACHINE/VARIANT, and MACHINE/calibration)."""
     runs: dict[str, list[dict[str, Any]]] = {}
     for name, outcome in outcomes.items():
         runs.setdefault(name.split("/")[1], []).append(outcome)
     calibrations = runs.pop("calibration", [])
-    done = {v: [m for o in found for m in o["motions"] if not m["failed"]] for v, found in runs.items()}
+    done = {v: [m for o in results for m in o["motions"] if not m["failed"]] for v, results in runs.items()}
     by_variant = {v: accuracy(motions) for v, motions in done.items()}
     metrics = dict(by_variant.get(OWN, {}))
     for law, prefix in LAWS.items():
-        found = by_variant.get(OWN if law == own_law else law, {})
-        metrics |= {f"{prefix}.{name}": value for name, value in found.items()}
+        results = by_variant.get(OWN if law == own_law else law, {})
+        metrics |= {f"{prefix}.{name}": value for name, value in results.items()}
     bare, raw, unshaped = (by_variant.get(v, {}) for v in (UNCOMPENSATED, UNCALIBRATED, UNSHAPED))
     if own := done.get(OWN):
         metrics["aim_offset_mean_m"] = _mean_size(
@@ -275,7 +275,7 @@ def gather(outcomes: Mapping[str, Any], own_law: str) -> dict[str, float]:
     if own_law in LAWS:
         alone = ("tip_error_uncorrected_mean_m", "uncalibrated_error_mean_m", "sway_reduction")
         metrics |= {f"{LAWS[own_law]}.{name}": metrics[name] for name in alone if name in metrics}
-    everything = [o for found in runs.values() for o in found]
+    everything = [o for results in runs.values() for o in results]
     metrics["stops"] = float(sum(o["stops"] for o in everything))
     metrics["failures"] = float(sum(o["missing"] + sum(m["failed"] for m in o["motions"]) for o in everything))
     metrics["calibration_failures"] = float(sum(o["profile"] is None for o in calibrations))

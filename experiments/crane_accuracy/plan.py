@@ -43,7 +43,7 @@ class Visit:
 
 
 def visits(repetitions: int, goals: Sequence[int] = range(len(GOALS_M))) -> list[Visit]:
-    """The motions to every goal, empty ones first, alternating between the goals.
+    """Plan the motions to every goal, empty ones first, alternating between the goals.
 
     With an odd number of repetitions the last motion is loaded for half of the goals (`LOADED_ONCE`).
     """
@@ -56,23 +56,23 @@ def visits(repetitions: int, goals: Sequence[int] = range(len(GOALS_M))) -> list
 
 
 def repetitions(variant: str) -> int:
-    """Motions of a variant to every goal on one machine."""
+    """Return the number of motions of a variant to every goal on one machine."""
     return REPETITIONS if variant == OWN else FEW if variant in LAWS else 1
 
 
 def law_of(profile: Profile) -> str:
-    """The law of all joints of a profile; empty if they differ."""
+    """Name the law of all joints of a profile; empty if they differ."""
     kinds = {spec.law.kind for spec in profile.joints.values() if spec.encoder is not None}
     return kinds.pop() if len(kinds) == 1 else ""
 
 
 def variants(own_law: str) -> tuple[str, ...]:
-    """All variants that run on a machine; the law of the profile runs once."""
+    """List all variants that run on a machine; the law of the profile runs once."""
     return (OWN, *(law for law in LAWS if law != own_law), UNCOMPENSATED, UNCALIBRATED, UNSHAPED)
 
 
 def pose_at(arm: Arm, point: Point) -> Pose:
-    """The pose of the arm with its true pin at a point; the arm chooses the telescope.
+    """Compute the pose of the arm with its true pin at a point; the arm chooses the telescope.
 
     Raises:
         Unreachable: no pose reaches the point.
@@ -81,5 +81,5 @@ def pose_at(arm: Arm, point: Point) -> Pose:
 
 
 def start_pose(arm: Arm) -> Pose:
-    """The start of every motion, above the middle of the trail."""
+    """Return the start of every motion, above the middle of the trail."""
     return pose_at(arm, (START_M, 0.0, START_HEIGHT_M))

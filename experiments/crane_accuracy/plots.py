@@ -34,8 +34,8 @@ def _motions(outcomes: Mapping[str, Any], variant: str) -> list[dict[str, Any]]:
 
 
 def _traced(outcomes: Mapping[str, Any], variant: str) -> dict[str, Any] | None:
-    found = (o["trace"] for name, o in outcomes.items() if name.endswith(f"/{variant}") and "trace" in o)
-    return next(found, None)
+    traces = (o["trace"] for name, o in outcomes.items() if name.endswith(f"/{variant}") and "trace" in o)
+    return next(traces, None)
 
 
 def _histogram(own: list[dict[str, Any]], path: Path) -> None:
@@ -87,12 +87,12 @@ def _points(
     path: Path,
 ) -> None:
     with sheet(path, len(GOALS_M), width=11.0, height=3.1) as axes:
-        spans = [MM * np.abs(view(np.array([m[key]]), m["goal"])).max() for key, found, _ in clouds for m in found]
+        spans = [MM * np.abs(view(np.array([m[key]]), m["goal"])).max() for key, cloud, _ in clouds for m in cloud]
         span = 1.1 * max(spans, default=10.0)
         for goal, axis in enumerate(axes):
-            for key, found, colour in clouds:
+            for key, cloud, colour in clouds:
                 for loaded, marker in ((False, "s"), (True, "x")):
-                    points = [m[key] for m in found if m["goal"] == goal and (m["load_kg"] > 0.0) == loaded]
+                    points = [m[key] for m in cloud if m["goal"] == goal and (m["load_kg"] > 0.0) == loaded]
                     x, y = MM * view(np.array(points).reshape(-1, 3), goal).T
                     face = {"markerfacecolor": "none"} if marker == "s" else {}
                     axis.plot(x, y, marker, ms=3.5, mew=0.7, ls="", color=colour, **face)
@@ -104,16 +104,16 @@ def _points(
 
 
 def _motion(traces: Mapping[str, dict[str, Any] | None], kinematics: Kinematics, path: Path) -> None:
-    with sheet(path, 4, width=13.0, height=3.1) as (way, error, spools, lean):
+    with sheet(path, 4, width=13.0, height=3.1) as (pin_path, error, spools, lean):
         own = traces[OWN]
         if own is not None:
             time = np.array(own["time_s"])
             true, encoder = np.array(own["true_m"]), np.array(own["encoder_m"])
             reference = np.array([pin_position(kinematics, q) for q in own["reference"]])
             for points, colour, label in ((true, OIL, "true"), (encoder, STEEL, "encoders")):
-                way.plot(np.hypot(points[:, 0], points[:, 1]), points[:, 2], color=colour, label=label)
+                pin_path.plot(np.hypot(points[:, 0], points[:, 1]), points[:, 2], color=colour, label=label)
             x, y, z = own["goal_m"]
-            way.plot([np.hypot(x, y)], [z], "+", color=RUST, ms=10, label="goal")
+            pin_path.plot([np.hypot(x, y)], [z], "+", color=RUST, ms=10, label="goal")
             error.plot(
                 time, MM * np.linalg.norm(encoder - reference, axis=1), color=STEEL, label="encoders, to reference"
             )
@@ -128,11 +128,11 @@ def _motion(traces: Mapping[str, dict[str, Any] | None], kinematics: Kinematics,
             curves = traces[variant]
             if curves is not None:
                 lean.plot(curves["time_s"], curves["lean_deg"], color=colour, label=label)
-        way.set(title="pin", xlabel="from slew axis [m]", ylabel="height [m]", aspect="equal")
+        pin_path.set(title="pin", xlabel="from slew axis [m]", ylabel="height [m]", aspect="equal")
         error.set(title="errors of the pin [mm]", yscale="log", ylim=(1.0, None))
         spools.set(title="valve commands [%]")
         lean.set(title="lean of the grapple [deg]")
         for axis in (error, spools, lean):
             axis.set_xlabel("time [s]")
-        for axis in (way, error, spools, lean):
+        for axis in (pin_path, error, spools, lean):
             axis.legend(fontsize=7)

@@ -107,7 +107,7 @@ class ReachCycles:
         return self.phase is Phase.DONE
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One planner cycle: the datagram to send now, or None."""
+        """Run one planner cycle: the datagram to send now, or None."""
         if report is not None:
             self._report = report
             self._evaluate(report, now_ns)
@@ -136,7 +136,7 @@ class ReachCycles:
                 self._stands_ns = now_ns
 
     def _measured(self, report: StateReport) -> tuple[float, ...]:
-        """Joint positions; a joint without an encoder counts as being where it was commanded."""
+        """Return the joint positions; a joint without an encoder counts as being where it was commanded."""
         return tuple(
             p if joint(self.profile, j).encoder is not None else q
             for j, p, q in zip(JOINTS, report.position, self._motion.goal, strict=True)
@@ -149,7 +149,7 @@ class ReachCycles:
         self.phase, self._motion, self._begun_ns, self._stands_ns = phase, motion, now_ns, 0
 
     def _reference_at_end(self, now_ns: int) -> bool:
-        """Whether the controller's reference is at the end of the motion; stores since when."""
+        """Tell whether the controller's reference is at the end of the motion; stores since when."""
         assert self._report is not None
         reference = self._report.reference
         if not self._stands_ns and all(map(isfinite, reference)) and dist(reference, self._motion.goal) < SAME:
@@ -178,7 +178,7 @@ class ReachCycles:
                 self._begin(Phase.BACK, self._return_motion(self._motion.goal), now_ns)
 
     def _load_or_depart(self, now_ns: int) -> None:
-        """At rest at the start: hang the next load, or start the next motion."""
+        """Hang the next load, or start the next motion; the crane is at rest at the start."""
         visit = self.visits[self._next]
         if visit.load_kg != self._hung_kg:
             self.hang(visit.load_kg)

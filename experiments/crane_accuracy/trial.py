@@ -117,7 +117,7 @@ class AccuracyTestbed:
         samples.lean_deg.append(degrees(acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))))
 
     def trace(self, run: Run, samples: Samples) -> Trace:
-        """The trace of one motion with its rest."""
+        """Return the trace of one motion with its rest."""
         time_s = (np.array(samples.stamps_ns) - run.begun_ns) * 1e-9
         command_s, shut = self._valves(run)
         return Trace(
@@ -125,11 +125,11 @@ class AccuracyTestbed:
         )
 
     def spools(self, run: Run, which: Joint) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s] and commands (-1 to 1) of the valve of one joint on the bus."""
+        """Return times [s] and commands (-1 to 1) of the valve of one joint on the bus."""
         return self.bus.commands[which].between(run.begun_ns, run.over_ns or self._system.now_ns)
 
     def _valves(self, run: Run) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s] of the commands, and whether the commands of all joints were exactly zero."""
+        """Return times [s] of the commands, and whether the commands of all joints were exactly zero."""
         times, slew = self.spools(run, Joint.SLEW)
         shut = slew == 0.0
         for j in JOINTS:
@@ -140,14 +140,14 @@ class AccuracyTestbed:
 
 
 def _pressed(action: OperatorAction, report: StateReport) -> None:
-    """The emulated operator prints nothing."""
+    """Print nothing: the operator is emulated."""
 
 
 # -- The two kinds of jobs
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """A job of either kind."""
+    """Run a job of either kind."""
     return calibrated(job) if job.kind == "calibration" else measured(job)
 
 
@@ -175,7 +175,7 @@ def measured(job: Job) -> dict[str, Any]:
 
 
 def varied(profile: Profile, variant: str) -> Profile:
-    """The profile of a variant: another law on every joint, or no sag model."""
+    """Make the profile of a variant: another law on every joint, or no sag model."""
     if variant == UNCOMPENSATED:
         return msgspec.structs.replace(profile, sag=None)
     if variant not in LAWS:
@@ -200,14 +200,14 @@ def _outcome(testbed: AccuracyTestbed, traced: int | None) -> dict[str, Any]:
         if key not in shortest:
             shortest[key] = minimum_time_s(np.array(run.motion.position), limits)
         ended_s = (run.ended_ns - run.begun_ns) * 1e-9
-        found = measure.motion_metrics(
+        motion_metrics = measure.motion_metrics(
             testbed.trace(run, samples), np.array(run.commanded_m), np.array(run.goal_m), ended_s
         )
         off = np.mean(samples.position[-25:], axis=0) - np.array(run.motion.goal)
         motions.append(
             {
                 **facts,
-                **found,
+                **motion_metrics,
                 "failed": False,
                 "planned_s": run.motion.duration_s,
                 "minimum_s": shortest[key],
@@ -225,7 +225,7 @@ def _outcome(testbed: AccuracyTestbed, traced: int | None) -> dict[str, Any]:
 
 
 def _curves(testbed: AccuracyTestbed, run: Run, samples: Samples) -> dict[str, Any]:
-    """Curves of one motion for the plot."""
+    """Return the curves of one motion for the plot."""
     trace = testbed.trace(run, samples)
     reference = [run.motion.at(t)[0] for t in trace.time_s.tolist()]
     curves: dict[str, Any] = {

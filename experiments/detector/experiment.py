@@ -55,8 +55,8 @@ def run(options: Options, console: Console) -> Result:
         for machine in MACHINES
         for i in range(trials)
     ]
-    with checkpoint(options, facts, MACHINES, options.truth, ("autonomy/perception", "training")) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "test pictures", console)
+    with checkpoint(options, facts, MACHINES, options.truth, ("autonomy/perception", "training")) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "test pictures", console)
         metrics = gather(list(outcomes.values()), networks) | on_photos(finder("half"), options)
         draw_plots(list(outcomes.values()), networks, options)
         result = make_result(
@@ -74,7 +74,7 @@ def run(options: Options, console: Console) -> Result:
 
 
 def gather(outcomes: list[dict[str, Any]], networks: tuple[str, ...]) -> dict[str, float]:
-    """Metrics of all pictures."""
+    """Compute the metrics of all pictures."""
     metrics: dict[str, float] = {}
     for name in networks:
         boxes = [matches(o, name, "boxes") for o in outcomes]
@@ -98,14 +98,14 @@ def gather(outcomes: list[dict[str, Any]], networks: tuple[str, ...]) -> dict[st
 
 
 def lost(outcomes: list[dict[str, Any]]) -> dict[str, float]:
-    """Average precision with perfectly separated logs, and shares found of logs with many and few pixels."""
+    """Compute average precision with perfectly separated logs, and shares found of logs with many and few pixels."""
     ideal = [matches(o, PARTED, "boxes") for o in outcomes]
-    found, pixels = [], []
+    detected, pixels = [], []
     for outcome in outcomes:
         picture = matches(outcome, "rgbd", "boxes")
-        found.append(matched_truths(picture, 0.5)[~picture.ignored])
+        detected.append(matched_truths(picture, 0.5)[~picture.ignored])
         pixels.append(np.array(outcome["pixels"])[~picture.ignored])
-    every, large = np.concatenate(found), np.concatenate(pixels) >= LARGE_PX
+    every, large = np.concatenate(detected), np.concatenate(pixels) >= LARGE_PX
     shares = {"found_large": every[large], "found_small": every[~large]}
     return {"parted.map50": curve(ideal, 0.5).average, "parted.map50_95": average_precision(ideal)} | {
         name: float(own.mean()) if len(own) else math.nan for name, own in shares.items()
@@ -122,7 +122,7 @@ def draw_plots(outcomes: list[dict[str, Any]], networks: tuple[str, ...], option
 
 
 def on_photos(net: LogSegmenter, options: Options) -> dict[str, float]:
-    """Metrics of the photographs; writes their sheet beside the result.  Empty without photographs."""
+    """Compute the metrics of the photographs; writes their sheet beside the result.  Empty without photographs."""
     shots = photos.photos(options.data or photos.folder())
     if not shots:
         return {}
@@ -130,17 +130,17 @@ def on_photos(net: LogSegmenter, options: Options) -> dict[str, float]:
     for shot in shots:
         height, width = shot.rgb.shape[:2]
         unknown = np.full((height, width), np.nan, np.float32)
-        found = net.segment_picture(shot.rgb, unknown, pinhole(width, height, PHOTO_VIEW_RAD))
+        instances = net.segment_picture(shot.rgb, unknown, pinhole(width, height, PHOTO_VIEW_RAD))
         wood = np.zeros((height, width), bool)
-        for log in found:
+        for log in instances:
             wood |= log.mask
         overlaps.append(photos.overlap(wood, shot.wood))
-        images.append(overlaid(shot.rgb, found))
+        images.append(overlaid(shot.rgb, instances))
     contact_sheet(options.out / "photos.png", images, 6)
     known = [o for o in overlaps if math.isfinite(o)]
     return {"photos": float(len(shots)), "photos_iou": float(np.median(known)) if known else math.nan}
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Log detection", CONCLUSION, INTRODUCTION, SECTIONS)

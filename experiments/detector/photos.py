@@ -36,23 +36,23 @@ class Photo:
 
 
 def folder() -> Path:
-    """Folder of the sheets."""
+    """Return the folder of the sheets."""
     return Path(os.environ.get("TIMBERHAND_DATA") or ROOT.parent / "shared" / "data") / "timberseg_previews"
 
 
 def photos(where: Path) -> list[Photo]:
-    """All photographs of the sheets; none without the folder."""
-    found = []
+    """Read all photographs of the sheets; none without the folder."""
+    photographs = []
     for sheet in SHEETS:
         plain, masks = where / f"{sheet}_plain.png", where / f"{sheet}_woodmask.png"
         if plain.is_file() and masks.is_file():
             wood = np.asarray(Image.open(masks).convert("L")) > 127
-            found += cut(sheet, np.asarray(Image.open(plain).convert("RGB")), wood)
-    return found
+            photographs += cut(sheet, np.asarray(Image.open(plain).convert("RGB")), wood)
+    return photographs
 
 
 def cut(name: str, sheet: np.ndarray, wood: np.ndarray) -> list[Photo]:
-    """The photographs of a sheet (H, W, 3), separated by white gutters."""
+    """Cut a sheet (H, W, 3) into its photographs, which white gutters separate."""
     wood = ndimage.binary_opening(wood, np.ones((OUTLINE_PX, OUTLINE_PX)))
     out: list[Photo] = []
     for window in _windows(np.asarray((sheet < GUTTER_LEVEL).any(axis=2)), 0, 0):
@@ -63,7 +63,7 @@ def cut(name: str, sheet: np.ndarray, wood: np.ndarray) -> list[Photo]:
 
 
 def _windows(inked: np.ndarray, top: int, left: int) -> Iterator[tuple[slice, slice]]:
-    """Windows separated by empty rows and columns, divided recursively."""
+    """Find the windows separated by empty rows and columns, divided recursively."""
     bands = _bands(inked.mean(axis=1) > MIN_INK_SHARE)
     if len(bands) == 1:
         columns = _bands(inked[bands[0][0] : bands[0][1]].mean(axis=0) > MIN_INK_SHARE)
@@ -84,6 +84,6 @@ def _bands(inked: np.ndarray) -> list[tuple[int, int]]:
 
 
 def overlap(found: np.ndarray, wood: np.ndarray) -> float:
-    """Intersection over union of two masks; NaN if both are empty."""
+    """Compute the intersection over union of two masks; NaN if both are empty."""
     union = np.count_nonzero(found | wood)
     return np.count_nonzero(found & wood) / union if union else float("nan")

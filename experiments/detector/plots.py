@@ -30,12 +30,12 @@ def precision_recall(path: Path, curves: Mapping[str, Curve]) -> None:
             axis.plot(recall, precision, label=f"{name}: AP {100 * curve.average:.1f} %")
         axis.set(xlabel="recall", ylabel="precision", xlim=(0.0, 1.01), ylim=(0.0, 1.02))
         axis.set_title("Boxes of logs, least overlap 0.5")
-        words = f"paper B: AP {100 * PAPER['map50']:.2f} % on its own photographs"
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), alignment="left", title=words)
+        legend_title = f"paper B: AP {100 * PAPER['map50']:.2f} % on its own photographs"
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), alignment="left", title=legend_title)
 
 
 def overlaid(rgb: np.ndarray, found: Sequence[Instance]) -> Image.Image:
-    """A picture with masks, boxes, scores and ends; visible ends are filled."""
+    """Draw masks, boxes, scores and ends into a picture; visible ends are filled."""
     picture = rgb.astype(float)
     for i, log in enumerate(found):
         picture[log.mask] = 0.45 * picture[log.mask] + 0.55 * COLOURS[i % len(COLOURS)]
@@ -53,7 +53,7 @@ def overlaid(rgb: np.ndarray, found: Sequence[Instance]) -> Image.Image:
 
 def gallery(path: Path, looks: Sequence[tuple[TestPicture, tuple[Instance, ...]]], columns: int = 3) -> None:
     """Write test pictures with their detections."""
-    contact_sheet(path, [overlaid(seen.rgb, found) for seen, found in looks], columns)
+    contact_sheet(path, [overlaid(test_picture.rgb, instances) for test_picture, instances in looks], columns)
 
 
 def contact_sheet(path: Path, images: Sequence[Image.Image], columns: int) -> None:

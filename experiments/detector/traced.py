@@ -55,18 +55,18 @@ class TracedPicture:
 
 
 def traced_pictures(folder: Path) -> Iterator[TracedPicture]:
-    """The pictures of a folder, in order."""
+    """Read the pictures of a folder, in order."""
     for file in sorted((folder / "pictures").glob("judged*.npz")):
-        with np.load(file, allow_pickle=False) as kept:
-            rgb = developed(kept["light"], random.Random(file.stem))
-            height, width = kept["ids"].shape
-            pin = Intrinsics(width, height, *(float(x) for x in kept["lens"]))
-            matched = kept["matched_m"] if "matched_m" in kept.files else None
-            yield TracedPicture(file.stem, rgb, kept["depth_m"].astype(np.float32), matched, kept["ids"], pin)
+        with np.load(file, allow_pickle=False) as archive:
+            rgb = developed(archive["light"], random.Random(file.stem))
+            height, width = archive["ids"].shape
+            pin = Intrinsics(width, height, *(float(x) for x in archive["lens"]))
+            matched = archive["matched_m"] if "matched_m" in archive.files else None
+            yield TracedPicture(file.stem, rgb, archive["depth_m"].astype(np.float32), matched, archive["ids"], pin)
 
 
 def compared(found: tuple[Instance, ...], ids: np.ndarray) -> tuple[Matches, Matches]:
-    """Detections against the numbers of a picture, by boxes and by masks."""
+    """Compare detections against the numbers of a picture, by boxes and by masks."""
     truth = [ids == k for k in range(1, int(ids.max()) + 1) if (ids == k).any()]
     small = np.array([t.sum() < MIN_LOG_PX for t in truth], bool)
     scores = np.array([i.score for i in found])
@@ -75,7 +75,7 @@ def compared(found: tuple[Instance, ...], ids: np.ndarray) -> tuple[Matches, Mat
 
 
 def figures(pictures: list[TracedPicture], find: Finder, depth: str) -> dict[str, float]:
-    """Average precisions, false finds and calibration; ``depth`` is exact, matched or none."""
+    """Compute average precisions, false finds and calibration; ``depth`` is exact, matched or none."""
     boxes, masks = [], []
     for one in pictures:
         z = one.matched_m if depth == "matched" else one.depth_m
@@ -107,7 +107,7 @@ def figures(pictures: list[TracedPicture], find: Finder, depth: str) -> dict[str
 
 
 def photos_iou(find: Finder, where: Path) -> dict[str, float]:
-    """Median overlap of found and labelled wood on photographs of scenes that were not trained on."""
+    """Compute the median overlap of found and labelled wood on photographs of scenes that were not trained on."""
     overlaps = []
     for shot in photos.photos(where):
         if shot.name in TRAINED_SCENES:

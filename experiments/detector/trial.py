@@ -35,7 +35,7 @@ FAITHFUL: Final = "faithful"
 
 
 def shipped() -> tuple[str, ...]:
-    """The variants of SIZES and FAITHFUL that have weights."""
+    """List the variants of SIZES and FAITHFUL that have weights."""
     files = {name: f"logs_{_variant(name)}" for name in SIZES} | {FAITHFUL: "log_boxes"}
     return tuple(name for name, file in files.items() if (SHIPPED / f"{file}.onnx").is_file())
 
@@ -46,18 +46,18 @@ def _variant(name: str) -> str:
 
 @cache
 def finder(name: str) -> LogSegmenter:
-    """The network of a variant in SIZES with its shipped weights."""
+    """Load the network of a variant in SIZES with its shipped weights."""
     return LogSegmenter(_variant(name), size_px=SIZES[name], use_window=name in ENLARGED)
 
 
 @cache
 def box_finder() -> BoxDetector:
-    """Paper B's detector with its shipped weights."""
+    """Load paper B's detector with its shipped weights."""
     return BoxDetector()
 
 
 def paper_boxes(seen: TestPicture) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (N, 4) and scores (N,) of paper B's detector for a picture that is SIZE_PX wide."""
+    """Detect boxes (N, 4) with scores (N,) by paper B's detector in a picture that is SIZE_PX wide."""
     height, width = seen.rgb.shape[:2]
     top = (SIZE_PX - height) // 2
     square = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
@@ -68,48 +68,48 @@ def paper_boxes(seen: TestPicture) -> tuple[np.ndarray, np.ndarray]:
 
 def perform(job: Job) -> dict[str, Any]:
     """Evaluate one picture, given by its machine (``kind``) and number."""
-    seen = picture(job.kind, job.options["number"], job.seed, job.options["truth"])
-    masks, ignored = seen.truths()
+    test_picture = picture(job.kind, job.options["number"], job.seed, job.options["truth"])
+    masks, ignored = test_picture.truths()
     boxes = np.array([box_of(m) for m in masks])
-    found = {}
+    detections = {}
     for name in job.options["networks"]:
         if name == FAITHFUL:
-            places, scores = paper_boxes(seen)
-            found[name] = {"scores": scores.tolist(), "boxes": box_overlaps(places, boxes).tolist()}
+            detected_boxes, scores = paper_boxes(test_picture)
+            detections[name] = {"scores": scores.tolist(), "boxes": box_overlaps(detected_boxes, boxes).tolist()}
             continue
-        logs = finder(name).segment_picture(seen.rgb, seen.depth_m, seen.intrinsics)
-        found[name] = {
+        logs = finder(name).segment_picture(test_picture.rgb, test_picture.depth_m, test_picture.intrinsics)
+        detections[name] = {
             "scores": [i.score for i in logs],
             "boxes": box_overlaps(np.array([i.box_px for i in logs]), boxes).tolist(),
             "masks": mask_overlaps([i.mask for i in logs], masks).tolist(),
         }
         if name == "rgbd":
-            found[PARTED] = parted(np.any([i.mask for i in logs], axis=0), masks, boxes)
+            detections[PARTED] = parted(np.any([i.mask for i in logs], axis=0), masks, boxes)
     return {
         "machine": job.kind,
-        "kind": seen.kind,
-        "camera": seen.camera,
-        "range_m": seen.range_m,
+        "kind": test_picture.kind,
+        "camera": test_picture.camera,
+        "range_m": test_picture.range_m,
         "ignored": ignored.tolist(),
         "pixels": [int(np.count_nonzero(m)) for m in masks],
-        "found": found,
+        "found": detections,
     }
 
 
 def parted(wood: np.ndarray, masks: list[np.ndarray], boxes: np.ndarray) -> dict[str, Any]:
-    """Detections if ``wood`` (H, W) were divided into logs like the true ``masks`` with their ``boxes`` (M, 4)."""
+    """Make detections as if ``wood`` (H, W) were divided into logs like the true ``masks`` with ``boxes`` (M, 4)."""
     places = [box_of(wood & m) for m in masks if (wood & m).any()]
     return {"scores": [1.0] * len(places), "boxes": box_overlaps(np.array(places), boxes).tolist()}
 
 
 def matches(outcome: dict[str, Any], name: str, by: str) -> Matches:
-    """The detections of a variant in a picture, compared ``by`` boxes or masks."""
-    found, truths = outcome["found"][name], len(outcome["ignored"])
-    overlaps = np.array(found[by], float).reshape(len(found["scores"]), truths)
-    return Matches(np.array(found["scores"]), overlaps, np.array(outcome["ignored"], bool))
+    """Return the detections of a variant in a picture, compared ``by`` boxes or masks."""
+    detections, truths = outcome["found"][name], len(outcome["ignored"])
+    overlaps = np.array(detections[by], float).reshape(len(detections["scores"]), truths)
+    return Matches(np.array(detections["scores"]), overlaps, np.array(outcome["ignored"], bool))
 
 
 def example(machine: str, number: int, seed: int, truth: str, name: str) -> tuple[TestPicture, tuple[Instance, ...]]:
-    """A picture with its detections, for a plot."""
+    """Make a picture with its detections, for a plot."""
     seen = picture(machine, number, seed, truth)
     return seen, finder(name).segment_picture(seen.rgb, seen.depth_m, seen.intrinsics)

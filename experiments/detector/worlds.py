@@ -47,15 +47,14 @@ class TestPicture:
     range_m: float
 
     def truths(self) -> tuple[list[np.ndarray], np.ndarray]:
-        """Masks (H, W) of all visible logs, and which (M,) of them have too few pixels to count."""
+        """Return the masks (H, W) of all visible logs, and which (M,) of them have too few pixels to count."""
         sizes = np.bincount(np.maximum(self.mask, 0).ravel())[:1000]
         own = [i for i in range(1, len(sizes)) if sizes[i]]
         return [self.mask == i for i in own], np.array([sizes[i] < MIN_LOG_PX for i in own], bool)
 
 
 def picture(machine: str, number: int, seed: int, truth: str = "nominal") -> TestPicture:
-    """Test picture ``number`` of a machine; ``seed`` draws everything but the pile, ``truth`` gives the errors of the
-    depth."""
+    """Make test picture ``number`` of a machine; ``seed`` draws all but the pile, ``truth`` gives depth errors."""
     piles = chunk(machine, CHUNK_OF_TESTS)
     pile = piles[number % len(piles)]
     rng = random.Random(f"test picture {machine} {number} {seed}")
@@ -79,7 +78,7 @@ def picture(machine: str, number: int, seed: int, truth: str = "nominal") -> Tes
 
 
 def _view(pile: Pile, camera: str, rng: random.Random) -> tuple[View, np.ndarray]:
-    """View of the machine's camera (over the bonnet, from the stick or straight down), and its target (3,) [m]."""
+    """Choose the view of the machine's camera (over the bonnet, from the stick or straight down), target (3,) [m]."""
     pin = intrinsics(profile_of(pile.machine).cameras[camera]).letterbox(SIZE_PX).inner
     mark = pile.logs[rng.randrange(len(pile.logs))].position_m
     target = np.array([mark[0] + rng.gauss(0.0, 0.3), mark[1] + rng.gauss(0.0, 0.3), mark[2]])
@@ -98,7 +97,7 @@ def _view(pile: Pile, camera: str, rng: random.Random) -> tuple[View, np.ndarray
 
 
 def _steel(pile: Pile, target: np.ndarray, rng: random.Random) -> Boxes:
-    """The bunk around logs that lie in it; in a quarter of the pictures a grapple above the logs."""
+    """Build the bunk around logs that lie in it; in a quarter of the pictures a grapple above the logs."""
     steel, profile = Steel(rng), profile_of(pile.machine)
     if pile.kind == "bunk":
         steel.bunk(profile, np.zeros(3), 0.0)

@@ -64,7 +64,7 @@ class Evidence:
         self._reason = 0
 
     def begin(self, now_ns: int, drives: bool) -> None:
-        """The injection is now."""
+        """Note the begin of the injection."""
         self._begin_ns, self._drives = now_ns, drives
         self._refused = (self._counted[0], self._counted[1])
 
@@ -87,7 +87,7 @@ class Evidence:
             self._note(now_ns, "all functions neutral")
 
     def outputs(self, outputs: Outputs, now_ns: int) -> None:
-        """The outputs of a tick, as the recorded tick replays to them."""
+        """Evaluate the outputs of a tick, as the recorded tick replays to them."""
         mode, reason = outputs.mode, outputs.reason
         if self._begin_ns is not None:
             reaction = FAULTS[reason].reaction
@@ -103,12 +103,12 @@ class Evidence:
         self._mode, self._reason = mode, reason
 
     def report(self, report: StateReport) -> None:
-        """A report of the controller."""
+        """Evaluate a report of the controller."""
         self._counted[0] = report.refused
         self._refusal(report.stamp_ns, report.refusal)
 
     def vehicle(self, report: VehicleReport) -> None:
-        """A report of the vehicle."""
+        """Evaluate a report of the vehicle."""
         self._counted[1] = report.refused
         self._refusal(report.stamp_ns, report.refusal)
 

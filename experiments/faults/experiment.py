@@ -47,16 +47,16 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     injections = plan(options.seed, trials)
     jobs = [*injections, *nominal_plan(options.seed, QUICK_NOMINAL_S if options.quick else NOMINAL_S)]
-    with checkpoint(options, jobs, PROFILES, options.truth, LOCKSTEP_SOURCES, TRIALS_FILE) as kept:
+    with checkpoint(options, jobs, PROFILES, options.truth, LOCKSTEP_SOURCES, TRIALS_FILE) as trial_store:
         over: InputRefused | None = None
         try:
-            with _limited(options.minutes, kept, len(jobs)):
-                pool.run(perform, jobs, kept, options.workers, "faults", console)
+            with _limited(options.minutes, trial_store, len(jobs)):
+                pool.run(perform, jobs, trial_store, options.workers, "faults", console)
         except InputRefused as error:
-            if error.code != TIME_OVER or any(job.name not in kept.done for job in injections):
+            if error.code != TIME_OVER or any(job.name not in trial_store.done for job in injections):
                 raise
             over = error
-        outcomes = {job.name: kept.done[job.name] for job in jobs if job.name in kept.done}
+        outcomes = {job.name: trial_store.done[job.name] for job in jobs if job.name in trial_store.done}
         metrics = gather(outcomes)
         result = make_result(
             "faults",
@@ -72,25 +72,25 @@ def run(options: Options, console: Console) -> Result:
         if options.docs is not None:
             write_evidence(outcomes, metrics, options.docs / "results" / "faults")
             if over is None:
-                kept.publish()
+                trial_store.publish()
         if over is not None:
             raise over  # which keeps the checkpoint
     return result
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Fault campaign", CONCLUSION, INTRODUCTION, sections(result))
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """One job of any kind."""
+    """Run one job of any kind."""
     by_kind = {"case": trial.perform, "files": files.perform, "nominal": nominal.perform}
     return by_kind[job.kind](job)
 
 
 def scenes_of(case: Case) -> list[str]:
-    """The scenes in which a case happens."""
+    """List the scenes in which a case happens."""
     physics = PHYSICS if case.physics else ""
     by_work = {
         Work.CRANE: [f"crane palms_471{physics}", f"crane aoro_fc8{physics}"],
@@ -103,7 +103,7 @@ def scenes_of(case: Case) -> list[str]:
 
 
 def plan(seed: int, trials: int) -> list[Job]:
-    """Every job with injections, by scene, so that a worker builds a machine once."""
+    """Plan every job with injections, by scene, so that a worker builds a machine once."""
     jobs = []
     for case in CASES:
         match case.where:
@@ -124,7 +124,7 @@ def _batches(case: Case, kind: str, scene: str, seed: int, count: int) -> Iterat
 
 
 def nominal_plan(seed: int, seconds: float) -> list[Job]:
-    """Stretches of nominal work that add up to ``seconds``."""
+    """Plan stretches of nominal work that add up to ``seconds``."""
     shares = {scene: share for scene, (_, _, share) in nominal.SETTINGS.items()}
     jobs = []
     for scene, share in shares.items():

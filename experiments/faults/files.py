@@ -45,7 +45,7 @@ FRAME: Final = (0x183, bytes(8))
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """All injections of one case; options: case, count."""
+    """Make all injections of one case; options: case, count."""
     case = CASES[job.options["case"] - 1]
     check = CHECKS[case.name]
     outcomes = []
@@ -81,7 +81,7 @@ def _outcome(what: str, bound_ms: float, found_ms: float | None, good: bool, sai
 
 
 def wall_clock(random: Random) -> dict[str, Any]:
-    """Frames of two seconds through the receive clock, while the wall clock is stepped at random moments."""
+    """Send frames of two seconds through the receive clock, while the wall clock is stepped at random moments."""
     now_ns = 100_000_000_000
     clock, wall_offset_ns = ReceiveClock(now_ns), 1_700_000_000 * 1_000_000_000
     worst_ns, future, steps = 0, 0, []
@@ -97,16 +97,16 @@ def wall_clock(random: Random) -> dict[str, Any]:
                 steps.append(step_ns)
         clock.begin(tick_ns, tick_ns + wall_offset_ns)
         for true_ns, stamp_ns in waiting:
-            found_ns = stamp_ns + clock.offset_ns
-            if not clock.since_ns <= found_ns <= clock.now_ns:
-                found_ns = clock.doubtful_ns(stamp_ns)
-            future += found_ns > tick_ns
-            worst_ns = max(worst_ns, abs(found_ns - true_ns))
+            receive_ns = stamp_ns + clock.offset_ns
+            if not clock.since_ns <= receive_ns <= clock.now_ns:
+                receive_ns = clock.doubtful_ns(stamp_ns)
+            future += receive_ns > tick_ns
+            worst_ns = max(worst_ns, abs(receive_ns - true_ns))
         waiting.clear()
         clock.emptied()
     good = worst_ns <= 2 * T_NS and not future
-    said = f"{len(steps)} steps of up to one hour; a frame looked at most {worst_ns / MS:.2f} ms older than it was"
-    return _outcome("wall clock stepped", 0.0, None, good, said)
+    sentence = f"{len(steps)} steps of up to one hour; a frame looked at most {worst_ns / MS:.2f} ms older than it was"
+    return _outcome("wall clock stepped", 0.0, None, good, sentence)
 
 
 def _recorder(folder: Path) -> Recorder:
@@ -115,7 +115,7 @@ def _recorder(folder: Path) -> Recorder:
 
 
 def disk_full(random: Random) -> dict[str, Any]:
-    """No file may grow beyond a random size from a random moment on, as on a full disk."""
+    """Let no file grow beyond a random size from a random moment on, as on a full disk."""
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     with tempfile.TemporaryDirectory() as folder:
         recorder = _recorder(Path(folder) / "run")
@@ -134,17 +134,19 @@ def disk_full(random: Random) -> dict[str, Any]:
         recorder.close()
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     found_ms = None if noticed_ns is None else (noticed_ns - full_ns) / MS
-    said = f"disk full at {full_ns / MS:.0f} ms; {recorder.dropped} lost records counted, no error reached the caller"
-    return _outcome("disk full", 1000.0, found_ms, found_ms is not None, said)
+    sentence = (
+        f"disk full at {full_ns / MS:.0f} ms; {recorder.dropped} lost records counted, no error reached the caller"
+    )
+    return _outcome("disk full", 1000.0, found_ms, found_ms is not None, sentence)
 
 
 def power_cut(random: Random) -> dict[str, Any]:
-    """The power fails while a recording or a profile is written."""
+    """Let the power fail while a recording or a profile is written."""
     return _recording_cut(random) if random.random() < 0.5 else _profile_cut(random)
 
 
 def _profile_cut(random: Random) -> dict[str, Any]:
-    """A process that writes calibrated profiles is killed at a random moment; every profile there must be whole."""
+    """Kill a process that writes calibrated profiles at a random moment; every profile there must be whole."""
     with tempfile.TemporaryDirectory() as folder:
         child = os.fork()
         if child == 0:
@@ -164,12 +166,12 @@ def _profile_cut(random: Random) -> dict[str, Any]:
             except ProfileError:
                 broken += 1
         found_ms = 1e3 * (time.process_time() - begin) / max(1, whole + broken)
-    said = f"{whole} whole profiles, {broken} broken"
-    return _outcome("profile cut", 2000.0, round(found_ms, 3), not broken, said)
+    sentence = f"{whole} whole profiles, {broken} broken"
+    return _outcome("profile cut", 2000.0, round(found_ms, 3), not broken, sentence)
 
 
 def _recording_cut(random: Random) -> dict[str, Any]:
-    """A recording is cut at a random byte; what was committed more than 250 ms before that byte must be read back."""
+    """Cut a recording at a random byte; what was committed over 250 ms before that byte must be read back."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         recorder = _recorder(run)
@@ -182,8 +184,8 @@ def _recording_cut(random: Random) -> dict[str, Any]:
                 commits.append((run_files(run)[0].stat().st_size, now_ns))
         recorder.close()
         path = run_files(run)[0]
-        at = random.randrange(commits[0][0], path.stat().st_size)
-        data = path.read_bytes()[:at]
+        cut_byte = random.randrange(commits[0][0], path.stat().st_size)
+        data = path.read_bytes()[:cut_byte]
         path.write_bytes(data)
         begin = time.process_time()
         recover(run)
@@ -191,10 +193,12 @@ def _recording_cut(random: Random) -> dict[str, Any]:
         last_ns = max(
             (r.log_ns for f in run_files(run) for r in scan(f, {"/crane0/raw"}) if isinstance(r, Stored)), default=-1
         )
-    committed_ns = max((ns for size, ns in commits if size <= at), default=0)
+    committed_ns = max((ns for size, ns in commits if size <= cut_byte), default=0)
     good = last_ns >= committed_ns - 250 * MS
-    said = f"cut at byte {at}; written until {committed_ns / MS:.0f} ms, read back until {last_ns / MS:.0f} ms"
-    return _outcome("recording cut", 2000.0, found_ms, good, said)
+    sentence = (
+        f"cut at byte {cut_byte}; written until {committed_ns / MS:.0f} ms, read back until {last_ns / MS:.0f} ms"
+    )
+    return _outcome("recording cut", 2000.0, found_ms, good, sentence)
 
 
 def _swapped(random: Random) -> bytes:
@@ -246,7 +250,7 @@ MALFORMED: Final[tuple[Callable[[Random], bytes], ...]] = (_swapped, _not_a_numb
 
 
 def mission(random: Random) -> dict[str, Any]:
-    """A mission file that must be refused, within a second, by a sentence with its file."""
+    """Read a mission file that must be refused, within a second, by a sentence with its file."""
     make = random.choice(MALFORMED)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mission"

@@ -80,7 +80,7 @@ METRICS: Final = CAMPAIGN + NOMINAL
 
 
 def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """All metrics; outcomes of cases have ``case``, those of nominal work ``trips``."""
+    """Compute all metrics; outcomes of cases have ``case``, those of nominal work ``trips``."""
     by_case = injections_of(outcomes)
     metrics: dict[str, float] = {}
     for case in CASES:
@@ -105,18 +105,18 @@ def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
 
 
 def injections_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[int, list[dict[str, Any]]]:
-    """All injections by the number of their case, each with its scene."""
-    found: dict[int, list[dict[str, Any]]] = {}
+    """Group all injections by the number of their case, each with its scene."""
+    by_case: dict[int, list[dict[str, Any]]] = {}
     for outcome in outcomes.values():
         if "case" in outcome:
             rows = [o | {"scene": outcome["scene"]} for o in outcome["outcomes"]]
-            found.setdefault(outcome["case"], []).extend(rows)
-    return found
+            by_case.setdefault(outcome["case"], []).extend(rows)
+    return by_case
 
 
 def neutral_ms(outcome: Mapping[str, Any]) -> float | None:
-    """Time to neutral outputs of valve node, vehicle or PLC (ground truth) of one injection that must stop the machine;
-    infinite if they never were.
+    """Compute the time to neutral outputs of valve node, vehicle or PLC (ground truth) of one injection that must stop
+    the machine; infinite if they never were.
     """
     if outcome["expected"] not in ("H", "R1", "R0", "NODE"):
         return None
@@ -124,24 +124,25 @@ def neutral_ms(outcome: Mapping[str, Any]) -> float | None:
 
 
 def harm_m(outcome: Mapping[str, Any]) -> float:
-    """Distance of the tip from its reference [m], or its travel where there is no reference."""
+    """Compute the distance of the tip from its reference [m], or its travel where there is no reference."""
     return max(float(outcome["astray_m"]), 0.0) or float(outcome["travel_m"])
 
 
 def is_blind(case: Case, missed: Mapping[str, Any]) -> bool:
-    """Whether a missed injection, with its scene, is in a blind spot that the catalogue names."""
+    """Tell whether a missed injection, with its scene, is in a blind spot that the catalogue names."""
     named = missed["scene"].split()[0] in case.blind_in or missed["verdict"] in case.blind_as
     return named and harm_m(missed) <= case.blind_most_m
 
 
 def case_prefix(case: Case) -> str:
-    """Beginning of the names of a case's metrics."""
+    """Return the beginning of the names of a case's metrics."""
     return f"c{case.number:02d}"
 
 
 def case_metrics(case: Case, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Metrics of one case: number, missed, those in named blind spots, detection, time to neutral, travel, distance
-    from the reference, and the harm of the missed ones: that distance, or the travel where there is no reference.
+    """Compute the metrics of one case: number, missed, those in named blind spots, detection, time to neutral, travel,
+    distance from the reference, and the harm of the missed ones: that distance, or the travel where there is no
+    reference.
     """
     p = case_prefix(case)
     times = [float(o["detect_ms"]) for o in rows if o["detect_ms"] is not None]

@@ -73,7 +73,7 @@ class _Trips:
         system.observer.on_outputs += [self.outputs, self.separation.outputs]
 
     def outcome(self, scene: str, seed: int) -> dict[str, Any]:
-        """What has been counted."""
+        """Return what has been counted."""
         system = self._system
         return {
             "scene": scene,
@@ -85,7 +85,7 @@ class _Trips:
         }
 
     def outputs(self, outputs: Outputs, now_ns: int) -> None:
-        """The outputs of a tick."""
+        """Evaluate the outputs of a tick."""
         mode = outputs.mode
         self.working_ticks += mode is Mode.ACTIVE
         if mode in (Mode.STOP, Mode.FAULT) and self._mode in (Mode.ARMED, Mode.ACTIVE):
@@ -94,7 +94,7 @@ class _Trips:
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """One stretch; options: scene, seconds."""
+    """Run one stretch; options: scene, seconds."""
     scene, seconds = job.options["scene"], job.options["seconds"]
     truth, terrain, _ = SETTINGS[scene]
     if scene.startswith("log"):
@@ -141,19 +141,21 @@ def _log_job(scene: str, seed: int, truth: str) -> dict[str, Any]:
 
 
 def _mission(job: Job, scene: str, truth: str, terrain: str) -> dict[str, Any]:
-    """A whole mission; what it loaded and believes is in the outcome, too."""
+    """Run a whole mission; what it loaded and believes is in the outcome, too."""
     name = scene.split()[1]
-    what = {"profile": name, "truth": truth, "way": "ours", "eyes": "ours", "limit_s": MISSION_LIMIT_S}
-    what |= {key: job.options[key] for key in (RECORD,) if key in job.options}
+    job_options = {"profile": name, "truth": truth, "way": "ours", "eyes": "ours", "limit_s": MISSION_LIMIT_S}
+    job_options |= {key: job.options[key] for key in (RECORD,) if key in job.options}
     if scene.endswith("calibrated"):
-        machine = calibrated(Job(job.name, "calibration", job.seed, what))
+        machine = calibrated(Job(job.name, "calibration", job.seed, job_options))
         if machine["profile"] is None:
             return {"scene": scene, "seed": job.seed, "seconds": 0.0, "failure": machine["failure"]}
-        what["text"] = machine["profile"]
+        job_options["text"] = machine["profile"]
     mission = shuffled(load_mission(PAPER_B, route_wanted=True).mission, job.seed)
     site = site_of(mission, profile_named(name), job.seed, truth, terrain=terrain)
     trips: list[_Trips] = []
-    told = run_mission(Job(job.name, "mission", job.seed, what), mission, site, lambda run: trips.append(_Trips(run)))
-    aboard = sum(log["in_bunk"] for log in told["logs"])
-    more = {key: told[key] for key in ("finished", "failure", "loaded", "stops", "given_up")}
-    return trips[0].outcome(scene, job.seed) | more | {"in_bunk": aboard}
+    mission_outcome = run_mission(
+        Job(job.name, "mission", job.seed, job_options), mission, site, lambda run: trips.append(_Trips(run))
+    )
+    aboard = sum(log["in_bunk"] for log in mission_outcome["logs"])
+    summary = {key: mission_outcome[key] for key in ("finished", "failure", "loaded", "stops", "given_up")}
+    return trips[0].outcome(scene, job.seed) | summary | {"in_bunk": aboard}

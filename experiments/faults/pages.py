@@ -36,7 +36,7 @@ _EMPTY: Final = "–"
 
 
 def sections(result: Result) -> tuple[Section, ...]:
-    """Sections of the summary page."""
+    """Make the sections of the summary page."""
     return (
         Section("Campaign", "", CAMPAIGN),
         Section("Work without faults", "", NOMINAL),
@@ -46,7 +46,7 @@ def sections(result: Result) -> tuple[Section, ...]:
 
 
 def table(metrics: Mapping[str, float]) -> str:
-    """One line for each entry."""
+    """Write one line for each entry."""
     lines = [
         "| # | fault | promised | injections | missed | detection p50 / p99 / max ms | neutral ms | tip travel m "
         "| tip astray m |",
@@ -65,7 +65,7 @@ def table(metrics: Mapping[str, float]) -> str:
 
 
 def blind_spots(metrics: Mapping[str, float]) -> str:
-    """What is not seen, with the largest way of the tip among the missed injections."""
+    """List what is not seen, with the largest travel of the tip among the missed injections."""
     lines = []
     for case in CASES:
         keys = ("missed", "blind_missed", "harm_m")
@@ -73,8 +73,8 @@ def blind_spots(metrics: Mapping[str, float]) -> str:
         if case.blind or missed:
             harm = f"the tip up to {100 * harm_m:.1f} cm astray"
             named = f" ({blind:.0f} of them in a named blind spot)" if missed else ""
-            said = f" {case.blind}" if case.blind else ""
-            lines.append(f"- *{case.number}, {case.title}*: {missed:.0f} missed{named}, {harm}.{said}")
+            explanation = f" {case.blind}" if case.blind else ""
+            lines.append(f"- *{case.number}, {case.title}*: {missed:.0f} missed{named}, {harm}.{explanation}")
     return "\n".join(lines) or "None."
 
 
@@ -88,7 +88,7 @@ def write_evidence(outcomes: Mapping[str, Mapping[str, Any]], metrics: Mapping[s
 
 
 def work_page(outcomes: Iterable[Mapping[str, Any]]) -> str:
-    """The page of the work without faults: hours by scene, every stop with what it takes to see it again, the
+    """Write the page of the work without faults: hours by scene, every stop with what it takes to see it again, the
     missions' logs, and how near each monitor came to a stop.
     """
     work = [o for o in outcomes if "working_s" in o or o.get("scene", "").startswith("mission")]
@@ -99,9 +99,11 @@ def work_page(outcomes: Iterable[Mapping[str, Any]]) -> str:
     out = ["---", "orphan: true", "---", "", "# Work without faults", ""]
     out += ["| scene | stretches | hours | false trips |", "|---|---|---|---|"]
     trips = []
-    for scene, found in sorted(by_scene.items()):
-        stopped = [(o["seed"], at_s, why) for o in found for at_s, why in o["trips"]]
-        out.append(f"| {scene} | {len(found)} | {sum(o['seconds'] for o in found) / HOUR_S:.2f} | {len(stopped)} |")
+    for scene, stretches in sorted(by_scene.items()):
+        stopped = [(o["seed"], at_s, why) for o in stretches for at_s, why in o["trips"]]
+        out.append(
+            f"| {scene} | {len(stretches)} | {sum(o['seconds'] for o in stretches) / HOUR_S:.2f} | {len(stopped)} |"
+        )
         trips += [f"- {scene}, seed {seed}, after {at_s:.2f} s: {why}" for seed, at_s, why in stopped]
     out += ["", *(trips or ["No stretch of work was stopped."]), ""]
     missions = [o for o in work if o["scene"].startswith("mission")]
@@ -123,7 +125,7 @@ def work_page(outcomes: Iterable[Mapping[str, Any]]) -> str:
 
 
 def separations(work: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How near each monitor came to a stop in work without faults, as lines of Markdown."""
+    """Tell how near each monitor came to a stop in work without faults, as lines of Markdown."""
     measured = [o for o in work if "shares" in o]
     if not measured:
         return []
@@ -148,7 +150,7 @@ def separations(work: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, float]) -> str:
-    """One page: what, bound, measured, one example, verdict."""
+    """Write one page: what, bound, measured, one example, verdict."""
     p = case_prefix(case)
     verdicts = Counter(o["verdict"] for o in rows)
     kinds = ", ".join(sorted({kind for o in rows for kind in _kinds(o)}))
@@ -213,7 +215,7 @@ def _example(o: Mapping[str, Any]) -> list[str]:
 
 
 def _since(o: Mapping[str, Any]) -> str:
-    """From when the bound counts, where that is not the moment of the fault."""
+    """Tell from when the bound counts, where that is not the moment of the fault."""
     due_ms = o.get("due_ms", 0.0)
     if due_ms == 0.0:
         return ""
@@ -221,7 +223,7 @@ def _since(o: Mapping[str, Any]) -> str:
 
 
 def _kinds(o: Mapping[str, Any]) -> list[str]:
-    return [f"`{words.split('/')[0].split('=')[0].split('+')[0]}`" for words in o["orders"]]
+    return [f"`{order_text.split('/')[0].split('=')[0].split('+')[0]}`" for order_text in o["orders"]]
 
 
 def _number(value: float | None) -> str:

@@ -98,7 +98,7 @@ class Swing:
             self._joints.append((q if math.isfinite(q) else 0.0, half, w))
 
     def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Positions and velocities."""
+        """Return positions and velocities."""
         t = max(0.0, time_s)
         q = tuple(start + half * (1.0 - math.cos(w * t)) for start, half, w in self._joints)
         return q, tuple(half * w * math.sin(w * t) for _, half, w in self._joints)
@@ -113,7 +113,7 @@ class HeldSwing:
         self._swing = swing
 
     def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Positions and velocities: the swing's, at a time of its own that stops."""
+        """Return positions and velocities: the swing's, at a time of its own that stops."""
         slowing_s = min(max(0.0, time_s - HOLD_AFTER_S), SLOWING_S)
         share = slowing_s / SLOWING_S
         # The rate is 1 - 3 share^2 + 2 share^3: no step in speed or acceleration at either end.
@@ -134,7 +134,7 @@ class CranePlanner:
         self._report: StateReport | None = None
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """The setpoint to send now."""
+        """Return the setpoint to send now."""
         self._report = report or self._report
         if self._report is None or self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
             self._motion = None
@@ -161,11 +161,11 @@ class DrivePlanner:
         self._armed = False
 
     def receive(self, report: VehicleReport) -> None:
-        """A report of the vehicle."""
+        """Receive a report of the vehicle."""
         self._vehicle = report
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """The setpoint to send now."""
+        """Return the setpoint to send now."""
         if report is not None:
             self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)
         v = self._vehicle
@@ -235,7 +235,7 @@ class Running:
         return self.name.startswith("hold")
 
     def advance(self) -> None:
-        """One slice."""
+        """Run one slice."""
         self.system.advance()
         self.evidence.slice(self.system.now_ns)
 
@@ -279,12 +279,12 @@ class Running:
                 )
 
     def phase(self) -> Phase | None:
-        """The phase of the log job, as its planner tells it; None in the other scenes."""
+        """Return the phase of the log job, as its planner tells it; None in the other scenes."""
         planner = self.system.activity
         return planner.phase if isinstance(planner, Activity) else None
 
     def speed(self) -> float:
-        """Greatest speed of what moves here, as the machine itself reports it [rad/s, m/s]."""
+        """Return the greatest speed of what moves here, as the machine itself reports it [rad/s, m/s]."""
         if self.scene.drives:
             vehicle = self.system.vehicle_report
             return abs(vehicle.speed_m_s) if vehicle is not None and math.isfinite(vehicle.speed_m_s) else 0.0
@@ -292,20 +292,20 @@ class Running:
         return max((abs(v) for v in report.velocity if math.isfinite(v)), default=0.0) if report else 0.0
 
     def place(self) -> tuple[float, ...]:
-        """True place of what could hurt [m]: the hanger pin in the base frame, or the front axle in the world."""
+        """Return the true place of what could hurt [m]: hanger pin in the base frame, or front axle in the world."""
         if self.scene.drives:
             return tuple(self.plant.world.carrier.front_axle())
         return tuple(pin_position(self.scene.profile.kinematics, self.plant.joint_positions()[:4]))
 
     def astray_m(self) -> float:
-        """Distance of the hanger pin from its reference [m]; 0 while driving, where the way itself counts."""
+        """Compute the pin's distance from its reference [m]; 0 while driving, where the path itself counts."""
         report = self.system.report
         if self.scene.drives or report is None or not all(map(math.isfinite, report.reference[:4])):
             return 0.0
         return math.dist(pin_position(self.scene.profile.kinematics, report.reference[:4]), self.place())
 
     def overloaded(self) -> bool:
-        """Whether the machine carries more than it bears (ground truth).
+        """Tell whether the machine carries more than it bears (ground truth).
 
         The force at the hanger pin makes a moment about the tipping line beyond the limit, or the lift's oil is above
         the pump's relief: the pump cannot lift the load, and a little more opens the port's.
@@ -319,7 +319,7 @@ class Running:
         return moment_nm > judged.limit_nm or max(world.hydraulics.pressures_pa["lift"]) > relief_pa
 
     def valves_neutral(self) -> bool:
-        """Whether the valve node's outputs are neutral now (ground truth; a held grapple counts as neutral)."""
+        """Tell whether the valve node's outputs are neutral now (ground truth; a held grapple counts as neutral)."""
         plc = getattr(self.plant, "plc", None)
         outputs = plc.outputs if plc is not None else self.plant.valve.outputs_pct
         node = self.plant.vehicle_node
@@ -327,7 +327,7 @@ class Running:
 
 
 def build(name: str, seed: int = 0, truth: str = "nominal", terrain: str = "flat") -> Running:
-    """The machine of a scene at its start."""
+    """Build the machine of a scene at its start."""
     profile_name, kind = KINDS[name]
     with tempfile.TemporaryDirectory() as folder:
         path = profile_path(profile_name)
@@ -369,7 +369,7 @@ def _plant(settings: Settings, kind: str, seed: int, truth: str, terrain: str) -
 
 @cache
 def warm(name: str) -> Running:
-    """The machine of a scene, moving; one per process."""
+    """Build the machine of a scene and bring it into motion; one per process."""
     machine = build(name)
     machine.until_moving()
     if machine.holds:

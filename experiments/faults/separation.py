@@ -34,7 +34,7 @@ class Separation:
         self.shares: Shares = {}
 
     def outputs(self, outputs: Outputs, now_ns: int) -> None:
-        """The outputs of a tick: only what an armed machine measures can stop its work."""
+        """Evaluate the outputs of a tick: only what an armed machine measures can stop its work."""
         if outputs.mode not in OPERATING:
             return
         controller = self._controller
@@ -70,7 +70,7 @@ class Separation:
 
 
 def merged(outcomes: Iterable[Mapping[str, Any]]) -> Shares:
-    """The shares of several runs, each with its ``scene``, ``seed`` and ``shares``."""
+    """Merge the shares of several runs, each with its ``scene``, ``seed`` and ``shares``."""
     total: Shares = {}
     for outcome in outcomes:
         for name, one in outcome["shares"].items():

@@ -39,7 +39,7 @@ NODE_MS: Final = 200.0
 
 
 def judge(outcome: Mapping[str, Any]) -> dict[str, Any]:
-    """``detect_ms`` (None: never), ``verdict`` and ``missed`` of an outcome.
+    """Return ``detect_ms`` (None: never), ``verdict`` and ``missed`` of an outcome.
 
     Verdicts: ok; late (after the bound); undetected; weak (a milder reaction than promised); tripped (a stop where
     nothing may stop); far (more tip travel than promised).  All but ok count as missed.
@@ -98,7 +98,7 @@ CHILD_LIMIT_S: Final = 120
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """All injections of one case in one scene; options: case, scene, count."""
+    """Make all injections of one case in one scene; options: case, scene, count."""
     case = CASES[job.options["case"] - 1]
     scene, count = job.options["scene"], job.options["count"]
     outcomes = []
@@ -191,10 +191,10 @@ def start(scene: str, number: int, seed: str) -> dict[str, Any]:
 
 
 def _words(order: Order) -> str:
-    """The order as a person writes it, without its moment."""
-    words = order.fault if not order.part else f"{order.fault}/{order.part}"
-    words += f"+{1e3 * order.length_s:.4g}ms" if math.isfinite(order.length_s) else ""
-    return words + (f"={order.sized():.4g}" if math.isfinite(order.sized()) and order.sized() else "")
+    """Write the order as a person writes it, without its moment."""
+    order_text = order.fault if not order.part else f"{order.fault}/{order.part}"
+    order_text += f"+{1e3 * order.length_s:.4g}ms" if math.isfinite(order.length_s) else ""
+    return order_text + (f"={order.sized():.4g}" if math.isfinite(order.sized()) and order.sized() else "")
 
 
 def _wait(machine: Running, random: Random, drawn: Injection) -> None:
@@ -221,19 +221,19 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
     """
     system, evidence = machine.system, machine.evidence
     window_ns = at_ns + round((drawn.window_s or drawn.bound_ms * 1e-3 + 0.5) * 1e9)
-    place, usual_m = machine.place(), machine.astray_m()
+    last_position, usual_m = machine.place(), machine.astray_m()
     travel_m = astray_m = overrun_m = 0.0
-    mark, mark_ns, valves_ms, standing = place, system.now_ns, None, False
+    mark, mark_ns, valves_ms, standing = last_position, system.now_ns, None, False
     stop_ns = 0
     due_ms = None if drawn.after_overload else 0.0
     while True:
         machine.advance()
         if due_ms is None and machine.overloaded():
             due_ms = round((system.now_ns - at_ns) * 1e-6, 3)
-        now_ns, here = system.now_ns, machine.place()
-        step_m = math.dist(here, place)
+        now_ns, position = system.now_ns, machine.place()
+        step_m = math.dist(position, last_position)
         travel_m += step_m
-        place = here
+        last_position = position
         if system.report is not None and system.report.mode == Mode.ACTIVE:
             astray_m = max(astray_m, machine.astray_m() - usual_m)
         else:
@@ -243,8 +243,8 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
         elif valves_ms is None:
             valves_ms = round((now_ns - at_ns) * 1e-6, 3)
         if now_ns - mark_ns >= 100_000_000:
-            standing = math.dist(here, mark) < STILL_M
-            mark, mark_ns = here, now_ns
+            standing = math.dist(position, mark) < STILL_M
+            mark, mark_ns = position, now_ns
         if machine.phase() not in (None, Phase.CARRY, Phase.LOWER):  # the planner gives the carry up
             evidence.reached.setdefault("H", round((now_ns - at_ns) * 1e-6, 3))
         neutral = evidence.neutral_ms is not None and not machine.holds  # a crane that holds is neutral anyway
@@ -258,7 +258,7 @@ def _follow(machine: Running, drawn: Injection, at_ns: int) -> tuple[float, floa
 
 
 def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The result of a function that runs in a forked child, which leaves this process as it is.
+    """Return the result of a function that runs in a forked child, which leaves this process as it is.
 
     Raises:
         InputRefused: the child failed; its traceback is in the sentence.
@@ -270,12 +270,12 @@ def in_child(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.alarm(CHILD_LIMIT_S)
         try:
-            said = json.dumps(function())
+            answer_text = json.dumps(function())
         except BaseException:  # noqa: BLE001  the parent must hear of everything, and the child must not go on
-            said = json.dumps({"failed": traceback.format_exc()})
+            answer_text = json.dumps({"failed": traceback.format_exc()})
         try:
             with os.fdopen(writing, "w") as pipe:
-                pipe.write(said)
+                pipe.write(answer_text)
         finally:
             os._exit(0)  # whatever happens, the child must not go on as its parent
     os.close(writing)

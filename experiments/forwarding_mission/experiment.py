@@ -52,10 +52,10 @@ def run(options: Options, console: Console) -> Result:
     check_truth(name, truth)
     trials = 0 if options.quick else options.trials or TRIALS
     machines = calibrations(options, name, truth, MACHINES if trials else 0)
-    with checkpoint(options, (), [name], truth, SOURCES, PUBLISHED_TRIALS) as kept:
-        outcomes = pool.run(perform, machines, kept, options.workers, "calibrations", console)
+    with checkpoint(options, (), [name], truth, SOURCES, PUBLISHED_TRIALS) as trial_store:
+        outcomes = pool.run(perform, machines, trial_store, options.workers, "calibrations", console)
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
-        outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)
+        outcomes |= pool.run(perform, jobs, trial_store, options.workers, "missions", console)
         result = make_result(
             "forwarding-mission",
             METRICS,
@@ -69,12 +69,12 @@ def run(options: Options, console: Console) -> Result:
         draw(outcomes, options.out)
         print_failures(outcomes, console)
         publish(result, page_of(result, outcomes), options, console)
-        kept.publish()
+        trial_store.publish()
     return result
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page; ``trials``: outcomes of the missions, for the error table."""
+    """Make the result page; ``trials``: outcomes of the missions, for the error table."""
     introduction = INTRODUCTION.format(
         machines=result.environment["machines"], along=CM * ALONG_M, across=CM * ACROSS_M, turn=TURN_DEG
     )
@@ -82,14 +82,14 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
 
 
 def failed(trial: Trial) -> bool:
-    """Whether a mission did not end, or left a log neither in the bunk nor at a landing: a campaign records it."""
+    """Tell whether a mission did not end, or left a log neither in the bunk nor at a landing: a campaign records it."""
     lost = [log for log in trial.outcome.get("logs", ()) if not (log["in_bunk"] or log["landed"])]
     return trial.job.kind == "mission" and bool(lost or not trial.outcome["finished"])
 
 
 def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[Job]:
-    """One mission of the nominal machine on the original field by each method."""
-    what: dict[str, Any] = {
+    """Plan one mission of the nominal machine on the original field by each method."""
+    job_options: dict[str, Any] = {
         "profile": profile,
         "truth": "nominal",
         "file": str(PAPER_B),
@@ -98,30 +98,37 @@ def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[J
         "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None,
         "limit_s": LIMIT_S,
     }
-    ways = ("ours",) if options.quick else ("ours", "paper-b")
-    return [Job(f"first/{way}", "mission", options.seed, what | {"way": way, "eyes": DETECTORS[way]}) for way in ways]
+    methods = ("ours",) if options.quick else ("ours", "paper-b")
+    return [
+        Job(f"first/{method}", "mission", options.seed, job_options | {"way": method, "eyes": DETECTORS[method]})
+        for method in methods
+    ]
 
 
 def calibrations(options: Options, profile: str, truth: str, count: int) -> list[Job]:
-    """Calibration jobs of the nominal machine and the individuals; none for a quick run."""
-    first = FIRST_SEED + SEEDS_PER_RUN * options.seed
-    what = {"profile": profile, "truth": truth}
-    nominal = Job(NOMINAL, "calibration", options.seed, what | {"truth": "nominal"})
-    return [nominal, *(Job(f"machine/{i}", "calibration", first + i, what) for i in range(count))] if count else []
+    """List the calibration jobs of the nominal machine and the individuals; none for a quick run."""
+    first_seed = FIRST_SEED + SEEDS_PER_RUN * options.seed
+    job_options = {"profile": profile, "truth": truth}
+    nominal = Job(NOMINAL, "calibration", options.seed, job_options | {"truth": "nominal"})
+    return (
+        [nominal, *(Job(f"machine/{i}", "calibration", first_seed + i, job_options) for i in range(count))]
+        if count
+        else []
+    )
 
 
 def missions(options: Options, profile: str, truth: str, trials: int, machines: Mapping[str, Any]) -> list[Job]:
-    """Our missions on alternating individuals, each on its own field.
+    """Plan our missions on alternating individuals, each on its own field.
 
     The seed draws the individual; the field has a seed of its own.
     """
-    first = FIRST_SEED + SEEDS_PER_RUN * options.seed
+    first_seed = FIRST_SEED + SEEDS_PER_RUN * options.seed
     jobs = []
     for i in range(trials):
         text = machines[f"machine/{i % MACHINES}"]["profile"]
         if text is None:
             continue
-        what: dict[str, Any] = {
+        job_options: dict[str, Any] = {
             "profile": profile,
             "truth": truth,
             "file": str(PAPER_B),
@@ -129,10 +136,10 @@ def missions(options: Options, profile: str, truth: str, trials: int, machines: 
             "text": text,
             "way": "ours",
             "eyes": DETECTORS["ours"],
-            "field": first + MACHINES + i,
+            "field": first_seed + MACHINES + i,
             "limit_s": LIMIT_S,
         }
-        jobs.append(Job(f"mission/{i}", "mission", first + i % MACHINES, what))
+        jobs.append(Job(f"mission/{i}", "mission", first_seed + i % MACHINES, job_options))
     return jobs
 
 
@@ -163,7 +170,7 @@ def drive(job: Job) -> dict[str, Any]:
 
 
 def short(mission: ForwardingMission) -> ForwardingMission:
-    """A short version: ``SHORT_M`` of the first leg, the first log, one lap."""
+    """Shorten a mission: ``SHORT_M`` of the first leg, the first log, one lap."""
     first, second = mission.waypoints[:2]
     plane = LocalPlane(first.latitude_deg, first.longitude_deg)
     x, y, _ = plane.local(second.latitude_deg, second.longitude_deg)

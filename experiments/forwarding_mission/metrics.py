@@ -118,7 +118,7 @@ INTRODUCTION: Final = (
 
 
 def sections(outcomes: Mapping[str, Any]) -> tuple[Section, ...]:
-    """Sections of the page."""
+    """Make the sections of the page."""
     return (
         Section(
             "All our missions",
@@ -148,7 +148,7 @@ def sections(outcomes: Mapping[str, Any]) -> tuple[Section, ...]:
 
 
 def table(outcomes: Mapping[str, Any]) -> str:
-    """The error table like Table 1 of paper B, both methods side by side, as Markdown; the paper's means below."""
+    """Write the error table like Table 1 of paper B as Markdown, both methods side by side, the paper's means below."""
     rows = {prefix: by_log(outcomes.get(name)) for prefix, name in FIRST.items()}
     lines = [
         "As Table 1 of paper B: true offset of the grapple from the middle of the log just before it is activated, in "
@@ -189,7 +189,7 @@ def _means(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def by_log(outcome: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """Every log of a mission with ``off_m``, the offset of the last grasp of this log alone (None without one)."""
+    """List every log of a mission with ``off_m``, the offset of the last grasp of this log alone (None without one)."""
     if outcome is None:
         return []
     last = dict(offsets(outcome))
@@ -197,7 +197,7 @@ def by_log(outcome: Mapping[str, Any] | None) -> list[dict[str, Any]]:
 
 
 def offsets(outcome: Mapping[str, Any]) -> Iterator[tuple[int, list[float]]]:
-    """Log and offset (across, along, up) [m] just before each grasp of one log alone on the ground."""
+    """List log and offset (across, along, up) [m] just before each grasp of one log alone on the ground."""
     for grasp in outcome["grasps"]:
         if grasp["state"] != "COLLECT":
             continue
@@ -207,7 +207,7 @@ def offsets(outcome: Mapping[str, Any]) -> Iterator[tuple[int, list[float]]]:
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
-    """Metrics of all missions; outcomes are named first/METHOD, mission/NUMBER and machine/NUMBER."""
+    """Compute the metrics of all missions; outcomes are named first/METHOD, mission/NUMBER and machine/NUMBER."""
     ours = [o for name, o in outcomes.items() if name.startswith("mission/") or name == FIRST["ours"]]
     machines = [o for name, o in outcomes.items() if name.startswith("machine/")]
     metrics = mission_metrics(ours)
@@ -219,12 +219,12 @@ def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _stop_count(stands: Sequence[Sequence[float]]) -> int:
-    """Number of loading stops; the machine may load several logs from one place."""
+    """Count the loading stops; the machine may load several logs from one place."""
     return sum(i == 0 or math.dist(at[:2], stands[i - 1][:2]) > MOVED_M for i, at in enumerate(stands))
 
 
 def mission_metrics(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Metrics of some missions together."""
+    """Compute the metrics of some missions together."""
     logs = [log for o in outcomes for log in o["logs"]]
     off = np.array([v for o in outcomes for _, v in offsets(o)]).reshape(-1, 3)
     far = np.linalg.norm(off, axis=1)

@@ -59,12 +59,12 @@ def _maps(trials: Mapping[str, Any], path: Path) -> None:
 
 def field(axis: Any, outcome: Mapping[str, Any], title: str) -> None:
     """Draw one mission from above."""
-    way = np.array(outcome["path"], float).reshape(-1, 4)
-    axis.plot(way[:, 1], way[:, 2], color=STEEL, lw=0.9, zorder=1)
-    if len(way):
-        axis.plot(*way[0, 1:3], "s", color=STEEL, ms=5)
-        axis.plot(*way[-1, 1:3], "o", color=STEEL, ms=5)
-    at = _lying(outcome)
+    driven_path = np.array(outcome["path"], float).reshape(-1, 4)
+    axis.plot(driven_path[:, 1], driven_path[:, 2], color=STEEL, lw=0.9, zorder=1)
+    if len(driven_path):
+        axis.plot(*driven_path[0, 1:3], "s", color=STEEL, ms=5)
+        axis.plot(*driven_path[-1, 1:3], "o", color=STEEL, ms=5)
+    poses = _lying(outcome)
     for grasp in outcome["grasps"]:
         if grasp["state"] != "COLLECT" or not outcome["stands"]:
             continue
@@ -72,9 +72,9 @@ def field(axis: Any, outcome: Mapping[str, Any], title: str) -> None:
         for attempt in grasp["attempts"]:
             log = attempt["log"]
             if stand is not None and log is not None:
-                axis.plot([stand[0], at[log][0]], [stand[1], at[log][1]], color=OIL, lw=0.5, alpha=0.6, zorder=2)
-    for log, place in zip(outcome["logs"], at, strict=True):
-        x, y, yaw = place
+                axis.plot([stand[0], poses[log][0]], [stand[1], poses[log][1]], color=OIL, lw=0.5, alpha=0.6, zorder=2)
+    for log, pose in zip(outcome["logs"], poses, strict=True):
+        x, y, yaw = pose
         half = 0.5 * log["size_m"][0]
         dx, dy = half * math.cos(yaw), half * math.sin(yaw)
         colour = (TIMBER if log["in_bunk"] else RUST) if log["detected"] else "black"
@@ -86,7 +86,7 @@ def field(axis: Any, outcome: Mapping[str, Any], title: str) -> None:
 
 
 def _lying(outcome: Mapping[str, Any]) -> list[tuple[float, float, float]]:
-    """Original place of every log; those of later laps are drawn outside of the first lap's."""
+    """Return the original place of every log; those of later laps are drawn outside of the first lap's."""
     logs, places = outcome["logs"], outcome["places"] or len(outcome["logs"])
     middle = float(np.mean([log["place_m"][1] for log in logs[:places]]))
     at = []

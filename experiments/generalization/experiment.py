@@ -88,37 +88,37 @@ def tried(job: Job) -> dict[str, Any]:
         folder = Path(scratch)
         truth, content = write_truth(nominal_file(o["profile"], o["around"]), o["truth"], job.seed, folder)
         outcome = calibrate(o["profile"], str(truth), job.seed, surveyed=True)
-        found: dict[str, Any] = {"truth": o["truth"], "seconds": outcome.seconds, "said": "", "jobs": [], "wrong": []}
+        report: dict[str, Any] = {"truth": o["truth"], "seconds": outcome.seconds, "said": "", "jobs": [], "wrong": []}
         if outcome.failure is not None or outcome.calibration is None:
-            return {**found, "calibrated": False, "said": outcome.failure or "no plan"}
+            return {**report, "calibrated": False, "said": outcome.failure or "no plan"}
         known = profile_named(o["profile"])
         result = identify(known, outcome.calibration.found)
         if result.implausible:
-            return {**found, "calibrated": False, "said": "; ".join(p.sentence for p in result.implausible)}
+            return {**report, "calibrated": False, "said": "; ".join(p.sentence for p in result.implausible)}
         path = folder / "calibrated.toml"
         try:
             write_profile(profile_path(o["profile"]), path, profile_changes(known, result), DATE)
             carry_envelope(profile_path(o["profile"]), folder)
         except InputRefused as error:
-            return {**found, "calibrated": False, "said": str(error)}
-        found |= {"calibrated": True, "wrong": wrong_values(result, content)}
+            return {**report, "calibrated": False, "said": str(error)}
+        report |= {"calibrated": True, "wrong": wrong_values(result, content)}
         if job.kind == MISSION:
-            return {**found, MISSION: driven(job, truth, path.read_text(encoding="utf-8"))}
+            return {**report, MISSION: driven(job, truth, path.read_text(encoding="utf-8"))}
         runs = [Path(o.get(RECORD, folder)) / f"job-{k}" for k in range(o["jobs"])]
         scenes = scenes_of(job.seed, o["jobs"])
         return {
-            **found,
+            **report,
             "jobs": [_loaded(path, truth, s, o["camera"], run) for s, run in zip(scenes, runs, strict=True)],
         }
 
 
 def scenes_of(seed: int, jobs: int) -> range:
-    """The seeds of a machine's scenes."""
+    """Return the seeds of a machine's scenes."""
     return range(SCENES * seed, SCENES * seed + jobs)
 
 
 def _loaded(profile: Path, truth: Path, seed: int, camera: str, folder: Path) -> dict[str, Any]:
-    """One log from the ground into the bunk."""
+    """Load one log from the ground into the bunk."""
     console = Console(file=io.StringIO())
     folder.mkdir(parents=True)
     shutil.copyfile(profile, folder / PROFILE_FILE)
@@ -135,7 +135,7 @@ def _loaded(profile: Path, truth: Path, seed: int, camera: str, folder: Path) ->
 
 
 def wrong_values(result: CalibrationResult, truth: dict[str, Any]) -> list[str]:
-    """What the written profile has wrong of the valves, in words; nobody was told."""
+    """List what the written profile has wrong of the valves, in words; nobody was told."""
     wrong = []
     for joint, one in result.joints.items():
         name = joint.name.lower()
@@ -169,7 +169,7 @@ CAMERA: Final = "stick"
 
 
 def jobs_of(options: Options) -> list[Job]:
-    """One trial for every truth; missions are of the shipped forwarder where the profile does not drive."""
+    """Make one trial for every truth; missions are of the shipped forwarder where the profile does not drive."""
     drawn = options.trials if options.trials is not None else DRAWN_MACHINES
     truths = [*COMBINED, f"{DRAWN}-0"] if options.quick else names(drawn)
     camera = CAMERA if CAMERA in profile_named(options.profile).cameras else ""
@@ -195,8 +195,8 @@ def run(options: Options, console: Console) -> Result:
     """Try every truth; write ``options.out`` and, if requested, the docs."""
     jobs = jobs_of(options)
     truths = [job.name for job in jobs]
-    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
-        outcomes = pool.run(tried, jobs, kept, options.workers, "machines", console)
+    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES) as trial_store:
+        outcomes = pool.run(tried, jobs, trial_store, options.workers, "machines", console)
         for name, outcome in outcomes.items():
             for sentence in sentences(outcome):
                 console.print(f"{name}: {sentence}", highlight=False)
@@ -216,20 +216,20 @@ def run(options: Options, console: Console) -> Result:
 
 
 def failed(trial: Trial) -> bool:
-    """Whether a calibrated machine left a log outside the bunk or needed a person: a campaign records its jobs."""
+    """Tell whether a calibrated machine left a log outside the bunk or needed a person: a campaign records its jobs."""
     mission = trial.outcome.get(MISSION)
     driven = mission is None or (mission["in_bunk"] == mission["logs"] and not mission["stops"])
     return not (driven and all(map(succeeded, trial.outcome["jobs"])))
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     truths = [key.removesuffix(".calibrated") for key in result.metrics if key.endswith(".calibrated")]
     return Page("A world it has never seen", CONCLUSION, INTRODUCTION, sections(truths))
 
 
 def draw(path: Path, truths: Sequence[str], metrics: Mapping[str, float]) -> None:
-    """A bar for every truth: the share of its logs in the bunk, hollow where no profile was written."""
+    """Draw a bar for every truth: the share of its logs in the bunk, hollow where no profile was written."""
     with sheet(path, 1, 8.0, 0.6 + 0.28 * len(truths)) as axis:
         for y, name in enumerate(truths):
             if metrics.get(f"{name}.calibrated", 0.0) > 0.0:
@@ -253,19 +253,22 @@ def driven(job: Job, truth: Path, text: str) -> dict[str, Any]:
     mission = drawn_mission(profile.carrier, job.seed)
     site = site_of(mission, profile, job.seed, str(truth), o["logs"], ground_of(o["truth"]))
     options = o | {"truth": str(truth), "text": text, "way": "ours", "eyes": "ours", "limit_s": MISSION_LIMIT_S}
-    found = run_mission(Job(job.name, MISSION, job.seed, options), mission, site)
+    mission_outcome = run_mission(Job(job.name, MISSION, job.seed, options), mission, site)
     return {
         "ground": ground_of(o["truth"]),
-        "logs": len(found["logs"]),
-        "believed": found["loaded"],
-        "in_bunk": sum(log["in_bunk"] for log in found["logs"]),
-        "given_up": len(found["given_up"]),
-        **{key: found[key] for key in ("finished", "failure", "stops", "refused", "seconds", "driven_m", "remarks")},
+        "logs": len(mission_outcome["logs"]),
+        "believed": mission_outcome["loaded"],
+        "in_bunk": sum(log["in_bunk"] for log in mission_outcome["logs"]),
+        "given_up": len(mission_outcome["given_up"]),
+        **{
+            key: mission_outcome[key]
+            for key in ("finished", "failure", "stops", "refused", "seconds", "driven_m", "remarks")
+        },
     }
 
 
 def drawn_mission(carrier: Carrier, seed: int) -> ForwardingMission:
-    """A route of two legs with a turn between them; nothing is said of the logs."""
+    """Draw a route of two legs with a turn between them; nothing is said of the logs."""
     rng = random.Random(f"unseen route {seed}")
     plane = LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg)
     turn = math.radians(rng.uniform(-MOST_TURN_DEG, MOST_TURN_DEG))

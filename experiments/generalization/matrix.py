@@ -77,40 +77,40 @@ COMBINED: Final[dict[str, tuple[str, tuple[tuple[str, float, bool], ...]]]] = {
 
 
 def names(drawn: int) -> list[str]:
-    """All truths but those of missions: both ends of every parameter, the combinations, and so many drawn ones."""
+    """Name all truths but those of missions: both ends of every parameter, the combinations, and so many drawn ones."""
     ends = [f"{name}-{end}" for name in PARAMETERS for end in ("low", "high")]
     return [*ends, *COMBINED, *(f"{DRAWN}-{i}" for i in range(drawn))]
 
 
 def title_of(name: str) -> str:
-    """A truth in words."""
-    what, _, end = name.rpartition("-")
-    if what in PARAMETERS:
-        known = PARAMETERS[what]
+    """Name a truth in words."""
+    kind, _, end = name.rpartition("-")
+    if kind in PARAMETERS:
+        known = PARAMETERS[kind]
         value = known.low if end == "low" else known.high
         return f"{known.title}{'' if known.absolute else ' x'} {value:.3g}"
-    if what == UNSEEN:
+    if kind == UNSEEN:
         return f"Mission {end}, ground: {ground_of(name)}"
     return COMBINED[name][0] if name in COMBINED else f"Everything drawn, machine {end}"
 
 
 def is_drawn(name: str) -> bool:
-    """Whether the truth has everything drawn, for single logs."""
+    """Tell whether the truth has everything drawn, for single logs."""
     return name.startswith(f"{DRAWN}-")
 
 
 def is_mission(name: str) -> bool:
-    """Whether the truth is that of a mission."""
+    """Tell whether the truth is that of a mission."""
     return name.startswith(f"{UNSEEN}-")
 
 
 def ground_of(name: str) -> str:
-    """The kind of ground of a mission; they alternate."""
+    """Return the kind of ground of a mission; they alternate."""
     return KINDS[int(name.rpartition("-")[2]) % len(KINDS)]
 
 
 def nominal_file(profile: str, truth: str) -> Path:
-    """The file to change: of the choice of ``--truth`` (`sim.individual`), or of the shipped machine ``profile``.
+    """Find the file to change: of the choice of ``--truth`` (`sim.individual`), or of the shipped machine ``profile``.
 
     Raises:
         InputRefused: neither is known.
@@ -135,19 +135,19 @@ def write_truth(nominal: Path, name: str, seed: int, folder: Path) -> tuple[Path
         InputRefused: there is no such truth.
     """
     document = tomlkit.parse(nominal.read_text())
-    what, _, end = name.rpartition("-")
-    if what in (DRAWN, UNSEEN):
+    kind, _, end = name.rpartition("-")
+    if kind in (DRAWN, UNSEEN):
         rng = random.Random(f"generalization {seed}")
         for parameter in PARAMETERS.values():
             _draw(document, parameter, rng)
-        if what == UNSEEN:
+        if kind == UNSEEN:
             document["wood"].update(WOOD)
-    elif what in PARAMETERS:
-        known = PARAMETERS[what]
+    elif kind in PARAMETERS:
+        known = PARAMETERS[kind]
         _change(document, known, known.low if end == "low" else known.high, known.absolute)
     elif name in COMBINED:
-        for which, value, absolute in COMBINED[name][1]:
-            _change(document, PARAMETERS[which], value, absolute)
+        for parameter_name, value, absolute in COMBINED[name][1]:
+            _change(document, PARAMETERS[parameter_name], value, absolute)
     else:
         raise InputRefused(
             "generalization.unknown-truth", f"there is no truth {name!r}; see experiments/generalization"
@@ -158,7 +158,7 @@ def write_truth(nominal: Path, name: str, seed: int, folder: Path) -> tuple[Path
 
 
 def _found(document: Any, place: tuple[str, ...]) -> Iterator[tuple[Any, str]]:
-    """Tables and keys of a place that exist; "*" is every key of its table."""
+    """Find the tables and keys of a place that exist; "*" is every key of its table."""
     key, *rest = place
     for k in list(document) if key == "*" else [key]:
         if k not in document:
@@ -170,8 +170,8 @@ def _found(document: Any, place: tuple[str, ...]) -> Iterator[tuple[Any, str]]:
 
 
 def _change(document: Any, parameter: Parameter, value: float, absolute: bool) -> None:
-    for place in parameter.places:
-        for table, key in _found(document, place):
+    for location in parameter.places:
+        for table, key in _found(document, location):
             table[key] = value if absolute else float(table[key]) * value
 
 
@@ -180,7 +180,7 @@ def _draw(document: Any, parameter: Parameter, rng: random.Random) -> None:
         return float(parameter.low * (parameter.high / parameter.low) ** rng.random())
 
     common = value()
-    for place in parameter.places:
-        for table, key in _found(document, place):
+    for location in parameter.places:
+        for table, key in _found(document, location):
             drawn = value() if parameter.each else common
             table[key] = drawn if parameter.absolute else float(table[key]) * drawn

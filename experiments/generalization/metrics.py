@@ -71,7 +71,7 @@ OVERALL: Final = (
 
 
 def of_truth(name: str) -> tuple[Metric, ...]:
-    """The metrics of one truth."""
+    """Define the metrics of one truth."""
     title, whole = title_of(name), is_mission(name)
     return (
         Metric(f"{name}.calibrated", f"{title}: calibrated", "%", "Share of its machines."),
@@ -86,7 +86,7 @@ def of_truth(name: str) -> tuple[Metric, ...]:
 
 
 def sections(truths: Sequence[str]) -> tuple[Section, ...]:
-    """The sections of a page about these truths."""
+    """Make the sections of a page about these truths."""
     singles, missions = ([t for t in truths if is_mission(t) is kind] for kind in (False, True))
     plots = (("truths.png", "Logs in the bunk, for every truth; hollow: no profile was written."),)
     return (
@@ -106,12 +106,12 @@ def sections(truths: Sequence[str]) -> tuple[Section, ...]:
 
 
 def succeeded(job: Mapping[str, Any]) -> bool:
-    """Whether the log lies in the bunk and nobody had to arm again."""
+    """Tell whether the log lies in the bunk and nobody had to arm again."""
     return bool(job["in_bunk"] and not job["stops"])
 
 
 def silent(outcome: Mapping[str, Any]) -> list[str]:
-    """What went wrong in a trial without a word of the machine."""
+    """List what went wrong in a trial without a word of the machine."""
     lost = [
         f"job {k}: called done, {job['said']}"
         for k, job in enumerate(outcome["jobs"])
@@ -123,19 +123,19 @@ def silent(outcome: Mapping[str, Any]) -> list[str]:
 
 
 def sentences(outcome: Mapping[str, Any]) -> list[str]:
-    """What is to be said of a trial: refusals, stops, logs that were left, and what is silent."""
-    said = [outcome["said"]] if outcome["said"] else []
-    said += [f"job {k}: {job['said']}" for k, job in enumerate(outcome["jobs"]) if not job["in_bunk"]]
+    """List what is to be said of a trial: refusals, stops, logs that were left, and what is silent."""
+    lines = [outcome["said"]] if outcome["said"] else []
+    lines += [f"job {k}: {job['said']}" for k, job in enumerate(outcome["jobs"]) if not job["in_bunk"]]
     if mission := outcome.get(MISSION):
-        left = mission["logs"] - mission["in_bunk"]
-        said += [f"{left} of {mission['logs']} logs are not in the bunk"] if left else []
-        said += [*filter(None, [mission["failure"]]), *mission["remarks"]]
+        missing = mission["logs"] - mission["in_bunk"]
+        lines += [f"{missing} of {mission['logs']} logs are not in the bunk"] if missing else []
+        lines += [*filter(None, [mission["failure"]]), *mission["remarks"]]
     stops = sum(job["stops"] for job in [*outcome["jobs"], *([mission] if mission else [])])
-    return said + ([f"{stops} stops"] if stops else []) + [f"silent: {one}" for one in silent(outcome)]
+    return lines + ([f"{stops} stops"] if stops else []) + [f"silent: {problem}" for problem in silent(outcome)]
 
 
 def gather(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Metrics of all trials and of every truth."""
+    """Compute the metrics of all trials and of every truth."""
     metrics = rate("calibrated_share", sum(o["calibrated"] for o in outcomes), len(outcomes))
     metrics["unsafe_or_silent"] = float(sum(len(silent(o)) for o in outcomes))
     jobs = [(is_drawn(o["truth"]), job) for o in outcomes for job in o["jobs"]]

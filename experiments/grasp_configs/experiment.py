@@ -53,13 +53,13 @@ PUBLISHED_TRIALS: Final = "results/grasp-configs/trials.jsonl.xz"
 
 
 def machines_of(options: Options, attempts: int) -> list[Job]:
-    """Calibration jobs of the individuals that the attempts need."""
-    what, first = (
+    """List the calibration jobs of the individuals that the attempts need."""
+    job_options, first_seed = (
         {"profile": options.profile, "truth": sampled_unless_given(options.truth)},
         FIRST_MACHINE + options.seed,
     )
     count = min(MACHINES, max(0, attempts - PAPER_ATTEMPTS - 1))
-    return [Job(f"machine/{i}", "calibration", first + i, what) for i in range(count)]
+    return [Job(f"machine/{i}", "calibration", first_seed + i, job_options) for i in range(count)]
 
 
 def jobs_of(
@@ -69,32 +69,36 @@ def jobs_of(
     machines: Mapping[str, Any] = MappingProxyType({}),
     alike: bool = False,
 ) -> list[Job]:
-    """Jobs of all attempts: ``attempts`` of each configuration for the first pair, a twentieth for the others.
+    """List all attempts' jobs: ``attempts`` of each configuration for the first pair, a twentieth for the others.
 
     ``alike``: every pair gets all attempts, on the same scenes and machines.
 
     ``machines``: the calibrated individuals by the names of their jobs; without any, the nominal machine makes all.
     """
-    found = []
+    jobs = []
     for pair in pairs:
         whole = alike or pair == pairs[0]
         count = attempts if whole else max(min(PAPER_ATTEMPTS, attempts), attempts // SHARE)
         for number in CONFIGURATIONS:
             for k in range(count):
-                plain = {"profile": options.profile, "truth": options.truth, "configuration": number}
-                plain |= {"poses": pair[0], "planner": pair[1]}
+                job_options = {"profile": options.profile, "truth": options.truth, "configuration": number}
+                job_options |= {"poses": pair[0], "planner": pair[1]}
                 seed = FIRST_SEED + 1000 * options.seed + k
                 turn = (k - PAPER_ATTEMPTS) % (MACHINES + 1) if k >= PAPER_ATTEMPTS and whole else 0
                 machine = machines.get(f"machine/{turn - 1}")
                 if machine is not None and machine["profile"] is not None:
-                    plain |= {"truth": sampled_unless_given(options.truth), "text": machine["profile"], "scene": seed}
+                    job_options |= {
+                        "truth": sampled_unless_given(options.truth),
+                        "text": machine["profile"],
+                        "scene": seed,
+                    }
                     seed = FIRST_MACHINE + options.seed + turn - 1
-                found.append(Job(f"{'.'.join(pair)}/{number}/{k}", "grasp", seed, plain))
-    return found
+                jobs.append(Job(f"{'.'.join(pair)}/{number}/{k}", "grasp", seed, job_options))
+    return jobs
 
 
 def pairs_of(profile: str) -> list[tuple[str, str]]:
-    """Pairs of the ablation whose weights exist; the evaluated pair comes first.
+    """List the pairs of the ablation whose weights exist; the evaluated pair comes first.
 
     A machine without the camera gets true poses: what is tried then is planning, crane and grapple.
     """
@@ -105,12 +109,12 @@ def pairs_of(profile: str) -> list[tuple[str, str]]:
 
 
 def sees(profile: str) -> bool:
-    """Whether the machine has the camera that detects the logs."""
+    """Tell whether the machine has the camera that detects the logs."""
     return CAMERA in profile_named(profile).cameras
 
 
 def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[str, float]:
-    """Metrics of every pair with its name as prefix, and of the evaluated pair without a prefix."""
+    """Compute the metrics of every pair with its name as prefix, and of the evaluated pair without a prefix."""
     by_pair: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     for name, o in outcomes.items():
         if name.startswith("machine/"):
@@ -141,22 +145,22 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
 
 
 def succeeded(outcome: Mapping[str, Any]) -> bool:
-    """Whether at least one log was lifted and nobody had to arm again: a stop that needs a person is a failure."""
+    """Tell whether at least one log was lifted and nobody had to arm again: a stop that needs a person is a failure."""
     return outcome["lifted"] > 0 and not outcome["stops"]
 
 
 def at_first(outcome: Mapping[str, Any]) -> bool:
-    """Whether the first closing of the jaws lifted at least one log, as the paper counts: one plan, one closing."""
+    """Tell whether the first closing of the jaws lifted at least one log, as the paper counts: one plan and closing."""
     return succeeded(outcome) and bool(outcome["closings"] == 1)
 
 
 def failed(trial: Trial) -> bool:
-    """Whether an attempt failed: a campaign keeps its recording."""
+    """Tell whether an attempt failed: a campaign keeps its recording."""
     return trial.job.kind == "grasp" and not succeeded(trial.outcome)
 
 
 def evaluated_again(result: Result, trials: Mapping[str, Any]) -> Result:
-    """The saved result by today's reading of its published attempts; what was measured stays."""
+    """Evaluate the saved result by today's reading of its published attempts; what was measured stays."""
     poses, planner = result.environment["judged"].split(" poses, ")
     metrics = result.metrics | gather(dict(trials), (poses, planner))
     missed, inconclusive = evaluate(METRICS, metrics, noisy=False)
@@ -165,7 +169,7 @@ def evaluated_again(result: Result, trials: Mapping[str, Any]) -> Result:
 
 
 def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]:
-    """Success, share of optimal grasps, logs per grasp, and times of some trials."""
+    """Compute success, share of optimal grasps, logs per grasp, and times of some trials."""
     up = [o for o in trials if succeeded(o)]
     piles = [o["lifted"] for o in trials if o["configuration"] in PILES]
     all_of = [o["lifted"] == o["logs"] for o in trials if o["configuration"] in ALL_LOGS]
@@ -183,13 +187,13 @@ def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]
 
 
 def published_ablation(docs: Path | None, judged_pair: tuple[str, str]) -> tuple[dict[str, float], str]:
-    """Published metrics of the other pairs and their commit; ({}, "") without any."""
+    """Read the published metrics of the other pairs and their commit; ({}, "") without any."""
     saved = None if docs is None else overview.results_in(docs).get("grasp-configs")
     if saved is None:
         return {}, ""
     pairs = {".".join(pair) for pair in product(POSE_SOURCES, PLANNERS)} - {".".join(judged_pair)}
-    kept = {name: value for name, value in saved.metrics.items() if name.rpartition(".")[0] in pairs}
-    return kept, saved.environment.get("ablation", saved.commit) if kept else ""
+    pair_metrics = {name: value for name, value in saved.metrics.items() if name.rpartition(".")[0] in pairs}
+    return pair_metrics, saved.environment.get("ablation", saved.commit) if pair_metrics else ""
 
 
 def _share(trials: Sequence[dict[str, Any]], category: str) -> float:
@@ -216,16 +220,16 @@ def run(options: Options, console: Console) -> Result:
     pairs = pairs_of(options.profile)
     attempts = options.trials or (1 if options.quick else ATTEMPTS)
     calibrations = machines_of(options, attempts)
-    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as kept:
-        machines = pool.run(calibrated, calibrations, kept, options.workers, "calibrations", console)
+    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as trial_store:
+        machines = pool.run(calibrated, calibrations, trial_store, options.workers, "calibrations", console)
         jobs = jobs_of(options, pairs[:1] if options.quick else pairs, attempts, machines)
-        outcomes = machines | pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
-        kept_metrics, since = published_ablation(options.docs, pairs[0]) if options.quick else ({}, "")
+        outcomes = machines | pool.run(attempt, jobs, trial_store, options.workers, "grasping attempts", console)
+        saved_metrics, since = published_ablation(options.docs, pairs[0]) if options.quick else ({}, "")
         more = {"truth": options.truth, "judged": " poses, ".join(pairs[0])} | ({"ablation": since} if since else {})
         result = make_result(
             "grasp-configs",
             METRICS,
-            kept_metrics | gather(outcomes, pairs[0]),
+            saved_metrics | gather(outcomes, pairs[0]),
             profile=options.profile,
             seed=options.seed,
             trials=len(jobs),
@@ -237,12 +241,12 @@ def run(options: Options, console: Console) -> Result:
         draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
         _print_failures(outcomes, ".".join(pairs[0]), console)
         publish(result, page_of(result, {}), options, console)
-        kept.publish()
+        trial_store.publish()
     return result
 
 
 def compare(options: Options, console: Console) -> Result:
-    """A foreign planner or detector and ours on the same attempts; the limits, which are for ours, judge neither.
+    """Compare a foreign planner or detector with ours on the same attempts; the limits are for ours, and judge neither.
 
     Raises:
         InputRefused: there is no such planner or detector, or a page is asked for, which is that of ours.
@@ -263,15 +267,17 @@ def compare(options: Options, console: Console) -> Result:
     besides = plugins.identity(GRASP_PLANNERS, options.planner)
     besides += plugins.identity(plugins.LOG_DETECTORS, options.detector)
     attempts = options.trials or (1 if options.quick else PAPER_ATTEMPTS)
-    with checkpoint(options, besides, [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
-        machines = pool.run(calibrated, machines_of(options, attempts), kept, options.workers, "calibrations", console)
+    with checkpoint(options, besides, [options.profile], options.truth, LOCKSTEP_SOURCES) as trial_store:
+        machines = pool.run(
+            calibrated, machines_of(options, attempts), trial_store, options.workers, "calibrations", console
+        )
         jobs = jobs_of(options, (foreign, ours), attempts, machines, alike=True)
-        outcomes = pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
+        outcomes = pool.run(attempt, jobs, trial_store, options.workers, "grasping attempts", console)
         metrics = gather(outcomes, foreign)
-        shown = [m for pair in (foreign, ours) for m in compared(*pair)]
+        shown_metrics = [m for pair in (foreign, ours) for m in compared(*pair)]
         result = make_result(
             "grasp-configs",
-            shown,
+            shown_metrics,
             metrics,
             profile=options.profile,
             seed=options.seed,
@@ -280,13 +286,16 @@ def compare(options: Options, console: Console) -> Result:
             paper=PAPER,
         )
         publish(
-            result, Page("A foreign method", (), "", (Section("Foreign and ours", "", tuple(shown)),)), options, console
+            result,
+            Page("A foreign method", (), "", (Section("Foreign and ours", "", tuple(shown_metrics)),)),
+            options,
+            console,
         )
     return result
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     since = result.environment.get("ablation", "")
     return Page("Grasping logs in twelve configurations", CONCLUSION, INTRODUCTION, sections(since))
 

@@ -33,13 +33,13 @@ class Grip:
 
 
 def clearance(log: LogState, ground_z_m: float) -> float:
-    """Clearance [m] below the lowest end of a log."""
+    """Compute the clearance [m] below the lowest end of a log."""
     fall = log.taper_m_m * log.length_m / 2
     return min(end[2] - (log.diameter_m + d) / 2 - ground_z_m for end, d in zip(log.ends_m, (fall, -fall), strict=True))
 
 
 def lifted(before: Sequence[LogState], after: Sequence[LogState], ground_z_m: float) -> list[int]:
-    """Indices of the logs that hang: risen, and with more clearance than before."""
+    """List the indices of the logs that hang: risen, and with more clearance than before."""
     return [
         i
         for i, (was, now) in enumerate(zip(before, after, strict=True))
@@ -49,7 +49,7 @@ def lifted(before: Sequence[LogState], after: Sequence[LogState], ground_z_m: fl
 
 
 def category(number: int, before: Sequence[LogState], up: Sequence[int], grip: Grip, misled: bool) -> str:
-    """Category of a grasp: ``failed``, ``optimal``, ``NI`` (from under another log, or at an edge) or ``MA``
+    """Name the category of a grasp: ``failed``, ``optimal``, ``NI`` (from under another log, or at an edge) or ``MA``
     (misaligned).
 
     ``SE`` replaces NI and MA if perception misled the planner.
@@ -64,19 +64,19 @@ def category(number: int, before: Sequence[LogState], up: Sequence[int], grip: G
 
 
 def _heights(logs: Sequence[LogState]) -> list[int]:
-    """Index of the topmost log."""
+    """Return the index of the topmost log."""
     return [max(range(len(logs)), key=lambda i: logs[i].position_m[2])]
 
 
 def _askew(before: Sequence[LogState], up: Sequence[int], grip: Grip) -> float:
-    """Angle [rad] between the normal of the grapple and the mean direction of the lifted logs."""
+    """Compute the angle [rad] between the normal of the grapple and the mean direction of the lifted logs."""
     doubled = [2.0 * math.atan2(before[i].axis[1], before[i].axis[0]) for i in up]
     along = math.atan2(sum(map(math.sin, doubled)), sum(map(math.cos, doubled))) / 2.0
     return abs(math.remainder(grip.yaw_rad - math.pi / 2 - along, math.pi))
 
 
 def _edge(before: Sequence[LogState], up: Sequence[int], grip: Grip) -> bool:
-    """Whether the grapple closed near the ends of the lifted logs, taken together."""
+    """Tell whether the grapple closed near the ends of the lifted logs, taken together."""
     doubled = [2.0 * math.atan2(before[i].axis[1], before[i].axis[0]) for i in up]
     along = math.atan2(sum(map(math.sin, doubled)), sum(map(math.cos, doubled))) / 2.0
     ax, ay = math.cos(along), math.sin(along)
@@ -86,13 +86,13 @@ def _edge(before: Sequence[LogState], up: Sequence[int], grip: Grip) -> bool:
 
 
 def _under(before: Sequence[LogState], up: Sequence[int]) -> bool:
-    """Whether a log was lifted from under one that was not."""
+    """Tell whether a log was lifted from under one that was not."""
     stay = [i for i in range(len(before)) if i not in up]
     return any(lies_on(before[j], before[i]) for i in up for j in stay)
 
 
 def lies_on(upper: LogState, lower: LogState) -> bool:
-    """Whether a log rests on another: they touch, and it is higher there by a third of their radii together."""
+    """Tell whether a log rests on another: they touch, and it is higher there by a third of their radii together."""
     radii = (upper.diameter_m + lower.diameter_m) / 2
     gap, rise = min((_between(p, lower) for p in _points(upper)), key=lambda g: g[0])
     return gap < radii + CONTACT_M and rise > 0.3 * radii
@@ -104,7 +104,7 @@ def _points(log: LogState, count: int = 41) -> list[tuple[float, ...]]:
 
 
 def _between(point: Sequence[float], log: LogState) -> tuple[float, float]:
-    """Distance [m] of a point from the axis of a log, and its height above the nearest point."""
+    """Compute the distance [m] of a point from the axis of a log, and its height above the nearest point."""
     a, b = log.ends_m
     span = [q - p for p, q in zip(a, b, strict=True)]
     t = sum((x - p) * w for x, p, w in zip(point, a, span, strict=True)) / sum(w * w for w in span)

@@ -42,7 +42,7 @@ def _pair(poses: str, planner: str) -> tuple[Metric, ...]:
 
 
 def compared(poses: str, planner: str) -> tuple[Metric, ...]:
-    """The metrics of a pair for a comparison: those of the ablation, and its CPU times."""
+    """Define the metrics of a pair for a comparison: those of the ablation, and its CPU times."""
     name = f"{poses}.{planner}"
     title = _pair(poses, planner)[0].title.removeprefix("Success: ")
     return (
@@ -157,7 +157,7 @@ SECTIONS: Final = (
 
 
 def sections(since: str = "") -> tuple[Section, ...]:
-    """Sections of the page; ``since``: the commit of the ablation, if it differs from that of the result."""
+    """Make the sections of the page; ``since``: the commit of the ablation, if it differs from that of the result."""
     *parts, ablation = SECTIONS
     return (
         *parts,

@@ -43,20 +43,32 @@ def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
     finally:
         plant.close()
     jaws, net = jaws_of(profile), GraspNet()
-    seen = CnnPlanner(net).view(as_cylinders(logs), jaws, profile.workspace.ground_z_m)
-    quality = net.maps(seen.depth_m).q
+    virtual_view = CnnPlanner(net).view(as_cylinders(logs), jaws, profile.workspace.ground_z_m)
+    quality = net.maps(virtual_view.depth_m).q
     chosen = SamplingPlanner()(GraspRequest(Arm(profile), logs, 0.0))
     with sheet(path, 3, 10.0, 3.6) as (scene, depth, q):
         scene.imshow(picture)
         scene.set(title="the pile")
-        depth.imshow(seen.depth_m, cmap="gray_r")
+        depth.imshow(virtual_view.depth_m, cmap="gray_r")
         depth.set(title="virtual depth; the search's grasp")
-        place = np.array([[chosen.x_m, chosen.y_m, chosen.support_z_m]])
-        _mark(depth, _pixel(seen.camera, place), -chosen.yaw_rad, _opening_px(jaws, seen.camera, place), MOSS)
+        grasp_point_m = np.array([[chosen.x_m, chosen.y_m, chosen.support_z_m]])
+        _mark(
+            depth,
+            _pixel(virtual_view.camera, grasp_point_m),
+            -chosen.yaw_rad,
+            _opening_px(jaws, virtual_view.camera, grasp_point_m),
+            MOSS,
+        )
         q.imshow(quality, cmap="viridis")
-        q.set(title=f"network's quality, best {seen.best.q:.2f}")
-        deep = np.array([[0.0, 0.0, float(seen.camera.position_m[2]) - 3.0]])
-        _mark(q, (seen.best.u_px, seen.best.v_px), seen.best.theta_rad, _opening_px(jaws, seen.camera, deep), RUST)
+        q.set(title=f"network's quality, best {virtual_view.best.q:.2f}")
+        deep = np.array([[0.0, 0.0, float(virtual_view.camera.position_m[2]) - 3.0]])
+        _mark(
+            q,
+            (virtual_view.best.u_px, virtual_view.best.v_px),
+            virtual_view.best.theta_rad,
+            _opening_px(jaws, virtual_view.camera, deep),
+            RUST,
+        )
         for axis in (scene, depth, q):
             axis.set(xticks=[], yticks=[])
             axis.grid(False)

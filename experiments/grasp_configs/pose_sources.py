@@ -51,7 +51,7 @@ class Detection:
 
 
 def true_poses(plant: Plant) -> tuple[LogObservation, ...]:
-    """Ground-truth poses of all logs."""
+    """Return the ground-truth poses of all logs."""
     return tuple(
         LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(plant.logs())
     )
@@ -64,7 +64,7 @@ class TruePoses:
         self._plant = plant
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
-        """The logs now."""
+        """Return the logs now."""
         return Detection(true_poses(self._plant))
 
 
@@ -80,15 +80,15 @@ class OurPerception:
         self._perception = Perception(profile, SURVEYED)
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
-        """The logs after these pictures."""
+        """Detect the logs after these pictures."""
         from autonomy.perception.segmentation.log_segmenter import segment
 
-        seen = self._camera.detect(stamp_ns, q)
+        capture = self._camera.detect(stamp_ns, q)
         begun = time.process_time()
-        for frame in seen.frames:
-            masks: Sequence[Masked] = seen.masks if self._masked else segment(frame)
-            tracks = self._perception.step(frame, seen.pose, masks)
-        seconds = (time.process_time() - begun) / len(seen.frames)
+        for frame in capture.frames:
+            masks: Sequence[Masked] = capture.masks if self._masked else segment(frame)
+            tracks = self._perception.step(frame, capture.pose, masks)
+        seconds = (time.process_time() - begun) / len(capture.frames)
         return Detection(tuple(t.estimate.observation(t.id) for t in tracks if t.hits > 1), seconds)
 
 
@@ -102,18 +102,20 @@ class PaperPerception:
         self._camera = _Surveyed(plant, profile, seed)
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
-        """The logs in one picture."""
+        """Detect the logs in one picture."""
         from autonomy.perception.segmentation.log_segmenter import segment
 
-        seen, begun = self._camera.detect(stamp_ns, q), time.process_time()
-        frame, pose = seen.frames[0], seen.pose
-        found = [papers.log_from_mask(frame, one.mask) for one in segment(frame)]
+        capture, begun = self._camera.detect(stamp_ns, q), time.process_time()
+        frame, pose = capture.frames[0], capture.pose
+        estimates = [papers.log_from_mask(frame, one.mask) for one in segment(frame)]
         logs: list[LogObservation] = []
-        for log in found:
+        for log in estimates:
             if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
-                at, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
+                center_m, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
                 logs.append(
-                    LogObservation(len(logs), _triple(at), _triple(axis), float(log.length_m), float(log.diameter_m))
+                    LogObservation(
+                        len(logs), _triple(center_m), _triple(axis), float(log.length_m), float(log.diameter_m)
+                    )
                 )
         return Detection(tuple(logs), time.process_time() - begun)
 
@@ -125,9 +127,9 @@ class ForeignPerception:
         self._detector, self._camera = detector, _Surveyed(plant, profile, seed)
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
-        """The logs in one picture."""
-        seen, begun = self._camera.detect(stamp_ns, q), time.process_time()
-        found, pose = self._detector(seen.frames[0]), seen.pose
+        """Detect the logs in one picture."""
+        capture, begun = self._camera.detect(stamp_ns, q), time.process_time()
+        estimates, pose = self._detector(capture.frames[0]), capture.pose
         seconds = time.process_time() - begun
         logs = [
             LogObservation(
@@ -137,7 +139,7 @@ class ForeignPerception:
                 log.length_m,
                 log.diameter_m,
             )
-            for i, log in enumerate(found)
+            for i, log in enumerate(estimates)
         ]
         return Detection(tuple(logs), seconds)
 
@@ -158,7 +160,7 @@ POSE_SOURCES: Final[dict[str, Callable[[Plant, Profile, int], PoseSource]]] = {
 
 
 def pose_source(name: str, plant: Plant, profile: Profile, seed: int) -> PoseSource:
-    """The source with this name: one of ours, or the detector of an entry point.
+    """Make the source with this name: one of ours, or the detector of an entry point.
 
     Raises:
         InputRefused: there is no such detector.
@@ -169,7 +171,7 @@ def pose_source(name: str, plant: Plant, profile: Profile, seed: int) -> PoseSou
 
 
 def misled(truth: Sequence[LogState], seen: Sequence[LogObservation]) -> bool:
-    """Whether perception missed a log, invented one, or misplaced one (paper A's SE)."""
+    """Tell whether perception missed a log, invented one, or misplaced one (paper A's SE)."""
     if len(seen) != len(truth):
         return True
     apart = [[math.dist(o.center_m, log.position_m) for o in seen] for log in truth]
@@ -209,7 +211,7 @@ class _Surveyed:
         self._profile = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Pictures:
-        """``PICTURE_COUNT`` pictures of the present scene."""
+        """Take ``PICTURE_COUNT`` pictures of the present scene."""
         camera, ids = self._profile.cameras[CAMERA], self._rig.picture(CAMERA)[2].mask
         pose = optical_pose(self._profile, camera, q)
         numbers = range(1, len(self._plant.logs()) + 1)

@@ -80,8 +80,8 @@ class Attempt:
     """Time since which the crane rests above the logs [ns]."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One planner cycle (contract of ``hil.harness.lockstep.Planner``): detects logs at the start until a grasp is
-        chosen, and once at each rest above it.
+        """Run one planner cycle (contract of ``hil.harness.lockstep.Planner``): detects logs at the start until a grasp
+        is chosen, and once at each rest above it.
         """
         activity = self.activity
         self._q = self._q if report is None else report.position
@@ -110,7 +110,7 @@ class Attempt:
         self.looks, self._looked_ns = self.looks + 1, now_ns
 
     def over(self, now_ns: int) -> bool:
-        """Whether the grapple has been held still for two seconds after the lift."""
+        """Tell whether the grapple has been held still for two seconds after the lift."""
         return self._up_ns > 0 and now_ns - self._up_ns > HELD_NS
 
 
@@ -133,14 +133,14 @@ class TimedPlanner:
 
 
 def weights_of(poses: str, planner: str) -> bool:
-    """Whether the weights that a pair of the ablation needs exist."""
+    """Tell whether the weights that a pair of the ablation needs exist."""
     needed = [WEIGHT_FILES[NETWORKS[planner]]] if planner in NETWORKS else []
     needed += [SEGMENTATION] if poses in ("ours", "faithful") else []
     return all((SHIPPED / name).exists() for name in needed)
 
 
 def planner_named(name: str) -> GraspPlanner:
-    """The planner with this name: one of ours, or that of an entry point.
+    """Make the planner with this name: one of ours, or that of an entry point.
 
     Raises:
         InputRefused: the network's weights are missing or damaged.
@@ -228,7 +228,7 @@ def _attempt(job: Job, profile: Profile, name: str, recorder: Recorder | None) -
 
 
 def _grip(plant: Plant) -> Grip:
-    """True position where the grapple closed."""
+    """Return the true position where the grapple closed."""
     x, y, _ = plant.tip()
     (_, turn) = plant.link_poses()["rotator"]
     m = plant.world.client.getMatrixFromQuaternion(turn)
@@ -236,8 +236,8 @@ def _grip(plant: Plant) -> Grip:
 
 
 def arranged(profile: str, truth: str, number: int, seed: int) -> tuple[tuple[LogSpec, ...], float]:
-    """The logs of an attempt, of random sizes, at a random place in a random direction, and the slew angle [rad] at
-    which the crane starts.
+    """Arrange the logs of an attempt and choose the slew angle [rad] at which the crane starts: random sizes, a random
+    place, a random direction.
 
     A fixed crane gets a place anywhere in its reach, clear of the bunk; it starts turned so far that its camera sees
     the place.  A forwarder gets its pick area.

@@ -97,10 +97,10 @@ def _cornell(options: Options, metrics: dict[str, float], console: Console) -> t
     ]
     if options.data is not None:
         net = GraspNet()
-        found = on_samples(net, samples, net.facts)
-        metrics |= rate("data_right", sum(f["right"] for f in found), len(found))
-        metrics |= rate("data_own_size", sum(f["own_size"] for f in found), len(found))
-        metrics["data_trained_on"] = float(sum(f["trained_on"] for f in found))
+        evaluations = on_samples(net, samples, net.facts)
+        metrics |= rate("data_right", sum(f["right"] for f in evaluations), len(evaluations))
+        metrics |= rate("data_own_size", sum(f["own_size"] for f in evaluations), len(evaluations))
+        metrics["data_trained_on"] = float(sum(f["trained_on"] for f in evaluations))
         return "both cross-validations (--data evaluates the shipped weights)", pictures
     if options.quick:
         return "both cross-validations (--quick)", pictures
@@ -122,27 +122,27 @@ def cross_validated(options: Options, folder: Path, samples: Any, console: Conso
 
 
 def gather(outcomes: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
-    """Success rates of both cross-validations."""
+    """Compute the success rates of both cross-validations."""
     metrics: dict[str, float] = {}
     for kind, name in zip(folds.KINDS, ("cornell_grouped", "cornell_paper_split"), strict=True):
-        trials = [t for job, found in outcomes.items() if job.startswith(f"{kind}-") for t in found]
+        trials = [t for job, results in outcomes.items() if job.startswith(f"{kind}-") for t in results]
         metrics |= rate(name, sum(t["right"] for t in trials), len(trials))
         metrics |= rate(f"{name}_own_size", sum(t["own_size"] for t in trials), len(trials))
     return metrics
 
 
 def data_root() -> Path:
-    """Folder of the third-party data: TIMBERHAND_DATA, otherwise beside the checkout."""
+    """Return the folder of the third-party data: TIMBERHAND_DATA, otherwise beside the checkout."""
     return Path(os.environ.get("TIMBERHAND_DATA", ROOT.parent / "shared" / "data"))
 
 
 def _prepare_ms(seed: int) -> float:
-    found = []
+    times_ms = []
     for depth, _ in latency.log_scenes(seed):
         start_ns = time.process_time_ns()
         normalized_relief(depth)
-        found.append((time.process_time_ns() - start_ns) / 1e6)
-    return float(np.median(found))
+        times_ms.append((time.process_time_ns() - start_ns) / 1e6)
+    return float(np.median(times_ms))
 
 
 def _setting(result: Result) -> str:
@@ -159,5 +159,5 @@ def _setting(result: Result) -> str:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Grasp network", CONCLUSION, INTRODUCTION, SECTIONS, _setting(result))

@@ -35,7 +35,7 @@ KINDS: Final = ("grouped", "paper")
 
 
 def perform(job: Job) -> list[dict[str, Any]]:
-    """Results for every test picture of fold ``options["fold"]``."""
+    """Compute the results for every test picture of fold ``options["fold"]``."""
     import torch
 
     torch.set_num_threads(1)
@@ -45,17 +45,20 @@ def perform(job: Job) -> list[dict[str, Any]]:
     if job.kind == "grouped":
         training_part, test_part = grouped_folds([s.number for s in samples], FOLDS)[job.options["fold"]]
         many = VIEWS_PER_SAMPLE
-        learned = [views[many * i + k] for i in training_part for k in range(many)]
+        training_examples = [views[many * i + k] for i in training_part for k in range(many)]
         numbers = {samples[i].number for i in test_part}
-        asked = [e for e in crops if e.number in numbers]
+        test_examples = [e for e in crops if e.number in numbers]
         size = median_size_px([e for e in crops if e.number in {samples[i].number for i in training_part}])
     else:
         training_part, test_part = paper_folds(len(views), FOLDS, job.seed)[job.options["fold"]]
-        learned, asked = [views[i] for i in training_part], [views[i] for i in test_part]
-        size = median_size_px(learned)
-    net, _ = train_network(learned, job.seed, job.name, quiet, epochs=epochs)
-    found = predict(net, asked)
-    return [{"number": e.number, **evaluate(maps, e.grasps, size)} for e, maps in zip(asked, found, strict=True)]
+        training_examples, test_examples = [views[i] for i in training_part], [views[i] for i in test_part]
+        size = median_size_px(training_examples)
+    net, _ = train_network(training_examples, job.seed, job.name, quiet, epochs=epochs)
+    predictions = predict(net, test_examples)
+    return [
+        {"number": e.number, **evaluate(maps, e.grasps, size)}
+        for e, maps in zip(test_examples, predictions, strict=True)
+    ]
 
 
 @lru_cache(maxsize=1)
@@ -65,7 +68,7 @@ def _examples(folder: str, seed: int) -> tuple[tuple[Sample, ...], list[Example]
 
 
 def identity(samples: tuple[Sample, ...], seed: int, epochs: int) -> str:
-    """Hash of everything that decides the outcome of a fold: network, schedule, and the preprocessed pictures."""
+    """Compute the hash of everything that decides a fold's outcome: network, schedule and preprocessed pictures."""
     digest = hashlib.sha256(
         f"{GraspNetwork()} {seed} {epochs} {VIEWS_PER_SAMPLE} {BATCH} {LEARNING_RATE} {len(samples)}".encode()
     )

@@ -34,7 +34,7 @@ InferencePath = Callable[[np.ndarray], PixelGrasp]
 
 
 def inference_paths(weights: Weights) -> dict[str, InferencePath]:
-    """The paths by name; each maps a picture (1, 1, 300, 300) to its grasp."""
+    """Build the paths by name; each maps a picture (1, 1, 300, 300) to its grasp."""
     import torch
 
     from training.common.weight_file import restore, save
@@ -65,38 +65,38 @@ def _through(net: OpenVinoNet) -> InferencePath:
 
 
 def times_ms(paths: Mapping[str, InferencePath], pictures: Sequence[np.ndarray], rounds: int) -> dict[str, list[float]]:
-    """CPU time of every call [ms], paths measured alternately; it excludes the time spent waiting for a processor."""
-    found: dict[str, list[float]] = {name: [] for name in paths}
+    """Measure the CPU time of every call [ms], paths alternately, without the time spent waiting for a processor."""
+    path_times_ms: dict[str, list[float]] = {name: [] for name in paths}
     for i in range(-2, rounds):
-        for name, way in paths.items():
+        for name, infer in paths.items():
             start_ns = time.process_time_ns()
-            way(pictures[i % len(pictures)])
+            infer(pictures[i % len(pictures)])
             if i >= 0:
-                found[name].append((time.process_time_ns() - start_ns) / 1e6)
-    return found
+                path_times_ms[name].append((time.process_time_ns() - start_ns) / 1e6)
+    return path_times_ms
 
 
 def agreement(
     paths: Mapping[str, InferencePath], pictures: Sequence[np.ndarray]
 ) -> dict[str, list[tuple[float, float]]]:
-    """(distance [px], angle [deg]) of the grasp from that of the original network in PyTorch, by path and picture."""
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in paths}
+    """Compute (distance [px], angle [deg]) of the grasp from the original PyTorch network's, by path and picture."""
+    differences: dict[str, list[tuple[float, float]]] = {name: [] for name in paths}
     for picture in pictures:
-        wanted = paths["torch"](picture)
-        for name, way in paths.items():
-            got = way(picture)
-            turned = abs((got.theta_rad - wanted.theta_rad + math.pi / 2) % math.pi - math.pi / 2)
-            apart = math.hypot(got.u_px - wanted.u_px, got.v_px - wanted.v_px)
-            found[name].append((apart, math.degrees(turned)))
-    return found
+        reference = paths["torch"](picture)
+        for name, infer in paths.items():
+            grasp = infer(picture)
+            turned = abs((grasp.theta_rad - reference.theta_rad + math.pi / 2) % math.pi - math.pi / 2)
+            apart = math.hypot(grasp.u_px - reference.u_px, grasp.v_px - reference.v_px)
+            differences[name].append((apart, math.degrees(turned)))
+    return differences
 
 
 def metrics(times: Mapping[str, list[float]], apart: Mapping[str, list[tuple[float, float]]]) -> dict[str, float]:
-    """Medians, ratios and agreement; the fastest path is the fastest of those that agree.
+    """Compute medians, ratios and agreement; the fastest path is the fastest of those that agree.
 
     Agreement is the 95th percentile over the pictures: if two places are equally good, rounding decides.
     """
-    medians = {name: float(np.median(found)) for name, found in times.items()}
+    medians = {name: float(np.median(path_times_ms)) for name, path_times_ms in times.items()}
     out: dict[str, float] = {}
     worst = {name: np.percentile(pairs, 95.0, axis=0) for name, pairs in apart.items()}
     for name, median in medians.items():
@@ -113,8 +113,8 @@ def metrics(times: Mapping[str, list[float]], apart: Mapping[str, list[tuple[flo
 
 
 def log_scenes(seed: int, count: int = SCENES) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(depth [m], network input) of rendered logs on the ground, seen by paper A's virtual camera."""
-    found = []
+    """Make (depth [m], network input) of rendered logs on the ground, seen by paper A's virtual camera."""
+    scenes = []
     for i in range(count):
         rng: Any = np.random.default_rng([seed, i])
         logs = 1 + i % 4
@@ -122,9 +122,9 @@ def log_scenes(seed: int, count: int = SCENES) -> list[tuple[np.ndarray, np.ndar
         turned = np.broadcast_to(turned, (logs,))
         radius = rng.uniform(0.06, 0.14, logs)
         height = radius + np.arange(logs) * (0.22 if i % 2 else 0.0)
-        place = np.stack([rng.uniform(-0.5, 0.5, logs), 4.0 + rng.uniform(-0.5, 0.5, logs), height], axis=1)
+        centers_m = np.stack([rng.uniform(-0.5, 0.5, logs), 4.0 + rng.uniform(-0.5, 0.5, logs), height], axis=1)
         axis = np.stack([np.cos(turned), np.sin(turned), np.zeros(logs)], axis=1)
-        world = Cylinders(place, axis, rng.uniform(1.2, 2.0, logs), radius)
+        world = Cylinders(centers_m, axis, rng.uniform(1.2, 2.0, logs), radius)
         depth = render(world, camera_above(operational_area(world)), 0.0)
-        found.append((depth, normalized_relief(depth)[None, None]))
-    return found
+        scenes.append((depth, normalized_relief(depth)[None, None]))
+    return scenes

@@ -32,7 +32,7 @@ def draw(metrics: Mapping[str, float], times: Mapping[str, list[float]], net: Gr
 
 def _cornell(m: Mapping[str, float], path: Path) -> None:
     with sheet(path) as axis:
-        shown = {name: words for name, words in BARS.items() if name in m}
+        shown = {name: label for name, label in BARS.items() if name in m}
         for i, name in enumerate(shown):
             low, high = (100.0 * m[f"{name}_{end}"] for end in ("low", "high"))
             colour = OIL if "own" not in name else STEEL

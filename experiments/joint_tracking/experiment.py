@@ -36,14 +36,14 @@ WORST: Final = ("rest_m", "settle_s", "wobble_m", "tip_peak_m")
 
 
 def machines(options: Options) -> dict[str, str]:
-    """Profiles by short name; a profile given by the caller replaces the shipped one of its kind."""
+    """Choose profiles by short name; a profile given by the caller replaces the shipped one of its kind."""
     kind = "palms" if profile_named(options.profile).carrier is None else "aoro"
     return {**MACHINES, kind: options.profile}
 
 
 def plan(options: Options, trials: int) -> list[Job]:
-    """Every job of the run."""
-    first = FIRST_SEED + options.seed * SEEDS_PER_RUN
+    """Plan every job of the run."""
+    first_seed = FIRST_SEED + options.seed * SEEDS_PER_RUN
     numbers = {
         "corner": QUICK_CORNERS if options.quick else range(len(CORNERS)),
         "matched": range(len(CHANGES) * trials),
@@ -52,29 +52,29 @@ def plan(options: Options, trials: int) -> list[Job]:
     for short, profile in machines(options).items():
         # Unless the caller gives a truth, every trial is another individual: one machine says little about a law.
         same = profile == options.profile and options.truth not in ("nominal", "sampled")
-        what = {"profile": profile, "truth": options.truth if same else "sampled"}
+        common_options = {"profile": profile, "truth": options.truth if same else "sampled"}
         for (state, calibrated), law in product(STATES.items(), LAWS):
             kinds: tuple[str, ...] = CALIBRATED if calibrated else SHIPPED
             if options.quick and law != own_law(profile):
                 kinds = ("cycle",) if calibrated else ()
             for kind in kinds:
                 for i in numbers.get(kind, range(trials)):
-                    more: dict[str, Any] = {"corner": i} if kind == "corner" else {}
+                    job_options: dict[str, Any] = {"corner": i} if kind == "corner" else {}
                     if kind == "matched":
-                        more |= {"change": list(CHANGES)[i % len(CHANGES)]}
+                        job_options |= {"change": list(CHANGES)[i % len(CHANGES)]}
                     if short == TRACED and kind == "cycle" and calibrated and i == 0:
-                        more["trace"] = True
-                    more |= {**what, "law": law, "calibrated": calibrated}
-                    jobs.append(Job(f"{short}/{law}/{state}/{kind}/{i}", kind, first + i, more))
+                        job_options["trace"] = True
+                    job_options |= {**common_options, "law": law, "calibrated": calibrated}
+                    jobs.append(Job(f"{short}/{law}/{state}/{kind}/{i}", kind, first_seed + i, job_options))
         for i in range(trials):
-            more = {"trace": True} if short == TRACED and i == 0 else {}
-            more |= {**what, "law": own_law(profile), "calibrated": True}
-            jobs.append(Job(f"{short}/stop/{i}", "stop", first + i, more))
+            job_options = {"trace": True} if short == TRACED and i == 0 else {}
+            job_options |= {**common_options, "law": own_law(profile), "calibrated": True}
+            jobs.append(Job(f"{short}/stop/{i}", "stop", first_seed + i, job_options))
     return jobs
 
 
 def own_law(profile: str) -> str:
-    """The law of the slew of a profile, which represents all joints."""
+    """Name the law of the slew of a profile, which represents all joints."""
     return profile_named(profile).joints["slew"].law.kind
 
 
@@ -88,8 +88,8 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, trials)
     profiles = machines(options)
-    with checkpoint(options, (), profiles.values(), options.truth, ["controller"]) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "joint-tracking trials", console)
+    with checkpoint(options, (), profiles.values(), options.truth, ["controller"]) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "joint-tracking trials", console)
         metrics = gather(outcomes)
         result = make_result(
             "joint-tracking",
@@ -106,19 +106,19 @@ def run(options: Options, console: Console) -> Result:
 
 
 def laws_of(profiles: Mapping[str, str]) -> dict[str, str]:
-    """The law of each profile, by the short name of its machine."""
+    """Name the law of each profile, by the short name of its machine."""
     return {short: own_law(profile) for short, profile in profiles.items()}
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     profiles = dict(zip(MACHINES, result.profile.split(", "), strict=True))
     laws = laws_of(profiles)
     return Page("Joint control laws", conclusion(laws), INTRODUCTION, sections(laws, result.metrics))
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
-    """Means over the trials of each kind; machine, law, state and scenario are in the name.
+    """Compute the means over the trials of each kind; machine, law, state and scenario are in the name.
 
     Some metrics also have their worst value.  Over all trials of a law: the share of valves closed and of motions that
     did not settle in each state, and how many of its machines with twice the spread diverged.
@@ -140,21 +140,21 @@ def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _compared(metrics: Mapping[str, float]) -> dict[str, float]:
-    """The sliding mode over the best of the PD and PID laws: tracking error and chatter, undisturbed and changed."""
-    found: dict[str, float] = {}
+    """Compare the sliding mode with the best PD or PID law: tracking error and chatter, undisturbed and changed."""
+    ratios: dict[str, float] = {}
     for short, kind in product(MACHINES, ("cycle", "matched")):
         names = {law: f"{short}_{law}_calibrated_{kind}" for law in (*BASELINES, SLIDING)}
         if all(f"{name}_tip_rms_m" in metrics for name in names.values()):
             best = min(BASELINES, key=lambda law: metrics[f"{names[law]}_tip_rms_m"])
-            for key, what in (("tip_rms_m", "rms"), ("chatter_pct_s", "chatter")):
+            for key, label in (("tip_rms_m", "rms"), ("chatter_pct_s", "chatter")):
                 ratio = metrics[f"{names[SLIDING]}_{key}"] / metrics[f"{names[best]}_{key}"]
-                found[f"{short}_{kind}_{what}_ratio"] = ratio
-    return found
+                ratios[f"{short}_{kind}_{label}_ratio"] = ratio
+    return ratios
 
 
 def _over_all(outcomes: Mapping[str, Any]) -> dict[str, float]:
     shares: dict[str, list[float]] = {}
-    found: dict[str, float] = {}
+    totals: dict[str, float] = {}
     for name, outcome in outcomes.items():
         short, law, *rest = name.split("/")
         for key in ("shut_share", "unsettled_share"):
@@ -163,7 +163,7 @@ def _over_all(outcomes: Mapping[str, Any]) -> dict[str, float]:
                 known += [] if math.isnan(outcome[key]) else [outcome[key]]
         if rest[1:2] in (["wide"], ["corner"]):
             for key, value in (("machines", 1.0), ("diverged", float(outcome["diverged"]))):
-                found[f"{short}_{law}_twice_{key}"] = found.get(f"{short}_{law}_twice_{key}", 0.0) + value
+                totals[f"{short}_{law}_twice_{key}"] = totals.get(f"{short}_{law}_twice_{key}", 0.0) + value
     for name, outcome in outcomes.items():
         short, kind, *_ = name.split("/")
         if kind == "stop":
@@ -172,9 +172,9 @@ def _over_all(outcomes: Mapping[str, Any]) -> dict[str, float]:
                     plain = outcome[key.replace("damped", "plain")]
                     for how, values in (("damped", outcome[key]), ("plain", plain)):
                         ring = f"{short}_stop_{how}"
-                        found[ring] = found.get(ring, 0.0) + sum(values)
+                        totals[ring] = totals.get(ring, 0.0) + sum(values)
     for short in {name.split("/")[0] for name in outcomes}:
-        if plain := found.pop(f"{short}_stop_plain", 0.0):
-            found[f"{short}_stop_damped_over_plain"] = found.pop(f"{short}_stop_damped") / plain
+        if plain := totals.pop(f"{short}_stop_plain", 0.0):
+            totals[f"{short}_stop_damped_over_plain"] = totals.pop(f"{short}_stop_damped") / plain
     # If no motion settles, no valve is closed after settling: this counts as 0, not as a missing metric.
-    return found | {name: sum(values) / len(values) if values else 0.0 for name, values in shares.items()}
+    return totals | {name: sum(values) / len(values) if values else 0.0 for name, values in shares.items()}

@@ -25,7 +25,7 @@ CORNERS: Final = tuple(product((0, 1), (0, 1), (False, True)))
 
 
 def kind_of(job: Job) -> str:
-    """The shipped machine that a profile resembles."""
+    """Name the shipped machine that a profile resembles."""
     return "palms_471" if profile_named(job.options["profile"]).carrier is None else "aoro_fc8"
 
 
@@ -59,7 +59,7 @@ class Machine:
 
 
 def with_valves(truth: Any, gain: float, delay: float = 1.0) -> Any:
-    """The truth with all valves' gains and dead times times these factors."""
+    """Multiply the gains and dead times of all valves of the truth by these factors."""
     functions = {}
     for name, function in truth.functions.items():
         valve = function.valve
@@ -74,8 +74,7 @@ def with_valves(truth: Any, gain: float, delay: float = 1.0) -> Any:
 
 
 def widened(job: Job, world: World) -> Any:
-    """The truth with twice the deviation of the dead time from the middle of the spread, and of the gain from
-    nominal."""
+    """Double the truth's deviation of the dead time from the middle of the spread, and of the gain from nominal."""
     middle_s = 0.5 * (world.truth.spread.delay_min_s + world.truth.spread.delay_max_s)
 
     def change(drawn: Any, nominal: Any) -> tuple[float, float, float]:
@@ -92,7 +91,7 @@ def widened(job: Job, world: World) -> Any:
 
 
 def cornered(job: Job, world: World) -> Any:
-    """The truth with all joints at the same bounds of twice the spread."""
+    """Put all joints of the truth at the same bounds of twice the spread."""
     spread, (late, fast, _) = world.truth.spread, CORNERS[job.options["corner"]]
     middle_s, half_s = 0.5 * (spread.delay_max_s + spread.delay_min_s), 0.5 * (spread.delay_max_s - spread.delay_min_s)
     delay_s = middle_s + (WIDE_FACTOR if late else -WIDE_FACTOR) * half_s
@@ -101,7 +100,7 @@ def cornered(job: Job, world: World) -> Any:
 
 
 def _changed(job: Job, world: World, change: Callable[[Any, Any], tuple[float, float, float]]) -> Any:
-    """``change`` maps drawn and nominal valve to dead time [s], which is at least one physics step, and full speeds."""
+    """Change every valve: ``change`` maps drawn and nominal to dead time [s] (least: one step) and full speeds."""
     with trial_world(job.options["profile"], "nominal", job.seed) as middle:
         nominal = middle.truth
     functions = {}

@@ -73,27 +73,31 @@ ROWS: Final = (
 
 
 def _machine(short: str, law: str) -> tuple[Metric, ...]:
-    """Metrics of one machine: those of the law in its profile, and those of every law."""
-    mine, raw = f"{short}_{law}_calibrated", f"{short}_{law}_shipped"
+    """Define the metrics of one machine: those of the law in its profile, and those of every law."""
+    calibrated, shipped = f"{short}_{law}_calibrated", f"{short}_{law}_shipped"
     own = (
         Metric(
-            f"{mine}_cycle_rest_m",
+            f"{calibrated}_cycle_rest_m",
             "Error of the tip at rest, mean",
             "mm",
             "Distance of the tip from its goal by the true joint positions, last half second before the next "
             "motion; mean over the ends of all cycles with the law of the profile.",
             most=REST_M,
         ),
-        Metric(f"{mine}_cycle_rest_m_max", "Error of the tip at rest, worst", "mm", "The same ends."),
-        Metric(f"{mine}_cycle_settle_s", "Settling time to 15 mm", "s", "After the end of a motion, mean."),
+        Metric(f"{calibrated}_cycle_rest_m_max", "Error of the tip at rest, worst", "mm", "The same ends."),
+        Metric(f"{calibrated}_cycle_settle_s", "Settling time to 15 mm", "s", "After the end of a motion, mean."),
         Metric(
-            f"{raw}_cycle_rest_m",
+            f"{shipped}_cycle_rest_m",
             "As shipped: error of the tip at rest, mean",
             "mm",
             "The same with the valves that the shipped profile assumes, on individual machines.",
         ),
         Metric(
-            f"{raw}_cycle_alarms", "As shipped: false alarms of the motion monitors", "joints", "All cycles.", most=0.0
+            f"{shipped}_cycle_alarms",
+            "As shipped: false alarms of the motion monitors",
+            "joints",
+            "All cycles.",
+            most=0.0,
         ),
     )
     every = []
@@ -139,7 +143,7 @@ def _machine(short: str, law: str) -> tuple[Metric, ...]:
 
 
 def table(short: str, metrics: Mapping[str, float]) -> str:
-    """All laws on the same machines and motions as a Markdown table; the best value of each row is bold."""
+    """Write all laws on the same machines and motions as a Markdown table; the best value of each row is bold."""
     lines = ["", "| | unit | " + " | ".join(LAWS.values()) + " |", "|---|---|" + "---|" * len(LAWS)]
     for title, unit, key, scale in ROWS:
         values = [scale * metrics.get(f"{short}_{law}_{key}", math.nan) for law in LAWS]
@@ -152,7 +156,7 @@ def table(short: str, metrics: Mapping[str, float]) -> str:
 
 
 def best_laws(short: str, law: str, metrics: Mapping[str, float]) -> str:
-    """The law in the profile, and in how many rows of the table each law is best."""
+    """Name the law in the profile, and in how many rows of the table each law is best."""
     wins = dict.fromkeys(LAWS, 0)
     for _, _, key, _ in ROWS:
         values = {name: metrics.get(f"{short}_{name}_{key}", math.nan) for name in LAWS}
@@ -163,7 +167,7 @@ def best_laws(short: str, law: str, metrics: Mapping[str, float]) -> str:
 
 
 def damping(short: str, metrics: Mapping[str, float]) -> str:
-    """Ringing after a stop without and with pressure feedback, as a Markdown table."""
+    """Write the ringing after a stop without and with pressure feedback as a Markdown table."""
     lines = [
         "",
         "| stop of | pin rings without [mm] | with [mm] | change | pressure rings without [bar] | with [bar] | change "
@@ -172,8 +176,10 @@ def damping(short: str, metrics: Mapping[str, float]) -> str:
     ]
     for key, title in STOPS.items():
         cells = []
-        for what, scale in (("ring_m", MM), ("ripple_bar", 1.0)):
-            plain, damped = (metrics.get(f"{short}_stop_{key}_{how}_{what}", math.nan) for how in ("plain", "damped"))
+        for quantity, scale in (("ring_m", MM), ("ripple_bar", 1.0)):
+            plain, damped = (
+                metrics.get(f"{short}_stop_{key}_{how}_{quantity}", math.nan) for how in ("plain", "damped")
+            )
             cells += [f"{scale * plain:.2f}", f"{scale * damped:.2f}", f"{PERCENT * (damped / plain - 1.0):+.0f} %"]
         lines.append(f"| {title} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
@@ -184,7 +190,7 @@ def _both(laws: Mapping[str, str], made: dict[str, str]) -> str:
 
 
 def conclusion(laws: Mapping[str, str]) -> tuple[str, ...]:
-    """Templates of the conclusion; ``laws``: the law of each machine's profile, by its short name."""
+    """Return the templates of the conclusion; ``laws``: the law of each machine's profile, by its short name."""
     rests = ", ".join(
         f"on `{MACHINES[short]}` {{{short}_{law}_calibrated_cycle_rest_m}} from its goal" for short, law in laws.items()
     )
@@ -192,7 +198,7 @@ def conclusion(laws: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def sections(laws: Mapping[str, str], metrics: Mapping[str, float]) -> tuple[Section, ...]:
-    """Sections of the page; ``laws``: the law of each machine's profile, by its short name."""
+    """Make the sections of the page; ``laws``: the law of each machine's profile, by its short name."""
 
     def machine(short: str, text: str) -> str:
         return f"{text} {best_laws(short, laws[short], metrics)}\n{table(short, metrics)}\n\nMetrics with limits:"

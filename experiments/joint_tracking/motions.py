@@ -20,40 +20,42 @@ RAMP_ENDS_S: Final = 0.8
 
 
 def smooth(x: float) -> tuple[float, float]:
-    """Progress and its rate of s = 35t^4 - 84t^5 + 70t^6 - 20t^7, at rest outside 0..1."""
+    """Compute the progress and its rate of s = 35t^4 - 84t^5 + 70t^6 - 20t^7, at rest outside 0..1."""
     if not 0.0 < x < 1.0:
         return (0.0, 0.0) if x <= 0.0 else (1.0, 0.0)
     return x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x))), 140.0 * (x * (1.0 - x)) ** 3
 
 
 def legs(start: Sequence[float], moves: Sequence[tuple[float, float, Mapping[str, float]]]) -> Reference:
-    """The sum of smooth moves, each with start [s], duration [s] and distance of each joint."""
+    """Add smooth moves, each with start [s], duration [s] and distance of each joint."""
 
     def reference(time_s: float) -> tuple[list[float], list[float]]:
         q, v = list(start), [0.0] * len(start)
-        for begin_s, duration_s, ways in moves:
+        for begin_s, duration_s, distances in moves:
             done, rate = smooth((time_s - begin_s) / duration_s)
-            for name, way in ways.items():
+            for name, distance in distances.items():
                 j = NAMES.index(name)
-                q[j] += way * done
-                v[j] += way * rate / duration_s
+                q[j] += distance * done
+                v[j] += distance * rate / duration_s
         return q, v
 
     return reference
 
 
 def duration_s(profile: Profile, ways: Mapping[str, float], share: float) -> float:
-    """Duration [s] of a smooth move whose fastest joint uses this share of its speed limit."""
-    return max(PEAK_OVER_MEAN * abs(way) / (share * profile.joints[name].speed_limit) for name, way in ways.items())
+    """Compute the duration [s] of a smooth move whose fastest joint uses this share of its speed limit."""
+    return max(
+        PEAK_OVER_MEAN * abs(distance) / (share * profile.joints[name].speed_limit) for name, distance in ways.items()
+    )
 
 
 def step(profile: Profile, start: Sequence[float], name: str, side: int) -> tuple[Reference, float]:
-    """A step of the position, as large as the gate allows, and its time [s]."""
-    way = side * STEP_S * profile.joints[name].speed_limit
+    """Make a step of the position, as large as the gate allows, and its time [s]."""
+    step_size = side * STEP_S * profile.joints[name].speed_limit
 
     def reference(time_s: float) -> tuple[list[float], list[float]]:
         q = list(start)
-        q[NAMES.index(name)] += way if time_s >= START_S else 0.0
+        q[NAMES.index(name)] += step_size if time_s >= START_S else 0.0
         return q, [0.0] * len(q)
 
     return reference, START_S
@@ -67,7 +69,7 @@ def ramp(
     share: float = RAMP_SHARE,
     ends_s: float = RAMP_ENDS_S,
 ) -> tuple[Reference, float]:
-    """A constant speed, a share of the limit, with smooth ends, and the time of its end [s]."""
+    """Make a constant speed, a share of the limit, with smooth ends, and the time of its end [s]."""
     speed = side * share * profile.joints[name].speed_limit
     j = NAMES.index(name)
 
@@ -85,7 +87,7 @@ def ramp(
 
 
 def _risen(t: float, ends_s: float) -> float:
-    """Time integral of a smoothstep from 0 to 1 over ``ends_s``."""
+    """Compute the time integral of a smoothstep from 0 to 1 over ``ends_s``."""
     x = t / ends_s
     if x <= 0.0:
         return 0.0

@@ -26,11 +26,11 @@ PANELS: Final = (
 
 def draw(metrics: Mapping[str, float], outcomes: Mapping[str, Any], machines: Mapping[str, str], out: Path) -> None:
     """Write all plots into ``out``."""
-    kept = {name.split("/")[1]: outcome["trace"] for name, outcome in outcomes.items() if "trace" in outcome}
+    traces = {name.split("/")[1]: outcome["trace"] for name, outcome in outcomes.items() if "trace" in outcome}
     for short in machines:
         _compare(metrics, short, out / f"{short}.png")
-    _traces({law: kept[law] for law in LAWS if law in kept}, out / "traces.png")
-    _stops(kept.get("stop", {}), out / "stop.png")
+    _traces({law: traces[law] for law in LAWS if law in traces}, out / "traces.png")
+    _stops(traces.get("stop", {}), out / "stop.png")
     _wide(outcomes, machines, out / "wide.png")
 
 
@@ -51,8 +51,10 @@ def _wide(outcomes: Mapping[str, Any], machines: Mapping[str, str], path: Path) 
         for axis, short in zip(axes, machines, strict=True):
             for (i, law), (state, shift, shade) in product(enumerate(LAWS), SHADES):
                 own = [f"{short}/{law}/{state}/{kind}/" for kind in ("wide", "corner")]
-                found = [o["wobble_m"] for name, o in outcomes.items() if name.startswith(tuple(own))]
-                axis.scatter([i + shift] * len(found), [MM * x for x in found], s=14, color=COLOURS[law], alpha=shade)
+                wobbles_m = [o["wobble_m"] for name, o in outcomes.items() if name.startswith(tuple(own))]
+                axis.scatter(
+                    [i + shift] * len(wobbles_m), [MM * x for x in wobbles_m], s=14, color=COLOURS[law], alpha=shade
+                )
             axis.set_yscale("log")
             axis.set_xticks(range(len(LAWS)), list(LAWS.values()))
             axis.set_title(f"{machines[short]}: wobble of the tip [mm]")

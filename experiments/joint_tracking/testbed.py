@@ -87,7 +87,7 @@ class JointTestbed:
             self._measure()
 
     def positions(self) -> list[float]:
-        """Joint positions as the controller estimates them; true positions of joints without an encoder."""
+        """Return joint positions as the controller estimates them; true positions of joints without an encoder."""
         return [e.position if e.known else self.world.q[name] for e, name in zip(self.estimators, NAMES, strict=True)]
 
     def run(self, reference: Reference, seconds: float, on_tick: Callable[[float], None] | None = None) -> Trace:
@@ -161,8 +161,8 @@ class JointTestbed:
 def controller_profile(
     profile: Profile, truth: Any, kind: str, calibration: Calibration | None, damped: bool
 ) -> Profile:
-    """The profile with another law, with or without pressure damping, and with calibrated or shipped valves; ``truth``
-    is that of the calibration.
+    """Make the profile with another law, with or without pressure damping, and with calibrated or shipped valves;
+    ``truth`` is that of the calibration.
     """
     import msgspec
 
@@ -187,7 +187,7 @@ class Calibration:
         self._rng = random.Random(f"calibration {seed}")
 
     def valve(self, valve_spec: Any, true: Any) -> Any:
-        """The valve map with errors of the standard deviations above."""
+        """Draw the valve map with errors of the standard deviations above."""
         import msgspec
 
         off = self._rng.gauss

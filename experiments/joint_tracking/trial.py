@@ -81,13 +81,13 @@ def cycle(
     with Machine(job, machine, later) as testbed:
         if load_kg := job.options.get("load_kg", 0.0):
             hang(testbed.world, load_kg)
-        start, ways = testbed.positions(), CYCLE[kind_of(job)]
-        out = duration_s(testbed.profile, ways, job.options.get("share", 0.45))
+        start, distances = testbed.positions(), CYCLE[kind_of(job)]
+        out = duration_s(testbed.profile, distances, job.options.get("share", 0.45))
         rise = {"lift": LIFT_RAD}
-        back = {name: -way for name, way in ways.items()}
+        back = {name: -distance for name, distance in distances.items()}
         there_s = START_S + out
         moves = [
-            (START_S, out, ways),
+            (START_S, out, distances),
             (START_S, 0.5 * out, rise),
             (START_S + 0.5 * out, 0.5 * out, {"lift": -LIFT_RAD}),
             (there_s + REST_S, out, back),
@@ -108,23 +108,23 @@ def cycle(
 
 
 def pump(job: Job) -> dict[str, Any]:
-    """The cycle at full speed, which needs more flow than the pump delivers."""
+    """Run the cycle at full speed, which needs more flow than the pump delivers."""
     return cycle(_with(job, share=1.0))
 
 
 def wide(job: Job) -> dict[str, Any]:
-    """The cycle on a machine whose dead times and gains deviate twice as much as the truth's spread allows."""
+    """Run the cycle on a machine whose dead times and gains deviate twice as much as the truth's spread allows."""
     return cycle(job, widened)
 
 
 def corner(job: Job) -> dict[str, Any]:
-    """The cycle on a machine in a corner of twice the spread; the option ``corner`` is an index of `CORNERS`."""
+    """Run the cycle on a machine in a corner of twice the spread; the option ``corner`` is an index of `CORNERS`."""
     loaded = CORNERS[job.options["corner"]][2]
     return cycle(_with(job, load_kg=LOAD_KG[kind_of(job)] if loaded else 0.0), cornered)
 
 
 def matched(job: Job) -> dict[str, Any]:
-    """The cycle of a calibrated machine that has changed since; the option ``change`` is one of `CHANGES`."""
+    """Run the cycle of a calibrated machine that has changed since; the option ``change`` is one of `CHANGES`."""
     load_kg, relief_pa = LOAD_KG[kind_of(job)], [0.0]
 
     def load(world: World, share: float) -> None:
@@ -145,9 +145,9 @@ def matched(job: Job) -> dict[str, Any]:
 
 
 def steps(job: Job) -> dict[str, Any]:
-    """Steps of every joint alone in both directions: overshoot and settling."""
+    """Step every joint alone in both directions: overshoot and settling."""
     with Machine(job) as testbed:
-        overshoot, settling, left, chatter = [], [], [], []
+        overshoot, settling, rest_errors, chatter = [], [], [], []
         for name in ARM:
             for side in (1, -1):
                 start = testbed.positions()
@@ -156,18 +156,18 @@ def steps(job: Job) -> dict[str, Any]:
                 j = NAMES.index(name)
                 q = np.array([x[j] for x in trace.position])
                 goal = trace.reference[-1][j]
-                way, after = goal - start[j], np.array(trace.time_s) >= begin_s
+                step_size, after = goal - start[j], np.array(trace.time_s) >= begin_s
                 error = np.abs(q[after] - goal)
-                late = np.nonzero(error > 0.1 * abs(way))[0]
-                overshoot.append(float(max(0.0, (side * (q[after] - goal)).max()) / abs(way)))
+                late = np.nonzero(error > 0.1 * abs(step_size))[0]
+                overshoot.append(float(max(0.0, (side * (q[after] - goal)).max()) / abs(step_size)))
                 settling.append(float(np.array(trace.time_s)[after][late[-1]]) - begin_s if late.size else 0.0)
-                left.append(float(error[-100:].mean()))
+                rest_errors.append(float(error[-100:].mean()))
                 chatter.append(_chatter_pct_s(trace, after))
-        return {"overshoot": overshoot, "settling_s": settling, "left": left, "chatter_pct_s": chatter}
+        return {"overshoot": overshoot, "settling_s": settling, "left": rest_errors, "chatter_pct_s": chatter}
 
 
 def ramps(job: Job) -> dict[str, Any]:
-    """Constant speed of every joint alone in both directions: tracking error."""
+    """Move every joint alone at constant speed in both directions: tracking error."""
     with Machine(job) as testbed:
         rms, ripple, chatter = [], [], []
         for name in ARM:
@@ -183,7 +183,7 @@ def ramps(job: Job) -> dict[str, Any]:
 
 
 def pick_up(job: Job) -> dict[str, Any]:
-    """A load is picked up while the boom rises, and stays on the hook."""
+    """Pick up a load while the boom rises; it stays on the hook."""
     load_kg = LOAD_KG[kind_of(job)]
     with Machine(job) as testbed:
         start = testbed.positions()
@@ -198,12 +198,12 @@ def pick_up(job: Job) -> dict[str, Any]:
 
 
 def stop(job: Job) -> dict[str, Any]:
-    """Ringing of the pin after a stop of boom and slew from high speed with full deceleration, with and without
-    pressure feedback.
+    """Measure the ringing of the pin after a stop of boom and slew from high speed with full deceleration, with and
+    without pressure feedback.
 
     Lateral ringing for the slew, vertical ringing for the boom.
     """
-    found: dict[str, Any] = {}
+    outcome: dict[str, Any] = {}
     for name, loaded, damped in product(STOPPED, (False, True), (True, False)):
         key = f"{name}_{'loaded' if loaded else 'empty'}_{'damped' if damped else 'plain'}"
         with Machine(_with(job, damped=damped)) as testbed:
@@ -212,26 +212,26 @@ def stop(job: Job) -> dict[str, Any]:
             start = testbed.positions()
             testbed.run(lambda _, at=start: (at, [0.0] * len(at)), 1.0)  # type: ignore[misc]
             both = [_stop(testbed, name, side) for side in (1, -1)]
-        found[f"{key}_ring_m"] = [ring_m for ring_m, _, _ in both]
-        found[f"{key}_ripple_bar"] = [ripple_bar for _, ripple_bar, _ in both]
+        outcome[f"{key}_ring_m"] = [ring_m for ring_m, _, _ in both]
+        outcome[f"{key}_ripple_bar"] = [ripple_bar for _, ripple_bar, _ in both]
         if job.options.get("trace") and loaded:
-            found.setdefault("trace", {})[key] = both[0][2]
-    return found
+            outcome.setdefault("trace", {})[key] = both[0][2]
+    return outcome
 
 
 def _stop(testbed: JointTestbed, name: str, side: int) -> tuple[float, float, list[Any]]:
-    """Ringing of the pin [m] and pressure ripple [bar] after a stop, and the curve: time after the stop, ringing."""
+    """Measure pin ringing [m] and pressure ripple [bar] after a stop, and the curve: time after the stop, ringing."""
     spec, pins = testbed.profile.joints[name], []
     ends_s = 1.5 * STOP_SHARE * spec.speed_limit / spec.acceleration_limit
     reference, over_s = motions.ramp(testbed.profile, testbed.positions(), name, side, STOP_SHARE, ends_s)
     trace = testbed.run(reference, over_s + STOP_S, lambda _: pins.append(testbed.world.crane.pose("hanger")[0]))
     t, pin = np.array(trace.time_s), np.array(pins)
-    out = pin[-1, :2] / np.linalg.norm(pin[-1, :2])
-    way = pin[:, 2] if name == "lift" else pin[:, :2] @ np.array((-out[1], out[0]))
-    when = (t >= over_s + RINGS_S[0]) & (t < over_s + RINGS_S[1])
-    fast = way - _slow(way, RINGING_S, t[1])
-    ripple_bar = _ripple_bar(trace, when, (NAMES.index(name),), RINGING_S)
-    return float(np.sqrt((fast[when] ** 2).mean())), ripple_bar, [(t - over_s).tolist(), fast.tolist()]
+    outward = pin[-1, :2] / np.linalg.norm(pin[-1, :2])
+    deflection_m = pin[:, 2] if name == "lift" else pin[:, :2] @ np.array((-outward[1], outward[0]))
+    ringing_rows = (t >= over_s + RINGS_S[0]) & (t < over_s + RINGS_S[1])
+    fast = deflection_m - _slow(deflection_m, RINGING_S, t[1])
+    ripple_bar = _ripple_bar(trace, ringing_rows, (NAMES.index(name),), RINGING_S)
+    return float(np.sqrt((fast[ringing_rows] ** 2).mean())), ripple_bar, [(t - over_s).tolist(), fast.tolist()]
 
 
 KINDS: Final[Mapping[str, Callable[[Job], dict[str, Any]]]] = {
@@ -255,7 +255,7 @@ def _with(job: Job, **options: Any) -> Job:
 def _tip_metrics(
     testbed: JointTestbed, trace: Trace, moved: tuple[tuple[float, float], ...], job: Job
 ) -> dict[str, Any]:
-    """Errors of the tip and metrics of the valves over the motions between the given times."""
+    """Compute the errors of the tip and metrics of the valves over the motions between the given times."""
     kinematics, t = testbed.profile.kinematics, np.array(trace.time_s)
     tip = np.array([pin_position(kinematics, q) for q in trace.position])
     goal = np.array([pin_position(kinematics, q) for q in trace.reference])
@@ -307,7 +307,7 @@ def _tip_metrics(
 
 
 def _slow(values: Any, over_s: float, period_s: float) -> Any:
-    """Moving average over a centred window, along the first axis."""
+    """Compute the moving average over a centred window, along the first axis."""
     n = round(0.5 * over_s / period_s)
     padded = np.concatenate((np.repeat(values[:1], n + 1, axis=0), values, np.repeat(values[-1:], n, axis=0)))
     summed = np.cumsum(padded, axis=0)
@@ -315,13 +315,13 @@ def _slow(values: Any, over_s: float, period_s: float) -> Any:
 
 
 def _chatter_pct_s(trace: Trace, when: Any) -> float:
-    """Travel of all spools of the arm per second [%/s]."""
+    """Compute the travel of all spools of the arm per second [%/s]."""
     spools = np.array(trace.spool_pct)[when, : len(ARM)]
     return float(np.abs(np.diff(spools, axis=0)).sum() / (when.sum() * trace.time_s[1]))
 
 
 def _ripple_bar(trace: Trace, when: Any, joints: Sequence[int] = range(len(ARM)), over_s: float = RIPPLE_S) -> float:
-    """RMS [bar] of the load pressures without their moving average; mean of the joints."""
+    """Compute the RMS [bar] of the load pressures without their moving average; mean of the joints."""
     pressures = np.array(trace.load_bar)[:, list(joints)]
     pressures = pressures[:, np.isfinite(pressures).all(axis=0)]
     fast = (pressures - _slow(pressures, over_s, trace.time_s[1]))[when]

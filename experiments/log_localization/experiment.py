@@ -48,8 +48,8 @@ def run(options: Options, console: Console) -> Result:
     masks = "network" if (SHIPPED / "logs_rgbd.onnx").exists() else "true"
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, name, truth, trials, masks)
-    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "log-localization trials", console)
+    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "log-localization trials", console)
         result = make_result(
             "log-localization",
             METRICS,
@@ -67,19 +67,21 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Log localization", CONCLUSION, INTRODUCTION, sections(result.environment["masks"]))
 
 
 def plan(options: Options, profile: str, truth: str, trials: int, masks: str) -> list[Job]:
-    """Every job of the run."""
-    first = FIRST_SEED + options.seed * SEEDS_PER_RUN
-    what = {"profile": profile, "truth": truth, "masks": masks}
+    """Plan every job of the run."""
+    first_seed = FIRST_SEED + options.seed * SEEDS_PER_RUN
+    job_options = {"profile": profile, "truth": truth, "masks": masks}
     jobs = [
-        Job(f"approach/{d}/{i}", "approach", first + i, what | {"degrees": float(d)})
+        Job(f"approach/{d}/{i}", "approach", first_seed + i, job_options | {"degrees": float(d)})
         for i in range(trials)
         for d in DEGREES
     ]
     curves = range(max(1, trials // TRIALS_PER_CURVE))
     angles = QUICK_ANGLES if options.quick else ANGLES
-    return jobs + [Job(f"curve/{a:g}/{i}", "curve", first + i, what | {"degrees": a}) for i in curves for a in angles]
+    return jobs + [
+        Job(f"curve/{a:g}/{i}", "curve", first_seed + i, job_options | {"degrees": a}) for i in curves for a in angles
+    ]

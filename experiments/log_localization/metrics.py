@@ -97,7 +97,7 @@ INTRODUCTION: Final = (
 
 
 def explanation() -> str:
-    """Why paper B's error grows with the angle, with the numbers of its set-up."""
+    """Explain why paper B's error grows with the angle, with the numbers of its set-up."""
     height, near, far, diameter, pitch = 2.4, 3.68, 5.68, 0.25, 0.5
     back, up = end_on_error_m(near, far, height, diameter, pitch)
     middle = 2.0 / (1.0 / near + 1.0 / far)
@@ -119,7 +119,7 @@ def explanation() -> str:
 
 
 def sections(masks: str) -> tuple[Section, ...]:
-    """Sections of the page; ``masks``: the source of the instance masks."""
+    """Make the sections of the page; ``masks``: the source of the instance masks."""
     source = {
         "true": "The masks are the renderer's own; paper B's pipeline gets their bounding boxes in whole pixels of its "
         "608 x 608 picture.",
@@ -159,7 +159,7 @@ def sections(masks: str) -> tuple[Section, ...]:
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
-    """Metrics of all approaches."""
+    """Compute the metrics of all approaches."""
     rows: dict[int, list[dict[str, Any]]] = {d: [] for d in DEGREES}
     for name, outcome in outcomes.items():
         kind, degrees, *_ = name.split("/")
@@ -174,12 +174,12 @@ def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
     for prefix, key in (("", ""), ("faithful.", "faithful_")):
         metrics[f"{prefix}p95_m"] = _quantile(every, f"{key}error_m", 0.95)
         metrics[f"{prefix}axis_median_deg"] = _median(every, f"{key}axis_deg")
-        for what in ("diameter", "length"):
-            metrics[f"{prefix}{what}_median_m"] = _median(every, f"{key}{what}_m")
+        for dimension in ("diameter", "length"):
+            metrics[f"{prefix}{dimension}_median_m"] = _median(every, f"{key}{dimension}_m")
     known = [row["nees"] for row in every if not math.isnan(row["nees"])]
     metrics["honesty"] = float(np.mean(known)) if known else math.nan
-    found = sum(not math.isnan(row["error_m"]) for row in every)
-    return metrics | rate("found", found, len(every))
+    located_count = sum(not math.isnan(row["error_m"]) for row in every)
+    return metrics | rate("found", located_count, len(every))
 
 
 def _median(rows: list[dict[str, Any]], key: str) -> float:
@@ -187,7 +187,7 @@ def _median(rows: list[dict[str, Any]], key: str) -> float:
 
 
 def _quantile(rows: list[dict[str, Any]], key: str, share: float) -> float:
-    """Quantile over all rows; a log that was not found counts as an infinite error of its position."""
+    """Compute the quantile over all rows; a log that was not found counts as an infinite error of its position."""
     values = [row[key] for row in rows]
     if key.endswith("error_m"):
         values = [math.inf if math.isnan(v) else v for v in values]

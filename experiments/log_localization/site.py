@@ -134,7 +134,7 @@ class Site:
         return scene
 
     def _front(self, x: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose (position, rotation) of the front frame on the ground with the camera above ``x``."""
+        """Compute the pose (position, rotation) of the front frame on the ground with the camera above ``x``."""
         c = self.profile.carrier
         assert c is not None
         at = x - self.camera.position_m[0]
@@ -149,7 +149,7 @@ class Site:
         return np.array([at, 0.0, z]), rpy_matrix((roll, pitch, 0.0))
 
     def shot(self, x: float, first: int = 0) -> Shot:
-        """The picture with the camera above ``x``; logs before number ``first`` are removed."""
+        """Take the picture with the camera above ``x``; logs before number ``first`` are removed."""
         at, turn = self._front(x)
         view = self._view(at, turn)
         if first not in self._renderers:
@@ -157,7 +157,7 @@ class Site:
         return Shot(self._renderers[first].render(view), view, at, turn)
 
     def estimated_pose(self, shot: Shot) -> Pose:
-        """Pose of the camera as the machine estimates it; the receiver has a new error in every frame."""
+        """Compute the pose of the camera as the machine estimates it; the receiver has a new error in every frame."""
         noise, _, up, attitude, phase = self._gnss
         measured = shot.at_m + self._wander + np.array([self._rng.gauss(0.0, noise * f) for f in (1.0, 1.0, up)])
         heading = math.sqrt(2.0) * phase / 1.8
@@ -172,7 +172,7 @@ class Site:
         )
 
     def frame(self, shot: Shot, stamp_ns: int) -> RgbdFrame:
-        """The frame that the surveyed camera delivers for a shot; every call has its own noise."""
+        """Make the frame that the surveyed camera delivers for a shot; every call has its own noise."""
         pin = intrinsics(self.camera)
         depth_m = self._noise.apply(shot.picture, pin, self._frames)
         self._frames += 1
@@ -180,7 +180,7 @@ class Site:
         return rescaled(raw, self.surveyed.depth_scale)
 
     def single(self, range_m: float) -> Shot:
-        """Log 1 from a camera at this range and an exactly known pose, mounted as on the machine."""
+        """Take a picture of log 1 from a camera at this range and an exactly known pose, mounted as on the machine."""
         log = self._lying[0]
         height = self.camera.position_m[2] + 0.8
         ahead = math.sqrt(max(0.3, range_m**2 - (height - 0.12) ** 2))
@@ -198,6 +198,6 @@ def _optical(at: np.ndarray, turn: np.ndarray, camera: Camera) -> Pose:
 
 
 def _quaternion(m: np.ndarray) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
+    """Compute the quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
     x, y, z, w = Rotation.from_matrix(m).as_quat()
     return (float(x), float(y), float(z), float(w))

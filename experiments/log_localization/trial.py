@@ -40,14 +40,14 @@ class TrueMask:
 
 
 def true_masks(frame: RgbdFrame, shot: Shot) -> list[TrueMask]:
-    """The masks of the renderer."""
+    """Return the masks of the renderer."""
     mask = shot.picture.mask
-    found = [TrueMask(mask == i) for i in np.unique(mask) if 0 < i < 1000]
-    return [m for m in found if np.count_nonzero(m.mask) >= MIN_MASK_PX]
+    masks = [TrueMask(mask == i) for i in np.unique(mask) if 0 < i < 1000]
+    return [m for m in masks if np.count_nonzero(m.mask) >= MIN_MASK_PX]
 
 
 def network_masks(frame: RgbdFrame, shot: Shot) -> Sequence[Masked]:
-    """The masks of the shipped network."""
+    """Compute the masks of the shipped network."""
     from autonomy.perception.segmentation.log_segmenter import segment
 
     return segment(frame)
@@ -94,18 +94,18 @@ def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
 
 
 def _near(frame: RgbdFrame, instances: Sequence[Masked]) -> list[Masked]:
-    """The instances within range."""
-    kept = []
-    for one in instances:
-        z = frame.depth_m[one.mask]
+    """Select the instances within range."""
+    near_instances = []
+    for instance in instances:
+        z = frame.depth_m[instance.mask]
         z = z[np.isfinite(z)]
         if len(z) and float(np.median(z)) < MAX_RANGE_M:
-            kept.append(one)
-    return kept
+            near_instances.append(instance)
+    return near_instances
 
 
 def detected(frame: RgbdFrame, mask: np.ndarray) -> Box:
-    """The box of a perfect detector: whole pixels of its letterbox, in pixels of the frame."""
+    """Compute the box of a perfect detector: whole pixels of its letterbox, in pixels of the frame."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     letterbox = frame.intrinsics.letterbox(DETECTOR_PX)
     scale = letterbox.inner.width_px / frame.intrinsics.width_px
@@ -116,7 +116,7 @@ def detected(frame: RgbdFrame, mask: np.ndarray) -> Box:
 
 
 def _mask_of(log: Shape, number: int, shot: Shot, instances: Sequence[Masked]) -> np.ndarray | None:
-    """The mask with most pixels of a log; None without one."""
+    """Find the mask with most pixels of a log; None without one."""
     truth = shot.picture.mask == log.pose.instance
     shares = [np.count_nonzero(truth & i.mask) for i in instances]
     return instances[int(np.argmax(shares))].mask if shares and max(shares) > 0 else None
@@ -131,7 +131,7 @@ def _log_errors(
     pose: Pose,
     mask: np.ndarray | None,
 ) -> dict[str, Any]:
-    """Errors of one log; NaN if it was not found."""
+    """Compute the errors of one log; NaN if it was not found."""
     out: dict[str, Any] = dict.fromkeys(
         (
             "error_m",
@@ -172,7 +172,7 @@ def _log_errors(
 
 
 def _curve(site: Site, segment: Segmenter) -> dict[str, Any]:
-    """Errors of single frames at each of ``RANGES_M``, by our and by the paper's pipeline."""
+    """Measure the errors of single frames at each of ``RANGES_M``, by our and by the paper's pipeline."""
     perception, log = Perception(site.profile), site.logs[0]
     ours, faithful = [], []
     for range_m in RANGES_M:

@@ -55,11 +55,11 @@ class CarrierCase:
     latency_s: float = 0.0
 
     def __str__(self) -> str:
-        words = [f"delay {1e3 * self.delay_s:.0f} ms, gain x{self.gain:.2f}"]
+        parts = [f"delay {1e3 * self.delay_s:.0f} ms, gain x{self.gain:.2f}"]
         if self.speed_m_s:
             far = "far" if math.isinf(self.distance_m) else f"{self.distance_m:.0f} m away"
-            words = [f"{self.speed_m_s:.2f} m/s, waypoint {far}, latency {1e3 * self.latency_s:.0f} ms", *words]
-        return ", ".join(words)
+            parts = [f"{self.speed_m_s:.2f} m/s, waypoint {far}, latency {1e3 * self.latency_s:.0f} ms", *parts]
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +67,17 @@ class Swing:
     """Replaces a joint's mechanics by one mode (`experiments.loop_design.mechanics.Mechanics`)."""
 
     def response(self, s: Array) -> Array:
-        """Angle over metered travel."""
+        """Compute the angle over metered travel."""
         w = SWING_RAD_S
         return w * w / (s * s + 2.0 * SWING_ZETA * w * s + w * w)
 
     def oil(self, s: Array) -> Array:
-        """Zero: no sensor measures this pressure."""
+        """Return zero: no sensor measures this pressure."""
         return 0.0 * s
 
 
 def studies(profile: Profile, work: CaseSet) -> list[JointStudy]:
-    """All loops of the carrier with the gains of the profile; none for a machine without a carrier."""
+    """Study all loops of the carrier with the gains of the profile; none for a machine without a carrier."""
     carrier = profile.carrier
     if carrier is None:
         return []
@@ -86,7 +86,7 @@ def studies(profile: Profile, work: CaseSet) -> list[JointStudy]:
 
 
 def natural(carrier: Carrier, speed_m_s: float) -> tuple[float, float]:
-    """(natural frequency [rad/s], damping ratio) of the heading loop without valve and receiver."""
+    """Compute (natural frequency [rad/s], damping ratio) of the heading loop without valve and receiver."""
     base = carrier.front_axle_m + carrier.rear_axle_m
     w = math.sqrt(carrier.heading_kp_1_s * speed_m_s / base)
     return w, 0.5 * carrier.heading_kp_1_s * carrier.rear_axle_m / (base * w)
@@ -97,7 +97,7 @@ def _hold(s: Array, period_s: float) -> Array:
 
 
 def heading_loop(carrier: Carrier, spool: Spool, case: CarrierCase) -> Array:
-    """Open-loop response of paper B's law, cut at the commanded articulation rate."""
+    """Compute the open-loop response of paper B's law, cut at the commanded articulation rate."""
     s, v = 1j * FREQUENCY_RAD_S, case.speed_m_s
     base = carrier.front_axle_m + carrier.rear_axle_m
     bends = _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) * Swing().response(s)
@@ -108,7 +108,7 @@ def heading_loop(carrier: Carrier, spool: Spool, case: CarrierCase) -> Array:
 
 
 def arm_loop(carrier: Carrier, spool: Spool) -> Array:
-    """Open-loop response of the height of one arm, cut at the commanded speed."""
+    """Compute the open-loop response of the height of one arm, cut at the commanded speed."""
     s = 1j * FREQUENCY_RAD_S
     measured = _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S)
     loop: Array = carrier.arm_kp_1_s * _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) / s * measured
@@ -116,7 +116,7 @@ def arm_loop(carrier: Carrier, spool: Spool) -> Array:
 
 
 def angle_spec(carrier: Carrier) -> JointSpec:
-    """The articulation and its law as a joint specification."""
+    """Describe the articulation and its law as a joint specification."""
     valve, rate = carrier.steer_valve, carrier.articulation_rate_limit_rad_s
     reaction_s = valve.delay_s + carrier.articulation_lag_s
     same = Valve(

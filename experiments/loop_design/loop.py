@@ -47,7 +47,7 @@ class Spool:
     zeta: float
 
     def response(self, s: Array) -> Array:
-        """Metered speed over commanded speed."""
+        """Compute the metered speed over commanded speed."""
         w = self.rad_s
         lag = w * w / (s * s + 2.0 * self.zeta * w * s + w * w)
         return self.gain * np.exp(-s * self.delay_s) * lag
@@ -57,11 +57,11 @@ class LawResponse:
     """Response of one joint's controller: velocity command over position and load pressure, without their sign."""
 
     def __init__(self, spec: JointSpec, period_s: float, lead_s: float, amplitude: float = 1.0) -> None:
-        """``lead_s``: time of SYNC before the tick; ``amplitude``: error over the layer, for super-twisting."""
+        """Take ``lead_s``, SYNC's time before the tick, and ``amplitude``, error over the layer, for super-twisting."""
         self._spec, self._period_s, self._lead_s, self._amplitude = spec, period_s, lead_s, amplitude
 
     def response(self, s: Array) -> tuple[Array, Array]:
-        """(command over measured position [1/s], command over load pressure [unit/s per bar]) at the tick."""
+        """Compute (command over measured position [1/s], command over load pressure [unit/s per bar]) at the tick."""
         spec, t = self._spec, self._period_s
         law, back = spec.law, np.exp(-s * t)
         position, velocity = self._estimate(s, back)
@@ -78,7 +78,7 @@ class LawResponse:
         return (feedback * position + rate * velocity) / predicted, to_load / predicted
 
     def _estimate(self, s: Array, back: Array) -> tuple[Array, Array]:
-        """Estimated position and velocity over the position at SYNC."""
+        """Compute the estimated position and velocity over the position at SYNC."""
         spec, t, age = self._spec, self._period_s, self._lead_s
         assert spec.encoder is not None
         alpha, beta = steady_gains(t, acceleration_density(spec), measurement_variance(spec.encoder))
@@ -88,7 +88,7 @@ class LawResponse:
         return position * innovation, velocity * innovation
 
     def _feedback(self, summed: Array) -> tuple[Array, float]:
-        """Gain on the predicted error over frequency [1/s], and on the error rate."""
+        """Compute the gain on the predicted error over frequency [1/s], and on the error rate."""
         law = self._spec.law
         kp = law.kp_1_s
         if law.kind == "pd":
@@ -106,7 +106,7 @@ class LawResponse:
 def open_loop(
     s: Array, spec: JointSpec, law: LawResponse, mechanics: Mechanics, spool: Spool, period_s: float
 ) -> Array:
-    """Response of the loop with negative feedback, cut at the velocity command."""
+    """Compute the response of the loop with negative feedback, cut at the velocity command."""
     hold = (1.0 - np.exp(-s * period_s)) / (s * period_s)
     travel = hold * np.exp(-s * TRANSPORT_S) * spool.response(s) / s
     moved = mechanics.response(s)
@@ -129,7 +129,8 @@ class Margins:
 
 
 def margins(frequency_rad_s: Array, loop: Array, integrators: int = 1) -> Margins:
-    """Least margins of a loop that starts with this number of integrators, from its response on a fine grid.
+    """Compute the least margins of a loop that starts with this number of integrators, from its response on a fine
+    grid.
 
     Every crossing of the unit circle and of the negative real axis counts.  An encirclement appears as a negative
     margin.  Where the phase returns over the axis with a gain above 1, the margin is towards less gain.
@@ -154,7 +155,7 @@ def margins(frequency_rad_s: Array, loop: Array, integrators: int = 1) -> Margin
 
 
 def _crossings(x: Array, y: Array, other: Array) -> tuple[Array, Array]:
-    """Zero crossings of ``y``: ``x`` and ``other`` there, by linear interpolation."""
+    """Find the zero crossings of ``y``: ``x`` and ``other`` there, by linear interpolation."""
     i = np.nonzero(np.signbit(y[:-1]) != np.signbit(y[1:]))[0]
     share = y[i] / (y[i] - y[i + 1])
     return x[i] + share * (x[i + 1] - x[i]), other[i] + share * (other[i + 1] - other[i])

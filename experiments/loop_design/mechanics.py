@@ -49,7 +49,7 @@ class Chamber:
     wait_s: float
 
     def impedance(self, s: Array, relaxation_1_s: float) -> Array:
-        """Force over travel; part of the oil flows through the damping orifice into the hose."""
+        """Compute the force over travel; part of the oil flows through the damping orifice into the hose."""
         soft = 1.0 + relaxation_1_s * STEADY_S / (1.0 + s * STEADY_S)
         off = self.decay_1_s * (s * self.wait_s / (1.0 + s * self.wait_s) if self.wait_s else 1.0)
         return self.spring * s / (s * soft + off)
@@ -80,12 +80,12 @@ class Mechanics:
     column_damping_s: float
 
     def oil(self, s: Array) -> Array:
-        """Force of the oil over the lag of the joint behind the metered oil."""
+        """Compute the force of the oil over the lag of the joint behind the metered oil."""
         r = self.relaxation_1_s
         return self.filling.impedance(s, r) + self.emptying.impedance(s, r)
 
     def response(self, s: Array) -> Array:
-        """Joint position over metered travel at the complex frequencies ``s``."""
+        """Compute the joint position over metered travel at the complex frequencies ``s``."""
         oil, w, z = self.oil(s), self.pendulum_rad_s, self.pendulum_zeta
         swing = 1.0 - self.pendulum_free * s * s / (s * s + 2.0 * z * w * s + w * w)
         column = self.column_inertia * s * s + self.column_spring * (1.0 + self.column_damping_s * s)
@@ -114,12 +114,12 @@ def mechanics(world: World, name: str, load_kg: float = 0.0, direction: int = 1,
         inertia += load_kg * LOG_GYRATION_M**2
         shared = 0.0
     else:
-        way = axis if slides else np.cross(axis, pin - at)
-        give = np.cross(bends, pin - foot)
-        inertia += hanging * float(way[2] ** 2)
-        column += hanging * float(give[2] ** 2)
-        shared += hanging * float(way[2] * give[2])
-        swinging = hanging * float(way[0] ** 2 + way[1] ** 2)
+        pin_jacobian = axis if slides else np.cross(axis, pin - at)
+        flex_jacobian = np.cross(bends, pin - foot)
+        inertia += hanging * float(pin_jacobian[2] ** 2)
+        column += hanging * float(flex_jacobian[2] ** 2)
+        shared += hanging * float(pin_jacobian[2] * flex_jacobian[2])
+        swinging = hanging * float(pin_jacobian[0] ** 2 + pin_jacobian[1] ** 2)
     structure = world.truth.structure
     stiff = structure.flex_roll_nm_rad if name == "slew" else structure.flex_pitch_nm_rad
     zeta = structure.fork_damping_nm_s_rad / (2.0 * about * pendulum)
@@ -143,7 +143,7 @@ def mechanics(world: World, name: str, load_kg: float = 0.0, direction: int = 1,
 
 
 def _pendulum(world: World, load_kg: float) -> tuple[float, float]:
-    """Mass times depth [kg m] and inertia [kg m^2] of all hanging parts about the fork's hinge."""
+    """Compute the mass times depth [kg m] and inertia [kg m^2] of all hanging parts about the fork's hinge."""
     hinge = _axis(world, "fork")
     moment = sum(_mass(world, link) * float(hinge[0][2] - _centre(world, link)[2]) for link in HANGING)
     depth = float(hinge[0][2] - world.crane.pose("rotator")[0][2]) + LOG_BELOW_ROTATOR_M
@@ -152,7 +152,7 @@ def _pendulum(world: World, load_kg: float) -> tuple[float, float]:
 
 
 def _chambers(world: World, name: str, direction: int, opening: float) -> tuple[float, Chamber, Chamber]:
-    """Lever arm [m], and the chambers that fill and empty in this direction."""
+    """Compute the lever arm [m], and the chambers that fill and empty in this direction."""
     supply, function, q = world.truth.supply, world.truth.functions[name], world.q[name]
     c, valve = function.cylinder, function.valve
     grid = np.linspace(c.arm_at[0], c.arm_at[-1], 257)
@@ -182,10 +182,10 @@ Hinge = tuple[Array, Array, bool]
 
 
 def _axis(world: World, name: str) -> Hinge:
-    """Origin and direction of a joint in the world frame, and whether it is prismatic."""
+    """Return origin and direction of a joint in the world frame, and whether it is prismatic."""
     joint = next(j for j in crane_links(world.profile, world.truth)[1] if j.name == name)
-    place, turn = world.crane.pose(joint.child)
-    return np.array(place), _turned(world, turn) @ np.array(joint.axis), joint.kind == "prismatic"
+    origin, turn = world.crane.pose(joint.child)
+    return np.array(origin), _turned(world, turn) @ np.array(joint.axis), joint.kind == "prismatic"
 
 
 def _turned(world: World, quaternion: Any) -> Array:
@@ -202,15 +202,19 @@ def _centre(world: World, link: str) -> Array:
 
 
 def _product(world: World, links: tuple[str, ...], one: Hinge, other: Hinge) -> float:
-    """Coupling inertia of two hinges in the masses of ``links``; for one hinge twice, its moment of inertia."""
+    """Compute the coupling inertia of two hinges in the masses of ``links``; for one hinge twice, its moment of
+    inertia.
+    """
     total = 0.0
     for link in links:
         index = world.crane.link[link]
         state = world.client.getLinkState(world.crane.body, index, computeForwardKinematics=1)
-        place, own = np.array(state[0]), _turned(world, state[1]).T
+        center, own = np.array(state[0]), _turned(world, state[1]).T
         about = np.array(world.client.getDynamicsInfo(world.crane.body, index)[2])
-        way_one, way_other = (axis if slides else np.cross(axis, place - at) for at, axis, slides in (one, other))
-        total += _mass(world, link) * float(way_one @ way_other)
+        jacobian_one, jacobian_other = (
+            axis if slides else np.cross(axis, center - at) for at, axis, slides in (one, other)
+        )
+        total += _mass(world, link) * float(jacobian_one @ jacobian_other)
         if not (one[2] or other[2]):
             total += float(about @ ((own @ one[1]) * (own @ other[1])))
     return total

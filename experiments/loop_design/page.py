@@ -66,7 +66,7 @@ HOW: Final = (
 
 
 def with_law(profile: Profile, kind: str) -> Profile:
-    """The profile with another law on every joint."""
+    """Give every joint of the profile another law."""
     joints = {
         name: msgspec.structs.replace(spec, law=msgspec.structs.replace(spec.law, kind=kind))
         for name, spec in profile.joints.items()
@@ -75,7 +75,7 @@ def with_law(profile: Profile, kind: str) -> Profile:
 
 
 def undamped(profile: Profile) -> Profile:
-    """The profile without pressure feedback."""
+    """Remove the pressure feedback from the profile."""
     joints = {
         name: msgspec.structs.replace(spec, law=msgspec.structs.replace(spec.law, damping_per_bar=0.0))
         for name, spec in profile.joints.items()
@@ -94,10 +94,10 @@ def write(machines: Sequence[tuple[Profile, list[JointStudy], CaseSet]], docs: P
     for profile, studies, cases in machines:
         laws = {kind: study(with_law(profile, kind), cases) for kind in LAWS}
         laws["undamped"] = study(undamped(profile), cases)
-        found = {kind: {joint.name: joint.document() for joint in studied} for kind, studied in laws.items()}
+        joint_documents = {kind: {joint.name: joint.document() for joint in studied} for kind, studied in laws.items()}
         if loops := {s.name: s.document() for s in studies if s.name not in profile.joints}:
-            found["carrier"] = loops
-        document["machines"][profile.name] = found
+            joint_documents["carrier"] = loops
+        document["machines"][profile.name] = joint_documents
         draw(profile.name, studies, docs / "results" / "loop-design")
     document["reached"] = all(loop["holds"] for _, _, loop in _with_limits(document))
     (docs / "results").mkdir(parents=True, exist_ok=True)
@@ -119,7 +119,7 @@ def rewrite(docs: Path) -> Path:
 
 
 def markdown(document: Mapping[str, Any], profiles: Sequence[Profile]) -> str:
-    """The page from the saved numbers."""
+    """Write the page from the saved numbers."""
     needed = document["needed"]
     plots = {
         profile.name: [_plot(profile.name, name) for name in (*_own(document, profile), *_carrier(document, profile))]
@@ -156,18 +156,18 @@ def markdown(document: Mapping[str, Any], profiles: Sequence[Profile]) -> str:
 
 
 def _own(document: Mapping[str, Any], profile: Profile) -> dict[str, Any]:
-    """Joints of a machine with the law of its profile."""
+    """List the joints of a machine with the law of its profile."""
     laws = document["machines"][profile.name]
     return {name: laws[joint["law"]][name] for name, joint in laws["undamped"].items()}
 
 
 def _carrier(document: Mapping[str, Any], profile: Profile) -> dict[str, Any]:
-    found: dict[str, Any] = document["machines"][profile.name].get("carrier", {})
-    return found
+    loops: dict[str, Any] = document["machines"][profile.name].get("carrier", {})
+    return loops
 
 
 def _with_limits(document: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Machine, joint and numbers of every loop whose margins have limits."""
+    """Yield machine, joint and numbers of every loop whose margins have limits."""
     for machine, laws in document["machines"].items():
         for kind, joints in laws.items():
             if kind != "undamped":
@@ -192,7 +192,7 @@ def _plot(machine: str, name: str) -> str:
 
 
 def _table(joints: Mapping[str, Any], law: str = "") -> list[str]:
-    """Rows of the loops; ``law``: its name, if not that of the saved one."""
+    """Write the rows of the loops; ``law``: its name, if not that of the saved one."""
     lines = [
         "| joint | law | kp [1/s] | phase [deg] | gain [dB] | bandwidth [Hz] | worst machine | |",
         "|---|---|---|---|---|---|---|---|",
@@ -230,7 +230,7 @@ def _laws(laws: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def plot_name(machine: str, loop: str) -> str:
-    """File name of the plot of a loop."""
+    """Return the file name of the plot of a loop."""
     return f"{machine}-{loop.replace(' ', '-')}.png"
 
 

@@ -114,7 +114,7 @@ class JointStudy:
         return float(FREQUENCY_RAD_S[np.argmax(closed < math.sqrt(0.5))] / (2.0 * math.pi))
 
     def document(self) -> dict[str, Any]:
-        """Numbers for the page; python-control computes the margins of the worst loop again."""
+        """Return the numbers for the page; python-control computes the margins of the worst loop again."""
         frd = control.FrequencyResponseData(self.worst_loop, FREQUENCY_RAD_S)
         gain, phase, *_ = control.stability_margins(frd)
         return {
@@ -144,7 +144,7 @@ def case_set(source: str, truth: str = "nominal") -> CaseSet:
     """
     profile = profile_named(source)
     load_kg = RATED_KG.get(profile.name, ANY_KG)
-    places: dict[str, list[tuple[Case, Mechanics]]] = {}
+    cases_by_joint: dict[str, list[tuple[Case, Mechanics]]] = {}
     for pose, share in REACH_SHARES.items():
         home = home_at(source, share * max_reach_m(profile), HEIGHT_M)
         with trial_world(source, truth, 0, home=home) as world:
@@ -153,13 +153,13 @@ def case_set(source: str, truth: str = "nominal") -> CaseSet:
                 n: Spool(f.valve.delay_s, 1.0, f.valve.spool_rad_s, f.valve.spool_zeta)
                 for n, f in world.truth.functions.items()
             }
-            for name, kg, way, opening in product(profile.joints, (0.0, load_kg), (1, -1), OPENINGS):
+            for name, kg, direction, opening in product(profile.joints, (0.0, load_kg), (1, -1), OPENINGS):
                 if profile.joints[name].encoder is not None:
-                    case = Case(pose, kg, way, opening, valves[name].delay_s, 1.0, 1.0)
-                    places.setdefault(name, []).append((case, mechanics(world, name, kg, way, opening)))
+                    case = Case(pose, kg, direction, opening, valves[name].delay_s, 1.0, 1.0)
+                    cases_by_joint.setdefault(name, []).append((case, mechanics(world, name, kg, direction, opening)))
     delays = np.linspace(spread.delay_min_s, spread.delay_max_s, DELAYS)
     gains = np.linspace(1.0 - spread.gain, 1.0 + spread.gain, GAINS)
-    return CaseSet(places, valves, tuple(delays.tolist()), tuple(gains.tolist()))
+    return CaseSet(cases_by_joint, valves, tuple(delays.tolist()), tuple(gains.tolist()))
 
 
 def study(profile: Profile, work: CaseSet) -> list[JointStudy]:

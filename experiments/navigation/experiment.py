@@ -53,8 +53,8 @@ def run(options: Options, console: Console) -> Result:
     trials = 1 if options.quick else options.trials or TRIALS
     points = list(CORNERS[:2]) if options.quick else list(CORNERS) * LAPS
     jobs = plan(options, name, truth, trials, points)
-    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "navigation drives", console)
+    with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "navigation drives", console)
         result = make_result(
             "navigation",
             METRICS,
@@ -71,27 +71,27 @@ def run(options: Options, console: Console) -> Result:
 
 
 def failed(trial: Trial) -> bool:
-    """Whether a drive did not arrive, or somebody had to arm again: a campaign keeps its recording."""
+    """Tell whether a drive did not arrive, or somebody had to arm again: a campaign keeps its recording."""
     return not trial.outcome["arrived"] or trial.outcome["stops"] > 0
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Navigation", CONCLUSION, INTRODUCTION, SECTIONS)
 
 
 def plan(options: Options, profile: str, truth: str, trials: int, points: list[tuple[float, float]]) -> list[Job]:
-    """Every drive, named METHOD/GROUND/TRIAL/START; both methods and all grounds use the same individuals."""
-    first = FIRST_SEED + options.seed * SEEDS_PER_RUN
+    """Plan every drive, named METHOD/GROUND/TRIAL/START; both methods and all grounds use the same individuals."""
+    first_seed = FIRST_SEED + options.seed * SEEDS_PER_RUN
     grounds = ("mud",) if options.quick else tuple(GROUNDS)
     starts = (QUICK_START,) if options.quick else STARTS
-    what = {"profile": profile, "truth": truth, "points": [list(p) for p in points]}
+    job_options = {"profile": profile, "truth": truth, "points": [list(p) for p in points]}
     return [
         Job(
             f"{method}/{ground}/{trial}/{k}",
             method,
-            first + trial,
-            what | {"way": method, "terrain": ground, "pose": list(_pose(start))},
+            first_seed + trial,
+            job_options | {"way": method, "terrain": ground, "pose": list(_pose(start))},
         )
         for trial in range(trials)
         for ground in grounds

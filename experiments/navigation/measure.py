@@ -49,7 +49,7 @@ class Drive:
 
 
 def heading_error(drive: Drive, points: Sequence[Point2]) -> Array:
-    """Bearing to the waypoint less heading [rad], as paper B's Fig. 14 (n,)."""
+    """Compute the bearing to the waypoint less heading [rad], as paper B's Fig. 14 (n,)."""
     goals = np.array(points)[drive["goal"].astype(int)]
     bearing = np.arctan2(goals[:, 1] - drive["y_m"], goals[:, 0] - drive["x_m"])
     error: Array = np.remainder(bearing - drive["yaw_rad"] + math.pi, 2.0 * math.pi) - math.pi
@@ -57,29 +57,31 @@ def heading_error(drive: Drive, points: Sequence[Point2]) -> Array:
 
 
 def after_first_corner(drive: Drive, points: Sequence[Point2]) -> int:
-    """Row at which a drive by paper B's law has turned to the second waypoint; the number of rows if it never does."""
+    """Find the row at which a drive by paper B's law has turned to the second waypoint; the row count if never."""
     error = np.abs(heading_error(drive, points))
     return int(np.argmax(np.append((drive["goal"] >= 1) & (error < SETTLED_RAD), True)))
 
 
 def last_lap(drive: Drive, points: Sequence[Point2], lap: int) -> Array:
-    """Positions (n, 2) from the switch after the last waypoint but ``lap`` to the end; ``lap`` waypoints make a lap."""
+    """Return the positions (n, 2) from the switch after the last waypoint but ``lap`` to the end; ``lap`` waypoints
+    make a lap.
+    """
     rows = drive["goal"] >= len(points) - lap
     return np.column_stack([drive["x_m"], drive["y_m"]])[rows]
 
 
 def common_path(laps: Sequence[Array]) -> Array:
-    """The mean (``SAMPLE_COUNT``, 2) of laps, each at equal shares of its length."""
+    """Compute the mean (``SAMPLE_COUNT``, 2) of laps, each at equal shares of its length."""
     out = np.zeros((SAMPLE_COUNT, 2))
     for lap in laps:
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lap, axis=0).T))])
-        share = np.linspace(0.0, way[-1], SAMPLE_COUNT)
-        out += np.column_stack([np.interp(share, way, lap[:, k]) for k in (0, 1)]) / len(laps)
+        travel_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lap, axis=0).T))])
+        share = np.linspace(0.0, travel_m[-1], SAMPLE_COUNT)
+        out += np.column_stack([np.interp(share, travel_m, lap[:, k]) for k in (0, 1)]) / len(laps)
     return out
 
 
 def distances(xy: Array, line: Array) -> Array:
-    """From each point (n, 2) to the nearest of the line's segments (m, 2) [m]."""
+    """Compute the distance from each point (n, 2) to the nearest of the line's segments (m, 2) [m]."""
     start, leg = line[:-1], np.diff(line, axis=0)
     square = np.maximum(np.einsum("ij,ij->i", leg, leg), 1e-12)
     out = np.empty(len(xy))
@@ -91,7 +93,7 @@ def distances(xy: Array, line: Array) -> Array:
 
 
 def convergence_errors(drives: Sequence[Drive], points: Sequence[Point2], lap: int) -> list[tuple[Array, Array]]:
-    """For each start: distance from the common path after the first corner, before the last lap and on it."""
+    """Compute for each start the distance from the common path after the first corner, before and on the last lap."""
     line = common_path([last_lap(d, points, lap) for d in drives])
     out = []
     for drive in drives:
@@ -103,13 +105,13 @@ def convergence_errors(drives: Sequence[Drive], points: Sequence[Point2], lap: i
 
 
 def planned(drive: Drive, points: Sequence[Point2], carrier: Carrier) -> Path:
-    """The path that the machine planned, from its estimated start."""
+    """Compute the path that the machine planned, from its estimated start."""
     x, y, yaw = drive.outcome["begin"]
     return joining_path((x, y), yaw, points, carrier)
 
 
 def lateral(drive: Drive, path: Path) -> tuple[Array, Array]:
-    """Distance along the path and from it (+ left) [m] of every row."""
+    """Compute the distance along the path and from it (+ left) [m] of every row."""
     ways, offs = np.empty(len(drive)), np.empty(len(drive))
     s: float | None = None
     for i, (x, y) in enumerate(zip(drive["x_m"], drive["y_m"], strict=True)):
@@ -142,10 +144,10 @@ def turn_rates(drive: Drive) -> tuple[list[float], list[float]]:
         rows = np.flatnonzero(goal == k)
         if len(rows) < 3:
             continue
-        turned, way = np.abs(yaw[rows] - yaw[rows[0]]), drive.distance_m[rows]
+        turned, travel_m = np.abs(yaw[rows] - yaw[rows[0]]), drive.distance_m[rows]
         if turned[-1] < MIN_TURN_RAD:
             continue
-        a, b = (way[int(np.argmax(turned >= share * turned[-1]))] for share in TURNED)
+        a, b = (travel_m[int(np.argmax(turned >= share * turned[-1]))] for share in TURNED)
         rates.append(math.degrees((TURNED[1] - TURNED[0]) * turned[-1]) / (b - a))
         full = np.flatnonzero(np.abs(drive["bend_rad"][rows]) > 0.98 * limit)
         if len(full) > 3:
@@ -155,6 +157,6 @@ def turn_rates(drive: Drive) -> tuple[list[float], list[float]]:
 
 
 def located(drive: Drive) -> Array:
-    """Error of the estimated position [m]."""
+    """Compute the error of the estimated position [m]."""
     error: Array = np.hypot(drive["seen_x_m"] - drive["x_m"], drive["seen_y_m"] - drive["y_m"])
     return error

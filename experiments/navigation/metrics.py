@@ -153,26 +153,26 @@ INTRODUCTION: Final = (
 
 
 def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carrier, lap: int = LAP) -> dict[str, float]:
-    """Metrics of all drives; outcomes are named METHOD/GROUND/TRIAL/START."""
+    """Compute the metrics of all drives; outcomes are named METHOD/GROUND/TRIAL/START."""
     groups: dict[tuple[str, str, str], list[Drive]] = {}
     for name, outcome in outcomes.items():
-        way, ground, trial, _ = name.split("/")
-        groups.setdefault((way, ground, trial), []).append(Drive(outcome))
+        method, ground, trial, _ = name.split("/")
+        groups.setdefault((method, ground, trial), []).append(Drive(outcome))
     ours: dict[str, list[np.ndarray]] = {}
     common: dict[str, list[np.ndarray]] = {}
     coming: list[np.ndarray] = []
-    own, stops, rates, fulls, off, claimed = [], [], [], [], [], []
-    for (way, ground, _), drives in groups.items():
+    own, stops, rates, fulls, location_errors_m, claimed = [], [], [], [], [], []
+    for (method, ground, _), drives in groups.items():
         good = [d for d in drives if d.outcome["arrived"]]
         for drive in drives:
             error = measure.located(drive)
-            off.append(error)
+            location_errors_m.append(error)
             claimed.append(error / drive["sigma_m"])
-        if way == "ours":
+        if method == "ours":
             for drive in good:
                 path = measure.planned(drive, points, carrier)
-                ways, lateral = measure.lateral(drive, path)
-                after = ways > measure.corner_end_m(path, points[0])
+                distances_m, lateral = measure.lateral(drive, path)
+                after = distances_m > measure.corner_end_m(path, points[0])
                 ours.setdefault(ground, []).append(np.abs(lateral[after]))
                 own.append(np.abs(drive["off_m"][after]))
                 x, y = drive.outcome["rest_m"]
@@ -192,7 +192,7 @@ def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carri
     for name, parts in (
         ("lateral_p95_m", every),
         ("own_p95_m", own),
-        ("located_p95_m", off),
+        ("located_p95_m", location_errors_m),
         ("faithful.lateral_p95_m", final),
         ("faithful.coming_p95_m", coming),
     ):

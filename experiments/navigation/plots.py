@@ -26,10 +26,10 @@ def draw(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carrier
     """Write all plots of the first trial; those of one ground show the first ground driven."""
     grounds = [g for g in GROUNDS if any(name.split("/")[1:3] == [g, "0"] for name in outcomes)]
     drives = {
-        (way, ground): [
-            Drive(o) for name, o in outcomes.items() if name.split("/")[:3] == [way, ground, "0"] and o["rows"]
+        (method, ground): [
+            Drive(o) for name, o in outcomes.items() if name.split("/")[:3] == [method, ground, "0"] and o["rows"]
         ]
-        for way in ("faithful", "ours")
+        for method in ("faithful", "ours")
         for ground in grounds
     }
     faithful, ours = drives["faithful", grounds[0]], drives["ours", grounds[0]]
@@ -103,13 +103,13 @@ def _steering(faithful: Sequence[Drive], ours: Sequence[Drive], carrier: Carrier
 
 def _lateral(drives: Mapping[str, Sequence[Drive]], points: Sequence[Point2], carrier: Carrier, path: Path) -> None:
     with sheet(path, len(drives), width=9.5, height=2.8) as axes:
-        for axis, (ground, some) in zip(np.atleast_1d(axes), drives.items(), strict=True):
-            for i, drive in enumerate(some):
-                way = measure.planned(drive, points, carrier)
-                ways, off = measure.lateral(drive, way)
-                after = ways > measure.corner_end_m(way, points[0])
-                begin = ways[int(np.argmax(after))]
-                axis.plot(ways[after] - begin, CM * off[after], color=COLOURS[i % len(COLOURS)], lw=0.8)
+        for axis, (ground, ground_drives) in zip(np.atleast_1d(axes), drives.items(), strict=True):
+            for i, drive in enumerate(ground_drives):
+                planned_path = measure.planned(drive, points, carrier)
+                distances_m, offsets_m = measure.lateral(drive, planned_path)
+                after = distances_m > measure.corner_end_m(planned_path, points[0])
+                begin = distances_m[int(np.argmax(after))]
+                axis.plot(distances_m[after] - begin, CM * offsets_m[after], color=COLOURS[i % len(COLOURS)], lw=0.8)
             axis.set(title=GROUNDS[ground], xlabel="distance after the first bend [m]", ylim=(-12, 12))
             limit_band(axis, -LIMIT_CM, LIMIT_CM)
         np.atleast_1d(axes)[0].set_ylabel("off the path, + left [cm]")

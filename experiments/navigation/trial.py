@@ -84,7 +84,7 @@ class NavigationPlanner:
         self._fresh = report
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """The setpoint to send now."""
+        """Return the setpoint to send now."""
         vehicle, self._fresh = self._fresh, None
         if report is not None:
             self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)
@@ -104,12 +104,12 @@ class NavigationPlanner:
         return self.navigator.phase in (Phase.ARRIVED, Phase.STOPPED)
 
     def _begin(self, location: Location) -> PathDrive | WaypointDrive:
-        here = (location.x_m, location.y_m)
-        self.begin = (*here, location.yaw_rad)
+        position = (location.x_m, location.y_m)
+        self.begin = (*position, location.yaw_rad)
         if self._kind == "faithful":
-            places = [self._plane.geodetic(*point)[:2] for point in self._points]
-            return WaypointDrive(self._carrier, [Waypoint(*place) for place in places])
-        return PathDrive(self._carrier, joining_path(here, location.yaw_rad, self._points, self._carrier))
+            geodetic_points = [self._plane.geodetic(*point)[:2] for point in self._points]
+            return WaypointDrive(self._carrier, [Waypoint(*geodetic_point) for geodetic_point in geodetic_points])
+        return PathDrive(self._carrier, joining_path(position, location.yaw_rad, self._points, self._carrier))
 
     def _keep(self, now_ns: int, location: Location) -> None:
         self._count += 1
@@ -120,7 +120,7 @@ class NavigationPlanner:
         steer = self.way.steer if isinstance(self.way, PathDrive) else None
         goal = self.way.number if isinstance(self.way, WaypointDrive) else -1
         own = (steer.s_m, steer.off_m) if steer else (math.nan, math.nan)
-        wanted = steer.articulation_rad if steer else math.nan
+        target_articulation_rad = steer.articulation_rad if steer else math.nan
         self.rows.append(
             [
                 (now_ns - START_NS) * 1e-9,
@@ -135,14 +135,14 @@ class NavigationPlanner:
                 location.sigma_m if location.usable else math.nan,
                 *own,
                 goal,
-                wanted,
+                target_articulation_rad,
                 c.roll_rad,
             ]
         )
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """One drive; ``options``: profile, truth, terrain, way, pose (x, y, yaw of the front axle), points."""
+    """Make one drive; ``options``: profile, truth, terrain, way, pose (x, y, yaw of the front axle), points."""
     profile = profile_named(job.options["profile"])
     with recorder_of(job, profile, profile_path(job.options["profile"])) as recorder:
         return _driven(job, profile, recorder)

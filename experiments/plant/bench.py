@@ -118,7 +118,7 @@ def _fixed_work_s() -> float:
 
 
 def measure(profile: str, truth: str, quick: bool, console: Console) -> tuple[dict[str, float], bool, dict[str, Any]]:
-    """Metrics, whether the host was noisy, and traces for the plots."""
+    """Measure metrics, whether the host was noisy, and traces for the plots."""
     watches: dict[str, Stopwatch] = {}
     metrics: dict[str, float] = {}
     cost: dict[str, float] = {}
@@ -152,13 +152,13 @@ def measure(profile: str, truth: str, quick: bool, console: Console) -> tuple[di
 
 
 def rows_of_logs(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
-    """Logs side by side on the ground from a corner away from the machine, ten in a row."""
+    """Place logs side by side on the ground from a corner away from the machine, ten in a row."""
     places = ((x_m - 3.0 * column, y_m - 0.5 * row) for row, column in product(range(count), range(10)))
     return tuple(LogSpec(x, y, 0.0, 2.6, 0.2, 600.0) for x, y in islice(places, count))
 
 
 def heap(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
-    """Logs released in layers of four above each other: a heap with many contacts."""
+    """Release logs in layers of four above each other: a heap with many contacts."""
     return tuple(
         LogSpec(x_m + 0.30 * (i % 4 - 1.5), y_m, math.pi / 2, 2.6, 0.2, 600.0, z_m=0.26 * (i // 4))
         for i in range(count)
@@ -166,7 +166,7 @@ def heap(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
 
 
 def _crane(profile: str, truth: str, stretches: int) -> Stopwatch:
-    """Intervals of one second with the crane moving all its functions, 12 logs in a heap."""
+    """Time intervals of one second with the crane moving all its functions, 12 logs in a heap."""
     p = profile_named(profile)
     with trial_world(profile, truth, 1, heap(12, *p.workspace.pick_center_m)) as world:
         driver, watch = Driver(world), Stopwatch()
@@ -180,7 +180,7 @@ def _crane(profile: str, truth: str, stretches: int) -> Stopwatch:
 
 
 def _second(driver: Driver, start: dict[str, float], number: int) -> None:
-    """A second of slow sines on every function."""
+    """Move every function in slow sines for a second."""
     spans = {"slew": 0.30, "lift": 0.08, "tilt": 0.15, "ext": 0.15, "rot": 0.8}
     n = PER_SECOND
     driver.grapple = 0.5 if number % 6 < 3 else -0.5
@@ -210,7 +210,7 @@ class BusWorld:
         return getattr(self._world, name)
 
     def step(self, spools: Sequence[float], drive: Drive = PARKED, articulation_rad_s: float = 0.0) -> None:
-        """One physics step of the plant with the spools (-1 to 1) commanded over the bus."""
+        """Run one physics step of the plant with the spools (-1 to 1) commanded over the bus."""
         pct = {n: 100.0 * max(-1.0, min(1.0, u)) for n, u in zip(self._world.functions, spools, strict=True)}
         frames: list[tuple[str, int, bytes]] = []
         if self._steps % CYCLE_STEPS == 0:
@@ -293,7 +293,7 @@ def _load_one(world: World, driver: Driver, quick: bool) -> None:
 
 
 def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:
-    """Half-second intervals of the crane at rest with this number of logs on the ground."""
+    """Time half-second intervals of the crane at rest with this number of logs on the ground."""
     with trial_world(profile, truth, 1, rows_of_logs(count, 12.0, -6.0)) as world:
         watch = Stopwatch()
         step_neutral(world, PER_SECOND // 2)
@@ -305,7 +305,7 @@ def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:
 
 
 def _camera(profile: str, truth: str, pictures: int) -> Stopwatch:
-    """One picture per interval while the crane moves."""
+    """Render one picture per interval while the crane moves."""
     from sim.camera.rig import CameraRig
 
     p = profile_named(profile)

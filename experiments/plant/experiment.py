@@ -51,7 +51,7 @@ def perform(job: Job) -> Any:
 
 
 def plan(options: Options, trials: int) -> list[Job]:
-    """Every job of the run, the longest first."""
+    """Plan every job of the run, the longest first."""
     seed = options.seed * SEEDS_PER_RUN
     common = {"profile": options.profile, "truth": options.truth, "quick": options.quick}
     shift_s = QUICK_SHIFT_S if options.quick else SHIFT_S
@@ -63,7 +63,9 @@ def plan(options: Options, trials: int) -> list[Job]:
     under = {**common, "profile": other, "truth": options.truth if same else "nominal"}
     jobs += [Job(kind, kind, seed, under) for kind in CARRIER]
     jobs += [
-        Job(f"{kind}/{i}", kind, seed + i, {**common, **what}) for i in range(trials) for kind, what in GRASPS.items()
+        Job(f"{kind}/{i}", kind, seed + i, {**common, **grasp_options})
+        for i in range(trials)
+        for kind, grasp_options in GRASPS.items()
     ]
     return jobs
 
@@ -77,8 +79,8 @@ def run(options: Options, console: Console) -> Result:
     check_truth(options.profile, options.truth)
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, trials)
-    with checkpoint(options, (), [options.profile], options.truth) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "plant trials", console)
+    with checkpoint(options, (), [options.profile], options.truth) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "plant trials", console)
         metrics, traces = gather(outcomes)
         speed, noisy, costs = bench.measure(options.profile, options.truth, options.quick, console)
         metrics |= speed
@@ -100,12 +102,12 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Plant experiment", CONCLUSION, INTRODUCTION, SECTIONS)
 
 
 def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
-    """Metrics and traces of all jobs."""
+    """Gather the metrics and traces of all jobs."""
     by_kind: dict[str, list[Any]] = {}
     for name, outcome in outcomes.items():
         by_kind.setdefault(name.split("/")[0], []).append(outcome)

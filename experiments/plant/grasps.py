@@ -52,7 +52,7 @@ class Driver:
         self._kin, self._limits = world.profile.kinematics, joint_limits(world.profile)
 
     def tick(self, rates: Mapping[str, float]) -> None:
-        """One physics step towards the reference, with feed-forward ``rates`` [unit/s]."""
+        """Run one physics step towards the reference, with feed-forward ``rates`` [unit/s]."""
         spools = {"grapple": self.grapple}
         for name, target in self.reference.items():
             valve = self.world.profile.joints[name].valve
@@ -89,11 +89,11 @@ class Driver:
             self._follow((x, y, z), ext_m)
 
     def pose(self, pin: Point, ext_m: float) -> dict[str, float]:
-        """Joint positions that put the pin there."""
+        """Compute the joint positions that put the pin there."""
         return dict(zip(ARM, (*inverse(self._kin, self._limits, *pin, ext_m), ext_m), strict=True))
 
     def extension_for(self, x: float, y: float, low_m: float, high_m: float) -> float:
-        """A telescope position [m] that reaches the whole vertical line.
+        """Find a telescope position [m] that reaches the whole vertical line.
 
         Raises:
             Unreachable: there is none.
@@ -111,12 +111,12 @@ class Driver:
         return min(max(wish, least + margin), most - margin)
 
     def log_yaw(self) -> float:
-        """Direction [rad] of a log that the grapple holds squarely at the present reference."""
+        """Compute the direction [rad] of a log that the grapple holds squarely at the present reference."""
         q = [self.reference[name] for name in DRIVEN]
         return grapple_yaw(self.world.profile, q) - math.pi / 2
 
     def rotator(self, slew: float, log_yaw: float) -> float:
-        """Rotator position that closes the grapple across a log."""
+        """Compute the rotator position that closes the grapple across a log."""
         return rotator_for_yaw(self.world.profile, slew, log_yaw + math.pi / 2, self.reference["rot"])
 
     def pick(self, x: float, y: float, log_yaw: float, hover_m: float, ground_m: float, lift_to_m: float) -> float:
@@ -185,8 +185,8 @@ class Driver:
         jaws = self.world.profile.grapple.jaws
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
             angle = self.world.jaw_angle_rad
-            wanted = floor + max(tip_below_pin_m(jaws, angle + sign * ahead) for ahead in LOOK_AHEAD_RAD)
-            z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
+            required_z = floor + max(tip_below_pin_m(jaws, angle + sign * ahead) for ahead in LOOK_AHEAD_RAD)
+            z = max(z, min(required_z, z + RAISE_SPEED_M_S * STEP_S))
             self._follow((x, y, z), ext)
             if done():
                 break
@@ -200,7 +200,7 @@ class Driver:
 
 
 def _minimum_jerk(t: float, duration_s: float) -> tuple[float, float]:
-    """Progress and its rate [1/s] at the share ``t`` of the time."""
+    """Compute the progress and its rate [1/s] at the share ``t`` of the time."""
     return t**3 * (10 - 15 * t + 6 * t * t), 30 * t * t * (1 - t) ** 2 / duration_s
 
 
@@ -215,7 +215,7 @@ OVER_FLOOR_M: Final = 0.05
 
 
 def grasp(job: Job) -> dict[str, Any]:
-    """Options: profile, truth, scene, logs, across_m, turned_rad, unload.
+    """Grasp a scene's logs; options: profile, truth, scene, logs, across_m, turned_rad, unload.
 
     ``held``: logs half a metre and more off the ground a second after the lift; ``raised``: logs that ever were;
     ``in_bunk``: logs at rest in the bunk after unloading.
@@ -311,7 +311,7 @@ def pick_logs(
 
 
 def over_stakes_m(world: World) -> float:
-    """Height of the pin [m] at which a load clears the stakes."""
+    """Compute the height of the pin [m] at which a load clears the stakes."""
     bunk = world.profile.bunk
     return bunk.floor_z_m + bunk.stake_height_m + OVER_STAKES_M + lowest_tip_below_pin_m(world.profile.grapple.jaws)
 
@@ -334,7 +334,7 @@ def unload(world: World, driver: Driver, logs: Sequence[LogState]) -> None:
 
 
 def _middle(world: World, logs: Sequence[LogState]) -> tuple[float, float, float]:
-    """Middle (x, y) [m] and direction [rad] of logs in the base frame."""
+    """Compute the middle (x, y) [m] and direction [rad] of logs in the base frame."""
     centre = [sum(log.position_m[i] for log in logs) / len(logs) for i in range(3)]
     x, y, _ = to_base(world, centre)
     # An axis is defined modulo pi: average the doubled angles.
@@ -345,7 +345,7 @@ def _middle(world: World, logs: Sequence[LogState]) -> tuple[float, float, float
 def _aim(
     world: World, driver: Driver, rng: random.Random | None, across_m: float, logs: Sequence[LogState]
 ) -> tuple[float, float, float, float]:
-    """Grasp target in the base frame with noise: x, y, direction of the logs, height of the ground.
+    """Compute the grasp target in the base frame with noise: x, y, direction of the logs, height of the ground.
 
     Raises:
         Unreachable: the crane reaches neither side of the logs.

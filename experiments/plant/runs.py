@@ -56,7 +56,7 @@ class Ringing(NamedTuple):
 
 
 def ringing(values: Sequence[float], step_s: float, floor: float, rest: float | None = None) -> Ringing:
-    """The oscillation of ``values`` about ``rest`` (default: the mean of the last quarter).
+    """Evaluate the oscillation of ``values`` about ``rest`` (default: the mean of the last quarter).
 
     Half swings smaller than ``floor`` and all later ones are ignored.  Fewer than three half swings: all NaN.
     """
@@ -87,7 +87,7 @@ def _world(
 def record(
     world: World, seconds: float, read: Callable[[], _Value], spools: Mapping[str, float] | None = None
 ) -> list[_Value]:
-    """What ``read`` returns every `SAMPLE_S` while these spools are open and all others closed."""
+    """Record what ``read`` returns every `SAMPLE_S` while these spools are open and all others closed."""
     commands = [(spools or {}).get(f, 0.0) for f in world.functions]
     rows = []
     for i in range(round(seconds / STEP_S)):
@@ -164,7 +164,7 @@ def pendulum(job: Job) -> Outcome:
 
 
 def released(world: World, hinge: str) -> list[float]:
-    """Angle from rest [rad] of a hinge of the hanging grapple after its release at 0.12 rad."""
+    """Record the angle from rest [rad] of a hinge of the hanging grapple after its release at 0.12 rad."""
     rest = world.q[hinge]
     world.client.resetJointState(world.crane.body, world.crane.index[hinge], rest + 0.12, 0.0)
     return record(world, 12.0, lambda: world.q[hinge] - rest)
@@ -190,7 +190,9 @@ def slew_stop(job: Job) -> Outcome:
 
 
 def stopped(world: World) -> tuple[list[float], Ringing]:
-    """Angle of the fork's hinge [rad] while the crane slews with a load and after its stop at 1.5 s; the swing then."""
+    """Record the angle of the fork's hinge [rad] while the crane slews with a load and after its stop at 1.5 s; the
+    swing then.
+    """
     grip = {"grapple": -0.2}
     angles = record(world, 1.5, lambda: world.q["fork"], {"slew": 0.45, **grip})
     angles += record(world, 11.5, lambda: world.q["fork"], grip)
@@ -198,7 +200,7 @@ def stopped(world: World) -> tuple[list[float], Ringing]:
 
 
 def sharing(job: Job) -> Outcome:
-    """Full spool on each function alone, then on all of them together, which share the pump."""
+    """Open every spool fully, each function alone, then all of them together, which share the pump."""
     home = home_at(job.options["profile"], 4.5, 0.4, 0.5)
     joints = profile_named(job.options["profile"]).joints
     # Away from the nearer end stop, so that no function reaches it.
@@ -220,7 +222,7 @@ def sharing(job: Job) -> Outcome:
 
 
 def cylinder(job: Job) -> Outcome:
-    """The lift cylinder alone with its spool shut, without friction and orifices, against 4000 kg m^2 and 8 kNm.
+    """Let the lift cylinder ring, its spool shut, without friction and orifices, against 4000 kg m^2 and 8 kNm.
 
     Trace: angle from rest [rad] at every physics step.
     """
@@ -266,7 +268,7 @@ def turning(job: Job) -> Outcome:
 
 
 def _steer(world: World, target_rad: float) -> list[float]:
-    """Spools that bring the articulation to an angle, all others closed."""
+    """Compute the spools that bring the articulation to an angle, all others closed."""
     carrier = world.profile.carrier
     assert carrier is not None
     spool = spool_for(carrier.steer_valve, STEER_KP_1_S * (target_rad - world.q["articulation"]))
@@ -321,7 +323,7 @@ def falling(job: Job) -> Outcome:
 
 
 def machine_energy_j(world: World) -> tuple[float, float]:
-    """Kinetic and potential energy of all links of the machine."""
+    """Compute the kinetic and potential energy of all links of the machine."""
     p, body = world.client, world.crane.body
     links = range(p.getNumJoints(body))
     states = p.getLinkStates(body, list(links), computeLinkVelocity=1, computeForwardKinematics=1)
@@ -331,7 +333,7 @@ def machine_energy_j(world: World) -> tuple[float, float]:
 
 
 def logs_energy_j(world: World) -> tuple[float, float]:
-    """Kinetic and potential energy of all logs."""
+    """Compute the kinetic and potential energy of all logs."""
     p, logs = world.client, world.log_bodies.body_ids
     return _energy_j(
         p, [(p.getDynamicsInfo(i, -1), *p.getBasePositionAndOrientation(i), *p.getBaseVelocity(i)) for i in logs]
@@ -339,7 +341,7 @@ def logs_energy_j(world: World) -> tuple[float, float]:
 
 
 def _energy_j(p: Any, bodies: Sequence[tuple[Any, ...]]) -> tuple[float, float]:
-    """Of bodies as dynamics, position, orientation, linear and angular velocity."""
+    """Compute kinetic and potential energy of bodies: dynamics, position, orientation, linear and angular velocity."""
     kinetic = potential = 0.0
     for (mass, _, principal, *_), position, turn, linear, angular in bodies:
         w = np.array(p.getMatrixFromQuaternion(turn)).reshape(3, 3).T @ np.array(angular)
@@ -401,7 +403,7 @@ def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
 
 
 def values_of(world: World) -> Iterator[float]:
-    """Every joint position and speed, chamber pressure and pose of a log."""
+    """Read every joint position and speed, chamber pressure and pose of a log."""
     poses = (world.client.getBasePositionAndOrientation(log) for log in world.log_bodies.body_ids)
     pressures = world.hydraulics.pressures_pa.values()
     return chain(world.q.values(), world.qd.values(), *pressures, *(v for pose in poses for v in pose))

@@ -146,7 +146,7 @@ def _performed(job: Job, settings: Settings, guard: Guard, recorder: Recorder | 
 
 
 def slope(x: list[float], y: list[float]) -> float:
-    """Slope of the least-squares line through (x, y); NaN if all x are equal."""
+    """Compute the slope of the least-squares line through (x, y); NaN if all x are equal."""
     mean_x, mean_y = mean(x), mean(y)
     square = sum((a - mean_x) ** 2 for a in x)
     return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / square if square else math.nan
@@ -220,7 +220,7 @@ METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 
 def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Metrics of all paths; outcomes are named PATH-NUMBER."""
+    """Compute the metrics of all paths; outcomes are named PATH-NUMBER."""
     metrics: dict[str, float] = {}
     for path in PATHS:
         trials = [o for name, o in outcomes.items() if name.startswith(f"{path}-")]
@@ -250,8 +250,8 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     common = {"profile": options.profile, "truth": options.truth}
     jobs = [Job(f"{path}-{i}", path, options.seed + i, common) for i in range(trials) for path in PATHS]
-    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "plc trials", console)
+    with checkpoint(options, (), [options.profile], options.truth, LOCKSTEP_SOURCES) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "plc trials", console)
         result = make_result(
             "plc",
             METRICS,
@@ -266,10 +266,10 @@ def run(options: Options, console: Console) -> Result:
 
 
 def failed(trial: Trial) -> bool:
-    """Whether the log is not in the bunk, or somebody had to arm again: a campaign keeps its recording."""
+    """Tell whether the log is not in the bunk, or somebody had to arm again: a campaign keeps its recording."""
     return not trial.outcome["success"] or trial.outcome["stops"] > 0
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("PLC path and CAN path", CONCLUSION, INTRODUCTION, SECTIONS)

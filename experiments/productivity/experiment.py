@@ -68,7 +68,7 @@ KINDS: Final = {
 
 
 def task(kind: str, profile: Profile, truth: str, seed: int, amount: int) -> tuple[ForwardingMission, Site]:
-    """A mission and its site; ``amount``: single logs, piles, or logs in the bunk."""
+    """Make a mission and its site; ``amount``: single logs, piles, or logs in the bunk."""
     carrier = profile.carrier
     assert carrier is not None
     plane = LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg)
@@ -76,17 +76,17 @@ def task(kind: str, profile: Profile, truth: str, seed: int, amount: int) -> tup
     rng = random.Random(f"{kind} {seed}")
     build = {"singles": _singles, "piles": _piles, "landing": _bunk}[kind]
     logs, end_m = build(profile, truth, seed, rng, amount)
-    way = tuple(Point(*plane.geodetic(front_m + x, 0.0)[:2]) for x in (0.0, end_m))
+    route = tuple(Point(*plane.geodetic(front_m + x, 0.0)[:2]) for x in (0.0, end_m))
     landings: tuple[Landing, ...] = ()
     if kind == "landing":
         ahead, left = LANDING_M
         landings = (Landing(Point(*plane.geodetic(front_m + end_m + ahead, left)[:2])),)
-    mission = ForwardingMission(KINDS[kind], way, landings=landings)
+    mission = ForwardingMission(KINDS[kind], route, landings=landings)
     return mission, Site(carrier.site_lat_deg, carrier.site_lon_deg, tuple(logs))
 
 
 def _singles(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
-    """Right and left of the route in turn, up to 25 degrees askew, as on paper B's field."""
+    """Place single logs right and left of the route in turn, up to 25 degrees askew, as on paper B's field."""
     logs: list[LogSpec] = []
     for i in range(amount):
         x = profile.carrier.front_axle_m + BEFORE_M + i * SINGLE_APART_M  # type: ignore[union-attr]
@@ -96,7 +96,7 @@ def _singles(profile: Profile, truth: str, seed: int, rng: random.Random, amount
 
 
 def _piles(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
-    """Two to six logs each, as paper A's configurations 6, 7 and 10 to 12, right and left in turn."""
+    """Place piles of two to six logs, as paper A's configurations 6, 7 and 10 to 12, right and left in turn."""
     logs: list[LogSpec] = []
     for i in range(amount):
         x = profile.carrier.front_axle_m + BEFORE_M + i * PILE_APART_M  # type: ignore[union-attr]
@@ -107,7 +107,9 @@ def _piles(profile: Profile, truth: str, seed: int, rng: random.Random, amount: 
 
 
 def _bunk(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
-    """Rows as the crane lays them: side by side with room for the grapple, each row in the gaps of the one below."""
+    """Fill the bunk in rows as the crane lays them: side by side with room for the grapple, each row in the gaps of the
+    one below.
+    """
     wood = replace(wood_of(profile.name, truth), length_m=LENGTH_M, diameter_m=DIAMETER_M)
     lumber, half = LogSampler(wood, seed), 0.5 * (profile.bunk.width_m - DIAMETER_M[1]) - STAKE_M
     logs: list[LogSpec] = []
@@ -139,7 +141,7 @@ def _at(
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """``options``: profile, truth, amount, way, limit_s; the kind of the job is that of the task."""
+    """Run a task; ``options``: profile, truth, amount, way, limit_s; the kind of the job is that of the task."""
     o = job.options
     mission, site = task(job.kind, profile_named(o["profile"]), o["truth"], job.seed, o["amount"])
     return run_mission(job, mission, site)
@@ -170,8 +172,8 @@ def run(options: Options, console: Console) -> Result:
     grapple_s = grapple.close_time_s + grapple.open_time_s
     trials = 1 if options.quick else options.trials or TRIALS
     jobs = plan(options, name, trials)
-    with checkpoint(options, (), [name], options.truth, LOCKSTEP_SOURCES) as kept:
-        outcomes = pool.run(perform, jobs, kept, options.workers, "runs", console)
+    with checkpoint(options, (), [name], options.truth, LOCKSTEP_SOURCES) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, options.workers, "runs", console)
         result = make_result(
             "productivity",
             METRICS,
@@ -188,19 +190,19 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     return Page("Productivity", CONCLUSION, INTRODUCTION, sections())
 
 
 def failed(trial: Trial) -> bool:
-    """Whether a run did not end: a campaign keeps its recording."""
+    """Tell whether a run did not end: a campaign keeps its recording."""
     return not trial.outcome["finished"]
 
 
 def plan(options: Options, profile: str, trials: int) -> list[Job]:
-    """Every run, named KIND/NUMBER, the longest first."""
-    first = FIRST_SEED + SEEDS_PER_RUN * options.seed
-    what: dict[str, Any] = {
+    """Plan every run, named KIND/NUMBER, the longest first."""
+    first_seed = FIRST_SEED + SEEDS_PER_RUN * options.seed
+    job_options: dict[str, Any] = {
         "profile": profile,
         "truth": options.truth,
         "way": "ours",
@@ -209,7 +211,7 @@ def plan(options: Options, profile: str, trials: int) -> list[Job]:
     }
     amounts = QUICK if options.quick else AMOUNTS
     return [
-        Job(f"{kind}/{i}", kind, first + i, what | {"amount": amount})
+        Job(f"{kind}/{i}", kind, first_seed + i, job_options | {"amount": amount})
         for i in range(trials)
         for kind, amount in amounts.items()
     ]

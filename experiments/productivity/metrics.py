@@ -104,7 +104,7 @@ class Cycle:
 
 
 def cycles(outcome: Mapping[str, Any], grapple_s: float) -> Iterator[Cycle]:
-    """The completed grasps of a mission; ``grapple_s``: minimum time for closing and opening the grapple."""
+    """Find the completed grasps of a mission; ``grapple_s``: minimum time for closing and opening the grapple."""
     for grasp in outcome["grasps"]:
         if "end_s" not in grasp:
             continue
@@ -116,7 +116,7 @@ def cycles(outcome: Mapping[str, Any], grapple_s: float) -> Iterator[Cycle]:
 
 
 def sections() -> tuple[Section, ...]:
-    """Sections of the page."""
+    """Make the sections of the page."""
     return (
         Section(
             "Crane cycle",
@@ -130,7 +130,7 @@ def sections() -> tuple[Section, ...]:
 
 
 def gather(outcomes: Mapping[str, Any], grapple_s: float) -> dict[str, float]:
-    """Metrics of all runs; outcomes are named KIND/NUMBER."""
+    """Compute the metrics of all runs; outcomes are named KIND/NUMBER."""
     kinds: dict[str, list[Mapping[str, Any]]] = {}
     for name, outcome in outcomes.items():
         kinds.setdefault(name.split("/")[0], []).append(outcome)
@@ -189,7 +189,7 @@ def _unloading(outcomes: Sequence[Mapping[str, Any]], grapple_s: float) -> dict[
 
 
 def _span_s(outcome: Mapping[str, Any]) -> float:
-    """Time from the first to the last grasp at the landing [s]."""
+    """Compute the time from the first to the last grasp at the landing [s]."""
     some = [g for g in outcome["grasps"] if g["state"] == "UNLOAD" and "end_s" in g]
     return float(some[-1]["end_s"] - some[0]["begin_s"]) if some else math.nan
 

@@ -58,7 +58,7 @@ class Continuity:
 
 
 def databases(profile: Profile) -> list[Database]:
-    """The databases that define the protected frames of a machine."""
+    """Load the databases that define the protected frames of a machine."""
     return [load("crane"), *([load("machine")] if profile.machine_bus else [])]
 
 
@@ -97,7 +97,7 @@ class BusObserver:
             self._first[SYNC_ID] = self.sent.frames[SYNC_ID]
 
     def unanswered(self) -> int:
-        """SYNCs without an answer of at least one encoder since all encoders run; one answer may be in flight."""
+        """Count SYNCs without an answer of at least one encoder since all encoders run; one may be in flight."""
         if not self._first:
             return 0
         syncs = self.sent.frames[SYNC_ID] - self._first[SYNC_ID]
@@ -105,7 +105,7 @@ class BusObserver:
         return max(0, syncs - answers - 1)
 
     def totals(self) -> dict[str, int]:
-        """All counters."""
+        """Return all counters."""
         return {
             "records": self.records,
             "records_lost": self.lost,
@@ -119,7 +119,7 @@ class BusObserver:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.timing.bus_observer", description="Check the tick records of a controller."
     )

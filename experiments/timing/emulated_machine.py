@@ -53,7 +53,7 @@ class EmulatedMachine(LiveMachine):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.timing.emulated_machine", description="A kinematic machine on its CAN buses."
     )

@@ -72,7 +72,7 @@ class Events:
     stalls: list[Stall] = field(default_factory=list)
 
     def cause(self, event: Stop | Loss) -> Stall | None:
-        """The longest stall of the host that can have caused a stop or a loss.
+        """Find the longest stall of the host that can have caused a stop or a loss.
 
         Refused frames need a stall that fills the transmit queue, other losses one that loses frames at any rate.
         """
@@ -92,12 +92,12 @@ class Events:
         return max(fitting, key=lambda stall: stall.length_ns, default=None)
 
     def sentences(self) -> list[str]:
-        """One sentence for every stop and loss: what, and the stall of the host before it."""
-        found: list[tuple[int, str, Stop | Loss]] = [
+        """Write one sentence for every stop and loss: what, and the stall of the host before it."""
+        events: list[tuple[int, str, Stop | Loss]] = [
             (s.at_ns, f"stop, {s.reason.name}: {s.words}", s) for s in self.stops
         ]
-        found += [(x.to_ns, f"{x.bus}: {x.refused} frames refused, {x.dropped} dropped", x) for x in self.losses]
-        return [f"{what} [{_words(self.cause(event))}]" for _, what, event in sorted(found, key=lambda item: item[0])]
+        events += [(x.to_ns, f"{x.bus}: {x.refused} frames refused, {x.dropped} dropped", x) for x in self.losses]
+        return [f"{text} [{_words(self.cause(event))}]" for _, text, event in sorted(events, key=lambda item: item[0])]
 
 
 def _words(stall: Stall | None) -> str:
@@ -105,17 +105,17 @@ def _words(stall: Stall | None) -> str:
 
 
 def losses_between(before: Facts, after: Facts) -> list[Loss]:
-    """What the controller's counters say of the time between two pages."""
-    found = []
+    """List the losses that the controller's counters show between two pages."""
+    losses = []
     for old, new in zip(before.buses, after.buses, strict=True):
         refused, dropped = new.refused - old.refused, new.dropped - old.dropped
         if refused or dropped:
-            found.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped))
-    return found
+            losses.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped))
+    return losses
 
 
 def event_metrics(measured: Sequence[Events]) -> dict[str, float]:
-    """Stops and losses of several measurements, how many of them no stall of the host explains, and the stalls."""
+    """Count stops and losses of several measurements, those that no stall of the host explains, and the stalls."""
     losses = [(x.frames, events.cause(x)) for events in measured for x in events.losses]
     causes = [events.cause(stop) for events in measured for stop in events.stops]
     stalls = [stall for events in measured for stall in events.stalls]
@@ -130,7 +130,7 @@ def event_metrics(measured: Sequence[Events]) -> dict[str, float]:
 
 
 def explained(metrics: Mapping[str, float]) -> dict[str, str]:
-    """Losses and stops that the host's stalls explain, all of them: inconclusive, with the reason."""
+    """List the losses and stops that the host's stalls explain, all of them: inconclusive, with the reason."""
     why = (
         f"the host withheld a processor for up to {metrics['stall_max_ms']:.0f} ms; a witness saw a stall before each "
         "of them"

@@ -76,27 +76,27 @@ def run(options: Options, console: Console) -> Result:
         measure_testbed(setting, plan, options.out / name, console)
         for setting, plan, name in zip(settings, plans, ("slow", "fast"), strict=True)
     )
-    found, compared = metrics.gather(slow, fast)
+    measured_values, compared = metrics.gather(slow, fast)
     from experiments.timing import receive_cost
 
     with console.status("timing: cost of a frame, interpreter and compiled tick") as status:
-        found |= receive_cost.measure(*((1_000, 3) if options.quick else (10_000, 9)))["metrics"]
-        found |= compiled_ratios(options.quick, status.update, console)
-    undecided = metrics.undecided(found)
+        measured_values |= receive_cost.measure(*((1_000, 3) if options.quick else (10_000, 9)))["metrics"]
+        measured_values |= compiled_ratios(options.quick, status.update, console)
+    undecided = metrics.undecided(measured_values)
     result = make_result(
         "timing",
         METRICS,
-        found,
+        measured_values,
         profile=machine,
         seed=options.seed,
         trials=len(slow.quiet),
         more={
             **host_activity.describe(),
-            "host_verdict": "quiet enough" if found["host_verdict"] else "inconclusive",
+            "host_verdict": "quiet enough" if measured_values["host_verdict"] else "inconclusive",
             "events": "; ".join(
                 f"{hz} Hz: {text}" for hz, of in ((200, slow), (FAST_HZ, fast)) for text in of.events.sentences()
             ),
-            "instructions": "counted" if "tick_instructions" in found else "not counted by this host",
+            "instructions": "counted" if "tick_instructions" in measured_values else "not counted by this host",
             "tick": compared[-1].end.tick,
         },
         undecided=undecided,
@@ -110,7 +110,7 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     slow, fast = FULL if result.trials == FULL[0].quiet else QUICK
     quiet = "The host was quiet enough for the comparison of wake-ups."
     if not result.metrics["host_verdict"]:
@@ -124,19 +124,19 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
 
 
 def machines(profile: str) -> tuple[str, str]:
-    """The machine with a carrier for 200 Hz and the fixed crane for 1 kHz; ``profile`` replaces the one of its kind."""
+    """Choose a machine with carrier for 200 Hz, a fixed crane for 1 kHz; ``profile`` replaces the one of its kind."""
     return (profile, FIXED_CRANE) if load_profile(profile).machine_bus else (FORWARDER, profile)
 
 
 def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console: Console) -> Measured:
     """Measure all windows of one testbed."""
-    what = f"timing: {setting.profile} at {setting.rate_hz} Hz"
-    with console.status(f"{what}: starting") as status, TimingTestbed(setting, directory) as testbed:
+    title = f"timing: {setting.profile} at {setting.rate_hz} Hz"
+    with console.status(f"{title}: starting") as status, TimingTestbed(setting, directory) as testbed:
 
         def windows(kind: str, number: int, length_s: float) -> list[MeasurementWindow]:
             done: list[MeasurementWindow] = []
             for i in range(number):
-                status.update(f"{what}: {kind} window {i + 1} of {number}")
+                status.update(f"{title}: {kind} window {i + 1} of {number}")
                 done.append(measure(testbed, length_s, directory))
             return done
 
@@ -149,13 +149,14 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
         after = testbed.counters()
         events = deepcopy(testbed.events)  # now, because tracing may stop the machine
         others = {name: float(after[name] - before[name]) for name in OTHERS}
-        status.update(f"{what}: counting system calls")
+        status.update(f"{title}: counting system calls")
         calls = system_calls(testbed, plan.trace_s, directory) if plan.trace_s else None
         return Measured(quiet, pressed, calls, events, others)
 
 
 def compiled_ratios(quick: bool, progress: Callable[[str], None], console: Console) -> dict[str, float]:
-    """How many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the kept recordings.
+    """Measure how many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the kept
+    recordings.
 
     NaN if there is no compiled tick or no recording.
     """
@@ -165,10 +166,10 @@ def compiled_ratios(quick: bool, progress: Callable[[str], None], console: Conso
     with tempfile.TemporaryDirectory() as folder:
         try:
             compare.need_build()
-            places = compare.kept_recordings(Path(folder))
+            recordings = compare.kept_recordings(Path(folder))
         except CommandFailed as error:
             console.print(f"timing: no ratio: {error}", highlight=False, soft_wrap=True)
             return dict.fromkeys(names, math.nan)
         ticks, rounds = (300, 1) if quick else (2000, 3)
-        rows = [compare.compare_cost(place, ticks, rounds, progress) for place in places]
+        rows = [compare.compare_cost(recording, ticks, rounds, progress) for recording in recordings]
     return {name: float(min(row[name] for row in rows)) for name in names}

@@ -118,14 +118,14 @@ class Measured:
 
 
 def loopback_bus(profile_name: str) -> str:
-    """``vcan`` where its interfaces exist and are up, else ``wire``."""
+    """Choose ``vcan`` where its interfaces exist and are up, else ``wire``."""
     profile = load_profile(profile_name)
     names = [VCAN_NAMES[b] for b in (profile.crane_bus, profile.machine_bus) if b]
     return "wire" if any(links.state(name) for name in names) else "vcan"
 
 
 def may_run_cyclictest(facts: Facts) -> bool:
-    """Whether cyclictest is installed and this user may give it the controller's priority."""
+    """Tell whether cyclictest is installed and this user may give it the controller's priority."""
     limit = facts.rtprio_limit or 0
     allowed = facts.may_prioritise or limit == UNLIMITED or limit >= PRIORITY
     return allowed and shutil.which("cyclictest") is not None
@@ -144,7 +144,7 @@ def measure_computer(
         testbed.wait(SETTLE_S)
         controller = testbed.family.children["controller"]
         granted = process_facts(controller.process.pid)
-        told = [line for line in controller.errors.read_text().splitlines() if "timing page" not in line]
+        error_lines = [line for line in controller.errors.read_text().splitlines() if "timing page" not in line]
         before, windows = _interrupts(testbed.cpu), []
         for i in range(count):
             show(f"window {i + 1} of {count}, {seconds / count:.0f} s")
@@ -174,7 +174,7 @@ def measure_computer(
         stops=len(testbed.events.stops),
         fifo=granted["policy"] == "fifo",
         locked_kb=int(str(granted["locked_kb"])),
-        refused=tuple(line.partition("not granted: ")[2] for line in told if "not granted" in line),
+        refused=tuple(line.partition("not granted: ")[2] for line in error_lines if "not granted" in line),
         steal_ms=sum(w.host.steal_ms for w in windows),
         load_before=load_before,
         emulated=facts.machine == "user-mode Linux",
@@ -192,30 +192,30 @@ def _interrupts(cpu: int) -> dict[str, int]:
 
 
 def disturbances(f: Figures) -> list[str]:
-    """Why clocked figures cannot be held against this computer; empty when it was left alone."""
-    found = []
+    """List why clocked figures cannot be held against this computer; empty when it was left alone."""
+    reasons = []
     if f.emulated:
-        found.append("this kernel runs as a process of another one")
+        reasons.append("this kernel runs as a process of another one")
     if f.steal_ms > STEAL_SHARE * 1e3 * f.seconds:
-        found.append(f"the hypervisor took {f.steal_ms:.0f} ms in {f.seconds:.0f} s")
+        reasons.append(f"the hypervisor took {f.steal_ms:.0f} ms in {f.seconds:.0f} s")
     if f.load_before > BUSY_SHARE:
-        found.append(f"other programs were running (load {f.load_before:.1f} per processor)")
-    return found
+        reasons.append(f"other programs were running (load {f.load_before:.1f} per processor)")
+    return reasons
 
 
 def judge(f: Figures) -> tuple[Judgement, ...]:
-    """The verdicts of all topics."""
+    """Judge all topics."""
     return (rights(f), wakeups(f), tick_cost(f), losses(f), memory(f), stops(f))
 
 
 def overall(found: Iterable[Judgement]) -> Verdict:
-    """The worst verdict."""
+    """Find the worst verdict."""
     order = list(Verdict)
     return max((j.verdict for j in found), key=order.index, default=Verdict.INCONCLUSIVE)
 
 
 def _clocked(f: Figures, topic: str, verdict: Verdict, said: str, advice: str) -> Judgement:
-    """A verdict that depends on the clock: what is not good is inconclusive where the computer was disturbed."""
+    """Give a verdict that depends on the clock: what is not good is inconclusive where the computer was disturbed."""
     if verdict is Verdict.GOOD:
         return Judgement(topic, verdict, said)
     if why := disturbances(f):
@@ -229,7 +229,7 @@ def _graded(share: float, good: float, marginal: float) -> Verdict:
 
 
 def rights(f: Figures) -> Judgement:
-    """FIFO scheduling and locked memory."""
+    """Judge FIFO scheduling and locked memory."""
     if f.fifo and f.locked_kb and not f.refused:
         sentence = f"the controller runs with SCHED_FIFO and {f.locked_kb >> 10} MB of locked memory"
         return Judgement("rights", Verdict.GOOD, sentence)
@@ -243,8 +243,8 @@ def rights(f: Figures) -> Judgement:
 
 
 def wakeups(f: Figures) -> Judgement:
-    """Lateness of the wake-ups, and deadlines missed."""
-    said = (
+    """Judge the lateness of the wake-ups, and deadlines missed."""
+    sentence = (
         f"{f.missed} of {f.ticks + f.missed} deadlines missed; late by {f.late_p50_us:.0f} us in the median, "
         f"{f.late_p99_us:.0f} at p99, {f.late_max_us:.0f} at most; {f.reference} {f.reference_max_us:.0f} at most"
     )
@@ -253,47 +253,49 @@ def wakeups(f: Figures) -> Judgement:
     verdict = _graded(f.late_max_us / f.period_us, GOOD_LATE_SHARE, MARGINAL_LATE_SHARE)
     if verdict is Verdict.GOOD and not f.missed and f.ticks < MIN_TICKS:
         advice = f"measure longer: a good verdict needs {MIN_TICKS} ticks"
-        return Judgement("wake-ups", Verdict.INCONCLUSIVE, said, advice)
+        return Judgement("wake-ups", Verdict.INCONCLUSIVE, sentence, advice)
     if f.reference_max_us >= SAME_SHARE * f.late_max_us:
         advice = f"{f.reference} was late, too: kernel, firmware or drivers; the settings below, the first one first"
     elif not f.fifo:
         advice = "the controller had no real-time priority; see the topic rights"
     else:
         advice = f"{f.reference} was not late: this is the controller's own; send this report"
-    return _clocked(f, "wake-ups", Verdict.UNFIT if f.missed else verdict, said, advice)
+    return _clocked(f, "wake-ups", Verdict.UNFIT if f.missed else verdict, sentence, advice)
 
 
 def tick_cost(f: Figures) -> Judgement:
-    """CPU time of a tick; other programs raise it, because they use the caches."""
+    """Judge the CPU time of a tick; other programs raise it, because they use the caches."""
     if math.isnan(f.tick_p99_us):
         return Judgement("tick", Verdict.INCONCLUSIVE, "no tick was measured", "measure again")
-    said = f"a tick takes {f.tick_p50_us:.0f} us of CPU time in the median, {f.tick_p99_us:.0f} at p99"
+    sentence = f"a tick takes {f.tick_p50_us:.0f} us of CPU time in the median, {f.tick_p99_us:.0f} at p99"
     advice = "compile the tick (timberhand compile), set the governor to performance, or use a faster processor"
-    return _clocked(f, "tick", _graded(f.tick_p99_us / f.period_us, GOOD_TICK_SHARE, MARGINAL_TICK_SHARE), said, advice)
+    return _clocked(
+        f, "tick", _graded(f.tick_p99_us / f.period_us, GOOD_TICK_SHARE, MARGINAL_TICK_SHARE), sentence, advice
+    )
 
 
 def losses(f: Figures) -> Judgement:
-    """Frames refused by a bus or lost before they were read."""
+    """Judge the frames refused by a bus or lost before they were read."""
     advice = "the controller read too late: first correct wake-ups and rights; else send this report"
     verdict = Verdict.UNFIT if f.frames_lost else Verdict.GOOD
     return _clocked(f, "frames", verdict, f"{f.frames_lost} frames were lost", advice)
 
 
 def memory(f: Figures) -> Judgement:
-    """Page faults and garbage collections while it ran."""
-    said = f"{f.page_faults} page faults, {f.gc_runs} runs of the garbage collector"
+    """Judge page faults and garbage collections while it ran."""
+    sentence = f"{f.page_faults} page faults, {f.gc_runs} runs of the garbage collector"
     if not f.page_faults and not f.gc_runs:
-        return Judgement("memory", Verdict.GOOD, said)
+        return Judgement("memory", Verdict.GOOD, sentence)
     if f.page_faults and not f.locked_kb:
-        return Judgement("memory", Verdict.MARGINAL, said, "memory is not locked; see the topic rights")
-    return Judgement("memory", Verdict.MARGINAL, said, "memory was locked, so this should be 0: send this report")
+        return Judgement("memory", Verdict.MARGINAL, sentence, "memory is not locked; see the topic rights")
+    return Judgement("memory", Verdict.MARGINAL, sentence, "memory was locked, so this should be 0: send this report")
 
 
 def stops(f: Figures) -> Judgement:
-    """Stops of the machine by its supervisor."""
-    said = f"the supervisor stopped the machine {f.stops} times"
+    """Judge the stops of the machine by its supervisor."""
+    sentence = f"the supervisor stopped the machine {f.stops} times"
     advice = "the reasons are under 'stop_reasons'; correct wake-ups first"
-    return _clocked(f, "stops", Verdict.UNFIT if f.stops else Verdict.GOOD, said, advice)
+    return _clocked(f, "stops", Verdict.UNFIT if f.stops else Verdict.GOOD, sentence, advice)
 
 
 REMOVED: Final = "(removed)"
@@ -304,12 +306,12 @@ VERSION: Final = 1
 
 
 def private_words(*words: str) -> frozenset[str]:
-    """Words to remove from a report, for example names of host and user; common ones say nothing and stay."""
+    """List the words to remove from a report, for example names of host and user; common ones say nothing and stay."""
     return frozenset(words) - _COMMON
 
 
 def without_private(value: Any, words: Iterable[str]) -> Any:
-    """The same plain value; in every text ``words`` and paths outside the system's own folders are removed."""
+    """Remove ``words`` and paths outside the system's own folders from every text of a plain value."""
     if isinstance(value, str):
         text = _PATH.sub(REMOVED, value)
         for word in sorted(words, key=len, reverse=True):
@@ -329,7 +331,7 @@ def without_private(value: Any, words: Iterable[str]) -> Any:
 def data_of(
     facts: Facts, computer: Computer, findings: Sequence[Finding], measured: Measured | str, words: Iterable[str]
 ) -> dict[str, Any]:
-    """The data of a report; ``measured`` is a sentence when the measurement failed, ``words`` are removed."""
+    """Gather the data of a report; ``measured`` is a sentence when the measurement failed, ``words`` are removed."""
     if isinstance(measured, str):
         advice = "correct what the sentence and the settings below say, and measure again; else send this report"
         judged: tuple[Judgement, ...] = (Judgement("run", Verdict.UNFIT, measured, advice),)
@@ -346,12 +348,12 @@ def data_of(
         "settings": asdict(facts),
         "findings": [f.document() for f in findings],
     }
-    found: dict[str, Any] = without_private(data, words)
-    return found
+    public_data: dict[str, Any] = without_private(data, words)
+    return public_data
 
 
 def text_of(data: dict[str, Any]) -> str:
-    """The report of these data."""
+    """Write the report of these data."""
     lines = ["# Real-time report", "", f"Verdict: **{data['verdict']}**.", ""]
     if data["disturbed"]:
         lines += [f"The computer was disturbed: {'; '.join(data['disturbed'])}.", ""]
@@ -362,25 +364,25 @@ def text_of(data: dict[str, Any]) -> str:
     parts = [data["computer"], data["settings"], data["measured"] or {}, (data["measured"] or {}).get("figures", {})]
     lines += [f"| {name} | {_cell(value)} |" for part in parts for name, value in part.items() if name != "figures"]
     lines += ["", "## Settings to change, the most useful first", ""]
-    wanted = [f for f in data["findings"] if f["severity"] != Severity.FINE.name.lower()]
-    for f in wanted:
+    changes = [f for f in data["findings"] if f["severity"] != Severity.FINE.name.lower()]
+    for f in changes:
         lines.append(f"- {f['what']}: {f['sentence']}; gain: {f['gain']}")
         lines += [f"  - `{command}`" for command in f["commands"]]
-    lines += [] if wanted else ["None."]
+    lines += [] if changes else ["None."]
     lines += ["", "## Data", "", "```json", json.dumps(data, indent=1), "```", ""]
     return "\n".join(lines)
 
 
 def read_data(text: str) -> dict[str, Any]:
-    """The data inside a report; raises ValueError when there are none."""
-    found = re.search(r"^```json\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    if found is None:
+    """Read the data inside a report; raises ValueError when there are none."""
+    match = re.search(r"^```json\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    if match is None:
         raise ValueError("this is not a real-time report: it holds no JSON")
-    data: dict[str, Any] = json.loads(found[1])
+    data: dict[str, Any] = json.loads(match[1])
     return data
 
 
 def _cell(value: object) -> str:
-    """Lists as words; a line feed or a column's mark would end the cell."""
+    """Write the content of a table cell, lists as words; a line feed or a column's mark would end the cell."""
     text = ", ".join(map(str, value)) if isinstance(value, list | dict) else str(value)
     return text.replace("|", "\\|").replace("\n", " ")

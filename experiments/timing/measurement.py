@@ -56,7 +56,7 @@ class MeasurementWindow(Span):
 
 
 def missing_tools() -> dict[str, str]:
-    """Missing programs with their Debian packages."""
+    """List the missing programs with their Debian packages."""
     return {tool: package for tool, package in TOOLS.items() if shutil.which(tool) is None}
 
 
@@ -94,18 +94,18 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
 
 
 def offset_us(stamp_ns: int, period_ns: int) -> int:
-    """Offset of cyclictest from the full second so that it wakes `QUIET_PHASE` of a period after the ticks."""
+    """Compute cyclictest's offset from the full second so that it wakes `QUIET_PHASE` of a period after the ticks."""
     return round((stamp_ns + QUIET_PHASE * period_ns) % period_ns / 1000) % (period_ns // 1000)
 
 
 def read_cyclictest(report: str) -> Durations:
-    """The histogram of a finished run, from its JSON report."""
+    """Read the histogram of a finished run, from its JSON report."""
     thread = json.loads(report)["thread"]["0"]
-    found = Durations(longest_ns=1000 * int(thread["max"]), total_ns=round(1000 * thread["avg"] * thread["cycles"]))
+    histogram = Durations(longest_ns=1000 * int(thread["max"]), total_ns=round(1000 * thread["avg"] * thread["cycles"]))
     for late_us, n in thread["histogram"].items():
-        found.bins[bin_of(1000 * int(late_us))] += int(n)
-    found.bins[-1] += max(0, int(thread["cycles"]) - found.count)
-    return found
+        histogram.bins[bin_of(1000 * int(late_us))] += int(n)
+    histogram.bins[-1] += max(0, int(thread["cycles"]) - histogram.count)
+    return histogram
 
 
 def read_sleep_loop(output: dict[str, Any]) -> SleepLoopReport:
@@ -139,7 +139,7 @@ def load(testbed: TimingTestbed, seconds: float) -> Iterator[None]:
 
 
 def system_calls(testbed: TimingTestbed, seconds: float, directory: Path) -> tuple[dict[str, int], float] | None:
-    """System calls of the controller by name, and the number of ticks; None if it cannot be traced.
+    """Count the system calls of the controller by name, and the number of ticks; None if it cannot be traced.
 
     Tracing slows the loop down but does not change how many system calls a tick makes.
     """
@@ -164,5 +164,5 @@ def system_calls(testbed: TimingTestbed, seconds: float, directory: Path) -> tup
 
 
 def count_calls(summary: str) -> dict[str, int]:
-    """System calls by name, from the table that ``strace -c`` prints."""
+    """Count the system calls by name, from the table that ``strace -c`` prints."""
     return {name: int(calls) for calls, name in _CALLS.findall(summary) if name != "total"}

@@ -47,7 +47,7 @@ MISSED: Final = "Periods skipped, or by which a wake-up of cyclictest was late."
 
 
 def _lateness(mark: str, where: str, *keys: str) -> tuple[Metric, ...]:
-    """Quantiles of the lateness of the three loops; ``mark`` follows the names of the loops."""
+    """Define the quantiles of the lateness of the three loops; ``mark`` follows the names of the loops."""
     return tuple(
         Metric(f"{loop}{mark}_{key}_us", f"{title}{where}: lateness, {QUANTILES[key]}", "us", LATE)
         for key in keys
@@ -56,7 +56,7 @@ def _lateness(mark: str, where: str, *keys: str) -> tuple[Metric, ...]:
 
 
 def _missed(end: str, where: str) -> tuple[Metric, ...]:
-    """Deadlines that each loop missed under load."""
+    """Define the deadlines that each loop missed under load."""
     loops = {"": "controller", "_cyclictest": "cyclictest", "_plain": "sleep loop"}
     named = {f"missed_loaded{loop}{end}": f"Deadlines missed{where}: {title}" for loop, title in loops.items()}
     return tuple(Metric(name, title, "", MISSED) for name, title in named.items())
@@ -253,7 +253,7 @@ class Measured:
 
 
 def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[MeasurementWindow]]:
-    """All metrics of the testbeds at 200 Hz and at 1 kHz, and the windows that were compared."""
+    """Compute all metrics of the testbeds at 200 Hz and at 1 kHz, and select the windows to compare."""
     compared, enough = compared_windows(slow.quiet)
     pressures = [w.host.pressure for w in slow.quiet if w.host.pressure is not None]
     metrics = {
@@ -292,7 +292,7 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
 
 
 def quiet(window: MeasurementWindow) -> bool:
-    """Whether cyclictest and the steal counter show a quiet host."""
+    """Tell whether cyclictest and the steal counter show a quiet host."""
     period_ns = window.end.period_ns
     return (
         window.cyclictest.longest_ns <= QUIET_LONGEST_SHARE * period_ns
@@ -302,7 +302,7 @@ def quiet(window: MeasurementWindow) -> bool:
 
 
 def still(window: MeasurementWindow) -> bool:
-    """Whether the host left the processor and its caches alone, as far as cyclictest, steal and pressure tell."""
+    """Tell whether the host left the processor and its caches alone, as far as cyclictest, steal and pressure tell."""
     return (
         window.cyclictest.quantile_ns(0.99) <= STILL_P99_NS
         and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
@@ -311,14 +311,14 @@ def still(window: MeasurementWindow) -> bool:
 
 
 def compared_windows(windows: Sequence[MeasurementWindow]) -> tuple[list[MeasurementWindow], bool]:
-    """The quiet windows and True; all windows and False if too few are quiet."""
+    """Select the quiet windows and return True; all windows and False if too few are quiet."""
     good = [w for w in windows if quiet(w)]
     enough = len(good) >= QUIET_WINDOW_SHARE * len(windows)
     return (good, True) if enough and good else (list(windows), False)
 
 
 def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWindow]:
-    """The quietest quarter, at least one, by the sleep loop's processor time alone: our own times choose nothing.
+    """Select the quietest quarter, at least one, by the sleep loop's processor time: our own times choose nothing.
 
     The loop does the same in every cycle, on the same processor in the same seconds.  What makes it dear, other
     machines' work in the shared caches, makes a tick dear; cyclictest's lateness does not tell these windows apart.
@@ -328,15 +328,19 @@ def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWi
 
 
 def cost_metrics(name: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Processor time of a tick in the quietest windows and in all, and whether the host was still in the former."""
+    """Compute the processor time of a tick in the quietest windows and in all, and whether the host was still in the
+    former.
+    """
     judged = quietest_windows(windows)
-    found = spread_us(name, pooled([w.durations["cpu"] for w in judged]))
-    found |= spread_us(f"{name}_all", pooled([w.durations["cpu"] for w in windows]))
-    return found | {f"{name}_host_still": float(all(map(still, judged)))}
+    metrics = spread_us(name, pooled([w.durations["cpu"] for w in judged]))
+    metrics |= spread_us(f"{name}_all", pooled([w.durations["cpu"] for w in windows]))
+    return metrics | {f"{name}_host_still": float(all(map(still, judged)))}
 
 
 def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Processor time of the sleep loop's cycle [us], and the tick's median in such cycles: the median window's."""
+    """Compute the sleep loop's processor time per cycle [us], and the tick's median in such cycles: the median
+    window's.
+    """
     in_cycles = [w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.sleep_loop.cpu_us for w in windows]
     return {
         "plain_cpu_us": float(np.median([w.sleep_loop.cpu_us for w in quietest_windows(windows)])),
@@ -346,14 +350,14 @@ def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
 
 
 def pooled(histograms: Sequence[Durations]) -> Durations:
-    """The sum of histograms."""
+    """Add up histograms."""
     bins = np.sum([np.zeros(BINS), *(np.asarray(h.bins) for h in histograms)], axis=0).astype(np.uint64)
     longest_ns = max((h.longest_ns for h in histograms), default=0)
     return Durations(bins.tobytes(), longest_ns, sum(h.total_ns for h in histograms))
 
 
 def quantile_us(histogram: Durations, share: float) -> float:
-    """A quantile [us], interpolated linearly inside its bin; NaN without entries."""
+    """Compute a quantile [us], interpolated linearly inside its bin; NaN without entries."""
     bins = np.array(histogram.bins)
     if not bins.any():
         return math.nan
@@ -365,14 +369,16 @@ def quantile_us(histogram: Durations, share: float) -> float:
 
 
 def spread_us(name: str, histogram: Durations) -> dict[str, float]:
-    """Metrics ``NAME_p50_us``, p99, p99.9 and the longest [us]."""
+    """Compute the metrics ``NAME_p50_us``, p99, p99.9 and the longest [us]."""
     shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-    found = {f"{name}_{k}_us": quantile_us(histogram, share) for k, share in shares.items()}
-    return found | {f"{name}_max_us": histogram.longest_ns / 1e3 if histogram.count else math.nan}
+    metrics = {f"{name}_{k}_us": quantile_us(histogram, share) for k, share in shares.items()}
+    return metrics | {f"{name}_max_us": histogram.longest_ns / 1e3 if histogram.count else math.nan}
 
 
 def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], share: float) -> dict[str, float]:
-    """Ratio of a quantile over all windows as metric ``name``, with the 95 % interval of the windows' own ratios."""
+    """Compute the ratio of a quantile over all windows as metric ``name``, with the 95 % interval of the windows' own
+    ratios.
+    """
 
     def of(a: Durations, b: Durations) -> float:
         below = quantile_us(b, share)
@@ -384,7 +390,7 @@ def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], sha
 
 
 def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Counters of the process over all windows: totals, or per tick where the name says so."""
+    """Compute the counters of the process over all windows: totals, or per tick where the name says so."""
     begin, end = windows[0].begin, windows[-1].end
     first, last = begin.process, end.process
     span = max(1, end.ticks - begin.ticks)
@@ -401,7 +407,8 @@ def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
 
 
 def block_growth(readings: Sequence[Facts]) -> float:
-    """Growth of the interpreter's memory blocks: minimum of the second half of the readings less that of the first.
+    """Compute the growth of the interpreter's memory blocks: minimum of the second half of the readings less that of
+    the first.
 
     The minima remove blocks that come and go between readings.
     """
@@ -411,28 +418,28 @@ def block_growth(readings: Sequence[Facts]) -> float:
 
 
 def system_call_metrics(calls: tuple[dict[str, int], float] | None) -> dict[str, float]:
-    """System calls per tick, in total and by name; NaN if the process cannot be traced."""
+    """Compute the system calls per tick, in total and by name; NaN if the process cannot be traced."""
     by_name, ticks = calls or ({}, math.nan)
     each = {f"syscalls_{name}": count / ticks for name, count in by_name.items()}
     return {"syscalls_per_tick": sum(by_name.values()) / ticks, **each}
 
 
 def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, Durations]:
-    """Histograms of controller, cyclictest and sleep loop over all windows."""
+    """Add up the histograms of controller, cyclictest and sleep loop over all windows."""
     histograms = [(w.durations["wake"], w.cyclictest, w.sleep_loop.lateness) for w in windows]
     ours, theirs, plain = (pooled(column) for column in zip(*histograms, strict=True))
     return ours, theirs, plain
 
 
 def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Lateness of the wake-ups of controller, cyclictest and sleep loop; ``mark`` follows their names."""
+    """Compute the lateness of the wake-ups of controller, cyclictest and sleep loop; ``mark`` follows their names."""
     ours, theirs, plain = loops(windows)
-    found = spread_us(f"wakeup{mark}", ours) | spread_us(f"cyclictest{mark}", theirs)
-    return found | spread_us(f"plain{mark}", plain)
+    metrics = spread_us(f"wakeup{mark}", ours) | spread_us(f"cyclictest{mark}", theirs)
+    return metrics | spread_us(f"plain{mark}", plain)
 
 
 def loaded(end: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Missed deadlines of the three loops under load; ``end`` is the suffix of the metric names."""
+    """Count the missed deadlines of the three loops under load; ``end`` is the suffix of the metric names."""
     ours, plain = sum(w.missed for w in windows), sum(w.sleep_loop.missed for w in windows)
     return {
         f"missed_loaded{end}": float(ours),
@@ -443,25 +450,25 @@ def loaded(end: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
 
 
 def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
-    """The metrics that a run with these values cannot decide, with the reason."""
-    found: dict[str, str] = {}
+    """List the metrics that a run with these values cannot decide, with the reason."""
+    reasons: dict[str, str] = {}
     noisy = "cyclictest itself was late: the host is too noisy"
     quiet_host, cycles, ticks = metrics["host_verdict"], metrics["judged_cycles"], metrics["ticks"]
 
     def need(name: str, count: float, least: int, unit: str) -> bool:
         if count < least:
-            found[name] = f"{count:.0f} {unit} are too few; at least {least} are needed"
+            reasons[name] = f"{count:.0f} {unit} are too few; at least {least} are needed"
         return count < least
 
     for name in ("wakeup_p50_ratio", "wakeup_p99_ratio"):
         if not quiet_host:
-            found[name] = noisy
+            reasons[name] = noisy
         else:
             need(name, cycles, MIN_RATIO_CYCLES, "cycles")
     if not metrics["missed"]:
         need("missed", cycles, MIN_MISS_CYCLES, "cycles")
     elif not quiet_host:
-        found["missed"] = noisy
+        reasons["missed"] = noisy
     for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
         if metrics[name] <= 0.0:
             need(name, ticks, MIN_STEADY_TICKS, "ticks")
@@ -470,20 +477,20 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
         most = next(m.most for m in METRICS if m.name == name) or math.inf
         enough = not need(name, count, MIN_CPU_TICKS, "ticks")
         if enough and metrics[name] > most and not metrics[f"{name.partition('_p')[0]}_host_still"]:
-            found[name] = "even the quietest windows were noisy, and noise adds to the processor time"
-    found |= explained(metrics)
+            reasons[name] = "even the quietest windows were noisy, and noise adds to the processor time"
+    reasons |= explained(metrics)
     if not quiet_host and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
-        found["sample_to_command_p99_us"] = noisy
+        reasons["sample_to_command_p99_us"] = noisy
     ours, plain = metrics["missed_loaded"], metrics["missed_loaded_plain"]
     if ours and metrics["missed_loaded_cyclictest"] >= ours:
-        found["missed_loaded_share"] = "cyclictest missed as many deadlines: the host withheld the processor"
+        reasons["missed_loaded_share"] = "cyclictest missed as many deadlines: the host withheld the processor"
     elif plain < MIN_PLAIN_MISSED and ours * 100.0 <= plain:
         why = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
-        found["missed_loaded_share"] = why
-    return unmeasured(METRICS, metrics) | found
+        reasons["missed_loaded_share"] = why
+    return unmeasured(METRICS, metrics) | reasons
 
 
 def unmeasured(definitions: Iterable[Metric], metrics: Mapping[str, float]) -> dict[str, str]:
-    """The metrics with a limit that have no value: inconclusive, with the reason."""
+    """List the metrics with a limit that have no value: inconclusive, with the reason."""
     missing = [m.name for m in definitions if m.limit_text() and math.isnan(metrics.get(m.name, math.nan))]
     return dict.fromkeys(missing, "it could not be measured here")

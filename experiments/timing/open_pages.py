@@ -50,14 +50,14 @@ class Window:
 
 
 def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: Progress) -> dict[str, list[Window]]:
-    """Windows without pages and with ``pages``, in turn; ``directory`` keeps what the processes write to stderr.
+    """Measure windows without pages and with ``pages``, in turn; ``directory`` keeps what processes write to stderr.
 
     Raises:
         CommandFailed: a process does not start or ends.
     """
     reports, port = free_udp_ports(2)
     setting = TestbedConfig(PROFILE, RATE_HZ, report_ports=(reports,))
-    found: dict[str, list[Window]] = {"none": [], "open": []}
+    windows: dict[str, list[Window]] = {"none": [], "open": []}
     with TimingTestbed(setting, directory) as testbed:
         testbed.helpers.environment = testbed.family.environment  # the console listens on the same wire
         testbed.helpers.start(
@@ -77,13 +77,13 @@ def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: 
                 progress(f"round {number + 1} of {rounds}: {pages if side == 'open' else 'no'} pages")
                 with _opened(testbed, port, pages if side == "open" else 0) as states:
                     window = _window(testbed, seconds, directory)
-                found[side].append(replace(window, states=sum(states)))
-    return found
+                windows[side].append(replace(window, states=sum(states)))
+    return windows
 
 
 @contextmanager
 def _opened(testbed: TimingTestbed, port: int, pages: int) -> Iterator[list[int]]:
-    """So many open pages, without their drawing: each reads every state and shows a panel.  The states of each so far.
+    """Open so many pages without drawing: each reads every state and shows a panel.  Yield the states of each so far.
 
     One of the panels is the CAN table, for which the console listens on the bus.
     """
@@ -119,7 +119,7 @@ def _window(testbed: TimingTestbed, seconds: float, directory: Path) -> Window:
 
 
 def judge(found: dict[str, list[Window]]) -> dict[str, Any]:
-    """The figures: medians of each side, whether its counts are the same, and the ratio of the processor times.
+    """Compute the figures: medians of each side, whether its counts are the same, and the ratio of the processor times.
 
     ``same`` of a count is None where it was not counted.  ``reached`` is false when a count differs or the ratio is
     certainly missed; a ratio whose interval holds the limit is inconclusive, and no failure.

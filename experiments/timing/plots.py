@@ -36,7 +36,7 @@ def draw(quiet: Sequence[MeasurementWindow], loaded: Sequence[MeasurementWindow]
 
 
 def draw_exceeded(axis: Any, histograms: Mapping[str, Durations], period_ns: int) -> None:
-    """Share of wake-ups later than x for each loop, one point per filled bin, and the period as a dashed line."""
+    """Draw the share of wake-ups later than x for each loop, a point per filled bin, and the period dashed."""
     for name, histogram in histograms.items():
         bins = np.array(histogram.bins, float)
         filled = np.flatnonzero(bins)
@@ -48,7 +48,7 @@ def draw_exceeded(axis: Any, histograms: Mapping[str, Durations], period_ns: int
 
 
 def stages(durations: Mapping[str, Durations], path: Path) -> None:
-    """Median, p99 and longest of every stage, of the tick by the clock and by CPU time, and of the whole latency."""
+    """Draw median, p99 and longest of every stage, of the tick by the clock and CPU time, and of the whole latency."""
     names = [n for n in (*WITHIN, *WHOLE) if n in durations and durations[n].longest_ns]
     with sheet(path, height=0.5 + 0.34 * len(names)) as axis:
         for y, name in enumerate(reversed(names)):
@@ -65,7 +65,7 @@ def stages(durations: Mapping[str, Durations], path: Path) -> None:
 
 
 def ages(inputs: Mapping[str, InputAge], path: Path) -> None:
-    """Newest and longest age of every input used."""
+    """Draw newest and longest age of every input used."""
     used = sorted((n, a) for n, a in inputs.items() if a.count)
     with sheet(path, height=0.6 + 0.2 * max(1, len(used))) as axis:
         for y, (_, age) in enumerate(reversed(used)):

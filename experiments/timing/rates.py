@@ -87,7 +87,7 @@ class CranePoint:
 
 
 def functions_of(machine: str) -> int:
-    """Functions of a machine: its joints, the grapple, and on a carrier articulation, drive and swing arms."""
+    """List the functions of a machine: its joints, the grapple, and on a carrier articulation, drive and swing arms."""
     return len(JOINTS) + 1 + (CARRIER_FUNCTIONS if load_profile(machine).carrier else 0)
 
 
@@ -136,7 +136,7 @@ def measure_rate(machine: str, rate_hz: int, seconds: float, directory: Path) ->
 
 
 def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[CranePoint]:
-    """More and more controllers of each kept recording on one processor, up to the first that it cannot carry."""
+    """Measure ever more controllers of each kept recording on one processor, up to the first that it cannot carry."""
     directory.mkdir(parents=True, exist_ok=True)
     points = []
     with tempfile.TemporaryDirectory() as folder:
@@ -173,16 +173,16 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
             time.sleep(0.05)
     finally:
         family.stop_all(())
-    found = list(outputs.values())
+    replays = list(outputs.values())
     return CranePoint(
         Path(manifest_of(files_of(recording)).profile).stem,
         cranes,
-        *(sum(x[name] for x in found) for name in ("ticks", "missed", "differing", "cpu_us")),
+        *(sum(x[name] for x in replays) for name in ("ticks", "missed", "differing", "cpu_us")),
     )
 
 
 def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
-    """Slope and intercept of the straight line, and its largest residual as a share of the largest value."""
+    """Compute slope and intercept of the straight line, and its largest residual as a share of the largest value."""
     if len(x) < 2:
         return math.nan, math.nan, math.nan
     slope, intercept = np.polyfit(x, y, 1)
@@ -191,7 +191,7 @@ def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
 
 
 def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[str, float]:
-    """All metrics."""
+    """Compute all metrics."""
     fast = next(p for p in points if p.machine == FORWARDER and p.rate_hz == max(q.rate_hz for q in points))
     metrics = {
         **{f"forwarder1k_{name}": value for name, value in fast.figures.items()},
@@ -199,27 +199,31 @@ def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[st
         "differing_ticks": float(sum(c.differing for c in cranes)),
     }
     for machine in MACHINES:
-        mine = {p.rate_hz: p.figures for p in points if p.machine == machine}
-        lines = [[f[name] for f in mine.values()] for name in ("frames_per_s", "cpu_share")]
+        rate_figures = {p.rate_hz: p.figures for p in points if p.machine == machine}
+        lines = [[f[name] for f in rate_figures.values()] for name in ("frames_per_s", "cpu_share")]
         slope, intercept, residual = fit(*lines)
         metrics |= {f"{machine}_frame_us": slope * 1e6, f"{machine}_rest_share": intercept}
         metrics[f"{machine}_frame_residual"] = residual
-        metrics |= {f"{machine}_{hz}_{n}": f[n] for hz, f in mine.items() for n in ("cpu_share", "frames_per_s")}
+        metrics |= {
+            f"{machine}_{hz}_{n}": f[n] for hz, f in rate_figures.items() for n in ("cpu_share", "frames_per_s")
+        }
         carried = [c.cranes for c in cranes if c.machine == machine and c.carried]
         metrics[f"{machine}_cranes"] = float(max(carried, default=0))
-        metrics[f"{machine}_cranes_bound"] = math.floor(0.95 / mine[200]["cpu_share"]) if 200 in mine else math.nan
+        metrics[f"{machine}_cranes_bound"] = (
+            math.floor(0.95 / rate_figures[200]["cpu_share"]) if 200 in rate_figures else math.nan
+        )
     slope, _, residual = fit([float(c.functions) for c in cranes], [c.cpu_us for c in cranes])
     return metrics | {"function_us": slope, "function_residual": residual}
 
 
 def undecided(metrics: Mapping[str, float], points: Sequence[RatePoint]) -> dict[str, str]:
-    """The metrics that this run cannot decide, with the reason."""
-    found = unmeasured(METRICS, metrics) | explained(metrics)
+    """List the metrics that this run cannot decide, with the reason."""
+    reasons = unmeasured(METRICS, metrics) | explained(metrics)
     stalled = any(s.length_ns >= STALL_NS for p in points for s in p.events.stalls)
     for name, _ in LINES:
         if metrics[f"{name}_residual"] > MAX_RESIDUAL and stalled:
-            found[f"{name}_residual"] = "the host stalled during the measurement"
-    return found
+            reasons[f"{name}_residual"] = "the host stalled during the measurement"
+    return reasons
 
 
 FAST: Final = Section(
@@ -279,7 +283,7 @@ INTRODUCTION: Final = (
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     setting = f"Commit `{result.commit}`. {host_activity.sentence(result.environment)}"
     return Page("Rates experiment", CONCLUSION, INTRODUCTION, SECTIONS, setting)
 
@@ -288,11 +292,13 @@ def draw(points: Sequence[RatePoint], cranes: Sequence[CranePoint], path: Path) 
     """Load against frames for each machine, and cost against functions for all controllers, with their lines."""
     with sheet(path, 2, height=3.4) as axes:
         for machine, colour in zip(MACHINES, (OIL, MOSS), strict=True):
-            mine = [p.figures for p in points if p.machine == machine]
-            ours = [c for c in cranes if c.machine == machine]
-            frames, loads = ([f[name] for f in mine] for name in ("frames_per_s", "cpu_share"))
+            machine_figures = [p.figures for p in points if p.machine == machine]
+            crane_points = [c for c in cranes if c.machine == machine]
+            frames, loads = ([f[name] for f in machine_figures] for name in ("frames_per_s", "cpu_share"))
             axes[0].plot(frames, [100 * share for share in loads], "o", color=colour, label=machine)
-            axes[1].plot([c.functions for c in ours], [c.cpu_us for c in ours], "o", color=colour, label=machine)
+            axes[1].plot(
+                [c.functions for c in crane_points], [c.cpu_us for c in crane_points], "o", color=colour, label=machine
+            )
             _line(axes[0], frames, [100 * share for share in loads], colour)
         _line(axes[1], [float(c.functions) for c in cranes], [c.cpu_us for c in cranes], STEEL)
         axes[1].axhline(PERIOD_NS / 1e3, color=RUST, ls="--", lw=0.8)

@@ -46,7 +46,9 @@ _SO_TIMESTAMPNS: Final = 35
 
 
 def traffic(database: Database) -> Iterator[RawFrame]:
-    """Frames that the controller receives on crane0, by cycle time, with valid values and running E2E counters."""
+    """Make the frames that the controller receives on crane0, by cycle time, with valid values and running E2E
+    counters.
+    """
     rng = random.Random(1)
     received = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
     messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in received]
@@ -74,7 +76,7 @@ class Reader:
                 self.accepted += 1
 
     def read_messages(self, messages: Sequence[can.Message]) -> None:
-        """The same for python-can's messages."""
+        """Check and decode python-can's messages in the same way."""
         for message in messages:
             checker, receive = self._slots[message.arbitration_id]
             data = bytes(message.data)
@@ -146,13 +148,13 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
 def _round(
     lane: Lane, supply: Iterator[RawFrame], reader: Reader, frames: int, clock: Callable[[], int]
 ) -> tuple[int, int]:
-    """Time [ns] of receiving, and of checking and decoding, for one round."""
+    """Measure the time [ns] of receiving, and of checking and decoding, for one round."""
     _discard(lane)  # on an interface every socket received the frames of the other paths
     read = reader.read_messages if lane.messages else reader.read
     rx_ns = decode_ns = 0
     for start in range(0, frames, DRAIN_FRAMES):
-        wanted = min(DRAIN_FRAMES, frames - start)
-        lane.send(list(itertools.islice(supply, wanted)))
+        frame_count = min(DRAIN_FRAMES, frames - start)
+        lane.send(list(itertools.islice(supply, frame_count)))
         received: list[Any] = []
         begin_ns = clock()
         lane.drain(received)
@@ -160,10 +162,10 @@ def _round(
         read(received)
         decode_ns += clock() - middle_ns
         rx_ns += middle_ns - begin_ns
-        if len(received) != wanted:
+        if len(received) != frame_count:
             raise CommandFailed(
                 "receive-cost.frames-missing",
-                f"{lane.label} gave {len(received)} of {wanted} frames; is anybody else sending?",
+                f"{lane.label} gave {len(received)} of {frame_count} frames; is anybody else sending?",
                 ExitCode.BUS,
             )
     return rx_ns, decode_ns
@@ -180,14 +182,14 @@ def _discard(lane: Lane) -> int:
 
 
 def _lanes(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
-    """Every path of this machine: ours, python-can's, python-can as a bus."""
+    """Open every path of this machine: ours, python-can's, python-can as a bus."""
     present = {name for _, name in socket.if_nameindex()} if kernel_has_can() else set()
     interface = next((name for name in ("vcan0", "vcan1") if name in present), None)
     return _on_pairs(stack) if interface is None else _on_interface(interface, stack)
 
 
 def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, ...]:
-    """Ours and python-can's on a virtual kernel CAN interface."""
+    """Open ours and python-can's on a virtual kernel CAN interface."""
     sender = stack.enter_context(open_bus(f"socketcan:{interface}", filters=[]))
     ours = stack.enter_context(open_bus(f"socketcan:{interface}"))
     theirs = stack.enter_context(can.Bus(interface="socketcan", channel=interface))
@@ -227,7 +229,7 @@ class _BusOnPair(PythonCanBus):
 
 
 def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
-    """Ours, python-can's and python-can as a bus, each on an AF_UNIX datagram pair."""
+    """Open ours, python-can's and python-can as a bus, each on an AF_UNIX datagram pair."""
 
     def pair() -> tuple[socket.socket, Callable[[list[RawFrame]], None]]:
         near, far = map(stack.enter_context, socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -260,7 +262,7 @@ def _recv_all(bus: can.BusABC) -> Callable[[list[Any]], object]:
 
 
 def _payload(codec: MessageCodec, rng: random.Random) -> bytes:
-    """Payload of the message with every value in range and available."""
+    """Make the payload of the message with every value in range and available."""
     while True:
         values = []
         for s in codec.signals:
@@ -272,7 +274,7 @@ def _payload(codec: MessageCodec, rng: random.Random) -> bytes:
 
 
 def _clock() -> tuple[Callable[[], int], str]:
-    """CPU time of this thread; wall time where the kernel counts CPU time in ticks, as user-mode Linux does."""
+    """Return this thread's CPU time; wall time where the kernel counts CPU time in ticks, as user-mode Linux does."""
     begin_ns = time.thread_time_ns()
     deadline_ns = time.perf_counter_ns() + 1_000_000
     while time.perf_counter_ns() < deadline_ns:

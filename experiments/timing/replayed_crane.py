@@ -64,7 +64,7 @@ class BusPair:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m experiments.timing.replayed_crane")
     parser.add_argument("recording", type=Path)
     parser.add_argument("--ticks", type=int, required=True)
@@ -108,8 +108,8 @@ def main(arguments: list[str] | None = None) -> int:
         missed += late_ns >= period_ns
         deadline_ns += period_ns * (1 + max(0, late_ns // period_ns))
     cpu_us = process_ns / len(ticks) / 1e3
-    found = {"ticks": len(ticks), "missed": missed, "differing": differing, "cpu_us": cpu_us}
-    print(json.dumps(found), flush=True)
+    summary = {"ticks": len(ticks), "missed": missed, "differing": differing, "cpu_us": cpu_us}
+    print(json.dumps(summary), flush=True)
     return 0
 
 

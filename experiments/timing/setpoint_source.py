@@ -62,7 +62,7 @@ class Swing:
         self.w = SPEED_SHARE * min(speed / half, math.sqrt(acceleration / half))
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Position and velocity."""
+        """Return position and velocity."""
         half, angle = self.reach / 2, self.w * t_s
         return self.start + half * (1.0 - math.cos(angle)), half * self.w * math.sin(angle)
 
@@ -88,7 +88,7 @@ class SetpointSource:
         return self.operator.step(report)
 
     def setpoint(self, now_ns: int) -> bytes | None:
-        """The setpoint to send now; None while the machine is not armed."""
+        """Return the setpoint to send now; None while the machine is not armed."""
         report, stamp_ns = self.report, now_ns - STAMP_AGE_NS
         if report is None or report.mode not in (Mode.ARMED, Mode.ACTIVE):
             return None
@@ -105,7 +105,9 @@ class SetpointSource:
         )
 
     def _from(self, reference: Sequence[float]) -> list[Swing]:
-        """A joint without an encoder has no position; it starts at 0, as the controller's own reference does."""
+        """Make the swings; a joint without an encoder has no position and starts at 0, as the controller's reference
+        does.
+        """
         starts = [0.0 if math.isnan(q) else q for q in reference]
         return [
             Swing(q, s.lower, s.upper, s.speed_limit, s.acceleration_limit, rises=j is Joint.LIFT)
@@ -118,7 +120,7 @@ class SetpointSource:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.timing.setpoint_source", description="Keep a machine in motion."
     )

@@ -16,7 +16,7 @@ from can_dbc.timing.durations import Durations
 
 
 def run(period_ns: int, seconds: float) -> tuple[Durations, int]:
-    """Lateness of every wake-up, and the periods skipped."""
+    """Measure the lateness of every wake-up, and the periods skipped."""
     lateness, missed = Durations(), 0
     deadline_ns = time.monotonic_ns() + period_ns
     end_ns = deadline_ns + round(seconds * 1e9)
@@ -31,7 +31,7 @@ def run(period_ns: int, seconds: float) -> tuple[Durations, int]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m experiments.timing.sleep_loop")
     parser.add_argument("--period-us", type=int, required=True)
     parser.add_argument("--seconds", type=float, required=True)
@@ -40,8 +40,8 @@ def main() -> None:
     lateness, missed = run(1000 * options.period_us, options.seconds)
     cpu_us = (time.thread_time_ns() - begin_ns) / 1e3 / max(1, lateness.count)
     bins = {str(i): n for i, n in enumerate(lateness.bins) if n}
-    found = {"bins": bins, "longest_ns": lateness.longest_ns, "missed": missed, "cpu_us": round(cpu_us, 3)}
-    print(json.dumps(found), flush=True)
+    summary = {"bins": bins, "longest_ns": lateness.longest_ns, "missed": missed, "cpu_us": round(cpu_us, 3)}
+    print(json.dumps(summary), flush=True)
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def run(options: Options, console: Console) -> Result:
     profile = load_profile(options.profile)
     setting = TestbedConfig(options.profile, profile.rate_hz, options.bus)
     console.print(f"soak: {minutes:.3g} minutes, {profile.name} at {profile.rate_hz} Hz on {options.bus}")
-    first = host_activity.sample()
+    first_sample = host_activity.sample()
     with console.status("soak: starting") as status, TimingTestbed(setting, options.out / "testbed") as testbed:
         testbed.wait(WARM_S)
         mark, before = testbed.mark(), testbed.counters()
@@ -141,14 +141,14 @@ def run(options: Options, console: Console) -> Result:
         readings.append(read(testbed, time.monotonic() - began))
         counted = testbed.counters()
         counted.subtract(before)
-    told = event_metrics([testbed.events])
+    event_values = event_metrics([testbed.events])
     metrics = {
         "minutes": minutes,
         "ticks": float(span.ticks),
         "missed": float(span.missed),
-        **{name: told[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
+        **{name: event_values[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
-        "steal_ms": host_activity.between(first, host_activity.sample()).steal_ms,
+        "steal_ms": host_activity.between(first_sample, host_activity.sample()).steal_ms,
         **memory(readings),
         **frames(counted, span),
         **spread_us("wakeup", span.durations["wake"]),
@@ -180,7 +180,7 @@ def run(options: Options, console: Console) -> Result:
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     e = result.environment
     rate = f" at {e['rate_hz']} Hz" if "rate_hz" in e else ""
     where = f"`{result.profile}`{rate} on {e['bus']}{e['lab']}"
@@ -189,26 +189,26 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
 
 
 def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
-    """The metrics that this run cannot decide, with the reason; stops are the host's if a witness saw it stall."""
-    found = {}
+    """List the metrics that this run cannot decide, with the reason; stops are the host's if a witness saw it stall."""
+    reasons = {}
     if metrics["active_share"] < MIN_ACTIVE_SHARE and metrics["stops"] and not metrics["stops_unexplained"]:
-        found["active_share"] = f"the host withheld a processor for up to {metrics['stall_max_ms']:.0f} ms"
+        reasons["active_share"] = f"the host withheld a processor for up to {metrics['stall_max_ms']:.0f} ms"
     most = STOP_BLOCKS if metrics["stops"] else JITTER_BLOCKS
     if metrics["ticks"] < MIN_STEADY_TICKS and 0.0 < metrics["allocated_blocks_growth"] <= most:
-        found["allocated_blocks_growth"] = f"{metrics['ticks']:.0f} ticks are too few to detect a leak"
-    return found
+        reasons["allocated_blocks_growth"] = f"{metrics['ticks']:.0f} ticks are too few to detect a leak"
+    return reasons
 
 
 def read(testbed: TimingTestbed, at_s: float) -> Reading:
     """Read a running testbed."""
     status = (Path(f"/proc/{testbed.family.children[n].process.pid}/status") for n in ("controller", "guard"))
     resident = (re.search(r"^VmRSS:\s+(\d+)", path.read_text(), re.MULTILINE) for path in status)
-    controller, guard = (int(found[1]) if found else 0 for found in resident)
+    controller, guard = (int(match[1]) if match else 0 for match in resident)
     return Reading(at_s, testbed.timing().facts, controller, guard, testbed.mode)
 
 
 def memory(readings: Sequence[Reading]) -> dict[str, float]:
-    """Growth between the halves of a run, and counters of the controller's process."""
+    """Compute the growth between the halves of a run, and counters of the controller's process."""
     half = max(1, len(readings) // 2)
     early, late = readings[:half], readings[half:]
     first, last = readings[0].facts.process, readings[-1].facts.process
@@ -222,7 +222,7 @@ def memory(readings: Sequence[Reading]) -> dict[str, float]:
 
 
 def frames(counted: Counter[str], span: Span) -> dict[str, float]:
-    """Counts of frames in a run, by bus observer, emulated machine and controller."""
+    """Count the frames in a run, by bus observer, emulated machine and controller."""
     lost = sum(loss.frames for loss in losses_between(span.begin, span.end))
     names = ("received", "sent", "gaps", "gaps_rig", "damaged", "unanswered", "records_lost")
     return {

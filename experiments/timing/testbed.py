@@ -111,7 +111,7 @@ class Span:
 
 
 def cores() -> tuple[int, set[int]]:
-    """The controller's processor, and those of everything else (the same one if there is only one)."""
+    """Choose the controller's processor, and those of everything else (the same one if there is only one)."""
     available = sorted(os.sched_getaffinity(0))
     return available[-1], set(available[:-1]) or {available[-1]}
 
@@ -245,7 +245,7 @@ class TimingTestbed:
             )
 
     def _own_share(self) -> float:
-        """Share of their processor that the processes of `BUS_CORE` used: the largest of the last few seconds."""
+        """Compute the share of their processor used by the processes of `BUS_CORE`: the largest of the last seconds."""
         return max(((b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(self._cpu_s)), default=0.0)
 
     @property
@@ -259,21 +259,21 @@ class TimingTestbed:
         return int(self.status["setpoints"]["stamp_ns"])
 
     def counters(self) -> Counter[str]:
-        """What observer and emulated machine have counted so far; a machine alone on its bus has frames refused."""
-        seen, rig = (Counter(self.status.get(name, {})) for name in ("observer", "machine"))
-        found = Counter({name: seen[name] for name in ("received", "sent", "gaps", "unanswered")})
-        return found + Counter(
+        """Return the counts of observer and emulated machine so far; a machine alone on its bus has frames refused."""
+        observed, rig = (Counter(self.status.get(name, {})) for name in ("observer", "machine"))
+        bus_counts = Counter({name: observed[name] for name in ("received", "sent", "gaps", "unanswered")})
+        return bus_counts + Counter(
             {
-                "damaged": seen["damaged"] + rig["damaged"],
+                "damaged": observed["damaged"] + rig["damaged"],
                 "gaps_rig": rig["gaps"],
-                "records_lost": seen["records_lost"] + seen["records_unreadable"],
+                "records_lost": observed["records_lost"] + observed["records_unreadable"],
                 "machine_frames_lost": rig["refused_frames"] + rig["dropped_frames"],
                 "machine_stalls": rig["stalls"],
             }
         )
 
     def timing(self) -> Timing:
-        """The controller's timing page now, its losses noted; raises CommandFailed when there is none."""
+        """Read the controller's timing page now, its losses noted; raises CommandFailed when there is none."""
         try:
             now = read_timing(self.page)
         except InputRefused as error:
@@ -284,7 +284,7 @@ class TimingTestbed:
         return now
 
     def fresh_timing(self) -> Timing:
-        """The next timing page that the controller writes; it writes one per second."""
+        """Wait for the next timing page that the controller writes; it writes one per second."""
         now = before = self.timing()
 
         def written() -> bool:
@@ -306,7 +306,7 @@ class TimingTestbed:
         return Mark(page, None if self._counter is None else count(self._counter))
 
     def since(self, mark: Mark) -> Span:
-        """The span since a mark, up to the next timing page."""
+        """Return the span since a mark, up to the next timing page."""
         now, begun = self.mark(), mark.instructions
         between = {name: after - mark.page.durations[name] for name, after in now.page.durations.items()}
         executed = None if begun is None or now.instructions is None else now.instructions - begun

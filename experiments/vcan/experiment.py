@@ -77,9 +77,9 @@ def _metrics(kind: str, title: str) -> Iterator[Metric]:
     yield Metric(f"{kind}_stops", f"Stops: {title}", "", "All runs, whatever their clock.", most=0.0, clocked=True)
     yield Metric(f"{kind}_leases_lost", f"Ended leases among them: {title}", "", "Setpoints that came too late.")
     yield Metric(f"{kind}_refused", f"Refused setpoints: {title}", "", "By the controller, at the end of each run.")
-    for clock, words in (("real", "real time"), ("simulated", "simulated time")):
-        yield Metric(f"{kind}_{clock}", f"Runs in {words}: {title}", "", "As announced.")
-        yield Metric(f"{kind}_{clock}_stops", f"Stops in {words}: {title}", "", "Of these runs alone.")
+    for clock, clock_text in (("real", "real time"), ("simulated", "simulated time")):
+        yield Metric(f"{kind}_{clock}", f"Runs in {clock_text}: {title}", "", "As announced.")
+        yield Metric(f"{kind}_{clock}_stops", f"Stops in {clock_text}: {title}", "", "Of these runs alone.")
     yield Metric(
         f"{kind}_real_share",
         f"Share of runs in real time: {title}",
@@ -109,8 +109,8 @@ def run(options: Options, console: Console) -> Result:
     kinds = list(KINDS)[: 1 if options.quick else None]
     common = {"out": str(options.out.resolve())}
     jobs = [Job(f"{kind}-{options.seed + i}", kind, options.seed + i, common) for kind in kinds for i in range(trials)]
-    with checkpoint(options, (), ["palms_471", "aoro_fc8"], options.truth, (*LOCKSTEP_SOURCES, "host")) as kept:
-        outcomes = pool.run(perform, jobs, kept, Workers(1), "vcan runs", console)
+    with checkpoint(options, (), ["palms_471", "aoro_fc8"], options.truth, (*LOCKSTEP_SOURCES, "host")) as trial_store:
+        outcomes = pool.run(perform, jobs, trial_store, Workers(1), "vcan runs", console)
         result = make_result(
             "vcan",
             METRICS,
@@ -126,7 +126,7 @@ def run(options: Options, console: Console) -> Result:
 
 
 def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """All metrics, and the figures of every seed as KIND_SEED_FIGURE."""
+    """Compute all metrics, and the figures of every seed as KIND_SEED_FIGURE."""
     metrics: dict[str, float] = {}
     for kind in KINDS:
         runs = [o for o in outcomes.values() if o["kind"] == kind]
@@ -150,7 +150,7 @@ def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
 
 
 def noisy(outcomes: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether the host took too much: by the witness beside the runs, or by the measurement that chose the clock."""
+    """Tell whether the host took too much: by the witness beside the runs, or the measurement that chose the clock."""
     wall_ms = sum(o["wall_s"] for o in outcomes.values()) * 1e3
     lost = sum(o["lost_ms"] for o in outcomes.values()) > MAX_LOST_SHARE * wall_ms
     long = any(o["longest_ms"] > MAX_LONGEST_MS for o in outcomes.values())
@@ -158,26 +158,26 @@ def noisy(outcomes: Mapping[str, Mapping[str, Any]]) -> bool:
 
 
 def environment_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Reasons of the chosen clocks and of the stops, by run."""
+    """Give the reasons of the chosen clocks and of the stops, by run."""
     clocks = {f"clock {name}": f"{o['clock']}: {o['clock_reason']}" for name, o in outcomes.items()}
     stops = {f"stops {name}": "; ".join(o["stop_reasons"]) for name, o in outcomes.items() if o["stop_reasons"]}
     probe = all(o["probe_real_time"] for o in outcomes.values())
-    words = "FIFO 99: the hypervisor alone delays it" if probe else "ordinary priority: other processes delay it"
-    return {**clocks, **stops, "probe": words}
+    probe_text = "FIFO 99: the hypervisor alone delays it" if probe else "ordinary priority: other processes delay it"
+    return {**clocks, **stops, "probe": probe_text}
 
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
-    """The result page."""
+    """Make the result page."""
     host, probe = host_activity.sentence(result.environment), result.environment["probe"]
     setting = f"Commit `{result.commit}`. {host} The witness ran at {probe}."
     return Page("Live runs on SocketCAN", CONCLUSION, INTRODUCTION, SECTIONS, setting)
 
 
 def command(kind: str, seed: int, out: Path) -> list[str]:
-    """The user's command line for one run."""
+    """Write the user's command line for one run."""
     job = f"mission run {MISSION} --logs {MISSION_LOGS}" if kind == "mission" else "demo"
-    words = f"{job} --detector perfect --bus vcan --seed {seed} --no-console --out"
-    return [sys.executable, "-m", "timberhand", *words.split(), str(out)]
+    arguments = f"{job} --detector perfect --bus vcan --seed {seed} --no-console --out"
+    return [sys.executable, "-m", "timberhand", *arguments.split(), str(out)]
 
 
 def perform(job: Job) -> dict[str, Any]:
@@ -187,10 +187,10 @@ def perform(job: Job) -> dict[str, Any]:
     /proc/stat reports none; without real-time priority other processes delay it, too.
     """
     out = Path(job.options["out"]) / job.name
-    first = host_activity.sample()
+    first_sample = host_activity.sample()
     with Witness(max(os.sched_getaffinity(0)), PROBE_PRIORITY, LATE_US) as witness:
-        told, said, code = run_command(command(job.kind, job.seed, out))
-    host = host_activity.between(first, host_activity.sample())
+        standard_output, standard_error, code = run_command(command(job.kind, job.seed, out))
+    host = host_activity.between(first_sample, host_activity.sample())
     late_ms = [stall.stall_ns * 1e-6 for stall in witness.stalls()]
     summary = out / "summary.json"
     return {
@@ -202,13 +202,13 @@ def perform(job: Job) -> dict[str, Any]:
         "lost_ms": sum(late_ms),
         "longest_ms": max(late_ms, default=0.0),
         "probe_real_time": witness.real_time,
-        **read_output(told, said),
+        **read_output(standard_output, standard_error),
         **read_summary(json.loads(summary.read_text()) if summary.exists() else {}),
     }
 
 
 def run_command(words: Sequence[str]) -> tuple[str, str, int]:
-    """Standard output, standard error and exit code of a command; 124 when it took too long."""
+    """Run a command; return its standard output, standard error and exit code, 124 when it took too long."""
     with subprocess.Popen(
         words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -222,7 +222,7 @@ def run_command(words: Sequence[str]) -> tuple[str, str, int]:
 
 
 def read_output(told: str, said: str) -> dict[str, Any]:
-    """Clock with its reason, reasons of the stops, ended leases."""
+    """Read the clock with its reason, reasons of the stops, ended leases."""
     clock = _CLOCK.search(said)
     reasons = [reason for _, reason in _MODE.findall(told)]
     return {
@@ -234,7 +234,7 @@ def read_output(told: str, said: str) -> dict[str, Any]:
 
 
 def read_summary(summary: dict[str, Any]) -> dict[str, Any]:
-    """Whether the job is done by the plant's physics, stops, refused setpoints, missed ticks, machine time [s]."""
+    """Read whether the job is done by the plant's physics, stops, refused setpoints, missed ticks, machine time [s]."""
     missions = summary.get("finished", False) and summary.get("in_bunk") == summary.get("loaded")
     return {
         "done": bool(missions if "finished" in summary else summary.get("in_bunk", False)),

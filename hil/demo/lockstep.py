@@ -44,13 +44,13 @@ class Companion(Protocol):
     """What goes along with a run and changes nothing of it by itself; `hil.demo.paced` is one."""
 
     def begin(self, system: Lockstep, activity: Activity, display: Display) -> None:
-        """The run is about to begin."""
+        """Prepare for the run that is about to begin."""
 
     def go_along(self, system: Lockstep) -> None:
-        """Called before every slice."""
+        """Act before a slice; called before every slice."""
 
     def on_outputs(self, outputs: Outputs, now_ns: int) -> None:
-        """Called after every tick."""
+        """Act on the outputs of a tick; called after every tick."""
 
 
 def run_lockstep(

@@ -68,7 +68,7 @@ class Pace:
         self.offset_ns = self.behind_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Virtual time is ``now_ns``, and goes on from here."""
+        """Set virtual time to ``now_ns``, and let it go on from here."""
         self.offset_ns = self._clock_ns() - now_ns
 
     def hold(self, now_ns: int) -> None:
@@ -82,7 +82,7 @@ class Pace:
 
 
 def in_virtual_time(command: bytes, offset_ns: int, now_ns: int) -> bytes | None:
-    """An operator's command with its stamp on the clock of the run, where it is now ``now_ns``; None for a heartbeat.
+    """Put the stamp of an operator's command on the clock of the run, now ``now_ns``; return None for a heartbeat.
 
     While the computer stood still, so did the run: a command from then is not from the future.  What is no command is
     left to the controller's gate.
@@ -99,7 +99,7 @@ def in_virtual_time(command: bytes, offset_ns: int, now_ns: int) -> bytes | None
 
 
 def in_real_time(report: bytes, offset_ns: int) -> bytes:
-    """A report of the controller with its stamps on the clock of this computer; a stamp of 0 means never."""
+    """Put the stamps of a controller's report on the clock of this computer; a stamp of 0 means never."""
     message = decode(report)
     assert isinstance(message, StateReport | VehicleReport)
     names = _STAMPS[type(message)]
@@ -135,7 +135,7 @@ class PageLink:
         self._scene.close()
 
     def commands(self, offset_ns: int, now_ns: int) -> list[bytes]:
-        """The commands that wait, in virtual time."""
+        """Return the commands that wait, in virtual time."""
         self._waiting.clear()
         self._commands.receive(self._waiting, [])
         translated = (in_virtual_time(command, offset_ns, now_ns) for command in self._waiting)

@@ -74,12 +74,12 @@ class Summary:
 
 
 def is_settled(verdict: dict[str, Any]) -> bool:
-    """Whether waiting changes nothing of the evaluation: it is a success, or every log is at rest."""
+    """Tell whether waiting changes nothing of the evaluation: it is a success, or every log is at rest."""
     return bool(verdict["success"] or all(log["at_rest"] for log in verdict["logs"]))
 
 
 def outcome_sentence(verdict: dict[str, Any]) -> str:
-    """The evaluation of the first log in words; ``verdict`` is the plant's evaluation as plain data."""
+    """Describe the evaluation of the first log; ``verdict`` is the plant's evaluation as plain data."""
     log = verdict["logs"][0]
     if log["in_bunk"] and log["released"] and log["at_rest"]:
         return "The log lies in the bunk: lifted, released and at rest, as the plant's physics sees it."

@@ -54,7 +54,7 @@ OFFERS: Final[dict[str, Offer]] = {
 
 
 def answer(request: dict[str, Any], run: Path) -> dict[str, Any]:
-    """The answer to one request of the page; ``run`` is the directory of the live run."""
+    """Answer one request of the page; ``run`` is the directory of the live run."""
     try:
         target = _emulated(run)
         match request:
@@ -70,7 +70,7 @@ def answer(request: dict[str, Any], run: Path) -> dict[str, Any]:
 
 
 def _emulated(run: Path) -> LiveTarget:
-    """The live run, if nothing of it can be a machine; raises InputRefused."""
+    """Return the live run if nothing of it can be a machine, else raise InputRefused."""
     target = LiveTarget.of(run)
     virtual = {f"{ours}socketcan:{name}" for name in VCAN_NAMES.values() for ours in ("", PYTHON_CAN)}
     for bus, address in target.buses.items():
@@ -96,10 +96,10 @@ class _Handler(socketserver.StreamRequestHandler):
         try:
             request = json.loads(self.rfile.readline(MAX_REQUEST_BYTES))
             assert isinstance(self.server, Desk)
-            told = answer(request, self.server.run) if isinstance(request, dict) else {"error": "not a request"}
+            response = answer(request, self.server.run) if isinstance(request, dict) else {"error": "not a request"}
         except (ValueError, OSError):
-            told = {"error": "not a request"}
-        self.wfile.write(json.dumps(told).encode() + b"\n")
+            response = {"error": "not a request"}
+        self.wfile.write(json.dumps(response).encode() + b"\n")
 
 
 class Desk(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):

@@ -102,7 +102,7 @@ def encoder_jump(random: Random, scene: Scene) -> Injection:
 
 
 def encoder_drift(random: Random, scene: Scene) -> Injection:
-    """The bound is that of the drift monitor for a crane that holds its pose (docs/reference/safety.md case 3)."""
+    """Draw a drift, bounded by the drift monitor for a crane that holds its pose (docs/reference/safety.md case 3)."""
     joint = random.choice(("slew", "lift", "tilt", "ext"))
     rate = random.choice((-1.0, 1.0)) * (0.5 * _DEG if joint != "ext" else 0.01)
     return _one(random, "encoder-drift", "D", 3000.0, joint, rate)
@@ -118,7 +118,7 @@ def encoder_scale(random: Random, scene: Scene) -> Injection:
 
 
 def _needed(random: Random, scene: Scene) -> str:
-    """A message that the present work needs."""
+    """Draw a message that the present work needs."""
     if scene.drives:
         return random.choice((*_NEEDED_CRANE, *_NEEDED_DRIVE))
     encoders = [ENCODER_MESSAGES[n] for n, s in scene.profile.joints.items() if s.encoder is not None]
@@ -132,7 +132,7 @@ def _protected(random: Random, scene: Scene) -> str:
 
 
 def _lost_ms(scene: Scene, name: str) -> float:
-    """Bound for the loss of a message: its time-out and one tick.  A PLC measures the joints in its own period."""
+    """Return the bound for a message's loss: its time-out and one tick.  A PLC measures joints in its own period."""
     timeout_ns = message(scene.profile, name)[1].timeout_ns
     if scene.plc and name in ENCODER_MESSAGES.values():
         timeout_ns = sample_timeout_ns(scene.profile)
@@ -197,18 +197,18 @@ def babble(random: Random, scene: Scene) -> Injection:
 
 
 def bus_off(random: Random, scene: Scene) -> Injection:
-    """Bus-off takes 32 errors: 5 ms on crane0, 20 ms on mach0, where the next frame may be 20 ms away, too."""
+    """Draw bus-off.  It takes 32 errors: 5 ms on crane0, 20 ms on mach0, where the next frame may be 20 ms away too."""
     bus = _bus(random, scene)
     return _one(random, "bus-errors", "R0", 20.0 + (10.0 if bus == scene.profile.crane_bus else 40.0), bus, 1.0)
 
 
 def error_passive(random: Random, scene: Scene) -> Injection:
-    """Seventeen errors in a row make a node error-passive; thirty-two would switch it off."""
+    """Draw seventeen errors in a row, which make a node error-passive; thirty-two would switch it off."""
     return replace(_one(random, "bus-errors", "D", 100.0, scene.profile.crane_bus, 1.0, length_s=0.0027), aligned=True)
 
 
 def cable_cut(random: Random, scene: Scene) -> Injection:
-    """A PLC has another cable, whose loss shows after its exchange of 10 ms and the time-out of its status."""
+    """Draw a cut cable.  A PLC has another one, whose loss shows after an exchange of 10 ms and its status time-out."""
     if scene.plc and random.random() < 0.5:
         return _one(random, "plc-off", "R1", 100.0 + 10.0)
     bus = _bus(random, scene)
@@ -240,7 +240,7 @@ def hose_burst(random: Random, scene: Scene) -> Injection:
 
 
 def overload(random: Random, scene: Scene) -> Injection:
-    """A mass appears on the rotator.  The bound counts from the moment at which the machine carries more than it bears.
+    """Draw a mass on the rotator.  The bound counts from the moment at which the machine carries more than it bears.
 
     A mass that appears falls with the crane: nothing holds it, and nothing presses on the machine, until it has
     compressed the lift's oil.  The moment about the tipping line exceeds its limit 220 to 240 ms after the mass
@@ -262,7 +262,7 @@ def planner_hung(random: Random, scene: Scene) -> Injection:
 
 
 def _some_bad(random: Random, fault: str) -> Injection:
-    """One bad datagram is refused; from the third in a second on the machine stops."""
+    """Draw one bad datagram, which is refused, or several: from the third in a second on the machine stops."""
     if random.random() < 0.5:
         return _one(
             random, fault, "REFUSED", SETPOINT_MS + 10.0, length_s=1e-3 * SETPOINT_MS, seen_ms=REPORT_MS, window_s=0.6
@@ -301,7 +301,7 @@ def gnss_lost(random: Random, scene: Scene) -> Injection:
 
 
 def gnss_jump(random: Random, scene: Scene) -> Injection:
-    """A jump is in the next position frame: 100 ms of period and 100 ms of the receiver's own delay."""
+    """Draw a jump, which is in the next position frame: 100 ms of period and 100 ms of the receiver's own delay."""
     if random.random() < 0.5:
         return _one(random, "gnss-jump", "H", 200.0 + 200.0, "", 3.0)
     return _one(random, "gnss-single", "H", 1200.0 + 200.0)
@@ -344,7 +344,7 @@ def person(random: Random, scene: Scene) -> Injection:
 
 
 def lever(random: Random, scene: Scene) -> Injection:
-    """A lever that is held, or only touched: either ends the automatic work."""
+    """Draw a lever that is held, or only touched: either ends the automatic work."""
     return _one(random, "lever-moved", "H", 20.0, length_s=random.choice((math.inf, random.uniform(0.05, 0.5))))
 
 

@@ -40,7 +40,7 @@ _TOO_FAST = 8.0
 
 
 def effect_of(order: Order, key: bytes | None = None) -> Effect:
-    """The effect of a planner fault; ``key`` authenticates datagrams that are made anew.
+    """Return the effect of a planner fault; ``key`` authenticates datagrams that are made anew.
 
     Raises:
         InputRefused: the fault is none of datagrams.
@@ -88,7 +88,7 @@ def _changed(change: Callable[[CraneSetpoint | DriveSetpoint], Datagram], key: b
 
 
 def _with_position(m: CraneSetpoint | DriveSetpoint, change: Callable[[float], float]) -> Datagram:
-    """Crane: every joint of every knot; carrier: the articulation, or the latitude of the waypoint."""
+    """Change every joint of every knot of a crane's setpoint, or the first height of a carrier's."""
     if isinstance(m, CraneSetpoint):
         return replace(m, knots=tuple(Knot(k.after_ns, tuple(map(change, k.position)), k.velocity) for k in m.knots))
     h1, h2, h3, h4 = m.heights_m
@@ -102,13 +102,13 @@ def _too_fast(m: CraneSetpoint | DriveSetpoint) -> Datagram:
 
 
 def _replayed() -> Effect:
-    kept: list[bytes] = []
+    recorded_datagrams: list[bytes] = []
 
     def effect(now_ns: int, sent: list[bytes]) -> list[bytes]:
-        if not kept:
-            kept.extend(sent)
+        if not recorded_datagrams:
+            recorded_datagrams.extend(sent)
             return sent
-        return kept[:1] if sent else []
+        return recorded_datagrams[:1] if sent else []
 
     return effect
 
@@ -127,7 +127,7 @@ def _delayed(delay_ns: int) -> Effect:
 
 
 def _damaged(data: bytes, random: Random) -> bytes:
-    """One of the ways in which a datagram arrives damaged."""
+    """Damage a datagram in one of the ways in which datagrams arrive damaged."""
     match random.randrange(4):
         case 0:
             return data[: random.randrange(len(data))]
@@ -140,7 +140,7 @@ def _damaged(data: bytes, random: Random) -> bytes:
 
 
 def _forged(random: Random, key: bytes | None) -> Effect:
-    """ARM and RESET of an operator where only a planner may speak."""
+    """Add ARM and RESET of an operator where only a planner may speak."""
 
     def effect(now_ns: int, sent: list[bytes]) -> list[bytes]:
         out = list(sent)
@@ -215,13 +215,13 @@ class Injector:
         self._waiting = left
 
     def datagrams(self, now_ns: int, sent: list[bytes]) -> list[bytes]:
-        """The datagrams that arrive."""
+        """Return the datagrams that arrive."""
         for effect in self._datagrams:
             sent = effect(now_ns, sent)
         return sent
 
     def stalled(self, process: str, now_ns: int) -> bool:
-        """Whether the process does not run now."""
+        """Tell whether the process does not run now."""
         until_ns = self._stalled.get(process)
         if until_ns is None:
             return False
@@ -233,7 +233,7 @@ class Injector:
         return True
 
     def late_ns(self, now_ns: int) -> int:
-        """How long ago the first tick was due that has not run."""
+        """Tell how long ago the first tick was due that has not run."""
         since_ns, self._late_since_ns = self._late_since_ns, None
         return 0 if since_ns is None else now_ns - since_ns
 

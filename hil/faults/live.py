@@ -47,16 +47,16 @@ class LiveTarget:
 
     @classmethod
     def of(cls, directory: Path) -> LiveTarget:
-        """The live run that records in a directory.
+        """Return the live run that records in a directory.
 
         Raises:
             InputRefused: no live run has left its addresses there.
         """
         path = directory / ADDRESSES
         try:
-            found = json.loads(path.read_text())
-            profile, key_file = load_profile(found["profile"]), Path(found["key_file"])
-            return cls(profile, found["ports"], found["buses"], found["pids"], key_file)
+            addresses = json.loads(path.read_text())
+            profile, key_file = load_profile(addresses["profile"]), Path(addresses["key_file"])
+            return cls(profile, addresses["ports"], addresses["buses"], addresses["pids"], key_file)
         except (OSError, ValueError, KeyError) as error:
             raise InputRefused(
                 "fault.no-live-run", f"{path} cannot be read ({error}); give the directory of a live run with --run"
@@ -121,7 +121,7 @@ def _disturb_bus(order: Order, target: LiveTarget, consent: bool) -> str:
 
 
 def _send_frames(order: Order, address: str, fault: Fault, consent: bool) -> str:
-    """Frames from a participant of our own: all that can be done to a bus of the kernel."""
+    """Send frames from a participant of our own: all that can be done to a bus of the kernel."""
     if fault.kind is not Kind.BABBLE:
         raise InputRefused(
             "fault.only-on-wire",

@@ -143,7 +143,7 @@ POSITIONS: Final = tuple(switch.name.lower().replace("_", "-") for switch in Mod
 
 
 def find(name: str, word: str = "") -> tuple[str, str]:
-    """The fault and the part that a person means: ``encoder-stuck``, or ``encoder-lift`` with the word ``stuck``.
+    """Find the fault and the part that a person means: ``encoder-stuck``, or ``encoder-lift`` with the word ``stuck``.
 
     Raises:
         InputRefused: there is no such fault.
@@ -158,8 +158,8 @@ def find(name: str, word: str = "") -> tuple[str, str]:
     for fault, kind in FAULTS.items():
         if kind.component == component and kind.word == word:
             return fault, part
-    words = sorted({k.word.value for k in FAULTS.values() if k.component == component})
-    known = f"it has {', '.join(words)}" if words else "see `timberhand inject --list`"
+    fault_words = sorted({k.word.value for k in FAULTS.values() if k.component == component})
+    known = f"it has {', '.join(fault_words)}" if fault_words else "see `timberhand inject --list`"
     raise InputRefused("fault.unknown-word", f"{component} has no fault {word!r}; {known}")
 
 
@@ -185,7 +185,7 @@ class Order:
     seed: int = 0
 
     def sized(self) -> float:
-        """The size, or the fault's default."""
+        """Return the size, or the fault's default."""
         return FAULTS[self.fault].size if math.isnan(self.size) else self.size
 
 
@@ -198,7 +198,7 @@ def make(
     size: float = math.nan,
     seed: int = 0,
 ) -> Order:
-    """An order from a person's words; a part that is left out is the fault's default.
+    """Make an order from a person's words; a part that is left out is the fault's default.
 
     Raises:
         InputRefused: there is no such fault, or the part does not suit it.
@@ -215,24 +215,28 @@ def make(
 
 
 def parse(text: str, seed: int = 0) -> Order:
-    """An order from its text, as in ``encoder-lift:stuck@12.3s+500ms``.
+    """Parse the text of an order, as in ``encoder-lift:stuck@12.3s+500ms``.
 
     Raises:
         InputRefused: the text is not an order.
     """
-    found = _TEXT.fullmatch(text)
-    if found is None:
+    order_match = _TEXT.fullmatch(text)
+    if order_match is None:
         raise InputRefused(
             "fault.syntax",
             f"{text!r} is not NAME[:WORD][/PART][@START][+DURATION][=SIZE], as in encoder-lift:stuck@12.3s",
         )
     try:
-        at_s = float(found["at"] or 0.0)
-        length_s = float(found["length"]) * (1e-3 if found["unit"] == "ms" else 1.0) if found["length"] else FOREVER_S
-        size = float(found["size"]) if found["size"] else math.nan
+        at_s = float(order_match["at"] or 0.0)
+        length_s = (
+            float(order_match["length"]) * (1e-3 if order_match["unit"] == "ms" else 1.0)
+            if order_match["length"]
+            else FOREVER_S
+        )
+        size = float(order_match["size"]) if order_match["size"] else math.nan
     except ValueError:
         raise InputRefused("fault.syntax", f"{text!r}: a number in it has two decimal points") from None
-    return make(found["name"], found["word"] or "", found["part"] or "", at_s, length_s, size, seed)
+    return make(order_match["name"], order_match["word"] or "", order_match["part"] or "", at_s, length_s, size, seed)
 
 
 def _check_part(fault: str, kind: Part, part: str) -> None:

@@ -22,7 +22,7 @@ _EXACT: Final = EXTENDED | EXTENDED_MASK
 
 
 def wire_fault(order: Order, profile: Profile, start_ns: int, end_ns: int) -> tuple[str, Fault]:
-    """The bus and the fault that carries out an order.
+    """Return the bus and the fault that carries out an order.
 
     Raises:
         InputRefused: this machine has no such bus or message, or the fault is none of a bus.

@@ -134,12 +134,12 @@ class Display:
 
 
 def _value_text(joint: Joint, value: float) -> str:
-    """Metres for the telescope, degrees for the other joints; a dash for an unknown value."""
+    """Format metres for the telescope, degrees for the other joints; a dash for an unknown value."""
     if math.isnan(value):
         return "–".rjust(7)
     return f"{value:6.3f} m" if joint is Joint.EXT else f"{math.degrees(value):6.1f}°"
 
 
 def _whole_text(value: float, unit: str) -> str:
-    """A value without decimals; a dash for an unknown one."""
+    """Format a value without decimals; a dash for an unknown one."""
     return "–" if math.isnan(value) else f"{value:.0f} {unit}"

@@ -71,7 +71,7 @@ NICENESS: Final = {"console": 10, "faults": 10, "detector": 5}
 
 
 def _address(name: str, backend: str) -> str:
-    """Address of a logical bus on the chosen backend; "auto" is vcan when its interface exists, else the wire."""
+    """Return the address of a logical bus on the backend; "auto" is vcan when its interface exists, else the wire."""
     match backend:
         case "wire":
             return f"wire:{name}"
@@ -86,7 +86,7 @@ def _address(name: str, backend: str) -> str:
 
 
 def uses_wire(profile: Profile, backend: str) -> bool:
-    """Whether a live run of this machine has the wire, in processes of this computer, for its buses."""
+    """Tell whether a live run of this machine has the wire, in processes of this computer, for its buses."""
     return _address(profile.crane_bus, backend).startswith("wire:")
 
 
@@ -295,8 +295,9 @@ class LiveRun(ABC, Generic[Outcome]):
             self._display.event(f"operator's page: {served['url']}", "bold")
             if "foxglove" in served:
                 self._display.event(f"Foxglove or Lichtblick: {served['foxglove']}", "bold")
-        told = [ports["page"]] if options.console_port else []
-        told += [ports["reports"]] if options.profile.carrier is not None else []  # the recorder keeps the log map
+        listener_ports = [ports["page"]] if options.console_port else []
+        # The recorder keeps the log map.
+        listener_ports += [ports["reports"]] if options.profile.carrier is not None else []
         self._start(
             "autonomy",
             "autonomy",
@@ -310,14 +311,14 @@ class LiveRun(ABC, Generic[Outcome]):
             "--order-port",
             ports["orders"],
             *self._keyed,
-            *(x for port in told for x in ("--tell", f"{HOST}:{port}")),
+            *(x for port in listener_ports for x in ("--tell", f"{HOST}:{port}")),
             *self.planner_arguments,
         )
         self._processes.await_message("autonomy", "event", START_S)
         self._processes.set_fifo_priority("autonomy", PLANNER_PRIORITY)
 
     def _start_detector(self, ports: dict[str, int]) -> int:
-        """The UDP port that answers requests for the list of logs: the plant's, or that of a camera's detector."""
+        """Start the detector of a camera, if any; return the UDP port for the list of logs: its own, or the plant's."""
         camera = self._options.camera
         if not camera:
             return ports["sim"]
@@ -447,7 +448,7 @@ class LiveRun(ABC, Generic[Outcome]):
 
     @abstractmethod
     def _summarize(self, sim_port: int) -> Outcome:
-        """The outcome of the run; the plant answers requests at ``sim_port``."""
+        """Summarize the outcome of the run; the plant answers requests at ``sim_port``."""
 
     @property
     def _seconds(self) -> float:

@@ -44,14 +44,14 @@ class Planner(Protocol):
     def step(
         self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]
     ) -> bytes | list[bytes] | None:
-        """The datagrams to send now; None for none."""
+        """Return the datagrams to send now; None for none."""
 
 
 class LogDetector(Protocol):
     """The source of log observations; `autonomy.perception.log_detector.LogDetector` is one."""
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs detected with the joints at ``q`` [rad, m]; None when there is nothing new."""
+        """Return the logs detected with the joints at ``q`` [rad, m]; None when there is nothing new."""
 
 
 class Disturbance(Protocol):
@@ -61,13 +61,13 @@ class Disturbance(Protocol):
         """Begin and end what is due now, before the slice."""
 
     def datagrams(self, now_ns: int, sent: list[bytes]) -> list[bytes]:
-        """The datagrams of the planner that reach the controller in this tick."""
+        """Return the datagrams of the planner that reach the controller in this tick."""
 
     def stalled(self, process: str, now_ns: int) -> bool:
-        """Whether a process (controller, guard, planner) does not run now."""
+        """Tell whether a process (controller, guard, planner) does not run now."""
 
     def late_ns(self, now_ns: int) -> int:
-        """How late the controller wakes for the tick of now."""
+        """Tell how late the controller wakes for the tick of now."""
 
 
 @dataclass(slots=True)
@@ -239,15 +239,15 @@ class Lockstep:
             self._datagrams.extend([requests] if isinstance(requests, bytes) else requests)
 
     def _detect(self) -> tuple[LogObservation, ...]:
-        """The logs, four times per second: detected by a camera, or their true poses."""
+        """Return the logs, four times per second: detected by a camera, or their true poses."""
         if self.ticks % (self._settings.rate_hz // 4):
             return ()
         if self._detector is not None:
-            found = self._detector.detect(self.report.position, self.now_ns) or () if self.report else ()
+            detected_logs = self._detector.detect(self.report.position, self.now_ns) or () if self.report else ()
         else:
-            found = true_logs(self.plant)
-        self.logs = found or self.logs
-        return found
+            detected_logs = true_logs(self.plant)
+        self.logs = detected_logs or self.logs
+        return detected_logs
 
     def _record_buses(self) -> None:
         recorder = self._observer.recorder
@@ -259,7 +259,7 @@ class Lockstep:
 
 
 def true_logs(plant: Plant) -> tuple[LogObservation, ...]:
-    """The logs of a plant as they truly are."""
+    """Return the logs of a plant as they truly are."""
     return tuple(
         LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(detect(plant))
     )

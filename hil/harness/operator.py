@@ -68,7 +68,7 @@ class Operator:
         return ""
 
     def step(self, report: StateReport) -> bytes | None:
-        """The operator command in answer to this report, as a datagram; None when there is none."""
+        """Return the operator command in answer to this report, as a datagram; None when there is none."""
         sent = self._press(report)
         if sent is None and self.watches and report.stamp_ns - self._beat_ns >= WATCH_PERIOD_NS:
             self._beat_ns = report.stamp_ns

@@ -44,7 +44,7 @@ class Child:
     rest: bytes = b""
 
     def complaint(self) -> str:
-        """The last line of its stderr, or its exit code."""
+        """Return the last line of its stderr, or its exit code."""
         lines = self.errors.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else f"exit code {self.process.returncode}"
 
@@ -86,7 +86,7 @@ class ProcessGroup:
         return child
 
     def messages(self) -> list[tuple[str, dict[str, Any]]]:
-        """The messages of the children since the last call, as (name, JSON object); never blocks."""
+        """Return the messages of the children since the last call, as (name, JSON object); never block."""
         received = []
         for key, _ in self.selector.select(0):
             child: Child = key.data
@@ -105,7 +105,7 @@ class ProcessGroup:
         return received
 
     def dead(self) -> Child | None:
-        """A child that has ended, if any."""
+        """Return a child that has ended, if any."""
         return next((c for c in self.children.values() if c.process.poll() is not None), None)
 
     def await_message(self, name: str, key: str, seconds: float) -> dict[str, Any]:
@@ -176,16 +176,16 @@ class ProcessGroup:
 
 
 def words_of(options: Mapping[str, object]) -> list[object]:
-    """Options of a command line: ``report_port=5`` is ``--report-port 5``; a list repeats its option, None omits it."""
-    words: list[object] = []
+    """Make command-line options: ``report_port=5`` is ``--report-port 5``; a list repeats its option, None omits it."""
+    arguments: list[object] = []
     for name, value in options.items():
-        for one in value if isinstance(value, list) else [] if value is None else [value]:
-            words += [f"--{name.replace('_', '-')}", one]
-    return words
+        for option_value in value if isinstance(value, list) else [] if value is None else [value]:
+            arguments += [f"--{name.replace('_', '-')}", option_value]
+    return arguments
 
 
 def announce_ready() -> list[int]:
-    """In a child: tell the harness that it is ready; the signals SIGTERM and SIGINT go into the returned list."""
+    """Tell the harness, from a child, that it is ready; SIGTERM and SIGINT go into the returned list."""
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda which, _frame: ended.append(which))
@@ -196,7 +196,7 @@ def announce_ready() -> list[int]:
 
 
 def free_udp_ports(count: int) -> list[int]:
-    """``count`` different UDP ports that are free on loopback now."""
+    """Find ``count`` different UDP ports that are free on loopback now."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     try:
         for s in sockets:

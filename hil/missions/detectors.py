@@ -35,7 +35,7 @@ class PerfectDetector:
         self._plant = plant
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...]:
-        """The logs in the base frame of the crane, whose x axis points backwards."""
+        """Return the logs in the base frame of the crane, whose x axis points backwards."""
         return tuple(
             LogObservation(log.id, log.position_m, log.axis, log.length_m, log.diameter_m)
             for log in detect_in_view(self._plant)
@@ -49,7 +49,7 @@ class FrontCameraDetector:
         self._front, self._manager = front, manager
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs in a picture taken now; None while the manager wants none."""
+        """Return the logs in a picture taken now; None while the manager wants none."""
         world, standpoint = self._manager.world, self._manager.standpoint(now_ns)
         if standpoint is None:
             return None
@@ -57,8 +57,10 @@ class FrontCameraDetector:
 
 
 def check_camera(profile: Profile) -> None:
-    """Raises:
-    InputRefused: the machine has no front camera.
+    """Check that the machine has a front camera.
+
+    Raises:
+        InputRefused: the machine has no front camera.
     """
     if CAMERA not in profile.cameras:
         raise InputRefused(
@@ -67,7 +69,7 @@ def check_camera(profile: Profile) -> None:
 
 
 def make_detector(kind: str, plant: Plant, profile: Profile, manager: ActivityManager, seed: int) -> LogDetector:
-    """The detector ``kind`` of the module docstring.
+    """Make the detector ``kind`` of the module docstring.
 
     Raises:
         InputRefused: the machine has no front camera.

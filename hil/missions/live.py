@@ -36,7 +36,7 @@ LOCALIZERS: Final = {"ours": "ours", "faithful": "paper-b"}
 
 
 def _with_camera(options: LiveOptions, detector: str) -> LiveOptions:
-    """The options with the camera that a detector needs.
+    """Return the options with the camera that a detector needs.
 
     Raises:
         InputRefused: the machine has no front camera.
@@ -54,11 +54,11 @@ def write_surveyed(options: LiveOptions, path: Path) -> Path:
         ValueError: the truth cannot be used, or the file cannot be written.
     """
     truth = seen_with(options.truth, options.seed, options.profile.name)
-    found = surveyed_profile(options.profile, truth, CAMERA, options.seed).cameras[CAMERA]
+    surveyed_camera = surveyed_profile(options.profile, truth, CAMERA, options.seed).cameras[CAMERA]
     changed: list[Change] = [
-        (("cameras", CAMERA, "position_m"), [round(v, 5) for v in found.position_m], "surveyed"),
-        (("cameras", CAMERA, "rpy_rad"), [round(v, 6) for v in found.rpy_rad], "surveyed"),
-        (("cameras", CAMERA, "depth_scale"), round(found.depth_scale, 6), "surveyed"),
+        (("cameras", CAMERA, "position_m"), [round(v, 5) for v in surveyed_camera.position_m], "surveyed"),
+        (("cameras", CAMERA, "rpy_rad"), [round(v, 6) for v in surveyed_camera.rpy_rad], "surveyed"),
+        (("cameras", CAMERA, "depth_scale"), round(surveyed_camera.depth_scale, 6), "surveyed"),
     ]
     path.unlink(missing_ok=True)
     write_profile(Path(profile_path(options.profile_name)), path, changed, "before the run")

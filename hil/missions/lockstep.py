@@ -157,8 +157,8 @@ class MissionRun:
         if self._recorder is not None and now_ns >= self._publish_ns:
             self._publish_ns = now_ns + REPORT_PERIOD_NS
             self._published += 1
-            told = self._publisher.report(now_ns, auto=True)
-            self._recorder.on_report(encode_mission(told, self._published, self._code, now_ns))
+            mission_report = self._publisher.report(now_ns, auto=True)
+            self._recorder.on_report(encode_mission(mission_report, self._published, self._code, now_ns))
         return sent
 
     def run(self, limit_s: float, directory: str, watch: Callable[[], None] = lambda: None) -> MissionSummary:

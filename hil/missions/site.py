@@ -17,7 +17,7 @@ from sim.site.site_file import Site
 def site_of(
     mission: ForwardingMission, profile: Profile, seed: int, truth: str, logs: int = 0, terrain: str = "flat"
 ) -> Site:
-    """The site; ``logs`` > 0 lays that many along the route instead of those of the mission.
+    """Make the site; ``logs`` > 0 lays that many along the route instead of those of the mission.
 
     ``terrain`` is the kind of its ground, one of `sim.ground.terrain.KINDS`.
 

@@ -22,16 +22,16 @@ class RigCamera:
         self._count = 0
 
     def frame(self) -> RgbdFrame:
-        """The picture now; stamps count the pictures."""
+        """Return the picture now; stamps count the pictures."""
         self._count += 1
         return frame_from_message(decode(encode(rgbd_message(self._rig.frame(self._camera, self._count)))))
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
 
 def camera_detector(plant: Plant, profile: Profile, camera: str, seed: int) -> LogDetector:
-    """A log detector behind a camera of the plant.
+    """Make a log detector behind a camera of the plant.
 
     Raises:
         InputRefused: the machine has no such camera.

@@ -76,7 +76,7 @@ def take_picture(profile: Profile, request: PictureRequest, path: Path) -> None:
 
 
 def depth_colors(depth_m: np.ndarray) -> np.ndarray:
-    """Depth (h, w) [m] as an RGB picture: near is yellow, far is violet, unknown is black."""
+    """Colour depth (h, w) [m] as an RGB picture: near is yellow, far is violet, unknown is black."""
     from matplotlib import colormaps
 
     share = np.clip((FAR_M - depth_m) / (FAR_M - NEAR_M), 0.0, 1.0)

@@ -22,7 +22,7 @@ PROFILE_FILE: Final = "profile.toml"
 
 
 def files_of(log: Path) -> list[Path]:
-    """The MCAP files of a run's directory, or the one file; the end of a directory's recording is recovered first.
+    """List the MCAP files of a run's directory, or the one file; recover the end of a directory's recording first.
 
     Raises:
         CommandFailed: there is no recording.
@@ -43,7 +43,7 @@ def files_of(log: Path) -> list[Path]:
 
 
 def no_frames(log: Path, reasons: Sequence[str]) -> CommandFailed:
-    """The error of a CAN log in which no frame can be read; ``reasons`` may be empty or hold empty ones."""
+    """Make the error of a CAN log in which no frame can be read; ``reasons`` may be empty or hold empty ones."""
     why = "; ".join(filter(None, reasons))
     return CommandFailed(
         "recording.no-frames",
@@ -60,7 +60,7 @@ def tell_end(path: Path, at_byte: int) -> None:
 
 
 def messages(files: list[Path], topic: str) -> Iterator[bytes]:
-    """The payloads of a topic, in recorded order.
+    """Yield the payloads of a topic, in recorded order.
 
     Raises:
         CommandFailed: not an MCAP file.
@@ -75,7 +75,7 @@ def messages(files: list[Path], topic: str) -> Iterator[bytes]:
 
 
 def contents(files: list[Path]) -> dict[str, int]:
-    """Topic -> number of messages, for topics that have any.
+    """Count the messages of every topic that has any.
 
     Raises:
         CommandFailed: not an MCAP file.
@@ -95,7 +95,7 @@ def contents(files: list[Path]) -> dict[str, int]:
 
 
 def manifest_of(files: list[Path]) -> Manifest:
-    """The manifest inside the recording.
+    """Return the manifest inside the recording.
 
     Raises:
         CommandFailed: there is none, or it is damaged.

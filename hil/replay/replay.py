@@ -39,7 +39,7 @@ Outputs = tuple[Sequence[RawFrame], Sequence[RawFrame], bytes, bytes]
 
 
 def differing_lines(recorded: Outputs, replayed: Outputs) -> dict[str, list[str]]:
-    """The outputs of either side in words, without the lines that both have."""
+    """Describe the outputs of either side in words, without the lines that both have."""
     databases = load("crane"), load("machine")
     lines = []
     for crane, machine, *reports in (recorded, replayed):
@@ -97,12 +97,12 @@ class Result:
         return self.ticks == self.total > 0 and not self.missing and not self.difference
 
     def as_dict(self) -> dict[str, Any]:
-        """The result for JSON."""
+        """Return the result for JSON."""
         return asdict(self) | {"agrees": self.agrees}
 
 
 def settings_for(manifest: Manifest, ticks: list[TickRecord], profile: str | None) -> Settings:
-    """The controller's settings of the recorded run: its profile, checked by hash, and its rate.
+    """Return the controller's settings of the recorded run: its profile, checked by hash, and its rate.
 
     Raises:
         CommandFailed: profile or DBC differ from the recorded ones.
@@ -133,7 +133,7 @@ def settings_for(manifest: Manifest, ticks: list[TickRecord], profile: str | Non
 
 
 def profile_beside(files: list[Path]) -> str | None:
-    """The profile that lies with a recording as ``profile.toml``, for machines whose profile has changed since."""
+    """Find the ``profile.toml`` that lies with a recording, for machines whose profile has changed since."""
     beside = files[0].parent / PROFILE_FILE
     return str(beside) if beside.is_file() else None
 
@@ -182,7 +182,7 @@ def replay(
 
 
 def recorded_ticks(files: list[Path]) -> Iterator[TickRecord]:
-    """The tick records of a recording, in order; raises CommandFailed."""
+    """Yield the tick records of a recording, in order; raises CommandFailed."""
     try:
         for data in messages(files, TICK):
             yield tick_record.decode(data)
@@ -195,14 +195,14 @@ def recorded_ticks(files: list[Path]) -> Iterator[TickRecord]:
 
 
 def _rate_hz(ticks: list[TickRecord]) -> int:
-    """The control rate, from the commonest distance of two ticks; 0 (the profile's rate) when there is only one."""
+    """Find the control rate from the commonest distance of two ticks; 0 (the profile's rate) when there is only one."""
     steps = Counter((b.now_ns - a.now_ns) // (1 + b.missed_ticks - a.missed_ticks) for a, b in pairwise(ticks))
     commonest = max(steps, key=lambda step_ns: steps[step_ns], default=0)
     return round(1e9 / commonest) if commonest > 0 else 0
 
 
 def _missing_start(ticks: list[TickRecord]) -> str:
-    """What is missing at the start; empty when the first tick is there, which sends report number 1."""
+    """Tell what is missing at the start; empty when the first tick is there, which sends report number 1."""
     if not ticks:
         return "the recording holds no tick of the controller"
     try:
@@ -219,7 +219,7 @@ def _missing_start(ticks: list[TickRecord]) -> str:
 
 
 def _missing_between(a: TickRecord, b: TickRecord, period_ns: int) -> int:
-    """Records missing between two ticks; ticks that the controller itself missed do not count."""
+    """Count the records missing between two ticks; ticks that the controller itself missed do not count."""
     return max(0, (b.now_ns - a.now_ns) // period_ns - 1 - (b.missed_ticks - a.missed_ticks))
 
 

@@ -73,9 +73,14 @@ class SeekableRecording:
         self.buses = self.manifest.buses
         self._lock = threading.Lock()
         self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
-        places = [place for path in files for place in self._places_of(path)]
-        self._places = sorted(places, key=lambda place: place.begin_ns)
-        topics = {topic for place in self._places for i, topic in place.topics.items() if _has(place, i)}
+        chunk_locations = [chunk_location for path in files for chunk_location in self._places_of(path)]
+        self._places = sorted(chunk_locations, key=lambda place: place.begin_ns)
+        topics = {
+            topic
+            for chunk_location in self._places
+            for i, topic in chunk_location.topics.items()
+            if _has(chunk_location, i)
+        }
         self._ticks_only = REPORT not in topics
         timed = {TICK} if self._ticks_only else {REPORT}
         within = [p for p in self._places if any(t in timed and _has(p, i) for i, t in p.topics.items())]
@@ -85,21 +90,23 @@ class SeekableRecording:
                 f"{files[0]} has no report of the controller, so there is nothing to show; give another recording",
                 ExitCode.CONFIGURATION,
             )
-        first = next(self.messages(timed, within[0].begin_ns, within[0].end_ns + 1))
-        self.begin_ns, self.end_ns = first.stamp_ns, max(p.end_ns for p in within)
+        first_message = next(self.messages(timed, within[0].begin_ns, within[0].end_ns + 1))
+        self.begin_ns, self.end_ns = first_message.stamp_ns, max(p.end_ns for p in within)
 
     def messages(self, topics: Collection[str], begin_ns: int, end_ns: int) -> Iterator[Message]:
-        """The messages with a time from ``begin_ns`` until before ``end_ns``, in their order within 200 ms."""
-        for place in self._places:
-            if place.end_ns < begin_ns or place.begin_ns >= end_ns:
+        """Yield the messages with a time from ``begin_ns`` until before ``end_ns``, in their order within 200 ms."""
+        for chunk_location in self._places:
+            if chunk_location.end_ns < begin_ns or chunk_location.begin_ns >= end_ns:
                 continue
-            wanted = [i for i, topic in place.topics.items() if topic in topics and _has(place, i)]
-            if wanted:
-                found = [m for m in self._taken(place, wanted) if begin_ns <= m.stamp_ns < end_ns]
-                yield from sorted(found, key=lambda message: message.stamp_ns)
+            channels = [i for i, topic in chunk_location.topics.items() if topic in topics and _has(chunk_location, i)]
+            if channels:
+                matching_messages = [
+                    m for m in self._taken(chunk_location, channels) if begin_ns <= m.stamp_ns < end_ns
+                ]
+                yield from sorted(matching_messages, key=lambda message: message.stamp_ns)
 
     def reports(self, begin_ns: int, end_ns: int) -> Iterator[StateReport | VehicleReport]:
-        """The controller's reports of a time."""
+        """Yield the controller's reports of a time."""
         if self._ticks_only:
             for message in self.messages({TICK}, begin_ns, end_ns):
                 tick = tick_record.decode(message.data)
@@ -117,26 +124,26 @@ class SeekableRecording:
             yield VehicleReport(**values) if message.topic == VEHICLE else StateReport(**values)
 
     def frames(self, bus: str, begin_ns: int, end_ns: int) -> list[Frame]:
-        """The frames of a bus; of a stop file those that the controller received and sent."""
+        """Return the frames of a bus; of a stop file those that the controller received and sent."""
         if not self._ticks_only:
-            found = []
+            bus_frames = []
             for message in self.messages({f"/{bus}/raw"}, begin_ns, end_ns):
                 key, length, data = _CAN_FRAME.unpack_from(message.data)
-                found.append(Frame(message.stamp_ns, key, data[:length]))
-            return found
+                bus_frames.append(Frame(message.stamp_ns, key, data[:length]))
+            return bus_frames
         frames: list[Frame] = []
         for message in self.messages({TICK}, begin_ns, end_ns):
             tick = tick_record.decode(message.data)
-            first = bus == self.buses[0]
-            sent = tick.frames_out if first else tick.machine_frames_out
-            frames += tick.frames_in if first else tick.machine_frames_in
+            is_first_bus = bus == self.buses[0]
+            sent = tick.frames_out if is_first_bus else tick.machine_frames_out
+            frames += tick.frames_in if is_first_bus else tick.machine_frames_in
             frames += [Frame(tick.now_ns, key, data) for key, data in sent]
         return sorted(frames)
 
     def timing(self, at_ns: int) -> dict[str, Any] | None:
-        """The newest state of the timing page before a time, as the recorder stored it."""
-        found = list(self.messages({TIMING}, at_ns - 3_000_000_000, at_ns))
-        return msgspec.json.decode(found[-1].data) if found else None
+        """Return the newest state of the timing page before a time, as the recorder stored it."""
+        timing_messages = list(self.messages({TIMING}, at_ns - 3_000_000_000, at_ns))
+        return msgspec.json.decode(timing_messages[-1].data) if timing_messages else None
 
     def _places_of(self, path: Path) -> Iterator[_Place]:
         try:
@@ -160,8 +167,8 @@ class SeekableRecording:
             yield _Place(index.message_start_time - shift_ns, index.message_end_time - shift_ns, path, index, topics)
 
     def _taken(self, place: _Place, channels: list[int]) -> list[Message]:
-        """The messages of the channels in a chunk."""
-        found = []
+        """Read the messages of the channels in a chunk."""
+        chunk_messages = []
         with self._lock, place.path.open("rb") as file:
             data = self._chunk(place, file)
             for channel in channels:
@@ -169,8 +176,8 @@ class SeekableRecording:
                 for _, at in MessageIndex.read(ReadDataStream(file)).records:
                     _, length, _, _, _, stamp_ns = _MESSAGE.unpack_from(data, at)
                     body = data[at + _MESSAGE.size : at + _RECORD_HEAD + length]
-                    found.append(Message(place.topics[channel], stamp_ns, body))
-        return found
+                    chunk_messages.append(Message(place.topics[channel], stamp_ns, body))
+        return chunk_messages
 
     def _chunk(self, place: _Place, file: Any) -> bytes:
         name = (place.path, place.chunk.chunk_start_offset)
@@ -190,11 +197,11 @@ def _has(place: _Place, channel: int) -> bool:
 
 
 def _values(data: bytes, fields: Collection[str]) -> dict[str, Any]:
-    """A report's fields from its JSON, in which an unknown number is null; one that is not there keeps its default."""
-    found, values = msgspec.json.decode(data), {}
+    """Read a report's fields from its JSON, in which an unknown number is null; an absent one keeps its default."""
+    decoded_report, values = msgspec.json.decode(data), {}
     for name in fields:
-        if name in found:
-            value = found[name]
+        if name in decoded_report:
+            value = decoded_report[name]
             if isinstance(value, list):
                 value = tuple(math.nan if v is None else v for v in value)
             values[name] = math.nan if value is None else value

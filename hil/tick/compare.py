@@ -30,7 +30,7 @@ Progress = Callable[[str], None]
 
 
 def kept_recordings(folder: Path) -> list[Path]:
-    """The recordings that the tests keep, unpacked below ``folder`` with the profiles of their runs: a fixed crane, and
+    """Unpack the recordings that the tests keep below ``folder``, with the profiles of their runs: a fixed crane, and
     a forwarder on both buses.
 
     Raises:
@@ -54,7 +54,7 @@ def kept_recordings(folder: Path) -> list[Path]:
 
 
 def need_build() -> str:
-    """The key of the build that fits; raises CommandFailed."""
+    """Return the key of the build that fits; raises CommandFailed."""
     build, reason = find_build()
     if build is None:
         raise CommandFailed(
@@ -68,7 +68,7 @@ def need_build() -> str:
 def compare_cost(
     recording: Path, ticks: int, rounds: int, progress: Progress, against: Release | None = None
 ) -> dict[str, Any]:
-    """Cost of each side over interleaved rounds (A B C A B C), and the ratios of the same rounds.
+    """Measure the cost of each side over interleaved rounds (A B C A B C), and the ratios of the same rounds.
 
     A side's figures are those of its quietest turn, because other load only ever adds time.  A ratio is the median
     over the rounds with its interval, because the sides of one round run one after the other on the same host.
@@ -84,8 +84,8 @@ def compare_cost(
     if against:
         comparisons.append(("release_ratio", "release", "compiled", MIN_RELEASE_RATIO))
     medians = {
-        (side, caches): [float(turn[caches]["cpu_p50_us"]) for turn in found]
-        for side, found in turns.items()
+        (side, caches): [float(turn[caches]["cpu_p50_us"]) for turn in figures]
+        for side, figures in turns.items()
         for caches in CACHES
     }
     ratios = {
@@ -96,8 +96,8 @@ def compare_cost(
     return {
         "recording": recording.parent.name,
         "ticks": turns["interpreter"][0]["ticks"],
-        **{side: _quietest(found) for side, found in turns.items()},
-        **{name: found["ratio"] for name, found in ratios.items()},
+        **{side: _quietest(figures) for side, figures in turns.items()},
+        **{name: figures["ratio"] for name, figures in ratios.items()},
         "ratios": ratios,
     }
 
@@ -144,7 +144,7 @@ def compare_random(recording: Path, seed: int, ticks: int, progress: Progress) -
 
 
 def environment() -> dict[str, Any]:
-    """What the figures depend on."""
+    """Describe what the figures depend on."""
     from importlib import metadata
 
     try:
@@ -161,7 +161,7 @@ def environment() -> dict[str, Any]:
 
 
 def _start(side: str, folder: Path | None, *arguments: object) -> subprocess.Popen[str]:
-    """A worker of this program, which judges the packages below ``folder``, by default its own."""
+    """Start a worker of this program, which judges the packages below ``folder``, by default its own."""
     return subprocess.Popen(
         [sys.executable, "-P", worker.__file__, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -195,7 +195,7 @@ CONFIDENCE: Final = 0.95
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float]:
-    """The interval that holds the true median with `CONFIDENCE`, between two of the sorted values (sign test).
+    """Find the interval that holds the true median with `CONFIDENCE`, between two of the sorted values (sign test).
 
     No assumption on the distribution, so that single disturbed rounds do not widen it; fewer than six values bound
     nothing and give an infinite interval.
@@ -209,14 +209,14 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def verdict(interval: tuple[float, float], at_least: float) -> str:
-    """Whether a ratio reaches a limit: "reached", "missed", or "inconclusive" where the interval holds the limit."""
+    """Judge whether a ratio reaches a limit: "reached", "missed", or "inconclusive" where the interval holds it."""
     if interval[0] >= at_least:
         return "reached"
     return "missed" if interval[1] < at_least else "inconclusive"
 
 
 def compared(slow: Sequence[float], fast: Sequence[float], at_least: float) -> dict[str, object]:
-    """The ratio of two series of the same rounds: median, interval (None without an upper bound), and verdict."""
+    """Compare two series of the same rounds: ratio's median, interval (None without an upper bound), and verdict."""
     ratios = [a / b for a, b in zip(slow, fast, strict=True)]
     low, high = median_interval(ratios)
     return {

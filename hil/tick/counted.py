@@ -25,7 +25,7 @@ _TICKS: Final = re.compile(r'"counted": (\d+)')
 
 
 def count(recording: Path, ticks: int, folder: Path) -> dict[str, Any]:
-    """Instructions and cold cache lines (64 bytes; of code, read, written) of one tick of a recording, on average.
+    """Count instructions and cold cache lines (64 bytes; of code, read, written) of a recording's average tick.
 
     Raises:
         CommandFailed: valgrind is missing or fails.
@@ -59,7 +59,7 @@ def count(recording: Path, ticks: int, folder: Path) -> dict[str, Any]:
 
 
 def _per_tick(said: str, told: str) -> dict[str, float]:
-    """The figures from what worker and valgrind wrote."""
+    """Compute the figures from what worker and valgrind wrote."""
     counted, events, ran = _COUNTED.search(told), _EVENTS.search(told), _TICKS.search(said)
     if counted is None or events is None or ran is None:
         raise CommandFailed(

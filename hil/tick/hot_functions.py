@@ -22,7 +22,7 @@ _FUNCTION = re.compile(r"^c?fn=\(\d+\) (CPy(?:Def|Py)_\w+)", re.MULTILINE)
 
 
 def called(recording: Path, folder: Path) -> set[str]:
-    """The compiled functions that run in the ticks of a recording, by valgrind's callgrind."""
+    """Find the compiled functions that run in the ticks of a recording, by valgrind's callgrind."""
     out = folder / "callgrind"
     subprocess.run(
         [
@@ -46,9 +46,9 @@ def main() -> None:
     need_build()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        found = set[str]().union(*(called(recording, folder) for recording in kept_recordings(folder)))
-    (source_root() / HOT_FUNCTIONS).write_text("".join(f"{function}\n" for function in sorted(found)))
-    print(f"{len(found)} functions run in a tick")
+        functions = set[str]().union(*(called(recording, folder) for recording in kept_recordings(folder)))
+    (source_root() / HOT_FUNCTIONS).write_text("".join(f"{function}\n" for function in sorted(functions)))
+    print(f"{len(functions)} functions run in a tick")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ TASK_CLOCK: Final = (_SOFTWARE, 1)
 
 
 def open_counter(thread: int, kind: tuple[int, int]) -> int | None:
-    """A descriptor that counts ``kind`` in a thread (its id) from now on; None if the host does not offer it."""
+    """Open a descriptor that counts ``kind`` in a thread (its id) from now on; None if the host does not offer it."""
     number = _SYSCALL.get(platform.machine())
     if number is None:
         return None
@@ -31,6 +31,6 @@ def open_counter(thread: int, kind: tuple[int, int]) -> int | None:
 
 
 def count(descriptor: int) -> int:
-    """The count so far."""
+    """Return the count so far."""
     (value,) = struct.unpack("<Q", os.read(descriptor, 8))
     return int(value)

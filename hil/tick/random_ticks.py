@@ -35,7 +35,7 @@ class RandomTicks:
         self._random = random.Random(seed)
 
     def one_pass(self) -> Iterator[TickRecord]:
-        """The ticks of one pass, for a fresh controller."""
+        """Yield the ticks of one pass, for a fresh controller."""
         rng = self._random
         rate, shift_ns = rng.choice(RATES), 0
         for tick in self._recorded:
@@ -87,7 +87,7 @@ class RandomTicks:
         return tuple(frames)
 
     def _changed_frame(self, frame: Frame) -> Frame:
-        """A payload with random bytes, mostly under a checksum that fits."""
+        """Put random bytes into a payload, mostly under a checksum that fits."""
         rng = self._random
         data = bytearray(frame.data)
         for _ in range(rng.randrange(1, 4)):
@@ -123,7 +123,7 @@ class RandomTicks:
         return tuple(given)
 
     def _changed_setpoint(self, data: bytes) -> bytes:
-        """A crane setpoint with other knots or another lease; any other datagram with one other byte."""
+        """Change the knots or the lease of a crane setpoint, or one byte of any other datagram."""
         rng = self._random
         try:
             message = datagrams.decode(data)

@@ -29,12 +29,12 @@ class Release:
 
 
 def newest_tag() -> str:
-    """The newest tag of this checkout; empty without one."""
+    """Return the newest tag of this checkout; empty without one."""
     return _git("tag", "--sort=-creatordate").split("\n", 1)[0].strip()
 
 
 def release(wanted: str, progress: Progress) -> Release:
-    """The packages of a commit, with its own compiled tick, or of a wheel as it is.
+    """Provide the packages of a commit, with its own compiled tick, or of a wheel as it is.
 
     Raises:
         CommandFailed: no such commit or wheel, or it does not compile.
@@ -78,7 +78,7 @@ def _from_wheel(wheel: Path, folder: Path) -> Release:
 
 @contextlib.contextmanager
 def _new(target: Path) -> Iterator[Path]:
-    """A folder that takes its place only when it is complete."""
+    """Make a folder that takes its place only when it is complete."""
     work = target.with_name(f".{target.name}")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -87,7 +87,7 @@ def _new(target: Path) -> Iterator[Path]:
 
 
 def _git(*arguments: str) -> str:
-    """What git prints; nothing when it refuses or is missing."""
+    """Return what git prints; nothing when it refuses or is missing."""
     try:
         return subprocess.run(["git", *arguments], cwd=source_root(), capture_output=True, text=True).stdout
     except OSError:

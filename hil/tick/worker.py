@@ -37,7 +37,7 @@ COUNTED_CACHE_BYTES: Final = 2 << 20
 
 
 def eviction_bytes() -> int:
-    """A size that does not fit beside the tick in the last-level cache: three quarters more, within reason."""
+    """Find a size that does not fit beside the tick in the last-level cache: three quarters more, within reason."""
     sizes = [MIN_EVICTION_BYTES * 4 // 7]
     for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size"):
         text = path.read_text().strip()
@@ -46,7 +46,7 @@ def eviction_bytes() -> int:
 
 
 def digest_of(outputs: tuple[Any, ...]) -> bytes:
-    """A digest of the frames and reports of one tick."""
+    """Compute a digest of the frames and reports of one tick."""
     frames, machine_frames, report, vehicle_report = outputs
     made = hashlib.sha256()
     for part in (frames, machine_frames):
@@ -58,7 +58,7 @@ def digest_of(outputs: tuple[Any, ...]) -> bytes:
 
 
 def recorded(place: Path, limit: int) -> tuple[Settings, list[TickRecord]]:
-    """Settings and the first ticks of a recording."""
+    """Read settings and the first ticks of a recording."""
     from hil.replay import replay
     from hil.replay.recording import files_of, manifest_of
 
@@ -114,7 +114,7 @@ def counted(place: Path, limit: int) -> dict[str, Any]:
 
 
 def replayed(place: Path) -> dict[str, Any]:
-    """What runs the tick here, how many ticks give other bytes than the recording, and the digest of all bytes."""
+    """Tell what runs the tick here, how many ticks give other bytes than the recording, and the digest of all bytes."""
     from controller.process.tick_recording import restore_inputs, transmitted
     from controller.step import Controller, step
     from controller.tick import Inputs
@@ -171,7 +171,7 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
 
 
 def _use_huge_pages() -> None:
-    """As the controller does before its first tick; the release that is judged may be older."""
+    """Collapse the heap as the controller does before its first tick; the release that is judged may be older."""
     with contextlib.suppress(ImportError):
         from runtime.memory import collapse_heap
 
@@ -179,7 +179,7 @@ def _use_huge_pages() -> None:
 
 
 def _counter() -> Callable[[], int] | None:
-    """Reads the instructions of this thread; None where the host, or the release that is judged, counts none."""
+    """Return a reader of this thread's instructions; None where the host, or the release that is judged, has none."""
     try:
         from hil.tick.instructions import INSTRUCTIONS, count, open_counter
     except ImportError:
@@ -189,7 +189,7 @@ def _counter() -> Callable[[], int] | None:
 
 
 def _timer_cost(between: Callable[[], None]) -> tuple[int, int]:
-    """Median of what the stopwatch itself takes with these caches, time and processor time [ns]."""
+    """Measure the median of what the stopwatch itself takes with these caches, time and processor time [ns]."""
     wall, cpu = [], []
     for _ in range(101):
         between()

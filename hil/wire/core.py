@@ -168,7 +168,7 @@ class WireCore:
         return finished
 
     def next_ns(self) -> int | None:
-        """Time of the next event if nobody submits anything; None for never."""
+        """Return the time of the next event if nobody submits anything; None for never."""
         times = [event[0] for event in self._events[:1]]
         for segment in self._segments:
             if segment.flight:
@@ -269,7 +269,7 @@ class WireCore:
     # -- errors
 
     def _destroy(self, segment: Segment, flight: Flight) -> None:
-        """Every node of the segment detects the error; the frame stays at the head of its queue."""
+        """Let every node of the segment detect the error; the frame stays at the head of its queue."""
         self.errors += 1
         for node in tuple(segment.nodes):
             if node is flight.sender:
@@ -304,8 +304,8 @@ class WireCore:
         if node.state is BusState.OFF:
             return
         cut = any(fault.node in (None, node.name) for fault in self._cuts)
-        here = node.segment
-        if here is None or cut is (here is self._main):
+        current_segment = node.segment
+        if current_segment is None or cut is (current_segment is self._main):
             self._leave(node)
             node.hold_ns = max(node.hold_ns, self.now_ns)  # waiting frames start now, not in the past
             node.segment = Segment() if cut else self._main
@@ -386,7 +386,7 @@ _STUFF7: Final = _stuff_table(7)
 
 @lru_cache(maxsize=4096)
 def _header(key: int, length: int) -> tuple[int, int, int, int]:
-    """CRC, stuffing state, stuff bits and bit count after start of frame, arbitration and control field."""
+    """Compute CRC, stuffing state, stuff bits and bit count after start of frame, arbitration and control field."""
     remote = 1 if key & REMOTE else 0
     if key & EXTENDED:
         identifier = key & EXTENDED_MASK
@@ -403,7 +403,7 @@ def _header(key: int, length: int) -> tuple[int, int, int, int]:
 
 
 def frame_bits(key: int, data: bytes) -> int:
-    """Bits from start of frame to the last CRC bit with its stuff bits; 10 more end the frame (CRC
+    """Count the bits from start of frame to the last CRC bit with its stuff bits; 10 more end the frame (CRC
     delimiter, acknowledge slot and delimiter, end of frame) and 3 separate it from the next."""
     crc, state, inserted, count = _header(key, len(data))
     if not key & REMOTE:
@@ -417,7 +417,7 @@ def frame_bits(key: int, data: bytes) -> int:
 
 
 def priority(key: int) -> int:
-    """The arbitration field as a number: the lowest wins the bus.  A standard frame wins over an extended
+    """Return the arbitration field as a number: the lowest wins the bus.  A standard frame wins over an extended
     one with the same leading 11 bits, and a data frame over its remote frame."""
     remote = 1 if key & REMOTE else 0
     if key & EXTENDED:

@@ -255,7 +255,7 @@ def serve(servers: list[Server], stop: socket.socket) -> None:
 
 
 def _listen(path: Path) -> socket.socket:
-    """A listening socket at `path`; the file of a dead daemon is replaced, a running daemon is an error."""
+    """Open a listening socket at `path`; the file of a dead daemon is replaced, a running daemon is an error."""
     if (length := len(os.fsencode(path))) > _SOCKET_PATH_BYTES:
         raise LinkError(
             "wire.path-too-long",

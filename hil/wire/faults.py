@@ -69,7 +69,7 @@ class Fault:
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> Self:
-        """A fault from its JSON fields; raises ValueError or TypeError for an unknown kind, field or value."""
+        """Make a fault from its JSON fields; raises ValueError or TypeError for an unknown kind, field or value."""
         converted = dict(fields, kind=Kind(fields.get("kind", "")))
         if "data" in fields:
             converted["data"] = bytes.fromhex(fields["data"])
@@ -103,7 +103,7 @@ class Damage:
         self._faults.clear()
 
     def fate(self, at_ns: int, sender: str, key: int, data: bytes) -> Fate:
-        """The fate of a frame that starts at `at_ns`; faults apply in the order in which they were added."""
+        """Decide the fate of a frame that starts at `at_ns`; faults apply in the order in which they were added."""
         error = False
         offsets: tuple[int, ...] = (0,)
         self._faults = [entry for entry in self._faults if at_ns < entry[0].end_ns]

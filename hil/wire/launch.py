@@ -21,7 +21,7 @@ _STOP_TIMEOUT_S: Final = 5.0
 def wire_daemon(
     buses: Mapping[str, int], directory: Path | None = None, joined: Mapping[str, str] | None = None
 ) -> Iterator[subprocess.Popen[str]]:
-    """A daemon that serves `buses` (name to bit/s), ready for clients; ends with the block.
+    """Run a daemon that serves `buses` (name to bit/s), ready for clients; it ends with the block.
 
     `joined` maps SocketCAN interfaces to the bus that they join.
 

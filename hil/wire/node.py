@@ -96,9 +96,9 @@ class Node:
     def discard(self) -> None:
         """Empty the transmit queue, except for the frame on the bus."""
         flight = self.segment.flight if self.segment else None
-        kept = 1 if flight is not None and flight.sender is self else 0
-        self.done += len(self.queue) - kept
-        while len(self.queue) > kept:
+        in_flight_count = 1 if flight is not None and flight.sender is self else 0
+        self.done += len(self.queue) - in_flight_count
+        while len(self.queue) > in_flight_count:
             self.queue.pop()
 
     def receive(self, frame: Frame) -> None:
@@ -109,18 +109,18 @@ class Node:
             self.dropped += 1
 
     def ready_ns(self, segment: Segment) -> int:
-        """The earliest time at which the head of the transmit queue may start."""
+        """Return the earliest time at which the head of the transmit queue may start."""
         return max(self.queue[0].ready_ns, self.hold_ns, segment.free_ns)
 
     def confinement(self) -> BusState:
-        """The fault confinement state for the present error counters (ISO 11898-1)."""
+        """Return the fault confinement state for the present error counters (ISO 11898-1)."""
         if self.tec > 255:
             return BusState.OFF
         worst = max(self.tec, self.rec)
         return BusState.PASSIVE if worst > 127 else BusState.WARNING if worst > 95 else BusState.ACTIVE
 
     def error_frame(self, at_ns: int, classes: int, changed: bool, transmitter: bool) -> Frame:
-        """SocketCAN's error frame for an error of these classes and, if `changed`, for the new state."""
+        """Make SocketCAN's error frame for an error of these classes and, if `changed`, for the new state."""
         flags = 0
         if changed and self.state is BusState.OFF:
             classes |= ERR_BUSOFF
@@ -128,11 +128,11 @@ class Node:
             classes |= ERR_CRTL
             side = _CRTL_TRANSMITTER if self.tec >= self.rec else _CRTL_RECEIVER
             flags = (CRTL_ACTIVE, CRTL_WARNING & side, CRTL_PASSIVE & side)[self.state]
-        place = 0
+        error_location = 0
         if classes & ERR_PROT:
-            place = _LOC_ACK if classes & ERR_ACK else _LOC_CRC
+            error_location = _LOC_ACK if classes & ERR_ACK else _LOC_CRC
         direction = _PROT_TX if transmitter else 0
-        data = bytes((0, flags, direction, place, 0, 0, min(self.tec, 255), self.rec))
+        data = bytes((0, flags, direction, error_location, 0, 0, min(self.tec, 255), self.rec))
         return Frame(at_ns, ERROR | ERR_CNT | classes, data)
 
 

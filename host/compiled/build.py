@@ -45,16 +45,16 @@ def compile_tick(progress: Progress, force: bool = False, root: Path | None = No
     root = root or compiled.source_root()
     folder = compiled.builds_folder(root)
     begin_s = time.monotonic()
-    found = None if force else compiled.find_build(root, folder)[0]
-    if found is None:
+    existing_build = None if force else compiled.find_build(root, folder)[0]
+    if existing_build is None:
         check_tools()
         with _alone(folder, progress):
-            found = None if force else compiled.find_build(root, folder)[0]
-            if found is None:
+            existing_build = None if force else compiled.find_build(root, folder)[0]
+            if existing_build is None:
                 key = _build(root, folder, progress)
                 _remove_old(folder, key)
                 return _answer(key, folder, begin_s, True)
-    return _answer(found.key, folder, begin_s, False)
+    return _answer(existing_build.key, folder, begin_s, False)
 
 
 def check_tools() -> None:
@@ -119,7 +119,7 @@ def _run_compiler(tree: Path, made: Path, progress: Progress) -> None:
 
 
 def _environment(tree: Path) -> dict[str, str]:
-    """The copy comes first, wherever the sources are installed."""
+    """Return an environment in which the copy comes first, wherever the sources are installed."""
     return {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
@@ -133,8 +133,8 @@ def _alone(folder: Path, progress: Progress) -> Iterator[None]:
         except BlockingIOError:
             progress("another process compiles; waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
-        for left in folder.glob(".work-*"):
-            shutil.rmtree(left, ignore_errors=True)
+        for leftover in folder.glob(".work-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
         yield
 
 

@@ -39,7 +39,7 @@ _AT_START: Final = ("_____top_level__", "_coroutine_setup")
 
 
 def extensions(tree: Path) -> list[Any]:
-    """The setuptools extensions of `MODULES` and of the generated codecs; ``tree`` is a copy of the sources."""
+    """Make the setuptools extensions of `MODULES` and of the generated codecs; ``tree`` is a copy of the sources."""
     from mypyc.build import mypycify
 
     tree = tree.resolve()

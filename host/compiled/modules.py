@@ -77,5 +77,5 @@ MODULES: Final = (
 
 
 def file_of(module: str) -> Path:
-    """The source file of a module below the root of the sources."""
+    """Return the source file of a module below the root of the sources."""
     return Path(*module.split(".")).with_suffix(".py")

@@ -32,22 +32,24 @@ def make_tree(root: Path, tree: Path) -> None:
 
 
 def needed_sources(tree: Path) -> list[Path]:
-    """The source files that determine a build: those of `MODULES`, what they import from our packages, and how.
+    """List the source files that determine a build: those of `MODULES`, what they import from our packages, and how.
 
     The compiler takes types and constants from modules that are imported only.
     """
-    found: dict[Path, None] = dict.fromkeys(HOW)
+    sources: dict[Path, None] = dict.fromkeys(HOW)
     waiting = [file_of(module) for module in (*MODULES, GENERATOR)]
     while waiting:
         path = waiting.pop()
-        if path in found:
+        if path in sources:
             continue
-        found[path] = None
+        sources[path] = None
         for node in ast.walk(ast.parse((tree / path).read_bytes())):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             for name in names:
-                place = Path(*name.split("."))
-                waiting += [p for p in (place.with_suffix(".py"), place / "__init__.py") if (tree / p).is_file()]
-    return sorted(found)
+                module_path = Path(*name.split("."))
+                waiting += [
+                    p for p in (module_path.with_suffix(".py"), module_path / "__init__.py") if (tree / p).is_file()
+                ]
+    return sorted(sources)

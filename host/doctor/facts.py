@@ -121,16 +121,16 @@ class Computer:
 
 
 def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts:
-    """The facts below ``root``; ``links`` is the output of ``ip -details -statistics -json link``."""
+    """Read the facts below ``root``; ``links`` is the output of ``ip -details -statistics -json link``."""
     cmdline = _text(root / "proc/cmdline")
     cpus = root / "sys/devices/system/cpu"
     unit = next((text for folder in _UNIT_FOLDERS if (text := _text(root / folder / _UNIT))), "")
     options = _setting(_text(root / _CONF), "CONTROLLER_OPTIONS")
-    if control_cpu is None and (found := re.search(r"--cpu[ =](\d+)", options)):
-        control_cpu = int(found[1])
+    if control_cpu is None and (match := re.search(r"--cpu[ =](\d+)", options)):
+        control_cpu = int(match[1])
     if control_cpu is None:
         control_cpu = _number(_setting(_text(root / _PROCESSOR), "CPUAffinity"))
-    ours = cpus / f"cpu{control_cpu or 0}"
+    control_cpu_folder = cpus / f"cpu{control_cpu or 0}"
     limits = _text(root / "proc/self/limits")
     daemons, softirq = _processes(root / "proc")
     banned = re.search(r"^IRQBALANCE_BANNED_CPULIST=\"?([\d,-]+)", _text(root / "etc/default/irqbalance"), re.MULTILINE)
@@ -140,12 +140,12 @@ def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts
         machine=_machine(root),
         online=cpu_set(_text(cpus / "online")),
         control_cpu=control_cpu,
-        siblings=cpu_set(_text(ours / "topology/thread_siblings_list")),
+        siblings=cpu_set(_text(control_cpu_folder / "topology/thread_siblings_list")),
         isolated=cpu_set(_text(cpus / "isolated")),
         tickless=cpu_set(_text(cpus / "nohz_full")) or cpu_set(_word(cmdline, "nohz_full")),
         rcu_offloaded=cpu_set(_word(cmdline, "rcu_nocbs")) | cpu_set(_text(cpus / "nohz_full")),
         governors={int(p.parts[-3][3:]): _text(p) for p in sorted(cpus.glob("cpu[0-9]*/cpufreq/scaling_governor"))},
-        idle=tuple(_idle_state(p) for p in sorted((ours / "cpuidle").glob("state[0-9]*"))),
+        idle=tuple(_idle_state(p) for p in sorted((control_cpu_folder / "cpuidle").glob("state[0-9]*"))),
         dma_latency=os.access(root / "dev/cpu_dma_latency", os.W_OK),
         clock_source=_text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource"),
         rt_runtime_us=_number(_text(root / "proc/sys/kernel/sched_rt_runtime_us")),
@@ -170,18 +170,18 @@ def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts
 
 
 def read_computer(root: Path, version: str, cpu: int) -> Computer:
-    """The computer below ``root``; ``version`` is that of uname(2), ``cpu`` the controller's processor."""
+    """Describe the computer below ``root``; ``version`` is that of uname(2), ``cpu`` the controller's processor."""
     info = _text(root / "proc/cpuinfo")
     model = re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE)
     memory = re.search(r"^MemTotal:\s+(\d+)", _text(root / "proc/meminfo"), re.MULTILINE)
     affinity = {int(p.parent.name): cpu_set(_text(p)) for p in root.glob("proc/irq/[0-9]*/smp_affinity_list")}
-    words = _text(root / "proc/cmdline").split()
+    boot_options = _text(root / "proc/cmdline").split()
     return Computer(
         processor=model[1] if model else "",
         processors=len(re.findall(r"^processor\s*:", info, re.MULTILINE)),
         memory_mb=int(memory[1]) >> 10 if memory else 0,
         kernel_version=version,
-        boot_words=tuple(w for w in words if BOOT_WORDS.fullmatch(w.partition("=")[0])),
+        boot_words=tuple(w for w in boot_options if BOOT_WORDS.fullmatch(w.partition("=")[0])),
         interrupts=tuple(sorted(n for n, cpus in affinity.items() if cpu in cpus)),
         interrupts_all=len(affinity),
         new_interrupts=_text(root / "proc/irq/default_smp_affinity"),
@@ -189,32 +189,32 @@ def read_computer(root: Path, version: str, cpu: int) -> Computer:
 
 
 def interrupt_counts(text: str, cpu: int) -> dict[str, int]:
-    """Interrupts of one processor since boot, by source, from the text of /proc/interrupts."""
+    """Count interrupts of one processor since boot, by source, from the text of /proc/interrupts."""
     head, *lines = text.splitlines() or [""]
     columns = head.split()
     if f"CPU{cpu}" not in columns:
         return {}
-    column, found = columns.index(f"CPU{cpu}"), dict[str, int]()
+    column, counts = columns.index(f"CPU{cpu}"), dict[str, int]()
     for line in lines:
         label, _, rest = line.strip().partition(":")
-        words = rest.split()
-        if len(words) > column and words[column].isdigit():
-            name = words[-1] if label.isdigit() and len(words) > len(columns) else label
-            found[name] = found.get(name, 0) + int(words[column])
-    return found
+        fields = rest.split()
+        if len(fields) > column and fields[column].isdigit():
+            name = fields[-1] if label.isdigit() and len(fields) > len(columns) else label
+            counts[name] = counts.get(name, 0) + int(fields[column])
+    return counts
 
 
 def cpu_set(text: str) -> frozenset[int]:
-    """``0-2,5`` as numbers; words as in ``isolcpus=managed_irq,domain,3`` are ignored."""
-    found: set[int] = set()
+    """Parse ``0-2,5`` as numbers; words as in ``isolcpus=managed_irq,domain,3`` are ignored."""
+    cpus: set[int] = set()
     for part in text.strip().split(","):
         if match := re.fullmatch(r"(\d+)(?:-(\d+))?", part):
-            found.update(range(int(match[1]), int(match[2] or match[1]) + 1))
-    return frozenset(found)
+            cpus.update(range(int(match[1]), int(match[2] or match[1]) + 1))
+    return frozenset(cpus)
 
 
 def can_links(root: Path, links: str) -> Iterable[CanLink]:
-    """The CAN interfaces in the output of ip(8)."""
+    """Read the CAN interfaces from the output of ip(8)."""
     for link in json.loads(links or "[]"):
         if link.get("link_type") != "can":
             continue
@@ -239,21 +239,21 @@ def can_links(root: Path, links: str) -> Iterable[CanLink]:
 
 
 def _interrupts(root: Path, name: str) -> tuple[int, ...]:
-    """Interrupts of the device of an interface, or of its nearest ancestor with any (a USB adapter's host)."""
+    """List the interrupts of an interface's device, or of its nearest ancestor with any (a USB adapter's host)."""
     device = (root / "sys/class/net" / name / "device").resolve()
-    for place in (device, *device.parents):
-        if place == root.resolve():
+    for folder in (device, *device.parents):
+        if folder == root.resolve():
             break
-        several = sorted(int(p.name) for p in (place / "msi_irqs").glob("[0-9]*"))
+        several = sorted(int(p.name) for p in (folder / "msi_irqs").glob("[0-9]*"))
         if several:
             return tuple(several)
-        if number := _number(_text(place / "irq")):
+        if number := _number(_text(folder / "irq")):
             return (number,)
     return ()
 
 
 def _preemption(root: Path) -> str:
-    """rt, full, lazy, voluntary, none, dynamic; empty when unknown."""
+    """Return rt, full, lazy, voluntary, none or dynamic; empty when unknown."""
     version = _text(root / "proc/version")
     if _text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         return "rt"
@@ -267,7 +267,7 @@ def _preemption(root: Path) -> str:
 
 
 def _machine(root: Path) -> str:
-    """ "" for real hardware, else what it is instead."""
+    """Return "" for real hardware, else what it is instead."""
     cpuinfo = _text(root / "proc/cpuinfo")
     if "User Mode Linux" in cpuinfo:
         return "user-mode Linux"
@@ -280,7 +280,7 @@ def _machine(root: Path) -> str:
 
 
 def _processes(proc: Path) -> tuple[set[str], dict[int, str]]:
-    """Names of all processes, and the scheduling of the ksoftirqd threads by processor."""
+    """Return names of all processes, and the scheduling of the ksoftirqd threads by processor."""
     names: set[str] = set()
     softirq: dict[int, str] = {}
     for stat in proc.glob("[0-9]*/stat"):
@@ -313,27 +313,27 @@ def _number(text: str) -> int | None:
 
 
 def _limit(limits: str, name: str) -> int | None:
-    """The hard limit; a process may raise its soft limit up to it."""
-    found = re.search(rf"^{name}\s+\S+\s+(\S+)", limits, re.MULTILINE)
-    return _number(found[1]) if found else None
+    """Return the hard limit; a process may raise its soft limit up to it."""
+    match = re.search(rf"^{name}\s+\S+\s+(\S+)", limits, re.MULTILINE)
+    return _number(match[1]) if match else None
 
 
 def _setting(unit: str, name: str) -> str:
-    found = re.search(rf"^{name}=(.*)$", unit, re.MULTILINE)
-    return found[1].strip() if found else ""
+    match = re.search(rf"^{name}=(.*)$", unit, re.MULTILINE)
+    return match[1].strip() if match else ""
 
 
 def _capable(root: Path, bit: int) -> bool:
-    found = re.search(r"^CapEff:\s*([0-9a-f]+)", _text(root / "proc/self/status"), re.MULTILINE)
-    return found is not None and bool(int(found[1], 16) >> bit & 1)
+    match = re.search(r"^CapEff:\s*([0-9a-f]+)", _text(root / "proc/self/status"), re.MULTILINE)
+    return match is not None and bool(int(match[1], 16) >> bit & 1)
 
 
 def _word(cmdline: str, name: str) -> str:
-    found = re.search(rf"(?:^|\s){name}=(\S+)", cmdline)
-    return found[1] if found else ""
+    match = re.search(rf"(?:^|\s){name}=(\S+)", cmdline)
+    return match[1] if match else ""
 
 
 def _chosen(text: str) -> str:
-    """The selected word, which is in brackets."""
-    found = re.search(r"\[(\w+)\]", text)
-    return found[1] if found else ""
+    """Return the selected word, which is in brackets."""
+    match = re.search(r"\[(\w+)\]", text)
+    return match[1] if match else ""

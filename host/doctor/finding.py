@@ -35,17 +35,17 @@ class Finding:
     commands: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """The finding as plain values for JSON."""
+        """Return the finding as plain values for JSON."""
         return asdict(self) | {"severity": self.severity.name.lower(), "commands": list(self.commands)}
 
 
 def fine(what: str, sentence: str) -> Finding:
-    """A finding without a suggested change."""
+    """Make a finding without a suggested change."""
     return Finding(what, Severity.FINE, sentence)
 
 
 def row(what: str, good: str, severity: Severity, wrong: str, gain: str, *commands: str) -> Finding:
-    """One topic: what is said where it is good, else (empty) what is wrong, what a change gains, its commands."""
+    """Make one finding: what is said where it is good, else (empty) what is wrong, a change's gain, its commands."""
     return fine(what, good) if good else Finding(what, severity, wrong, gain, commands)
 
 
@@ -77,7 +77,7 @@ def show(console: Console, title: str, findings: Sequence[Finding]) -> None:
 
 
 def conclusion(findings: Sequence[Finding]) -> str:
-    """The final line."""
+    """Write the final line."""
     worst = max((f.severity for f in findings), default=Severity.FINE)
     count = sum(f.severity is worst for f in findings)
     return _CONCLUSIONS[worst].format(count, "" if count == 1 else "s")

@@ -47,13 +47,13 @@ ADVICE, CHANGE, FAULT = Severity.ADVICE, Severity.CHANGE, Severity.FAULT
 
 
 def examine() -> tuple[Finding, ...]:
-    """All findings, in the order in which to correct them."""
+    """Return all findings, in the order in which to correct them."""
     before = (python(), *packages(), tick(), *profiles(), *buses(), *camera(), vcan_lab(), kernel_of_lab())
     return (*before, *places(), ports(), *key(), *signed())
 
 
 def python() -> Finding:
-    """The interpreter; pip refuses versions that are too old, and pybullet has no wheels for the newest."""
+    """Check the interpreter; pip refuses versions that are too old, and pybullet has no wheels for the newest."""
     version = sys.version.split()[0]
     return row(
         "python",
@@ -66,14 +66,14 @@ def python() -> Finding:
 
 
 def packages() -> Iterator[Finding]:
-    """Whether every required package is installed in a suitable version."""
+    """Check whether every required package is installed in a suitable version."""
     gain, mend = "a working program", "make setup"
     try:
-        wanted = [Requirement(text) for text in metadata.requires("timberhand") or ()]
+        requirements = [Requirement(text) for text in metadata.requires("timberhand") or ()]
     except metadata.PackageNotFoundError:
         yield row("packages", "", FAULT, "timberhand itself is not installed", gain, mend)
         return
-    base = [need for need in wanted if need.marker is None or need.marker.evaluate({"extra": ""})]
+    base = [need for need in requirements if need.marker is None or need.marker.evaluate({"extra": ""})]
     lacking = [fault for need in base if (fault := _missing(need))]
     good = (
         ""
@@ -82,7 +82,7 @@ def packages() -> Iterator[Finding]:
     )
     yield row("packages", good, FAULT, f"missing: {', '.join(lacking)}", gain, mend)
     for extra, purpose in EXTRAS.items():
-        needs = [n for n in wanted if n.marker and n.marker.evaluate({"extra": extra}) and n not in base]
+        needs = [n for n in requirements if n.marker and n.marker.evaluate({"extra": extra}) and n not in base]
         if faults := [fault for need in needs if (fault := _missing(need))]:
             command = f"{sys.executable} -m pip install 'timberhand[{extra}]'"
             yield Finding(f"packages, {extra}", ADVICE, f"missing: {', '.join(faults)}", purpose, (command,))
@@ -90,14 +90,18 @@ def packages() -> Iterator[Finding]:
 
 def _missing(need: Requirement) -> str:
     try:
-        there = metadata.version(need.name)
+        installed_version = metadata.version(need.name)
     except metadata.PackageNotFoundError:
         return need.name
-    return "" if need.specifier.contains(there, prereleases=True) else f"{need.name} {need.specifier} (is {there})"
+    return (
+        ""
+        if need.specifier.contains(installed_version, prereleases=True)
+        else f"{need.name} {need.specifier} (is {installed_version})"
+    )
 
 
 def tick() -> Finding:
-    """Whether the controller would run a compiled tick, asked in a process of its own as `python -m controller`."""
+    """Check whether the controller would run a compiled tick, in a process of its own as `python -m controller`."""
     program = "from runtime.compiled import activate; found = activate(); print(found, found.reason, sep='|')"
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout.strip()
     running, _, reason = answer.partition("|")
@@ -106,7 +110,7 @@ def tick() -> Finding:
 
 
 def profiles() -> Iterator[Finding]:
-    """The shipped profiles, and the one in the settings."""
+    """Check the shipped profiles, and the one in the settings."""
     names = [*shipped_profiles()]
     if (chosen := _settings().get("PROFILE")) and chosen not in names:
         names.append(chosen)
@@ -121,15 +125,15 @@ def profiles() -> Iterator[Finding]:
 
 
 def buses() -> Iterator[Finding]:
-    """The buses that a controller can use."""
+    """Check the buses that a controller can use."""
     interfaces, settings = [name for _, name in socket.if_nameindex()], _settings()
     if not kernel_has_can():
         wrong = "this kernel has no SocketCAN; the wire (a CAN bus in user space) works"
         command = "sudo modprobe can_raw  # if that fails: a kernel with CONFIG_CAN_RAW"
         yield Finding("buses", ADVICE, wrong, "a real machine", (command,))
     else:
-        there = [name for name in interfaces if _type_of(name) == "280"]  # ARPHRD_CAN, linux/if_arp.h
-        yield fine("buses", f"SocketCAN: {', '.join(there) or 'no interface yet'}; the wire")
+        can_interfaces = [name for name in interfaces if _type_of(name) == "280"]  # ARPHRD_CAN, linux/if_arp.h
+        yield fine("buses", f"SocketCAN: {', '.join(can_interfaces) or 'no interface yet'}; the wire")
     for setting in ("CRANE_BUS", "MACHINE_BUS"):
         address = settings.get(setting, "")
         name = address.removeprefix(PYTHON_CAN).removeprefix("socketcan:")
@@ -140,7 +144,7 @@ def buses() -> Iterator[Finding]:
 
 
 def camera() -> Iterator[Finding]:
-    """The camera of the services, by the settings: whether what delivers its pictures is there."""
+    """Check the camera of the services, by the settings: whether what delivers its pictures is there."""
     settings = _settings()
     if "SCENE" not in settings:
         return
@@ -159,7 +163,7 @@ def camera() -> Iterator[Finding]:
 
 
 def vcan_lab() -> Finding:
-    """Whether the vcan lab works here."""
+    """Check whether the vcan lab works here."""
     request = Request((), "/", {}, os.getuid(), os.getgid(), (), 0o22)
     try:
         method = choose(survey(request))
@@ -170,47 +174,53 @@ def vcan_lab() -> Finding:
 
 
 def kernel_of_lab() -> Finding:
-    """The optional kernel with simulated time."""
+    """Check the optional kernel with simulated time."""
     gain = "tests in simulated time: hil vcan --time-travel"
     return row("lab kernel", uml.find(uml.user_cache()) or "", ADVICE, "not built", gain, "make lab-kernel")
 
 
 def places() -> Iterator[Finding]:
-    """The directories of recordings and shared pages."""
-    for place, purpose in ((DATA, "the service's recordings"), (Path("runs"), "recordings of runs started here")):
-        if place is DATA and not place.exists():
+    """Check the directories of recordings and shared pages."""
+    for folder, purpose in ((DATA, "the service's recordings"), (Path("runs"), "recordings of runs started here")):
+        if folder is DATA and not folder.exists():
             continue  # not installed as a service
-        near = next(p for p in (place.absolute(), *place.absolute().parents) if p.exists())
-        free_mb = shutil.disk_usage(near).free >> 20
-        if place is not DATA and not os.access(near, os.W_OK):
-            yield Finding("disk", CHANGE, f"{near} cannot be written", purpose, (f"ls -ld {near}",))
+        existing_folder = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+        free_mb = shutil.disk_usage(existing_folder).free >> 20
+        if folder is not DATA and not os.access(existing_folder, os.W_OK):
+            yield Finding(
+                "disk", CHANGE, f"{existing_folder} cannot be written", purpose, (f"ls -ld {existing_folder}",)
+            )
         elif free_mb < MIN_FREE_MB:
-            yield Finding("disk", CHANGE, f"{near} has {free_mb} MB free", purpose, (f"du -h -d 1 {near}",))
+            yield Finding(
+                "disk", CHANGE, f"{existing_folder} has {free_mb} MB free", purpose, (f"du -h -d 1 {existing_folder}",)
+            )
         else:
-            yield fine("disk", f"{near}: {free_mb >> 10} GB free for {purpose}")
+            yield fine("disk", f"{existing_folder}: {free_mb >> 10} GB free for {purpose}")
     if not os.access(shm := "/dev/shm", os.W_OK):  # asked only  # nosec B108
         gain = "the controller's timing page"
         yield Finding("disk", CHANGE, f"{shm} cannot be written", gain, ("mount | grep shm",))
 
 
 def ports() -> Finding:
-    """The UDP ports of the settings, and the port of the page."""
-    wanted = {name: int(value) for name, value in _settings().items() if name.endswith("_PORT") and value.isdigit()}
-    wanted = wanted or {"CONSOLE_PORT": 8471}
-    taken = {name: port for name, port in wanted.items() if not _free(port, name == "CONSOLE_PORT")}
-    which = ", ".join(f"{name} {port}" for name, port in taken.items())
+    """Check the UDP ports of the settings, and the port of the page."""
+    required_ports = {
+        name: int(value) for name, value in _settings().items() if name.endswith("_PORT") and value.isdigit()
+    }
+    required_ports = required_ports or {"CONSOLE_PORT": 8471}
+    taken = {name: port for name, port in required_ports.items() if not _free(port, name == "CONSOLE_PORT")}
+    taken_text = ", ".join(f"{name} {port}" for name, port in taken.items())
     return row(
         "ports",
-        "" if taken else f"free: {', '.join(map(str, wanted.values()))}",
+        "" if taken else f"free: {', '.join(map(str, required_ports.values()))}",
         ADVICE,
-        f"in use: {which}; expected while the services run",
+        f"in use: {taken_text}; expected while the services run",
         "the processes find their ports",
         f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'",
     )
 
 
 def key() -> Iterator[Finding]:
-    """The key of the installed services: there, secret, and long enough."""
+    """Check the key of the installed services: there, secret, and long enough."""
     if not CONF.exists():
         return
     mend = ("sudo timberhand service install",)
@@ -230,7 +240,7 @@ def key() -> Iterator[Finding]:
 
 
 def signed() -> Iterator[Finding]:
-    """Whether an installed release and the machine's own files are what was signed."""
+    """Check whether an installed release and the machine's own files are what was signed."""
     tree = installed.tree_of(installed.PROGRAM)
     if tree is None:
         return
@@ -240,11 +250,11 @@ def signed() -> Iterator[Finding]:
         yield Finding("signature", ADVICE, f"no key of a signer in {SIGNER}", gain, (command,))
         return
     chosen = _settings().get("PROFILE")
-    found = list(installed.problems(SIGNER, profile_path(chosen) if chosen else installed.PROGRAM))
-    for problem in found:
+    problems = list(installed.problems(SIGNER, profile_path(chosen) if chosen else installed.PROGRAM))
+    for problem in problems:
         command = "sudo timberhand service update BUNDLE"
         yield Finding("signature", CHANGE, problem.sentence, gain, (command,))
-    if not found:
+    if not problems:
         yield fine("signature", f"the release {tree.name} and the machine's files are what was signed")
 
 

@@ -28,12 +28,12 @@ ADVICE, CHANGE = Severity.ADVICE, Severity.CHANGE
 
 
 def evaluate(facts: Facts) -> tuple[Finding, ...]:
-    """The findings of all topics, in order of gain; the CAN interfaces last.  What is unknown has none."""
+    """Return the findings of all topics, in order of gain; the CAN interfaces last.  What is unknown has none."""
     return (*_rights(facts), *_processors(facts), *_kernel_settings(facts), *_can_interfaces(facts))
 
 
 def _rights(f: Facts) -> Iterator[Finding]:
-    """Priority of the controller (the largest single gain), its memory, the kernel, the machine."""
+    """Check the controller's priority (the largest single gain), its memory, the kernel, the machine."""
     limit, unit = f.rtprio_limit or 0, (f.unit_rtprio or 0) if f.unit_there else 0
     granted = f"this user may use FIFO {PRIORITY}"
     granted = granted if f.may_prioritise or limit == UNLIMITED or limit >= PRIORITY else ""
@@ -77,9 +77,10 @@ def _rights(f: Facts) -> Iterator[Finding]:
 
 
 def _processors(f: Facts) -> Iterator[Finding]:
-    """Clock rate, the controller's processor and who else uses it: threads of its core, interrupts, irqbalance."""
-    mine, others = f.control_cpu, (f.siblings & f.online) - {f.control_cpu}
-    governors = {c: g for c, g in f.governors.items() if mine in (None, c)}  # none: virtual, or firmware hides it
+    """Check clock rate, the controller's processor and who else uses it: its core's threads, interrupts, irqbalance."""
+    control_cpu, others = f.control_cpu, (f.siblings & f.online) - {f.control_cpu}
+    # No governors: the processor is virtual, or firmware hides them.
+    governors = {c: g for c, g in f.governors.items() if control_cpu in (None, c)}
     slow = {c: f"'{g}'" for c, g in governors.items() if g != "performance"}
     if governors:
         yield row(
@@ -92,7 +93,7 @@ def _processors(f: Facts) -> Iterator[Finding]:
             LASTING,
         )
     yield _processor(f)
-    if mine is None:
+    if control_cpu is None:
         return
     if others:
         yield row(
@@ -104,62 +105,62 @@ def _processors(f: Facts) -> Iterator[Finding]:
             *(f"echo 0 | sudo tee /sys/devices/system/cpu/cpu{c}/online" for c in sorted(others)),
         )
     real = [link for link in f.links if link.interrupts]
-    shared = [link for link in real if mine in link.interrupt_cpus]
+    shared = [link for link in real if control_cpu in link.interrupt_cpus]
     if real:
         numbers = ", ".join(str(n) for link in shared for n in link.interrupts)
         yield row(
             "interrupts",
-            "" if shared else f"interrupts of {_names(real)} do not use processor {mine}",
+            "" if shared else f"interrupts of {_names(real)} do not use processor {control_cpu}",
             CHANGE,
-            f"interrupt {numbers} of {_names(shared)} may use processor {mine}",
+            f"interrupt {numbers} of {_names(shared)} may use processor {control_cpu}",
             "no interrupt delays the loop",
             _tune(f),
         )
     if f.irqbalance:
-        keeps_off = mine in f.irqbalance_banned | f.isolated
+        keeps_off = control_cpu in f.irqbalance_banned | f.isolated
         yield row(
             "irqbalance",
-            f"running; it does not use processor {mine}" if keeps_off else "",
+            f"running; it does not use processor {control_cpu}" if keeps_off else "",
             CHANGE,
-            f"running; it may move interrupts to processor {mine} at any time",
+            f"running; it may move interrupts to processor {control_cpu} at any time",
             "interrupts stay on their processors",
-            f"echo IRQBALANCE_BANNED_CPULIST={mine} | sudo tee -a /etc/default/irqbalance",
+            f"echo IRQBALANCE_BANNED_CPULIST={control_cpu} | sudo tee -a /etc/default/irqbalance",
             "sudo systemctl restart irqbalance",
         )
 
 
 def _processor(f: Facts) -> Finding:
-    """A processor for the controller alone: useful only if the kernel keeps it free of everything else."""
-    mine, what, free = f.control_cpu, "processor", f.isolated & f.online
-    if mine is None and free:
+    """Check for a processor for the controller alone: useful only if the kernel keeps it free of everything else."""
+    control_cpu, topic, free = f.control_cpu, "processor", f.isolated & f.online
+    if control_cpu is None and free:
         wrong = f"processor {_list(free)} is isolated, but the controller does not use it"
-        return Finding(what, CHANGE, wrong, ALONE, (_pin(max(free)),))
-    if mine is None and len(f.online) < 4:
-        return fine(what, f"the controller may use any of {len(f.online)} processors, too few to isolate one")
-    if mine is None:
+        return Finding(topic, CHANGE, wrong, ALONE, (_pin(max(free)),))
+    if control_cpu is None and len(f.online) < 4:
+        return fine(topic, f"the controller may use any of {len(f.online)} processors, too few to isolate one")
+    if control_cpu is None:
         spare = max(f.online)
         wrong = "no processor is isolated for the controller"
-        return Finding(what, ADVICE, wrong, ALONE, (*_boot(f, spare), _pin(spare)))
-    if mine not in f.online:
-        wrong = f"the settings name processor {mine}, which does not exist"
-        return Finding(what, CHANGE, wrong, "the controller runs on the intended processor", (_unpin(f),))
-    if mine not in f.isolated:
-        wrong = f"the controller runs on processor {mine}, which is not isolated"
+        return Finding(topic, ADVICE, wrong, ALONE, (*_boot(f, spare), _pin(spare)))
+    if control_cpu not in f.online:
+        wrong = f"the settings name processor {control_cpu}, which does not exist"
+        return Finding(topic, CHANGE, wrong, "the controller runs on the intended processor", (_unpin(f),))
+    if control_cpu not in f.isolated:
+        wrong = f"the controller runs on processor {control_cpu}, which is not isolated"
         gain = "nothing else delays it; pinned to a shared processor it is later than unpinned"
-        return Finding(what, CHANGE, wrong, gain, (*_boot(f, mine), _unpin(f, "or: ")))
-    ticking = [name for name, s in (("nohz_full", f.tickless), ("rcu_nocbs", f.rcu_offloaded)) if mine not in s]
+        return Finding(topic, CHANGE, wrong, gain, (*_boot(f, control_cpu), _unpin(f, "or: ")))
+    ticking = [name for name, s in (("nohz_full", f.tickless), ("rcu_nocbs", f.rcu_offloaded)) if control_cpu not in s]
     return row(
-        what,
-        "" if ticking else f"processor {mine} is isolated for the controller",
+        topic,
+        "" if ticking else f"processor {control_cpu} is isolated for the controller",
         ADVICE,
-        f"processor {mine} is isolated, but not by {' and '.join(ticking)}",
+        f"processor {control_cpu} is isolated, but not by {' and '.join(ticking)}",
         "the kernel's timer and RCU work run on other processors",
-        *_boot(f, mine),
+        *_boot(f, control_cpu),
     )
 
 
 def _kernel_settings(f: Facts) -> Iterator[Finding]:
-    """Idle states, delivery of frames, throttling, clock source, huge pages, task groups, timer slack."""
+    """Check idle states, delivery of frames, throttling, clock source, huge pages, task groups, timer slack."""
     if f.idle:
         deepest = max((state for state in f.idle if not state.disabled), key=lambda s: s.latency_us, default=None)
         name, us = (deepest.name, deepest.latency_us) if deepest else ("", 0)
@@ -235,7 +236,7 @@ def _kernel_settings(f: Facts) -> Iterator[Finding]:
 
 
 def _can_interfaces(facts: Facts) -> Iterator[Finding]:
-    """One finding per CAN interface: bit rate, recovery, queue, error counters."""
+    """Make one finding per CAN interface: bit rate, recovery, queue, error counters."""
     if not facts.links:
         command = "timberhand hil vcan --check  # virtual interfaces"
         gain = "a real bus, or a virtual one for tests"
@@ -244,26 +245,26 @@ def _can_interfaces(facts: Facts) -> Iterator[Finding]:
 
 
 def _link(link: CanLink) -> Finding:
-    what, name, rate, percent = f"CAN {link.name}", link.name, f"{link.bitrate} bit/s", 100.0 * link.sample_point
+    topic, name, rate, percent = f"CAN {link.name}", link.name, f"{link.bitrate} bit/s", 100.0 * link.sample_point
     if not link.up:
         command = f"sudo ip link set {name} up" if link.virtual else f"sudo systemctl start timberhand-can@{name}"
-        return Finding(what, CHANGE, "the interface is down", "a working bus", (command,))
+        return Finding(topic, CHANGE, "the interface is down", "a working bus", (command,))
     if link.virtual:
-        return fine(what, "virtual and up")
+        return fine(topic, "virtual and up")
     if link.counters.get("bus_off") or link.counters.get("error_passive") or link.state not in ("ERROR-ACTIVE", ""):
         counted = ", ".join(f"{name} {count}" for name, count in link.counters.items() if count) or "no counts"
         wrong = f"{link.state or 'up'}, {rate}, with errors: {counted}"
         gain = "frames without retransmission: check cable, termination (60 ohms between the wires) and bit rate"
         commands = (f"ip -details -statistics link show {name}", f"candump -e {name},0:0,#FFFFFFFF")
-        return Finding(what, CHANGE, wrong, gain, commands)
+        return Finding(topic, CHANGE, wrong, gain, commands)
     if link.sample_point and not SAMPLE_POINTS[0] <= link.sample_point <= SAMPLE_POINTS[1]:
         gain = "the sample point of the other nodes (CiA 301: 87.5 %): no errors from length or temperature"
         up = f"sudo ip link set {name} up type can bitrate {link.bitrate} sample-point 0.875 restart-ms 100"
         commands = (f"sudo ip link set {name} down", up)
-        return Finding(what, CHANGE, f"{rate}, sampled at {percent:.1f} % of the bit", gain, commands)
+        return Finding(topic, CHANGE, f"{rate}, sampled at {percent:.1f} % of the bit", gain, commands)
     sampled = f" sampled at {percent:.1f} %," if link.sample_point else ""
     return row(
-        what,
+        topic,
         f"{rate},{sampled} restart after {link.restart_ms} ms, queue of {link.tx_queue} frames, no errors"
         if link.restart_ms
         else "",
@@ -286,8 +287,8 @@ def _unpin(facts: Facts, alternative: str = "") -> str:
 
 def _boot(facts: Facts, cpu: int) -> tuple[str, str]:
     others = _list(facts.online - {cpu})
-    words = f"isolcpus=managed_irq,domain,{cpu} nohz_full={cpu} rcu_nocbs={cpu} irqaffinity={others}"
-    return f'sudo nano /etc/default/grub  # GRUB_CMDLINE_LINUX="{words}"', "sudo update-grub  # then reboot"
+    boot_options = f"isolcpus=managed_irq,domain,{cpu} nohz_full={cpu} rcu_nocbs={cpu} irqaffinity={others}"
+    return f'sudo nano /etc/default/grub  # GRUB_CMDLINE_LINUX="{boot_options}"', "sudo update-grub  # then reboot"
 
 
 def _tune(facts: Facts) -> str:

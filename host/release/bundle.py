@@ -103,7 +103,7 @@ def make(wheel: Path, private: Path, out: Path, find_links: Path | None, lock: L
 
 
 def requirements(wheels: Sequence[Path]) -> str:
-    """Requirements with hashes of exactly these wheels."""
+    """Write requirements with hashes of exactly these wheels."""
     lines = []
     for wheel in wheels:
         name, version, _, _ = parse_wheel_filename(wheel.name)
@@ -112,7 +112,7 @@ def requirements(wheels: Sequence[Path]) -> str:
 
 
 def program_sums(wheel: Path) -> dict[str, str]:
-    """Name below site-packages -> hash of every file that a wheel installs there, but for pip's own record."""
+    """Map each name below site-packages to the hash of a file that a wheel installs there, but for pip's own record."""
     with zipfile.ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if not name.endswith(("/", "/RECORD"))]
         if moved := [name for name in names if ".data/" in name]:
@@ -258,7 +258,7 @@ def _locked(wheel: Path, lock: Lock) -> str:
 
 
 def _add_sbom(folder: Path) -> None:
-    """What is in the bundle, as CycloneDX 1.6, from its requirements with their hashes."""
+    """Describe what is in the bundle, as CycloneDX 1.6, from its requirements with their hashes."""
     command = [sys.executable, "-m", "cyclonedx_py", "requirements", "--output-reproducible", "--of", "JSON"]
     done = subprocess.run(
         [*command, "-o", str(folder / SBOM), str(folder / REQUIREMENTS)], capture_output=True, text=True, check=False
@@ -277,7 +277,7 @@ def _files(folder: Path) -> set[str]:
 
 
 def _pack(folder: Path, archive: Path) -> None:
-    """A tar file that depends on the contents alone."""
+    """Write a tar file that depends on the contents alone."""
 
     def plain(entry: tarfile.TarInfo) -> tarfile.TarInfo:
         entry.mtime = entry.uid = entry.gid = 0

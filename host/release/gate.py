@@ -70,7 +70,7 @@ class Gate:
 
 
 def lacking(controller: ServiceReading, guard: ServiceReading) -> str:
-    """What keeps the gate shut, in words; empty when nothing does."""
+    """Say what keeps the gate shut; empty when nothing does."""
     if not controller.ready:
         return f"the controller is not READY{_said(controller)}"
     if not controller.words.startswith(STANDBY_WORDS):

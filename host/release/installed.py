@@ -24,7 +24,7 @@ _BELOW: Final = ("lib", "site-packages")
 
 
 def tree_of(program: Path) -> Path | None:
-    """The tree of the release that a program belongs to; None for a checkout or another environment."""
+    """Find the tree of the release that a program belongs to; None for a checkout or another environment."""
     if (program.parent.parent.name, program.name) != _BELOW:
         return None
     tree = program.parent.parent.parent
@@ -32,7 +32,7 @@ def tree_of(program: Path) -> Path | None:
 
 
 def problems(signer: Path, profile: Path, program: Path = PROGRAM) -> Iterator[Problem]:
-    """What is not as it was signed, with codes; nothing without the signer's key or outside an installation."""
+    """Report what is not as it was signed, with codes; nothing without the signer's key or outside an installation."""
     tree = tree_of(program)
     if not signer.is_file() or tree is None:
         return
@@ -53,8 +53,8 @@ def _program(tree: Path, program: Path, signer: Path) -> Iterator[Problem]:
         return
     try:
         verify(listed, signer)
-        wanted = sums.decode(listed.read_text(), str(listed)).get(PROGRAM_SUMS)
-        if wanted is None or sums.differing(tree, {PROGRAM_SUMS: wanted}):
+        sums_digest = sums.decode(listed.read_text(), str(listed)).get(PROGRAM_SUMS)
+        if sums_digest is None or sums.differing(tree, {PROGRAM_SUMS: sums_digest}):
             changed = [PROGRAM_SUMS]
         else:
             changed = sums.differing(program, sums.decode((tree / PROGRAM_SUMS).read_text(), str(tree / PROGRAM_SUMS)))
@@ -62,9 +62,9 @@ def _program(tree: Path, program: Path, signer: Path) -> Iterator[Problem]:
         yield Problem(error.code, str(error))
         return
     if changed:
-        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        rest = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         yield Problem(
             "installed.changed",
-            f"{changed[0]}{more} of the release {tree.name} is not what was signed; update to its bundle again, or "
+            f"{changed[0]}{rest} of the release {tree.name} is not what was signed; update to its bundle again, or "
             "roll back",
         )

@@ -45,8 +45,8 @@ def check(folder: Path, public: Path) -> list[str]:
         )
     verify(folder / SUMS, public)
     listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))
-    there = {path.name for path in folder.glob("*.toml")}
-    if wrong := sums.differing(folder, listed) or sorted(there - listed.keys()):
+    toml_names = {path.name for path in folder.glob("*.toml")}
+    if wrong := sums.differing(folder, listed) or sorted(toml_names - listed.keys()):
         raise CommandFailed(
             "machine-files.changed",
             f"{folder / wrong[0]} is not what was signed; sign it again, or restore it",

@@ -28,7 +28,7 @@ UNARMED: Final = frozenset(mode.name for mode in Mode) - {Mode.ARMED.name, Mode.
 
 
 def service_mode() -> str | None:
-    """The mode of the controller that runs as a service; None when none runs."""
+    """Return the mode of the controller that runs as a service; None when none runs."""
     try:
         timing = read_timing(PAGE)
     except InputRefused:
@@ -37,7 +37,7 @@ def service_mode() -> str | None:
 
 
 def refuse_while_armed(mode: str | None) -> None:
-    """Raises CommandFailed when a controller in ``mode`` may move the machine."""
+    """Raise CommandFailed when a controller in ``mode`` may move the machine."""
     if mode is not None and mode not in UNARMED:
         raise CommandFailed(
             "update.armed", f"the machine is {mode}; bring it to rest and disarm it first", ExitCode.SAFETY_STOP
@@ -48,7 +48,7 @@ class Services(Protocol):
     """What the steps need of the services."""
 
     def mode(self) -> str | None:
-        """The controller's mode; None when none runs."""
+        """Return the controller's mode; None when none runs."""
 
     def stop(self) -> None:
         """Stop every service; raises CommandFailed."""
@@ -60,10 +60,10 @@ class Services(Protocol):
         """Start controller and guard, as far as they are enabled."""
 
     def start_others(self) -> None:
-        """Have whatever else is enabled started, and do not wait for it."""
+        """Start whatever else is enabled, and do not wait for it."""
 
     def readings(self) -> tuple[ServiceReading, ServiceReading]:
-        """Controller and guard."""
+        """Read controller and guard."""
 
 
 class SystemdServices:
@@ -105,9 +105,9 @@ def _enabled() -> list[str]:
 
 
 def _reading(unit: str) -> ServiceReading:
-    found = show(unit, "ActiveState", "StatusText", "MainPID")
+    properties = show(unit, "ActiveState", "StatusText", "MainPID")
     return ServiceReading(
-        found.get("ActiveState") == "active", found.get("StatusText", ""), int(found.get("MainPID") or 0)
+        properties.get("ActiveState") == "active", properties.get("StatusText", ""), int(properties.get("MainPID") or 0)
     )
 
 

@@ -21,7 +21,7 @@ PUBLIC_NAME: Final = "signer.pem"
 
 
 def signature_path(file: Path) -> Path:
-    """Where the signature of a file lies."""
+    """Return where the signature of a file lies."""
     return file.with_name(f"{file.name}.sig")
 
 

@@ -45,15 +45,15 @@ class Trees:
         self.incoming = place / "incoming"
 
     def tree(self, name: str) -> Path:
-        """The folder of a release."""
+        """Return the folder of a release."""
         return self.releases / name
 
     def state(self) -> State:
-        """What the links name now."""
+        """Return what the links name now."""
         return State(self._named(CURRENT), self._named(PREVIOUS), self._named(TRIAL))
 
     def whole(self) -> list[str]:
-        """The releases that were finished, by name."""
+        """List the releases that were finished, by name."""
         return sorted(path.parent.name for path in self.releases.glob(f"*/{MARKER}"))
 
     def seal(self, name: str, marker: bytes) -> None:
@@ -112,12 +112,12 @@ class Trees:
 
 
 def marker_of(tree: Path) -> dict[str, str]:
-    """What a release says of itself; empty where it does not."""
+    """Read what a release says of itself; empty where it does not."""
     try:
-        found = json.loads((tree / MARKER).read_text())
+        marker = json.loads((tree / MARKER).read_text())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return marker if isinstance(marker, dict) else {}
 
 
 def write_durably(path: Path, data: bytes) -> None:

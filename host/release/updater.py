@@ -86,7 +86,7 @@ BACK: Final = (Step.STOP, Step.RETURN, Step.RELOAD, Step.END_TRIAL, Step.START, 
 
 
 def after_interruption(state: State) -> tuple[Step, ...]:
-    """What is left to do after a power cut, from what the links say."""
+    """List what is left to do after a power cut, from what the links say."""
     if state.trial is None:
         return (Step.CLEAR,)
     if state.trial == state.current:
@@ -95,7 +95,7 @@ def after_interruption(state: State) -> tuple[Step, ...]:
 
 
 def needs_return(state: State) -> bool:
-    """Whether a failure now has changed the release in use, so that it must be changed back."""
+    """Tell whether a failure now has changed the release in use, so that it must be changed back."""
     return state.trial is not None and state.trial != state.current
 
 
@@ -115,7 +115,7 @@ class Program(Protocol):
         """Install a checked bundle into a tree, all but its marker; raises CommandFailed."""
 
     def check(self, tree: Path) -> None:
-        """Whether the release accepts this computer's settings; raises CommandFailed."""
+        """Check whether the release accepts this computer's settings; raises CommandFailed."""
 
     def links(self, tree: Path) -> None:
         """Lay out what lies outside the tree; raises CommandFailed."""
@@ -322,9 +322,9 @@ def _run(name: str, command: Sequence[str]) -> None:
 
 
 def _of_disk(error: OSError) -> CommandFailed:
-    what = "the disk is full; free some space" if error.errno == errno.ENOSPC else f"{error.strerror}; see dmesg"
+    cause = "the disk is full; free some space" if error.errno == errno.ENOSPC else f"{error.strerror}; see dmesg"
     return CommandFailed(
         "update.disk",
-        f"{error.filename or 'a file'} cannot be written: {what}; nothing has changed",
+        f"{error.filename or 'a file'} cannot be written: {cause}; nothing has changed",
         ExitCode.CONFIGURATION,
     )

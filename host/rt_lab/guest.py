@@ -57,8 +57,8 @@ def main() -> None:
         result |= control_loop(Path(order["path"][0]))
     except Exception as error:  # noqa: BLE001  the first process reports every error
         result["error"] = f"{type(error).__name__}: {error}"
-    for said in sorted(RUNTIME.glob("*.err")):
-        print(f"{said.stem}: {said.read_text()[-1500:]}")
+    for log_path in sorted(RUNTIME.glob("*.err")):
+        print(f"{log_path.stem}: {log_path.read_text()[-1500:]}")
     print(f"RESULT {json.dumps(result)}", flush=True)
     time.sleep(0.2)
     libc.reboot(_POWER_OFF)
@@ -70,11 +70,11 @@ def step(text: str) -> None:
 
 def set_up() -> None:
     """Mount file systems, load CAN, create the virtual buses."""
-    places = {"/proc": "proc", "/sys": "sysfs", "/dev": "devtmpfs", "/run": "tmpfs"}
-    places["/dev/shm"] = "tmpfs"  # mounted here, in a machine of its own  # nosec B108
-    for place, kind in places.items():
-        os.makedirs(place, exist_ok=True)
-        libc.mount(kind.encode(), place.encode(), kind.encode(), 0, None)
+    mounts = {"/proc": "proc", "/sys": "sysfs", "/dev": "devtmpfs", "/run": "tmpfs"}
+    mounts["/dev/shm"] = "tmpfs"  # mounted here, in a machine of its own  # nosec B108
+    for mount_point, kind in mounts.items():
+        os.makedirs(mount_point, exist_ok=True)
+        libc.mount(kind.encode(), mount_point.encode(), kind.encode(), 0, None)
     RUNTIME.mkdir()
     for name in MODULES:
         with open(f"/lib/modules/{os.uname().release}/kernel/{name}.ko", "rb") as module:
@@ -87,7 +87,7 @@ def set_up() -> None:
 
 
 def reference_loop() -> dict[str, Any]:
-    """cyclictest at the controller's priority with locked memory."""
+    """Run cyclictest at the controller's priority with locked memory."""
     report = RUNTIME / "cyclictest.json"
     command = ["cyclictest", "-q", "-m", "-t", "1", "-p", "80", "--policy", "fifo", "-i", "2000", "-l", str(CYCLES)]
     with open(RUNTIME / "cyclictest.err", "wb") as err:
@@ -98,7 +98,7 @@ def reference_loop() -> dict[str, Any]:
 
 
 def control_loop(checkout: Path) -> dict[str, Any]:
-    """Controller, guard and emulated nodes on vcan; the controller is killed while the crane slews."""
+    """Run controller, guard and emulated nodes on vcan; the controller is killed while the crane slews."""
     from can_dbc.messages.envelope import read_key, write_key
     from can_dbc.timing.page import read_timing
     from host.service_lab import trial
@@ -129,43 +129,46 @@ def control_loop(checkout: Path) -> dict[str, Any]:
         "--key-file",
         key_file,
     )
-    found: dict[str, Any] = {"guard_ready": await_ready(guard_ready), "controller_ready": await_ready(controller_ready)}
-    step(f"guard and controller are ready: {found}")
+    figures: dict[str, Any] = {
+        "guard_ready": await_ready(guard_ready),
+        "controller_ready": await_ready(controller_ready),
+    }
+    step(f"guard and controller are ready: {figures}")
     pilot = Pilot(PROFILE, SETPOINTS, operator, REPORTS, f"socketcan:{LINKS[0]}", read_key(key_file))
-    found["standby"] = pilot.until(lambda: pilot.report and Mode(pilot.report.mode) is Mode.STANDBY, WAIT_S)
+    figures["standby"] = pilot.until(lambda: pilot.report and Mode(pilot.report.mode) is Mode.STANDBY, WAIT_S)
     pilot.until(lambda: False, TICKS_S)
     for name, process in (("controller", controller), ("guard", guard)):
         facts = process_facts(process.pid)
-        found[f"{name}_policy"] = f"{facts['policy']} {facts['priority']}"
-        found[f"{name}_locked_kb"] = facts["locked_kb"]
-    told = [line for name in ("controller", "controller.guard") for line in said(name) if "not granted" in line]
+        figures[f"{name}_policy"] = f"{facts['policy']} {facts['priority']}"
+        figures[f"{name}_locked_kb"] = facts["locked_kb"]
+    refusals = [line for name in ("controller", "controller.guard") for line in said(name) if "not granted" in line]
     timing = read_timing(page).facts
-    found |= {"refused": told, "ticks": timing.ticks, "missed": timing.missed, "tick": timing.tick}
+    figures |= {"refused": refusals, "ticks": timing.ticks, "missed": timing.missed, "tick": timing.tick}
     step(f"the controller is in {timing.mode} after {timing.ticks} ticks, {timing.missed} missed")
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PILOT_PRIORITY))
     trial.slew_until_fast(pilot)
-    found["opening_pct"] = pilot.opening_pct()
+    figures["opening_pct"] = pilot.opening_pct()
     pilot.clear()
     killed_ns = time.monotonic_ns()
     controller.kill()
     pilot.until(lambda: False, AFTER_KILL_S)
-    found["neutral_ms"] = trial.time_after(pilot, killed_ns, lambda v: v.state in trial.MOVING)
-    found["shut_ms"] = trial.time_after(pilot, killed_ns, lambda v: v.opening_pct > trial.SHUT_PCT)
+    figures["neutral_ms"] = trial.time_after(pilot, killed_ns, lambda v: v.state in trial.MOVING)
+    figures["shut_ms"] = trial.time_after(pilot, killed_ns, lambda v: v.opening_pct > trial.SHUT_PCT)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    step(f"killed at an opening of {found['opening_pct']:.0f} %; neutral after {found['neutral_ms']:.1f} ms")
-    found["frames"] = int(Path(f"/sys/class/net/{LINKS[0]}/statistics/rx_packets").read_text())
+    step(f"killed at an opening of {figures['opening_pct']:.0f} %; neutral after {figures['neutral_ms']:.1f} ms")
+    figures["frames"] = int(Path(f"/sys/class/net/{LINKS[0]}/statistics/rx_packets").read_text())
     for process in (guard, nodes, controller):
         process.send_signal(signal.SIGTERM)
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(30)
-    return found
+    return figures
 
 
 def start(checkout: Path, module: str, *words: object) -> tuple[subprocess.Popen[bytes], socket.socket]:
     """Start a process like systemd (Type=notify); its notifications arrive at the socket."""
-    place = f"{RUNTIME}/{module}.notify"
+    socket_path = f"{RUNTIME}/{module}.notify"
     notified = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    notified.bind(place)
+    notified.bind(socket_path)
     with open(RUNTIME / f"{module}.out", "wb") as out, open(RUNTIME / f"{module}.err", "wb") as err:
         process = subprocess.Popen(
             [sys.executable, "-m", module, *map(str, words)],
@@ -173,7 +176,7 @@ def start(checkout: Path, module: str, *words: object) -> tuple[subprocess.Popen
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=err,
-            env=os.environ | {"NOTIFY_SOCKET": place},
+            env=os.environ | {"NOTIFY_SOCKET": socket_path},
         )
     return process, notified
 
@@ -183,7 +186,7 @@ def said(module: str) -> list[str]:
 
 
 def await_ready(notified: socket.socket) -> bool:
-    """Whether READY=1 arrives."""
+    """Wait for READY=1; tell whether it arrives."""
     limit_s = time.monotonic() + WAIT_S
     while (left_s := limit_s - time.monotonic()) > 0 and select.select([notified], [], [], left_s)[0]:
         if b"READY=1" in notified.recv(4096):
@@ -192,7 +195,7 @@ def await_ready(notified: socket.socket) -> bool:
 
 
 def await_text(process: subprocess.Popen[bytes], out: Path, word: str) -> bool:
-    """Whether a process prints ``word`` before it ends."""
+    """Wait until a process prints ``word``; tell whether it does before it ends."""
     limit_s = time.monotonic() + WAIT_S
     while time.monotonic() < limit_s and process.poll() is None:
         if word in out.read_text():

@@ -40,7 +40,7 @@ POSITIVE: Final = ("controller_locked_kb", "guard_locked_kb", "frames", "ticks",
 
 
 def missing() -> str | None:
-    """Why this computer cannot run the lab; None when it can, given a kernel package."""
+    """Say why this computer cannot run the lab; None when it can, given a kernel package."""
     if platform.machine() != "x86_64":
         return f"the guest needs the packages of this computer, which is {platform.machine()} and not x86_64"
     for program, package in PROGRAMS.items():
@@ -58,8 +58,8 @@ def run(package: Path | None, accelerator: str, timeout_s: float, show: Callable
     if fault := missing():
         raise LabError("rt-lab.missing", fault)
     begin_s = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="timberhand-rt-") as place:
-        work = Path(place)
+    with tempfile.TemporaryDirectory(prefix="timberhand-rt-") as folder_name:
+        work = Path(folder_name)
         kernel, modules = unpack(package or kernel_package(show), work / "kernel")
         archive = make_archive(work, modules)
         size_mb = archive.stat().st_size >> 20
@@ -69,7 +69,7 @@ def run(package: Path | None, accelerator: str, timeout_s: float, show: Callable
 
 
 def evaluate(result: dict[str, Any]) -> list[str]:
-    """One sentence for each check that failed."""
+    """Return one sentence for each check that failed."""
     faults = [f"the guest reports: {result['error']}"] if "error" in result else []
     if "PREEMPT_RT" not in result.get("kernel", ""):
         faults.append(f"the kernel is not PREEMPT_RT: {result.get('kernel', 'unknown')}")
@@ -178,7 +178,7 @@ print(json.dumps({"files": files, "maps": sorted(maps), "stdlib": sysconfig.get_
 
 
 def make_archive(work: Path, modules: Iterable[Path]) -> Path:
-    """The archive that the kernel unpacks as its file system; ``modules`` lie below ``work/kernel``.
+    """Make the archive that the kernel unpacks as its file system; ``modules`` lie below ``work/kernel``.
 
     Raises:
         LabError: the modules cannot be imported here, or cpio fails.
@@ -188,9 +188,9 @@ def make_archive(work: Path, modules: Iterable[Path]) -> Path:
     )
     if listed.returncode:
         raise LabError("rt-lab.archive", f"a module of the guest cannot be imported: {listed.stderr.strip()[-300:]}")
-    found = json.loads(listed.stdout)
-    files = {Path(found["python"]), LOADER} | _libraries(found["maps"]) | set(walk(Path(found["stdlib"])))
-    files |= _packages(found["files"], Path(found["site"])) | _checkout(found["files"], found["site"])
+    imports = json.loads(listed.stdout)
+    files = {Path(imports["python"]), LOADER} | _libraries(imports["maps"]) | set(walk(Path(imports["stdlib"])))
+    files |= _packages(imports["files"], Path(imports["site"])) | _checkout(imports["files"], imports["site"])
     for program in filter(None, map(shutil.which, GUEST_PROGRAMS)):
         files |= {Path(program), *_linked(program)}
     own = work / "own"
@@ -199,15 +199,15 @@ def make_archive(work: Path, modules: Iterable[Path]) -> Path:
         target = own / module.relative_to(work / "kernel")
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(module, target)
-    (own / "init").write_text(f"#!{found['python']} -SB\n" + GUEST.read_text())
+    (own / "init").write_text(f"#!{imports['python']} -SB\n" + GUEST.read_text())
     (own / "init").chmod(0o755)
-    order = {"python": found["python"], "path": [str(CHECKOUT), found["site"]]}
+    order = {"python": imports["python"], "path": [str(CHECKOUT), imports["site"]]}
     (own / "order.json").write_text(json.dumps(order))
     names = sorted({str(p).lstrip("/") for f in files for p in (f, *f.parents) if p != Path("/")})
-    mine = sorted(str(p.relative_to(own)) for p in own.rglob("*"))
+    own_names = sorted(str(p.relative_to(own)) for p in own.rglob("*"))
     archive = work / "initrd"
     with archive.open("wb") as out:
-        for folder, members in ((Path("/"), names), (own, mine)):
+        for folder, members in ((Path("/"), names), (own, own_names)):
             made = subprocess.run(
                 ["cpio", "--quiet", "-o", "-H", "newc", "-0", "-L"],
                 input="\0".join(members).encode(),
@@ -222,37 +222,41 @@ def make_archive(work: Path, modules: Iterable[Path]) -> Path:
 
 
 def walk(folder: Path) -> list[Path]:
-    """The files of a package that the guest needs."""
+    """List the files of a package that the guest needs."""
     return [p for p in folder.rglob("*") if p.is_file() and not set(p.relative_to(folder).parts) & set(EXCLUDED)]
 
 
 def _libraries(maps: Iterable[str]) -> set[Path]:
-    """The loaded shared libraries, under every name that the loader may look for."""
+    """Find the loaded shared libraries, under every name that the loader may look for."""
     libraries = {Path(text) for text in maps if ".so" in text and Path(text).is_file()}
     return libraries | {alias for lib in libraries for alias in lib.parent.glob("*.so*") if alias.resolve() == lib}
 
 
 def _packages(files: Iterable[str], site: Path) -> set[Path]:
-    """The installed packages of these files, with the libraries that their wheels bundle in ``NAME.libs``."""
+    """Find the installed packages of these files, with the libraries that their wheels bundle in ``NAME.libs``."""
     tops = {Path(text).relative_to(site).parts[0] for text in files if Path(text).is_relative_to(site)}
-    found: set[Path] = set()
+    paths: set[Path] = set()
     for top in tops | {f"{name}.libs" for name in tops}:
-        there = site / top
-        found |= set(walk(there)) if there.is_dir() else {there} if there.is_file() else set()
-    return found
+        package_path = site / top
+        paths |= (
+            set(walk(package_path)) if package_path.is_dir() else {package_path} if package_path.is_file() else set()
+        )
+    return paths
 
 
 def _checkout(files: Iterable[str], site: str) -> set[Path]:
-    """Our packages, and the compiled tick beside them if there is one."""
-    ours = {Path(t).relative_to(CHECKOUT).parts[0] for t in files if Path(t).is_relative_to(CHECKOUT) and site not in t}
-    folders = [CHECKOUT / name for name in ours] + [CHECKOUT / "build" / "compiled"]
+    """Find our packages, and the compiled tick beside them if there is one."""
+    package_names = {
+        Path(t).relative_to(CHECKOUT).parts[0] for t in files if Path(t).is_relative_to(CHECKOUT) and site not in t
+    }
+    folders = [CHECKOUT / name for name in package_names] + [CHECKOUT / "build" / "compiled"]
     return {p for folder in folders if folder.is_dir() for p in walk(folder)}
 
 
 def _linked(program: str) -> set[Path]:
-    """The shared libraries of a program."""
-    told = subprocess.run(["ldd", program], capture_output=True, text=True, check=False).stdout
-    return {Path(text) for text in re.findall(r"(/\S+) \(0x", told)}
+    """Find the shared libraries of a program."""
+    ldd_output = subprocess.run(["ldd", program], capture_output=True, text=True, check=False).stdout
+    return {Path(text) for text in re.findall(r"(/\S+) \(0x", ldd_output)}
 
 
 # -- The package of Debian's PREEMPT_RT kernel: downloaded once into the user's cache, and the few files it is for.
@@ -264,7 +268,7 @@ DOWNLOAD_S: Final = 300.0
 
 
 def kernel_package(show: Callable[[str], None]) -> Path:
-    """The newest package that apt knows; kept in the cache, in place of older ones.
+    """Get the newest package that apt knows; kept in the cache, in place of older ones.
 
     Raises:
         LabError: apt knows none, or it cannot be downloaded.
@@ -273,37 +277,40 @@ def kernel_package(show: Callable[[str], None]) -> Path:
         depends = subprocess.run(["apt-cache", "depends", META_PACKAGE], capture_output=True, text=True).stdout
     except OSError:
         depends = ""
-    found = re.search(r"Depends: (linux-image-\S*rt-amd64)", depends)
-    if not found:
+    match = re.search(r"Depends: (linux-image-\S*rt-amd64)", depends)
+    if not match:
         raise LabError("rt-lab.no-kernel", f"apt knows no {META_PACKAGE}: apt-get update, or give a package (--kernel)")
     cache = user_cache() / "kernels"
     cache.mkdir(parents=True, exist_ok=True)
-    if there := sorted(cache.glob(f"{found[1]}_*.deb")):
-        return there[-1]
-    show(f"downloading {found[1]}, 70 MB")
+    if packages := sorted(cache.glob(f"{match[1]}_*.deb")):
+        return packages[-1]
+    show(f"downloading {match[1]}, 70 MB")
     done = subprocess.run(
-        ["apt-get", "download", found[1]], cwd=cache, capture_output=True, text=True, timeout=DOWNLOAD_S
+        ["apt-get", "download", match[1]], cwd=cache, capture_output=True, text=True, timeout=DOWNLOAD_S
     )
-    there = sorted(cache.glob(f"{found[1]}_*.deb"))
-    if done.returncode or not there:
+    packages = sorted(cache.glob(f"{match[1]}_*.deb"))
+    if done.returncode or not packages:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise LabError("rt-lab.no-kernel", f"{found[1]} cannot be downloaded: {reason}")
-    for old in set(cache.glob("linux-image-*.deb")) - {there[-1]}:
+        raise LabError("rt-lab.no-kernel", f"{match[1]} cannot be downloaded: {reason}")
+    for old in set(cache.glob("linux-image-*.deb")) - {packages[-1]}:
         old.unlink()
-    return there[-1]
+    return packages[-1]
 
 
 def unpack(package: Path, folder: Path) -> tuple[Path, list[Path]]:
-    """The kernel and its CAN modules from the package, below ``folder``.
+    """Unpack the kernel and its CAN modules from the package, below ``folder``.
 
     Raises:
         LabError: the package does not hold them.
     """
     folder.mkdir(parents=True)
-    wanted = ["./boot/vmlinuz-*", *(f"*/kernel/{name}.ko" for name in MODULES)]
+    patterns = ["./boot/vmlinuz-*", *(f"*/kernel/{name}.ko" for name in MODULES)]
     with subprocess.Popen(["dpkg-deb", "--fsys-tarfile", package], stdout=subprocess.PIPE) as archive:
         subprocess.run(
-            ["tar", "-x", "-C", folder, "--wildcards", *wanted], stdin=archive.stdout, capture_output=True, check=False
+            ["tar", "-x", "-C", folder, "--wildcards", *patterns],
+            stdin=archive.stdout,
+            capture_output=True,
+            check=False,
         )
     kernel, modules = sorted(folder.glob("boot/vmlinuz-*")), sorted(folder.rglob("*.ko"))
     if len(kernel) != 1 or len(modules) != len(MODULES):

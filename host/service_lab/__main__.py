@@ -16,7 +16,7 @@ from host.vcan_lab.spec import LabError
 
 
 def main() -> int:
-    """The command."""
+    """Run the command; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m host.service_lab", description=__doc__.split("\n")[0])
     parser.add_argument("--wheel", type=Path, help="wheel to install (default: built from this checkout)")
     parser.add_argument(

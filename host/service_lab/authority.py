@@ -24,19 +24,19 @@ OPERATORS: Final = Path("/run/timberhand-operator/controller")
 
 
 def probe(expect: Expect, page: str) -> None:
-    """The page commands for who opened the printed address, nobody else; the planner's user cannot see the socket."""
+    """Check: the page commands for who opened the printed address alone, and the planner's user sees no socket."""
     origin = page.rstrip("/")
     _, session = post(origin, "session")
-    told = json.loads(session)
-    expect(told["token"] == "", f"who has not opened the printed address got the page {told['page']}")
+    answer = json.loads(session)
+    expect(answer["token"] == "", f"who has not opened the printed address got the page {answer['page']}")
     token = open_page(origin)
     unnamed, _ = post(origin, "operator/reset")
     expect(unnamed == 403, f"a reset that no page sends was answered {unnamed}")
     for action, mode in (("stop", "STOP. "), ("reset", "STANDBY. ")):
         if action != "stop":
             post(origin, "lease/take", token, {"over": 0})
-        code, told = post(origin, f"operator/{action}", token)
-        expect(code == 204, f"the page's {action} was answered {code}: {told}")
+        code, answer = post(origin, f"operator/{action}", token)
+        expect(code == 204, f"the page's {action} was answered {code}: {answer}")
         limit = time.monotonic() + AUTHORITY_S
         while not (status := show(trial.CONTROLLER, "StatusText")["StatusText"]).startswith(mode):
             if time.monotonic() > limit:
@@ -58,12 +58,12 @@ def open_page(origin: str) -> str:
 
 
 def printed_address() -> str:
-    """The page's address with its token, from the console's journal of its present start."""
+    """Find the page's address with its token, in the console's journal of its present start."""
     return next(str(json.loads(line)["url"]) for line in reversed(journal("timberhand-console")) if '"url"' in line)
 
 
 def post(origin: str, path: str, token: str = "", body: object = None) -> tuple[int, str]:
-    """Status and text of the page's answer to a command."""
+    """Send a command to the page; return status and text of its answer."""
     headers = {"Origin": origin, "Content-Type": "application/json"} | ({TOKEN_HEADER: token} if token else {})
     data = b"" if body is None else json.dumps(body).encode()
     request = urllib.request.Request(f"{origin}/api/{path}", data, headers, method="POST")

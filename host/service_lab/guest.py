@@ -118,7 +118,7 @@ def change_settings(check: Check) -> dict[str, str]:
 
 
 def prioritize() -> None:
-    """Real-time priorities as in the vcan lab: frames and systemd must not wait for ordinary processes."""
+    """Set real-time priorities as in the vcan lab: frames and systemd must not wait for ordinary processes."""
     os.sched_setscheduler(1, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(SYSTEMD_PRIORITY))
     for comm in Path("/proc").glob("[0-9]*/comm"):
         if comm.read_text().startswith("ksoftirqd"):
@@ -126,7 +126,7 @@ def prioritize() -> None:
 
 
 def bus_without_interface(check: Check) -> None:
-    """An interface of the settings does not exist: one sentence, exit status 4."""
+    """Start a bus whose interface does not exist: one sentence, exit status 4."""
     systemctl("start", "timberhand-can@crane0.service")
     lines = [line for line in journal("timberhand-can@crane0.service") if line.startswith("can-up: ")]
     check.expect(
@@ -136,7 +136,7 @@ def bus_without_interface(check: Check) -> None:
 
 
 def plug_in(check: Check) -> None:
-    """The installed udev rule sets up a new interface."""
+    """Add an interface; check that the installed udev rule sets it up."""
     subprocess.run(["ip", "link", "add", trial.INTERFACE, "type", "vcan"], check=True)
     flags = Path(f"/sys/class/net/{trial.INTERFACE}/flags")
     limit_s = time.monotonic() + 10.0
@@ -165,7 +165,7 @@ def cold_start(check: Check) -> None:
 
 
 def ready_s() -> float:
-    """Time from the start of the present controller process to READY [s]."""
+    """Compute the time from the start of the present controller process to READY [s]."""
     times = show(trial.CONTROLLER, "ExecMainStartTimestampMonotonic", "ActiveEnterTimestampMonotonic")
     return (int(times["ActiveEnterTimestampMonotonic"]) - int(times["ExecMainStartTimestampMonotonic"])) * 1e-6
 
@@ -203,13 +203,13 @@ def wait_for_work(check: Check, page: str) -> None:
 
 
 def has_timing(recording: Path) -> bool:
-    """Whether a running recording holds the controller's timing and frames of the bus."""
+    """Tell whether a running recording holds the controller's timing and frames of the bus."""
     frames = recording.with_name(f"{trial.INTERFACE}.log").stat().st_size
-    return bool(frames) and any(isinstance(found, Stored) for found in scan(recording, {TIMING}))
+    return bool(frames) and any(isinstance(record, Stored) for record in scan(recording, {TIMING}))
 
 
 def inspect(check: Check, page: str) -> None:
-    """All services run with the rights and priorities of their units, and the machine is not armed."""
+    """Check that all services run with the rights and priorities of their units, and the machine is not armed."""
     wait_for_work(check, page)
     users = set()
     for name in SERVICES:
@@ -222,8 +222,8 @@ def inspect(check: Check, page: str) -> None:
         facts = process_facts(main_pid(unit))
         check.result["figures"][f"{name}_locked_kb"] = facts["locked_kb"]
         users.add(facts["user"])
-        wanted = ("fifo", FIFO[name]) if name in FIFO else ("other", 0)
-        check.expect((facts["policy"], facts["priority"]) == wanted, f"{unit} is scheduled {facts}")
+        expected_scheduling = ("fifo", FIFO[name]) if name in FIFO else ("other", 0)
+        check.expect((facts["policy"], facts["priority"]) == expected_scheduling, f"{unit} is scheduled {facts}")
         check.expect(bool(facts["locked_kb"]) == (name in FIFO), f"{unit} has {facts['locked_kb']} kB locked")
         check.expect(name != "controller" or facts["processors"] == [0], f"{unit} runs on {facts['processors']}")
         check.expect(facts["capabilities"] == 0 and facts["no_new_privileges"] and facts["seccomp"], f"{unit}: {facts}")
@@ -258,7 +258,9 @@ def evaluate_trial(check: Check, ending: trial.Ending, figures: dict[str, Any]) 
     """Check the figures of a trial."""
     name = ending.name
     check.figure(f"{name}_neutral_ms", figures["neutral_ms"], NEUTRAL_MS)
-    check.result["figures"] |= {f"{name}_{what}": figures[what] for what in ("no_flow_ms", "shut_ms", "ended_ms")}
+    check.result["figures"] |= {
+        f"{name}_{figure_name}": figures[figure_name] for figure_name in ("no_flow_ms", "shut_ms", "ended_ms")
+    }
     check.expect(trial.was_moving(figures), f"{name}: the crane did not move when the service ended")
     if not ending.signal:
         check.expect(figures["frames_when_stopped"] == 0, "frames of a controller that was stopped")
@@ -275,7 +277,7 @@ def evaluate_trial(check: Check, ending: trial.Ending, figures: dict[str, Any]) 
 
 
 def buses_lost(check: Check, pilot: Pilot, plant_port: int) -> None:
-    """The processes survive the loss of their bus, report it, and need an operator but no restart afterwards."""
+    """Check that the processes survive the loss of their bus, report it, and then need an operator but no restart."""
     for loss in trial.LOSSES:
         figures = trial.lose(loss, pilot, plant_port)
         check.result["trials"].append(figures)
@@ -291,11 +293,11 @@ def buses_lost(check: Check, pilot: Pilot, plant_port: int) -> None:
 
 
 def check_status_command(check: Check) -> None:
-    """`timberhand service status`."""
-    found = json.loads(carry_out(check, "status", PROGRAM, "service", "status", "--json").stdout)
-    running = {unit["name"] for unit in found["units"] if unit["state"] == "running"}
-    check.expect(running >= set(SERVICES), f"the status shows {found['units']}")
-    timing = found["timing"]
+    """Check `timberhand service status`."""
+    status = json.loads(carry_out(check, "status", PROGRAM, "service", "status", "--json").stdout)
+    running = {unit["name"] for unit in status["units"] if unit["state"] == "running"}
+    check.expect(running >= set(SERVICES), f"the status shows {status['units']}")
+    timing = status["timing"]
     check.expect(timing and not timing["silent"] and timing["ticks"] > 100, f"the status shows {timing}")
     shown = carry_out(check, "status", PROGRAM, "service", "status").stdout
     check.expect("wake-up late" in shown and "crane0" in shown, f"the status: {shown}")
@@ -303,14 +305,14 @@ def check_status_command(check: Check) -> None:
 
 
 def check_removal(check: Check) -> None:
-    """Nothing is left that could start."""
+    """Check that nothing is left that could start."""
     check.expect(not Path("/opt/timberhand").exists(), "the program is still there")
     check.expect(show("timberhand.target", "LoadState")["LoadState"] == "not-found", "the target is still there")
     check.expect(not Path("/etc/timberhand/timberhand.conf").exists(), "unchanged settings are still there")
 
 
 def run_loading(check: Check, order: dict[str, str]) -> None:
-    """One log into the bunk, for a guest whose time is simulated."""
+    """Load one log into the bunk, for a guest whose time is simulated."""
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     install(check, order)
     conf = change_settings(check)

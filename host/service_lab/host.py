@@ -67,7 +67,7 @@ WantedBy=multi-user.target
 
 
 def missing() -> str | None:
-    """Why this computer cannot run the lab; None when it can."""
+    """Say why this computer cannot run the lab; None when it can."""
     if platform.machine() != "x86_64":
         return f"user-mode Linux runs on x86_64 only, this is {platform.machine()}"
     if uml.find(uml.user_cache()) is None:
@@ -86,7 +86,7 @@ def missing() -> str | None:
 
 
 def python_for_services() -> str:
-    """The system's Python of this version; services cannot use one in a home directory."""
+    """Return the system's Python of this version; services cannot use one in a home directory."""
     return f"/usr/bin/python{sys.version_info.major}.{sys.version_info.minor}"
 
 
@@ -147,14 +147,14 @@ def run(
         result: dict[str, Any] = {"failed": [], "figures": {}, "trials": []}
         for part in parts:
             (folder / "order.json").write_text(json.dumps(order | {"steps": part}))
-            told = _boot([f"init={init}", *settings], timeout_s, show_step)
-            joined = {name: result[name] + told[name] for name in ("failed", "trials")}
-            result |= told | joined | {"figures": result["figures"] | told["figures"]}
+            part_result = _boot([f"init={init}", *settings], timeout_s, show_step)
+            joined = {name: result[name] + part_result[name] for name in ("failed", "trials")}
+            result |= part_result | joined | {"figures": result["figures"] | part_result["figures"]}
         return result
 
 
 def _bundles(wheel: Path, folder: Path) -> dict[str, str]:
-    """Signed bundles for the updates: a release that works, and one whose controller ends at once."""
+    """Make signed bundles for the updates: a release that works, and one whose controller ends at once."""
     private, public = make_keys(folder / "keys")
     made = {"signer": str(public)}
     changes = {"bundle": {}, "broken": {"controller/__main__.py": b"raise SystemExit(1)\n"}}
@@ -170,7 +170,7 @@ def _bundles(wheel: Path, folder: Path) -> dict[str, str]:
 
 
 def _packages() -> Path:
-    """The folder of this environment's packages."""
+    """Return the folder of this environment's packages."""
     return Path(sysconfig.get_path("purelib"))
 
 
@@ -194,7 +194,7 @@ def _warm_up(python: str, path: str) -> None:
 def _boot(settings: list[str], timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
     kernel = uml.find(uml.user_cache())
     assert kernel
-    messages, far = os.pipe()
+    messages, guest_end = os.pipe()
     log = os.memfd_create("kernel log")
     arguments = [
         f"mem={MEM_MB}M",
@@ -205,7 +205,7 @@ def _boot(settings: list[str], timeout_s: float, show_step: Callable[[str], None
         "con=null",
         "con0=null,fd:1",
         "ssl=null",
-        f"con1=null,fd:{far}",
+        f"con1=null,fd:{guest_end}",
         "uml_dir=/proc/",
         "quiet",
         "panic=1",
@@ -222,9 +222,9 @@ def _boot(settings: list[str], timeout_s: float, show_step: Callable[[str], None
         env={"PATH": os.defpath},
         cwd="/",
         start_new_session=True,
-        pass_fds=[far],
+        pass_fds=[guest_end],
     )
-    os.close(far)
+    os.close(guest_end)
     try:
         result = _receive(messages, time.monotonic() + timeout_s, show_step)
     finally:
@@ -242,7 +242,7 @@ def _boot(settings: list[str], timeout_s: float, show_step: Callable[[str], None
 
 
 def _receive(messages: int, deadline_s: float, show_step: Callable[[str], None]) -> dict[str, Any] | None:
-    """The result of the guest; None when it ends or the deadline passes first."""
+    """Receive the result of the guest; None when it ends or the deadline passes first."""
     rest = b""
     while (left_s := deadline_s - time.monotonic()) > 0 and select.select([messages], [], [], left_s)[0]:
         data = os.read(messages, 65536)
@@ -257,8 +257,8 @@ def _receive(messages: int, deadline_s: float, show_step: Callable[[str], None])
             if not isinstance(message, dict):
                 show_step(text)
             elif "result" in message:
-                found: dict[str, Any] = message["result"]
-                return found
+                result: dict[str, Any] = message["result"]
+                return result
             else:
                 show_step(f"{message['at_s']:7.1f} s  {message['event']}")
     return None

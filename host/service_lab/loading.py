@@ -51,7 +51,7 @@ def load_a_log(page: str, plant_port: int, expect: Expect, step: Step) -> dict[s
 
 
 def ask_plant(port: int, question: str) -> dict[str, Any]:
-    """The emulated machine's answer (``python -m sim``)."""
+    """Ask the emulated machine (``python -m sim``); return its answer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(5.0)
         client.sendto(json.dumps({"op": question}).encode(), ("127.0.0.1", port))

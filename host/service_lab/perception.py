@@ -28,7 +28,7 @@ Step = Callable[[str], None]
 
 
 def try_perception(port: int, expect: Expect, step: Step) -> dict[str, float]:
-    """All of it; returns the times it took [s].  Controller and guard must not notice."""
+    """Try all of it; return the times it took [s].  Controller and guard must not notice."""
     before = [show(unit, "MainPID", "NRestarts") for unit in OTHERS]
     figures: dict[str, float] = {}
     camera = start_camera(port)
@@ -60,18 +60,18 @@ def try_perception(port: int, expect: Expect, step: Step) -> dict[str, float]:
 
 
 def start_camera(port: int) -> subprocess.Popen[bytes]:
-    """The camera as a process of its own."""
+    """Start the camera as a process of its own."""
     environment = os.environ | {"PYTHONPATH": ":".join(sys.path[1:])}
     return subprocess.Popen([sys.executable, "-m", "host.service_lab.perception", str(port)], env=environment)
 
 
 def words() -> str:
-    """The service's status line."""
+    """Return the service's status line."""
     return show(UNIT, "StatusText").get("StatusText", "")
 
 
 def sees() -> bool:
-    """Whether it reports a log."""
+    """Tell whether it reports a log."""
     return "1 logs" in words()
 
 
@@ -81,14 +81,14 @@ def _is_another(pid: int) -> bool:
 
 def _until(reached: Callable[[], Any], limit_s: float, expect: Expect, sentence: str) -> float:
     begin_s = time.monotonic()
-    while not (found := reached()) and time.monotonic() < begin_s + limit_s:
+    while not (outcome := reached()) and time.monotonic() < begin_s + limit_s:
         time.sleep(0.5)
-    expect(found, f"perception: {sentence}: {words()!r}, {journal(UNIT)[-8:]}")
+    expect(outcome, f"perception: {sentence}: {words()!r}, {journal(UNIT)[-8:]}")
     return time.monotonic() - begin_s
 
 
 def main() -> None:
-    """The camera, until it is killed."""
+    """Run the camera, until it is killed."""
     from machine.loading.profile_file import load_profile
     from sim.camera.rig import CameraRig
     from sim.camera.server import CameraServer

@@ -114,7 +114,7 @@ class Pilot:
         return True
 
     def opening_pct(self) -> float:
-        """The largest opening now [%]."""
+        """Return the largest opening now [%]."""
         return self.valves[-1].opening_pct if self.valves else 0.0
 
     def _poll(self) -> None:

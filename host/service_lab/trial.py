@@ -156,12 +156,12 @@ def release(command: subprocess.Popen[bytes]) -> None:
 
 
 def was_moving(figures: dict[str, Any]) -> bool:
-    """Whether the crane moved until the end of the service, so that the trial is valid."""
+    """Tell whether the crane moved until the end of the service, so that the trial is valid."""
     return bool(figures["moving_until_then"] and figures["opening_pct"] > OPEN_PCT)
 
 
 def time_after(pilot: Pilot, began_ns: int, moving: Callable[[Valve], bool]) -> float:
-    """Time from ``began_ns`` to the first feedback after the last motion [ms]."""
+    """Compute the time from ``began_ns`` to the first feedback after the last motion [ms]."""
     last_ns = max((v.stamp_ns for v in pilot.valves if moving(v)), default=began_ns)
     return next((max(v.stamp_ns - began_ns, 0) * 1e-6 for v in pilot.valves if v.stamp_ns > last_ns), float("inf"))
 
@@ -173,7 +173,7 @@ def _frames(pilot: Pilot) -> int:
 
 
 def _after_restart(unit: str, pilot: Pilot, pid: int, restarts: int, began_ns: int) -> dict[str, Any]:
-    """The figures after the restart: the service returns, the machine stays disarmed despite setpoints."""
+    """Measure after the restart: the service returns, the machine stays disarmed despite setpoints."""
     pilot.report = None
     pilot.until(lambda: pilot.report and pilot.guarded_ns > began_ns + GUARD_BACK_NS, 15.0)
     figures = observe_idle(pilot)
@@ -200,7 +200,7 @@ def observe_idle(pilot: Pilot) -> dict[str, Any]:
 
 
 def is_idle(figures: dict[str, Any]) -> bool:
-    """Whether the machine waited for an operator during `observe_idle`."""
+    """Tell whether the machine waited for an operator during `observe_idle`."""
     armed = figures["armed_after"] or {"ARMED", "ACTIVE"} & set(figures["modes_after"])
     return not armed and figures["opening_after_pct"] <= SHUT_PCT
 
@@ -273,7 +273,7 @@ def _processes() -> list[dict[str, str]]:
 
 
 def _slew(port: int) -> float:
-    """The true slew angle [rad]."""
+    """Return the true slew angle [rad]."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(5.0)
         client.sendto(json.dumps({"op": "state"}).encode(), ("127.0.0.1", port))

@@ -38,7 +38,7 @@ class Machine(Protocol):
 
 
 def try_updates(order: dict[str, str], machine: Machine, expect: Expect, step: Step) -> dict[str, Any]:
-    """All three; returns the times they took [s].
+    """Try all three; return the times they took [s].
 
     The machine is off until the new release starts: emulating it would take half of the guest's only processor.
     """
@@ -57,7 +57,7 @@ def _update(bundle: str) -> subprocess.CompletedProcess[str]:
 
 
 def _refused(order: dict[str, str], expect: Expect) -> float:
-    """A bundle with one changed byte."""
+    """Try a bundle with one changed byte."""
     begin_s = time.monotonic()
     before = Trees(PLACE).state()
     with tempfile.NamedTemporaryFile(suffix=".tar") as file:
@@ -73,12 +73,12 @@ def _refused(order: dict[str, str], expect: Expect) -> float:
 
 def _begin_update(bundle: str, machine: Machine) -> subprocess.Popen[str]:
     """Start an update; returns when it has changed the release, or has ended."""
-    good = Trees(PLACE).state()
+    state_before = Trees(PLACE).state()
     limit_s = time.monotonic() + SWITCH_S
     machine.send_signal(signal.SIGSTOP)
     try:
         update = subprocess.Popen([COMMAND, "service", "update", bundle], stderr=subprocess.PIPE, text=True)
-        while (state := Trees(PLACE).state()) == good or state.trial == state.current:
+        while (state := Trees(PLACE).state()) == state_before or state.trial == state.current:
             if update.poll() is not None or time.monotonic() > limit_s:
                 break
             time.sleep(0.1)
@@ -88,52 +88,54 @@ def _begin_update(bundle: str, machine: Machine) -> subprocess.Popen[str]:
 
 
 def _good(order: dict[str, str], machine: Machine, expect: Expect) -> float:
-    """A release that works stays, with the former one behind it."""
+    """Check that a release that works stays, with the former one behind it."""
     begin_s = time.monotonic()
     former = Trees(PLACE).state().current
     update = _begin_update(order["bundle"], machine)
-    _, words = update.communicate()
-    expect(update.returncode == 0, f"the update ended with {update.returncode}: {words[-1500:]}")
+    _, error_text = update.communicate()
+    expect(update.returncode == 0, f"the update ended with {update.returncode}: {error_text[-1500:]}")
     state = Trees(PLACE).state()
-    wanted = Path(order["bundle"]).name.removeprefix("timberhand-").removesuffix(".tar")
-    expect(state.current == wanted, f"after the update {state.current} is in use")
+    release_name = Path(order["bundle"]).name.removeprefix("timberhand-").removesuffix(".tar")
+    expect(state.current == release_name, f"after the update {state.current} is in use")
     expect(state == State(state.current, former, None), f"after the update the links are {state}")
     expect(not (missing := _lacking(SETTLE_S)), f"after the update {missing}")
     return time.monotonic() - begin_s
 
 
 def _cut_off(order: dict[str, str], machine: Machine, expect: Expect) -> float:
-    """A release that does not come up; the update is killed while it waits at the gate, and the target starts again."""
-    good = Trees(PLACE).state()
+    """Try a release that does not come up; kill the update while it waits at the gate, and start the target again."""
+    state_before = Trees(PLACE).state()
     update = _begin_update(order["broken"], machine)
     state = Trees(PLACE).state()
     update.send_signal(signal.SIGKILL)
-    _, words = update.communicate()
-    expect(state.trial == good.current, f"the update has not changed the release: {state}, {words}")
+    _, error_text = update.communicate()
+    expect(state.trial == state_before.current, f"the update has not changed the release: {state}, {error_text}")
     begin_s = time.monotonic()
     systemctl("stop", "timberhand.target")
     systemctl("--no-block", "start", "timberhand.target")  # as the computer's start does
     while time.monotonic() < begin_s + RETURN_S:
-        if Trees(PLACE).state() == good and not _lacking():
+        if Trees(PLACE).state() == state_before and not _lacking():
             break
         time.sleep(0.5)
     took_s = time.monotonic() - begin_s
-    expect(Trees(PLACE).state() == good, f"it does not come back: {Trees(PLACE).state()}, {journal(RESUME)[-12:]}")
+    expect(
+        Trees(PLACE).state() == state_before, f"it does not come back: {Trees(PLACE).state()}, {journal(RESUME)[-12:]}"
+    )
     expect(not (missing := _lacking(SETTLE_S)), f"it came back, and {missing}: {journal(RESUME)[-12:]}")
     limit_s = time.monotonic() + SWITCH_S
     while show(RESUME, "ActiveState")["ActiveState"] == "activating" and time.monotonic() < limit_s:
         time.sleep(0.2)
     ended = show(RESUME, "ActiveState", "ExecMainStatus")
-    wanted = {"ActiveState": "inactive", "ExecMainStatus": str(int(ExitCode.FIGURE_MISSED))}
-    expect(ended == wanted, f"{RESUME} ended with {ended}: {journal(RESUME)[-12:]}")
-    kept = [json.loads(line) for line in FAILURES.read_text().splitlines()] if FAILURES.is_file() else []
-    failed = [(one["unit"], one["result"], one["status"]) for one in kept]
+    expected_ending = {"ActiveState": "inactive", "ExecMainStatus": str(int(ExitCode.FIGURE_MISSED))}
+    expect(ended == expected_ending, f"{RESUME} ended with {ended}: {journal(RESUME)[-12:]}")
+    failures = [json.loads(line) for line in FAILURES.read_text().splitlines()] if FAILURES.is_file() else []
+    failed = [(failure["unit"], failure["result"], failure["status"]) for failure in failures]
     expect((CONTROLLER, "exit-code", "1") in failed, f"no record of the controller that failed: {failed}")
     return took_s
 
 
 def _lacking(within_s: float = 0.0) -> str:
-    """What a release lacks, and still does after so long: a stall of the lab makes commands late for a moment."""
+    """Say what a release lacks, and still does after so long: a stall of the lab makes commands late for a moment."""
     limit_s = time.monotonic() + within_s
     while missing := lacking(*SystemdServices(PLACE / "current/deploy/units").readings()):
         if time.monotonic() > limit_s:

@@ -98,8 +98,8 @@ def vcan(
     try:
         method = choose(survey(request), request.kernel)
         if check:
-            found = {"way": method.kind, "why": method.reason, "kernel": method.kernel, "links": request.links}
-            typer.echo(json.dumps(found) if as_json else f"{method.kind}: {method.reason}")
+            method_facts = {"way": method.kind, "why": method.reason, "kernel": method.kernel, "links": request.links}
+            typer.echo(json.dumps(method_facts) if as_json else f"{method.kind}: {method.reason}")
             return
         if verbose:
             typer.echo(f"vcan lab: {method.kind}: {method.reason}", err=True)

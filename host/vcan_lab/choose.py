@@ -48,7 +48,7 @@ class Method:
 
 
 def choose(facts: HostFacts, kernel: str | None = None) -> Method:
-    """The first method that works: native before user-mode Linux, existing interfaces before new ones.
+    """Choose the first method that works: native before user-mode Linux, existing interfaces before new ones.
 
     ``kernel``: as in `Request`; a requested kernel is the only method.
 
@@ -137,7 +137,7 @@ class LostTime:
     steal_share: float
 
     def words(self) -> str:
-        """For a person."""
+        """Describe the lost time for a person."""
         return (
             f"{100 * self.share:.0f} % of its processor's time lost, at most {self.longest_ns / 1e6:.0f} ms at once "
             f"(steal by the hypervisor: {100 * self.steal_share:.1f} %)"
@@ -155,7 +155,7 @@ class Clock:
 
 
 def choose_clock(lost: LostTime, kernel: str | None, detects: bool = False) -> Clock:
-    """Real time where the host leaves enough; else simulated time, if the lab's own kernel ``kernel`` is there.
+    """Choose real time where the host leaves enough; else simulated time, if the lab's own kernel ``kernel`` is there.
 
     ``detects``: a camera's detector runs in the guest, which needs more than its one processor.
     """
@@ -175,12 +175,12 @@ def measure(seconds: float = LOOK_S) -> LostTime:
     Raises:
         subprocess.SubprocessError: the probe fails.
     """
-    found = run_probe(lost_time.__file__, seconds)
-    return LostTime(found["share"], found["longest_ns"], found["steal_share"])
+    probe_result = run_probe(lost_time.__file__, seconds)
+    return LostTime(probe_result["share"], probe_result["longest_ns"], probe_result["steal_share"])
 
 
 def clock_here(detects: bool = False) -> Clock | None:
-    """The clock for a live run in the lab now; None where the lab is not user-mode Linux, or there is none.
+    """Choose the clock for a live run in the lab now; None where the lab is not user-mode Linux, or there is none.
 
     ``detects``: as in `choose_clock`.
     """

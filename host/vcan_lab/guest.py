@@ -53,7 +53,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def main(descriptors: list[str]) -> None:
-    """Entry, called by ``spec.RUN_GUEST``."""
+    """Run the guest; called by ``spec.RUN_GUEST``."""
     if os.getpid() == 1:
         _first_process()
     control, out, err = map(int, descriptors)
@@ -114,7 +114,7 @@ def _held_time() -> Iterator[None]:
 
 
 def _set_up(order: dict[str, Any]) -> None:
-    """Mounts, modules and settings of a booted machine."""
+    """Set up mounts, modules and settings of a booted machine."""
     os.umask(0)
     _mount("sysfs", "/sys", "sysfs")
     os.makedirs("/dev/pts", exist_ok=True)
@@ -203,7 +203,7 @@ class Host:
         sys.exit(1)  # the wrapper is gone
 
     def receive(self) -> list[dict[str, Any]] | None:
-        """The messages of a readable channel; None at its end."""
+        """Read the messages of a readable channel; None at its end."""
         data = os.read(self.fd, 65536)
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines] if data else None

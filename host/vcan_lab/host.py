@@ -94,17 +94,17 @@ class Lab:
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
         self._handlers = {number: signal.signal(number, lambda *_: None) for number in FORWARDED}
         self._handlers[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # `_write` handles it
-        self.control, far = socket.socketpair()
+        self.control, guest_end = socket.socketpair()
         (out, out_far), (err, err_far) = os.pipe(), os.pipe()
         self.streams = {"out": Stream(out, sys.stdout.fileno()), "err": Stream(err, sys.stderr.fileno())}
-        passed = (out_far, err_far, far.fileno())
+        passed = (out_far, err_far, guest_end.fileno())
         try:
             if method.kernel:
                 self.guest = uml.start(method.kernel, request, passed, self._log)
             else:
                 self.guest = self._start_native(passed)
         finally:
-            far.close()
+            guest_end.close()
             os.close(out_far)
             os.close(err_far)
 
@@ -149,7 +149,7 @@ class Lab:
                     self._read(name, stream)
 
     def status(self) -> int:
-        """The exit status of the command; raises LabError when there is none."""
+        """Return the exit status of the command; raises LabError when there is none."""
         if self.timed_out:
             return TIMED_OUT
         if self.interrupted:
@@ -180,7 +180,7 @@ class Lab:
             os.close(fd)
 
     def summary(self) -> str:
-        """Times and memory of an ended lab."""
+        """Summarize times and memory of an ended lab."""
         text = f"vcan lab: {self.method.kind}, ready after {self.booted_s - self.began_s:.2f} s"
         text += f", ended after {time.monotonic() - self.began_s:.2f} s"
         if self.method.kernel:

@@ -23,7 +23,7 @@ _HEADER_LEN = 16
 
 
 def state(name: str) -> str | None:
-    """Why the CAN interface ``name`` cannot be used; None when it exists and is up."""
+    """Say why the CAN interface ``name`` cannot be used; None when it exists and is up."""
     try:
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
             can.bind((name,))

@@ -34,11 +34,11 @@ def lost(duration_ns: int) -> tuple[int, int, int]:
 
 
 def steal_s(cpu: int) -> float:
-    """Time of a processor that the hypervisor took, since boot; 0 where it is not reported."""
+    """Read the time of a processor that the hypervisor took, since boot; 0 where it is not reported."""
     for line in Path("/proc/stat").read_text().splitlines():
-        words = line.split()
-        if words[0] == f"cpu{cpu}" and len(words) > _STEAL + 1:
-            return int(words[_STEAL + 1]) / os.sysconf("SC_CLK_TCK")
+        fields = line.split()
+        if fields[0] == f"cpu{cpu}" and len(fields) > _STEAL + 1:
+            return int(fields[_STEAL + 1]) / os.sysconf("SC_CLK_TCK")
     return 0.0
 
 
@@ -53,13 +53,13 @@ def main() -> None:
     stolen_s = steal_s(cpu)
     total_ns, lost_ns, longest_ns = lost(int(float(sys.argv[1]) * 1e9))
     stolen_s = steal_s(cpu) - stolen_s
-    found = {
+    result = {
         "share": lost_ns / total_ns,
         "longest_ns": longest_ns,
         "steal_share": stolen_s * 1e9 / total_ns,
         "cpu": cpu,
     }
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ class Request:
 
 
 def link_fault(name: str) -> str | None:
-    """Why ``name`` is not an interface name (linux/if.h); None when it is one."""
+    """Say why ``name`` is not an interface name (linux/if.h); None when it is one."""
     if not 0 < len(name.encode()) <= _IFNAMSIZ:
         return f"interface name {name!r} must have 1 to {_IFNAMSIZ} bytes"
     if name in (".", "..") or "/" in name or ":" in name or any(c.isspace() for c in name):
@@ -66,7 +66,7 @@ def link_fault(name: str) -> str | None:
 
 
 def order(request: Request, lab: str, new_links: bool, needed: Sequence[str] = ()) -> dict[str, Any]:
-    """The first message on the control channel, ready for JSON: everything that the guest needs.
+    """Write the first message on the control channel, ready for JSON: everything that the guest needs.
 
     ``new_links``: create the interfaces.  ``needed``: further paths that the guest must see.
     """
@@ -89,7 +89,7 @@ def order(request: Request, lab: str, new_links: bool, needed: Sequence[str] = (
 def kernel_arguments(
     python: str, package_root: str, request: Request, out_fd: int, err_fd: int, control_fd: int
 ) -> list[str]:
-    """Arguments of ``linux.uml``: the host's root file system, three consoles on descriptors, the guest as init.
+    """List arguments of ``linux.uml``: the host's root file system, three consoles on descriptors, the guest as init.
 
     The guest makes the root file system writable, without access times.
 
@@ -125,7 +125,7 @@ def kernel_arguments(
 
 
 def _quoted(text: str) -> str:
-    """``text`` as one word of a kernel command line, which has double quotes but no escapes."""
+    """Quote ``text`` as one word of a kernel command line, which has double quotes but no escapes."""
     if '"' in text or "\n" in text:
         raise LabError(
             "lab.path", f"the kernel's command line cannot hold the path {text!r}; use a path without quotes"

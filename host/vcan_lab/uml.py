@@ -22,7 +22,7 @@ _MEMORY_FOLDER = "/dev/shm"  # looked at only; the kernel names its own file the
 
 
 def start(kernel: str, request: Request, passed: tuple[int, int, int], log: int) -> subprocess.Popen[bytes]:
-    """The process of the keeper; closing its standard input ends the lab.
+    """Start the process of the keeper; closing its standard input ends the lab.
 
     ``passed``: descriptors of out, err, control; ``log``: descriptor for the kernel's output.
     """
@@ -75,13 +75,13 @@ SOURCE = Path(__file__).with_name("xstate_shim.c")
 
 
 def needed(cpuinfo: str) -> bool:
-    """Whether a CPU's register state (text of /proc/cpuinfo) exceeds the kernel's fixed buffer."""
+    """Tell whether a CPU's register state (text of /proc/cpuinfo) exceeds the kernel's fixed buffer."""
     flags = re.search(r"^flags\s*:(.*)$", cpuinfo, re.MULTILINE)
     return flags is not None and "amx_tile" in flags[1].split()
 
 
 def library(cache: Path) -> Path:
-    """The compiled shim in the folder ``cache``; compiled when it is missing or older than its source."""
+    """Return the compiled shim in the folder ``cache``; compile it when it is missing or older than its source."""
     built = cache / "xstate_shim.so"
     if built.exists() and built.stat().st_mtime >= SOURCE.stat().st_mtime:
         return built
@@ -113,7 +113,7 @@ def library(cache: Path) -> Path:
 
 
 def user_cache() -> Path:
-    """The cache folder of timberhand (XDG base directories)."""
+    """Return the cache folder of timberhand (XDG base directories)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "timberhand"
 
 
@@ -124,7 +124,7 @@ MISSING: Final = "the lab kernel is not built: make lab-kernel"
 
 
 def find(cache: Path) -> str | None:
-    """The newest kernel in the folder ``cache`` built from the present configuration; None when there is none."""
+    """Find the newest kernel in the folder ``cache`` built from the present configuration; None when there is none."""
     try:
         digest = hashlib.sha256(CONFIG.read_bytes()).hexdigest()[:12]
     except FileNotFoundError:  # an installation without the checkout

@@ -182,7 +182,7 @@ class Answers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def answers_of(raw: dict[str, Any], where: str) -> Answers:
-    """The checked answers of parsed TOML; ``where`` begins every line of an error.
+    """Check the answers of parsed TOML; ``where`` begins every line of an error.
 
     Raises:
         InputRefused: a key is missing or unknown, or a value has the wrong type or is impossible.
@@ -193,12 +193,12 @@ def answers_of(raw: dict[str, Any], where: str) -> Answers:
         problems = list(_contradictions(built))
     if problems:
         raise InputRefused("answers.wrong", "\n".join(f"{where}: {problem}" for problem in problems))
-    found: Answers = built
-    return found
+    answers: Answers = built
+    return answers
 
 
 def read_answers(path: Path) -> dict[str, Any]:
-    """The parsed TOML of a file of answers; raises InputRefused."""
+    """Read the parsed TOML of a file of answers; raises InputRefused."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -208,7 +208,7 @@ def read_answers(path: Path) -> dict[str, Any]:
 
 
 def _contradictions(answers: Answers) -> Iterator[Problem]:
-    """What no profile could show any more: drives that are neither cylinder nor motor, tongs that do not close."""
+    """Find what no profile could show any more: drives neither cylinder nor motor, tongs that do not close."""
     for name in answers.joints.__struct_fields__:
         drive: DriveAnswers = getattr(answers.joints, name).drive
         path = f"joints.{name}.drive"

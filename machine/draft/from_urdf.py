@@ -43,7 +43,7 @@ class _Placed:
 
 
 def answers_from_urdf(path: Path, names: Mapping[str, str]) -> dict[str, Any]:
-    """``kinematics`` and the ranges in ``joints``, as parsed answers; ``names``: the file's joint of each of ours.
+    """Read ``kinematics`` and the ranges in ``joints`` as parsed answers; ``names``: the file's joint of each of ours.
 
     Raises:
         InputRefused: the file cannot be read, a joint is missing, or its joints are no such crane.
@@ -119,7 +119,7 @@ def _unfit(path: Path, what: str) -> InputRefused:
 
 
 def _placed(path: Path) -> dict[str, _Placed]:
-    """All joints of the file by name, in the root's frame."""
+    """Place all joints of the file by name, in the root's frame."""
     try:
         root: Element = defusedxml.ElementTree.parse(path).getroot()
         joints = {j.attrib["name"]: j for j in root.findall("joint")}
@@ -132,14 +132,14 @@ def _placed(path: Path) -> dict[str, _Placed]:
 
 
 def _link(joint: Element, end: str) -> str:
-    found = joint.find(end)
-    if found is None:
+    link_element = joint.find(end)
+    if link_element is None:
         raise ValueError(f"joint {joint.attrib['name']} has no {end}")
-    return found.attrib["link"]
+    return link_element.attrib["link"]
 
 
 def _frame(joint: Element, below: Mapping[str, Element]) -> tuple[Matrix, Vector]:
-    """Rotation and origin of a joint's frame in the root's, all joints at zero."""
+    """Compute rotation and origin of a joint's frame in the root's, all joints at zero."""
     above = below.get(_link(joint, "parent"))
     turn, at = (UNTURNED, (0.0, 0.0, 0.0)) if above is None else _frame(above, below)
     origin = joint.find("origin")
@@ -179,7 +179,7 @@ def _number(text: str) -> float:
 
 
 def _rotation(rpy: Vector) -> Matrix:
-    """About the fixed axes x, then y, then z."""
+    """Compute the rotation about the fixed axes x, then y, then z."""
     (cr, cp, cy), (sr, sp, sy) = (tuple(f(a) for a in rpy) for f in (math.cos, math.sin))
     return (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
@@ -201,5 +201,5 @@ def _minus(a: Vector, b: Vector) -> Vector:
 
 
 def _angle(a: Vector, b: Vector) -> float:
-    """Angle between unit vectors [rad]."""
+    """Compute the angle between unit vectors [rad]."""
     return math.acos(max(-1.0, min(1.0, _dot(a, b))))

@@ -29,7 +29,7 @@ class Question:
     proposal: Any
 
     def parse(self, typed: str) -> Any:
-        """The answer that a person typed; None for `NONE`.
+        """Parse the answer that a person typed; None for `NONE`.
 
         Raises:
             ValueError: it is not of the question's type, in words.
@@ -45,31 +45,31 @@ class Question:
 
 
 def example() -> Answers:
-    """The example's answers."""
+    """Return the example's answers."""
     return answers_of(read_answers(EXAMPLE), EXAMPLE.name)
 
 
 def questions(answers: Answers) -> list[Question]:
-    """Every question in the order of the answers, with their values as proposals."""
+    """List every question in the order of the answers, with their values as proposals."""
     return list(_questions(answers, ()))
 
 
 def _questions(struct: msgspec.Struct, path: tuple[str, ...]) -> Iterator[Question]:
-    """Plain values of a table before its tables, as TOML wants it."""
-    inner = []
+    """Yield the plain values of a table before its tables, as TOML wants it."""
+    subtables = []
     for field in msgspec.structs.fields(struct):
         value = getattr(struct, field.name)
         if isinstance(value, msgspec.Struct):
-            inner.append((value, (*path, field.name)))
+            subtables.append((value, (*path, field.name)))
         elif get_origin(field.type) is Annotated:
             meta = next(m for m in get_args(field.type)[1:] if isinstance(m, msgspec.Meta))
             yield Question((*path, field.name), meta.description or "", field.type, value)
-    for value, place in inner:
-        yield from _questions(value, place)
+    for value, table_path in subtables:
+        yield from _questions(value, table_path)
 
 
 def answers_text(answers: Answers) -> str:
-    """All answers as TOML, each with its question behind it; what does not apply is left out."""
+    """Write all answers as TOML, each with its question behind it; what does not apply is left out."""
     out = [f"# Answers about {answers.title}; SI units: m, rad, s, kg, Pa", ""]
     table: tuple[str, ...] = ()
     for question in questions(answers):
@@ -93,6 +93,6 @@ def put(raw: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
 
 
 def merged(over: dict[str, Any], under: dict[str, Any]) -> dict[str, Any]:
-    """Tables of ``over``, with what only ``under`` has."""
+    """Merge the tables of ``over``, with what only ``under`` has."""
     both = {k: merged(over[k], under[k]) for k in over.keys() & under.keys() if isinstance(over[k], dict)}
     return {**under, **over, **both}

@@ -28,7 +28,7 @@ Line = tuple[str, Any, str]
 
 
 def value_text(value: Any) -> str:
-    """One TOML value; floats keep all their digits."""
+    """Write one TOML value; floats keep all their digits."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -39,7 +39,7 @@ def value_text(value: Any) -> str:
 
 
 def table(path: str, lines: Iterable[Line]) -> str:
-    """A table; ``path`` empty: the top of a file."""
+    """Write a table; ``path`` empty: the top of a file."""
     out = [f"[{path}]"] if path else []
     for key, value, origin in lines:
         kind, _, more = origin.partition(" ")
@@ -59,7 +59,7 @@ TELESCOPE_CENTRE: Final = 0.46
 
 
 def weights_at_pins(masses: MassAnswers) -> tuple[float, float]:
-    """The empty crane as weights at the stick pin and at the hanger pin [kg]."""
+    """Compute the empty crane as weights at the stick pin and at the hanger pin [kg]."""
     links = ((masses.stick_kg, STICK_CENTRE), (masses.telescope_kg, TELESCOPE_CENTRE))
     head = BOOM_CENTRE * masses.boom_kg + sum((1.0 - share) * mass for mass, share in links)
     return head, masses.grapple_kg + sum(share * mass for mass, share in links)
@@ -76,7 +76,7 @@ BELOW_CONTROLLER_M: Final = 0.05
 
 
 def envelope_kinematics(profile: Profile) -> dict[str, float]:
-    """The geometry in the guard's own terms, by key [m, rad]."""
+    """Return the geometry in the guard's own terms, by key [m, rad]."""
     kin = profile.kinematics
     return {
         "boom_pin_z_m": kin.d1_m,
@@ -91,7 +91,7 @@ def envelope_kinematics(profile: Profile) -> dict[str, float]:
 
 
 def envelope_text(profile: Profile) -> str:
-    """The envelope without its last line."""
+    """Write the envelope without its last line."""
     ground, kin = profile.workspace.ground_z_m, profile.kinematics
     hang_m = kin.hanger_to_fork_m + kin.fork_to_rotator_m - BELOW_CONTROLLER_M
     high = round(kin.d1_m - UNDER_BOOM_PIN_M + hang_m, 4)
@@ -123,7 +123,7 @@ def _column(ground: float, high: float) -> tuple[list[float], list[float]]:
 
 
 def _corners(box: KeepOut, hang_m: float) -> tuple[list[float], list[float]]:
-    """The axis-parallel box around a box that is turned about the vertical, and ``hang_m`` higher."""
+    """Compute the axis-parallel box around a box that is turned about the vertical, and ``hang_m`` higher."""
     (x, y, z), (a, b, c) = box.center_m, box.half_m
     cos, sin = abs(math.cos(box.yaw_rad)), abs(math.sin(box.yaw_rad))
     dx, dy = cos * a + sin * b, sin * a + cos * b
@@ -152,7 +152,7 @@ CLOSED_ROWS: Final = 4
 
 
 def profile_text(answers: Answers, messages: Mapping[int, str]) -> str:
-    """The profile.
+    """Write the profile.
 
     ``messages``: encoder messages of ``crane.dbc`` by their node; a node without one keeps the number as its name,
     which the profile's check refuses with the names that exist.
@@ -195,7 +195,7 @@ def profile_text(answers: Answers, messages: Mapping[int, str]) -> str:
 
 
 def flows(drive: DriveAnswers) -> tuple[float, float]:
-    """Oil per joint motion on the positive and the negative side [m^3 per rad or m]: chambers without and with rod."""
+    """Compute oil per motion on positive and negative side [m^3 per rad or m]: chambers without and with rod."""
     if drive.displacement_m3_rad is not None:
         return drive.displacement_m3_rad, drive.displacement_m3_rad
     bore, rod = drive.bore_m or 0.0, drive.rod_m or 0.0
@@ -261,7 +261,7 @@ def _joint_text(which: Joint, joint: JointAnswers, messages: Mapping[int, str]) 
 
 
 def unit_per_count(encoder: EncoderAnswers) -> float:
-    """Step of an encoder [rad or m]."""
+    """Compute the step of an encoder [rad or m]."""
     return encoder.unit_m if encoder.unit_m is not None else 2.0 * math.pi / encoder.total_counts
 
 
@@ -286,7 +286,7 @@ def _encoder_text(path: str, encoder: EncoderAnswers, messages: Mapping[int, str
 
 
 def jaw_rows(answers: Answers) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Angle [rad], half gap of the tips [m] and tips below the hanger pin [m] of tongs on two pivots."""
+    """Compute the angle [rad], half gap of the tips [m] and tips below the hanger pin [m] of tongs on two pivots."""
     grapple, kin = answers.grapple, answers.kinematics
     beside, out, down = tong(grapple)
     hang = kin.hanger_to_fork_m + kin.fork_to_rotator_m + kin.rotator_to_tong_pivot_m
@@ -300,7 +300,7 @@ def jaw_rows(answers: Answers) -> tuple[tuple[float, ...], tuple[float, ...], tu
 
 
 def tong(grapple: GrappleAnswers) -> tuple[float, float, float]:
-    """Pivot from the middle; tip of an open tong outward of its pivot and below it [m]."""
+    """Compute the pivot from the middle; tip of an open tong outward of its pivot and below it [m]."""
     out = (grapple.opening_m - grapple.pivots_m) / 2.0
     return grapple.pivots_m / 2.0, out, math.sqrt(grapple.tong_m**2 - out**2)
 

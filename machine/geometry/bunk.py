@@ -11,7 +11,7 @@ STAKE_THICKNESS_M: Final = 0.08
 
 
 def stake_walls(bunk: Bunk) -> tuple[KeepOut, KeepOut]:
-    """The left and the right row of stakes, each as a wall: a log passes over the whole row wherever the stakes are."""
+    """Return the left and the right row of stakes as walls: a log passes over the whole row wherever the stakes are."""
     c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
     x, y = bunk.center_m
     side = bunk.width_m / 2 + STAKE_THICKNESS_M / 2

@@ -21,7 +21,7 @@ ARMS: Final = ("arm_fl", "arm_fr", "arm_rl", "arm_rr")
 
 
 def arm_angle_from_height(carrier: Carrier, height_m: float) -> float:
-    """Angle of a swing arm below the horizontal [rad] that raises the frame by ``height_m``.
+    """Compute the angle of a swing arm below the horizontal [rad] that raises the frame by ``height_m``.
 
     Raises:
         ValueError: the arm is too short for this height.
@@ -36,32 +36,32 @@ def arm_angle_from_height(carrier: Carrier, height_m: float) -> float:
 
 
 def height_from_arm_angle(carrier: Carrier, angle_rad: float) -> float:
-    """The inverse of ``arm_angle_from_height`` [m]."""
+    """Compute the inverse of ``arm_angle_from_height`` [m]."""
     return carrier.arm_length_m * sin(angle_rad) - carrier.arm_drop_low_m
 
 
 def pivot_height_m(carrier: Carrier, height_m: float) -> float:
-    """Height of the pivots' plane above level ground with every arm at ``height_m`` [m]."""
+    """Compute the height of the pivots' plane above level ground with every arm at ``height_m`` [m]."""
     return carrier.wheel_radius_m + carrier.arm_drop_low_m + height_m
 
 
 def arm_pivot_m(carrier: Carrier, arm: str) -> Point:
-    """Pivot of one of ``ARMS`` in the frame of its half [m]; y is the middle plane of the wheel."""
+    """Compute the pivot of one of ``ARMS`` in the frame of its half [m]; y is the middle plane of the wheel."""
     transport = arm_angle_from_height(carrier, carrier.arm_transport_m)
     axle, ahead = _axle(carrier, arm)
     return ahead * (axle - carrier.arm_length_m * cos(transport)), _side_m(carrier, arm), 0.0
 
 
 def hub_m(carrier: Carrier, arm: str, height_m: float) -> Point:
-    """Wheel hub of one of ``ARMS`` in the frame of its half at a height of that arm [m]."""
+    """Compute the wheel hub of one of ``ARMS`` in the frame of its half at a height of that arm [m]."""
     x, y, _ = arm_pivot_m(carrier, arm)
     reach = carrier.arm_length_m * cos(arm_angle_from_height(carrier, height_m))
     return x + _axle(carrier, arm)[1] * reach, y, -(carrier.arm_drop_low_m + height_m)
 
 
 def turning_radius_m(carrier: Carrier, articulation_rad: float) -> float:
-    """Radius of the circle of the front axle's middle at a constant articulation [m]; infinite when straight
-    (docs/reference/machines.md section 7.1).
+    """Compute the radius of the circle of the front axle's middle at a constant articulation [m]; infinite when
+    straight (docs/reference/machines.md section 7.1).
     """
     bend = abs(sin(articulation_rad))
     return (carrier.front_axle_m * cos(articulation_rad) + carrier.rear_axle_m) / bend if bend else inf
@@ -70,7 +70,7 @@ def turning_radius_m(carrier: Carrier, articulation_rad: float) -> float:
 def heading_rate_rad_s(
     carrier: Carrier, speed_m_s: float, articulation_rad: float, articulation_rate_rad_s: float
 ) -> float:
-    """Rate of the front half's heading without slip [rad/s]; ``speed_m_s`` is the speed of the front axle
+    """Compute the rate of the front half's heading without slip [rad/s]; ``speed_m_s`` is the speed of the front axle
     (docs/reference/machines.md section 7.1).
     """
     turned = speed_m_s * sin(articulation_rad) + carrier.rear_axle_m * articulation_rate_rad_s
@@ -78,34 +78,35 @@ def heading_rate_rad_s(
 
 
 def rear_from_front(articulation_rad: float, point: Point) -> Point:
-    """A point of the front frame in the rear frame [m]."""
+    """Transform a point of the front frame to the rear frame [m]."""
     return _turned(point, articulation_rad)
 
 
 def rear_from_base(carrier: Carrier, point: Point) -> Point:
-    """A point of the crane's base frame in the rear frame [m]."""
+    """Transform a point of the crane's base frame to the rear frame [m]."""
     x, y, z = _turned(point, carrier.crane_yaw_rad)
     bx, by, bz = carrier.crane_base_m
     return x + bx, y + by, z + bz
 
 
 def base_from_rear(carrier: Carrier, point: Point) -> Point:
-    """A point of the rear frame in the crane's base frame [m]."""
+    """Transform a point of the rear frame to the crane's base frame [m]."""
     bx, by, bz = carrier.crane_base_m
     return _turned((point[0] - bx, point[1] - by, point[2] - bz), -carrier.crane_yaw_rad)
 
 
 def axis_from_antenna(carrier: Carrier, antenna_m: tuple[float, float], heading_rad: float) -> tuple[float, float]:
-    """The articulation axis [m] east and north of where the place of the main antenna counts from; ``heading_rad`` is
-    that of the front half, clockwise from true north.
+    """Compute the articulation axis [m] east and north of where the place of the main antenna counts from.
+
+    ``heading_rad`` is that of the front half, clockwise from true north.
     """
     x, y, _ = _turned(carrier.antenna_main_m, 0.5 * pi - heading_rad)
     return antenna_m[0] - x, antenna_m[1] - y
 
 
 def wheel_gap_m(carrier: Carrier, articulation_rad: float) -> float:
-    """Free length between front and rear wheel on the inner side of a bend at the transport height [m]; 0 or less
-    means that they touch.
+    """Compute the free length between front and rear wheel on the inner side of a bend at the transport height [m]; 0
+    or less means that they touch.
     """
     side = 0.5 * carrier.track_width_m
     x, y, _ = rear_from_front(abs(articulation_rad), (carrier.front_axle_m, side, 0.0))

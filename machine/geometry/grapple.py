@@ -25,12 +25,12 @@ RAISED_GROUND_M: Final = 0.1
 
 
 def grapple_yaw(profile: Profile, q: Sequence[float]) -> float:
-    """Direction of the opening axis [rad], not wrapped; ``q`` is indexed by ``Joint``."""
+    """Compute the direction of the opening axis [rad], not wrapped; ``q`` is indexed by ``Joint``."""
     return q[Joint.SLEW] + q[Joint.ROT] + _across(profile.kinematics)
 
 
 def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0) -> float:
-    """Rotator angle within its limits that gives ``yaw`` modulo pi at this slew, the one nearest to ``near``.
+    """Find the rotator angle in its limits that gives ``yaw`` modulo pi at this slew, the one nearest to ``near``.
 
     Raises:
         Unreachable: the rotator turns less than pi, and no angle fits.
@@ -49,32 +49,32 @@ def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0
 
 
 def _across(kin: Kinematics) -> float:
-    """Direction across the reach at slew 0 [rad]."""
+    """Compute the direction across the reach at slew 0 [rad]."""
     return kin.theta1_offset_rad - pi / 2
 
 
 def pin_to_jaw_pivot_m(kin: Kinematics) -> float:
-    """Height of the hanger pin above the jaw pivots of the hanging grapple [m]."""
+    """Compute the height of the hanger pin above the jaw pivots of the hanging grapple [m]."""
     return kin.hanger_to_fork_m + kin.fork_to_rotator_m + kin.rotator_to_tong_pivot_m
 
 
 def tip_below_pin_m(jaws: JawTable, jaw_rad: float) -> float:
-    """Depth of the jaw tips below the hanger pin [m]; linear between table rows, constant beyond them."""
+    """Compute the depth of the jaw tips below the hanger pin [m]; linear between table rows, constant beyond them."""
     return _interpolate(jaws.angle_rad, jaws.tip_below_pin_m, jaw_rad)
 
 
 def half_gap_m(jaws: JawTable, jaw_rad: float) -> float:
-    """Half the distance between the jaw tips [m]; negative when the jaws overlap."""
+    """Compute half the distance between the jaw tips [m]; negative when the jaws overlap."""
     return _interpolate(jaws.angle_rad, jaws.half_gap_m, jaw_rad)
 
 
 def lowest_tip_below_pin_m(jaws: JawTable) -> float:
-    """The greatest depth of the tips while closing [m]: the clearance that a closing grapple needs."""
+    """Return the greatest depth of the tips while closing [m]: the clearance that a closing grapple needs."""
     return max(jaws.tip_below_pin_m)
 
 
 def lowest_pin_m(profile: Profile) -> float:
-    """Height of the hanger pin [m] below which no work brings it: its grapple would be in the ground.
+    """Compute the height of the hanger pin [m] below which no work brings it: its grapple would be in the ground.
 
     On a fixed base that of the open grapple, which stands on the ground to grasp what lies there.  Under a carrier the
     ground is deeper by what its frame is raised; there it is that of the shortest grapple, closed and empty.
@@ -86,12 +86,12 @@ def lowest_pin_m(profile: Profile) -> float:
 
 
 def jaw_angle_from_opening_pct(jaws: JawTable, opening_pct: float) -> float:
-    """Jaw angle [rad] for the opening reported on the bus (100 = fully open, 0 = closed); clipped to that range."""
+    """Compute the jaw angle [rad] for the opening on the bus (100 = fully open, 0 = closed); clipped to that range."""
     return (1.0 - min(max(opening_pct, 0.0), 100.0) / 100.0) * jaws.angle_rad[-1]
 
 
 def opening_pct_from_jaw_angle(jaws: JawTable, jaw_rad: float) -> float:
-    """The inverse of ``jaw_angle_from_opening_pct``."""
+    """Compute the inverse of ``jaw_angle_from_opening_pct``."""
     return 100.0 * (1.0 - min(max(jaw_rad / jaws.angle_rad[-1], 0.0), 1.0))
 
 

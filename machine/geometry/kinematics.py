@@ -62,13 +62,13 @@ class ChainPoints(NamedTuple):
 
 
 def _stick_vector(kin: Kinematics, phi: float, reach_m: float) -> tuple[float, float]:
-    """Stick pin to a point ``reach_m`` along the telescope axis, (r, z); ``phi``: angle of DH axis x3."""
+    """Compute (r, z) from stick pin to a point ``reach_m`` along the telescope axis; ``phi``: angle of DH axis x3."""
     c, s = cos(phi), sin(phi)
     return kin.a3_m * c + reach_m * s, kin.a3_m * s - reach_m * c
 
 
 def _boom_vector(kin: Kinematics, lift: float) -> tuple[float, float]:
-    """Boom pin to stick pin, (r, z)."""
+    """Compute the vector from boom pin to stick pin, (r, z)."""
     phi = lift + kin.theta2_offset_rad
     return kin.a2_m * cos(phi), kin.a2_m * sin(phi)
 
@@ -83,14 +83,14 @@ def _turn(kin: Kinematics, slew: float, r: float, z: float) -> Point:
 
 
 def pin_position(kin: Kinematics, q: Sequence[float]) -> Point:
-    """Hanger pin (x, y, z) in m for ``q`` (at least four elements)."""
+    """Compute the hanger pin (x, y, z) in m for ``q`` (at least four elements)."""
     boom_r, boom_z = _boom_vector(kin, q[Joint.LIFT])
     stick_r, stick_z = _stick_vector(kin, _phi3(kin, q), kin.d4_m + q[Joint.EXT])
     return _turn(kin, q[Joint.SLEW], kin.a1_m + boom_r + stick_r, kin.d1_m + boom_z + stick_z)
 
 
 def chain_points(kin: Kinematics, q: Sequence[float]) -> ChainPoints:
-    """Points of the crane for drawing.
+    """List the points of the crane for drawing.
 
     ``telescope_front`` is where the pin is at extension 0, so the moving part shows its full extension.
     """
@@ -112,7 +112,7 @@ def chain_points(kin: Kinematics, q: Sequence[float]) -> ChainPoints:
 
 
 def jacobian(kin: Kinematics, q: Sequence[float]) -> tuple[tuple[float, float, float, float], ...]:
-    """Derivative of the pin with respect to (slew, lift, tilt, ext): three rows x, y, z [m/rad, m/m]."""
+    """Compute the derivative of the pin with respect to (slew, lift, tilt, ext): three rows x, y, z [m/rad, m/m]."""
     theta, phi = q[Joint.SLEW] + kin.theta1_offset_rad, _phi3(kin, q)
     ct, st = cos(theta), sin(theta)
     boom_r, boom_z = _boom_vector(kin, q[Joint.LIFT])
@@ -127,7 +127,7 @@ def jacobian(kin: Kinematics, q: Sequence[float]) -> tuple[tuple[float, float, f
 
 
 def max_reach_m(profile: Profile) -> float:
-    """Greatest distance of the pin from the slew axis, with the arm straight and level [m]."""
+    """Compute the greatest distance of the pin from the slew axis, with the arm straight and level [m]."""
     kin = profile.kinematics
     return kin.a1_m + kin.a2_m + hypot(kin.a3_m, kin.d4_m + joint_limits(profile)[Joint.EXT][1])
 
@@ -147,14 +147,14 @@ def _target(kin: Kinematics, x: float, y: float, z: float) -> _Target:
 
 
 def _closes(kin: Kinematics, target: _Target, ext_m: float) -> bool:
-    """Whether boom and stick span the distance with this extension."""
+    """Tell whether boom and stick span the distance with this extension."""
     stick = hypot(kin.a3_m, kin.d4_m + ext_m)
     d = target.distance_m
     return d > 0.0 and abs(kin.a2_m - stick) - _CLOSE_SLACK_M <= d <= kin.a2_m + stick + _CLOSE_SLACK_M
 
 
 def _boom_and_stick(kin: Kinematics, target: _Target, ext_m: float) -> tuple[float, float]:
-    """Lift and tilt (elbow up) for an extension whose triangle closes; joint limits are not checked."""
+    """Compute lift and tilt (elbow up) for an extension whose triangle closes; joint limits are not checked."""
     d, boom, length = target.distance_m, kin.a2_m, kin.d4_m + ext_m
     stick = hypot(kin.a3_m, length)
     # Both angles from one area (Heron), so that they agree to rounding even where the arm is straight.
@@ -191,7 +191,7 @@ def _boom_obstacle(lift: float, tilt: float, limits: Limits) -> Obstacle | None:
 
 
 def _distance_obstacle(kin: Kinematics, target: _Target, shortest: float, longest: float) -> Obstacle:
-    """Why no extension in between closes the triangle; distances along the line from boom pin to point."""
+    """Tell why no extension in between closes the triangle; distances along the line from boom pin to point."""
     far = kin.a2_m + hypot(kin.a3_m, kin.d4_m + longest)
     if target.distance_m > far:
         return "reach.too-far", f"too far by {target.distance_m - far:.2f} m"
@@ -206,7 +206,7 @@ def _unreachable(x: float, y: float, z: float, obstacle: Obstacle) -> Unreachabl
 
 
 def inverse(kin: Kinematics, limits: Limits, x: float, y: float, z: float, ext_m: float) -> tuple[float, float, float]:
-    """Slew, lift and tilt in rad, elbow up, that bring the pin to a point with the given extension.
+    """Compute slew, lift and tilt in rad, elbow up, that bring the pin to a point with the given extension.
 
     ``limits`` is indexed by ``Joint`` (``machine.profile.joint_limits``).  The arm points toward the point; poses
     folded back behind the mast are not produced.
@@ -231,7 +231,7 @@ def inverse(kin: Kinematics, limits: Limits, x: float, y: float, z: float, ext_m
 
 
 def _breakpoints(kin: Kinematics, limits: Limits, target: _Target) -> list[float]:
-    """Every extension inside the telescope's range at which a limit can begin or cease to hold, sorted.
+    """List every extension inside the telescope's range at which a limit can begin or cease to hold, sorted.
 
     Between two neighbours nothing changes, so one test in the middle decides the whole interval.
     """
@@ -258,18 +258,18 @@ def _fits(kin: Kinematics, limits: Limits, target: _Target, ext_m: float) -> boo
 
 def _intervals(kin: Kinematics, limits: Limits, target: _Target) -> list[tuple[float, float]]:
     points = _breakpoints(kin, limits, target)
-    found: list[tuple[float, float]] = []
+    intervals: list[tuple[float, float]] = []
     for low, high in pairwise(points):
         if _fits(kin, limits, target, 0.5 * (low + high)):
-            if found and found[-1][1] == low:
-                low = found.pop()[0]
-            found.append((low, high))
+            if intervals and intervals[-1][1] == low:
+                low = intervals.pop()[0]
+            intervals.append((low, high))
     # A point on the edge of the work space is reached by one extension only.
-    return found or [(e, e) for e in points if _fits(kin, limits, target, e)]
+    return intervals or [(e, e) for e in points if _fits(kin, limits, target, e)]
 
 
 def reachable_extensions(profile: Profile, x: float, y: float, z: float) -> tuple[tuple[float, float], ...]:
-    """Intervals of the extension [m] with which the point is reached inside all limits; may be empty."""
+    """Find the intervals of the extension [m] with which the point is reached inside all limits; may be empty."""
     limits = joint_limits(profile)
     target = _target(profile.kinematics, x, y, z)
     if _slew_obstacle(target.slew, limits):
@@ -278,7 +278,7 @@ def reachable_extensions(profile: Profile, x: float, y: float, z: float) -> tupl
 
 
 def _comfortable(kin: Kinematics, limits: Limits) -> list[tuple[float, float]]:
-    """The limits less ``STOP_MARGIN_SHARE``, and the stick at least ``MIN_BEND_RAD`` off the straight arm."""
+    """Return the limits less ``STOP_MARGIN_SHARE``, and the stick at least ``MIN_BEND_RAD`` off the straight arm."""
     inner = [(low + STOP_MARGIN_SHARE * (high - low), high - STOP_MARGIN_SHARE * (high - low)) for low, high in limits]
     straight = atan2(kin.d4_m + limits[Joint.EXT][0], kin.a3_m) - kin.theta3_offset_rad
     folded, stretched = inner[Joint.TILT]
@@ -287,12 +287,12 @@ def _comfortable(kin: Kinematics, limits: Limits) -> list[tuple[float, float]]:
 
 
 def _least(cost: Callable[[float], float], low: float, high: float, n: int = 24) -> tuple[float, float]:
-    """(cost, argument) of the minimum on an interval: golden section around each low point of a grid."""
+    """Find the (cost, argument) of the minimum on an interval: golden section around each low point of a grid."""
     step = (high - low) / n
     costs = [cost(low + i * step) for i in range(n + 1)]
-    found = []
-    for i, here in enumerate(costs):
-        if here > min(costs[max(0, i - 1) : i + 2]):
+    minima = []
+    for i, grid_cost in enumerate(costs):
+        if grid_cost > min(costs[max(0, i - 1) : i + 2]):
             continue
         a, b = max(low, low + (i - 1) * step), min(high, low + (i + 1) * step)
         while b - a > 1e-8:
@@ -302,14 +302,14 @@ def _least(cost: Callable[[float], float], low: float, high: float, n: int = 24)
             else:
                 a = left
         middle = 0.5 * (a + b)
-        found += [(here, low + i * step), (cost(middle), middle)]
-    return min(found)
+        minima += [(grid_cost, low + i * step), (cost(middle), middle)]
+    return min(minima)
 
 
 def solve(
     profile: Profile, x: float, y: float, z: float, preference: float | Sequence[float] | None = None
 ) -> tuple[float, float, float, float]:
-    """Slew, lift, tilt [rad] and extension [m] that bring the pin to a point; ``preference`` resolves the redundancy.
+    """Find slew, lift, tilt [rad] and extension [m] for the pin at a point; ``preference`` resolves the redundancy.
 
     A number is a preferred extension (the nearest feasible one is used); a joint vector is the present pose (shortest
     travel time at the profile's speed limits); None keeps the joints farthest from their stops.  Poses near a stop or
@@ -350,7 +350,7 @@ def solve(
 
 
 def _nearest_obstacle(kin: Kinematics, limits: Limits, target: _Target) -> Obstacle:
-    """The obstacle at the extension that violates the limits least."""
+    """Find the obstacle at the extension that violates the limits least."""
     low, high = limits[Joint.EXT]
     reasons: list[tuple[float, Obstacle]] = []
     for i in range(21):

@@ -30,7 +30,7 @@ class LinkFrame(NamedTuple):
 
 
 def link_frames(profile: Profile, q: Sequence[float]) -> tuple[LinkFrame, ...]:
-    """The frames at joint positions in ``Joint`` order [rad, m]; those that depend on an unknown joint are left out."""
+    """Compute the frames at joint positions in ``Joint`` order [rad, m], without those that need an unknown joint."""
     if not all(map(isfinite, q[: Joint.ROT])):
         return ()
     kin = profile.kinematics

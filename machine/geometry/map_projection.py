@@ -23,7 +23,7 @@ class MapProjection:
         self._scale = (0.0, 0.0)
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> Metres:
-        """East and north of the origin."""
+        """Compute east and north of the origin."""
         if self._origin is None:
             s = math.sin(math.radians(latitude_deg))
             across = _A_M / math.sqrt(1.0 - _E2 * s * s)

@@ -34,7 +34,7 @@ class Intrinsics:
     cy_px: float
 
     def scaled(self, factor: float) -> Intrinsics:
-        """The same view sampled with ``factor`` times the pixels along each side (sizes rounded)."""
+        """Return the same view sampled with ``factor`` times the pixels along each side (sizes rounded)."""
         return Intrinsics(
             round(self.width_px * factor),
             round(self.height_px * factor),
@@ -45,29 +45,29 @@ class Intrinsics:
         )
 
     def crop(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Intrinsics:
-        """A window of this picture; it may extend beyond the picture (a negative left or top pads)."""
+        """Cut a window of this picture; it may extend beyond the picture (a negative left or top pads)."""
         return Intrinsics(width_px, height_px, self.fx_px, self.fy_px, self.cx_px - left_px, self.cy_px - top_px)
 
     def square(self, size_px: int) -> Intrinsics:
-        """The largest centred square, rendered directly at ``size_px``."""
+        """Cut the largest centred square, rendered directly at ``size_px``."""
         side = min(self.width_px, self.height_px)
         window = self.crop((self.width_px - side) // 2, (self.height_px - side) // 2, side, side)
         return window.scaled(size_px / side)
 
     def letterbox(self, size_px: int) -> Letterbox:
-        """Paper B 3.2.2: the whole view inside a square of ``size_px``, padded with black bars."""
+        """Fit, as paper B 3.2.2, the whole view inside a square of ``size_px``, padded with black bars."""
         inner = self.scaled(size_px / max(self.width_px, self.height_px))
         left, top = (size_px - inner.width_px) // 2, (size_px - inner.height_px) // 2
         return Letterbox(inner.crop(-left, -top, size_px, size_px), inner, left, top)
 
     def project(self, points_m: Array) -> Array:
-        """Pixels (N, 2) of optical-frame points (N, 3) [m] with positive z."""
+        """Compute the pixels (N, 2) of optical-frame points (N, 3) [m] with positive z."""
         z = points_m[:, 2]
         u = points_m[:, 0] / z * self.fx_px + self.cx_px
         return np.stack([u, points_m[:, 1] / z * self.fy_px + self.cy_px], axis=1)
 
     def deproject(self, u_px: float, v_px: float, z_m: float) -> Array:
-        """Optical-frame point (3,) [m] of a pixel at depth ``z_m``."""
+        """Compute the optical-frame point (3,) [m] of a pixel at depth ``z_m``."""
         return np.array([(u_px - self.cx_px) / self.fx_px * z_m, (v_px - self.cy_px) / self.fy_px * z_m, z_m])
 
 
@@ -81,7 +81,7 @@ class Letterbox:
     top_px: int
 
     def pad(self, picture: Array, fill: float) -> Array:
-        """The square with ``picture`` of the inner size in it and ``fill`` in the bars."""
+        """Make the square with ``picture`` of the inner size in it and ``fill`` in the bars."""
         square = np.full((self.outer.height_px, self.outer.width_px, *picture.shape[2:]), fill, picture.dtype)
         rows = slice(self.top_px, self.top_px + self.inner.height_px)
         square[rows, self.left_px : self.left_px + self.inner.width_px] = picture
@@ -89,19 +89,19 @@ class Letterbox:
 
 
 def intrinsics(camera: Camera) -> Intrinsics:
-    """The pinhole of a profile's camera."""
+    """Return the pinhole of a profile's camera."""
     c = camera
     return Intrinsics(c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px)
 
 
 def pinhole(width_px: int, height_px: int, hfov_rad: float) -> Intrinsics:
-    """A centred pinhole with square pixels and a horizontal field of view."""
+    """Make a centred pinhole with square pixels and a horizontal field of view."""
     f = width_px / 2 / math.tan(hfov_rad / 2)
     return Intrinsics(width_px, height_px, f, f, (width_px - 1) / 2, (height_px - 1) / 2)
 
 
 def rpy_matrix(rpy_rad: Sequence[float]) -> Array:
-    """Rotation matrix (3, 3) of roll, pitch, yaw about the fixed axes x, then y, then z."""
+    """Compute the rotation matrix (3, 3) of roll, pitch, yaw about the fixed axes x, then y, then z."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad), np.sin(rpy_rad)
     return np.array(
         [

@@ -31,12 +31,12 @@ MAX_AIM_ITERATIONS: Final = 12
 
 
 def plausible_load_kg(load_kg: float) -> float:
-    """A reported load for use by a planner: 0 if it is unknown (NaN), negative or implausibly high."""
+    """Return a reported load for use by a planner: 0 if it is unknown (NaN), negative or implausibly high."""
     return load_kg if isfinite(load_kg) and 0.0 <= load_kg <= MAX_LOAD_KG else 0.0
 
 
 def distances(kin: Kinematics, q: Sequence[float]) -> tuple[float, float, float]:
-    """Distances of stick pin and hanger pin from the slew axis and the hanger pin's height, without sag [m]."""
+    """Compute stick pin's and hanger pin's distances from the slew axis and hanger pin's height, without sag [m]."""
     x, y, z = pin_position(kin, q)
     theta = q[Joint.SLEW] + kin.theta1_offset_rad
     head = kin.a1_m + kin.a2_m * cos(q[Joint.LIFT] + kin.theta2_offset_rad)
@@ -55,7 +55,7 @@ def _lean(sag: Sag, head: float, pin: float, load_kg: float) -> float:
 
 
 def true_pin(sag: Sag | None, kin: Kinematics, q: Sequence[float], load_kg: float = 0.0) -> Point:
-    """The hanger pin with the column leaning [m]."""
+    """Compute the hanger pin with the column leaning [m]."""
     if sag is None:
         return pin_position(kin, q)
     head, r, z = distances(kin, q)
@@ -76,7 +76,7 @@ def aim(
     ext_m: float,
     load_kg: float = 0.0,
 ) -> tuple[float, float, float]:
-    """Slew, lift and tilt that bring the true pin to a point with the given extension; `kinematics.inverse` with sag.
+    """Find slew, lift and tilt for the true pin at a point with the given extension; `kinematics.inverse` with sag.
 
     Raises:
         Unreachable: the sentence names the point that the crane without sag would have to reach.
@@ -98,7 +98,7 @@ def aim_free(
     preference: float | Sequence[float] | None = None,
     load_kg: float = 0.0,
 ) -> tuple[float, float, float, float]:
-    """Slew, lift, tilt and extension that bring the true pin to a point; `kinematics.solve` with the profile's sag.
+    """Find slew, lift, tilt and extension for the true pin at a point; `kinematics.solve` with the profile's sag.
 
     Raises:
         Unreachable: no joint position inside the limits reaches the point.
@@ -122,7 +122,7 @@ def _iterate(
     z: float,
     load_kg: float,
 ) -> tuple[float, float, float, float]:
-    """Joints for the point that lies above the requested one by as much as the crane sags: fixed-point iteration."""
+    """Find the joints for the point as far above the requested one as the crane sags: fixed-point iteration."""
     up = (0.0, 0.0, 0.0)
     for _ in range(MAX_AIM_ITERATIONS):
         q = joints(x + up[0], y + up[1], z + up[2])

@@ -68,10 +68,10 @@ _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
 
 def problems_of(profile: Profile) -> list[Problem]:
-    """Every problem of the values of a profile."""
+    """List every problem of the values of a profile."""
     problems = [*out_of_range(profile, ""), *_top_level_problems(profile)]
-    for which in Joint:
-        problems += _joint_problems(which, joint(profile, which))
+    for axis in Joint:
+        problems += _joint_problems(axis, joint(profile, axis))
     problems += _duplicates(profile)
     problems += _grapple_problems(profile)
     for name, camera in profile.cameras.items():
@@ -154,7 +154,7 @@ def _valve_problems(path: str, spec: JointSpec, speed: Range) -> Iterator[Proble
 
 
 def _side_problems(path: str, valve: Valve | CarrierValve, key: str, limit: float, speed: Range) -> Iterator[Problem]:
-    """Checks dead band and full speed of both sides of a valve whose function must reach ``limit`` (its ``key``)."""
+    """Check dead band and full speed of both sides of a valve whose function must reach ``limit`` (its ``key``)."""
     for side in ("plus", "minus"):
         deadband = getattr(valve, f"deadband_{side}_pct")
         if not 0.0 <= deadband < MAX_DEADBAND_PCT:
@@ -219,19 +219,19 @@ def _encoder_problems(
 
 
 def _duplicates(profile: Profile) -> Iterator[Problem]:
-    seen: dict[tuple[str, object], str] = {}
-    for which in Joint:
-        name, spec = which.name.lower(), joint(profile, which)
+    user_names: dict[tuple[str, object], str] = {}
+    for axis in Joint:
+        name, spec = axis.name.lower(), joint(profile, axis)
         used: list[tuple[str, object]] = [("valve.signal", spec.valve.signal)]
         if spec.encoder is not None:
             used += [("encoder.node", spec.encoder.node), ("encoder.message", spec.encoder.message)]
         for key, value in used:
-            other = seen.setdefault((key, value), name)
+            other = user_names.setdefault((key, value), name)
             if other != name:
                 yield _used_twice(f"joints.{name}.{key}", value, f"joints.{other}.{key}", "each joint")
     node = None if profile.carrier is None else profile.carrier.articulation_encoder.node
-    if ("encoder.node", node) in seen:
-        other = seen["encoder.node", node]
+    if ("encoder.node", node) in user_names:
+        other = user_names["encoder.node", node]
         yield _used_twice(f"{_STEERING_ENCODER}.node", node, f"joints.{other}.encoder.node", "each encoder")
 
 
@@ -312,7 +312,7 @@ def _carrier_problems(profile: Profile, carrier: Carrier) -> Iterator[Problem]:
 
 
 def _suspension_problems(path: str, carrier: Carrier) -> Iterator[Problem]:
-    """Checks the geometry of swing arms and turning circle."""
+    """Check the geometry of swing arms and turning circle."""
     low, high = carrier.arm_drop_low_m, carrier.arm_drop_low_m + carrier.arm_travel_m
     most = MAX_ARM_DROP_SHARE * carrier.arm_length_m
     if max(abs(low), abs(high)) > most:
@@ -338,7 +338,7 @@ def _suspension_problems(path: str, carrier: Carrier) -> Iterator[Problem]:
 
 
 def _sag_problems(profile: Profile, sag: Sag) -> Iterator[Problem]:
-    """Checks that the compliant column is still a column at the farthest reach of the boom."""
+    """Check that the compliant column is still a column at the farthest reach of the boom."""
     kin = profile.kinematics
     head, pin = kin.a1_m + kin.a2_m, max_reach_m(profile)
     lean = sag.head_rad_m * head + sag.pin_rad_m * pin - sag.rest_rad
@@ -354,13 +354,13 @@ def _sag_problems(profile: Profile, sag: Sag) -> Iterator[Problem]:
 
 
 def _reach_problems(profile: Profile) -> Iterator[Problem]:
-    """Checks that the arm reaches its work places; only meaningful for an otherwise sound profile."""
+    """Check that the arm reaches its work places; only meaningful for an otherwise sound profile."""
     reach = max_reach_m(profile)
-    places = {
+    centers_m = {
         "bunk.center_m": profile.bunk.center_m,
         "workspace.pick_center_m": profile.workspace.pick_center_m,
     }
-    for key, place in places.items():
-        if hypot(*place) > reach:
-            text = f"{hypot(*place):.2f} m from the slew axis; the crane reaches {reach:.2f} m"
+    for key, center_m in centers_m.items():
+        if hypot(*center_m) > reach:
+            text = f"{hypot(*center_m):.2f} m from the slew axis; the crane reaches {reach:.2f} m"
             yield Problem("profile.out-of-reach", key, text)

@@ -44,12 +44,12 @@ class ProfileError(TimberhandError, ValueError):
 
 
 def shipped_profiles() -> tuple[str, ...]:
-    """Names of the profiles that come with the package."""
+    """List the names of the profiles that come with the package."""
     return tuple(sorted(path.stem for path in SHIPPED_FOLDER.glob("*.toml") if "." not in path.stem))  # no envelopes
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
-    """The checked profile of a shipped name (``"palms_471"``) or of a TOML file; raises ``ProfileError``."""
+    """Load and check the profile of a shipped name (``"palms_471"``) or of a TOML file; raises ``ProfileError``."""
     path = profile_file(name_or_path)
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -84,7 +84,7 @@ def _lines(path: Path, problems: Sequence[Problem]) -> str:
 
 
 def profile_hash(profile: Profile) -> int:
-    """CRC-32 of the canonical content; datagrams carry it to prove that both ends use the same profile.
+    """Compute the CRC-32 of the canonical content; datagrams carry it to prove that both ends use the same profile.
 
     Comments, order and layout of the file do not count; every value does.  Missing sections that came later do not
     count, nor does a later value's default, so that a machine without them keeps the hash of its recordings.
@@ -96,7 +96,7 @@ def profile_hash(profile: Profile) -> int:
 
 
 def profile_check(name_or_path: str | Path) -> int:
-    """CRC-32 of a profile's file, its lower 24 bits, by which the guard knows it; OSError, ``ProfileError``.
+    """Compute the CRC-32 of a profile's file, lower 24 bits, by which the guard knows it; OSError, ``ProfileError``.
 
     The guard does not read a profile as others do, so it knows the bytes alone: comments count.
     """
@@ -104,7 +104,7 @@ def profile_check(name_or_path: str | Path) -> int:
 
 
 def profile_file(name_or_path: str | Path) -> Path:
-    """The file of a shipped name or of a path; raises ``ProfileError`` for an unknown name."""
+    """Find the file of a shipped name or of a path; raises ``ProfileError`` for an unknown name."""
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml"):
         return Path(name_or_path)

@@ -192,7 +192,7 @@ _SLIPS: Final = {
 
 
 def out_of_range(struct: msgspec.Struct, path: str) -> Iterator[Problem]:
-    """The problem of every number that its table refuses, of a profile or of a part at the key path ``path``."""
+    """Report every number that its table refuses, of a profile or of a part at the key path ``path``."""
     ranges = _RANGES.get(type(struct), {})
     for name, key in zip(struct.__struct_fields__, struct.__struct_encode_fields__, strict=True):
         value: Any = getattr(struct, name)
@@ -215,7 +215,7 @@ def _check_all(path: str, value: Any, allowed: Range) -> Iterator[Problem]:
 
 
 def check_range(path: str, value: float, allowed: Range) -> Iterator[Problem]:
-    """The problem of a number outside ``allowed``; the sentence suggests the unit that may have been meant."""
+    """Report a number outside ``allowed``; the sentence suggests the unit that may have been meant."""
     low, high, unit = allowed
     if low <= value <= high:
         return

@@ -46,13 +46,13 @@ _JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 
 
 def did_you_mean(word: str, known: tuple[str, ...]) -> str:
-    """The end of a sentence with the known word that is nearest, empty without one."""
+    """Write the end of a sentence with the known word that is nearest, empty without one."""
     close = get_close_matches(word, known, 1)
     return f'; did you mean "{close[0]}"?' if close else ""
 
 
 def build(kind: Any, value: Any, path: str, problems: list[Problem]) -> Any:
-    """``value`` converted to ``kind``; adds every mismatch to ``problems`` with its full key path."""
+    """Convert ``value`` to ``kind``; adds every mismatch to ``problems`` with its full key path."""
     if get_origin(kind) is types.UnionType:  # T | None, where an absent key means None
         kind = next(k for k in get_args(kind) if k is not types.NoneType)
     if get_origin(kind) is dict:
@@ -78,7 +78,7 @@ def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: l
     if not isinstance(value, dict):
         problems.append(Problem("profile.not-a-table", path, f"must be a table, found {value!r}"))
         return None
-    found = len(problems)
+    problems_before = len(problems)
     dot = f"{path}." if path else ""
     fields = msgspec.structs.fields(kind)
     names = tuple(field.encode_name for field in fields)
@@ -94,11 +94,11 @@ def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: l
     keys = {f.encode_name: f for f in fields if f.encode_name in value}
     parts = {f.name: build(f.type, value[key], dot + key, problems) for key, f in keys.items()}
     parts |= {f.name: None for f in absent if f.required}
-    return kind(**parts) if len(problems) == found else None
+    return kind(**parts) if len(problems) == problems_before else None
 
 
 def _build_table(kind: Any, value: Any, path: str, problems: list[Problem]) -> dict[str, Any]:
-    """A table of named things, in the order of the file; the joints are a fixed set in chain order."""
+    """Build a table of named things, in the order of the file; the joints are a fixed set in chain order."""
     thing = path.removesuffix("s")
     if not isinstance(value, dict):
         problems.append(Problem("profile.not-a-table", path, f"must be a table of {path}, found {value!r}"))

@@ -140,7 +140,7 @@ EVIDENCE: Final[dict[Reason, Measurement]] = {
 
 
 def quantities(reason: Reason, detail: int, numbers: Sequence[float | None]) -> tuple[Quantity, ...]:
-    """The numbers of a reason that are known, with names and units; none for a reason without an entry."""
+    """List the numbers of a reason that are known, with names and units; none for a reason without an entry."""
     measured = EVIDENCE.get(reason)
     if measured is None:
         return ()

@@ -37,7 +37,7 @@ class StopDetector:
         self._before = "unknown"
 
     def step(self, mode: int, reason: int) -> str | None:
-        """The mode before a stop that begins with this report; None when none begins.
+        """Return the mode before a stop that begins with this report; None when none begins.
 
         A machine that is stopped already in the first report has stopped before it: no stop begins.
         """
@@ -77,7 +77,7 @@ class Explanation:
 
 
 def explain(reason: int, numbers: Sequence[float | None] = ()) -> Explanation:
-    """The explanation of a reason with its detail in bits 8 to 15, as ``StateReport.reason`` carries them.
+    """Explain a reason with its detail in bits 8 to 15, as ``StateReport.reason`` carries them.
 
     Raises:
         ValueError: this release does not know the reason.
@@ -86,22 +86,22 @@ def explain(reason: int, numbers: Sequence[float | None] = ()) -> Explanation:
     fault = FAULTS[known]
     part = part_of(fault.about, detail)
     sentence = fault.sentence.format(part).rstrip(".")
-    found = quantities(known, detail, numbers)
-    return Explanation(known.name, f"{sentence[0].upper()}{sentence[1:]}.", found, fault.advice, part)
+    evidence = quantities(known, detail, numbers)
+    return Explanation(known.name, f"{sentence[0].upper()}{sentence[1:]}.", evidence, fault.advice, part)
 
 
 def describe(reason: int, detail: int = 0, numbers: Sequence[float | None] = ()) -> str:
-    """`Explanation.text` of a reason; ``reason`` may carry its detail in bits 8 to 15."""
+    """Return `Explanation.text` of a reason; ``reason`` may carry its detail in bits 8 to 15."""
     return explain(reason & 0xFF | (detail or reason >> 8) << 8, numbers).text
 
 
 def sentence_of(reason: Reason, detail: int = 0) -> str:
-    """The operator's sentence without its full stop."""
+    """Return the operator's sentence without its full stop."""
     return explain(reason | detail << 8).sentence[:-1]
 
 
 def part_of(about: DetailKind, detail: int) -> str:
-    """The part that a detail names; empty when it names none."""
+    """Name the part of a detail; empty when it names none."""
     match about:
         case DetailKind.JOINT:
             if detail < len(JOINTS):
@@ -118,12 +118,12 @@ def part_of(about: DetailKind, detail: int) -> str:
 
 
 def message_id(reason: Reason) -> str:
-    """The MESSAGE_ID of a reason in the journal: 32 hexadecimal digits."""
+    """Return the MESSAGE_ID of a reason in the journal: 32 hexadecimal digits."""
     return uuid.uuid5(_NAMESPACE, reason.name).hex
 
 
 def priority(reason: Reason) -> int:
-    """How serious a stop is, as a priority of syslog."""
+    """Tell how serious a stop is, as a priority of syslog."""
     if reason in _BY_A_PERSON:
         return NOTICE
     return ERROR if FAULTS[reason].reaction >= Reaction.RAMP else WARNING

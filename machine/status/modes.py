@@ -24,5 +24,5 @@ STOPPED: Final = (Mode.STOP, Mode.FAULT)
 
 
 def mode_name(mode: int) -> str:
-    """The name of a mode, also of one of another release."""
+    """Return the name of a mode, also of one of another release."""
     return Mode(mode).name if mode in set(Mode) else f"MODE {mode}"

@@ -193,10 +193,10 @@ class Fault(NamedTuple):
 
 
 def pack(reason: Reason, detail: int) -> int:
-    """Reason and detail as one 16-bit number, as ``StateReport`` carries them."""
+    """Pack reason and detail as one 16-bit number, as ``StateReport`` carries them."""
     return reason | detail << 8
 
 
 def known(reason: int) -> Reason | None:
-    """The reason without its detail; None for one of another release."""
+    """Return the reason without its detail; None for one of another release."""
     return Reason(reason & 0xFF) if reason & 0xFF in set(Reason) else None

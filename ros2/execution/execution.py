@@ -70,7 +70,7 @@ class MotionCheck:
                 )
 
     def _check_setpoints(self, motion: Motion) -> None:
-        """Raises GoalRefused."""
+        """Check the setpoints of a motion, one window after the other; raise GoalRefused."""
         window_s = _KNOTS * PERIOD_NS * 1e-9
         for window in range(int(motion.duration_s / window_s) + 1):
             begin_s = window * window_s
@@ -85,7 +85,7 @@ class MotionCheck:
                 ) from None
 
     def _check_window(self, motion: Motion, begin_s: float) -> None:
-        """Raises RequestRefused."""
+        """Check the setpoint of the window that begins at ``begin_s``; raise RequestRefused."""
         knots = tuple(Knot(i * PERIOD_NS, *motion.at(begin_s + i * PERIOD_NS * 1e-9)) for i in range(_KNOTS + 1))
         final = begin_s + _KNOTS * PERIOD_NS * 1e-9 >= motion.duration_s
         setpoint = CraneSetpoint(0, 0, 0, 0, GrappleCommand.NEUTRAL, final, knots)
@@ -186,7 +186,7 @@ class TrajectoryExecution:
             self._run.ending = outcome
 
     def step(self, now_ns: int, report: StateReport | None) -> tuple[bytes | None, Outcome | None]:
-        """The setpoint to send now, and the outcome when the goal has ended."""
+        """Return the setpoint to send now, and the outcome when the goal has ended."""
         self._inbox.accept(now_ns, report, ())
         run, tracker = self._run, self._tracker
         if run is None or tracker is None:
@@ -211,7 +211,7 @@ class TrajectoryExecution:
         return self._stream.datagram(now_ns, tracker.motion, tracker.clock_s, command, tracker.announce()), None
 
     def progress(self) -> Progress | None:
-        """Where the goal is; None without one."""
+        """Return where the goal is; None without one."""
         run, tracker = self._run, self._tracker
         if run is None or tracker is None:
             return None
@@ -227,7 +227,7 @@ class TrajectoryExecution:
         )
 
     def _start(self, now_ns: int) -> Axes:
-        """Where a motion begins: at the reference that the crane follows, else where it is."""
+        """Return where a motion begins: at the reference that the crane follows, else where it is."""
         rest = (0.0,) * len(JOINTS)
         problem = self._inbox.blocked_reason(now_ns, rest)
         if problem is not None:
@@ -239,7 +239,7 @@ class TrajectoryExecution:
         return self._inbox.position([p if math.isfinite(p) else 0.0 for p in report.position])
 
     def _stopped(self, run: _Run, now_ns: int, setpoint: Axes) -> Outcome | None:
-        """The outcome when the controller executes nothing any more, or refuses what is sent."""
+        """Return the outcome when the controller executes nothing any more, or refuses what is sent."""
         problem = self._inbox.blocked_reason(now_ns, setpoint)
         report = self._inbox.report
         if problem is not None:
@@ -254,7 +254,7 @@ class TrajectoryExecution:
         return None
 
     def _judge(self, run: _Run, tracker: TrajectoryTracker, measured: Sequence[float], now_ns: int) -> None:
-        """Whether the crane leaves its path, has arrived, is too late, or holds."""
+        """Judge whether the crane leaves its path, has arrived, is too late, or holds."""
         if run.ending is None:
             self._judge_motion(run, tracker, measured, now_ns)
         if run.ending is not None and run.held_ns is None and (tracker.is_stopped or tracker.left_s <= 0.0):
@@ -263,23 +263,25 @@ class TrajectoryExecution:
     @staticmethod
     def _judge_motion(run: _Run, tracker: TrajectoryTracker, measured: Sequence[float], now_ns: int) -> None:
         errors = [w - p for w, p in zip(tracker.setpoint, measured, strict=True)]
-        if off := _sentence(errors, run.tolerances.path):
-            run.ending = Outcome(Status.ABORTED, ErrorCode.PATH_TOLERANCE_VIOLATED, f"{off} its path; the crane holds")
+        if path_error := _sentence(errors, run.tolerances.path):
+            run.ending = Outcome(
+                Status.ABORTED, ErrorCode.PATH_TOLERANCE_VIOLATED, f"{path_error} its path; the crane holds"
+            )
             return
         if tracker.left_s > 0.0:
             return
         if run.late_ns is None:
             run.late_ns = now_ns + round(min(run.tolerances.time_s, 1e9) * NS_PER_S)
-        far = _sentence(errors, run.tolerances.goal)
-        if not far:
+        goal_error = _sentence(errors, run.tolerances.goal)
+        if not goal_error:
             run.ending = Outcome(Status.SUCCEEDED, ErrorCode.SUCCESSFUL, "the crane has arrived")
         elif now_ns >= run.late_ns:
-            text = f"{far} its goal, {run.tolerances.time_s:.1f} s after the motion's end; the crane holds"
+            text = f"{goal_error} its goal, {run.tolerances.time_s:.1f} s after the motion's end; the crane holds"
             run.ending = Outcome(Status.ABORTED, ErrorCode.GOAL_TOLERANCE_VIOLATED, text)
 
 
 def _wait_ns(goal: Goal, wall_ns: int) -> int:
-    """Time until the goal's stamp; 0 without one."""
+    """Compute the time until the goal's stamp; 0 without one."""
     stamp_ns = nanoseconds(goal.trajectory.header.stamp)
     if stamp_ns == 0:
         return 0
@@ -299,11 +301,11 @@ def _wait_ns(goal: Goal, wall_ns: int) -> int:
 
 
 def _sentence(errors: Sequence[float], tolerance: Axes) -> str:
-    """The beginning of a sentence about the joint that is farthest beyond its tolerance; empty when none is."""
-    which = beyond(errors, tolerance)
-    if which is None:
+    """Begin a sentence about the joint that is farthest beyond its tolerance; empty when none is."""
+    worst_joint = beyond(errors, tolerance)
+    if worst_joint is None:
         return ""
-    return f"{which.name.lower()} is {abs(errors[which]):.3f} {unit_of(which)} from"
+    return f"{worst_joint.name.lower()} is {abs(errors[worst_joint]):.3f} {unit_of(worst_joint)} from"
 
 
 def _of(values: Sequence[float], joints: tuple[Joint, ...]) -> Axes:

@@ -42,7 +42,7 @@ class GoalMotion:
 
 
 def goal_motion(goal: Goal, start: Axes) -> GoalMotion:
-    """The motion of a goal from ``start`` (`Joint` order, rad, EXT m), where the crane is at rest.
+    """Compute the motion of a goal from ``start`` (`Joint` order, rad, EXT m), where the crane is at rest.
 
     Raises:
         GoalRefused: the goal is incomplete or contradictory, or does not begin at ``start``.
@@ -87,9 +87,11 @@ def _joints(goal: Goal) -> tuple[Joint, ...]:
     known = {j.name.lower(): j for j in JOINTS}
     wrong = sorted({name for name in names if name not in known or names.count(name) > 1})
     if wrong or not names:
-        what = f"the goal names {', '.join(map(repr, wrong))}" if wrong else "the goal names no joint"
+        fault = f"the goal names {', '.join(map(repr, wrong))}" if wrong else "the goal names no joint"
         raise GoalRefused(
-            "ros2.goal-joints", f"{what}; name each of these at most once: {', '.join(known)}", ErrorCode.INVALID_JOINTS
+            "ros2.goal-joints",
+            f"{fault}; name each of these at most once: {', '.join(known)}",
+            ErrorCode.INVALID_JOINTS,
         )
     return tuple(known[name] for name in names)
 
@@ -101,7 +103,7 @@ def _numbers(values: Sequence[float], count: int, what: str, point: int) -> list
 
 
 def _speeds(goal: Goal, count: int) -> np.ndarray | None:
-    """The velocities of all points (n, joints); None when the goal has none."""
+    """Return the velocities of all points (n, joints); None when the goal has none."""
     points = goal.trajectory.points
     if not any(len(p.velocities) for p in points):
         return None
@@ -127,14 +129,14 @@ def _check_start(first: np.ndarray, joints: tuple[Joint, ...], start: Axes) -> N
 
 
 def _accelerations(curve: CubicHermiteSpline) -> Axes:
-    """An acceleration is linear along each cubic, so its ends have the greatest."""
+    """Find the greatest accelerations: each is linear along a cubic, so its ends have the greatest."""
     cubic, square = curve.c[0], curve.c[1]
     ends = np.stack([2.0 * square, 6.0 * cubic * np.diff(curve.x)[:, None] + 2.0 * square])
     return tuple(np.max(np.abs(ends), axis=(0, 1)).tolist())
 
 
 def _sampled(curve: CubicHermiteSpline, end_s: float) -> Trajectory:
-    """The curve every `STEP_S`; the last sample is at rest at the end."""
+    """Sample the curve every `STEP_S`; the last sample is at rest at the end."""
     time = np.minimum(np.arange(math.ceil(end_s / STEP_S - _ROUNDING) + 1) * STEP_S, end_s)
     position, velocity = curve(time), curve(time, 1)
     velocity[0] = velocity[-1] = np.zeros(N_JOINTS)
@@ -142,7 +144,7 @@ def _sampled(curve: CubicHermiteSpline, end_s: float) -> Trajectory:
 
 
 def unit_of(j: Joint) -> str:
-    """The unit of a joint's position."""
+    """Return the unit of a joint's position."""
     return "m" if j is Joint.EXT else "rad"
 
 
@@ -182,7 +184,7 @@ class Tolerances:
 
 
 def tolerances_of(goal: Goal) -> Tolerances:
-    """The tolerances of a goal.
+    """Return the tolerances of a goal.
 
     Raises:
         GoalRefused: one is for an unknown joint, or for a velocity or an acceleration.
@@ -196,16 +198,16 @@ def tolerances_of(goal: Goal) -> Tolerances:
 
 
 def beyond(errors: Sequence[float], tolerance: Axes) -> Joint | None:
-    """The joint that is farthest beyond its tolerance, if any is."""
+    """Find the joint that is farthest beyond its tolerance, if any is."""
     share, worst = max((abs(error) / limit, j) for error, limit, j in zip(errors, tolerance, JOINTS, strict=True))
     return worst if share > 1.0 else None
 
 
 def _by_joint(given: Sequence[JointTolerance], default: Axes) -> Axes:
-    found = list(default)
+    joint_tolerances = list(default)
     for tolerance in given:
-        which = next((j for j in JOINTS if j.name.lower() == tolerance.name), None)
-        if which is None:
+        joint = next((j for j in JOINTS if j.name.lower() == tolerance.name), None)
+        if joint is None:
             raise GoalRefused(
                 "ros2.goal-tolerance",
                 f"a tolerance is for joint {tolerance.name!r}, which this crane does not have",
@@ -218,5 +220,5 @@ def _by_joint(given: Sequence[JointTolerance], default: Axes) -> Axes:
                 ErrorCode.INVALID_GOAL,
             )
         if tolerance.position != 0.0:
-            found[which] = tolerance.position if tolerance.position > 0.0 else math.inf
-    return tuple(found)
+            joint_tolerances[joint] = tolerance.position if tolerance.position > 0.0 else math.inf
+    return tuple(joint_tolerances)

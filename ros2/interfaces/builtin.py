@@ -91,15 +91,15 @@ class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
 
 
 def time_of(ns: int) -> Time:
-    """The message of a time in ns."""
+    """Make the message of a time in ns."""
     return Time(ns // NS_PER_S, ns % NS_PER_S)
 
 
 def duration_of(ns: int) -> Duration:
-    """The message of a duration in ns."""
+    """Make the message of a duration in ns."""
     return Duration(ns // NS_PER_S, ns % NS_PER_S)
 
 
 def nanoseconds(message: Time | Duration) -> int:
-    """The ns of a time or a duration."""
+    """Return the ns of a time or a duration."""
     return message.sec * NS_PER_S + message.nanosec

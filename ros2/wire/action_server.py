@@ -72,7 +72,7 @@ class Caller:
 
 
 def with_header(message: type[IdlStruct]) -> Any:
-    """The type that travels for ``message``: the number of the client, that of its call, and the message's fields.
+    """Make the type that travels for ``message``: numbers of the client and of its call, and the message's fields.
 
     It has the name of the message alone, because ``cdds_request_header_t`` is no part of the type.
     """
@@ -84,7 +84,7 @@ def with_header(message: type[IdlStruct]) -> Any:
 
 
 def fields_of(message: Any) -> dict[str, Any]:
-    """The fields of a message by name."""
+    """Return the fields of a message by name."""
     return {field.name: getattr(message, field.name) for field in fields(message)}
 
 
@@ -98,7 +98,7 @@ class ServiceServer(Generic[Request, Response]):
         self._writer = node.writer(f"rr/{name}Reply", self._reply_type, reliable(_DEPTH), identity)
 
     def requests(self) -> Iterator[tuple[Caller, Request]]:
-        """The requests that arrived since the last call."""
+        """Take the requests that arrived since the last call."""
         for sample in self._reader.take(MAX_REQUESTS):
             info = sample.sample_info
             if info.valid_data:
@@ -110,7 +110,7 @@ class ServiceServer(Generic[Request, Response]):
         send(self._writer, self._reply_type(caller.client, caller.call, **fields_of(response)))
 
     def callers(self) -> set[int]:
-        """The writers of the clients that are there."""
+        """Return the writers of the clients that are there."""
         return {handle & _64_BITS for handle in self._reader.get_matched_publications()}
 
 
@@ -153,7 +153,7 @@ class GoalTable:
         return True
 
     def get(self, goal_id: bytes) -> GoalRecord | None:
-        """A goal, None when it is unknown."""
+        """Return a goal, None when it is unknown."""
         return self._goals.get(goal_id)
 
     def finish(self, goal_id: bytes, status: Status, result: Result) -> None:
@@ -183,11 +183,11 @@ class GoalTable:
         return (CancelCode.NONE if named else CancelCode.REJECTED), named
 
     def info(self, goal_id: bytes) -> GoalInfo:
-        """The message that names a goal."""
+        """Make the message that names a goal."""
         return GoalInfo(UUID(goal_id), time_of(self._goals[goal_id].accepted_ns))
 
     def statuses(self) -> list[GoalStatus]:
-        """The status of every goal."""
+        """List the status of every goal."""
         return [GoalStatus(self.info(name), goal.status) for name, goal in self._goals.items()]
 
 
@@ -229,24 +229,24 @@ class ActionServer:
     def step(self, wall_ns: int) -> tuple[list[NewGoal], list[bytes]]:
         """Answer what has arrived; returns the goals to begin and those to cancel."""
         begun, cancelled = [], []
-        for caller, asked in self._send_goal.requests():
-            goal_id = bytes(asked.goal_id.uuid)
+        for caller, goal_request in self._send_goal.requests():
+            goal_id = bytes(goal_request.goal_id.uuid)
             accepted = self._goals.accept(goal_id, caller.writer, wall_ns)
             self._send_goal.respond(caller, SendGoalResponse(accepted, time_of(wall_ns)))
             if accepted:
-                begun.append(NewGoal(goal_id, asked.goal))
-        for caller, request in self._cancel_goal.requests():
-            code, named = self._goals.cancel(request.goal_info)
+                begun.append(NewGoal(goal_id, goal_request.goal))
+        for caller, cancel_request in self._cancel_goal.requests():
+            code, named = self._goals.cancel(cancel_request.goal_info)
             self._cancel_goal.respond(caller, CancelGoalResponse(code, [self._goals.info(g) for g in named]))
             cancelled += named
-        for caller, wanted in self._get_result.requests():
-            self._answer_result(caller, bytes(wanted.goal_id.uuid))
+        for caller, result_request in self._get_result.requests():
+            self._answer_result(caller, bytes(result_request.goal_id.uuid))
         if begun or cancelled:
             self._publish_status()
         return begun, cancelled
 
     def executing(self, goal_id: bytes) -> None:
-        """A goal is being executed."""
+        """Mark a goal as being executed."""
         goal = self._goals.get(goal_id)
         if goal is not None:
             goal.status = Status.EXECUTING
@@ -265,7 +265,7 @@ class ActionServer:
         self._told = send(self._feedback, message) or self._told
 
     def client_is_gone(self, goal_id: bytes, now_ns: int) -> bool:
-        """Whether the client of a goal is gone, as in the module docstring; call it between two feedbacks."""
+        """Tell whether the client of a goal is gone, as in the module docstring; call it between two feedbacks."""
         goal = self._goals.get(goal_id)
         if goal is None or goal.client not in self._send_goal.callers():
             return True
@@ -274,7 +274,7 @@ class ActionServer:
         return self._acknowledged_ns is not None and now_ns - self._acknowledged_ns > SILENCE_NS
 
     def _all_acknowledged(self) -> bool:
-        """Whether every reliable reader has what was sent.
+        """Tell whether every reliable reader has what was sent.
 
         Not ``DataWriter.wait_for_acks``: in release 11.0.1 it fails with an AttributeError when the time is up.
         """

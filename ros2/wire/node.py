@@ -32,7 +32,7 @@ class Node:
     """A node ``name`` in the root namespace of a domain (``ROS_DOMAIN_ID``)."""
 
     def __init__(self, name: str, domain_id: int, interface: str = LOOPBACK) -> None:
-        """``interface`` is the address of the network interface to use.
+        """Open a node; ``interface`` is the address of the network interface to use.
 
         Raises:
             LinkError: the domain cannot be opened there.
@@ -52,17 +52,17 @@ class Node:
         self._graph = self._writer("ros_discovery_info", ParticipantEntitiesInfo, latched(1))
 
     def publisher(self, topic: str, message: type[Message], profile: Qos) -> DataWriter[Message]:
-        """A writer of the topic ``/topic``."""
+        """Make a writer of the topic ``/topic``."""
         return self.writer(f"rt/{topic}", message, profile)
 
     def writer(self, name: str, message: type[Message], profile: Qos, identity: str = "") -> DataWriter[Message]:
-        """A writer by the topic's name on the wire."""
+        """Make a writer by the topic's name on the wire."""
         made = self._writer(name, message, profile, identity)
         self._writers.append(Gid(made.get_guid().bytes))
         return made
 
     def reader(self, name: str, message: type[Message], profile: Qos, identity: str = "") -> DataReader[Message]:
-        """A reader by the topic's name on the wire."""
+        """Make a reader by the topic's name on the wire."""
         topic = Topic(self.participant, name, message)
         made = DataReader(self.participant, topic, qos=endpoint_qos(message, profile, identity))
         self._readers.append(Gid(made.get_guid().bytes))
@@ -90,7 +90,7 @@ def send(writer: DataWriter[Message], message: Message) -> bool:
 
 
 def _configuration(interface: str) -> str:
-    """Cyclone's configuration: one interface; on loopback no multicast, and this computer is the only peer."""
+    """Write Cyclone's configuration: one interface; on loopback no multicast, this computer as the only peer."""
     local = interface == LOOPBACK
     multicast = "<AllowMulticast>false</AllowMulticast>" if local else ""
     return (

@@ -15,7 +15,7 @@ _XCDR1: Final = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcd
 
 
 def endpoint_qos(message: type[IdlStruct], profile: Qos, identity: str = "") -> Qos:
-    """The QoS of a reader or writer of ``message``.
+    """Return the QoS of a reader or writer of ``message``.
 
     ``identity`` is ``clientid=...;`` or ``serviceid=...;`` where the endpoint is half of a service.
     """
@@ -23,12 +23,12 @@ def endpoint_qos(message: type[IdlStruct], profile: Qos, identity: str = "") -> 
 
 
 def reliable(depth: int) -> Qos:
-    """Reliable and volatile, the default of ROS 2 and of its services."""
+    """Return a reliable and volatile QoS, the default of ROS 2 and of its services."""
     return Qos(Policy.Reliability.Reliable(BLOCKED_NS), Policy.Durability.Volatile, Policy.History.KeepLast(depth))
 
 
 def latched(depth: int) -> Qos:
-    """Reliable and transient local: a late reader gets the last ``depth`` samples."""
+    """Return a reliable and transient local QoS: a late reader gets the last ``depth`` samples."""
     return Qos(
         Policy.Reliability.Reliable(BLOCKED_NS),
         Policy.Durability.TransientLocal,
@@ -37,5 +37,5 @@ def latched(depth: int) -> Qos:
 
 
 def sensor_data() -> Qos:
-    """Best effort, of which only the newest matter: pictures."""
+    """Return a best-effort QoS, of whose samples only the newest matter: pictures."""
     return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))

@@ -38,7 +38,7 @@ _FEEDBACK_WITHOUT_INDEX: Final = "80398fcb9674a79081a9906e2ccf0c804dd7cb15e22e36
 
 
 def type_hash(message: type[IdlStruct]) -> str:
-    """The hash of a type, as in ``RIHS01_...``; raises KeyError for one that the bridge does not announce."""
+    """Return the hash of a type, as in ``RIHS01_...``; raises KeyError for one that the bridge does not announce."""
     if message is FeedbackMessageWithoutIndex:
         return f"RIHS01_{_FEEDBACK_WITHOUT_INDEX}"
     return f"RIHS01_{_HASHES[message.__idl_typename__]}"

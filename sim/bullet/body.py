@@ -56,22 +56,22 @@ class Body:
             p.setJointMotorControl2(self.body, i, p.VELOCITY_CONTROL, force=0.0)
 
     def set_damping(self, joint: str, damping: float) -> None:
-        """Passive damping of a joint [Nm s/rad]."""
+        """Set the passive damping of a joint [Nm s/rad]."""
         self._p.changeDynamics(self.body, self.index[joint], jointDamping=damping)
 
     def set_friction(self, links: Iterable[str], friction: float) -> None:
-        """Friction factor of links."""
+        """Set the friction factor of links."""
         for name in links:
             self._p.changeDynamics(self.body, self.link[name], lateralFriction=friction)
 
     def collide_only(self, one: Iterable[str], other: Sequence[str]) -> None:
-        """Inside the body, only links of ``one`` against links of ``other`` collide."""
-        wanted = {(a, b) for a in one for b in other}
+        """Let only links of ``one`` collide with links of ``other`` inside the body."""
+        colliding_pairs = {(a, b) for a in one for b in other}
         names = list(self.link)
         for i, a in enumerate(names):
             for b in names[i + 1 :]:
-                on = (a, b) in wanted or (b, a) in wanted
-                self._p.setCollisionFilterPair(self.body, self.body, self.link[a], self.link[b], int(on))
+                collides = (a, b) in colliding_pairs or (b, a) in colliding_pairs
+                self._p.setCollisionFilterPair(self.body, self.body, self.link[a], self.link[b], int(collides))
 
     def place(self, positions: Mapping[str, float]) -> None:
         """Put these joints at rest at a position; the others stay."""
@@ -79,12 +79,12 @@ class Body:
             self._p.resetJointState(self.body, self.index[joint], value, 0.0)
 
     def states(self) -> list[tuple[float, float, Vector, float]]:
-        """Position, velocity, reaction (force and torque at joints with a sensor), motor torque; in ``names`` order."""
+        """Read position, velocity, reaction (force, torque; joints with a sensor), motor torque; in ``names`` order."""
         states: list[tuple[float, float, Vector, float]] = self._p.getJointStates(self.body, self._moving)
         return states
 
     def apply(self, indices: list[int], torques: list[float]) -> None:
-        """Torques on joints for the next physics step."""
+        """Apply torques on joints for the next physics step."""
         self._p.setJointMotorControlArray(self.body, indices, self._p.TORQUE_CONTROL, forces=torques)
 
     def hold(self, joints: Iterable[str], force: float) -> None:
@@ -99,7 +99,7 @@ class Body:
         self._p.enableJointForceTorqueSensor(self.body, self.index[joint], True)
 
     def pose(self, link: str) -> Pose:
-        """URDF frame of a link in the world."""
+        """Return the URDF frame of a link in the world."""
         i = self.link[link]
         pose: Pose
         if i < 0:
@@ -109,13 +109,13 @@ class Body:
         return state[4], state[5]
 
     def poses(self) -> dict[str, Pose]:
-        """URDF frames of all links in the world."""
+        """Return the URDF frames of all links in the world."""
         names = [n for n in self.link if n != self.root]
         states = self._p.getLinkStates(self.body, [self.link[n] for n in names], computeForwardKinematics=1)
         return {self.root: self.pose(self.root)} | {n: (s[4], s[5]) for n, s in zip(names, states, strict=True)}
 
     def gravity_moment(self, joint: str, axis: Vector, outboard: Sequence[str], gravity: float) -> float:
-        """Moment of the weight of ``outboard`` links about ``axis`` (in the child link's frame) of a joint [Nm]."""
+        """Compute the moment of the weight of ``outboard`` links about a joint's ``axis`` (child link's frame) [Nm]."""
         p = self._p
         at = p.getLinkState(self.body, self.index[joint], computeForwardKinematics=1)
         m = p.getMatrixFromQuaternion(at[5])
@@ -143,7 +143,7 @@ def _inverse(p: BulletClient, pose: Pose) -> Pose:
 
 
 def magnitude(v: Sequence[float]) -> float:
-    """Length of a vector's first three components."""
+    """Compute the length of a vector's first three components."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
@@ -177,7 +177,7 @@ class JointDef:
 
 
 def urdf_text(name: str, links: Sequence[LinkDef], joints: Sequence[JointDef]) -> str:
-    """The whole robot; the first link is the root, joints follow the order given."""
+    """Write the whole robot; the first link is the root, joints follow the order given."""
     out = [f'<robot name="{name}">']
     for link in links:
         out += _link(link)

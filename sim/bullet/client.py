@@ -54,6 +54,6 @@ GRAVITY_M_S2: Final = 9.81
 
 
 def new_client() -> BulletClient:
-    """A new physics client without a window."""
+    """Make a new physics client without a window."""
     with _silent():
         return BulletClient(pybullet.DIRECT)

@@ -21,18 +21,18 @@ class View:
     rotation: np.ndarray
 
     def to_optical(self, points_m: np.ndarray) -> np.ndarray:
-        """World points (N, 3) in the optical frame."""
+        """Transform world points (N, 3) into the optical frame."""
         optical: np.ndarray = (np.asarray(points_m, float) - self.position_m) @ self.rotation
         return optical
 
     def to_world(self, points_m: np.ndarray) -> np.ndarray:
-        """Optical-frame points (N, 3) in the world."""
+        """Transform optical-frame points (N, 3) into the world."""
         world: np.ndarray = np.asarray(points_m, float) @ self.rotation.T + self.position_m
         return world
 
 
 def quaternion_matrix(q: Sequence[float]) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
+    """Compute the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
     x, y, z, w = q
     return np.array(
         [
@@ -51,7 +51,7 @@ def mount_view(
     error_m: Sequence[float] = (0.0, 0.0, 0.0),
     error_rpy_rad: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> View:
-    """The view of a camera on a link.
+    """Compute the view of a camera on a link.
 
     ``link_pose`` is (position, quaternion) of the link in the world; ``position_m`` and ``rpy_rad`` are the nominal
     body frame in the link, ``error_m`` and ``error_rpy_rad`` the true body frame in the nominal one.
@@ -63,7 +63,7 @@ def mount_view(
 
 
 def look_at(eye_m: Sequence[float], target_m: Sequence[float], pinhole_px: Intrinsics) -> View:
-    """A free camera at ``eye_m`` that looks at ``target_m`` with the horizon level.
+    """Make a free camera at ``eye_m`` that looks at ``target_m`` with the horizon level.
 
     Raises:
         PlantError: the camera would look straight up or down, where the horizon is undefined.
@@ -83,7 +83,7 @@ def look_at(eye_m: Sequence[float], target_m: Sequence[float], pinhole_px: Intri
 def orbit(
     target_m: Sequence[float], distance_m: float, azimuth_rad: float, elevation_rad: float, pinhole_px: Intrinsics
 ) -> View:
-    """A free camera on a sphere around ``target_m``; azimuth from the world's +x, elevation above the horizon."""
+    """Make a free camera on a sphere around ``target_m``; azimuth from the world's +x, elevation above the horizon."""
     ce = math.cos(elevation_rad)
     away = (ce * math.cos(azimuth_rad), ce * math.sin(azimuth_rad), math.sin(elevation_rad))
     return look_at([t + distance_m * a for t, a in zip(target_m, away, strict=True)], target_m, pinhole_px)

@@ -32,34 +32,34 @@ BARE, LANDING, CLEARING = Density(0.0, 0.0), Density(0.0, 0.04), Density(0.25, 0
 
 
 def _blade(b: SceneBuilder, rng: random.Random, x: float, y: float) -> None:
-    z, tall, way = b.ground.height(x, y), rng.uniform(0.10, 0.42), rng.uniform(-math.pi, math.pi)
-    lean = tall * rng.uniform(0.1, 0.8)
-    dx, dy = lean * math.cos(way), lean * math.sin(way)
-    points = [(x, y, z - 0.02), (x + 0.3 * dx, y + 0.3 * dy, z + 0.6 * tall), (x + dx, y + dy, z + tall)]
+    z, height_m, direction_rad = b.ground.height(x, y), rng.uniform(0.10, 0.42), rng.uniform(-math.pi, math.pi)
+    lean = height_m * rng.uniform(0.1, 0.8)
+    dx, dy = lean * math.cos(direction_rad), lean * math.sin(direction_rad)
+    points = [(x, y, z - 0.02), (x + 0.3 * dx, y + 0.3 * dy, z + 0.6 * height_m), (x + dx, y + dy, z + height_m)]
     dry = rng.random()
     tint = (88 + 80 * dry, 112 + 40 * dry, 48 + 38 * dry)
     b.rod(np.array(points), (0.004, 0.003, 0.001), GRASS, tint)
 
 
 def _branch(b: SceneBuilder, rng: random.Random, x: float, y: float) -> None:
-    way, thick = rng.uniform(-math.pi, math.pi), rng.uniform(0.006, 0.02)
+    direction_rad, thick = rng.uniform(-math.pi, math.pi), rng.uniform(0.006, 0.02)
     tint = [c * rng.uniform(0.8, 1.2) for c in (104, 82, 62)]
     points, step = [], rng.uniform(0.12, 0.35)
     for _ in range(5):
         points.append((x, y, b.ground.height(x, y) + thick + rng.uniform(0.0, 0.08)))
-        way += rng.uniform(-0.35, 0.35)
-        x, y = x + step * math.cos(way), y + step * math.sin(way)
+        direction_rad += rng.uniform(-0.35, 0.35)
+        x, y = x + step * math.cos(direction_rad), y + step * math.sin(direction_rad)
     b.rod(np.array(points), [thick * f for f in (1.0, 0.85, 0.7, 0.5, 0.25)], TWIG, tint)
     for i in (1, 2, 3):
         if rng.random() < 0.7:
             px, py, pz = points[i]
-            side, reach = way + rng.choice((-0.9, 0.9)), rng.uniform(0.1, 0.35)
+            side, reach = direction_rad + rng.choice((-0.9, 0.9)), rng.uniform(0.1, 0.35)
             tip = (px + reach * math.cos(side), py + reach * math.sin(side), pz + rng.uniform(0.0, 0.15))
             b.rod(np.array([points[i], tip]), (0.4 * thick, 0.15 * thick), TWIG, tint)
 
 
 def _some(rng: random.Random, mean: float) -> int:
-    """A random whole number whose mean is ``mean``."""
+    """Draw a random whole number whose mean is ``mean``."""
     return int(mean) + (rng.random() < mean % 1.0)
 
 
@@ -71,7 +71,7 @@ class GroundCover:
         self._tile = lru_cache(maxsize=400)(self._made)
 
     def around(self, x_m: float, y_m: float, reach_m: float = 8.0) -> Rods:
-        """All rods on the tiles within ``reach_m`` of a place."""
+        """Return all rods on the tiles within ``reach_m`` of a place."""
         rods = SceneBuilder(self._ground).build().rods
         i0, i1 = math.floor((x_m - reach_m) / TILE_M), math.floor((x_m + reach_m) / TILE_M)
         j0, j1 = math.floor((y_m - reach_m) / TILE_M), math.floor((y_m + reach_m) / TILE_M)

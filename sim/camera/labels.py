@@ -36,7 +36,7 @@ class Label:
 
 
 def labels(scene: Scene, view: View, picture: Picture) -> tuple[Label, ...]:
-    """All logs of the scene, in scene order; ``picture`` is the scene rendered at ``view``."""
+    """Label all logs of the scene, in scene order; ``picture`` is the scene rendered at ``view``."""
     return tuple(_label(scene, view, picture.mask, log) for log in scene.logs)
 
 

@@ -27,7 +27,7 @@ Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng: np.random.Generator) -> Mesh:
-    """A closed tube around a spine: vertices, triangles and normals."""
+    """Make a closed tube around a spine: vertices, triangles and normals."""
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1)[:, None]
     across = np.cross(along, (0.0, 0.0, 1.0) if abs(along[0, 2]) < 0.9 else (1.0, 0.0, 0.0))
@@ -130,7 +130,7 @@ class MeshRenderer:
         self._mesh((flat, np.concatenate(faces), normals), GROUND_COLOUR, GROUND)
 
     def render(self, view: View) -> Picture:
-        """The scene, in the form of the first renderer's ``render``."""
+        """Render the scene, in the form of the first renderer's ``render``."""
         pin, eye, turn = view.intrinsics, view.position_m, view.rotation
         w, h = pin.width_px, pin.height_px
         to_gl = np.eye(4)
@@ -157,12 +157,12 @@ class MeshRenderer:
 
 
 def _fine(log: LogPose) -> tuple[np.ndarray, np.ndarray]:
-    """The spine in many pieces, for a smooth bow and for bumps."""
+    """Compute the spine in many pieces, for a smooth bow and for bumps."""
     return log.spine(24)
 
 
 def _quaternion(m: np.ndarray) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of a rotation matrix."""
+    """Compute the quaternion (x, y, z, w) of a rotation matrix."""
     k = np.array(
         [
             [m[0, 0] - m[1, 1] - m[2, 2], 0.0, 0.0, 0.0],

@@ -31,7 +31,7 @@ MIN_TEXTURE_STEP: Final = 5.0  # mean step of green from pixel to pixel below wh
 
 @cache
 def _tile(length_px: float, seed: int) -> np.ndarray:
-    """Periodic Gaussian noise (TILE_PX, TILE_PX), unit variance, autocorrelation 1/e at ``length_px``."""
+    """Make periodic Gaussian noise (TILE_PX, TILE_PX), unit variance, autocorrelation 1/e at ``length_px``."""
     f = np.fft.fftfreq(TILE_PX)
     reach = np.exp(-2.0 * (math.pi * length_px / 2.0) ** 2 * (f[:, None] ** 2 + f[None, : TILE_PX // 2 + 1] ** 2))
     white = np.random.default_rng(seed).standard_normal((TILE_PX, TILE_PX))
@@ -42,7 +42,7 @@ def _tile(length_px: float, seed: int) -> np.ndarray:
 
 @njit(cache=True)
 def _plain(rgb: np.ndarray) -> np.ndarray:
-    """For squares of PATCH_PX, whether they lack texture."""
+    """Tell for squares of PATCH_PX whether they lack texture."""
     rows, columns = rgb.shape[0] // PATCH_PX + 1, rgb.shape[1] // PATCH_PX + 1
     plain = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
@@ -82,7 +82,7 @@ def _fatten(
     shift_row: int,
     shift_column: int,
 ) -> np.ndarray:
-    """Inverse depth whose near surfaces are widened at every jump of more than ``jump``."""
+    """Widen the near surfaces of inverse depth at every jump of more than ``jump``."""
     height, width = inverse.shape
     out = inverse.copy()
     for row in range(height - 1):
@@ -120,7 +120,7 @@ def _matched(
     shift: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Noisy depth of ``inverse``; ``fb`` is focal length times baseline [px m], ``zoom`` delivered per native pixel."""
+    """Make noisy depth of ``inverse``; ``fb``: focal length x baseline [px m]; ``zoom``: delivered per native pixel."""
     height, width = inverse.shape
     root = sigma / math.sqrt(2.0)
     for row in range(height):
@@ -157,7 +157,7 @@ class StereoNoise:
         self._plain_cut = normal.inv_cdf(1.0 - truth.plain_hole_share)
 
     def apply(self, picture: Picture, pinhole: Intrinsics, frame: int) -> np.ndarray:
-        """Depth (H, W) float32 [m] as the camera measures it, NaN where it has none.
+        """Return the depth (H, W) float32 [m] as the camera measures it, NaN where it has none.
 
         ``pinhole`` is the picture's (it may be smaller than the camera's own), ``frame`` selects this frame's errors.
         """

@@ -37,7 +37,7 @@ def _draw_triangle(
     px: np.ndarray,
     py: np.ndarray,
 ) -> None:
-    """A triangle of the ground in the optical frame."""
+    """Draw a triangle of the ground in the optical frame."""
     height, width = inverse.shape
     ax, ay, az = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     bx, by, bz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
@@ -115,20 +115,20 @@ def draw_grid(
     i0, i1, j0, j1 = max(0, i0), min(last_i, i1), max(0, j0), min(last_j, j1)
     if i1 <= i0 or j1 <= j0:
         return
-    place = np.empty((2, j1 - j0 + 1, 3))
+    row_points = np.empty((2, j1 - j0 + 1, 3))
     px, py = np.empty(4), np.empty(4)
     left, right = -(cx + 1.0) / fx, (width + 1.0 - cx) / fx
     for i in range(i0, i1 + 1):
-        now, before = place[i & 1], place[1 - (i & 1)]
+        current_row, previous_row = row_points[i & 1], row_points[1 - (i & 1)]
         for j in range(j0, j1 + 1):
             x, y = x0 + i * span - eye[0], y0 + j * span - eye[1]
             z = heights[i * stride, j * stride] - eye[2]
             for k in range(3):
-                now[j - j0, k] = x * rotation[0, k] + y * rotation[1, k] + z * rotation[2, k]
+                current_row[j - j0, k] = x * rotation[0, k] + y * rotation[1, k] + z * rotation[2, k]
         if i == i0:
             continue
         for j in range(j1 - j0):
-            a, b, c, d = before[j], before[j + 1], now[j], now[j + 1]
+            a, b, c, d = previous_row[j], previous_row[j + 1], current_row[j], current_row[j + 1]
             if max(max(a[2], b[2]), max(c[2], d[2])) < NEAR_M:
                 continue
             if min(min(a[0] - right * a[2], b[0] - right * b[2]), min(c[0] - right * c[2], d[0] - right * d[2])) > 0.0:
@@ -153,7 +153,7 @@ def draw_plane(
     cx: float,
     cy: float,
 ) -> None:
-    """The level ground ``below`` metres under the camera wherever nothing is drawn; ``up`` in the optical frame."""
+    """Draw the level ground ``below`` metres under the camera where nothing is drawn; ``up`` in the optical frame."""
     height, width = inverse.shape
     su, sv = -up[0] / below / fx, -up[1] / below / fy
     for row in range(height):
@@ -199,7 +199,7 @@ class ImagingConditions:
 
     @classmethod
     def random(cls, seed: int) -> ImagingConditions:
-        """Conditions drawn from ``seed``: sun 20..70 degrees high, clear to overcast, exposure, white balance."""
+        """Draw conditions from ``seed``: sun 20..70 degrees high, clear to overcast, exposure, white balance."""
         rng = random.Random(f"look {seed}")
         azimuth, height = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(20.0, 70.0))
         clear, exposure = rng.uniform(0.0, 1.0), rng.uniform(0.75, 1.25)
@@ -220,7 +220,7 @@ def _grain() -> np.ndarray:
 
 
 def render(scene: Scene, view: View, conditions: ImagingConditions = ImagingConditions(), frame: int = 0) -> Picture:
-    """The picture of an ideal camera at ``view``.  ``frame`` changes the sensor's grain only."""
+    """Render the picture of an ideal camera at ``view``.  ``frame`` changes the sensor's grain only."""
     pin, eye, turn = view.intrinsics, view.position_m, np.ascontiguousarray(view.rotation)
     lens: tuple[float, float, float, float] = (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
     rods, boxes, ground = scene.rods, scene.boxes, scene.ground
@@ -291,7 +291,7 @@ def render(scene: Scene, view: View, conditions: ImagingConditions = ImagingCond
 
 
 def surfaces_of(scene: Scene, view: View, instance: int) -> np.ndarray:
-    """The pixels (H, W) bool of an instance's rods if nothing else were there."""
+    """Find the pixels (H, W) bool of an instance's rods if nothing else were there."""
     inverse, code = _blank(view)
     own = scene.rods.instance == instance
     rods = Rods(*(getattr(scene.rods, f.name)[own] for f in fields(Rods)))
@@ -329,7 +329,7 @@ def _draw(inverse: np.ndarray, code: np.ndarray, view: View, rods: Rods, boxes: 
 
 
 def _middle(scene: Scene, view: View) -> np.ndarray:
-    """Middle (x, y) of the shaded square: four to eight metres ahead in the viewing direction."""
+    """Find the middle (x, y) of the shaded square: four to eight metres ahead in the viewing direction."""
     forward = view.rotation[:, 2]
     fall = (float(view.position_m[2]) - scene.ground.mean_m) / max(1e-3, -float(forward[2]))
     reach = min(max(fall, 0.0), 8.0) if forward[2] < 0.0 else 6.0

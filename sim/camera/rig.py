@@ -82,13 +82,13 @@ class CameraRig:
         self.names = tuple(profile.cameras)
 
     def view(self, name: str, scene: Scene) -> View:
-        """The true view of a camera, with its own pinhole."""
+        """Return the true view of a camera, with its own pinhole."""
         camera, truth = self._profile.cameras[name], self._truth.cameras[name]
         pose, error = scene.links[camera.link], (truth.mount_position_m, truth.mount_rpy_rad)
         return mount_view(pose, intrinsics(camera), camera.position_m, camera.rpy_rad, *error)
 
     def scene(self, name: str) -> Scene:
-        """The present scene, with the ground cover near a camera."""
+        """Return the present scene, with the ground cover near a camera."""
         scene = self._scenes()
         if self._cover is not None:
             x, y, _ = scene.links[self._profile.cameras[name].link][0]
@@ -96,12 +96,12 @@ class CameraRig:
         return scene
 
     def picture(self, name: str) -> tuple[Scene, View, Picture]:
-        """Scene, view and picture of an ideal camera at the true pose, for labels: without bars or noise."""
+        """Return scene, view and picture of an ideal camera at the true pose, for labels: without bars or noise."""
         scene = self.scene(name)
         return scene, *self._picture(name, scene)
 
     def frame(self, name: str, now_ns: int) -> RgbdFrame:
-        """The next frame of camera ``name``.
+        """Take the next frame of camera ``name``.
 
         Raises:
             KeyError: the profile has no such camera.
@@ -109,7 +109,7 @@ class CameraRig:
         return self.capture(name, self.scene(name), now_ns)
 
     def capture(self, name: str, scene: Scene, now_ns: int) -> RgbdFrame:
-        """The next frame of camera ``name``, of a scene that was visible at ``now_ns``."""
+        """Take the next frame of camera ``name``, of a scene that was visible at ``now_ns``."""
         camera = self._profile.cameras[name]
         view, picture = self._picture(name, scene)
         rgb, pin = picture.rgb, view.intrinsics

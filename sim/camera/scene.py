@@ -42,7 +42,7 @@ class Ground:
 
     @classmethod
     def flat(cls, z_m: float = 0.0, edge_m: float = 120.0) -> Ground:
-        """A level square around the origin."""
+        """Make a level square around the origin."""
         return cls(-edge_m / 2, -edge_m / 2, edge_m, np.full((2, 2), float(z_m)))
 
     @property
@@ -51,7 +51,7 @@ class Ground:
         return float(self.heights_m.mean())
 
     def height(self, x_m: float, y_m: float) -> float:
-        """Height [m] of the surface; outside the grid that of its edge."""
+        """Return the height [m] of the surface; outside the grid that of its edge."""
         return surface_height(x_m, y_m, self.x0_m, self.y0_m, self.cell_m, self.heights_m)
 
 
@@ -75,7 +75,7 @@ class Rods:
     instance: np.ndarray
 
     def moved(self, rotation: np.ndarray, position_m: np.ndarray) -> Rods:
-        """Every rod turned by its ``rotation`` (S, 3, 3) and shifted to its ``position_m`` (S, 3)."""
+        """Turn every rod by its ``rotation`` (S, 3, 3) and shift it to its ``position_m`` (S, 3)."""
 
         def turn(v: np.ndarray) -> np.ndarray:
             turned: np.ndarray = np.einsum("sij,sj->si", rotation, v)
@@ -129,7 +129,7 @@ class LogPose:
         return 3 if self.sweep_m <= STRAIGHT_M else 5
 
     def spine(self, pieces: int) -> tuple[np.ndarray, np.ndarray]:
-        """Points (pieces + 1, 3) of the bowed pith in the world and the radii (pieces + 1,) there."""
+        """Compute points (pieces + 1, 3) of the bowed pith in the world and the radii (pieces + 1,) there."""
         s = np.linspace(-0.5, 0.5, pieces + 1)
         local = np.stack([-4.0 * self.sweep_m * s * s, np.zeros_like(s), s * self.length_m], axis=1)
         points = local @ quaternion_matrix(self.quaternion).T + np.asarray(self.position_m)
@@ -159,13 +159,13 @@ class SceneBuilder:
         self._logs: list[LogPose] = []
 
     def log(self, log: LogPose, tint: Vector = (1.0, 1.0, 1.0)) -> None:
-        """A log, its bark coloured by ``tint``."""
+        """Add a log, its bark coloured by ``tint``."""
         points, radii = log.spine(log.pieces)
         self._logs.append(log)
         self._chain(points, radii, quaternion_matrix(log.quaternion)[:, 1], BARK, tint, log.instance)
 
     def rod(self, points_m: np.ndarray, radii_m: Vector, surface: int, tint: Vector, instance: int = COVER) -> None:
-        """A chain of frusta through ``points_m`` (N, 3) with the radii there: a twig, a blade of grass."""
+        """Add a chain of frusta through ``points_m`` (N, 3) with the radii there: a twig, a blade of grass."""
         points = np.asarray(points_m, float)
         chord = points[-1] - points[0]
         side = np.cross(chord, (0.0, 0.0, 1.0) if abs(chord[2]) < 0.9 * np.linalg.norm(chord) else (1.0, 0.0, 0.0))
@@ -187,12 +187,12 @@ class SceneBuilder:
             along += float(lengths[i])
 
     def box(self, size_m: Vector, position_m: Vector, quaternion: Vector, colour: Vector, instance: int) -> None:
-        """A box: full edge lengths, pose in the world."""
+        """Add a box: full edge lengths, pose in the world."""
         half = np.asarray(size_m, float) / 2
         self._boxes.append((np.asarray(position_m, float), quaternion_matrix(quaternion), half, colour, instance))
 
     def build(self, links: Mapping[str, tuple[Vector, Vector]] | None = None) -> Scene:
-        """The packed scene."""
+        """Return the packed scene."""
         n, m = len(self._rods), len(self._boxes)
         rod = list(zip(*self._rods, strict=True)) if n else [()] * 12
         box = list(zip(*self._boxes, strict=True)) if m else [()] * 5
@@ -235,7 +235,7 @@ class WorldScenes:
         self._local = local.build()
 
     def __call__(self) -> Scene:
-        """The scene now."""
+        """Return the scene now."""
         links = self._world.link_poses()
         turns = np.stack([quaternion_matrix(links[n][1]) for n in self._links])[self._of_link]
         at = np.array([links[n][0] for n in self._links])[self._of_link]
@@ -256,5 +256,5 @@ class WorldScenes:
 
 
 def scene_from_world(world: World) -> Scene:
-    """The present scene of a running plant."""
+    """Return the present scene of a running plant."""
     return WorldScenes(world)()

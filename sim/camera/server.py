@@ -108,7 +108,7 @@ class CameraServer:
 
 
 def rgbd_message(frame: RgbdFrame) -> RgbdMessage:
-    """A frame as it is sent: depth in whole millimetres, no true pose."""
+    """Pack a frame as it is sent: depth in whole millimetres, no true pose."""
     pin, depth = frame.intrinsics, np.nan_to_num(frame.depth_m * np.float32(MM_PER_M), nan=0.0)
     millimetres = np.clip(np.rint(depth), 0, 65535).astype("<u2")
     size = (pin.width_px, pin.height_px, pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)

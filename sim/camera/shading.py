@@ -32,7 +32,7 @@ _GROUND_MASK, _BARK_MASK, _PATCH_MASK, _GRAIN_MASK = GROUND_PX - 1, BARK_PX - 1,
 
 @njit(cache=True, fastmath=True)
 def angle_of(y: float, x: float) -> float:
-    """atan2 to 0.005 rad: enough to look up a texture."""
+    """Compute atan2 to 0.005 rad: enough to look up a texture."""
     ax, ay = abs(x), abs(y)
     big = max(ax, ay)
     if big == 0.0:

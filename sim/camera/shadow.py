@@ -49,9 +49,10 @@ def shadow_map(
     y0: float,
     cell: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (MAP_PX, MAP_PX) of rods ends (S, 2, 3), radii (S, 2) and boxes, world frame; (x0, y0) is cell 0's ray.
+    """Map the heights (MAP_PX, MAP_PX) of rods ends (S, 2, 3), radii (S, 2) and boxes in the world frame.
 
-    Returns the map and which of its blocks are used; in those, cells without shadow hold LOWEST_M.
+    (x0, y0) is the ray of cell 0.  Returns the map and which of its blocks are used; in those, cells without shadow
+    hold LOWEST_M.
     """
     out = np.empty((MAP_PX, MAP_PX), np.float32)
     used = np.zeros((MAP_PX >> BLOCK_BITS, MAP_PX >> BLOCK_BITS), np.bool_)

@@ -24,7 +24,7 @@ VARIANT_COUNT: Final = 6  # number of appearances; a seed selects one
 def noise(
     rng: np.random.Generator, shape: tuple[int, int], wave_px: tuple[float, float], slope: float = 1.0
 ) -> np.ndarray:
-    """Periodic noise, mean 0 and unit variance, with features about ``wave_px`` (rows, columns) long.
+    """Make periodic noise, mean 0 and unit variance, with features about ``wave_px`` (rows, columns) long.
 
     A larger ``slope`` leaves less fine structure.
     """
@@ -48,7 +48,7 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
 
 
 def _pyramid(picture: np.ndarray) -> np.ndarray:
-    """All levels (MIP_LEVEL_COUNT, size, size, 3) of a square picture, each stored in its top left corner."""
+    """Compute all levels (MIP_LEVEL_COUNT, size, size, 3) of a square picture, each stored in its top left corner."""
     out = np.zeros((MIP_LEVEL_COUNT, *picture.shape), np.uint8)
     level = picture
     for i in range(MIP_LEVEL_COUNT):
@@ -88,7 +88,7 @@ def _forest(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bark(rng: np.random.Generator, style: str) -> np.ndarray:
-    """(along, around, 3): pine for ``asphalt``, birch for ``forest``."""
+    """Draw bark (along, around, 3): pine for ``asphalt``, birch for ``forest``."""
     size = (BARK_PX, BARK_PX)
     fine = noise(rng, size, (6, 4), 1.5)
     if style == "asphalt":
@@ -103,7 +103,7 @@ def _bark(rng: np.random.Generator, style: str) -> np.ndarray:
 
 
 def _end_grain(rng: np.random.Generator) -> np.ndarray:
-    """(END_PX, END_PX, 3): growth rings, darker heart, drying cracks; the bark is its rim."""
+    """Draw an end (END_PX, END_PX, 3): growth rings, darker heart, drying cracks; the bark is its rim."""
     y, x = np.mgrid[0:END_PX, 0:END_PX] / (END_PX / 2) - 1.0
     wobble = noise(rng, (END_PX, END_PX), (60, 60))
     r, angle = np.hypot(x, y) + 0.012 * wobble, np.arctan2(y, x)
@@ -118,7 +118,7 @@ def _end_grain(rng: np.random.Generator) -> np.ndarray:
 
 
 def _horizon(rng: np.random.Generator) -> np.ndarray:
-    """(elevation, azimuth, 3): a wall of trees under a sky."""
+    """Draw a horizon (elevation, azimuth, 3): a wall of trees under a sky."""
     rows, columns = HORIZON_PX
     up = np.linspace(0.0, 1.0, rows)[:, None]
     sky = _mix((214, 222, 230), (150, 182, 220), np.repeat(up, columns, 1) + 0.08 * noise(rng, HORIZON_PX, (20, 90)))
@@ -160,5 +160,5 @@ def _variant(style: str, variant: int) -> Textures:
 
 
 def textures(style: str, seed: int) -> Textures:
-    """The surfaces of a style ("asphalt" with pine, "forest" with birch) in one of VARIANT_COUNT appearances."""
+    """Return the surfaces of a style ("asphalt" with pine, "forest" with birch) in one of VARIANT_COUNT appearances."""
     return _variant(style, seed % VARIANT_COUNT)

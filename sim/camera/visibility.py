@@ -53,7 +53,7 @@ def _spans(
     low: np.ndarray,
     high: np.ndarray,
 ) -> tuple[int, int]:
-    """Row spans of the convex hull of eight corners (8, 3) in the optical frame; returns (first, last) row."""
+    """Compute row spans of the convex hull of eight corners (8, 3) in the optical frame; return (first, last) row."""
     behind = 0
     px, py = np.empty(8), np.empty(8)
     for i in range(8):
@@ -123,7 +123,7 @@ def draw_box(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """One box in the optical frame."""
+    """Draw one box in the optical frame."""
     height, width = inverse.shape
     corners = np.empty((8, 3))
     _box_corners(centre, axes, half, corners)
@@ -178,7 +178,7 @@ def draw_box(
 
 @njit(cache=True)
 def _frame_of(wx: float, wy: float, wz: float, axes: np.ndarray) -> None:
-    """Axes (3, 3) whose column 2 is the unit vector w."""
+    """Compute axes (3, 3) whose column 2 is the unit vector w."""
     if abs(wx) < 0.7:
         ux, uy, uz = 0.0, wz, -wy
     else:
@@ -207,7 +207,7 @@ def _draw_cap(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """A disc at ``at`` whose outward normal is sign * column 2 of ``axes``."""
+    """Draw a disc at ``at`` whose outward normal is sign * column 2 of ``axes``."""
     height, width = inverse.shape
     nx, ny, nz = sign * axes[0, 2], sign * axes[1, 2], sign * axes[2, 2]
     away = nx * at[0] + ny * at[1] + nz * at[2]
@@ -247,7 +247,7 @@ def draw_rod(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """One frustum in the optical frame: its side between the cutting planes, and its caps."""
+    """Draw one frustum in the optical frame: its side between the cutting planes, and its caps."""
     height, width = inverse.shape
     wx, wy, wz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     length = math.sqrt(wx * wx + wy * wy + wz * wz)
@@ -312,7 +312,7 @@ def draw_objects(
     cx: float,
     cy: float,
 ) -> None:
-    """All rods, then all boxes, in the optical frame.  rod_ends and rod_normals (S, 2, 3), rod_radii (S, 2)."""
+    """Draw all rods, then all boxes, in the optical frame.  rod_ends and rod_normals (S, 2, 3), rod_radii (S, 2)."""
     low, high = np.empty(inverse.shape[0]), np.empty(inverse.shape[0])
     rods = rod_ends.shape[0]
     for i in range(rods):

@@ -56,9 +56,9 @@ CLEAR_M: Final = 4.5
 
 
 def extended(heights: Heights, reach_cells: float) -> Heights:
-    """A periodic grid (last row and column equal the first) with at least ``reach_cells`` on every side of its middle.
+    """Extend a periodic grid to at least ``reach_cells`` on every side of its middle.
 
-    A grid that is wide enough is returned as it is.
+    Its last row and column equal the first.  A grid that is wide enough is returned as it is.
     """
     period = len(heights) - 1
     half = max(period // 2, math.ceil(reach_cells))
@@ -69,7 +69,7 @@ def extended(heights: Heights, reach_cells: float) -> Heights:
 
 
 def drawn_ground(undulation: Heights, cell_m: float, seed: int) -> Heights:
-    """The undulation of rough ground in part, with slope, ruts, stones and stumps of a seed; height 0 in the middle."""
+    """Draw rough ground: its undulation in part, slope, ruts, stones and stumps of a seed; height 0 in the middle."""
     rng = random.Random(f"drawn ground {seed}")
     half = len(undulation) // 2
     along: Heights = cell_m * (np.arange(len(undulation), dtype=np.float64) - half)
@@ -88,7 +88,7 @@ def drawn_ground(undulation: Heights, cell_m: float, seed: int) -> Heights:
 
 
 def _pass(x: Heights, y: Heights, rng: random.Random) -> Heights:
-    """Depth [m] of the pair of ruts of one pass; they run out before the place where the machine stands first."""
+    """Draw the depth [m] of the two ruts of one pass; they run out before the place where the machine stands first."""
     heading, aside_m = rng.uniform(-math.pi, math.pi), rng.uniform(-RUT_PLACE_M, RUT_PLACE_M)
     depth_m = rng.uniform(*RUT_DEPTH_M)
     off = np.abs(np.abs(math.cos(heading) * y - math.sin(heading) * x - aside_m) - RUT_APART_M)
@@ -98,8 +98,8 @@ def _pass(x: Heights, y: Heights, rng: random.Random) -> Heights:
 
 
 def _obstacles(rng: random.Random, i: int, j: int) -> list[tuple[float, float, float, float]]:
-    """Stones and stumps of a block: place, height and radius [m]."""
-    found = []
+    """Draw the stones and stumps of a block: place, height and radius [m]."""
+    obstacles = []
     for count, heights_m, radii_m in (
         (STONES_IN_BLOCK, STONE_HEIGHT_M, STONE_RADIUS_M),
         (STUMPS_IN_BLOCK, STUMP_HEIGHT_M, STUMP_RADIUS_M),
@@ -108,8 +108,8 @@ def _obstacles(rng: random.Random, i: int, j: int) -> list[tuple[float, float, f
             x_m, y_m = (i + rng.random()) * BLOCK_M, (j + rng.random()) * BLOCK_M
             height_m, radius_m = rng.uniform(*heights_m), rng.uniform(*radii_m)
             if math.hypot(x_m, y_m) - radius_m > CLEAR_M:
-                found.append((x_m, y_m, height_m, radius_m))
-    return found
+                obstacles.append((x_m, y_m, height_m, radius_m))
+    return obstacles
 
 
 def _raise(heights: Heights, cell_m: float, x_m: float, y_m: float, height_m: float, radius_m: float) -> None:
@@ -156,7 +156,7 @@ LOG_FRICTION: Final = 0.8
 
 @njit(cache=True)
 def surface_height(x: float, y: float, x0: float, y0: float, cell: float, heights: NDArray[np.float64]) -> float:
-    """Height [m] of the surface at one point."""
+    """Compute the height [m] of the surface at one point."""
     u = min(max((x - x0) / cell, 0.0), heights.shape[0] - 1.0)
     v = min(max((y - y0) / cell, 0.0), heights.shape[1] - 1.0)
     i, j = min(int(u), heights.shape[0] - 2), min(int(v), heights.shape[1] - 2)
@@ -173,7 +173,7 @@ def surface_height(x: float, y: float, x0: float, y0: float, cell: float, height
 
 
 def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float64]:
-    """Gaussian-filtered noise of unit standard deviation, wrapped at the edges."""
+    """Filter noise with a Gaussian, to unit standard deviation, wrapped at the edges."""
     f = np.fft.fftfreq(noise.shape[0])
     window = np.exp(-2.0 * (math.pi * length_cells) ** 2 * (f[:, None] ** 2 + f[None, : noise.shape[1] // 2 + 1] ** 2))
     smooth = np.fft.irfft2(np.fft.rfft2(noise) * window, noise.shape)
@@ -182,7 +182,7 @@ def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float
 
 
 def _rough(seed: int) -> NDArray[np.float64]:
-    """Undulation of ROUGHNESS_LAYERS with height 0 in the middle of the grid; exact in single precision."""
+    """Draw the undulation of ROUGHNESS_LAYERS with height 0 in the middle of the grid; exact in single precision."""
     rng = np.random.default_rng(random.Random(f"terrain {seed}").getrandbits(64))
     shape = (ROUGH_CELL_COUNT, ROUGH_CELL_COUNT)
     heights = np.zeros(shape)
@@ -229,11 +229,11 @@ class Terrain:
         return self.kind in ("flat", "mud")
 
     def height(self, x: float, y: float) -> float:
-        """Height of the surface [m]."""
+        """Return the height of the surface [m]."""
         return surface_height(x, y, *self.grid)
 
     def normal(self, x: float, y: float) -> Vector:
-        """Unit normal, upward, of the triangle at a point."""
+        """Compute the unit normal, upward, of the triangle at a point."""
         x0, y0 = self.origin_m
         last = self.heights.shape[0] - 2
         i, j = (max(0, min(int((at - low) / self.cell_m), last)) for at, low in ((x, x0), (y, y0)))

@@ -46,9 +46,9 @@ class Tyre(NamedTuple):
 
 @njit(cache=True)
 def _held(w: float, free: float, capacity: float, inertia: float, h: float) -> float:
-    """Torque of a friction that stops the speed ``w`` if it can: ``free`` is all other torque."""
-    wanted = -(inertia * w / h + free)
-    return min(max(wanted, -capacity), capacity)
+    """Compute the torque of a friction that stops the speed ``w`` if it can: ``free`` is all other torque."""
+    stopping_torque_nm = -(inertia * w / h + free)
+    return min(max(stopping_torque_nm, -capacity), capacity)
 
 
 @njit(cache=True)

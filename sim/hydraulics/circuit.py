@@ -58,7 +58,7 @@ class Hydraulics:
         s["q"], s["qd"], s["torque"], s["driven"] = at, 0.0, torques, torques
 
     def step(self, commands: Sequence[float], q: Sequence[float], qd: Sequence[float]) -> list[float]:
-        """Mean joint torques [Nm, N] over one physics step; commands -1..1, ``q`` and ``qd`` of the joints now."""
+        """Compute mean joint torques [Nm, N] of one physics step; commands -1..1, ``q``, ``qd`` of the joints now."""
         self._commands[:], self._q[:], self._qd[:] = commands, q, qd
         for name, chamber in self.burst:
             at = self.names.index(name)

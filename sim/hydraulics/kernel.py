@@ -29,13 +29,13 @@ BISECTION_COUNT = 24
 
 @njit(cache=True)
 def orifice(drop: float) -> float:
-    """Flow factor of an edge over its pressure drop: 1 near 1 MPa, ~ square root beyond SOFT_PA."""
+    """Compute the flow factor of an edge over its pressure drop: 1 near 1 MPa, ~ square root beyond SOFT_PA."""
     return drop / math.sqrt(UNIT_PA * (abs(drop) + SOFT_PA))
 
 
 @njit(cache=True)
 def friction(c: FunctionConstants, speed: float) -> tuple[float, float]:
-    """Stribeck friction of a piston [N] and a stable slope over speed [N s/m].
+    """Compute the Stribeck friction of a piston [N] and a stable slope over speed [N s/m].
 
     docs/reference/machines.md section 3, form of PATU.
     """
@@ -50,7 +50,7 @@ def friction(c: FunctionConstants, speed: float) -> tuple[float, float]:
 
 @njit(cache=True)
 def move_spool(c: FunctionConstants, s: FunctionState, command: float, h: float) -> None:
-    """Second-order spool, play (hysteresis), dead-band and metering; sets ``opening`` in -1..1."""
+    """Advance the second-order spool, play (hysteresis), dead-band and metering; set ``opening`` in -1..1."""
     w = c.spool_rad_s
     s.spool_speed += h * (w * w * (command - s.spool) - 2.0 * c.spool_zeta * w * s.spool_speed)
     s.spool += h * s.spool_speed
@@ -67,7 +67,7 @@ def move_spool(c: FunctionConstants, s: FunctionState, command: float, h: float)
 
 @njit(cache=True)
 def demand(c: FunctionConstants, s: FunctionState, supply: float, margin: float) -> float:
-    """Flow [m^3/s] that a function demands at this pump pressure: its compensator keeps the drop at the margin."""
+    """Find the flow [m^3/s] a function demands at this pump pressure: its compensator keeps the drop at the margin."""
     if s.opening > 0.0:
         drop = min(min(supply, c.limit_plus) - s.pressure_a, margin)
         return c.in_plus * s.opening * max(0.0, orifice(drop))
@@ -79,7 +79,7 @@ def demand(c: FunctionConstants, s: FunctionState, supply: float, margin: float)
 
 @njit(cache=True)
 def share_flow(constants: Records, states: Records, pump: Pump, balance: Balance, h: float) -> float:
-    """Pump pressure after the load-sensing line, and every function's inflow within the pump's flow."""
+    """Compute the pump pressure after the load-sensing line, and every function's inflow within the pump's flow."""
     load = 0.0
     for i in range(len(states)):
         s = states[i]
@@ -90,22 +90,22 @@ def share_flow(constants: Records, states: Records, pump: Pump, balance: Balance
     target = min(load + pump.margin, pump.relief)
     balance.supply += (target - balance.supply) * min(1.0, h / pump.build_up)
     supply = balance.supply
-    wanted = 0.0
+    total_demand_m3_s = 0.0
     for i in range(len(states)):
         states[i].inflow = demand(constants[i], states[i], supply, pump.margin)
-        wanted += states[i].inflow
-    balance.limited = 1.0 if wanted > pump.flow else 0.0
-    if wanted > pump.flow and pump.post:
+        total_demand_m3_s += states[i].inflow
+    balance.limited = 1.0 if total_demand_m3_s > pump.flow else 0.0
+    if total_demand_m3_s > pump.flow and pump.post:
         for i in range(len(states)):
-            states[i].inflow *= pump.flow / wanted
-    elif wanted > pump.flow:
+            states[i].inflow *= pump.flow / total_demand_m3_s
+    elif total_demand_m3_s > pump.flow:
         low, high = 0.0, supply
         for _ in range(BISECTION_COUNT):
             supply = 0.5 * (low + high)
-            wanted = 0.0
+            total_demand_m3_s = 0.0
             for i in range(len(states)):
-                wanted += demand(constants[i], states[i], supply, pump.margin)
-            if wanted > pump.flow:
+                total_demand_m3_s += demand(constants[i], states[i], supply, pump.margin)
+            if total_demand_m3_s > pump.flow:
                 high = supply
             else:
                 low = supply
@@ -117,7 +117,7 @@ def share_flow(constants: Records, states: Records, pump: Pump, balance: Balance
 
 @njit(cache=True)
 def meter_out(gain: float, pressure: float, pump: Pump) -> tuple[float, float]:
-    """Flow out of a chamber through its compensated edge [m^3/s] and the slope over its pressure."""
+    """Compute the flow out of a chamber through its compensated edge [m^3/s] and the slope over its pressure."""
     drop = pressure - pump.tank
     if drop <= 0.0:
         return 0.0, 0.0
@@ -128,7 +128,7 @@ def meter_out(gain: float, pressure: float, pump: Pump) -> tuple[float, float]:
 
 @njit(cache=True)
 def port(pressure: float, pump: Pump) -> tuple[float, float]:
-    """Flow into a chamber through its make-up or relief valve and the slope over its pressure."""
+    """Compute the flow into a chamber through its make-up or relief valve and the slope over its pressure."""
     if pressure < pump.tank:
         return VALVE_M3_S_PA * (pump.tank - pressure), VALVE_M3_S_PA
     if pressure > pump.shock:
@@ -152,7 +152,7 @@ def chamber(
     balance: Balance,
     h: float,
 ) -> float:
-    """One chamber's pressure after ``h``; adds its energies to ``balance``.
+    """Compute one chamber's pressure after ``h``; add its energies to ``balance``.
 
     ``stiff``: h bulk / volume; ``swept``: flow that the piston takes; ``inflow`` comes at pressure ``source``; ``out``
     leaves to the tank; oil leaks to the ``other`` chamber and passes the damping orifice to its ``hose``.
@@ -179,7 +179,7 @@ def chamber(
 
 @njit(cache=True)
 def end_stop(c: FunctionConstants, s: FunctionState) -> float:
-    """Torque of the drive's own cushioned end stops [Nm, N]; it only pushes."""
+    """Compute the torque of the drive's own cushioned end stops [Nm, N]; it only pushes."""
     stiffness, damping = c.inertia * STOP_RAD_S**2, c.inertia * STOP_RAD_S
     if s.at < c.low:
         return max(0.0, stiffness * (c.low - s.at) - damping * s.speed)
@@ -197,7 +197,7 @@ def advance_function(
     balance: Balance,
     h: float,
 ) -> tuple[float, float]:
-    """One function over one substep; returns the joint torque [Nm, N] of its oil and that of its end stops."""
+    """Advance one function over one substep; return the joint torque [Nm, N] of its oil and that of its end stops."""
     a, b = s.pressure_a, s.pressure_b
     force = a * c.area_a - b * c.area_b
     before = s.arm * s.speed
@@ -240,7 +240,7 @@ def advance_function(
 
 @njit(cache=True)
 def look_up(c: FunctionConstants, table: Array, q: float) -> tuple[float, float]:
-    """(arm, travel from the lower end) of a lever at joint position ``q``; beyond its ends the arm stays."""
+    """Look up (arm, travel from the lower end) of a lever at joint position ``q``; beyond its ends the arm stays."""
     at = (q - c.lever_low) / c.lever_step
     last = table.shape[1] - 2
     i = max(0, min(last, math.floor(at)))
@@ -283,7 +283,7 @@ def cross_connect(
     pump: Pump,
     h: float,
 ) -> float:
-    """Float valve of an axle: oil flows between equal chambers of its two swing arms; returns the power lost [W]."""
+    """Let oil flow between equal chambers of an axle's swing arms by its float valve; return the power lost [W]."""
     stiff_a = stiff_b = 0.0
     for s in (left, right):
         stiff_a += h * pump.bulk / (constant.dead_volume + constant.area_a * s.travel)
@@ -312,7 +312,7 @@ def advance(
     substeps: int,
     torques: Array,
 ) -> float:
-    """One physics step.  ``floating``: index of the left arm of the axle whose float valve is open, or -1."""
+    """Advance one physics step.  ``floating``: index of the left arm of the axle whose float valve is open, or -1."""
     pump, balance = pumps[0], balances[0]
     h = step_s / substeps
     delayed = np.empty(len(states))

@@ -122,7 +122,7 @@ class Balance(Protocol):
 
 
 def _dtype(fields: type) -> np.dtype[np.void]:
-    """The dtype of a record with these fields, in their order."""
+    """Make the dtype of a record with these fields, in their order."""
     kinds = {"float": np.float64, "int": np.int64}
     return np.dtype([(name, kinds[kind]) for name, kind in fields.__annotations__.items()])
 
@@ -134,7 +134,7 @@ BALANCE: Final = _dtype(Balance)
 
 
 def pump(supply: Supply) -> Records:
-    """The one PUMP record."""
+    """Make the one PUMP record."""
     s = supply
     post = float(s.sharing == "post_compensated")
     values = (post, s.pump_flow_m3_s, s.pressure_margin_pa, s.relief_pa, s.shock_pa, s.tank_pa, s.build_up_s)
@@ -142,7 +142,7 @@ def pump(supply: Supply) -> Records:
 
 
 def _lever(function: Function) -> tuple[Array, Array]:
-    """Lever arm dx/dq and piston travel from its lower end, on a uniform grid over the joint's positions."""
+    """Compute lever arm dx/dq and piston travel from its lower end, on a uniform grid over the joint's positions."""
     c = function.cylinder
     q = np.linspace(c.arm_at[0], c.arm_at[-1], LEVER_POINT_COUNT)
     arm = np.interp(q, c.arm_at, c.arm)
@@ -151,7 +151,7 @@ def _lever(function: Function) -> tuple[Array, Array]:
 
 
 def functions(truth: Truth, step_s: float) -> tuple[Records, Array]:
-    """CONSTANTS of every function, and their lever tables (function, arm or travel, grid)."""
+    """Make the CONSTANTS of every function, and their lever tables (function, arm or travel, grid)."""
     margin = truth.supply.pressure_margin_pa
     full = margin / np.sqrt(UNIT_PA * (margin + SOFT_PA))
     records = np.zeros(len(truth.functions), CONSTANTS)

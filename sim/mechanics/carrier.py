@@ -47,7 +47,7 @@ PARKED: Final = Drive(0.0, True)
 
 
 def _specified(profile: Profile, truth: Truth) -> tuple[CarrierProfile, CarrierTruth]:
-    """The carrier's profile and truth; only for a machine with a carrier."""
+    """Return the carrier's profile and truth; only for a machine with a carrier."""
     assert profile.carrier is not None and truth.carrier is not None
     return profile.carrier, truth.carrier
 
@@ -79,7 +79,7 @@ def _shapes(c: CarrierProfile, link: str) -> tuple[Shape, ...]:
 
 
 def _arm_link(c: CarrierProfile, t: CarrierTruth, name: str) -> LinkDef:
-    """Arm as a beam and wheel as a disc.  The wheel's inertia about its axle counts for its spin, not for the arm."""
+    """Model arm as beam, wheel as disc.  The wheel's inertia about its axle counts for its spin, not for the arm."""
     length, mass = c.arm_length_m, t.arm_mass_kg + t.wheel_mass_kg
     com = (t.arm_mass_kg / 2 + t.wheel_mass_kg) / mass * length
     about = t.arm_mass_kg * (length**2 / 12 + (com - length / 2) ** 2) + t.wheel_mass_kg * (length - com) ** 2
@@ -93,7 +93,7 @@ def _arm_link(c: CarrierProfile, t: CarrierTruth, name: str) -> LinkDef:
 
 
 def carrier_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[JointDef]]:
-    """CARRIER_LINKS (root first) and CARRIER_JOINTS of the machine's multibody; SI units."""
+    """Make CARRIER_LINKS (root first) and CARRIER_JOINTS of the machine's multibody; SI units."""
     c, t = _specified(profile, truth)
     halves = zip(("rear", "front"), (t.rear, t.front), strict=True)
     links = [LinkDef(n, f.mass_kg, f.com_m, f.inertia_kg_m2, _shapes(c, n)) for n, f in halves]
@@ -191,15 +191,15 @@ class Carrier:
     def apply(self, drive: Drive) -> None:
         """Apply the tyres' forces of the next physics step to the arms and turn the wheels."""
         p, body, h, t = self._p, self._body, self._step_s, self._t
-        wanted = 0.0 if drive.brake else drive.speed_m_s
+        target_speed_m_s = 0.0 if drive.brake else drive.speed_m_s
         ramp = t.drive_acceleration_m_s2 * h
-        self._reference += max(-ramp, min(ramp, wanted - self._reference))
+        self._reference += max(-ramp, min(ramp, target_speed_m_s - self._reference))
         spin = self._reference / self._c.wheel_radius_m
-        offer = 0.0
+        requested_torque_nm = 0.0
         if not drive.brake:
-            offer = t.drive_gain_nm_s_rad * (spin - sum(self._speeds.tolist()) / 4.0)
-            offer = max(-t.drive_torque_nm, min(t.drive_torque_nm, offer))
-        self._torque += h / (h + t.drive_lag_s) * (offer - self._torque)
+            requested_torque_nm = t.drive_gain_nm_s_rad * (spin - sum(self._speeds.tolist()) / 4.0)
+            requested_torque_nm = max(-t.drive_torque_nm, min(t.drive_torque_nm, requested_torque_nm))
+        self._torque += h / (h + t.drive_lag_s) * (requested_torque_nm - self._torque)
         self._brake += h / (h + t.brake_lag_s) * (float(drive.brake) - self._brake)
         if not drive.brake and self._brake < 1e-3:
             self._brake = 0.0
@@ -225,7 +225,7 @@ class Carrier:
             p.applyExternalTorque(body, i, f[3:], p.WORLD_FRAME)
 
     def pose(self, link: str) -> tuple[Vector, Quaternion]:
-        """Frame of one of CARRIER_LINKS in the world."""
+        """Return the frame of one of CARRIER_LINKS in the world."""
         if link == "rear":
             at, turn = self._p.getBasePositionAndOrientation(self._body)
             axes = self._p.getMatrixFromQuaternion(turn)
@@ -236,7 +236,7 @@ class Carrier:
         return state[4], state[5]
 
     def front_axle(self) -> Vector:
-        """Middle of the front axle, between the hubs, in the world [m]."""
+        """Return the middle of the front axle, between the hubs, in the world [m]."""
         x, y, z = (sum(pair) / 2 for pair in zip(self._hub_at("arm_fl"), self._hub_at("arm_fr"), strict=True))
         return x, y, z
 
@@ -266,7 +266,7 @@ class Carrier:
         return angle
 
     def attitude(self, link: str) -> Vector:
-        """Roll (+ left side up), pitch (+ nose down) and heading (0 = east, + left) of a link [rad]."""
+        """Return roll (+ left side up), pitch (+ nose down) and heading (0 = east, + left) of a link [rad]."""
         return quaternion_rpy(self.pose(link)[1])
 
     @property

@@ -34,7 +34,7 @@ SMALL_LINKS: Final = {"base": (100.0, 5.0), "turntable": (15.0, 0.5), "flexure":
 
 
 def _telescope(k: Kinematics, steel: Steel) -> tuple[float, Vector, Vector, Vector]:
-    """The telescope in the stick frame: pitch [rad] and direction of its axis, its frame at 0, the pin at 0.
+    """Place the telescope in the stick frame: pitch [rad] and direction of its axis, its frame at 0, the pin at 0.
 
     Third and fourth row of the DH chain: a3 across and d4 along the telescope's own axis, which theta3's offset turns.
     """
@@ -47,7 +47,7 @@ def _telescope(k: Kinematics, steel: Steel) -> tuple[float, Vector, Vector, Vect
 
 
 def crane_shapes(profile: Profile, steel: Steel) -> list[Shape]:
-    """All boxes of the crane; ``solid`` ones collide."""
+    """Return all boxes of the crane; ``solid`` ones collide."""
     k = profile.kinematics
     grey, yellow, dark = (0.45, 0.47, 0.5), (0.95, 0.72, 0.1), (0.2, 0.2, 0.22)
     pitch, along, frame, pin = _telescope(k, steel)
@@ -77,7 +77,7 @@ def crane_shapes(profile: Profile, steel: Steel) -> list[Shape]:
 
 
 def crane_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[JointDef]]:
-    """Links in CRANE_LINKS order, the root ``base`` first, and joints in CRANE_JOINTS order."""
+    """Make the links in CRANE_LINKS order, the root ``base`` first, and the joints in CRANE_JOINTS order."""
     shapes = crane_shapes(profile, truth.steel)
     links = []
     for name in CRANE_LINKS:
@@ -134,7 +134,7 @@ def _joints(profile: Profile, steel: Steel) -> list[JointDef]:
 
 
 def rigid_pin(joints: Sequence[JointDef], q: Mapping[str, float]) -> Vector:
-    """The hanger pin in the base frame with a straight column, computed along the joint table."""
+    """Compute the hanger pin in the base frame with a straight column, along the joint table."""
     at, (rx, ry, rz) = (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # columns of the rotation
     for joint in joints:
         x, y, z = joint.origin_m
@@ -155,7 +155,7 @@ def rigid_pin(joints: Sequence[JointDef], q: Mapping[str, float]) -> Vector:
 
 
 def _turned(a: Vector, b: Vector, angle: float) -> tuple[Vector, Vector]:
-    """Two axes turned about the third, from ``a`` towards ``b``."""
+    """Turn two axes about the third, from ``a`` towards ``b``."""
     c, s = math.cos(angle), math.sin(angle)
     return (
         (c * a[0] + s * b[0], c * a[1] + s * b[1], c * a[2] + s * b[2]),
@@ -180,11 +180,11 @@ class Column:
         self._rest = tuple(-moment / k for moment, k in zip(home_moments, self._k, strict=True))
 
     def torques(self, angles: Sequence[float], rates: Sequence[float], extra_s: float = 0.0) -> list[float]:
-        """Torques [Nm] on flex_pitch and flex_roll; ``extra_s`` adds to the ratio of damper to spring."""
+        """Compute the torques [Nm] on flex_pitch and flex_roll; ``extra_s`` adds to the ratio of damper to spring."""
         d = self._damping_s + extra_s
         springs = zip(angles, self._rest, rates, self._k, strict=True)
         return [-k * (x - rest + d * v) for x, rest, v, k in springs]
 
     def balance(self, moments: Sequence[float]) -> list[float]:
-        """The angles at which the springs carry these moments [Nm]."""
+        """Compute the angles at which the springs carry these moments [Nm]."""
         return [rest + moment / k for rest, moment, k in zip(self._rest, moments, self._k, strict=True)]

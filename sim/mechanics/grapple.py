@@ -39,7 +39,7 @@ class JawGeometry:
 
 
 def jaw_geometry(profile: Profile) -> JawGeometry:
-    """Least-squares fit of pivots and chord to the profile's table.
+    """Fit pivots and chord to the profile's table by least squares.
 
     half gap = x + out cos(a) - down sin(a), tip below pivot = out sin(a) + down cos(a).
     """
@@ -56,7 +56,7 @@ def jaw_geometry(profile: Profile) -> JawGeometry:
 
 
 def _solve3(m: list[list[float]], y: Sequence[float]) -> tuple[float, float, float]:
-    """Cramer's rule."""
+    """Solve by Cramer's rule."""
 
     def det(a: list[list[float]]) -> float:
         return (
@@ -71,13 +71,13 @@ def _solve3(m: list[list[float]], y: Sequence[float]) -> tuple[float, float, flo
 
 
 def jaw_points(jaws: JawGeometry, side: int) -> list[tuple[float, float]]:
-    """Polyline (x, z) [m] of a jaw in its link frame at angle 0; side -1 left, +1 right."""
+    """Return the polyline (x, z) [m] of a jaw in its link frame at angle 0; side -1 left, +1 right."""
     x, z = jaws.out_m, jaws.down_m
     return [(side * (a * x + b * z), -a * z + b * x) for a, b in JAW_PROFILE_CHORDS]
 
 
 def grapple_shapes(profile: Profile) -> list[Shape]:
-    """Boxes of fork, rotator and jaws.
+    """Return the boxes of fork, rotator and jaws.
 
     The beam between the pivots is slim and lies above them, because a thick log needs the room between the jaws.
     """

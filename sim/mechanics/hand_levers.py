@@ -36,5 +36,5 @@ class HandLevers:
         self._at[name], self._until_ns[name] = value, now_ns + LEVER_HOLD_NS
 
     def held(self, now_ns: int) -> dict[str, float]:
-        """The levers that are out of neutral now."""
+        """Return the levers that are out of neutral now."""
         return {n: v for n, v in self._at.items() if v and now_ns < self._until_ns[n]}

@@ -44,7 +44,7 @@ class Device(CanopenSlave):
             self.outbox.append(emergency_frame(Emergency(self.node, code, register[0], bytes(5))))
 
     def tick(self, now_ns: int) -> None:
-        """Boot-up, heartbeat, and the node's periodic frames."""
+        """Send boot-up, heartbeat, and the node's periodic frames."""
         if self.state == NodeState.BOOT_UP:
             self.outbox.append((HEARTBEAT_BASE + self.node, b"\x00"))
             self.state = NodeState.OPERATIONAL
@@ -54,7 +54,7 @@ class Device(CanopenSlave):
             self.cycle(now_ns)
 
     def cycle(self, now_ns: int) -> None:
-        """Periodic frames of an operational node."""
+        """Send the periodic frames of an operational node."""
 
 
 class EstopBox(Device):
@@ -91,7 +91,7 @@ class EstopBox(Device):
         return self.relay_on and self.guard_on
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
-        """A frame of the guard; others are ignored."""
+        """Accept a frame of the guard; others are ignored."""
         if key == self._guard.key:
             self._guard.accept(data, now_ns)
 
@@ -105,7 +105,7 @@ class EstopBox(Device):
         return self._reset_until_ns is not None
 
     def press(self) -> None:
-        """Both contacts open; the pilot supply drops at once and stays off until ``reset``."""
+        """Open both contacts; the pilot supply drops at once and stays off until ``reset``."""
         self._channels, self._source, self.relay_on = (0, 0), 1, False
         self._event()
 
@@ -122,7 +122,7 @@ class EstopBox(Device):
         self._event()
 
     def move_lever(self, moved: bool) -> None:
-        """A person moves a hand lever, or lets go of it; what the lever does to the oil is not modelled."""
+        """Move a hand lever as a person does, or let go of it; what the lever does to the oil is not modelled."""
         self._lever = int(moved)
         self._event()
 

@@ -99,13 +99,13 @@ class EncoderNode:
         self._booted = False
 
     def observe(self, now_ns: int, position: float, speed: float) -> None:
-        """True joint position and speed at ``now_ns``."""
+        """Record the true joint position and speed at ``now_ns``."""
         self._history.append(position)
         self._now_ns = now_ns
         self._speed = speed
 
     def measure(self, now_ns: int) -> float:
-        """Its present reading, with all its errors [rad or m]."""
+        """Return its present reading, with all its errors [rad or m]."""
         self._sample(now_ns)
         return position_from_counts(self.spec, self._values[0x6004, 0])
 
@@ -130,7 +130,7 @@ class EncoderNode:
         self.node.nmt.send_command(0x80)  # pre-operational, starts the heartbeat of 1017h
 
     def set_alarm(self, alarms: int) -> None:
-        """Alarm bits of 6503h (rotary) or 5122h:01 (linear); a change sends an emergency message."""
+        """Set the alarm bits of 6503h (rotary) or 5122h:01 (linear); a change sends an emergency message."""
         if alarms == self.alarms:
             return
         self.alarms = alarms
@@ -140,7 +140,7 @@ class EncoderNode:
         self.node.emcy.send(code, register, alarms.to_bytes(2, "little"))
 
     def sync(self, now_ns: int) -> None:
-        """SYNC: sample, and send TPDO1 if it is due."""
+        """Sample on a SYNC, and send TPDO1 if it is due."""
         self._sample(now_ns)
         node = self.node
         if node.nmt.state != OPERATIONAL:
@@ -162,7 +162,7 @@ class EncoderNode:
         self._network.send_message(cob & 0x7FF, payload.to_bytes(length, "little"))
 
     def _read_pdo(self) -> Pdo:
-        """TPDO1 as configured; objects beyond eight bytes are left out."""
+        """Read TPDO1 as configured; objects beyond eight bytes are left out."""
         get = self.node.get_data
         mapping, shift = [], 0
         for i in range(1, get(0x1A00, 0)[0] + 1):
@@ -204,14 +204,14 @@ class EncoderBus:
         self.encoders, self._network = encoders, network
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
-        """NMT and SDO frames; malformed ones are ignored, as a CAN controller's filter would."""
+        """Handle NMT and SDO frames; malformed ones are ignored, as a CAN controller's filter would."""
         self._network.now_ns = now_ns
         is_sdo = SDO_TO_SERVER < key <= SDO_TO_SERVER + 0x7F and len(data) == 8
         if is_sdo or (key == NMT_ID and len(data) == 2):
             self._network.notify(key, bytearray(data), now_ns * 1e-9)
 
     def tick(self, now_ns: int) -> None:
-        """Boot-ups and heartbeats."""
+        """Send boot-ups and heartbeats."""
         self._network.now_ns = now_ns
         for encoder in self.encoders.values():
             encoder.tick(now_ns)
@@ -219,6 +219,6 @@ class EncoderBus:
             task.tick(now_ns)
 
     def sync(self, now_ns: int) -> None:
-        """SYNC to all."""
+        """Pass a SYNC to all."""
         for encoder in self.encoders.values():
             encoder.sync(now_ns)

@@ -99,10 +99,13 @@ class GnssNode(J1939Node):
                 self.outbox += sent
 
     def _measure(self, now_ns: int) -> None:
-        """One epoch: measure the antennas, and queue the messages that are due."""
+        """Measure the antennas for one epoch, and queue the messages that are due."""
         gauss, t = self._rng.gauss, self._truth
-        place, turn = self._front_pose()
-        main, aux = _sum(place, _turned(turn, self._main)), _sum(place, _turned(turn, self._aux))
+        position_m, orientation = self._front_pose()
+        main, aux = (
+            _sum(position_m, _turned(orientation, self._main)),
+            _sum(position_m, _turned(orientation, self._aux)),
+        )
         azimuth = math.atan2(aux[1] - main[1], aux[0] - main[0]) - self._baseline_rad
         last, self._last = self._last or (main, azimuth), (main, azimuth)
         driven = math.sqrt(1.0 - self._keep * self._keep)
@@ -125,7 +128,7 @@ class GnssNode(J1939Node):
             self._put(out, "VesselHeading", Heading=heading, Reference=0, **stamp)
             rate = -_wrapped(azimuth - last[1]) / (CYCLE_NS * 1e-9) + gauss(0.0, t.rate_noise_rad_s)
             self._put(out, "RateOfTurn", Rate=rate, **stamp)
-            roll, pitch, _ = quaternion_rpy(turn)
+            roll, pitch, _ = quaternion_rpy(orientation)
             noise = t.attitude_noise_rad
             yaw = None if heading is None else _wrapped(heading)
             attitude = {"Yaw": yaw, "Pitch": gauss(-pitch, noise), "Roll": gauss(roll, noise)}
@@ -140,7 +143,7 @@ class GnssNode(J1939Node):
         self._pending.append((now_ns + round(self._rng.uniform(*t.latency_s) * 1e9), out))
 
     def _position(self, antenna: Vector) -> tuple[float, float, float] | tuple[None, None, None]:
-        """Measured latitude, longitude and height; draws the same random numbers for every fix."""
+        """Measure latitude, longitude and height; draw the same random numbers for every fix."""
         noise = [self._rng.gauss(0.0, 1.0) for _ in range(3)]
         if not self.fix:
             return None, None, None
@@ -165,9 +168,14 @@ class GnssNode(J1939Node):
             quality = self._truth.fixes[self.fix.name.lower()]
             fields = {"NumberOfSvs": quality.satellites, "Hdop": quality.hdop, "Pdop": 1.6 * quality.hdop}
             fields["Integrity"] = 1 if self.fix is Fix.RTK_FIXED else 2
-        place = {"Latitude": lat, "Longitude": lon, "Altitude": height, "GeoidalSeparation": self._truth.geoid_m}
+        position_fields = {
+            "Latitude": lat,
+            "Longitude": lon,
+            "Altitude": height,
+            "GeoidalSeparation": self._truth.geoid_m,
+        }
         kind = {"GnssType": GPS_GLONASS, "Method": int(self.fix), "ReferenceStations": 0}
-        self._put(out, "GnssPositionData", **utc, **place, **kind, **fields, **stamp)
+        self._put(out, "GnssPositionData", **utc, **position_fields, **kind, **fields, **stamp)
 
     def _put(self, out: list[tuple[int, bytes]], message: str, **fields: Any) -> None:
         codec = self._messages.message(message)
@@ -188,7 +196,7 @@ def _wrapped(angle: float) -> float:
 
 
 def _turned(q: Quaternion, v: Vector) -> Vector:
-    """``v`` turned by the unit quaternion (x, y, z, w)."""
+    """Turn ``v`` by the unit quaternion (x, y, z, w)."""
     x, y, z, w = q
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
     return (

@@ -40,7 +40,7 @@ class ImuNode(Device):
         """Its cable is cut: it sends nothing."""
 
     def observe(self, lean_rad: Pair) -> None:
-        """True lean at the end of a step."""
+        """Record the true lean at the end of a step."""
         self._history.append(lean_rad)
 
     def tick(self, now_ns: int) -> None:

@@ -59,13 +59,13 @@ class J1939Node:
         self.outbox += frames(self._claim, self.name, NULL_ADDRESS if self.address_lost else self.address)
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
-        """A frame of the bus."""
+        """Handle a frame of the bus."""
         if key >> 16 & 0xFF not in ADDRESS_FORMATS:
             return
         _, pgn, source, destination = split_id(key)
         if pgn == REQUEST_PGN:
-            wanted = self._request.receive(data)[0] if len(data) == 3 else None
-            if wanted == CLAIM_PGN and destination in (self.address, BROADCAST):
+            requested_pgn = self._request.receive(data)[0] if len(data) == 3 else None
+            if requested_pgn == CLAIM_PGN and destination in (self.address, BROADCAST):
                 self._send_claim()
         elif pgn == CLAIM_PGN and source == self.address and len(data) == 8:
             theirs, ours = (int.from_bytes(name, "little") for name in (data, self.name))
@@ -81,7 +81,7 @@ class J1939Node:
             self.cycle(now_ns)
 
     def cycle(self, now_ns: int) -> None:
-        """Periodic frames of a node that has its address."""
+        """Send the periodic frames of a node that has its address."""
 
 
 # -- The swing-arm controller (source address 30h): spool commands of the four arms and the two float valves.
@@ -197,7 +197,7 @@ class EngineNode(J1939Node):
         self._trouble = (0, 0)
 
     def set_trouble(self, spn: int, fmi: int) -> None:
-        """A suspect parameter number and failure mode, with the amber lamp; (0, 0): none."""
+        """Set a suspect parameter number and failure mode, with the amber lamp; (0, 0): none."""
         self._trouble = (spn, fmi)
 
     def cycle(self, now_ns: int) -> None:
@@ -275,7 +275,7 @@ class Gear(IntEnum):
 
 
 def spool_for(valve: CarrierValve | Valve, speed: float, least: float = 0.0) -> float:
-    """Spool command -1..1 that gives ``speed`` by the profile; speeds up to ``least`` leave the spool neutral."""
+    """Find the spool command -1..1 that gives ``speed`` by the profile; speeds up to ``least`` leave it neutral."""
     if abs(speed) <= least:
         return 0.0
     plus = speed > 0.0

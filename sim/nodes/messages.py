@@ -20,7 +20,7 @@ class PeriodicTimer:
         self._period, self._next = period_ns, phase_ns
 
     def due(self, now_ns: int) -> bool:
-        """Whether the period has elapsed since the last call; a late caller gets one, not a burst."""
+        """Tell whether the period has elapsed since the last call; a late caller gets one, not a burst."""
         if now_ns < self._next:
             return False
         self._next += self._period * max(1, -(-(now_ns - self._next + 1) // self._period))
@@ -41,7 +41,7 @@ class ProtectedMessage:
         self.key, self._encode, self._sender = codec.key, codec.encode, Sender(codec.data_ids)
 
     def frame(self, *values: float | None) -> tuple[int, bytes]:
-        """The next frame."""
+        """Make the next frame."""
         return self.key, self._sender.protect(self._encode(0, 0, *values))
 
 
@@ -74,7 +74,7 @@ class ProtectedInput:
         self.late = False
 
     def accept(self, data: bytes, now_ns: int) -> bool:
-        """Whether the frame was valid and accepted."""
+        """Tell whether the frame was valid and accepted."""
         if not self._checker.check(data).usable:
             return False
         try:
@@ -89,14 +89,14 @@ class ProtectedInput:
         return True
 
     def fresh(self, now_ns: int, limit_ns: int) -> bool:
-        """Whether the newest valid frame is at most ``limit_ns`` old."""
+        """Tell whether the newest valid frame is at most ``limit_ns`` old."""
         return self.values is not None and now_ns - self.stamp_ns <= limit_ns
 
     def last(self, count: int) -> tuple[Any, ...]:
-        """The last ``count`` signals of the newest frame, None where not available."""
+        """Return the last ``count`` signals of the newest frame, None where not available."""
         return (None,) * count if self.values is None else self.values[-count:]
 
     def get(self, signal: str) -> float:
-        """A signal of the newest frame, 0 when unknown or not available."""
+        """Return a signal of the newest frame, 0 when unknown or not available."""
         value = None if self.values is None else self.values[self._index[signal]]
         return 0.0 if value is None else value

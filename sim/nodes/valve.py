@@ -122,7 +122,7 @@ class ValveNode(Device):
         self._locked: ExitCode | None = None
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
-        """A command or guard frame; others and invalid ones are ignored."""
+        """Accept a command or guard frame; others and invalid ones are ignored."""
         source = self._inputs.get(key)
         if source is None or not source.accept(data, now_ns):
             return
@@ -130,7 +130,7 @@ class ValveNode(Device):
             self._locked = None
 
     def sync(self, now_ns: int) -> None:
-        """A SYNC was received."""
+        """Record that a SYNC was received."""
         self._sync_ns = now_ns
 
     def decide(self, now_ns: int) -> None:
@@ -139,27 +139,27 @@ class ValveNode(Device):
         if missing is not None and self.valve_state is ValveState.ACTIVE:
             self._locked, self._lost_ns, self._ramp_from = missing, now_ns, list(self.outputs_pct)
             self._ramp_from[-1] = 0.0  # the grapple's valve closes at once and holds
-        wanted = [0.0] * len(FUNCTIONS)
+        outputs_pct = [0.0] * len(FUNCTIONS)
         armed = self._b.get("ArmKey") == ARM_KEY
         if missing is ExitCode.SAFETY_STOP or (missing is not None and not self._commands_fresh(now_ns, PILOT_NS)):
             self.valve_state, self.exit = ValveState.PILOT_OFF, missing
         elif self._locked is not None:
             self.exit = self._locked
-            left = 1.0 - (now_ns - (self._lost_ns or 0)) / RAMP_NS
-            self.valve_state = ValveState.RAMP if left > 0.0 else ValveState.FAULT
-            wanted = [max(0.0, left) * u for u in self._ramp_from]
+            remaining_share = 1.0 - (now_ns - (self._lost_ns or 0)) / RAMP_NS
+            self.valve_state = ValveState.RAMP if remaining_share > 0.0 else ValveState.FAULT
+            outputs_pct = [max(0.0, remaining_share) * u for u in self._ramp_from]
         elif missing is not None or not armed:
             self.valve_state, self.exit = ValveState.NEUTRAL, missing or ExitCode.NOT_ARMED
         else:
             self.valve_state, self.exit = ValveState.ACTIVE, ExitCode.OK
-            wanted = self._commands()
-        self.outputs_pct = wanted
+            outputs_pct = self._commands()
+        self.outputs_pct = outputs_pct
 
     def _commands_fresh(self, now_ns: int, limit_ns: int) -> bool:
         return self._a.fresh(now_ns, limit_ns) and self._b.fresh(now_ns, limit_ns)
 
     def _missing_condition(self, now_ns: int) -> ExitCode | None:
-        """The first condition that is not met, or None."""
+        """Find the first condition that is not met, or None."""
         if not self._pilot_on():
             return ExitCode.SAFETY_STOP
         synchronous = self._sync_ns is not None and now_ns - self._sync_ns <= SYNC_NS
@@ -207,7 +207,7 @@ class ValveNode(Device):
             self.outbox.append(self._plc.frame(run, self._watchdog, CYCLE_US, 0))
 
     def _grapple_state(self, m: ValveInputs) -> GrappleState:
-        """From the opening where it is measured, else from the pressures at the ends."""
+        """Judge by the opening where it is measured, else by the pressures at the ends."""
         command = self.outputs_pct[5]
         if m.opening is None:
             opened, closed = m.release_bar > END_BAR, m.clamp_bar > END_BAR

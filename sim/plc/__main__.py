@@ -51,7 +51,7 @@ class PlcRegisters:
         self._program, self._clock_ns = program, clock_ns
 
     def read(self, address: int, count: int) -> list[int]:
-        """A part of the status block or of the command block; both read alike as holding and as input registers."""
+        """Read a part of the status or of the command block; both read alike as holding and as input registers."""
         for begin, length in ((plc.STATUS_AT, plc.STATUS_COUNT), (plc.COMMAND_AT, plc.COMMAND_COUNT)):
             if begin <= address and address + count <= begin + length:
                 block = self._program.status() if begin == plc.STATUS_AT else self._program.arbiter.command_block()
@@ -59,15 +59,15 @@ class PlcRegisters:
         raise RegisterRefused(RegisterRefused.ADDRESS)
 
     def write(self, client: int, address: int, values: Sequence[int]) -> None:
-        """A write by this connection."""
+        """Pass on a write by this connection."""
         self._program.arbiter.write(client, address, values, self._clock_ns())
 
     def commands(self, client: int) -> bool:
-        """Whether this connection commands."""
+        """Tell whether this connection commands."""
         return self._program.arbiter.commander(self._clock_ns()) == client
 
     def closed(self, client: int) -> None:
-        """The connection has ended; the commander may return on a new one."""
+        """Report that the connection has ended; the commander may return on a new one."""
         self._program.arbiter.disconnected(client)
 
 
@@ -154,7 +154,7 @@ class LivePlc(LivePlant):
         self.datagrams: Datagrams | None = None
 
     def clock_ns(self) -> int:
-        """The plant's time."""
+        """Return the plant's time."""
         return self._now_ns
 
     def open(self, modbus: Address | None, udp: Address | None) -> dict[str, int]:
@@ -183,7 +183,7 @@ class LivePlc(LivePlant):
         self._loop.run_until_complete(asyncio.sleep(pause_s))
 
     def report(self) -> dict[str, float]:
-        """Also the counts of the network."""
+        """Report the counts of the network, too."""
         arbiter = self._program.arbiter
         counts = {
             "accepted": arbiter.accepted,

@@ -32,7 +32,7 @@ SENT_COUNT = 64  # replies whose time is kept
 
 
 def is_neutral(command: Command) -> bool:
-    """Whether a command may begin a session."""
+    """Tell whether a command may begin a session."""
     return command.mode is Mode.NEUTRAL and not command.armed and not command.reset and not command.grapple
 
 
@@ -63,7 +63,7 @@ class Session:
         return self._header(self._offer, hello.sequence, now_ns)
 
     def admits(self, client: Hashable, header: Header, command: Command, now_ns: int) -> bool:
-        """Whether a command is new; its number is then used up.
+        """Tell whether a command is new; its number is then used up.
 
         The number of one that only echoes an old reply is used up too, so that the next reply echoes it: after a
         silence in both directions this is how the two ends find each other again.
@@ -79,7 +79,7 @@ class Session:
         return current
 
     def reply_header(self, now_ns: int) -> Header:
-        """The header of the next reply in the open session."""
+        """Make the header of the next reply in the open session."""
         return self._header(self.number, self._sequence, now_ns)
 
     def _header(self, session: int, echo: int, now_ns: int) -> Header:
@@ -88,7 +88,7 @@ class Session:
         return Header(session, self._replies, now_ns // 1000, echo)
 
     def _echoes(self, echo: int, now_ns: int) -> bool:
-        """Whether a number is that of a reply of the last 50 ms."""
+        """Tell whether a number is that of a reply of the last 50 ms."""
         behind = self._replies - echo
         known = 0 <= behind < min(self._replies, SENT_COUNT)
         return known and now_ns - self._sent_ns[echo % SENT_COUNT] <= MAX_ECHO_NS
@@ -109,7 +109,7 @@ class CommandArbiter:
     def __init__(
         self, bounds: Bounds, order: WordOrder, draw: Callable[[], int] | None = None, key: bytes | None = None
     ) -> None:
-        """``draw`` gives the numbers of sessions over UDP, random by default; ``key`` authenticates the datagrams."""
+        """Create the arbiter; ``draw`` numbers UDP sessions, by default at random; ``key`` authenticates datagrams."""
         self._bounds, self.order = bounds, order
         self.watchdog_ms = plc.WATCHDOG_DEFAULT_MS
         self.command = Command()
@@ -126,12 +126,12 @@ class CommandArbiter:
         self._reset_seen = self._commander_disconnected = False
 
     def commander(self, now_ns: int) -> Hashable:
-        """The client that commands now; None without one."""
+        """Return the client that commands now; None without one."""
         alive = self._commander is not None and now_ns - self._alive_ns <= self.watchdog_ms * MS
         return self._commander if alive else None
 
     def disconnected(self, client: Hashable) -> None:
-        """The client's connection has ended.
+        """Record that the client's connection has ended.
 
         Its command stays valid for the usual time, but any client may take over.
         """
@@ -141,11 +141,11 @@ class CommandArbiter:
         )
 
     def commanded(self) -> bool:
-        """Whether any client has commanded since the last `release`."""
+        """Tell whether any client has commanded since the last `release`."""
         return self._commander is not None
 
     def age_ns(self, now_ns: int) -> int:
-        """Age of the newest accepted command."""
+        """Return the age of the newest accepted command."""
         return now_ns - self._accepted_ns
 
     def release(self) -> None:
@@ -160,7 +160,7 @@ class CommandArbiter:
             self.fault, self.fault_axis = fault, axis
 
     def take_reset_edge(self) -> bool:
-        """Whether the newest command began to request a reset; faults are then cleared."""
+        """Tell whether the newest command began to request a reset; faults are then cleared."""
         before, self._reset_seen = self._reset_seen, self.command.reset
         edge = self._reset_seen and not before
         if edge:
@@ -168,7 +168,7 @@ class CommandArbiter:
         return edge
 
     def write(self, client: Hashable, address: int, values: Sequence[int], now_ns: int) -> None:
-        """A Modbus write.
+        """Take a Modbus write.
 
         Raises:
             RegisterRefused: wrong address, illegal value or another commander; nothing has changed.
@@ -206,7 +206,7 @@ class CommandArbiter:
             self._block = list(draft)
 
     def datagram(self, client: Hashable, data: bytes, now_ns: int) -> Header | None:
-        """A UDP command.  A damaged or old one, and one of a stranger, is dropped and counted.
+        """Take a UDP command.  A damaged or old one, and one of a stranger, is dropped and counted.
 
         Returns the header of the answer to a hello, which is due at once, and None for every other datagram.
         """
@@ -237,7 +237,7 @@ class CommandArbiter:
         self.accepted += 1
 
     def _may_command(self, client: Hashable, now_ns: int) -> bool:
-        """Whether this client may command."""
+        """Tell whether this client may command."""
         return self._commander_disconnected or self.commander(now_ns) in (None, client)
 
     def _require_command_right(self, client: Hashable, now_ns: int) -> None:
@@ -256,5 +256,5 @@ class CommandArbiter:
             self._drafts.pop(next(iter(self._drafts)))
 
     def command_block(self) -> list[int]:
-        """The accepted command block, for reading back."""
+        """Return the accepted command block, for reading back."""
         return list(self._block)

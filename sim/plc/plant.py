@@ -72,7 +72,7 @@ class PlcPlant(Plant):
         return self.plc.state is State.EXECUTE
 
     def _inputs(self, now_ns: int) -> Inputs:
-        """Readings of the PLC's cards; an encoder is read as it would answer on its bus."""
+        """Read the PLC's cards; an encoder is read as it would answer on its bus."""
         pressures = self._pressures()
         lift, tilt, ext = (pressures[name] for name in ("lift", "tilt", "ext"))
         opening, closing = pressures["grapple"]

@@ -53,12 +53,12 @@ LINEAR_SHARE = 0.01
 
 
 def resolution(spec: JointSpec) -> float:
-    """One count of the PLC's feedback [rad, m]."""
+    """Return one count of the PLC's feedback [rad, m]."""
     return RESOLUTION_M if spec.kind == "prismatic" else RESOLUTION_RAD
 
 
 def stop_band(spec: JointSpec) -> float:
-    """Band around the reference in which a joint rests: two counts, or its travel in 10 ms at its speed limit."""
+    """Find the band around the reference in which a joint rests: two counts, or 10 ms of travel at its speed limit."""
     return max(2.0 * resolution(spec), STOP_BAND_S * spec.speed_limit)
 
 
@@ -77,12 +77,12 @@ class PdLaw:
         self.reset()
 
     def reset(self) -> None:
-        """The valve is at neutral."""
+        """Set the state of a valve at neutral."""
         self._command = 0.0
         self._resting = True
 
     def measure(self, position: float, elapsed_s: float) -> None:
-        """A reading of the encoder, ``elapsed_s`` after the last one."""
+        """Take a reading of the encoder, ``elapsed_s`` after the last one."""
         counted = round(position / self._resolution) * self._resolution
         if self._known:
             share = -math.expm1(-elapsed_s / self._spec.law.velocity_filter_s)
@@ -91,7 +91,7 @@ class PdLaw:
         self.velocity = round(self._filtered / self._resolution) * self._resolution
 
     def step(self, q_ref: float, v_ref: float, speed: float, elapsed_s: float) -> float:
-        """The valve's opening, -1..1; ``speed`` is the share of the speed limit that may be used."""
+        """Compute the valve's opening, -1..1; ``speed`` is the share of the speed limit that may be used."""
         spec = self._spec
         command = v_ref
         if spec.encoder is not None:
@@ -109,7 +109,7 @@ class PdLaw:
 
 
 def valve_opening(valve: Valve, velocity: float) -> float:
-    """The inverse of the valve's dead-band, linear in the first per cent."""
+    """Invert the valve's dead-band, linear in the first per cent."""
     if velocity >= 0.0:
         share, deadband, sign = velocity / valve.full_speed_plus, valve.deadband_plus_pct / 100.0, valve.sign
     else:
@@ -146,7 +146,7 @@ class Inputs:
 
 
 def bounds_of(profile: Profile, role: Role) -> Bounds:
-    """The values that a command may hold on this machine."""
+    """Return the values that a command may hold on this machine."""
     if role is Role.VALVES:
         return Bounds.valves()
     specs = [joint(profile, j) for j in JOINTS]
@@ -177,14 +177,14 @@ class Program:
         self._from = list(self.outputs)
 
     def scan(self, now_ns: int) -> list[float]:
-        """The outputs at ``now_ns``; a cycle runs when it is due."""
+        """Return the outputs at ``now_ns``; a cycle runs when it is due."""
         if now_ns >= self._next_ns:
             self._next_ns = max(self._next_ns + CYCLE_NS, now_ns + CYCLE_NS // 2)
             self._cycle(now_ns)
         return self.outputs
 
     def status(self) -> list[int]:
-        """The present status block; it includes commands accepted since the last cycle."""
+        """Return the present status block; it includes commands accepted since the last cycle."""
         feedback = replace(self.feedback, accepted=self.arbiter.sequence & 0xFFFF)
         return plc.status_registers(feedback, self.arbiter.watchdog_ms, self.arbiter.order)
 
@@ -209,7 +209,7 @@ class Program:
         self.feedback = self._make_feedback(inputs, now_ns)
 
     def _decide(self, estop: int, now_ns: int) -> None:
-        """The state of this cycle."""
+        """Decide the state of this cycle."""
         arbiter = self.arbiter
         may_move = estop & MOTION_ALLOWED == MOTION_ALLOWED
         reset = arbiter.take_reset_edge()

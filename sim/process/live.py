@@ -62,10 +62,10 @@ class LiveMachine:
                 self._wait(pause_ns * 1e-9)
 
     def _on_received(self, frames: list[Frame]) -> None:
-        """Called with the frames drained from a bus."""
+        """Act on the frames drained from a bus; called with them."""
 
     def _on_step(self, now_ns: int) -> None:
-        """Called after every step."""
+        """Act after a step; called after every step."""
 
     def _wait(self, pause_s: float) -> None:
         """Wait until the next step is due or a frame arrives.
@@ -79,7 +79,7 @@ class LiveMachine:
             time.sleep(pause_s)
 
     def report(self) -> dict[str, float]:
-        """Real-time statistics in totals: share of time lost, number of pauses, frames of the buses."""
+        """Report real-time statistics in totals: share of time lost, number of pauses, frames of the buses."""
         elapsed_ns = max(1, time.monotonic_ns() - self._started_ns)
         stats = [bus.stats for bus in self._buses.values()]
         return {

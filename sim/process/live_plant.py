@@ -192,7 +192,7 @@ LEVER_LABELS: Final = {
 
 
 def scene_of(plant: Plant) -> dict[str, Any]:
-    """The constant part: shapes on links, wheels, logs, ground, levers, and the view point."""
+    """Describe the constant part: shapes on links, wheels, logs, ground, levers, and the view point."""
     carrier, log_bodies = plant.profile.carrier, plant.world.log_bodies
     wheel = None if carrier is None else {"radius_m": carrier.wheel_radius_m, "width_m": carrier.wheel_width_m}
     middle, _ = plant.base_pose()
@@ -217,7 +217,7 @@ def scene_of(plant: Plant) -> dict[str, Any]:
 
 
 def view_of(plant: Plant) -> dict[str, Any]:
-    """The moving part, and the numbers beside it."""
+    """Describe the moving part, and the numbers beside it."""
     h = plant.world.hydraulics
     return {
         "time_s": plant.time_s,
@@ -273,7 +273,7 @@ def _facts(plant: Plant) -> dict[str, str]:
 
 
 def _fixed(value: float, digits: int) -> str:
-    """Without a minus sign before zero."""
+    """Format without a minus sign before zero."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
@@ -282,7 +282,7 @@ def _list(values: Sequence[float], scale: float, unit: str) -> str:
 
 
 def _ground(terrain: Terrain) -> dict[str, Any]:
-    """Level ground as its height, uneven ground as a coarse grid about the origin."""
+    """Describe level ground by its height, uneven ground by a coarse grid about the origin."""
     if terrain.kind == "flat":
         return {"z_m": terrain.height(0.0, 0.0)}
     n = round(2 * GROUND_HALF_M / GROUND_CELL_M) + 1

@@ -68,12 +68,12 @@ class LogSampler:
         self.rng, self._shapes = random.Random(f"scene {seed}"), random.Random(f"shapes {seed}")
 
     def density(self) -> float:
-        """Density [kg/m^3] of one log."""
+        """Draw the density [kg/m^3] of one log."""
         spread = self.wood.density_spread * max(-2.0, min(2.0, self.rng.gauss(0.0, 1.0)))
         return self.wood.density_kg_m3 * (1.0 + spread)
 
     def log(self, x_m: float, y_m: float, yaw_rad: float, density: float | None = None) -> LogSpec:
-        """A log of random size and shape, butt at a random end, bowing to a random side."""
+        """Draw a log of random size and shape, butt at a random end, bowing to a random side."""
         w, rng, shapes = self.wood, self.rng, self._shapes
         return LogSpec(
             x_m=x_m,
@@ -92,7 +92,7 @@ class LogSampler:
 def random_scene(
     profile: Profile, wood: Wood, seed: int, logs: int, at: tuple[float, float] | None = None
 ) -> tuple[LogSpec, ...]:
-    """``logs`` logs inside the profile's pick area, or an area of its size about ``at``, apart from each other.
+    """Draw ``logs`` logs inside the profile's pick area, or an area of its size about ``at``, apart from each other.
 
     Their sizes are those of papers A and B (docs/reference/machines.md section 9).
 
@@ -101,23 +101,23 @@ def random_scene(
     """
     sampler, half = LogSampler(wood, seed), profile.workspace.pick_half_size_m
     cx, cy = _pick_center(profile) if at is None else at
-    found: list[LogSpec] = []
+    placed_specs: list[LogSpec] = []
     failed = 0
-    while len(found) < logs and failed < MAX_TRY_COUNT:
+    while len(placed_specs) < logs and failed < MAX_TRY_COUNT:
         density, rng = sampler.density(), sampler.rng
         x, y, yaw = cx + rng.uniform(-half, half), cy + rng.uniform(-half, half), rng.uniform(-math.pi / 2, math.pi / 2)
         spec = sampler.log(x, y, yaw, density)
-        if all(footprint_gap(spec, other) > 0.1 for other in found):
-            found.append(spec)
+        if all(footprint_gap(spec, other) > 0.1 for other in placed_specs):
+            placed_specs.append(spec)
             failed = 0
         else:
             failed += 1
-    if len(found) < logs:
+    if len(placed_specs) < logs:
         raise PlantError(
             "scene.pick-area-full",
             f"the pick area has no room for {logs} separate logs; request fewer logs or enlarge pick_half_size_m",
         )
-    return tuple(found)
+    return tuple(placed_specs)
 
 
 def arrangement(
@@ -131,7 +131,7 @@ def arrangement(
     yaw_rad: float | None = None,
     route: Sequence[tuple[float, float]] = ((0.0, 0.0), (40.0, 0.0)),
 ) -> tuple[LogSpec, ...]:
-    """A scene of a kind in KINDS, about ``at`` (default: the pick area's middle), axis at ``yaw_rad`` (default random).
+    """Draw a scene of a kind in KINDS about ``at`` (default: pick area's middle), axis at ``yaw_rad`` (default random).
 
     single: one log; separate: as ``random_scene``; parallel: side by side; skewed: side by side, 15 to 30 deg apart;
     crossed: the last across the others; pile: rows upon rows; row: single logs beside ``route`` (waypoints [m]), on
@@ -167,7 +167,7 @@ def configuration(
     at: tuple[float, float] | None = None,
     yaw_rad: float | None = None,
 ) -> tuple[LogSpec, ...]:
-    """One of paper A's configurations, 1 to 12 (see CONFIGURATIONS), with random logs.
+    """Draw one of paper A's configurations, 1 to 12 (see CONFIGURATIONS), with random logs.
 
     Raises:
         PlantError: there is no configuration of this number.
@@ -181,7 +181,7 @@ def configuration(
 
 
 def _pick_center(profile: Profile) -> tuple[float, float]:
-    """Middle of the pick area in the world, for the machine at its start."""
+    """Return the middle of the pick area in the world, for the machine at its start."""
     (x, y), c = profile.workspace.pick_center_m, profile.carrier
     if c is None:
         return x, y
@@ -199,7 +199,7 @@ def _drawn(sampler: LogSampler, logs: int, yaws: Callable[[], float]) -> list[Lo
 
 
 def _rows(counts: Sequence[int], logs: Sequence[LogSpec]) -> list[LogSpec]:
-    """Rows of logs along x, side by side in y, each row on top of and centred over the one below it."""
+    """Stack rows of logs along x, side by side in y, each row on top of and centred over the one below it."""
     following = iter(logs)
     out: list[LogSpec] = []
     middle = 0.0
@@ -218,7 +218,7 @@ def _parallel(sampler: LogSampler, logs: int) -> list[LogSpec]:
 
 
 def _pile(sampler: LogSampler, logs: int) -> list[LogSpec]:
-    """The thickest logs lie below: a thick log on thin ones rolls off, and the pile falls apart."""
+    """Pile logs, the thickest below: a thick log on thin ones rolls off, and the pile falls apart."""
     drawn = _drawn(sampler, logs, lambda: sampler.rng.uniform(-0.08, 0.08))
     return _rows(PILE_ROWS[logs], sorted(drawn, key=lambda log: -log.diameter_m))
 
@@ -229,7 +229,7 @@ def _skewed(sampler: LogSampler, logs: int) -> list[LogSpec]:
 
 
 def _crossed(sampler: LogSampler, logs: int) -> list[LogSpec]:
-    """Parallel logs half a metre apart and one across them, turned by 40 to 90 deg."""
+    """Lay parallel logs half a metre apart and one across them, turned by 40 to 90 deg."""
     rng, lower = sampler.rng, []
     for i in range(logs - 1):
         lower.append(sampler.log(rng.uniform(-0.2, 0.2), 0.7 * (i - (logs - 2) / 2), rng.uniform(-0.05, 0.05)))
@@ -242,38 +242,38 @@ def _row(sampler: LogSampler, logs: int, route: Sequence[tuple[float, float]]) -
     legs = list(pairwise(route))
     total = sum(math.dist(a, b) for a, b in legs)
     spacing = (total - ROUTE_START_M) / logs
-    found: list[LogSpec] = []
+    placed_specs: list[LogSpec] = []
     for i in range(logs):
         for _ in range(MAX_TRY_COUNT):
-            left = ROUTE_START_M + spacing * (i + rng.uniform(0.2, 0.8))
-            side, off, yaw = rng.choice((-1.0, 1.0)), rng.uniform(2.4, 4.4), rng.uniform(-math.pi / 2, math.pi / 2)
+            leg_distance_m = ROUTE_START_M + spacing * (i + rng.uniform(0.2, 0.8))
+            side, offset_m, yaw = rng.choice((-1.0, 1.0)), rng.uniform(2.4, 4.4), rng.uniform(-math.pi / 2, math.pi / 2)
             for a, b in legs:
-                if left <= math.dist(a, b):
+                if leg_distance_m <= math.dist(a, b):
                     break
-                left -= math.dist(a, b)
+                leg_distance_m -= math.dist(a, b)
             along = math.atan2(b[1] - a[1], b[0] - a[0])
-            x = a[0] + left * math.cos(along) - side * off * math.sin(along)
-            y = a[1] + left * math.sin(along) + side * off * math.cos(along)
+            x = a[0] + leg_distance_m * math.cos(along) - side * offset_m * math.sin(along)
+            y = a[1] + leg_distance_m * math.sin(along) + side * offset_m * math.cos(along)
             spec = sampler.log(x, y, yaw + along)
-            if _off_route(spec, route) and all(footprint_gap(spec, other) > 0.3 for other in found):
-                found.append(spec)
+            if _off_route(spec, route) and all(footprint_gap(spec, other) > 0.3 for other in placed_specs):
+                placed_specs.append(spec)
                 break
         else:
             raise PlantError(
                 "scene.route-too-short",
                 f"the route of {total:.0f} m has no room for {logs} logs; request fewer logs or lengthen the route",
             )
-    return tuple(found)
+    return tuple(placed_specs)
 
 
 def _off_route(s: LogSpec, route: Sequence[tuple[float, float]]) -> bool:
     flat = np.array([1.0, 1.0, 0.0])
-    way = np.array([(*point, 0.0) for point in _driven(route)])
-    return float(np.min(distances(spine(s)[0] * flat, way))) > ROUTE_CLEAR_M + s.diameter_m / 2
+    path_points = np.array([(*point, 0.0) for point in _driven(route)])
+    return float(np.min(distances(spine(s)[0] * flat, path_points))) > ROUTE_CLEAR_M + s.diameter_m / 2
 
 
 def _driven(route: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The route with its corners rounded, each as widely as its legs allow."""
+    """Round the corners of the route, each as widely as its legs allow."""
     out = [route[0]]
     for before, corner, after in zip(route, route[1:], route[2:], strict=False):
         into = math.atan2(corner[1] - before[1], corner[0] - before[0])
@@ -292,7 +292,7 @@ def _driven(route: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _bunk(sampler: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...]:
-    """Logs along the bunk, from stake to stake, row upon row."""
+    """Lay logs along the bunk, from stake to stake, row upon row."""
     rng, stake = sampler.rng, profile.bunk.width_m / 2 - 0.01
     out: list[LogSpec] = []
     edge = -stake

@@ -29,7 +29,7 @@ def _truth(name: str, seed: int, machine: str) -> Truth:
 def settle_logs(
     profile: Profile, kind: str, seed: int, logs: int, terrain: Terrain, route: Sequence[tuple[float, float]]
 ) -> tuple[LogPose, ...]:
-    """An arrangement of ``sim.scenes.arrangements`` at rest on ``terrain``, with the nominal truth; instances 1, 2, ...
+    """Settle an arrangement of ``sim.scenes.arrangements`` on ``terrain``, with the nominal truth; instances 1, 2, ...
 
     Raises:
         PlantError: there is no room, or the logs do not come to rest.
@@ -49,7 +49,7 @@ def settle_logs(
 def stereo_noise(
     profile: Profile, camera: str, seed: int | str, truth: str = "nominal", truth_seed: int = 0
 ) -> StereoNoise:
-    """Depth errors of a machine's camera according to a truth."""
+    """Return the depth errors of a machine's camera according to a truth."""
     return StereoNoise(profile.cameras[camera], _truth(truth, truth_seed, profile.name).cameras[camera], seed)
 
 
@@ -64,7 +64,7 @@ def varied_stereo_noise(
     plain_holes: float,
     correlation_px: float,
 ) -> StereoNoise:
-    """A better or worse camera than the nominal one.
+    """Make a better or worse camera than the nominal one.
 
     ``sigma``, ``edges`` and ``holes`` are factors of its disparity error, of both its edge widths and of its share of
     holes; ``plain_holes`` is the share of holes on surfaces without texture, ``correlation_px`` the correlation length

@@ -39,7 +39,7 @@ class LogPlace:
 def place_logs(
     profile: Profile, truth: str, seed: int, places: Sequence[LogPlace], rounds: int = 1
 ) -> tuple[LogSpec, ...]:
-    """Logs at the places, then as many for every further lap, far away.
+    """Lay logs at the places, then as many for every further lap, far away.
 
     Raises:
         PlantError: the truth is unknown.
@@ -49,29 +49,31 @@ def place_logs(
     wood = load_truth(truth, seed, profile.name).wood
     count = len(places) * rounds
     drawn = arrangement("row", profile, wood, seed, count, route=((0.0, 0.0), (10.0 * count + 20.0, 0.0)))
-    found = []
+    placed_specs = []
     for i, spec in enumerate(drawn):
-        place = places[i % len(places)]
+        location = places[i % len(places)]
         x_m, y_m = (
-            (place.x_m, place.y_m) if i < len(places) else (-SUPPLY_DISTANCE_M, SUPPLY_SPACING_M * (i - len(drawn) / 2))
+            (location.x_m, location.y_m)
+            if i < len(places)
+            else (-SUPPLY_DISTANCE_M, SUPPLY_SPACING_M * (i - len(drawn) / 2))
         )
-        found.append(
+        placed_specs.append(
             replace(
                 spec,
                 x_m=x_m,
                 y_m=y_m,
-                yaw_rad=spec.yaw_rad if place.yaw_rad is None else place.yaw_rad,
-                length_m=place.length_m or spec.length_m,
-                diameter_m=place.diameter_m or spec.diameter_m,
+                yaw_rad=spec.yaw_rad if location.yaw_rad is None else location.yaw_rad,
+                length_m=location.length_m or spec.length_m,
+                diameter_m=location.diameter_m or spec.diameter_m,
             )
         )
-    return tuple(found)
+    return tuple(placed_specs)
 
 
 def along_route(
     profile: Profile, truth: str, seed: int, logs: int, route: Sequence[tuple[float, float]]
 ) -> tuple[LogSpec, ...]:
-    """``logs`` logs beside a route [m], drawn from the truth's wood.
+    """Lay ``logs`` logs beside a route [m], drawn from the truth's wood.
 
     Raises:
         PlantError: there is no room beside the route.

@@ -39,7 +39,7 @@ Scene = tuple[LogSpec, ...]
 
 
 def laid_at_rest(build: Callable[[Scene], Plant], scene: Scene, terrain: Terrain) -> Plant:
-    """The plant that ``build`` makes of a scene on ``terrain`` in which every log rests near its place.
+    """Make by ``build`` the plant of a scene on ``terrain`` in which every log rests near its place.
 
     Raises:
         PlantError: after ``MAX_ATTEMPTS`` a log still rolls, or the scene cannot be built for another reason.
@@ -64,13 +64,13 @@ def laid_at_rest(build: Callable[[Scene], Plant], scene: Scene, terrain: Terrain
 
 
 def rolled(plant: Plant, scene: Scene) -> set[int]:
-    """The numbers of the logs that came to rest away from their places."""
+    """Find the numbers of the logs that came to rest away from their places."""
     places = ((state.position_m, log) for state, log in zip(plant.logs(), scene, strict=True))
     return {i for i, (at, log) in enumerate(places) if math.dist(at[:2], (log.x_m, log.y_m)) > ROLLED_M}
 
 
 def laid_anew(log: LogSpec, terrain: Terrain, attempt: int) -> LogSpec:
-    """The log along the slope at its place; from the second attempt on also aside, right and left in turn."""
+    """Lay the log along the slope at its place; from the second attempt on also aside, right and left in turn."""
     aside_m = (attempt - 1) * ASIDE_M * (-1) ** attempt
     yaw = _fall_rad(terrain, log.x_m, log.y_m)
     x_m, y_m = log.x_m - aside_m * math.sin(yaw), log.y_m + aside_m * math.cos(yaw)
@@ -80,7 +80,7 @@ def laid_anew(log: LogSpec, terrain: Terrain, attempt: int) -> LogSpec:
 
 
 def _fall_rad(terrain: Terrain, x_m: float, y_m: float) -> float:
-    """Direction in which the ground falls most [rad]."""
+    """Find the direction in which the ground falls most [rad]."""
     h, d = terrain.height, SLOPE_SPAN_M
     return math.atan2(h(x_m, y_m - d) - h(x_m, y_m + d), h(x_m - d, y_m) - h(x_m + d, y_m))
 
@@ -103,7 +103,7 @@ class Site:
     terrain: str = "flat"
 
     def plant(self, profile: Profile, truth: str, seed: int) -> Plant:
-        """The plant whose world has its origin at this site.
+        """Make the plant whose world has its origin at this site.
 
         Raises:
             PlantError: the machine does not drive, or the logs cannot be placed.
@@ -112,12 +112,12 @@ class Site:
             raise PlantError(
                 "site.fixed-machine", f"{profile.name} does not drive; use a machine that drives, such as aoro_fc8"
             )
-        here = {"site_lat_deg": self.latitude_deg, "site_lon_deg": self.longitude_deg}
-        carrier = msgspec.structs.replace(profile.carrier, **here)
-        here_profile = msgspec.structs.replace(profile, carrier=carrier)
+        origin_fields = {"site_lat_deg": self.latitude_deg, "site_lon_deg": self.longitude_deg}
+        carrier = msgspec.structs.replace(profile.carrier, **origin_fields)
+        site_profile = msgspec.structs.replace(profile, carrier=carrier)
 
         def build(scene: tuple[LogSpec, ...]) -> Plant:
-            return Plant(here_profile, seed, truth, scene=scene, terrain=self.terrain)
+            return Plant(site_profile, seed, truth, scene=scene, terrain=self.terrain)
 
         if self.terrain == "flat":  # logs on level ground stay where they are laid
             return build(self.logs)

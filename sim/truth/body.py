@@ -17,7 +17,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inertia_kg_m2: tuple[float, float, float]
 
     def sampled(self, draw: VariationSampler) -> Link:
-        """The link of an individual: mass and inertia scaled together."""
+        """Draw the link of an individual: mass and inertia scaled together."""
         scale = draw.factor(draw.spread.mass)
         x, y, z = (scale * i for i in self.inertia_kg_m2)
         return msgspec.structs.replace(self, mass_kg=scale * self.mass_kg, inertia_kg_m2=(x, y, z))
@@ -63,7 +63,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tong_sync_nm_s_rad: float
 
     def sampled(self, draw: VariationSampler) -> Structure:
-        """The structure of an individual."""
+        """Draw the structure of an individual."""
         s = draw.spread
         hanging = draw.factor(s.friction)
         return msgspec.structs.replace(
@@ -103,7 +103,7 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inertia_kg_m2: tuple[float, float, float]
 
     def sampled(self, draw: VariationSampler) -> Frame:
-        """The half of an individual."""
+        """Draw the half of an individual."""
         k = draw.factor(draw.spread.mass)
         x, y, z = (c + draw.within(COM_M) for c in self.com_m)
         a, b, c = (k * i for i in self.inertia_kg_m2)
@@ -141,7 +141,7 @@ class CarrierTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     brake_lag_s: float
 
     def sampled(self, draw: VariationSampler) -> CarrierTruth:
-        """The carrier of an individual: masses and friction by the variation, centres of mass within 5 cm."""
+        """Draw the carrier of an individual: masses and friction by the variation, centres of mass within 5 cm."""
         mass, friction = draw.spread.mass, draw.spread.friction
         wheel = draw.factor(mass)
         return msgspec.structs.replace(

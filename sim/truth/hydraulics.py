@@ -36,7 +36,7 @@ class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     leakage_m3_s_pa: float
 
     def sampled(self, draw: VariationSampler) -> Supply:
-        """The supply of an individual."""
+        """Draw the supply of an individual."""
         return msgspec.structs.replace(
             self,
             pump_flow_m3_s=self.pump_flow_m3_s * draw.factor(draw.spread.pump),
@@ -71,7 +71,7 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_inertia: float
 
     def sampled(self, draw: VariationSampler) -> Cylinder:
-        """The cylinder of an individual: its seals have more or less friction, its load is lighter or heavier."""
+        """Draw the cylinder of an individual: its seals have more or less friction, its load is lighter or heavier."""
         dry = draw.factor(draw.spread.friction)
         return msgspec.structs.replace(
             self,
@@ -105,7 +105,7 @@ class ValveTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     check_ratio: float = 0.0
 
     def sampled(self, draw: VariationSampler) -> ValveTruth:
-        """The valve of an individual."""
+        """Draw the valve of an individual."""
         s = draw.spread
         return msgspec.structs.replace(
             self,
@@ -118,8 +118,8 @@ class ValveTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def widely_sampled(self, draw: VariationSampler, nominal: ValveTruth) -> ValveTruth:
-        """Any sensible valve instead of this one: dead-bands, dead time and full speeds, each drawn for itself, the
-        full speeds around the ``nominal`` ones.
+        """Draw any sensible valve instead of this one: dead-bands, dead time and full speeds, each drawn for itself,
+        the full speeds around the ``nominal`` ones.
         """
         return msgspec.structs.replace(
             self,
@@ -138,5 +138,5 @@ class Function(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     valve: ValveTruth
 
     def sampled(self, draw: VariationSampler) -> Function:
-        """The function of an individual."""
+        """Draw the function of an individual."""
         return Function(self.cylinder.sampled(draw), self.valve.sampled(draw))

@@ -48,7 +48,7 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_truth(choice: str, seed: int, machine: str) -> Truth:
-    """The truth of a choice (`sim.individual`) for ``machine``; ``seed`` draws the individual.
+    """Load the truth of a choice (`sim.individual`) for ``machine``; ``seed`` draws the individual.
 
     Raises:
         PlantError: the file is missing, incomplete, has unknown keys or describes another machine.
@@ -80,7 +80,7 @@ def load_truth(choice: str, seed: int, machine: str) -> Truth:
 
 
 def _with_shipped_sections(content: dict[str, Any]) -> dict[str, Any]:
-    """A file's content; a file about a shipped machine need not repeat what no individual varies."""
+    """Complete a file's content; a file about a shipped machine need not repeat what no individual varies."""
     machine = content.get("machine")
     if not isinstance(machine, str) or machine not in FILES:
         return content
@@ -89,13 +89,13 @@ def _with_shipped_sections(content: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def _shipped(machine: str) -> dict[str, Any]:
-    """The content of a machine's shipped file; nobody writes to it."""
+    """Read the content of a machine's shipped file; nobody writes to it."""
     content: dict[str, Any] = msgspec.toml.decode(Path(__file__).with_name(FILES[machine]).read_bytes())
     return content
 
 
 def _sampled(truth: Truth, seed: int) -> Truth:
-    """One individual; every part draws from its own stream, so that a new part changes no other."""
+    """Draw one individual; every part draws from its own stream, so that a new part changes no other."""
 
     def draw(part: str) -> VariationSampler:
         return VariationSampler(truth.spread, part, seed)
@@ -114,7 +114,7 @@ def _sampled(truth: Truth, seed: int) -> Truth:
 
 
 def _with_wide_valves(nominal: Truth, truth: Truth, seed: int) -> Truth:
-    """The same individual with other valves on its joints; grapple and carrier keep theirs: nobody maps them."""
+    """Give the same individual other valves on its joints; grapple and carrier keep theirs: nobody maps them."""
 
     def changed(name: str, function: Function) -> Function:
         if name not in JOINT_FUNCTIONS:

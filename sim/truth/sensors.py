@@ -37,12 +37,12 @@ class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     plain_hole_share: float
 
     def sampled(self, draw: VariationSampler) -> CameraTruth:
-        """The camera of an individual: shifted and turned at random, its matching better or worse by a third."""
+        """Draw the camera of an individual: shifted and turned at random, its matching better or worse by a third."""
 
         def off(nominal: Vector, bound: float) -> Vector:
-            way = [draw.rng.gauss(0.0, 1.0) for _ in range(3)]
-            size = bound * draw.rng.random() / math.hypot(*way)
-            x, y, z = (n + size * w for n, w in zip(nominal, way, strict=True))
+            direction = [draw.rng.gauss(0.0, 1.0) for _ in range(3)]
+            size = bound * draw.rng.random() / math.hypot(*direction)
+            x, y, z = (n + size * w for n, w in zip(nominal, direction, strict=True))
             return (x, y, z)
 
         return msgspec.structs.replace(
@@ -88,7 +88,7 @@ class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     geoid_m: float
 
     def sampled(self, draw: VariationSampler) -> GnssTruth:
-        """The receiver of an individual: antennas mounted a little beside their nominal places."""
+        """Draw the receiver of an individual: antennas mounted a little beside their nominal places."""
         bound = draw.spread.antenna_m
         main, aux = (tuple(x + draw.within(bound) for x in at) for at in (self.main_offset_m, self.aux_offset_m))
         return msgspec.structs.replace(self, main_offset_m=main, aux_offset_m=aux)
@@ -107,7 +107,7 @@ class EncoderTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latency_s: float
 
     def sampled(self, draw: VariationSampler) -> EncoderTruth:
-        """The encoder of an individual: mounted with its own zero error and eccentricity."""
+        """Draw the encoder of an individual: mounted with its own zero error and eccentricity."""
         return msgspec.structs.replace(
             self,
             offset=self.offset + draw.within(draw.spread.offset),

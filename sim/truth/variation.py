@@ -43,18 +43,18 @@ class VariationSampler:
         self.rng = random.Random(f"truth {part} {seed}")
 
     def within(self, bound: float) -> float:
-        """A number in -bound..bound, more often near 0."""
+        """Draw a number in -bound..bound, more often near 0."""
         return bound * max(-1.0, min(1.0, self.rng.gauss(0.0, SIGMA_SHARE)))
 
     def factor(self, bound: float) -> float:
-        """A factor in 1-bound..1+bound."""
+        """Draw a factor in 1-bound..1+bound."""
         return 1.0 + self.within(bound)
 
     def delay(self, nominal_s: float) -> float:
-        """A dead time [s] between the two bounds; a function without dead time keeps none."""
+        """Draw a dead time [s] between the two bounds; a function without dead time keeps none."""
         s = self.spread
         return self.rng.triangular(s.delay_min_s, s.delay_max_s, nominal_s) if nominal_s else 0.0
 
     def log_uniform(self, low: float, high: float) -> float:
-        """A number in low..high, both positive; equal ratios are equally likely."""
+        """Draw a number in low..high, both positive; equal ratios are equally likely."""
         return float(low * (high / low) ** self.rng.random())

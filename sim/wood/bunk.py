@@ -24,12 +24,12 @@ COLOUR: Final = (0.35, 0.37, 0.4)
 
 
 def bunk_link(profile: Profile) -> str:
-    """The link that the bunk is part of."""
+    """Return the link that the bunk is part of."""
     return "base" if profile.carrier is None else "rear"
 
 
 def bunk_boxes(profile: Profile) -> list[tuple[Vector, Vector]]:
-    """Edge lengths and middle in the bunk's frame [m]: the floor first, then the stakes."""
+    """Return edge lengths and middle in the bunk's frame [m]: the floor first, then the stakes."""
     b = profile.bunk
     low = profile.workspace.ground_z_m if profile.carrier is None else b.floor_z_m - FRAME_M
     boxes: list[tuple[Vector, Vector]] = [
@@ -37,12 +37,12 @@ def bunk_boxes(profile: Profile) -> list[tuple[Vector, Vector]]:
     ]
     side, z = b.width_m / 2 + STAKE_M / 2, b.floor_z_m + b.stake_height_m / 2
     stake = (STAKE_M, STAKE_M, b.stake_height_m)
-    places = STAKE_PLACES if profile.carrier is None else CARRIER_STAKE_PLACES
-    return boxes + [(stake, (place * b.length_m, y, z)) for place in places for y in (-side, side)]
+    length_shares = STAKE_PLACES if profile.carrier is None else CARRIER_STAKE_PLACES
+    return boxes + [(stake, (length_share * b.length_m, y, z)) for length_share in length_shares for y in (-side, side)]
 
 
 def bunk_shapes(profile: Profile) -> list[Shape]:
-    """Floor and stakes in the frame of ``bunk_link``."""
+    """Return floor and stakes in the frame of ``bunk_link``."""
     b, c = profile.bunk, profile.carrier
     shapes = []
     for size, middle in bunk_boxes(profile):
@@ -56,13 +56,13 @@ def bunk_shapes(profile: Profile) -> list[Shape]:
 
 
 def from_bunk(b: Bunk, point: Sequence[float]) -> Vector:
-    """Point of the bunk's frame in the crane's base frame."""
+    """Transform a point of the bunk's frame into the crane's base frame."""
     c, s = math.cos(b.yaw_rad), math.sin(b.yaw_rad)
     return (b.center_m[0] + c * point[0] - s * point[1], b.center_m[1] + s * point[0] + c * point[1], point[2])
 
 
 def to_bunk(b: Bunk, point: Sequence[float]) -> Vector:
-    """Point of the crane's base frame in the bunk's frame."""
+    """Transform a point of the crane's base frame into the bunk's frame."""
     c, s = math.cos(b.yaw_rad), math.sin(b.yaw_rad)
     x, y = point[0] - b.center_m[0], point[1] - b.center_m[1]
     return (c * x + s * y, c * y - s * x, point[2])

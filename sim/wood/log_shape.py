@@ -46,11 +46,11 @@ class LogSpec:
         return self.sweep * self.length_m
 
     def radius(self, s: float) -> float:
-        """Radius [m] at s."""
+        """Return the radius [m] at s."""
         return (self.diameter_m - self.taper_m_m * s * self.length_m) / 2
 
     def axis_point(self, s: float) -> Vector:
-        """The pith at s, log frame [m]: a parabola in the x-z plane."""
+        """Compute the pith at s, log frame [m]: a parabola in the x-z plane."""
         return (-4.0 * self.sweep_m * s * s, 0.0, s * self.length_m)
 
     @property
@@ -59,7 +59,7 @@ class LogSpec:
         return 3 if self.sweep_m <= STRAIGHT_M else 5
 
     def directions(self) -> tuple[Vector, Vector]:
-        """The log frame's x and z axis at release: the side it bows to, and along it."""
+        """Compute the log frame's x and z axis at release: the side it bows to, and along it."""
         cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         cp, sp = math.cos(self.pitch_rad), math.sin(self.pitch_rad)
         cr, sr = math.cos(self.roll_rad), math.sin(self.roll_rad)
@@ -67,7 +67,7 @@ class LogSpec:
         return (cr * down[0] - sr * sy, cr * down[1] + sr * cy, cr * down[2]), (cp * cy, cp * sy, sp)
 
     def spine(self, points: int = 11) -> list[Vector]:
-        """Points of the pith at release, relative to the middle [m]."""
+        """Compute points of the pith at release, relative to the middle [m]."""
         x, z = self.directions()
         out = []
         for i in range(points):
@@ -87,7 +87,7 @@ class Mass:
 
 
 def mass_of(spec: LogSpec) -> Mass:
-    """The mass properties of the tapered, bowed log."""
+    """Compute the mass properties of the tapered, bowed log."""
     step = spec.length_m / DISC_COUNT
     discs = []
     for i in range(DISC_COUNT):
@@ -111,14 +111,14 @@ def mass_of(spec: LogSpec) -> Mass:
 
 
 def log_segments(spec: LogSpec) -> list[tuple[Vector, Vector, float, float]]:
-    """The body as coaxial pieces: both ends of each in the log frame [m] and the radii there [m]."""
+    """Cut the body into coaxial pieces: both ends of each in the log frame [m] and the radii there [m]."""
     n = spec.pieces
     knots = [i / n - 0.5 for i in range(n + 1)]
     return [(spec.axis_point(a), spec.axis_point(b), spec.radius(a), spec.radius(b)) for a, b in pairwise(knots)]
 
 
 def quaternion_of(spec: LogSpec) -> Quaternion:
-    """Orientation (x, y, z, w) of the log frame at release: yaw, then pitch, then roll."""
+    """Compute the orientation (x, y, z, w) of the log frame at release: yaw, then pitch, then roll."""
     h, p, r = spec.yaw_rad / 2, (math.pi / 2 - spec.pitch_rad) / 2, spec.roll_rad / 2
     yaw, pitch = (0.0, 0.0, math.sin(h), math.cos(h)), (0.0, math.sin(p), 0.0, math.cos(p))
     return _times(_times(yaw, pitch), (0.0, 0.0, math.sin(r), math.cos(r)))

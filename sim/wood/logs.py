@@ -70,7 +70,7 @@ class LogState:
 
 
 def reach_m(scene: Sequence[LogSpec]) -> float:
-    """How far the ground must reach from the origin for a scene, in x and y [m]."""
+    """Compute how far the ground must reach from the origin for a scene, in x and y [m]."""
     return GROUND_MARGIN_M + max((abs(at) for log in scene for at in (log.x_m, log.y_m)), default=0.0)
 
 
@@ -125,7 +125,7 @@ class LogBodies:
         self._p.resetBaseVelocity(self.body_ids[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def _rise_m(self, which: int, east_m: float, north_m: float) -> float:
-        """How much higher a log must lie at another place so as not to touch the ground there [m]."""
+        """Compute how much higher a log must lie at another place so as not to touch the ground there [m]."""
         if self._terrain.level:
             return 0.0
         log = self.states()[which]
@@ -139,7 +139,7 @@ class LogBodies:
         )
 
     def states(self) -> list[LogState]:
-        """The logs now, in scene order.  Only those that moved since the last call are computed."""
+        """Return the logs now, in scene order.  Only those that moved since the last call are computed."""
         p = self._p
         now = [(p.getBasePositionAndOrientation(body), p.getBaseVelocity(body)) for body in self.body_ids]
         moved = [i for i, seen in enumerate(now) if seen != self._seen[i]]
@@ -180,14 +180,14 @@ class LogBodies:
 
 
 def _times(q: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions [n, 4] followed by turns [n] about their own y."""
+    """Compute quaternions [n, 4] followed by turns [n] about their own y."""
     s, c = np.sin(angle / 2), np.cos(angle / 2)
     x, y, z, w = q.T
     return np.stack([c * x - s * z, c * y + s * w, c * z + s * x, c * w - s * y], axis=1)
 
 
 def _axes(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """The three axes [n, 3] of quaternions [n, 4]."""
+    """Compute the three axes [n, 3] of quaternions [n, 4]."""
     x, y, z, w = q.T
     return (
         np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1),
@@ -233,7 +233,7 @@ def _body(p: BulletClient, spec: LogSpec, mass: Mass, pose: Pose, contact: Conta
 
 
 def _lifts(scene: Sequence[LogSpec], terrain: Terrain) -> list[float]:
-    """Height of the ground under each log's lowest line; logs that are near each other share the highest."""
+    """Find the height of the ground under each log's lowest line; logs that are near each other share the highest."""
     lifts = []
     # Stones and stumps are as narrow as the ground's cells: they must not hide between two points.
     fine = terrain.kind == "drawn"
@@ -264,7 +264,7 @@ def _lifts(scene: Sequence[LogSpec], terrain: Terrain) -> list[float]:
 
 
 def _settled(profile: Profile, contact: Contact, scene: Sequence[LogSpec], terrain: Terrain, base: Pose) -> list[Pose]:
-    """Poses of the bodies after the scene has come to rest on the terrain and in the bunk."""
+    """Return the poses of the bodies after the scene has come to rest on the terrain and in the bunk."""
     p = new_client()
     try:
         p.setGravity(0.0, 0.0, -GRAVITY_M_S2)
@@ -335,8 +335,10 @@ def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
 
 
 def _check_apart(p: BulletClient, bodies: Sequence[int], when: str) -> None:
-    """Raises:
-    PlantError: a log is inside another body.
+    """Check that the logs are apart from each other and from other bodies.
+
+    Raises:
+        PlantError: a log is inside another body.
     """
     p.performCollisionDetection()
     number = {body: i for i, body in enumerate(bodies)}

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def spine(s: LogSpec) -> tuple[Array, Array]:
-    """Points [SPINE, 3] of the pith at release, z over level ground, and the radii there [SPINE]."""
+    """Compute points [SPINE, 3] of the pith at release, z over level ground, and the radii there [SPINE]."""
     points = np.array(s.spine(SPINE_POINT_COUNT))
     radii = np.array([s.radius(i / (SPINE_POINT_COUNT - 1) - 0.5) for i in range(SPINE_POINT_COUNT)])
     points += (s.x_m, s.y_m, s.z_m - float(np.min(points[:, 2] - radii)))
@@ -27,7 +27,7 @@ def spine(s: LogSpec) -> tuple[Array, Array]:
 
 
 def distances(p: Array, q: Array) -> Array:
-    """Distances [n-1, m-1] of every straight piece of one polyline [n, 3] from every piece of another [m, 3]."""
+    """Measure every straight piece of one polyline [n, 3] from every piece of another [m, 3]: distances [n-1, m-1]."""
     u, v = np.diff(p, axis=0)[:, None, :], np.diff(q, axis=0)[None, :, :]
     w = q[None, :-1, :] - p[:-1, None, :]
     uu, vv, uv, uw, vw = (np.sum(a * b, axis=2) for a, b in ((u, u), (v, v), (u, v), (u, w), (v, w)))
@@ -40,28 +40,28 @@ def distances(p: Array, q: Array) -> Array:
 
 
 def clearance(a: LogSpec, b: LogSpec) -> float:
-    """Gap [m] between two logs at release; negative when they overlap."""
+    """Compute the gap [m] between two logs at release; negative when they overlap."""
     (p, rp), (q, rq) = spine(a), spine(b)
     radii = np.maximum(rp[:-1], rp[1:])[:, None] + np.maximum(rq[:-1], rq[1:])[None, :]
     return float(np.min(distances(p, q) - radii))
 
 
 def footprint_gap(a: LogSpec, b: LogSpec) -> float:
-    """Gap [m] between two logs' footprints on the ground plane; negative when they overlap."""
+    """Compute the gap [m] between two logs' footprints on the ground plane; negative when they overlap."""
     (p, _), (q, _) = spine(a), spine(b)
     flat = np.array([1.0, 1.0, 0.0])
     return float(np.min(distances(p * flat, q * flat))) - (a.diameter_m + b.diameter_m) / 2
 
 
 def beside(s: LogSpec, others: Sequence[LogSpec]) -> LogSpec:
-    """The log shifted to +y until it touches no other."""
+    """Shift the log to +y until it touches no other."""
     while (gap := min((clearance(s, o) for o in others), default=GAP_M)) < GAP_M:
         s = replace(s, y_m=s.y_m + max(STEP_M, GAP_M - gap))
     return s
 
 
 def upon(s: LogSpec, others: Sequence[LogSpec]) -> LogSpec:
-    """The log raised until it touches no other."""
+    """Raise the log until it touches no other."""
     while (gap := min((clearance(s, o) for o in others), default=GAP_M)) < GAP_M:
         s = replace(s, z_m=s.z_m + max(STEP_M, GAP_M - gap))
     return s

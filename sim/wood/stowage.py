@@ -104,23 +104,23 @@ class Stowage:
             self._stow(aboard, at, moving)
 
     def _aboard(self) -> tuple[int, ...]:
-        """Logs with their middle between the stakes, above the floor."""
+        """Find the logs with their middle between the stakes, above the floor."""
         p, b = self._p, self._bunk
         inward = p.invertTransform(*self._machine.pose("base"))
-        found = []
+        log_indices = []
         for i, log in enumerate(self._log_bodies.body_ids):
             x, y, z = to_bunk(b, p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(log))[0])
             if abs(x) < b.length_m / 2 and abs(y) < b.width_m / 2 and z > b.floor_z_m:
-                found.append(i)
-        return tuple(found)
+                log_indices.append(i)
+        return tuple(log_indices)
 
     def _lies_still(self, log: int, origin: Vector, linear: Vector, angular: Vector) -> bool:
-        place, (v, w) = self._p.getBasePositionAndOrientation(log)[0], self._p.getBaseVelocity(log)
-        with_bunk = _carried(linear, angular, origin, place)
+        position_m, (v, w) = self._p.getBasePositionAndOrientation(log)[0], self._p.getBaseVelocity(log)
+        with_bunk = _carried(linear, angular, origin, position_m)
         return math.dist(w, angular) < STILL_RAD_S and math.dist(v, with_bunk) < STILL_M_S
 
     def _approached(self, box: Box, load: Sequence[int]) -> bool:
-        """Whether the grapple, or a log that is not part of the load, reaches into the box."""
+        """Tell whether the grapple, or a log that is not part of the load, reaches into the box."""
         for body, link in self._p.getOverlappingObjects(*box) or ():
             if (
                 (link in self._grapple_links)
@@ -131,7 +131,7 @@ class Stowage:
         return False
 
     def _box(self, load: Sequence[int]) -> Box:
-        """The surroundings of the load: its bounding box widened by ``NEAR_M``."""
+        """Compute the surroundings of the load: its bounding box widened by ``NEAR_M``."""
         lows, highs = zip(*(self._p.getAABB(self._log_bodies.body_ids[i]) for i in load), strict=True)
         low, high = ([f(c) for c in zip(*side, strict=True)] for f, side in ((min, lows), (max, highs)))
         return (low[0] - NEAR_M, low[1] - NEAR_M, low[2] - NEAR_M), (
@@ -155,20 +155,20 @@ class Stowage:
         log_bodies.stowed = aboard
 
     def _fix(self, aboard: Sequence[int], at: Pose, moving: tuple[Vector, Vector]) -> tuple[int, int]:
-        """A body without a shape but with the load's weight, and the constraint that fixes it to the rear frame."""
+        """Make a body without a shape but with the load's weight, and a constraint that fixes it to the rear frame."""
         p = self._p
         mass, own, inertia = self._mass(aboard)
-        place, turn = p.multiplyTransforms(*at, *own)
-        body: int = p.createMultiBody(mass, -1, basePosition=place, baseOrientation=turn, useMaximalCoordinates=1)
+        position_m, turn = p.multiplyTransforms(*at, *own)
+        body: int = p.createMultiBody(mass, -1, basePosition=position_m, baseOrientation=turn, useMaximalCoordinates=1)
         p.changeDynamics(body, -1, mass=mass, localInertiaDiagonal=inertia, linearDamping=0.0, angularDamping=0.0)
-        p.resetBaseVelocity(body, _carried(*moving, at[0], place), moving[1])
+        p.resetBaseVelocity(body, _carried(*moving, at[0], position_m), moving[1])
         zero = (0.0, 0.0, 0.0)
         tie: int = p.createConstraint(self._machine.body, -1, body, -1, p.JOINT_FIXED, zero, own[0], zero, own[1])
         p.changeConstraint(tie, maxForce=FIXED_JOINT_N)
         return body, tie
 
     def _mass(self, aboard: Sequence[int]) -> tuple[float, Pose, list[float]]:
-        """Mass, centre and principal axes, and principal inertia [kg m^2] of the load, in the root's axes."""
+        """Compute mass, centre and principal axes, and principal inertia [kg m^2] of the load, in the root's axes."""
         p, log_bodies = self._p, self._log_bodies
         masses, places = [log_bodies.masses[i] for i in aboard], np.array([at for at, _ in self._relative_poses])
         middle = np.average(places, axis=0, weights=masses)
@@ -184,8 +184,8 @@ class Stowage:
     def _follow(self, at: Pose) -> None:
         """Move the stowed logs with the bunk."""
         p, log_bodies = self._p, self._log_bodies
-        for i, kept in zip(log_bodies.stowed, self._relative_poses, strict=True):
-            p.resetBasePositionAndOrientation(log_bodies.body_ids[i], *p.multiplyTransforms(*at, *kept))
+        for i, relative_pose in zip(log_bodies.stowed, self._relative_poses, strict=True):
+            p.resetBasePositionAndOrientation(log_bodies.body_ids[i], *p.multiplyTransforms(*at, *relative_pose))
         self._at, self._around = at, self._box(log_bodies.stowed)
 
     def _wake(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
@@ -196,8 +196,8 @@ class Stowage:
             log = log_bodies.body_ids[i]
             p.setCollisionFilterGroupMask(log, -1, COLLISION_GROUP, COLLIDE_ALL)
             p.changeDynamics(log, -1, activationState=p.ACTIVATION_STATE_WAKE_UP)
-            place = p.getBasePositionAndOrientation(log)[0]
-            p.resetBaseVelocity(log, _carried(*moving, at[0], place), moving[1])
+            position_m = p.getBasePositionAndOrientation(log)[0]
+            p.resetBaseVelocity(log, _carried(*moving, at[0], position_m), moving[1])
         if self._fixed_body is not None:
             body, tie = self._fixed_body
             p.removeConstraint(tie)  # Bullet does not remove it with the body
@@ -218,7 +218,7 @@ class ApparentWeight:
         self.now: Vector = (0.0, 0.0, -gravity_m_s2)
 
     def update(self, velocity: Vector, axes: Sequence[float]) -> None:
-        """Velocity of the frame [m/s] and its rotation matrix, row by row."""
+        """Take the velocity of the frame [m/s] and its rotation matrix, row by row."""
         last = self._velocity or velocity
         a, b, c = ((last[i] - velocity[i]) / self._check_period_s for i in range(3))
         c -= self._gravity
@@ -227,7 +227,7 @@ class ApparentWeight:
         self._velocity, self.now = velocity, (x, y, z)
 
     def differs(self, other: Vector) -> bool:
-        """Whether it differs from another in direction or size by more than a load at rest tolerates."""
+        """Tell whether it differs from another in direction or size by more than a load at rest tolerates."""
         x, y, z = other
         u, v, w = self.now
         size, was = math.hypot(u, v, w), math.hypot(x, y, z)
@@ -237,20 +237,20 @@ class ApparentWeight:
 
 
 def _carried(linear: Vector, angular: Vector, origin: Vector, place: Vector) -> Vector:
-    """Velocity of a place of a body that moves as its origin does and turns about it."""
+    """Compute the velocity of a place of a body that moves as its origin does and turns about it."""
     x, y, z = (p - o for p, o in zip(place, origin, strict=True))
     (u, v, w), (a, b, c) = linear, angular
     return u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
 
 
 def _moved(a: Pose, b: Pose) -> bool:
-    """Whether two poses differ by more than stowed logs may lag behind."""
+    """Tell whether two poses differ by more than stowed logs may lag behind."""
     cosine = sum(x * y for x, y in zip(a[1], b[1], strict=True))  # of half the angle between them
     return math.dist(a[0], b[0]) > FOLLOW_M or 1.0 - cosine * cosine > (FOLLOW_RAD / 2) ** 2
 
 
 def _turn_of(axes: NDArray[np.float64]) -> Quaternion:
-    """Quaternion of a rotation matrix [3, 3]."""
+    """Compute the quaternion of a rotation matrix [3, 3]."""
     m = axes.tolist()
     pitch = -math.asin(max(-1.0, min(1.0, m[2][0])))
     return rpy_quaternion(math.atan2(m[2][1], m[2][2]), pitch, math.atan2(m[1][0], m[0][0]))

@@ -152,7 +152,7 @@ def motion(
     from machine.loading.profile_file import ProfileError, load_profile
 
     error = Console(stderr=True)
-    found = {}
+    metrics_by_machine = {}
     for name in profile or ["palms_471", "aoro_fc8"]:
         try:
             machine = load_profile(name)
@@ -165,7 +165,7 @@ def motion(
                 bench = run(machine, seeds, progress)
         except (ProfileError, ValueError) as trouble:
             raise CommandFailed.from_error(trouble, ExitCode.CONFIGURATION) from None
-        found[name] = bench.metrics()
+        metrics_by_machine[name] = bench.metrics()
         if not as_json:
             m = bench.metrics()
             typer.echo(
@@ -178,7 +178,7 @@ def motion(
             for sentence in bench.blocked[:5]:
                 typer.echo(f"  {sentence}")
     if as_json:
-        typer.echo(json.dumps(found, indent=2))
+        typer.echo(json.dumps(metrics_by_machine, indent=2))
 
 
 # -- ``timberhand bench pages``: what a tick does without and with open pages of the console.
@@ -225,28 +225,28 @@ def pages(
         print(f"bench: {text}", file=sys.stderr, flush=True)
 
     with tempfile.TemporaryDirectory() as folder:
-        found = open_pages.judge(open_pages.measure(rounds, seconds, number, Path(folder), progress))
+        judgement = open_pages.judge(open_pages.measure(rounds, seconds, number, Path(folder), progress))
     where = environment() | host_activity.describe()
     if as_json:
-        print(json.dumps({"environment": where, "pages": number, **found}, indent=2))
+        print(json.dumps({"environment": where, "pages": number, **judgement}, indent=2))
     else:
         print("  ".join(f"{name} {value}" for name, value in where.items()))
-        _show_pages(found, number)
-    if not found["reached"]:
+        _show_pages(judgement, number)
+    if not judgement["reached"]:
         raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
 def _show_pages(found: dict[str, Any], number: int) -> None:
     print(f"{'':28}{'no page':>12}{f'{number} pages':>12}")
-    for name, words in COUNTS.items():
-        told = found["counts"][name]
-        if told["same"] is None:
-            print(f"{words:28}{'not counted here':>24}")
+    for name, title in COUNTS.items():
+        count = found["counts"][name]
+        if count["same"] is None:
+            print(f"{title:28}{'not counted here':>24}")
         else:
-            print(f"{words:28}{told['none']:12g}{told['open']:12g}   {'the same' if told['same'] else 'differs'}")
+            print(f"{title:28}{count['none']:12g}{count['open']:12g}   {'the same' if count['same'] else 'differs'}")
     cpu = found["cpu"]
-    few = cpu["high"] is None
-    interval = "fewer than 6 rounds give no interval" if few else f"{cpu['low']:.2f} to {cpu['high']:.2f}"
+    too_few = cpu["high"] is None
+    interval = "fewer than 6 rounds give no interval" if too_few else f"{cpu['low']:.2f} to {cpu['high']:.2f}"
     print(
         f"{'processor time of a tick, us':28}{cpu['none']:12g}{cpu['open']:12g}   "
         f"ratio {cpu['ratio']:.2f} ({interval}), at least {cpu['at_least']}: {cpu['verdict']}"
@@ -270,7 +270,7 @@ app.command("tick")(bench_tick.tick)
 
 @app.command()
 def pool(as_json: JsonOption = False) -> None:
-    """Overhead of a trial, and how two workers scale: trials that only wait.
+    """Measure the overhead of a trial, and how two workers scale: trials that only wait.
 
     [bold]Examples[/bold]
 
@@ -280,13 +280,13 @@ def pool(as_json: JsonOption = False) -> None:
 
     from experiments.benches.pool import TRIALS, WAIT_S, measure
 
-    found = [measure(count, Console(stderr=True)) for count in (1, 2)]
+    runs = [measure(count, Console(stderr=True)) for count in (1, 2)]
     if as_json:
-        print(json.dumps([asdict(one) for one in found]))
+        print(json.dumps([asdict(run) for run in runs]))
         return
-    for one in found:
+    for run in runs:
         print(
-            f"{one.workers} worker{'s' if one.workers > 1 else ''}: {TRIALS} trials of {WAIT_S:g} s in "
-            f"{one.wall_s:.2f} s, {1e3 * one.between_s:.1f} ms between two, {one.peak_bytes / 2**20:.0f} MiB each"
+            f"{run.workers} worker{'s' if run.workers > 1 else ''}: {TRIALS} trials of {WAIT_S:g} s in "
+            f"{run.wall_s:.2f} s, {1e3 * run.between_s:.1f} ms between two, {run.peak_bytes / 2**20:.0f} MiB each"
         )
-    print(f"two are {found[0].wall_s / found[1].wall_s:.2f} times as fast as one")
+    print(f"two are {runs[0].wall_s / runs[1].wall_s:.2f} times as fast as one")

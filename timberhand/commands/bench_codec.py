@@ -37,7 +37,7 @@ def codec(
 
 
 def measure(repetitions: int) -> dict[str, Any]:
-    """Medians of interleaved repetitions [ns per frame] per message, and the ratios of their sums."""
+    """Return medians of interleaved repetitions [ns per frame] per message, and the ratios of their sums."""
     import gc
     import os
     import platform

@@ -71,19 +71,22 @@ def tick(
         raise typer.BadParameter("--against compares costs; leave --random and --count out")
     key = compare.need_build()
     with tempfile.TemporaryDirectory() as folder:
-        places = recordings or compare.kept_recordings(Path(folder))
+        recording_paths = recordings or compare.kept_recordings(Path(folder))
         if random:
-            rows = _random(places, seed, random, progress)
+            rows = _random(recording_paths, seed, random, progress)
             reached = all(row["differs_after"] is None for row in rows)
         elif counted:
-            rows = [_counted(place, ticks, Path(folder), progress) for place in places]
+            rows = [_counted(recording_path, ticks, Path(folder), progress) for recording_path in recording_paths]
             reached = True
         else:
-            wanted = against or release.newest_tag()
-            other = release.release(wanted, progress) if wanted else None
+            release_reference = against or release.newest_tag()
+            other = release.release(release_reference, progress) if release_reference else None
             if other is None:
                 progress("no release to compare with: there is no tag, and no --against")
-            rows = [compare.compare_cost(place, ticks, rounds, progress, other) for place in places]
+            rows = [
+                compare.compare_cost(recording_path, ticks, rounds, progress, other)
+                for recording_path in recording_paths
+            ]
             reached = all(_good(row) for row in rows)
     environment = compare.environment() | {"build": key}
     result = {"environment": environment, "reached": reached, "recordings": rows}
@@ -100,7 +103,7 @@ def tick(
 def _random(places: list[Path], seed: int, ticks: int, progress: Progress) -> list[dict[str, Any]]:
     from hil.tick.compare import compare_random
 
-    return [compare_random(place, seed, -(-ticks // len(places)), progress) for place in places]
+    return [compare_random(recording_path, seed, -(-ticks // len(places)), progress) for recording_path in places]
 
 
 def _counted(place: Path, ticks: int, folder: Path, progress: Progress) -> dict[str, Any]:
@@ -111,7 +114,7 @@ def _counted(place: Path, ticks: int, folder: Path, progress: Progress) -> dict[
 
 
 def _good(row: dict[str, Any]) -> bool:
-    missed = any(found["verdict"] == "missed" for found in row["ratios"].values())
+    missed = any(ratio["verdict"] == "missed" for ratio in row["ratios"].values())
     return not missed and not row["interpreter"]["differing"] and not row["compiled"]["differing"]
 
 
@@ -119,15 +122,21 @@ def _show_cost(row: dict[str, Any]) -> None:
     typer.echo(f"{row['recording']}: {row['ticks']} ticks, processor time of a tick p50 / p99")
     for side in ("interpreter", "compiled", "release"):
         if side in row:
-            found = row[side]
-            figures = (f"{c} {found[c]['cpu_p50_us']:.0f} / {found[c]['cpu_p99_us']:.0f} us" for c in ("hot", "cold"))
-            count = found["instructions_p50"]
+            summary = row[side]
+            figures = (
+                f"{c} {summary[c]['cpu_p50_us']:.0f} / {summary[c]['cpu_p99_us']:.0f} us" for c in ("hot", "cold")
+            )
+            count = summary["instructions_p50"]
             counted = f"{count} instructions" if count else "instructions not counted here"
-            typer.echo(f"  {side:12} {'   '.join(figures)}   {counted}   {found['differing']} ticks differ")
-    for name, found in row["ratios"].items():
-        few = found["high"] is None
-        interval = "fewer than 6 rounds give no interval" if few else f"{found['low']:.2f} to {found['high']:.2f}"
-        typer.echo(f"  {name:20} {found['ratio']:.2f} ({interval}), at least {found['at_least']}: {found['verdict']}")
+            typer.echo(f"  {side:12} {'   '.join(figures)}   {counted}   {summary['differing']} ticks differ")
+    for name, summary in row["ratios"].items():
+        too_few = summary["high"] is None
+        interval = (
+            "fewer than 6 rounds give no interval" if too_few else f"{summary['low']:.2f} to {summary['high']:.2f}"
+        )
+        typer.echo(
+            f"  {name:20} {summary['ratio']:.2f} ({interval}), at least {summary['at_least']}: {summary['verdict']}"
+        )
 
 
 def _show_count(row: dict[str, Any]) -> None:

@@ -125,7 +125,7 @@ def calibrate(
 
 
 def _chosen(names: Sequence[str] | None) -> tuple[Joint, ...]:
-    """The named joints, or all."""
+    """Return the named joints, or all."""
     from machine.joints import JOINTS, Joint
 
     try:
@@ -306,7 +306,7 @@ def _live(
 
 
 def _surveyor(survey: str | None, screen: Console) -> Surveyor | None:
-    """The source of survey readings: none, typed, or an instrument."""
+    """Make the source of survey readings: none, typed, or an instrument."""
     from autonomy.calibration.live import SurveyInstrument
     from can_dbc.messages.udp_address import udp_address
 
@@ -325,7 +325,7 @@ class _Typed:
         self._screen = screen
 
     def read(self, now_ns: int) -> tuple[float, float, float] | None:
-        """Position of the hanger pin [m]; None after invalid input."""
+        """Ask for the position of the hanger pin [m]; None after invalid input."""
         text = typer.prompt("hanger pin x y z [m, crane base frame]", err=True)
         try:
             x, y, z = map(float, text.replace(",", " ").split())
@@ -335,7 +335,7 @@ class _Typed:
         return x, y, z
 
     def read_yaw(self, now_ns: int) -> float | None:
-        """Direction of the grapple [rad]; NaN when nobody can read it, None after invalid input."""
+        """Ask for the direction of the grapple [rad]; NaN when nobody can read it, None after invalid input."""
         text = typer.prompt("direction along which the grapple opens [deg from x towards y, - for none]", err=True)
         try:
             return math.nan if text.strip() == "-" else math.radians(float(text))
@@ -367,14 +367,17 @@ class _Progress:
         """Show the present state of the run."""
         from autonomy.calibration.plan import task_name
 
-        left = calibration.remaining_s()
+        remaining_s = calibration.remaining_s()
         if calibration.waiting != self._waiting:
             self._waiting = calibration.waiting
             if self._waiting is not None:
                 self._screen.print(f"waiting for ARM: {self._waiting}", highlight=False)
-        whole = max(calibration.elapsed_s + left, 1.0)
+        whole = max(calibration.elapsed_s + remaining_s, 1.0)
         self._bar.update(
-            self._task, completed=calibration.elapsed_s / whole, description=task_name(calibration.task), left=left
+            self._task,
+            completed=calibration.elapsed_s / whole,
+            description=task_name(calibration.task),
+            left=remaining_s,
         )
 
 

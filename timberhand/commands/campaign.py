@@ -84,7 +84,7 @@ def campaign(
         detector=detector,
     )
     try:
-        result, found = campaigns.run(name.value, options, recordings, Console(stderr=True))
+        result, summary = campaigns.run(name.value, options, recordings, Console(stderr=True))
     except KeyboardInterrupt:
         raise CommandFailed(
             "experiment.interrupted",
@@ -94,7 +94,7 @@ def campaign(
     if as_json:
         print((options.out / campaigns.SUMMARY).read_text(), end="")
     else:
-        print("\n".join(_words(found, options.out / campaigns.TABLE)))
+        print("\n".join(_words(summary, options.out / campaigns.TABLE)))
     if result.missed:
         raise CommandFailed(
             "experiment.figure-missed",
@@ -113,12 +113,12 @@ def _words(found: Campaign, table: Path) -> list[str]:
         f"{found.worker_bytes / 2**20:.0f} MiB each; {_size(found.table_bytes)} a trial in the table, "
         f"{_size(found.kept_bytes)} on the disk",
     ]
-    for one in found.recorded:
-        note = "" if one.repeated else "  (the repetition did not fail in the same way: the trial is not repeatable)"
-        lines.append(f"failed {one.name}: timberhand console --replay {recording_of(Path(one.recording))}{note}")
+    for trial in found.recorded:
+        note = "" if trial.repeated else "  (the repetition did not fail in the same way: the trial is not repeatable)"
+        lines.append(f"failed {trial.name}: timberhand console --replay {recording_of(Path(trial.recording))}{note}")
     return lines
 
 
 def _size(count: float) -> str:
-    """Bytes in words."""
+    """Write bytes in words."""
     return f"{count:.0f} B" if count < 1e4 else f"{count / 1e3:.0f} kB"

@@ -39,8 +39,8 @@ def check(file: File = None, as_json: JsonOption = False) -> None:
     path = _file(file)
     problems = [*problems_of(_text(path), read(SHIPPED)), *signature_problems(path, SIGNER)]
     if as_json:
-        found = [asdict(problem) for problem in problems]
-        print(json.dumps({"file": str(path), "problems": found}, indent=2))
+        problem_rows = [asdict(problem) for problem in problems]
+        print(json.dumps({"file": str(path), "problems": problem_rows}, indent=2))
     else:
         for problem in problems:
             print(f"{path}{f':{problem.line}' if problem.line else ''}: {problem.sentence}")
@@ -105,17 +105,17 @@ def diff(
     from timberhand.configuration.inventory import differences
 
     try:
-        found = differences(first, second)
+        changes = differences(first, second)
     except ConfigError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except tomllib.TOMLDecodeError as error:
         raise CommandFailed("config.broken-toml", f"broken TOML: {error}", ExitCode.CONFIGURATION) from None
     if as_json:
-        print(json.dumps([{"key": key, "first": a, "second": b} for key, a, b in found], indent=2, default=str))
+        print(json.dumps([{"key": key, "first": a, "second": b} for key, a, b in changes], indent=2, default=str))
     else:
-        for key, a, b in found:
+        for key, a, b in changes:
             print(f"{key}: {'–' if a is None else a} → {'–' if b is None else b}")
-    if found:
+    if changes:
         raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 

@@ -265,7 +265,7 @@ def demo(
 
 
 def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> CommandFailed | None:
-    """Why ``--live`` or ``--no-live`` cannot be followed; None when it can.  ``udp``: a PLC is linked by datagrams."""
+    """Say why ``--live`` or ``--no-live`` cannot be followed; None when it can.  ``udp``: a PLC linked by datagrams."""
     if live is None:
         return None
     option = "--live" if live else "--no-live"
@@ -291,18 +291,18 @@ def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> Comma
 
 
 def paced_or_live(finding: Finding, live_only: bool, more: float = 0.0) -> tuple[bool, str]:
-    """Whether the demo is paced on a computer of which a look found ``finding``, and what to say.
+    """Tell whether the demo is paced on a computer of which a look found ``finding``, and what to say.
 
     ``live_only``: what was asked for exists in a live run alone; ``more``: processors that it needs besides.
     """
     from host.real_time import obstacle
 
-    found = obstacle(finding, more)
-    if not found:
+    obstacle_text = obstacle(finding, more)
+    if not obstacle_text:
         return False, ""
     if live_only:
-        return False, f"{found}: the machine may stop, and --plc-link udp exists live alone."
-    return True, f"{found}: the demo runs in paced virtual time instead; --live insists."
+        return False, f"{obstacle_text}: the machine may stop, and --plc-link udp exists live alone."
+    return True, f"{obstacle_text}: the demo runs in paced virtual time instead; --live insists."
 
 
 def _paces(screen: RichConsole, live_only: bool, more: float) -> bool:

@@ -78,7 +78,7 @@ def doctor(
 
 
 def _links() -> str:
-    """The interfaces by ip(8); none without it."""
+    """List the interfaces by ip(8); none without it."""
     import shutil
     import subprocess
 
@@ -110,18 +110,23 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
             ExitCode.CONFIGURATION,
         ) from None
     cpu = cores()[0]
-    found = facts.read(Path("/"), _links(), cpu)
+    host_facts = facts.read(Path("/"), _links(), cpu)
     machine = facts.read_computer(Path("/"), platform.version(), cpu)
     chosen = loopback_bus(profile) if bus is LoopbackBus.AUTO else bus.value
     console = Console(highlight=False)
-    with tempfile.TemporaryDirectory(prefix="timberhand-report-") as place, console.status("") as status:
+    with tempfile.TemporaryDirectory(prefix="timberhand-report-") as folder, console.status("") as status:
         try:
             measured: Measured | str = measure_computer(
-                found, profile, chosen, seconds, Path(place), lambda step: status.update(f"real-time report: {step}")
+                host_facts,
+                profile,
+                chosen,
+                seconds,
+                Path(folder),
+                lambda step: status.update(f"real-time report: {step}"),
             )
         except CommandFailed as failure:
             measured = f"the measurement failed: {failure}"
-    data = data_of(found, machine, timing.evaluate(found), measured, _private())
+    data = data_of(host_facts, machine, timing.evaluate(host_facts), measured, _private())
     out.write_text(text_of(data))
     for judged in data["judgements"]:
         console.print(f"{judged['verdict']:>12}  {judged['topic']}: {judged['sentence']}", soft_wrap=True)
@@ -134,7 +139,7 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
 
 
 def _private() -> frozenset[str]:
-    """The names that a report must not hold."""
+    """Return the names that a report must not hold."""
     import contextlib
     import os
     import platform

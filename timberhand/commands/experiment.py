@@ -164,7 +164,7 @@ def experiment(
 
 
 def _all(quick: bool, workers: int | None, common: list[str], docs: Path | None, out: Path) -> None:
-    """Every experiment: the quick pass, and unless that was asked for, the estimate and the full runs."""
+    """Run every experiment: the quick pass, and unless that was asked for, the estimate and the full runs."""
     from rich.console import Console
 
     from experiments.common import all_experiments as every
@@ -173,25 +173,25 @@ def _all(quick: bool, workers: int | None, common: list[str], docs: Path | None,
     screen, count = Console(stderr=True), workers or len(os.sched_getaffinity(0))
     common = ["--workers", str(count), *common]
     try:
-        found = every.perform(True, common, out / "quick", screen)
+        outcomes = every.perform(True, common, out / "quick", screen)
         if not quick:
-            every.show_estimate(every.estimate_h(found, count), screen)
-            found = every.perform(False, [*common, *(["--docs", str(docs)] if docs else [])], out, screen)
+            every.show_estimate(every.estimate_h(outcomes, count), screen)
+            outcomes = every.perform(False, [*common, *(["--docs", str(docs)] if docs else [])], out, screen)
     except KeyboardInterrupt:
         raise CommandFailed(
             "experiment.interrupted",
             f"interrupted; finished trials are kept in {out}, the same command continues",
             ExitCode.INTERRUPTED,
         ) from None
-    every.show(found, screen)
-    failed = [one.name for one in found if one.code not in (ExitCode.OK, ExitCode.FIGURE_MISSED)]
+    every.show(outcomes, screen)
+    failed = [outcome.name for outcome in outcomes if outcome.code not in (ExitCode.OK, ExitCode.FIGURE_MISSED)]
     if failed:
         raise CommandFailed(
             "experiment.failed",
             f"{', '.join(failed)} did not end with a result; run them one by one: timberhand experiment NAME",
             ExitCode.CONFIGURATION,
         )
-    missed = [one.name for one in found if one.code == ExitCode.FIGURE_MISSED]
+    missed = [outcome.name for outcome in outcomes if outcome.code == ExitCode.FIGURE_MISSED]
     if missed and not quick:
         raise CommandFailed(
             "experiment.figure-missed", f"figures missed in: {', '.join(missed)}; see {out}", ExitCode.FIGURE_MISSED

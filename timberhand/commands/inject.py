@@ -120,13 +120,13 @@ def _seconds(text: str) -> float:
 
 
 def _newest_run() -> Path:
-    """The directory below runs/ with the newest live run."""
+    """Find the directory below runs/ with the newest live run."""
     from hil.harness.live import ADDRESSES
     from runtime.errors import InputRefused
 
-    found = sorted(Path("runs").glob(f"*/{ADDRESSES}"), key=lambda path: path.stat().st_mtime)
-    if not found:
+    address_files = sorted(Path("runs").glob(f"*/{ADDRESSES}"), key=lambda path: path.stat().st_mtime)
+    if not address_files:
         raise InputRefused(
             "fault.no-live-run", "there is no live run below runs/; start `timberhand demo`, or add --lockstep"
         )
-    return found[-1].parent
+    return address_files[-1].parent

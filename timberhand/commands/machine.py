@@ -83,11 +83,11 @@ def new(
     except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     path = make(merged(given, described), str(answers or folder), folder)
-    found = [finding for finding in check_files(str(path)) if finding.code != "guard.envelope-damaged"]
-    _show(str(path), found)
+    findings = [finding for finding in check_files(str(path)) if finding.code != "guard.envelope-damaged"]
+    _show(str(path), findings)
     envelope = path.with_name(f"{path.stem}.envelope.toml")
     print(f"next: check every limit in {envelope}, then run: python -m controller.guard.seal {envelope}")
-    if any(not finding.note for finding in found):
+    if any(not finding.note for finding in findings):
         raise typer.Exit(ExitCode.CONFIGURATION)
 
 
@@ -113,19 +113,19 @@ def check(
 
     from timberhand.machine_files.check import check as check_files
 
-    found = check_files(profile)
+    findings = check_files(profile)
     if as_json:
-        print(json.dumps({"profile": profile, "findings": [asdict(finding) for finding in found]}, indent=2))
+        print(json.dumps({"profile": profile, "findings": [asdict(finding) for finding in findings]}, indent=2))
     else:
-        _show(profile, found)
-    if any(not finding.note for finding in found):
+        _show(profile, findings)
+    if any(not finding.note for finding in findings):
         raise typer.Exit(ExitCode.CONFIGURATION)
 
 
 def _show(profile: str, found: list[Finding]) -> None:
     for finding in found:
-        place = "" if finding.sentence.startswith(finding.file) else f"{finding.file}: "
-        print(f"{'note: ' if finding.note else ''}{place}{finding.sentence} [{finding.code}]")
+        prefix = "" if finding.sentence.startswith(finding.file) else f"{finding.file}: "
+        print(f"{'note: ' if finding.note else ''}{prefix}{finding.sentence} [{finding.code}]")
     wrong = sum(not finding.note for finding in found)
     print(f"{profile}: {'no problem' if not wrong else f'{wrong} problem' + 's' * (wrong > 1)}")
 
@@ -133,14 +133,14 @@ def _show(profile: str, found: list[Finding]) -> None:
 def _names(text: str) -> dict[str, str]:
     pairs = [pair.partition("=") for pair in text.split(",") if pair]
     known = ("slew", "lift", "tilt", "ext", "hanger", "rot", "fork", "tong_left")
-    for ours, equals, theirs in pairs:
-        if not equals or not theirs or ours not in known:
+    for own_name, equals, theirs in pairs:
+        if not equals or not theirs or own_name not in known:
             raise CommandFailed(
                 "machine.urdf-joints",
                 f"--urdf-joints {text}: write OURS=THEIRS with one of {', '.join(known)}, as in slew=joint1",
                 ExitCode.USAGE,
             )
-    return {ours: theirs for ours, _, theirs in pairs}
+    return {own_name: theirs for own_name, _, theirs in pairs}
 
 
 def _ask(described: dict[str, Any]) -> dict[str, Any]:

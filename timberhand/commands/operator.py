@@ -130,7 +130,7 @@ def _replace(file: Path, text: str) -> None:
 
 
 def _sender(profile: str, operator: Path | None) -> tuple[Profile, Callable[[OperatorAction, int | None], None]]:
-    """The machine, and a function that sends an action with its stamp (None: now) to its controller."""
+    """Return the machine, and a function that sends an action with its stamp (None: now) to its controller."""
     import os
     import time
 

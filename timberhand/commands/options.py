@@ -93,7 +93,7 @@ def check_foreign(experiment: str, planner: str, detector: str) -> None:
 
 
 def planner_of(name: str, virtual_cameras: int, pictures: Path | None) -> PlannerChoice:
-    """The choice of ``--planner``, ``--virtual-cameras`` and ``--plan-pictures``, whose folder is made.
+    """Return the choice of ``--planner``, ``--virtual-cameras`` and ``--plan-pictures``, whose folder is made.
 
     Raises:
         CommandFailed: there is no such planner, it has no virtual camera or draws no pictures, or the folder is none.
@@ -112,7 +112,7 @@ def planner_of(name: str, virtual_cameras: int, pictures: Path | None) -> Planne
 
 
 def truth_of(profile: str, truth: str) -> str:
-    """The choice of ``--truth`` for the machine of ``--profile``: with the file beside a profile of one's own.
+    """Return the choice of ``--truth`` for the machine of ``--profile``: with the file beside a profile of one's own.
 
     Raises:
         CommandFailed: the profile cannot be used.

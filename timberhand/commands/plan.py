@@ -51,12 +51,12 @@ def check(
         draft, review = _read(file, logs, machine)
     except MissionError as error:
         if as_json:
-            found = {
+            error_document = {
                 "file": str(file),
                 "problems": [str(problem) for problem in error.problems],
                 "codes": [problem.code for problem in error.problems],
             }
-            typer.echo(json.dumps(found, indent=2))
+            typer.echo(json.dumps(error_document, indent=2))
             raise typer.Exit(ExitCode.CONFIGURATION) from None
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if as_json:
@@ -103,7 +103,7 @@ def convert(
         save_bytes(out, exported.data)
     except MissionError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
-    draft.notes += [f"{what} not in {out.name}: {kind} does not hold it" for what in exported.left_out]
+    draft.notes += [f"{omission} not in {out.name}: {kind} does not hold it" for omission in exported.left_out]
     if as_json:
         typer.echo(json.dumps(_facts(file, draft, None) | {"out": str(out)}, indent=2))
         return
@@ -161,7 +161,7 @@ def show(
 
 
 def _machine(name: str) -> Profile:
-    """The profile of a machine that drives."""
+    """Load the profile of a machine that drives."""
     from machine.loading.profile_file import ProfileError, load_profile
 
     try:
@@ -178,7 +178,7 @@ def _machine(name: str) -> Profile:
 
 
 def _read(file: Path, logs: Path | None, machine: Profile) -> tuple[Draft, Review | None]:
-    """The checked mission, and its review for the machine; None without a route."""
+    """Read the checked mission, and its review for the machine; None without a route."""
     from autonomy.missions.mission_file import load_mission
     from autonomy.missions.review import review
 
@@ -189,7 +189,7 @@ def _read(file: Path, logs: Path | None, machine: Profile) -> tuple[Draft, Revie
 
 
 def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
-    """The JSON document of a mission."""
+    """Return the JSON document of a mission."""
     from math import degrees, isfinite
 
     mission = draft.mission
@@ -229,7 +229,7 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
 
 
 def _contents(draft: Draft) -> str:
-    """The contents of a mission in words."""
+    """Describe the contents of a mission."""
     mission = draft.mission
     parts = (("waypoint", mission.waypoints), ("fence", mission.fences), ("landing", mission.landings))
     counted = [f"{len(p)} {word}{'' if len(p) == 1 else 's'}" for word, p in (*parts, ("log", mission.logs)) if p]

@@ -57,7 +57,7 @@ def learn(
         from training.motion.primitives_plot import plot_primitives
 
         plot_primitives(plot, machine, motions, primitives)
-    found = {
+    facts = {
         "profile": machine.name,
         "motions": len(motions),
         "out": primitives.out.demonstrations,
@@ -66,10 +66,10 @@ def learn(
         "back_s": round(primitives.back.duration_s, 2),
     }
     if as_json:
-        typer.echo(json.dumps(found))
+        typer.echo(json.dumps(facts))
         return
     typer.echo(
-        f"{out}: learned from {found['out']} motions out and {found['back']} back of {len(motions)} of {machine.name}, "
+        f"{out}: learned from {facts['out']} motions out and {facts['back']} back of {len(motions)} of {machine.name}, "
         f"{primitives.out.duration_s:.1f} s and {primitives.back.duration_s:.1f} s"
     )
 

@@ -74,7 +74,7 @@ def decode(
 
 
 def _refuse_nothing(recording: Path, decoder: Decoder, records: Trace) -> None:
-    """Raises CommandFailed for a file in which no frame could be read."""
+    """Raise CommandFailed for a file in which no frame could be read."""
     from hil.replay.recording import no_frames
 
     if not decoder.counts["frames"]:

@@ -101,7 +101,7 @@ def verify(
     from host.release.updater import SIGNER
 
     with tempfile.TemporaryDirectory(prefix="timberhand-") as folder:
-        place = Path(folder, "bundle")
-        bundles.unpack(bundle, place)
-        release = bundles.check(place, public_key or SIGNER)
+        bundle_folder = Path(folder, "bundle")
+        bundles.unpack(bundle, bundle_folder)
+        release = bundles.check(bundle_folder, public_key or SIGNER)
     print(f"{release.name}, for {release.machine}: signature and every file are good")

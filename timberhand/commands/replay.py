@@ -55,10 +55,10 @@ def replay(
     elif result.agrees:
         typer.echo(f"{result.ticks} ticks agree byte for byte ({result.profile}, {result.rate_hz} Hz)")
     elif result.difference:
-        found = result.difference
-        typer.echo(f"{result.ticks} ticks agree; tick {found['tick']} ({found['at']}) differs:")
+        difference = result.difference
+        typer.echo(f"{result.ticks} ticks agree; tick {difference['tick']} ({difference['at']}) differs:")
         for side in ("recorded", "replayed"):
-            for line in found[side]:
+            for line in difference[side]:
                 typer.echo(f"  {side}  {line}")
     else:
         typer.echo(f"{result.ticks} ticks agree; {result.missing}")

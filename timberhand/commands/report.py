@@ -37,21 +37,21 @@ def report(
     from host.exit_codes import CommandFailed, ExitCode
 
     try:
-        found = overview.results_in(docs)
-        if not found:
+        results = overview.results_in(docs)
+        if not results:
             raise CommandFailed(
                 "report.no-results",
                 f"{docs / 'results'} holds no results of experiments; name the folder with --docs",
                 ExitCode.CONFIGURATION,
             )
         if check:
-            _check(found)
+            _check(results)
             return
         written = result_page.rewrite(docs)
         if (docs / "results" / "loop-design.json").exists() and (docs / "loop-design.md").exists():
             written = [loop_design.rewrite(docs), *written]
         print("\n".join(map(str, written)))
-        print(f"{len(found)} experiments")
+        print(f"{len(results)} experiments")
     except (OSError, ValueError) as error:
         raise CommandFailed(
             "report.results-unusable", f"the results in {docs} cannot be used: {error}", ExitCode.CONFIGURATION
@@ -71,8 +71,8 @@ def _check(results: dict[str, Result]) -> None:
             continue
         old.append(name)
         files = verdict.changed
-        more = f" ({len(files)} files: {', '.join(files[:3])}{', ...' if len(files) > 3 else ''})" if files else ""
-        print(f"{name}: {verdict.standing}. {verdict.why}{more}")
+        file_list = f" ({len(files)} files: {', '.join(files[:3])}{', ...' if len(files) > 3 else ''})" if files else ""
+        print(f"{name}: {verdict.standing}. {verdict.why}{file_list}")
     if old:
         raise CommandFailed(
             "report.stale",

@@ -76,7 +76,7 @@ def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO, detects: bool
 
 
 def _simulates(detects: bool) -> bool:
-    """Whether the lab runs in simulated time; announced on stderr.  False where the lab is not user-mode Linux."""
+    """Tell whether the lab runs in simulated time; announced on stderr.  False where the lab is not user-mode Linux."""
     from host.vcan_lab.choose import clock_here
 
     chosen = clock_here(detects)
@@ -87,7 +87,7 @@ def _simulates(detects: bool) -> bool:
 
 
 def _without_page(arguments: list[str]) -> list[str]:
-    """No page: a browser cannot reach one inside user-mode Linux."""
+    """Add the option for no page: a browser cannot reach one inside user-mode Linux."""
     return arguments if "--no-console" in arguments else [*arguments, "--no-console"]
 
 

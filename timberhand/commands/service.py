@@ -151,25 +151,25 @@ def status(
     from timberhand.service_status import read_status, screen
 
     console = Console(highlight=False)
-    found, before = read_status(timing), None
-    if not (watch or as_json or found.units or found.timing):
-        raise CommandFailed("service.nothing-found", " ".join(found.notes), ExitCode.CONFIGURATION)
+    current_status, previous_timing = read_status(timing), None
+    if not (watch or as_json or current_status.units or current_status.timing):
+        raise CommandFailed("service.nothing-found", " ".join(current_status.notes), ExitCode.CONFIGURATION)
     try:
         while as_json:
-            print(json.dumps(found.named()), flush=True)
+            print(json.dumps(current_status.named()), flush=True)
             if not watch:
                 return
             time.sleep(PERIOD_S)
-            found = read_status(timing)
+            current_status = read_status(timing)
         if not watch:
-            console.print(screen(found))
+            console.print(screen(current_status))
             return
         with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
             while True:
-                live.update(screen(found, before), refresh=True)
-                before = found.timing or before
+                live.update(screen(current_status, previous_timing), refresh=True)
+                previous_timing = current_status.timing or previous_timing
                 time.sleep(PERIOD_S)
-                found = read_status(timing)
+                current_status = read_status(timing)
     except KeyboardInterrupt:
         raise typer.Exit(ExitCode.INTERRUPTED) from None
 

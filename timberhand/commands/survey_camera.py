@@ -55,27 +55,27 @@ def survey_camera(
     from runtime.errors import InputRefused
 
     try:
-        known = load_profile(profile)
-        seen = load_targets(targets)
+        machine = load_profile(profile)
+        observations = load_targets(targets)
     except (ProfileError, InputRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
-    if camera not in known.cameras:
-        names = ", ".join(known.cameras) or "none"
+    if camera not in machine.cameras:
+        names = ", ".join(machine.cameras) or "none"
         raise CommandFailed(
-            "survey-camera.no-camera", f"{known.name} has no camera {camera!r}; it has: {names}", ExitCode.USAGE
+            "survey-camera.no-camera", f"{machine.name} has no camera {camera!r}; it has: {names}", ExitCode.USAGE
         )
-    before = known.cameras[camera]
+    before = machine.cameras[camera]
     q = _joints(joints, before)
     try:
-        link = link_pose(known, before.link, q, math.radians(articulation_deg))
-        found = surveyed(before, link, seen.pixels_px, seen.depths_m, seen.places_m)
+        link = link_pose(machine, before.link, q, math.radians(articulation_deg))
+        surveyed_camera = surveyed(before, link, observations.pixels_px, observations.depths_m, observations.places_m)
     except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
-    remark = f"by {len(seen.places_m)} surveyed targets"
+    remark = f"by {len(observations.places_m)} surveyed targets"
     values: dict[str, Any] = {
-        "position_m": [round(v, 4) for v in found.position_m],
-        "rpy_rad": [round(v, 5) for v in found.rpy_rad],
-        "depth_scale": round(found.depth_scale, 5),
+        "position_m": [round(v, 4) for v in surveyed_camera.position_m],
+        "rpy_rad": [round(v, 5) for v in surveyed_camera.rpy_rad],
+        "depth_scale": round(surveyed_camera.depth_scale, 5),
     }
     changed: list[tuple[tuple[str, ...], Any, str]] = [
         (("cameras", camera, name), value, remark) for name, value in values.items()
@@ -85,19 +85,19 @@ def survey_camera(
     except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     if as_json:
-        print(json.dumps({"camera": camera, "targets": len(seen.places_m), **values}, indent=2))
-    moved_mm = 1000.0 * math.dist(before.position_m, found.position_m)
-    turns = (math.remainder(b - a, math.tau) for a, b in zip(before.rpy_rad, found.rpy_rad, strict=True))
+        print(json.dumps({"camera": camera, "targets": len(observations.places_m), **values}, indent=2))
+    moved_mm = 1000.0 * math.dist(before.position_m, surveyed_camera.position_m)
+    turns = (math.remainder(b - a, math.tau) for a, b in zip(before.rpy_rad, surveyed_camera.rpy_rad, strict=True))
     turned = math.degrees(max(map(abs, turns)))
     Console(stderr=True).print(
         f"[green]✔[/green] {out} written: the mount of {camera} differs from the old profile by {moved_mm:.0f} mm and "
-        f"{turned:.1f} deg, the depth scale by {100.0 * (found.depth_scale - 1.0):+.2f} %",
+        f"{turned:.1f} deg, the depth scale by {100.0 * (surveyed_camera.depth_scale - 1.0):+.2f} %",
         highlight=False,
     )
 
 
 def _joints(text: str | None, camera: Camera) -> list[float]:
-    """Joint positions [rad, m] in ``Joint`` order."""
+    """Return joint positions [rad, m] in ``Joint`` order."""
     if text is None:
         if camera.link in ("boom", "stick"):
             raise CommandFailed(

@@ -329,16 +329,16 @@ def masks(
 
 
 def _photographs() -> list[tuple[np.ndarray, np.ndarray]]:
-    """The photographs that may be trained on, and their wood."""
+    """Return the photographs that may be trained on, and their wood."""
     from experiments.detector.photos import folder, photos
     from experiments.detector.traced import TRAINED_SCENES
 
-    found = [(shot.rgb, shot.wood) for shot in photos(folder()) if shot.name in TRAINED_SCENES]
-    if not found:
+    photographs = [(shot.rgb, shot.wood) for shot in photos(folder()) if shot.name in TRAINED_SCENES]
+    if not photographs:
         raise CommandFailed(
             "train.no-photographs", f"{folder()} holds no photographs; leave out --photographs", ExitCode.CONFIGURATION
         )
-    return found
+    return photographs
 
 
 def _train_on_pictures(weights: Path, folder: Path | None, make: Callable[[Path, Console], Path]) -> None:

@@ -96,11 +96,13 @@ def _open_page(run: Path | None, port: int) -> None:
     from timberhand.replay_page import show_recording
     from timberhand.why.stops import find_stops
 
-    found = next(iter(find_stops(run, newest=True)), None)
-    if found is None:
+    found_stop = next(iter(find_stops(run, newest=True)), None)
+    if found_stop is None:
         raise _no_stop(f"in {run or 'runs/'}")
-    place = found.source if found.source.is_dir() else found.source.parent.parent
-    show_recording(place if run_files(place) else found.source, None, port, stop_ns=found.stop.at_ns)
+    run_folder = found_stop.source if found_stop.source.is_dir() else found_stop.source.parent.parent
+    show_recording(
+        run_folder if run_files(run_folder) else found_stop.source, None, port, stop_ns=found_stop.stop.at_ns
+    )
 
 
 def _no_stop(where: str) -> CommandFailed:
@@ -121,13 +123,13 @@ def _explain(
 
     console, count = Console(highlight=False), 0
     newest: FoundStop | None = None
-    for found in find_stops(run, newest=not every):
-        count, newest = count + 1, found
-        events = events_of(found.ticks, found.stop.at_ns)
+    for found_stop in find_stops(run, newest=not every):
+        count, newest = count + 1, found_stop
+        events = events_of(found_stop.ticks, found_stop.stop.at_ns)
         if stops is not None:
-            stops.append(as_dict(found, events))
+            stops.append(as_dict(found_stop, events))
         else:
-            show(console, found, events)
+            show(console, found_stop, events)
             console.print()
     if plot is not None and newest is not None:
         from timberhand.why.plot import draw

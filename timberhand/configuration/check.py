@@ -28,24 +28,24 @@ _PLACE: Final = re.compile(r"[\w.:\[\]-]+:\d+")
 
 
 def problems_of(text: str, shipped: str) -> list[Problem]:
-    """Everything that is wrong with a settings file, in the order of its lines."""
-    found: list[Problem] = []
-    settings = parse(text, found)
-    found += unknown(settings, parse(shipped, []))
-    found += _ports(settings)
-    found += _buses(settings)
+    """List everything that is wrong with a settings file, in the order of its lines."""
+    problems: list[Problem] = []
+    settings = parse(text, problems)
+    problems += unknown(settings, parse(shipped, []))
+    problems += _ports(settings)
+    problems += _buses(settings)
     profile_setting = settings.get("PROFILE")
     if profile_setting is not None:
-        found += _machine(settings, profile_setting)
-    return sorted(found, key=lambda problem: problem.line)
+        problems += _machine(settings, profile_setting)
+    return sorted(problems, key=lambda problem: problem.line)
 
 
 def signature_problems(settings: Path, signer: Path) -> Iterator[Problem]:
-    """What of the program and the machine's files is not as it was signed."""
+    """Report what of the program and the machine's files is not as it was signed."""
     profile = parse(read(settings), []).get("PROFILE")
     path = profile_path(profile.value) if profile is not None else PROGRAM
-    for found in installed.problems(signer, path):
-        yield Problem(0, f"{found.sentence} [{found.code}]")
+    for problem in installed.problems(signer, path):
+        yield Problem(0, f"{problem.sentence} [{problem.code}]")
 
 
 def _number(settings: dict[str, Setting], name: str) -> int | None:
@@ -74,15 +74,15 @@ def _ports(settings: dict[str, Setting]) -> Iterator[Problem]:
 
 
 def _buses(settings: dict[str, Setting]) -> Iterator[Problem]:
-    for which in ("CRANE", "MACHINE"):
-        bus = settings.get(f"{which}_BUS")
+    for bus_name in ("CRANE", "MACHINE"):
+        bus = settings.get(f"{bus_name}_BUS")
         if bus is not None and bus.value and not _BUS.fullmatch(bus.value):
-            yield Problem(bus.line, f"{which}_BUS={bus.value} is no address; write socketcan:INTERFACE")
-        rate = settings.get(f"{which}_BITRATE")
-        value = _number(settings, f"{which}_BITRATE")
+            yield Problem(bus.line, f"{bus_name}_BUS={bus.value} is no address; write socketcan:INTERFACE")
+        rate = settings.get(f"{bus_name}_BITRATE")
+        value = _number(settings, f"{bus_name}_BITRATE")
         if rate is not None and (value is None or not BIT_RATES[0] <= value <= BIT_RATES[1]):
             low, high = BIT_RATES
-            yield Problem(rate.line, f"{which}_BITRATE={rate.value}: classic CAN has {low} to {high} bit/s")
+            yield Problem(rate.line, f"{bus_name}_BITRATE={rate.value}: classic CAN has {low} to {high} bit/s")
     crane, machine = settings.get("CRANE_BUS"), settings.get("MACHINE_BUS")
     if crane is not None and not crane.value:
         yield Problem(crane.line, "CRANE_BUS is empty: every machine has a crane bus, as in socketcan:crane0")
@@ -104,7 +104,7 @@ def _machine(settings: dict[str, Setting], named: Setting) -> Iterator[Problem]:
 
 
 def _fit(settings: dict[str, Setting], profile: Profile) -> Iterator[Problem]:
-    """Whether buses, camera and PLC are those of the machine."""
+    """Check whether buses, camera and PLC are those of the machine."""
     bus = settings.get("MACHINE_BUS")
     if bus is not None and profile.carrier is not None and not bus.value:
         yield Problem(bus.line, f"{profile.name} drives and needs MACHINE_BUS, as in socketcan:mach0")

@@ -32,7 +32,7 @@ class Part:
 
 
 def parts(settings: Path, profile: str) -> Iterator[Part]:
-    """Every file that decides how this machine behaves; those that are missing are left out."""
+    """List every file that decides how this machine behaves; those that are missing are left out."""
     own = profile_path(profile)
     name = load_profile(profile).name
     beside = own.with_name(f"{name}.envelope.toml")
@@ -51,20 +51,20 @@ def _part(kind: str, path: Path) -> Iterator[Part]:
 
 
 def profile_word(profile: str) -> str:
-    """The machine's name, and the hash that every datagram carries."""
+    """Return the machine's name, and the hash that every datagram carries."""
     machine = load_profile(profile)
     return f"{machine.name} ({machine.title}), profile hash {profile_hash(machine):08x}"
 
 
 def effective(path: Path) -> dict[str, tuple[Setting, bool]]:
-    """Name -> setting, and whether it differs from the shipped one."""
+    """Map name -> setting, and whether it differs from the shipped one."""
     shipped = parse(read(SHIPPED), [])
-    ours = parse(read(path), [])
-    return {name: (s, name not in shipped or shipped[name].value != s.value) for name, s in ours.items()}
+    own_settings = parse(read(path), [])
+    return {name: (s, name not in shipped or shipped[name].value != s.value) for name, s in own_settings.items()}
 
 
 def differences(first: Path, second: Path) -> list[tuple[str, Any, Any]]:
-    """(key path, value of the first, of the second) of two settings files, or of two TOML files; None: not there."""
+    """List (key path, first value, second value) of two settings files, or of two TOML files; None: not there."""
     a, b = _flat(first), _flat(second)
     return [(key, a.get(key), b.get(key)) for key in sorted(a.keys() | b.keys()) if a.get(key) != b.get(key)]
 
@@ -73,9 +73,9 @@ def _flat(path: Path) -> dict[str, Any]:
     text = read(path)
     if path.suffix != ".toml":
         return {name: setting.value for name, setting in parse(text, []).items()}
-    found: dict[str, Any] = {}
-    _flatten(tomllib.loads(text), "", found)
-    return found
+    values: dict[str, Any] = {}
+    _flatten(tomllib.loads(text), "", values)
+    return values
 
 
 def _flatten(value: Any, place: str, found: dict[str, Any]) -> None:

@@ -40,7 +40,7 @@ class Problem:
 
 
 def read(path: Path) -> str:
-    """The text of a settings file; raises ConfigError."""
+    """Read the text of a settings file; raises ConfigError."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -50,8 +50,8 @@ def read(path: Path) -> str:
 
 
 def parse(text: str, problems: list[Problem]) -> dict[str, Setting]:
-    """Name -> setting; appends what is no setting, and what stands twice (the last one counts, as for systemd)."""
-    found: dict[str, Setting] = {}
+    """Read name -> setting; append to ``problems`` what is no setting, or is set twice (the last counts)."""
+    settings: dict[str, Setting] = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.lstrip().startswith(("#", ";")):
             continue
@@ -60,18 +60,18 @@ def parse(text: str, problems: list[Problem]) -> dict[str, Setting]:
             problems.append(Problem(number, f"{line.strip()[:60]!r} is no setting; write NAME=value without spaces"))
             continue
         name, value = match.groups()
-        if name in found:
-            problems.append(Problem(number, f"{name} stands in line {found[name].line}, too; remove one of them"))
-        found[name] = Setting(value, number)
-    return found
+        if name in settings:
+            problems.append(Problem(number, f"{name} stands in line {settings[name].line}, too; remove one of them"))
+        settings[name] = Setting(value, number)
+    return settings
 
 
 def unknown(settings: dict[str, Setting], known: dict[str, Setting]) -> Iterator[Problem]:
-    """Names that this release does not have, and those that the file lacks."""
+    """Report names that this release does not have, and those that the file lacks."""
     for name, setting in settings.items():
         if name not in known:
-            near = get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]}?" if near else "; remove it"
+            similar_names = get_close_matches(name, known, 1)
+            hint = f"; did you mean {similar_names[0]}?" if similar_names else "; remove it"
             yield Problem(setting.line, f"there is no setting {name}{hint}")
     for name in known:
         if name not in settings:
@@ -80,16 +80,16 @@ def unknown(settings: dict[str, Setting], known: dict[str, Setting]) -> Iterator
 
 
 def migrated(text: str, shipped: str) -> tuple[str, list[str]]:
-    """The shipped file with the values of ``text``, and what was done about names that it does not have."""
-    ours = parse(text, [])
+    """Return the shipped file with the values of ``text``, and what was done about names that it does not have."""
+    own_settings = parse(text, [])
     known = parse(shipped, [])
     lines = shipped.splitlines()
     notes = []
     for name, setting in known.items():
-        if name in ours:
-            lines[setting.line - 1] = f"{name}={ours[name].value}"
+        if name in own_settings:
+            lines[setting.line - 1] = f"{name}={own_settings[name].value}"
         else:
             notes.append(f"{name} is new: {setting.value or 'empty'}")
-    for name in ours.keys() - known.keys():
-        notes.append(f"{name}={ours[name].value} is gone: this release has no such setting")
+    for name in own_settings.keys() - known.keys():
+        notes.append(f"{name}={own_settings[name].value} is gone: this release has no such setting")
     return "\n".join(lines) + "\n", sorted(notes)

@@ -41,7 +41,7 @@ class Finding:
 
 
 def check(name: str) -> list[Finding]:
-    """All findings about the machine of a shipped profile or of a file, problems first."""
+    """Return all findings about the machine of a shipped profile or of a file, problems first."""
     source = profile_path(name)
     try:
         profile = load_profile(name)
@@ -49,7 +49,7 @@ def check(name: str) -> list[Finding]:
         if not error.problems:
             return [Finding(error.code, str(source), str(error))]
         return [Finding(p.code, str(source), str(p)) for p in error.problems]
-    found = [
+    findings = [
         *_controller(source, profile),
         *_places(source, profile),
         *_envelope(source, profile),
@@ -57,11 +57,11 @@ def check(name: str) -> list[Finding]:
         *_urdf(source, profile),
         *_lacking(source, profile),
     ]
-    return sorted(found, key=lambda finding: finding.note)
+    return sorted(findings, key=lambda finding: finding.note)
 
 
 def _controller(source: Path, profile: Profile) -> Iterator[Finding]:
-    """What the controller itself refuses at its start: nodes, frames and signals that do not exist."""
+    """Report what the controller itself refuses at its start: nodes, frames and signals that do not exist."""
     try:
         Controller(Settings(profile, profile_hash(profile), profile.rate_hz))
     except ConfigError as error:
@@ -69,7 +69,7 @@ def _controller(source: Path, profile: Profile) -> Iterator[Finding]:
 
 
 def _places(source: Path, profile: Profile) -> Iterator[Finding]:
-    """Whether the tongs reach the ground where logs lie, and the floor of the bunk."""
+    """Check whether the tongs reach the ground where logs lie, and the floor of the bunk."""
     hang = lowest_tip_below_pin_m(profile.grapple.jaws)
     places = {
         "workspace.pick_center_m": (*profile.workspace.pick_center_m, profile.workspace.ground_z_m),

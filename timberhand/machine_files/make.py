@@ -48,7 +48,7 @@ def make(raw: dict[str, Any], where: str, folder: Path) -> Path:
 
 
 def _texts(answers: Answers) -> dict[str, str]:
-    """The text of every file, by its name."""
+    """Write the text of every file, by its name."""
     drafted = profile_text(answers, encoder_messages())
     with TemporaryDirectory() as scratch:
         path = Path(scratch) / f"{answers.name}.toml"
@@ -69,6 +69,6 @@ def _texts(answers: Answers) -> dict[str, str]:
 
 
 def encoder_messages() -> dict[int, str]:
-    """The encoder messages of ``crane.dbc`` by the node that sends them."""
+    """Return the encoder messages of ``crane.dbc`` by the node that sends them."""
     codecs = load("crane").messages.values()
     return {m.key - TPDO1: m.name for m in codecs if ENCODER_SENDER in m.senders and TPDO1 < m.key < TPDO1 + 0x80}

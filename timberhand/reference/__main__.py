@@ -36,7 +36,7 @@ from machine.status.reasons import Fault, Reaction, Reason
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table; bars in cells are escaped."""
+    """Write a table; bars in cells are escaped."""
 
     def line(cells: Sequence[object]) -> str:
         return "| " + " | ".join(str(cell).replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
@@ -45,7 +45,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def generated(title: str, source: str, introduction: str) -> str:
-    """The head of a generated page: title, where it comes from, what it says."""
+    """Write the head of a generated page: title, where it comes from, what it says."""
     return (
         f"# {title}\n\n<!-- generated from {source} by `python -m timberhand.reference`; do not edit -->\n\n"
         f"{introduction}\n"
@@ -56,7 +56,7 @@ def generated(title: str, source: str, introduction: str) -> str:
 
 
 def cli_page() -> str:
-    """docs/reference/cli.md."""
+    """Return the text of docs/reference/cli.md."""
     from typer.cli import get_docs_for_click
     from typer.main import get_command
 
@@ -81,7 +81,7 @@ def cli_page() -> str:
 
 
 def _show_whole_sentences(command: Any) -> None:
-    """Lists of commands show the first sentence of their help; Click would cut it at 45 characters."""
+    """Let lists of commands show the first sentence of their help; Click would cut it at 45 characters."""
     for sub in getattr(command, "commands", {}).values():
         if sub.help and not sub.short_help:
             sub.short_help = " ".join(sub.help.split("\n\n")[0].split())
@@ -116,17 +116,17 @@ CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*(\.[a-z0-9]+(-[a-z0-9]+)*)+")
 
 
 def codes(repository: Path) -> dict[str, list[tuple[str, str, str]]]:
-    """By code: (class or function that takes it, file, sentence with ``…`` for what varies) of each place."""
-    found: dict[str, list[tuple[str, str, str]]] = defaultdict(list)
+    """Map code -> (class or function that takes it, file, sentence with ``…`` for what varies) of each place."""
+    occurrences: dict[str, list[tuple[str, str, str]]] = defaultdict(list)
     for package in PACKAGES:
         for path in sorted((repository / package).rglob("*.py")):
             for code, taker, sentence in _codes_of(ast.parse(path.read_text())):
-                found[code].append((taker, path.relative_to(repository).as_posix(), sentence))
-    return dict(sorted(found.items()))
+                occurrences[code].append((taker, path.relative_to(repository).as_posix(), sentence))
+    return dict(sorted(occurrences.items()))
 
 
 def _codes_of(tree: ast.Module) -> Iterator[tuple[str, str, str]]:
-    """Calls whose first two arguments are a code and a sentence."""
+    """Find calls whose first two arguments are a code and a sentence."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call) or len(node.args) < 2:
             continue
@@ -140,7 +140,7 @@ def _codes_of(tree: ast.Module) -> Iterator[tuple[str, str, str]]:
 
 
 def _sentence(node: ast.expr) -> str:
-    """The text of a string or an f-string; ``…`` stands for what is put in."""
+    """Return the text of a string or an f-string; ``…`` stands for what is put in."""
     match node:
         case ast.Constant(value=str(text)):
             return text
@@ -153,7 +153,7 @@ def _sentence(node: ast.expr) -> str:
 
 
 def errors_page(repository: Path) -> str:
-    """docs/reference/errors.md."""
+    """Return the text of docs/reference/errors.md."""
     rows = dict.fromkeys(
         (f"`{code}`", sentence, f"`{file}`")
         for code, places in codes(repository).items()
@@ -174,7 +174,7 @@ BUSES = {"crane": "crane0: CANopen and own PDOs", "machine": "mach0: J1939", "gn
 
 
 def frames_page() -> str:
-    """docs/reference/frames.md."""
+    """Return the text of docs/reference/frames.md."""
     head = generated(
         "CAN frames",
         "`can_dbc/*.dbc`",
@@ -220,7 +220,7 @@ def _message(message: MessageCodec) -> str:
 
 
 def faults() -> str:
-    """docs/reference/faults.md."""
+    """Return the text of docs/reference/faults.md."""
     rows = (
         (
             int(reason),
@@ -246,13 +246,17 @@ def faults() -> str:
 
 
 def _measured(reason: Reason) -> str:
-    """Names of the numbers; the unit of a joint's is that of the joint."""
-    found = EVIDENCE.get(reason)
-    return "" if found is None else ", ".join(name for name in (found.signal, found.limit, found.other) if name)
+    """Name the numbers; the unit of a joint's is that of the joint."""
+    evidence = EVIDENCE.get(reason)
+    return (
+        ""
+        if evidence is None
+        else ", ".join(name for name in (evidence.signal, evidence.limit, evidence.other) if name)
+    )
 
 
 def transitions() -> str:
-    """docs/reference/transitions.md."""
+    """Return the text of docs/reference/transitions.md."""
     events = [event for event in Event if any(known is event for _, known in TRANSITIONS)]
     rows = (
         (
@@ -271,7 +275,10 @@ def transitions() -> str:
 
 
 def catalog() -> str:
-    """deploy/system/timberhand.catalog; the fields in ``@`` are those of `recorder.__main__.stop_fields`."""
+    """Return the text of deploy/system/timberhand.catalog.
+
+    The fields in ``@`` are those of `recorder.__main__.stop_fields`.
+    """
     head = "# generated from `machine.status.faults.FAULTS` by `python -m timberhand.reference`; do not edit\n"
     stops = (entry for entry in sorted(FAULTS.items()) if entry[1].reaction >= Reaction.HOLD)
     return head + "".join(_entry(reason, fault) for reason, fault in stops)
@@ -318,7 +325,7 @@ EYES: Final = {
 
 
 def readme(repository: Path) -> str:
-    """The README with its table of today; as it is where no git history says what the figures are worth."""
+    """Return the README with its table of today; as it is where no git history says what the figures are worth."""
     text = (repository / "README.md").read_text()
     if not has_history():
         return text
@@ -333,14 +340,14 @@ def _table(docs: Path) -> str:
         if metric.title not in SHOWN.get(name, ()):
             continue
         paper = metric.text(result.paper[metric.name]) if metric.name in result.paper else ""
-        here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
+        measured = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
         standing = judge(result.commit, EXPERIMENTS[name]).standing
-        rows.append((f"[{name}](docs/{name}.md)", metric.title, paper, here, _eyes(result), standing))
+        rows.append((f"[{name}](docs/{name}.md)", metric.title, paper, measured, _eyes(result), standing))
     return table(("experiment", "metric", "paper", "here", "logs seen by", "sources"), rows)
 
 
 def _eyes(result: Result) -> str:
-    """What saw the logs; empty where none are looked for."""
+    """Say what saw the logs; empty where none are looked for."""
     named = result.environment.get("eyes") or result.environment.get("judged", "").partition(" poses")[0]
     return EYES[named] if named else ""
 
@@ -357,7 +364,7 @@ BUILT: Final[dict[str, Callable[[], str]]] = {
 
 
 def committed(repository: Path = REPOSITORY) -> dict[Path, str]:
-    """The text of every generated page that is committed, by its path."""
+    """Return the text of every generated page that is committed, by its path."""
     made = {
         "docs/reference/faults.md": faults(),
         "docs/reference/transitions.md": transitions(),
@@ -368,7 +375,7 @@ def committed(repository: Path = REPOSITORY) -> dict[Path, str]:
 
 
 def stale(made: dict[Path, str]) -> list[Path]:
-    """The pages whose text on disk is not this one."""
+    """List the pages whose text on disk is not this one."""
     return [path for path, text in made.items() if not path.is_file() or path.read_text() != text]
 
 
@@ -385,7 +392,7 @@ def write_built() -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m timberhand.reference", description="Generate the reference pages.")
     parser.add_argument("--check", action="store_true", help="write nothing; fail if a committed page is stale")
     options = parser.parse_args(arguments)

@@ -22,7 +22,7 @@ Series = list[tuple[float, ...]]
 
 
 def draw(found: FoundStop, path: Path) -> None:
-    """Writes the plot as PNG; raises OSError."""
+    """Write the plot as PNG; raises OSError."""
     at_ns = found.stop.at_ns
     reports = list(reports_of(found.ticks))
     times = [(report.stamp_ns - at_ns) / 1e9 for report in reports]
@@ -72,16 +72,16 @@ def _draw_joints(axis: Any, times: list[float], values: Series, label: str, dash
 
 
 def _commands(found: FoundStop) -> tuple[list[float], Series]:
-    """Times and spool commands [%] of every tick that sent them, in ``Joint`` order."""
+    """Collect times and spool commands [%] of every tick that sent them, in ``Joint`` order."""
     database = load("crane")
-    wanted = {database.message(name).key: (database.message(name), names) for name, names in COMMANDS.items()}
+    command_codecs = {database.message(name).key: (database.message(name), names) for name, names in COMMANDS.items()}
     times: list[float] = []
     rows: Series = []
     for tick in found.ticks:
         row: list[float] = []
         for key, data in tick.frames_out:
-            if key in wanted:
-                codec, names = wanted[key]
+            if key in command_codecs:
+                codec, names = command_codecs[key]
                 values = codec.decode(data)
                 row += [_NAN if (value := values[codec.index[name]]) is None else value for name in names]
         if len(row) == len(JOINTS):
@@ -91,5 +91,5 @@ def _commands(found: FoundStop) -> tuple[list[float], Series]:
 
 
 def _scaled(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Angles in degrees, the telescope in cm, so that all joints fit on one axis."""
+    """Convert angles to degrees, the telescope to cm, so that all joints fit on one axis."""
     return tuple(value * 100.0 if joint == Joint.EXT else math.degrees(value) for joint, value in enumerate(values))

@@ -21,7 +21,7 @@ _STYLES: Final = {"FAULT": "bold red", "STOP": "bold yellow"}
 
 
 def when(stop: Stop) -> str:
-    """Time of the stop: UTC, or in lockstep the virtual time, which the candump files have too."""
+    """Write the time of the stop: UTC, or in lockstep the virtual time, which the candump files have too."""
     if stop.utc_ns is None:
         return f"at {stop.at_ns / 1e9:.3f} s of virtual time"
     at = datetime.datetime.fromtimestamp(stop.utc_ns // 10**9, datetime.UTC)
@@ -29,7 +29,7 @@ def when(stop: Stop) -> str:
 
 
 def show(console: Console, found: FoundStop, events: Sequence[Event]) -> None:
-    """Prints time, mode, reason, numbers, advice, timeline and file."""
+    """Print time, mode, reason, numbers, advice, timeline and file."""
     stop, explained = found.stop, found.stop.explanation
     style = _STYLES.get(stop.mode, "bold")
     head = f"[{style}]{stop.mode}[/] {when(stop)}, {stop.mode_before} before, {escape(found.manifest.profile)}"
@@ -43,20 +43,20 @@ def show(console: Console, found: FoundStop, events: Sequence[Event]) -> None:
         for number, line in enumerate(lines):
             _line(console, f"  [dim]{'' if number else name:<12}[/]{escape(line)}")
     _line(console, "[dim]  what happened[/]")
-    kept = sorted(sorted(events, key=lambda event: abs(event.at_s))[:MAX_EVENTS])
-    for event in kept:
+    shown_events = sorted(sorted(events, key=lambda event: abs(event.at_s))[:MAX_EVENTS])
+    for event in shown_events:
         _line(console, f"  {event.at_s:+9.3f} s  {escape(event.text)}")
-    if not kept:
+    if not shown_events:
         _line(console, "  nothing else in the two seconds before it")
-    if len(kept) < len(events):
-        _line(console, f"  {len(events) - len(kept)} more events are in --json")
+    if len(shown_events) < len(events):
+        _line(console, f"  {len(events) - len(shown_events)} more events are in --json")
     _line(console, f"[dim]  recorded in[/]  {escape(str(found.source))}")
 
 
 def _measured(stop: Stop) -> list[str]:
-    """The numbers, one a line, or why there are none."""
-    if found := [quantity.text for quantity in stop.explanation.quantities]:
-        return found
+    """List the numbers, one a line, or why there are none."""
+    if quantities := [quantity.text for quantity in stop.explanation.quantities]:
+        return quantities
     if Reason(stop.reason & 0xFF) not in EVIDENCE:
         return ["no number belongs to this reason"]
     return ["unknown" if stop.numbers else "not recorded; the recording is of an earlier release"]
@@ -67,7 +67,7 @@ def _line(console: Console, markup: str) -> None:
 
 
 def as_dict(found: FoundStop, events: Sequence[Event]) -> dict[str, Any]:
-    """The same for JSON, with values in SI units (times in ms where the unit says so)."""
+    """Return the same for JSON, with values in SI units (times in ms where the unit says so)."""
     stop, explained = found.stop, found.stop.explanation
     return {
         "number": stop.number,

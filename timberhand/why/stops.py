@@ -46,7 +46,7 @@ class FoundStop:
 
 
 def find_stops(run: Path | None, newest: bool = False) -> Iterator[FoundStop]:
-    """The stops of ``run``, oldest first; with ``newest`` the last of them only.  None found: an empty iterator.
+    """Find the stops of ``run``, oldest first; with ``newest`` the last of them only.  None found: an empty iterator.
 
     Raises:
         CommandFailed: there is no recording, or it cannot be read.
@@ -56,12 +56,12 @@ def find_stops(run: Path | None, newest: bool = False) -> Iterator[FoundStop]:
         for path in paths[-1:] if newest else paths:
             yield from read_stop(path)
     elif run is not None:
-        found = stops_in_recording(_recording(run))
-        yield from deque(found, maxlen=1) if newest else found
+        stops = stops_in_recording(_recording(run))
+        yield from deque(stops, maxlen=1) if newest else stops
 
 
 def read_stop(path: Path) -> Iterator[FoundStop]:
-    """The stop in a file of the stop recorder; none if its writer was killed before the first chunk was complete."""
+    """Read the stop in a stop recorder's file; none if its writer was killed before the first chunk was complete."""
     stop = next(messages([path], TOPIC), None)
     if stop is not None:
         ticks = tuple(recorded_ticks([path]))
@@ -69,7 +69,7 @@ def read_stop(path: Path) -> Iterator[FoundStop]:
 
 
 def stops_in_recording(files: list[Path]) -> Iterator[FoundStop]:
-    """The stops of a whole recording, found in the controller's reports."""
+    """Find the stops of a whole recording in the controller's reports."""
     manifest = manifest_of(files)
     offset_ns = manifest.utc_offset_ns if manifest.live else None
     detector, number = StopDetector(), 0
@@ -119,10 +119,10 @@ def _report_of(tick: TickRecord) -> StateReport | None:
 
 
 def _newest_directory() -> list[Path]:
-    """The stop files of the directory, of all on this computer, that has the newest one."""
-    places = [*Path("runs").glob(f"*/{STOPS_NAME}"), SERVICE_STOPS]
-    found = [paths for place in places if (paths := _in_directory(place))]
-    return max(found, key=lambda paths: paths[-1].stat().st_mtime_ns, default=[])
+    """Find the stop files of the directory, of all on this computer, that has the newest one."""
+    directories = [*Path("runs").glob(f"*/{STOPS_NAME}"), SERVICE_STOPS]
+    stop_files = [paths for directory in directories if (paths := _in_directory(directory))]
+    return max(stop_files, key=lambda paths: paths[-1].stat().st_mtime_ns, default=[])
 
 
 def _stop_files(run: Path) -> list[Path]:
@@ -138,7 +138,7 @@ def _in_directory(directory: Path) -> list[Path]:
 
 
 def _recording(run: Path) -> list[Path]:
-    """The MCAP files of a run; raises CommandFailed with a sentence about what was looked for."""
+    """Find the MCAP files of a run; raises CommandFailed with a sentence about what was looked for."""
     try:
         return files_of(run)
     except CommandFailed as error:
@@ -176,7 +176,7 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def failures(file: Path = SERVICE_FAILURES) -> Iterator[Failure]:
-    """The failures in a file, oldest first; none without a file; a line that was cut off is left out."""
+    """Read the failures in a file, oldest first; none without a file; a line that was cut off is left out."""
     try:
         lines = file.read_bytes().splitlines()
     except OSError:
@@ -187,8 +187,10 @@ def failures(file: Path = SERVICE_FAILURES) -> Iterator[Failure]:
 
 
 def newest_failure(after_utc_ns: int | None, file: Path = SERVICE_FAILURES) -> tuple[Failure, int] | None:
-    """The newest failure that is not older than a stop, and how often that service has failed since; None: none."""
-    since = [found for found in failures(file) if after_utc_ns is None or found.utc_s * 10**9 >= after_utc_ns - 10**9]
-    if not since:
+    """Find the newest failure not older than a stop, and how often that service has failed since; None: none."""
+    recent_failures = [
+        failure for failure in failures(file) if after_utc_ns is None or failure.utc_s * 10**9 >= after_utc_ns - 10**9
+    ]
+    if not recent_failures:
         return None
-    return since[-1], sum(found.unit == since[-1].unit for found in since)
+    return recent_failures[-1], sum(failure.unit == recent_failures[-1].unit for failure in recent_failures)

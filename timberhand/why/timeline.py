@@ -69,14 +69,14 @@ class Event(NamedTuple):
 
 
 def events_of(ticks: tuple[TickRecord, ...], at_ns: int) -> list[Event]:
-    """The events from `BEFORE_S` before the stop at ``at_ns`` to the end of the ticks."""
+    """List the events from `BEFORE_S` before the stop at ``at_ns`` to the end of the ticks."""
     watchers = (_modes, _refusals, _frames, _silences, _requests, _buses, _lateness)
-    found = sorted((event for watch in watchers for event in watch(ticks)), key=lambda event: event[0])
-    return [Event((ns - at_ns) / 1e9, text) for ns, text in found if ns - at_ns >= -BEFORE_S * 1e9]
+    entries = sorted((event for watch in watchers for event in watch(ticks)), key=lambda event: event[0])
+    return [Event((ns - at_ns) / 1e9, text) for ns, text in entries if ns - at_ns >= -BEFORE_S * 1e9]
 
 
 def reports_of(ticks: Ticks) -> Iterator[StateReport]:
-    """The state reports of the ticks, without those that cannot be read."""
+    """Decode the state reports of the ticks, without those that cannot be read."""
     for tick in ticks:
         with contextlib.suppress(DatagramRefused):
             if report := report_of(tick):
@@ -84,7 +84,7 @@ def reports_of(ticks: Ticks) -> Iterator[StateReport]:
 
 
 def _modes(ticks: Ticks) -> Found:
-    """Changes of the mode, and of what slows the machine down."""
+    """Find changes of the mode, and of what slows the machine down."""
     for last, report in pairwise(reports_of(ticks)):
         if last.mode != report.mode:
             at_ns = report.since_ns if report.since_ns > last.stamp_ns else report.stamp_ns
@@ -97,7 +97,7 @@ def _modes(ticks: Ticks) -> Found:
 
 
 def _refusals(ticks: Ticks) -> Found:
-    """Setpoints that the controller refused."""
+    """Find setpoints that the controller refused."""
     for last, report in pairwise(reports_of(ticks)):
         if count := report.refused - last.refused & 0xFFFF:
             times = "" if count == 1 else f"{count} times, the last one: "
@@ -105,7 +105,7 @@ def _refusals(ticks: Ticks) -> Found:
 
 
 def _frames(ticks: Ticks) -> Found:
-    """Changes of the watched signals, and emergency messages."""
+    """Find changes of the watched signals, and emergency messages."""
     last: dict[str, dict[str, float]] = {}
     for bus, database, (stamp_ns, key, data) in _received(ticks):
         codec = database.find(key)
@@ -134,19 +134,19 @@ class _Silence:
         self._silent: set[str] = set()
 
     def came(self, name: str, stamp_ns: int, timeout_ns: int) -> Found:
-        """A message came."""
+        """Note that a message came."""
         if name in self._silent:
             self._silent.remove(name)
             yield stamp_ns, f"{name} back after {(stamp_ns - self._last_ns[name]) / 1e6:.0f} ms"
         self._last_ns[name], self._timeouts_ns[name] = stamp_ns, timeout_ns
 
     def forget(self) -> None:
-        """What came so far has ended on purpose."""
+        """Forget what came so far, which has ended on purpose."""
         self._last_ns.clear()
         self._silent.clear()
 
     def pass_time(self, now_ns: int) -> Found:
-        """Which messages are silent now; their event is at the last one."""
+        """Find the messages that are silent now; their event is at the last one."""
         for name, last_ns in self._last_ns.items():
             if name not in self._silent and now_ns - last_ns > self._timeouts_ns[name]:
                 self._silent.add(name)
@@ -154,7 +154,7 @@ class _Silence:
 
 
 def _silences(ticks: Ticks) -> Found:
-    """Messages on the buses that are silent for their time-out in the DBC."""
+    """Find messages on the buses that are silent for their time-out in the DBC."""
     silence = _Silence()
     for tick in ticks:
         for _, database, (stamp_ns, key, _) in _received((tick,)):
@@ -165,7 +165,7 @@ def _silences(ticks: Ticks) -> Found:
 
 
 def _requests(ticks: Ticks) -> Found:
-    """What operators send, and pauses in the planner's setpoints."""
+    """Find what operators send, and pauses in the planner's setpoints."""
     setpoints, beats = _Silence(), _Silence()
     for tick in ticks:
         for data in (*tick.operator, *tick.datagrams):
@@ -187,7 +187,7 @@ def _requests(ticks: Ticks) -> Found:
 
 
 def _buses(ticks: Ticks) -> Found:
-    """States of the own node on each bus, and bursts of its counters."""
+    """Find states of the own node on each bus, and bursts of its counters."""
     buses = {"crane0": [tick.bus for tick in ticks], "mach0": [tick.machine_bus for tick in ticks]}
     times_ns = [tick.now_ns for tick in ticks]
     for name, readings in buses.items():
@@ -195,14 +195,14 @@ def _buses(ticks: Ticks) -> Found:
             if last.state != bus.state:
                 yield now_ns, f"{name}: {BusState(last.state).name} → {BusState(bus.state).name}"
     for name, readings in buses.items():
-        for what, count in COUNTERS.items():
+        for counter_name, count in COUNTERS.items():
             for begin_ns, end_ns, new in _bursts(times_ns, [count(bus) for bus in readings]):
                 within = f" within {(end_ns - begin_ns) / 1e6:.0f} ms" if end_ns > begin_ns else ""
-                yield begin_ns, f"{name}: {new} {what}{within}"
+                yield begin_ns, f"{name}: {new} {counter_name}{within}"
 
 
 def _bursts(times_ns: list[int], counts: list[int]) -> Iterator[list[int]]:
-    """Increments of a counter with pauses of at most `BURST_NS`: first and last time, and how many."""
+    """Group increments of a counter with pauses of at most `BURST_NS`: first and last time, and how many."""
     burst: list[int] = []
     for now_ns, (last, count) in zip(times_ns[1:], pairwise(counts), strict=True):
         if count <= last:
@@ -218,16 +218,16 @@ def _bursts(times_ns: list[int], counts: list[int]) -> Iterator[list[int]]:
 
 
 def _lateness(ticks: Ticks) -> Found:
-    """Ticks that began more than 10 ms late, and periods that were skipped."""
+    """Find ticks that began more than 10 ms late, and periods that were skipped."""
     for last, tick in pairwise((*ticks[:1], *ticks)):
         if tick.late_ns > LATE_NS:
             skipped = tick.missed_ticks - last.missed_ticks
-            more = f", {skipped} periods skipped" if skipped else ""
-            yield tick.now_ns, f"the tick began {tick.late_ns / 1e6:.1f} ms late{more}"
+            skipped_text = f", {skipped} periods skipped" if skipped else ""
+            yield tick.now_ns, f"the tick began {tick.late_ns / 1e6:.1f} ms late{skipped_text}"
 
 
 def _received(ticks: Ticks) -> Iterator[tuple[str, Database, tuple[int, int, bytes]]]:
-    """Every frame of the ticks with its bus and the bus's database."""
+    """Return every frame of the ticks with its bus and the bus's database."""
     crane, machine = load("crane"), load("machine")
     for tick in ticks:
         yield from (("crane0", crane, frame) for frame in tick.frames_in)
@@ -242,10 +242,10 @@ def _label(codec: MessageCodec, name: str, value: Any) -> str:
 
 
 def _name_of(reason: int) -> str:
-    found = known(reason)
-    return f"reason {reason & 0xFF}" if found is None else found.name
+    known_reason = known(reason)
+    return f"reason {reason & 0xFF}" if known_reason is None else known_reason.name
 
 
 def _text_of(reason: int, numbers: tuple[float, ...] = ()) -> str:
-    """A reason on a line of the timeline: without the advice, which belongs to the stop."""
+    """Write a reason on a line of the timeline: without the advice, which belongs to the stop."""
     return _name_of(reason) if known(reason) is None else f"{(e := explain(reason, numbers)).finding} [{e.code}]"

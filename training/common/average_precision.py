@@ -38,7 +38,8 @@ class Curve:
 
 
 def box_overlaps(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Intersection over union (N, M) of boxes (N, 4) and (M, 4): left, top, right, bottom, the last two exclusive."""
+    """Compute the intersection over union (N, M) of boxes (N, 4) and (M, 4): left, top, right, bottom, the last two
+    exclusive."""
     found, truth = np.asarray(found, float).reshape(-1, 4), np.asarray(truth, float).reshape(-1, 4)
     low = np.maximum(found[:, None, :2], truth[None, :, :2])
     high = np.minimum(found[:, None, 2:], truth[None, :, 2:])
@@ -49,7 +50,7 @@ def box_overlaps(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def mask_overlaps(found: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
-    """Intersection over union (N, M) of masks (H, W)."""
+    """Compute the intersection over union (N, M) of masks (H, W)."""
     if not len(found) or not len(truth):
         return np.zeros((len(found), len(truth)))
     a, b = (np.stack([m.ravel() for m in masks]).astype(np.float32) for masks in (found, truth))
@@ -59,37 +60,39 @@ def mask_overlaps(found: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> n
 
 
 def curve(pictures: Sequence[Matches], threshold: float) -> Curve:
-    """Precision over recall of all pictures at an overlap threshold; the average is NaN without ground truths."""
-    scores, right, truths = [], [], 0
+    """Compute precision over recall of all pictures at an overlap threshold; the average is NaN without ground
+    truths."""
+    scores, correct, truths = [], [], 0
     for picture in pictures:
         truths += int(np.count_nonzero(~picture.ignored))
         for score, is_true in _verdicts(picture, threshold):
             scores.append(score)
-            right.append(is_true)
+            correct.append(is_true)
     order = np.argsort(-np.array(scores), kind="stable")
-    hits = np.cumsum(np.array(right, float)[order])
-    found = np.arange(1, len(order) + 1)
-    precision, recall = hits / found, hits / max(truths, 1)
+    hits = np.cumsum(np.array(correct, float)[order])
+    detection_counts = np.arange(1, len(order) + 1)
+    precision, recall = hits / detection_counts, hits / max(truths, 1)
     return Curve(precision, recall, np.array(scores)[order], _average(precision, recall) if truths else float("nan"))
 
 
 def average_precision(pictures: Sequence[Matches], thresholds: Sequence[float] = THRESHOLDS) -> float:
-    """Mean over the thresholds: mAP@0.5:0.95 by default."""
+    """Compute the mean over the thresholds: mAP@0.5:0.95 by default."""
     return float(np.mean([curve(pictures, t).average for t in thresholds]))
 
 
 def matched_truths(picture: Matches, threshold: float) -> np.ndarray:
-    """Which ground truths (M,) were detected, at any score."""
+    """Tell which ground truths (M,) were detected, at any score."""
     return _matched(picture, threshold)[1]
 
 
 def _verdicts(picture: Matches, threshold: float) -> list[tuple[float, bool]]:
-    """Score of every detection that counts, and whether it is true."""
+    """Return the score of every detection that counts, and whether it is true."""
     return _matched(picture, threshold)[0]
 
 
 def _matched(picture: Matches, threshold: float) -> tuple[list[tuple[float, bool]], np.ndarray]:
-    """Score of every detection that counts, whether it is true, and which ground truths (M,) were matched."""
+    """Return the score of every detection that counts, whether it is true, and which ground truths (M,) were
+    matched."""
     free = np.ones(len(picture.ignored), bool)
     out = []
     for i in np.argsort(-picture.scores, kind="stable"):

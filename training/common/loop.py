@@ -44,7 +44,7 @@ class Schedule:
     checkpoint_every_s: float = 120.0
 
     def rate(self, step: int) -> float:
-        """Learning rate of a step (0-based)."""
+        """Compute the learning rate of a step (0-based)."""
         warm = max(1, round(WARM_UP_SHARE * self.steps))
         if step < warm:
             return self.learning_rate * (step + 1) / warm
@@ -61,7 +61,7 @@ def train(
     title: str,
     console: Console,
 ) -> list[float]:
-    """Train in place; returns the loss of every step.
+    """Train in place and return the loss of every step.
 
     Args:
         net: the module to train.
@@ -107,14 +107,14 @@ def train(
 
 
 def seeded(make: Callable[[], Net], seed: int) -> Net:
-    """A network with random parameters from a seed; torch's global generator is not affected."""
+    """Make a network with random parameters from a seed; torch's global generator is not affected."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return make()
 
 
 def initialised(make: Callable[[], Net], seed: int, start: Mapping[str, np.ndarray] | None) -> Net:
-    """A network of pictures with the arrays ``start``, or with random parameters from ``seed``."""
+    """Make a network of pictures with the arrays ``start``, or with random parameters from ``seed``."""
     net = seeded(make, seed)
     if start is not None:
         restore(net, start)
@@ -122,20 +122,20 @@ def initialised(make: Callable[[], Net], seed: int, start: Mapping[str, np.ndarr
 
 
 def channels_last(net: Net) -> Net:
-    """The net with its parameters in channels-last layout, which convolutions on a CPU prefer."""
+    """Return the net with its parameters in channels-last layout, which convolutions on a CPU prefer."""
     moved: Net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # absent from the stubs
     return moved
 
 
 def stacked(rows: Sequence[tuple[np.ndarray, ...]]) -> tuple[torch.Tensor, ...]:
-    """A batch from samples, whose first array is the picture."""
+    """Stack a batch from samples, whose first array is the picture."""
     images, *rest = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
     return (images.contiguous(memory_format=torch.channels_last), *rest)
 
 
 @contextmanager
 def deferred_interrupt() -> Iterator[list[int]]:
-    """Collects Ctrl-C instead of raising it in the middle of a step, where the weights are half updated."""
+    """Collect Ctrl-C instead of raising it in the middle of a step, where the weights are half updated."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield noted  # only the main thread receives signals
@@ -180,20 +180,20 @@ def _read_checkpoint(
     if path is None or not path.is_file():
         return []
     try:
-        kept: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, weights_only=True)
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError):
         return []
-    if kept.get("run") != name:
+    if state.get("run") != name:
         return []
-    net.load_state_dict(kept["net"])
-    optimiser.load_state_dict(kept["optimiser"])
-    return list(kept["losses"])
+    net.load_state_dict(state["net"])
+    optimiser.load_state_dict(state["optimiser"])
+    return list(state["losses"])
 
 
 # -- Progress bars of trainings, on stderr.
 
 
 def progress_bar(console: Console, *extra: ProgressColumn) -> Progress:
-    """A bar with description, count and remaining time that vanishes at the end."""
+    """Make a bar with description, count and remaining time that vanishes at the end."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), *extra)
     return Progress(*columns, console=console, transient=True)

@@ -51,7 +51,7 @@ def write(
     facts: Mapping[str, str],
     half: bool = False,
 ) -> Path:
-    """Write the weights to ``path`` and the card beside them; returns the card's path.
+    """Write the weights to ``path`` and the card beside them; return the card's path.
 
     ``facts`` are written to the weight file's metadata with data, command, seed and metrics; ``half`` as in ``save``.
     """
@@ -125,12 +125,12 @@ def restore(net: torch.nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def parameter_count(net: torch.nn.Module) -> int:
-    """Number of trained parameters (without the statistics of batch normalisation)."""
+    """Count the trained parameters (without the statistics of batch normalisation)."""
     return sum(values.numel() for values in net.parameters())
 
 
 def text(path: Path, net: torch.nn.Module, interface: Interface, card: Card) -> str:
-    """The card as Markdown."""
+    """Format the card as Markdown."""
     rows = {
         "file": f"`{path.name}`, {path.stat().st_size / 1e6:.2f} MB, "
         f"sha256 `{hashlib.sha256(path.read_bytes()).hexdigest()}`",

@@ -14,8 +14,8 @@ NO_DEPTH_SHARE, NO_COLOUR_SHARE = 0.1, 0.03  # of pictures in which a sensor fai
 
 
 def augmented(sample: Labelled, rng: np.random.Generator, size_px: int) -> Labelled:
-    """A square window of ``size_px`` around one of the picture's logs, possibly mirrored, in other colours, sometimes
-    without depth or colour."""
+    """Cut a square window of ``size_px`` around one of the picture's logs, possibly mirrored, in other colours,
+    sometimes without depth or colour."""
     if rng.random() < ENLARGED_SHARE:
         sample = enlarged(cropped(sample, *_window(sample, rng, size_px // 2), size_px // 2))
     else:
@@ -31,7 +31,7 @@ def augmented(sample: Labelled, rng: np.random.Generator, size_px: int) -> Label
 
 
 def _window(sample: Labelled, rng: np.random.Generator, size_px: int) -> tuple[int, int]:
-    """Left and top: anywhere in a tenth of the pictures, otherwise with the centre of some log well inside."""
+    """Draw left and top: anywhere in a tenth of the pictures, otherwise with the centre of some log well inside."""
     room = np.array(sample.ids.shape[::-1]) - size_px
     if not len(sample.logs) or rng.random() < 0.1:
         left, top = rng.integers(0, room + 1)
@@ -42,7 +42,7 @@ def _window(sample: Labelled, rng: np.random.Generator, size_px: int) -> tuple[i
 
 
 def recoloured(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The picture (H, W, 3) float32 as of another camera: gains, hue, saturation, contrast, gamma, grain."""
+    """Recolour the picture (H, W, 3) float32 as of another camera: gains, hue, saturation, contrast, gamma, grain."""
     mix = np.eye(3, dtype=np.float32)
     if rng.random() < 0.3:
         turn = rng.uniform(-0.6, 0.6) if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)

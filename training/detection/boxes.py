@@ -27,7 +27,7 @@ MIN_BOX_PX: Final = 20
 
 
 def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
-    """Target maps (5, h, w) float32 and their weights (2, h, w).
+    """Compute target maps (5, h, w) float32 and their weights (2, h, w).
 
     The maps are peaks (probability) at the middles of boxes, and logarithms of the distances to the sides in STRIDE.
     """
@@ -58,26 +58,31 @@ def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
 
 
 def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """The loss of a batch: focal cross entropy of the peaks (Zhou et al. 2019), distance of the logarithms of the
-    sides, and 1 minus the generalised overlap of the boxes."""
-    found = net(images).float()
-    peak, logit = maps[:, 0], found[:, 0]
+    """Compute the loss of a batch: focal cross entropy of the peaks (Zhou et al. 2019), distance of the logarithms of
+    the sides, and 1 minus the generalised overlap of the boxes."""
+    predicted_maps = net(images).float()
+    peak, logit = maps[:, 0], predicted_maps[:, 0]
     probability = torch.sigmoid(logit)
     hit = (peak == 1.0).float()
     away = (1.0 - peak) ** 4 * probability**2 * -F.logsigmoid(-logit)
     near = (1.0 - probability) ** 2 * -F.logsigmoid(logit)
     score = ((hit * near + (1.0 - hit) * away) * weights[:, 0]).sum() / (hit.sum() + 1.0)
-    sides = (found[:, 1:] - maps[:, 1:]).abs().sum(1) + OVERLAP_SHARE * _giou_loss(found[:, 1:], maps[:, 1:])
+    sides = (predicted_maps[:, 1:] - maps[:, 1:]).abs().sum(1) + OVERLAP_SHARE * _giou_loss(
+        predicted_maps[:, 1:], maps[:, 1:]
+    )
     total: torch.Tensor = score + SIDE_SHARE * (sides * weights[:, 1]).sum() / (weights[:, 1].sum() + 1.0)
     return total
 
 
 def _giou_loss(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """1 minus the generalised overlap (N, h, w) (Rezatofighi et al. 2019) of boxes around the same cells, from the
-    logarithms of their sides (N, 4, h, w)."""
-    one, other = (x.clamp(-4.0, 5.0).exp() for x in (found, truth))
-    shared, around = _area(torch.minimum(one, other)), _area(torch.maximum(one, other))
-    union = _area(one) + _area(other) - shared
+    """Compute 1 minus the generalised overlap (N, h, w) (Rezatofighi et al. 2019) of boxes around the same cells, from
+    the logarithms of their sides (N, 4, h, w)."""
+    predicted_sides, true_sides = (x.clamp(-4.0, 5.0).exp() for x in (found, truth))
+    shared, around = (
+        _area(torch.minimum(predicted_sides, true_sides)),
+        _area(torch.maximum(predicted_sides, true_sides)),
+    )
+    union = _area(predicted_sides) + _area(true_sides) - shared
     return 2.0 - shared / union - union / around
 
 
@@ -95,19 +100,19 @@ def run(
     console: Console,
     start: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[BoxNetwork, list[float]]:
-    """Train in batches of ``size``; returns the net and the loss of every step.
+    """Train in batches of ``size``; return the net and the loss of every step.
 
     ``sources`` are small pictures and, optionally, large ones, each with their count.  The training starts from the
     arrays ``start``, or from random parameters.
     """
     net = initialised(BoxNetwork, seed, start)
-    what = f"boxes, {' and '.join(str(count) for _, count in sources)} pictures, batch {size}, seed {seed}"
-    losses = train(net, batches(sources, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
+    run_name = f"boxes, {' and '.join(str(count) for _, count in sources)} pictures, batch {size}, seed {seed}"
+    losses = train(net, batches(sources, size, seed), loss, schedule, checkpoint, run_name, "boxes of logs", console)
     return net.eval(), losses
 
 
 def batches(sources: Sequence[tuple[Picture, int]], size: int, seed: int) -> Callable[[int], tuple[torch.Tensor, ...]]:
-    """A function that returns the batch of a step; the sources alternate."""
+    """Make a function that returns the batch of a step; the sources alternate."""
 
     def batch(step: int) -> tuple[torch.Tensor, ...]:
         rng = np.random.default_rng([seed, step])

@@ -50,7 +50,7 @@ class Plan:
     """Pictures of twice the size, which show bark from close up; if there are any, half of the windows are theirs."""
 
     def schedule_text(self, crops_px: str) -> str:
-        """The schedule for the card."""
+        """Describe the schedule for the card."""
         begin = f", begun with {self.start.name}" if self.start else ""
         return (
             f"{self.steps} steps of up to {BATCH} windows of {crops_px} px, AdamW with {self.learning_rate} and a "
@@ -58,7 +58,7 @@ class Plan:
         )
 
     def command(self, what: str, out: Path) -> str:
-        """The command that reproduces the weights."""
+        """Return the command that reproduces the weights."""
         start = f" --start {self.start.name}" if self.start else ""
         return (
             f"timberhand train {what} --pictures {self.count}{f' --large {self.large}' if self.large else ''} "
@@ -69,25 +69,25 @@ class Plan:
 def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console) -> Path:
     """Train on the pictures of ``folder`` and write weights and card; an interrupted run continues.
 
-    Missing pictures are drawn first.  Returns the path of the card.
+    Missing pictures are drawn first.  Return the path of the card.
 
     Raises:
         InputRefused: the initial weights are missing, damaged or of another network.
     """
     start = initial_arrays(plan.start, variant) if plan.start else None
     source = small_pictures(folder, plan.count, console)
-    some, count = source, plan.count
+    training_source, count = source, plan.count
     if plan.large:
-        some, count = mixed_pictures(source, plan, folder, console), 2 * plan.count
+        training_source, count = mixed_pictures(source, plan, folder, console), 2 * plan.count
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
-    kept = out.with_suffix(".checkpoint")
-    net, losses = run(some, count, variant, schedule, BATCH, plan.seed, kept, console, start)
+    checkpoint = out.with_suffix(".checkpoint")
+    net, losses = run(training_source, count, variant, schedule, BATCH, plan.seed, checkpoint, console, start)
     return ship(variant, net, losses, plan, source, out)
 
 
 def initial_arrays(weights: Path, variant: str) -> dict[str, np.ndarray]:
-    """The arrays of a weight file for the start: one of the same variant, or for ``depth`` one of ``rgbd`` without the
-    colour channels.
+    """Read the arrays of a weight file for the start: one of the same variant, or for ``depth`` one of ``rgbd`` without
+    the colour channels.
 
     Raises:
         InputRefused: as ``load``.
@@ -102,7 +102,7 @@ def initial_arrays(weights: Path, variant: str) -> dict[str, np.ndarray]:
 
 
 def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path:
-    """Train the box detector in the role of paper B's in the same way.  Returns the path of the card.
+    """Train the box detector in the role of paper B's in the same way.  Return the path of the card.
 
     Raises:
         InputRefused: as ``produce``.
@@ -110,11 +110,11 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
     start = load(plan.start, BOXES).arrays() if plan.start else None
     source = small_pictures(folder, plan.count, console)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
-    kept = out.with_suffix(".checkpoint")
+    checkpoint = out.with_suffix(".checkpoint")
     sources = [(source, plan.count)]
     if plan.large:
         sources.append((large_pictures(plan, folder, console), plan.large))
-    net, losses = boxes.run(sources, schedule, BATCH, plan.seed, kept, console, start)
+    net, losses = boxes.run(sources, schedule, BATCH, plan.seed, checkpoint, console, start)
     card = Card(
         "Boxes of logs in colour pictures",
         "Letterboxed colour picture of 608 x 608 px in, boxes of logs out: the role of paper B's YOLOv3 (3.2.2).",
@@ -130,7 +130,7 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
 
 
 def small_pictures(folder: Path, count: int, console: Console) -> Callable[[int], Labelled]:
-    """The small pictures by number; missing ones of the first ``count`` and of the held-out ones are drawn."""
+    """Provide the small pictures by number; draw missing ones of the first ``count`` and of the held-out ones."""
     _draw_missing(folder, [*range(-(-count // shards.SHARD)), HELD_OUT], SMALL_PX, console)
     return pictures(folder)
 
@@ -138,16 +138,16 @@ def small_pictures(folder: Path, count: int, console: Console) -> Callable[[int]
 def mixed_pictures(
     small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console
 ) -> Callable[[int], Labelled]:
-    """Small and large pictures alternately; missing large ones are drawn."""
-    some = large_pictures(plan, folder, console)
-    return lambda i: some(i // 2 % plan.large) if i % 2 else small(i // 2)
+    """Provide small and large pictures alternately; draw missing large ones."""
+    large = large_pictures(plan, folder, console)
+    return lambda i: large(i // 2 % plan.large) if i % 2 else small(i // 2)
 
 
 def large_pictures(plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
-    """The large pictures of a plan by number; missing ones are drawn."""
+    """Provide the large pictures of a plan by number; draw missing ones."""
     _draw_missing(folder, range(FIRST_LARGE, FIRST_LARGE - (-plan.large // shards.SHARD)), LARGE_PX, console)
-    source, first = pictures(folder, LARGE_PX), FIRST_LARGE * shards.SHARD
-    return lambda i: source(first + i)
+    source, first_index = pictures(folder, LARGE_PX), FIRST_LARGE * shards.SHARD
+    return lambda i: source(first_index + i)
 
 
 def _draw_missing(folder: Path, numbers: Sequence[int], size_px: int, console: Console) -> None:
@@ -166,7 +166,7 @@ def ship(
     source: Callable[[int], Labelled],
     out: Path,
 ) -> Path:
-    """Write trained weights with their card; returns the card's path."""
+    """Write trained weights with their card; return the card's path."""
     card = Card(
         f"Logs in pictures, from {'colour and depth' if variant == 'rgbd' else 'depth alone'}",
         "Picture in, eight maps out, from which logs are decoded: mask, centre, offset to it, angle, ends, edges.",
@@ -184,33 +184,35 @@ def ship(
 
 
 def test_metrics(segmenter: LogSegmenter, source: Callable[[int], Labelled]) -> dict[str, str]:
-    """Average precision on drawn pictures of held-out piles, as text."""
+    """Compute the average precision on drawn pictures of held-out piles, as text."""
     by_masks, by_boxes = [], []
     for index in range(HELD_OUT * shards.SHARD, HELD_OUT * shards.SHARD + TEST_PICTURES):
         by_mask, by_box = matches(segmenter, source(index))
         by_masks.append(by_mask)
         by_boxes.append(by_box)
     figures = {}
-    for name, found in (("boxes", by_boxes), ("masks", by_masks)):
-        figures[f"{name}, mAP@0.5 on {TEST_PICTURES} pictures of held-out piles"] = f"{curve(found, 0.5).average:.3f}"
-        figures[f"{name}, mAP@0.5:0.95 on them"] = f"{average_precision(found):.3f}"
+    for name, picture_matches in (("boxes", by_boxes), ("masks", by_masks)):
+        figures[f"{name}, mAP@0.5 on {TEST_PICTURES} pictures of held-out piles"] = (
+            f"{curve(picture_matches, 0.5).average:.3f}"
+        )
+        figures[f"{name}, mAP@0.5:0.95 on them"] = f"{average_precision(picture_matches):.3f}"
     return figures
 
 
 def matches(segmenter: LogSegmenter, sample: Labelled) -> tuple[Matches, Matches]:
-    """Detections in a picture against its ground truth, by masks and by boxes."""
-    found = segmenter.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
+    """Compare detections in a picture with its ground truth, by masks and by boxes."""
+    detections = segmenter.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
     truth = [sample.ids == log[ID] for log in sample.logs]
-    small = np.array([t.sum() < MIN_LOG_PX for t in truth], bool)
-    scores = np.array([i.score for i in found])
-    by_box = box_overlaps(np.array([i.box_px for i in found]), np.array([box_of(t) for t in truth]))
+    is_small = np.array([t.sum() < MIN_LOG_PX for t in truth], bool)
+    scores = np.array([i.score for i in detections])
+    by_box = box_overlaps(np.array([i.box_px for i in detections]), np.array([box_of(t) for t in truth]))
     return (
-        Matches(scores, mask_overlaps([i.mask for i in found], truth), small),
-        Matches(scores, by_box, small),
+        Matches(scores, mask_overlaps([i.mask for i in detections], truth), is_small),
+        Matches(scores, by_box, is_small),
     )
 
 
 def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a non-empty mask, the last two exclusive."""
+    """Return left, top, right, bottom of a non-empty mask, the last two exclusive."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)

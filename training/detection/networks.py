@@ -26,14 +26,14 @@ WIDTHS: Final = {64: 64, 32: 64, 16: 64, 8: 64, 4: 32, 2: 16}
 def block(
     channels: int, out: int, kernel: int = 3, stride: int = 1, dilation: int = 1, groups: int = 1, bend: bool = True
 ) -> nn.Sequential:
-    """Convolution without change of the size but by the stride, batch normalisation and, to ``bend``, a ReLU."""
+    """Make a convolution without change of the size but by the stride, batch normalisation and, to ``bend``, a ReLU."""
     padding = dilation * (kernel - 1) // 2
     conv = nn.Conv2d(channels, out, kernel, stride, padding, dilation, groups, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(out), *([nn.ReLU()] if bend else []))
 
 
 def doubled(images: torch.Tensor) -> torch.Tensor:
-    """Bilinear upsampling by 2; pixel areas correspond, borders repeat."""
+    """Upsample by 2, bilinearly; pixel areas correspond, borders repeat."""
     return F.interpolate(images, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
@@ -64,7 +64,7 @@ class UNet(nn.Module):
         self.maps = nn.Conv2d(24, len(MAPS), 1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Maps (N, 8, H / 2, W / 2)."""
+        """Compute maps (N, 8, H / 2, W / 2)."""
         at2 = self.at2(self.in2(images))
         at4 = self.at4(self.in4(at2))
         at8 = self.at8(self.in8(at4))
@@ -97,7 +97,7 @@ class BoxNetwork(nn.Module):
         self.boxes = nn.Conv2d(64, 1 + SIDE_COUNT, 1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Maps (N, 5, H / 8, W / 8)."""
+        """Compute maps (N, 5, H / 8, W / 8)."""
         at8 = self.at8(self.in8(self.at4(self.in4(self.in2(images)))))
         deep = self.wider16(self.wide16(self.at16(self.in16(at8))))
         boxes: torch.Tensor = self.boxes(self.more8(self.out8(doubled(self.to8(deep)) + at8)))
@@ -118,7 +118,7 @@ class TrunkBlock(nn.Module):
         )
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """The block's output."""
+        """Compute the block's output."""
         out: torch.Tensor = self.conv(images)
         return out + images if self.residual else out
 
@@ -155,7 +155,7 @@ class MaskNetwork(nn.Module):
         self.maps = nn.Conv2d(24, len(MAPS) + FEATURES, 1)
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Maps (N, 24, H / 2, W / 2) and kernels (N, 23, H / 8, W / 8)."""
+        """Compute maps (N, 24, H / 2, W / 2) and kernels (N, 23, H / 8, W / 8)."""
         x, taps = F.avg_pool2d(images, 2), dict[int, torch.Tensor]()
         for part, stride in zip(self.features, self.strides, strict=True):
             taps[stride] = x = part(x)
@@ -168,6 +168,7 @@ class MaskNetwork(nn.Module):
 
 
 def scoring_network(features: int) -> nn.Sequential:
-    """The features of a segment, or of a pair of them, in, the logit of a probability out: channels of a picture."""
+    """Make a network: the features of a segment, or of a pair of them, in, the logit of a probability out: channels of
+    a picture."""
     first, logit = nn.Conv2d(features, HIDDEN_UNITS, 1), nn.Conv2d(HIDDEN_UNITS, 1, 1)
     return nn.Sequential(OrderedDict(first=first, bent=nn.ReLU(), logit=logit))

@@ -53,7 +53,7 @@ class Examples:
 
     @classmethod
     def joined(cls, parts: list[Examples]) -> Examples:
-        """The examples of several parts."""
+        """Join the examples of several parts."""
         return cls(
             np.concatenate([p.features for p in parts]),
             np.concatenate([p.target for p in parts]),
@@ -62,38 +62,40 @@ class Examples:
 
 
 def merge_examples(foreground: Foreground, ids: np.ndarray, rng: np.random.Generator) -> Examples:
-    """Pairs of segments and whether they are one log; ``ids`` (h, w): the log of each pixel of the maps, 0 none."""
-    segments, found = over_segment(foreground), []
+    """Collect pairs of segments and whether they are one log; ``ids`` (h, w): the log of each pixel of the maps, 0
+    none."""
+    segments, round_examples = over_segment(foreground), []
     for round_ in range(ROUNDS):
         merger = SegmentMerger(foreground, segments)
         while round_ and rng.random() > STOP_PROBABILITY:
             owners = [owner(foreground, ids, s)[0] for s in merger.segments]
-            same = [(i, j) for i in range(len(owners)) for j in range(i) if owners[i] == owners[j] > 0]
-            if not same:
+            same_log_pairs = [(i, j) for i in range(len(owners)) for j in range(i) if owners[i] == owners[j] > 0]
+            if not same_log_pairs:
                 break
-            merger.merge_pair(*sorted(same[rng.integers(len(same))]))
-        found.append(_pair_examples(merger, ids, rng))
-    return Examples.joined(found)
+            merger.merge_pair(*sorted(same_log_pairs[rng.integers(len(same_log_pairs))]))
+        round_examples.append(_pair_examples(merger, ids, rng))
+    return Examples.joined(round_examples)
 
 
 def _pair_examples(merger: SegmentMerger, ids: np.ndarray, rng: np.random.Generator) -> Examples:
-    """At most MAX_PAIRS, so that a few pictures with many segments do not dominate."""
+    """Draw at most MAX_PAIRS, so that a few pictures with many segments do not dominate."""
     owners = [owner(merger.foreground, ids, s) for s in merger.segments]
     pairs, features = merger.pairs()
     grain = merger.foreground.grain
-    kept, targets, weights = [], [], []
+    pair_indices, targets, weights = [], [], []
     for k in rng.permutation(len(pairs))[:MAX_PAIRS]:
         i, j = pairs[k]
         if min(owners[i][1], owners[j][1]) >= MIN_PURITY and (owners[i][0] or owners[j][0]):
-            kept.append(k)
+            pair_indices.append(k)
             targets.append(owners[i][0] == owners[j][0])
             weights.append(np.sqrt(min(len(merger.segments[i].members), len(merger.segments[j].members)) / grain))
     target, weight = np.array(targets, np.float32), np.array(weights, np.float32)
-    return Examples(features[kept].reshape(-1, len(PAIR_FEATURES)), target, weight)
+    return Examples(features[pair_indices].reshape(-1, len(PAIR_FEATURES)), target, weight)
 
 
 def quality_examples(foreground: Foreground, ids: np.ndarray, merge: Scorer) -> Examples:
-    """Segments merged with the scorer ``merge``, and their largest overlap (intersection over union) with a log."""
+    """Collect segments merged with the scorer ``merge``, and their largest overlap (intersection over union) with a
+    log."""
     merger = SegmentMerger(foreground, over_segment(foreground))
     merger.merge_all(merge)
     sizes = np.bincount(ids.ravel(), minlength=256)
@@ -107,21 +109,21 @@ def quality_examples(foreground: Foreground, ids: np.ndarray, merge: Scorer) -> 
 
 
 def owner(foreground: Foreground, ids: np.ndarray, segment: Segment) -> tuple[int, float]:
-    """The log with most of a segment's pixels, and its share of them."""
+    """Find the log with most of a segment's pixels, and its share of them."""
     count = np.bincount(ids[foreground.y[segment.members], foreground.x[segment.members]])
     return int(count.argmax()), float(count.max() / len(segment.members))
 
 
 def train_scorer(network: Interface, examples: Examples, steps: int, seed: int, console: Console) -> torch.nn.Module:
-    """A scoring network, trained with the cross entropy to the targets, which may be fractions."""
+    """Train a scoring network with the cross entropy to the targets, which may be fractions."""
     net = seeded(lambda: scoring_network(network.channels), seed)
     features = torch.from_numpy(examples.features.T[None, :, None].copy())
     target = torch.from_numpy(examples.target)
     weight = torch.from_numpy(examples.weight / examples.weight.mean())
 
     def batch(step: int) -> tuple[torch.Tensor, ...]:
-        some = torch.from_numpy(np.random.default_rng([seed, step]).integers(0, len(target), BATCH))
-        return features[..., some], target[some], weight[some]
+        example_indices = torch.from_numpy(np.random.default_rng([seed, step]).integers(0, len(target), BATCH))
+        return features[..., example_indices], target[example_indices], weight[example_indices]
 
     def loss(net: torch.nn.Module, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         logit = net(features).reshape(-1)
@@ -166,28 +168,30 @@ def produce(count: int, seed: int, folder: Path, out: Path, weights: Path | None
     """Train both scorers on ``count`` pictures and write their weights and cards into ``out``.
 
     Pictures that ``folder`` lacks are drawn first.  ``weights`` are those of the segmentation network; None selects the
-    shipped ones.  Returns the path of the last card.
+    shipped ones.  Return the path of the last card.
 
     Raises:
         InputRefused: the network's weights are missing or damaged.
     """
-    seen = labelled_foregrounds(count, folder, weights, console)
+    foregrounds = labelled_foregrounds(count, folder, weights, console)
     rng = np.random.default_rng(seed)
     training, held_out = (
-        Examples.joined([merge_examples(f, ids, rng) for f, ids in part]) for part in (seen.training, seen.held_out)
+        Examples.joined([merge_examples(f, ids, rng) for f, ids in part])
+        for part in (foregrounds.training, foregrounds.held_out)
     )
     merge = _ship(MERGE_NETWORK, training, held_out, count, seed, out, console)
     training, held_out = (
-        Examples.joined([quality_examples(f, ids, merge) for f, ids in part]) for part in (seen.training, seen.held_out)
+        Examples.joined([quality_examples(f, ids, merge) for f, ids in part])
+        for part in (foregrounds.training, foregrounds.held_out)
     )
     _ship(QUALITY_NETWORK, training, held_out, count, seed, out, console)
     return out / f"{QUALITY_NETWORK.name}.md"
 
 
 def labelled_foregrounds(count: int, folder: Path, weights: Path | None, console: Console) -> LabelledForegrounds:
-    """The foregrounds of ``count`` pictures; every other picture is doubled before."""
+    """Compute the foregrounds of ``count`` pictures; every other picture is doubled before."""
     segmenters = [LogSegmenter("rgbd", weights, size, scorers=ZERO_SCORERS) for size in (2 * SIZE_PX, SIZE_PX)]
-    source, found = pictures(folder, SIZE_PX), []
+    source, foregrounds = pictures(folder, SIZE_PX), []
     with progress_bar(console) as progress:
         task = progress.add_task("drawing pictures", total=count)
         for number in range(-(-count // SHARD)):
@@ -199,12 +203,12 @@ def labelled_foregrounds(count: int, folder: Path, weights: Path | None, console
             ids = sample.ids[scale // 2 :: scale, scale // 2 :: scale][: maps.shape[1], : maps.shape[2]]
             missing = (maps.shape[1] - ids.shape[0], maps.shape[2] - ids.shape[1])
             ids = np.pad(np.where(ids == IGNORED, 0, ids), ((0, missing[0]), (0, missing[1])))
-            found.append((foreground_of(maps, scale, sample.depth_m), ids))
+            foregrounds.append((foreground_of(maps, scale, sample.depth_m), ids))
             progress.advance(task)
     held_out = [i % HELD_OUT_EVERY == 0 and count > 1 for i in range(count)]
     return LabelledForegrounds(
-        [s for s, h in zip(found, held_out, strict=True) if not h],
-        [s for s, h in zip(found, held_out, strict=True) if h],
+        [s for s, h in zip(foregrounds, held_out, strict=True) if not h],
+        [s for s, h in zip(foregrounds, held_out, strict=True) if h],
     )
 
 
@@ -233,13 +237,13 @@ def _ship(
 
 
 def cross_entropy(scorer: Scorer, examples: Examples) -> float:
-    """Weighted mean cross entropy between the scorer's probabilities and the targets."""
+    """Compute the weighted mean cross entropy between the scorer's probabilities and the targets."""
     probability = np.clip(scorer.probability(examples.features), 1e-6, 1.0 - 1e-6)
     each = -examples.target * np.log(probability) - (1.0 - examples.target) * np.log(1.0 - probability)
     return float(np.average(each, weights=examples.weight))
 
 
 def accuracy(scorer: Scorer, examples: Examples) -> float:
-    """Weighted share of examples for which scorer and target are on the same side of 0.5."""
+    """Compute the weighted share of examples for which scorer and target are on the same side of 0.5."""
     agrees = (scorer.probability(examples.features) > 0.5) == (examples.target > 0.5)
     return float(np.average(agrees, weights=examples.weight))

@@ -47,7 +47,8 @@ lie beside it."""
 
 
 def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
-    """The maps (8, h, w) float32 that the network should predict (probabilities for its logits), and weights (8, h, w).
+    """Compute the maps (8, h, w) float32 that the network should predict (probabilities for its logits), and weights
+    (8, h, w).
 
     The weights are: of mask, peaks and edges (0 where the picture is ignored); of the offset; of the angle; four
     factors that turn an error of the offset (u, v) into errors along and across the log in units of the tolerance; 1
@@ -103,7 +104,7 @@ def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tolerances(x: np.ndarray, y: np.ndarray, axis: np.ndarray) -> tuple[float, float]:
-    """Tolerances of the offsets of a log's pixels along and across its axis [pixels of the maps]."""
+    """Compute tolerances of the offsets of a log's pixels along and across its axis [pixels of the maps]."""
     if not len(x):
         return 1.0, 1.0
     along, across = x * axis[0] + y * axis[1], y * axis[0] - x * axis[1]
@@ -151,29 +152,31 @@ Picture = Callable[[int], Labelled]
 
 
 def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """The loss of a batch: cross entropy of mask, peaks and edges, distances of offsets and angles.
+    """Compute the loss of a batch: cross entropy of mask, peaks and edges, distances of offsets and angles.
 
     Offsets and angles of a log are weighted with the square root of its size.
     """
-    found = net(images).float()
+    predicted_maps = net(images).float()
     weight, of_offset, of_angle = weights[:, :3].unbind(1)
     total = weight.sum() + 1.0
 
     def entropy(i: int, factor: torch.Tensor) -> torch.Tensor:
-        return (F.binary_cross_entropy_with_logits(found[:, i], maps[:, i], reduction="none") * factor).sum() / total
+        return (
+            F.binary_cross_entropy_with_logits(predicted_maps[:, i], maps[:, i], reduction="none") * factor
+        ).sum() / total
 
     open_ = (weight > 0.0).float()
-    probability, truth = torch.sigmoid(found[:, MASK]) * open_, maps[:, MASK] * open_
+    probability, truth = torch.sigmoid(predicted_maps[:, MASK]) * open_, maps[:, MASK] * open_
     shared, sizes = (probability * truth).sum((1, 2)), (probability + truth).sum((1, 2))
     dice = (1.0 - 2.0 * (shared + 1.0) / (sizes + 2.0)).mean()
     value = 4.0 * entropy(MASK, weight) + dice
     for i in (1, 6):
         value = value + PEAK_SHARE * entropy(i, weight * (1.0 + PEAK_WEIGHT * maps[:, i]))
     value = value + EDGE_SHARE * entropy(7, weight * (1.0 + EDGE_WEIGHT * maps[:, 7] + BETWEEN_WEIGHT * weights[:, 7]))
-    miss = (found[:, 2:4] - maps[:, 2:4]).repeat(1, 2, 1, 1) * weights[:, 3:7]
+    miss = (predicted_maps[:, 2:4] - maps[:, 2:4]).repeat(1, 2, 1, 1) * weights[:, 3:7]
     # Votes far off are lost anyway: the logarithm favours those that can still be corrected.
     offset = torch.log1p(miss[:, :2].sum(1).abs()) + torch.log1p(miss[:, 2:].sum(1).abs())
-    angle = (found[:, 4:6] - maps[:, 4:6]).abs().sum(1)
+    angle = (predicted_maps[:, 4:6] - maps[:, 4:6]).abs().sum(1)
     value = value + OFFSET_SHARE * (offset * of_offset).sum() / (of_offset.sum() + 1e-3)
     total_loss: torch.Tensor = value + ANGLE_SHARE * (angle * of_angle).sum() / (of_angle.sum() + 1e-3)
     return total_loss
@@ -182,7 +185,7 @@ def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights
 def batches(
     picture: Picture, count: int, size: int, variant: str, seed: int
 ) -> Callable[[int], tuple[torch.Tensor, ...]]:
-    """A function that returns the batch of a step from ``count`` pictures."""
+    """Make a function that returns the batch of a step from ``count`` pictures."""
 
     def batch(step: int) -> tuple[torch.Tensor, ...]:
         rng = np.random.default_rng([seed, step])
@@ -208,14 +211,14 @@ def run(
     console: Console,
     start: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[UNet, list[float]]:
-    """Train a variant on ``count`` pictures in batches of ``size``; returns the net and the loss of every step.
+    """Train a variant on ``count`` pictures in batches of ``size``; return the net and the loss of every step.
 
     The training starts from the arrays ``start``, or from random parameters.
     """
     net = initialised(lambda: UNet(variant), seed, start)
-    what = (
+    run_name = (
         f"segmentation {variant}, {count} pictures, batch {size}, seed {seed}, {'scratch' if start is None else 'on'}"
     )
     batch = batches(picture, count, size, variant, seed)
-    losses = train(net, batch, loss, schedule, checkpoint, what, f"logs, {variant}", console)
+    losses = train(net, batch, loss, schedule, checkpoint, run_name, f"logs, {variant}", console)
     return net.eval(), losses

@@ -34,19 +34,19 @@ class Sample:
 
 
 def load(folder: Path) -> tuple[Sample, ...]:
-    """All samples in the order of their numbers.
+    """Read all samples in the order of their numbers.
 
     Raises:
         InputRefused: there is no sample, or a file cannot be read.
     """
     files = sorted(folder.rglob("pcd*d.tiff")) if folder.is_dir() else []
-    found = [s for path in files if (s := _sample(path)) is not None]
-    if not found:
+    samples = [s for path in files if (s := _sample(path)) is not None]
+    if not samples:
         raise InputRefused(
             "dataset.no-samples",
             f"{folder}: no Cornell samples; the folder must hold pcdNNNNd.tiff and pcdNNNNcpos.txt",
         )
-    return tuple(sorted(found, key=lambda s: s.number))
+    return tuple(sorted(samples, key=lambda s: s.number))
 
 
 def _sample(path: Path) -> Sample | None:
@@ -61,23 +61,23 @@ def _sample(path: Path) -> Sample | None:
 
 
 def depth(path: Path) -> np.ndarray:
-    """Depth (H, W) float32 [m], NaN where it is unknown (zero or not finite in the file)."""
+    """Read depth (H, W) float32 [m], NaN where it is unknown (zero or not finite in the file)."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            found = np.asarray(image, np.float32)
+            depth_m = np.asarray(image, np.float32)
     except (OSError, UnidentifiedImageError, ValueError) as error:
         raise InputRefused(
             "dataset.bad-depth", f"{path}: cannot be read as a TIFF of float32 metres ({error})"
         ) from None
-    if found.ndim != 2:
-        raise InputRefused("dataset.bad-depth", f"{path}: not a depth picture but of shape {found.shape}")
-    return np.where(np.isfinite(found) & (found > 0.0), found, np.float32(np.nan))
+    if depth_m.ndim != 2:
+        raise InputRefused("dataset.bad-depth", f"{path}: not a depth picture but of shape {depth_m.shape}")
+    return np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.float32(np.nan))
 
 
 def rectangles(path: Path) -> tuple[Rectangle, ...]:
-    """The rectangles of a label file, without those with a corner that is not a number.
+    """Read the rectangles of a label file, without those with a corner that is not a number.
 
     Raises:
         InputRefused: a line is not two numbers, or the number of lines is not a multiple of four.
@@ -94,21 +94,21 @@ def rectangles(path: Path) -> tuple[Rectangle, ...]:
 
 
 def grouped_folds(numbers: list[int], folds: int) -> list[tuple[list[int], list[int]]]:
-    """(train, test) indices into ``numbers`` (ascending).
+    """Return (train, test) indices into ``numbers`` (ascending).
 
     Every test fold is a run of neighbours.  Numbers within ``GUARD_COUNT`` of it are excluded from training, so that no
     object is on both sides.
     """
-    found = []
+    fold_indices = []
     for test in np.array_split(np.arange(len(numbers)), folds):
         low, high = numbers[test[0]] - GUARD_COUNT, numbers[test[-1]] + GUARD_COUNT
         train = [i for i, n in enumerate(numbers) if not low <= n <= high]
-        found.append((train, test.tolist()))
-    return found
+        fold_indices.append((train, test.tolist()))
+    return fold_indices
 
 
 def paper_folds(count: int, folds: int, seed: int) -> list[tuple[list[int], list[int]]]:
-    """(train, test) indices of augmented copies, assigned at random as in the paper.
+    """Return (train, test) indices of augmented copies, assigned at random as in the paper.
 
     Copies of one object, even of one picture, are on both sides.
     """
@@ -138,7 +138,7 @@ class Rectangle:
     jaw_px: float
 
     def corners(self) -> np.ndarray:
-        """Its corners (4, 2) [px] in order; the first edge runs along the opening."""
+        """Compute its corners (4, 2) [px] in order; the first edge runs along the opening."""
         along = 0.5 * self.opening_px * np.array([math.cos(self.theta_rad), math.sin(self.theta_rad)])
         across = 0.5 * self.jaw_px * np.array([-math.sin(self.theta_rad), math.cos(self.theta_rad)])
         middle = np.array([self.u_px, self.v_px])
@@ -148,7 +148,7 @@ class Rectangle:
 
 
 def from_corners(corners: np.ndarray) -> Rectangle:
-    """The rectangle of four corners (4, 2) as in the Cornell data, where hand-drawn ones are slightly skewed."""
+    """Make the rectangle of four corners (4, 2) as in the Cornell data, where hand-drawn ones are slightly skewed."""
     (p0, p1, p2, _), (u, v) = corners, corners.mean(axis=0)
     along, across = p1 - p0, p2 - p1
     theta = wrapped(math.atan2(along[1], along[0]))
@@ -156,23 +156,23 @@ def from_corners(corners: np.ndarray) -> Rectangle:
 
 
 def wrapped(theta_rad: float) -> float:
-    """The direction in [-pi/2, pi/2), because half a turn does not change a grasp."""
+    """Wrap the direction into [-pi/2, pi/2), because half a turn does not change a grasp."""
     return (theta_rad + math.pi / 2) % math.pi - math.pi / 2
 
 
 def angle_between(a_rad: float, b_rad: float) -> float:
-    """The angle between two directions, 0 to pi/2."""
+    """Compute the angle between two directions, 0 to pi/2."""
     return abs(wrapped(a_rad - b_rad))
 
 
 def iou(a: Rectangle, b: Rectangle) -> float:
-    """Exact intersection over union."""
+    """Compute the exact intersection over union."""
     shared = _area(_clipped(a.corners(), b.corners()))
     return shared / (a.opening_px * a.jaw_px + b.opening_px * b.jaw_px - shared)
 
 
 def is_correct(grasp: Rectangle, labels: Iterable[Rectangle]) -> bool:
-    """Whether the grasp is correct for one of the labels."""
+    """Tell whether the grasp is correct for one of the labels."""
     return any(
         angle_between(grasp.theta_rad, label.theta_rad) < MAX_ANGLE_RAD and iou(grasp, label) > MIN_IOU
         for label in labels
@@ -180,20 +180,22 @@ def is_correct(grasp: Rectangle, labels: Iterable[Rectangle]) -> bool:
 
 
 def _clipped(polygon: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """The part of a convex polygon inside a convex window of the same turning sense (Sutherland and Hodgman 1974)."""
+    """Clip a convex polygon to a convex window of the same turning sense (Sutherland and Hodgman 1974)."""
     for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
         if len(polygon) == 0:
             break
         edge = end - start
         inside = edge[0] * (polygon[:, 1] - start[1]) - edge[1] * (polygon[:, 0] - start[0])
-        kept = []
-        for i, here in enumerate(inside):
-            before = inside[i - 1]
-            if (here >= 0.0) != (before >= 0.0):
-                kept.append(polygon[i - 1] + before / (before - here) * (polygon[i] - polygon[i - 1]))
-            if here >= 0.0:
-                kept.append(polygon[i])
-        polygon = np.array(kept)
+        clipped_points = []
+        for i, side in enumerate(inside):
+            previous_side = inside[i - 1]
+            if (side >= 0.0) != (previous_side >= 0.0):
+                clipped_points.append(
+                    polygon[i - 1] + previous_side / (previous_side - side) * (polygon[i] - polygon[i - 1])
+                )
+            if side >= 0.0:
+                clipped_points.append(polygon[i])
+        polygon = np.array(clipped_points)
     return polygon
 
 

@@ -25,11 +25,11 @@ from training.grasp.network_training import (
 
 
 def produce(samples: Sequence[Sample], seed: int, epochs: int, out: Path, console: Console) -> tuple[Path, Path]:
-    """Train on all samples and write weights and card; an interrupted run continues.  Returns both paths."""
+    """Train on all samples and write weights and card; an interrupted run continues.  Return both paths."""
     with console.status("cutting views"):
         examples = network_training.augmented_examples(samples, seed)
-    kept = out.with_suffix(".checkpoint")
-    net, losses = network_training.train_network(examples, seed, "grasp network", console, kept, epochs=epochs)
+    checkpoint = out.with_suffix(".checkpoint")
+    net, losses = network_training.train_network(examples, seed, "grasp network", console, checkpoint, epochs=epochs)
     return out, ship(net, losses, samples, seed, epochs, out)
 
 
@@ -41,7 +41,7 @@ def ship(
     epochs: int,
     out: Path,
 ) -> Path:
-    """Write trained weights with their card; returns the card's path."""
+    """Write trained weights with their card; return the card's path."""
     opening, jaw = network_training.median_size_px(network_training.plain_examples(samples))
     facts = {
         "numbers": " ".join(str(s.number) for s in samples),
@@ -73,12 +73,12 @@ def ship(
 
 
 def on_samples(net: GraspNet, samples: Sequence[Sample], facts: Mapping[str, str]) -> list[dict[str, Any]]:
-    """The grasp that the net chooses on every sample's plain crop, and whether it is correct.
+    """Return the grasp that the net chooses on every sample's plain crop, and whether it is correct.
 
     ``facts`` of the weight file give the size of the rectangle and the numbers of the training samples.
     """
     known = set(facts["numbers"].split())
-    found = []
+    results = []
     for s in samples:
         view = central_view(s.depth_m)
         labels = visible_grasps(s.grasps, view)
@@ -87,7 +87,7 @@ def on_samples(net: GraspNet, samples: Sequence[Sample], facts: Mapping[str, str
         g = net.best(view_depth(s.depth_m, view))
         usual = Rectangle(g.u_px, g.v_px, g.theta_rad, float(facts["opening_px"]), float(facts["jaw_px"]))
         own = any(is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, r.opening_px, r.jaw_px), [r]) for r in labels)
-        found.append(
+        results.append(
             {
                 "number": s.number,
                 "right": is_correct(usual, labels),
@@ -96,4 +96,4 @@ def on_samples(net: GraspNet, samples: Sequence[Sample], facts: Mapping[str, str
                 "q": g.q,
             }
         )
-    return found
+    return results

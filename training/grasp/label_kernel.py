@@ -30,7 +30,7 @@ _HALF_PLATE, _UNDER = HALF_PLATE_M, SCOOP_SHARE
 
 
 def facts_of(jaws: Jaws) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of a grapple for ``evaluate_candidate``: facts (7,) and outline (k, 2)."""
+    """Return numbers of a grapple for ``evaluate_candidate``: facts (7,) and outline (k, 2)."""
     facts = (
         jaws.half_gap_m,
         jaws.blade_m,
@@ -70,8 +70,8 @@ def evaluate_candidate(
     at: np.ndarray,
     captured: np.ndarray,
 ) -> tuple[float, float]:
-    """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 3) and ``captured`` (n,) are
-    scratch."""
+    """Return (lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 3) and ``captured`` (n,)
+    are scratch."""
     n = len(world)
     cu, su = math.cos(yaw), math.sin(yaw)
     w, gap, tip = facts[BLADE] / 2, facts[HALF_GAP], level + _TIP

@@ -45,22 +45,22 @@ class View:
 
 
 def central_view(depth_m: np.ndarray) -> View:
-    """The paper's crop in the middle of the picture."""
+    """Return the paper's crop in the middle of the picture."""
     height, width = depth_m.shape
     return View((width - 1) / 2, (height - 1) / 2)
 
 
 def random_view(depth_m: np.ndarray, grasps: tuple[Rectangle, ...], rng: np.random.Generator) -> View:
-    """A random copy (paper A II-D: zooms, crops, rotations) with the middle of at least one grasp.
+    """Draw a random copy (paper A II-D: zooms, crops, rotations) with the middle of at least one grasp.
 
     Its middle lies near the line from the middle of the picture to the mean of the grasps.
     """
     plain = central_view(depth_m)
     start = np.array([plain.u_px, plain.v_px])
-    way = np.mean([(g.u_px, g.v_px) for g in grasps], axis=0) - start
+    offset_px = np.mean([(g.u_px, g.v_px) for g in grasps], axis=0) - start
     for _ in range(MAX_ATTEMPTS):
         turned, zoom = rng.uniform(-math.pi, math.pi), rng.uniform(*ZOOM_RANGE)
-        u, v = start + rng.uniform(0.0, 1.0) * way + rng.uniform(-MAX_SHIFT_PX, MAX_SHIFT_PX, 2)
+        u, v = start + rng.uniform(0.0, 1.0) * offset_px + rng.uniform(-MAX_SHIFT_PX, MAX_SHIFT_PX, 2)
         view = View(float(u), float(v), float(turned), float(zoom))
         if visible_grasps(grasps, view):
             return view
@@ -68,7 +68,7 @@ def random_view(depth_m: np.ndarray, grasps: tuple[Rectangle, ...], rng: np.rand
 
 
 def view_depth(depth_m: np.ndarray, view: View) -> np.ndarray:
-    """The depth (300, 300) float32 [m] of a view, bilinear; the border of the picture repeats, NaN stays NaN."""
+    """Sample the depth (300, 300) float32 [m] of a view, bilinear; the border of the picture repeats, NaN stays NaN."""
     across = (np.arange(SIDE_PX) - (SIDE_PX - 1) / 2) * view.zoom
     c, s = math.cos(view.turned_rad), math.sin(view.turned_rad)
     u = view.u_px + c * across[None, :] - s * across[:, None]
@@ -77,20 +77,20 @@ def view_depth(depth_m: np.ndarray, view: View) -> np.ndarray:
 
 
 def visible_grasps(grasps: Iterable[Rectangle], view: View) -> tuple[Rectangle, ...]:
-    """The grasps with their middle inside the view, in pixels of the view."""
+    """Return the grasps with their middle inside the view, in pixels of the view."""
     c, s = math.cos(view.turned_rad), math.sin(view.turned_rad)
-    found = []
+    visible = []
     for g in grasps:
         du, dv = (g.u_px - view.u_px) / view.zoom, (g.v_px - view.v_px) / view.zoom
         u, v = c * du + s * dv + (SIDE_PX - 1) / 2, -s * du + c * dv + (SIDE_PX - 1) / 2
         if -0.5 <= u < SIDE_PX - 0.5 and -0.5 <= v < SIDE_PX - 0.5:
             theta = wrapped(g.theta_rad - view.turned_rad)
-            found.append(Rectangle(u, v, theta, g.opening_px / view.zoom, g.jaw_px / view.zoom))
-    return tuple(found)
+            visible.append(Rectangle(u, v, theta, g.opening_px / view.zoom, g.jaw_px / view.zoom))
+    return tuple(visible)
 
 
 def label_maps(grasps: Iterable[Rectangle]) -> np.ndarray:
-    """Q, cos 2 theta, sin 2 theta (3, 300, 300) float32.
+    """Draw Q, cos 2 theta, sin 2 theta (3, 300, 300) float32.
 
     Q is 1 inside the rectangles and 0 elsewhere (paper A II-D).  The direction is the mean of the rectangles that cover
     a pixel, and 0 where there is none.
@@ -138,27 +138,27 @@ class GraspNetwork(nn.Module):
         self.q, self.cos2, self.sin2 = (nn.Conv2d(16, 1, 1) for _ in HEADS)
 
     def features(self, pooled: torch.Tensor) -> torch.Tensor:
-        """Features (N, 32, h / 2, w / 2) of pictures at a third of the side (N, 1, h, w)."""
+        """Compute features (N, 32, h / 2, w / 2) of pictures at a third of the side (N, 1, h, w)."""
         x = F.max_pool2d(self.norm2(F.relu(self.conv2(self.conv1(pooled)))), 2)
         x = self.norm4(self.conv4(F.relu(self.conv3(x))))
-        found: torch.Tensor = self.norm6(F.relu(self.conv6(self.conv5(x))))
-        return found
+        feature_maps: torch.Tensor = self.norm6(F.relu(self.conv6(self.conv5(x))))
+        return feature_maps
 
     def hidden(self, features: torch.Tensor) -> torch.Tensor:
-        """What the heads read (N, 16, h, w)."""
+        """Compute what the heads read (N, 16, h, w)."""
         return F.relu(self.conv7(F.interpolate(features, scale_factor=2.0, mode="bilinear", align_corners=False)))
 
     def heads_of(self, hidden: torch.Tensor) -> torch.Tensor:
-        """The HEADS (N, 3, h, w), as one convolution."""
+        """Compute the HEADS (N, 3, h, w), as one convolution."""
         weights, biases = (torch.cat([getattr(self, head).get_parameter(kind) for head in HEADS]) for kind in KINDS)
         return F.conv2d(hidden, weights, biases)
 
     def heads(self, pooled: torch.Tensor) -> torch.Tensor:
-        """Maps (N, 3, h, w) at a third of the side."""
+        """Compute maps (N, 3, h, w) at a third of the side."""
         return self.heads_of(self.hidden(self.features(pooled)))
 
     def forward(self, pictures: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Outputs of ``autonomy.grasp.network.PAPER``."""
+        """Compute the outputs of ``autonomy.grasp.network.PAPER``."""
         features = self.features(F.avg_pool2d(pictures, POOL))
         heads = self.heads_of(self.hidden(features))
         return features, heads, F.interpolate(heads, scale_factor=float(POOL), mode="bilinear", align_corners=False)
@@ -168,7 +168,7 @@ class OriginalOrder(GraspNetwork):
     """Table I as it stands, with the heads on the upsampled features, for comparison."""
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
-        """Maps (N, 3, H, W)."""
+        """Compute maps (N, 3, H, W)."""
         hidden = self.hidden(self.features(F.avg_pool2d(pictures, POOL)))
         up = F.interpolate(hidden, scale_factor=float(POOL), mode="bilinear", align_corners=False)
         return torch.cat([self.q(up), self.cos2(up), self.sin2(up)], 1)
@@ -188,13 +188,13 @@ class Example:
 
 
 def plain_examples(samples: Sequence[Sample]) -> list[Example]:
-    """The central crop of every sample, without samples that have no grasp there."""
+    """Cut the central crop of every sample, without samples that have no grasp there."""
     views = ((s, central_view(s.depth_m)) for s in samples)
     return [_example(s, view) for s, view in views if visible_grasps(s.grasps, view)]
 
 
 def augmented_examples(samples: Sequence[Sample], seed: int, count: int = VIEWS_PER_SAMPLE) -> list[Example]:
-    """``count`` views of every sample, sample by sample: the plain crop and random copies."""
+    """Cut ``count`` views of every sample, sample by sample: the plain crop and random copies."""
     return [_example(s, _view(s, seed, i)) for s in samples for i in range(count)]
 
 
@@ -215,7 +215,7 @@ def _example(sample: Sample, view: View) -> Example:
 
 @cache
 def upsampling() -> np.ndarray:
-    """The matrix (300, 100) float32 of the last upsampling along one side."""
+    """Return the matrix (300, 100) float32 of the last upsampling along one side."""
     eye = torch.eye(LOW_PX)[None]
     return torch.nn.functional.interpolate(eye, scale_factor=POOL, mode="linear")[0].T.numpy()
 
@@ -229,7 +229,7 @@ def train_network(
     epochs: int = EPOCHS,
     batch: int = BATCH,
 ) -> tuple[GraspNetwork, list[float]]:
-    """Train a net on the examples; returns it and the loss of every step."""
+    """Train a net on the examples; return it and the loss of every step."""
     low, projected = (torch.from_numpy(np.stack([getattr(e, name) for e in examples])) for name in ("low", "projected"))
     square = torch.tensor([e.square for e in examples])
     a_side = torch.from_numpy(upsampling().T @ upsampling())
@@ -237,11 +237,11 @@ def train_network(
     orders: dict[int, np.ndarray] = {}
 
     def batch_of(step: int) -> tuple[torch.Tensor, ...]:
-        epoch, place = divmod(step, per_epoch)
+        epoch, batch_index = divmod(step, per_epoch)
         if epoch not in orders:
             orders.clear()
             orders[epoch] = np.random.default_rng([seed, epoch]).permutation(len(examples))
-        chosen = torch.from_numpy(orders[epoch][place * batch : (place + 1) * batch])
+        chosen = torch.from_numpy(orders[epoch][batch_index * batch : (batch_index + 1) * batch])
         return low[chosen][:, None].contiguous(memory_format=torch.channels_last), projected[chosen], square[chosen]
 
     def loss(net: GraspNetwork, pictures: torch.Tensor, labels: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
@@ -254,7 +254,7 @@ def train_network(
 
 
 def equation_5(maps: torch.Tensor, projected: torch.Tensor, square: torch.Tensor, a_side: torch.Tensor) -> torch.Tensor:
-    """Eq. 5 of upsampled maps (N, 3, 100, 100): mean over pictures and pixels of the three squared errors' sum.
+    """Compute eq. 5 of upsampled maps (N, 3, 100, 100): mean over pictures and pixels of the three squared errors' sum.
 
     ``a_side`` is the upsampling's transpose times itself (100, 100).
     """
@@ -264,25 +264,26 @@ def equation_5(maps: torch.Tensor, projected: torch.Tensor, square: torch.Tensor
 
 
 def predict(net: GraspNetwork, examples: Sequence[Example]) -> list[GraspMaps]:
-    """Maps at a third of the side, float32."""
+    """Predict maps at a third of the side, float32."""
     net.eval()
-    found = []
+    predicted_maps = []
     with torch.inference_mode():
         for e in examples:
             out = net.heads(torch.from_numpy(e.low)[None, None].contiguous(memory_format=torch.channels_last))
-            found.append(grasp_maps(out[0].numpy()))
-    return found
+            predicted_maps.append(grasp_maps(out[0].numpy()))
+    return predicted_maps
 
 
 def median_size_px(examples: Sequence[Example]) -> tuple[float, float]:
-    """Median opening and jaw size [px] of the labels, because the network predicts neither."""
+    """Compute the median opening and jaw size [px] of the labels, because the network predicts neither."""
     sizes = np.array([(g.opening_px, g.jaw_px) for e in examples for g in e.grasps])
     opening, jaw = np.median(sizes, axis=0)
     return float(opening), float(jaw)
 
 
 def evaluate(maps: GraspMaps, grasps: Sequence[Rectangle], size_px: tuple[float, float]) -> dict[str, float | bool]:
-    """The chosen grasp, and whether it is correct with the median size (``right``) and with each label's size."""
+    """Return the chosen grasp, and whether it is correct with the median size (``right``) and with each label's
+    size."""
     g = best_pixel(maps)
     own = any(is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, r.opening_px, r.jaw_px), [r]) for r in grasps)
     return {

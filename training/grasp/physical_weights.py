@@ -60,7 +60,7 @@ class GraspFrame:
 
 
 def cylinders_of(logs: Sequence[LogPose]) -> Cylinders:
-    """Settled logs as cylinders."""
+    """Convert settled logs to cylinders."""
     return Cylinders(
         np.array([log.position_m for log in logs], float),
         np.array([log.axis for log in logs]),
@@ -72,7 +72,7 @@ def cylinders_of(logs: Sequence[LogPose]) -> Cylinders:
 def frames(
     pile: Sequence[LogPose], ground_z_m: float, jaws: Jaws, seed: int, count: int = FRAMES_PER_PILE
 ) -> Iterator[GraspFrame]:
-    """``count`` frames of one pile; deterministic."""
+    """Draw ``count`` frames of one pile; deterministic."""
     rng = np.random.default_rng([seed, 7])
     facts = facts_of(jaws)
     whole = cylinders_of(pile)
@@ -93,7 +93,7 @@ def frame(
     rng: np.random.Generator,
     seed: int,
 ) -> GraspFrame:
-    """One frame of a world."""
+    """Draw one frame of a world."""
     recreated = shortened_logs(world, jaws.blade_m)
     shift_m = rng.uniform(-CAMERA_SHIFT_M, CAMERA_SHIFT_M, 3)
     eye = operational_area(recreated).centroid_m + shift_m + np.array([0.0, 0.0, CAMERA_HEIGHT_M])
@@ -141,7 +141,8 @@ def _rotated(world: Cylinders, yaw: float) -> Cylinders:
 
 
 def _interpolation_matrix() -> np.ndarray:
-    """Linear interpolation (100, 25) from the grid to all pixels along one side, constant beyond its ends."""
+    """Compute the linear interpolation (100, 25) from the grid to all pixels along one side, constant beyond its
+    ends."""
     at = np.clip((np.arange(LOW_PX) - GRID_PX // 2) / GRID_PX, 0.0, LOW_PX // GRID_PX - 1.0)
     eye = np.eye(LOW_PX // GRID_PX)
     return np.stack([np.interp(at, np.arange(len(eye)), row) for row in eye], axis=1).astype(np.float32)
@@ -167,22 +168,22 @@ TEST_FRAMES: Final = 200
 def drawn_frames(
     count: int, seed: int, first_chunk: int = 0, folder: Path | None = None, tick: Callable[[], None] = lambda: None
 ) -> list[GraspFrame]:
-    """``count`` frames, ``FRAMES_PER_PILE`` of each pile; only piles on flat ground outside the bunk are used."""
-    profile, found = profile_of(MACHINE), list[GraspFrame]()
+    """Draw ``count`` frames, ``FRAMES_PER_PILE`` of each pile; only piles on flat ground outside the bunk are used."""
+    profile, grasp_frames = profile_of(MACHINE), list[GraspFrame]()
     jaws, ground = jaws_of(profile), profile.workspace.ground_z_m
     chunks = 1 + count // (FRAMES_PER_PILE * CHUNK // 2)
-    while len(found) < count:
+    while len(grasp_frames) < count:
         for pile in piles(MACHINE, first_chunk, chunks, folder):
-            if pile.terrain == "flat" and pile.kind != "bunk" and len(found) < count:
-                some = min(FRAMES_PER_PILE, count - len(found))
-                found.extend(frames(pile.logs, ground, jaws, seed + pile.number, some))
+            if pile.terrain == "flat" and pile.kind != "bunk" and len(grasp_frames) < count:
+                frame_count = min(FRAMES_PER_PILE, count - len(grasp_frames))
+                grasp_frames.extend(frames(pile.logs, ground, jaws, seed + pile.number, frame_count))
                 tick()
         first_chunk += chunks
-    return found
+    return grasp_frames
 
 
 def examples_of(found: list[GraspFrame]) -> list[network_training.Example]:
-    """Frames as examples for eq. 5; the labels of all 90 000 pixels are interpolated."""
+    """Make examples for eq. 5 from frames; the labels of all 90 000 pixels are interpolated."""
     up = network_training.upsampling()
     square = up.T @ up
     out = []
@@ -194,27 +195,27 @@ def examples_of(found: list[GraspFrame]) -> list[network_training.Example]:
 
 
 def quality_share(net: GraspNetwork, found: list[GraspFrame]) -> float:
-    """Mean ratio of the label's quality at the network's best pixel to the best quality in the frame."""
+    """Compute the mean ratio of the label's quality at the network's best pixel to the best quality in the frame."""
     maps = network_training.predict(net, examples_of(found))
     shares = []
-    for one, frame in zip(maps, found, strict=True):
+    for grasp_map, frame in zip(maps, found, strict=True):
         best = float(frame.labels[0].max())
         if best > 0.0:
-            shares.append(float(frame.labels[0].flat[int(np.argmax(one.q))]) / best)
+            shares.append(float(frame.labels[0].flat[int(np.argmax(grasp_map.q))]) / best)
     return float(np.mean(shares)) if shares else 0.0
 
 
 def produce(
     seed: int, out: Path, console: Console, count: int = FRAMES, epochs: int = EPOCHS, folder: Path | None = None
 ) -> tuple[Path, Path]:
-    """Draw frames, train, and write weights and card; an interrupted run continues.  Returns both paths."""
+    """Draw frames, train, and write weights and card; an interrupted run continues.  Return both paths."""
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("drawing frames", total=-(-count // FRAMES_PER_PILE))
-        found = drawn_frames(count, seed, 0, folder, lambda: progress.advance(task))
-    kept = out.with_suffix(".checkpoint")
+        grasp_frames = drawn_frames(count, seed, 0, folder, lambda: progress.advance(task))
+    checkpoint = out.with_suffix(".checkpoint")
     title = "grasp network, physical labels"
     net, losses = network_training.train_network(
-        examples_of(found), seed, title, console, kept, epochs=epochs, batch=BATCH
+        examples_of(grasp_frames), seed, title, console, checkpoint, epochs=epochs, batch=BATCH
     )
     share = quality_share(net, drawn_frames(TEST_FRAMES, seed + 1, HELD_OUT, folder))
     card = Card(

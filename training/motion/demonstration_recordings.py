@@ -27,7 +27,8 @@ DEFAULT_PROFILE: Final = "aoro_fc8"
 
 
 def motions_in(log: Path, profile: str | None = None) -> tuple[Profile, tuple[JointTrack, ...]]:
-    """The machine and the demonstrations of a run's directory, an MCAP file, a CAN log or a file of demonstrations.
+    """Read the machine and the demonstrations of a run's directory, an MCAP file, a CAN log or a file of
+    demonstrations.
 
     Raises:
         CommandFailed: the recording cannot be read, is of another machine, or holds no motion.
@@ -71,7 +72,8 @@ def _frames(log: Path, profile: str | None) -> tuple[Profile, Iterator[Frame]]:
 
 
 def _of_one_interface(log: Path, trace: Trace, machine: Profile) -> Iterator[Frame]:
-    """The frames of a log; refused when those of encoders come on several interfaces, which may be two machines."""
+    """Yield the frames of a log; refuse it when those of encoders come on several interfaces, which may be two
+    machines."""
     database = load_database("crane")
     keys = {database.message(e.message).key for e in encoders(machine).values() if e.message in database.messages}
     interfaces: set[str] = set()
@@ -99,7 +101,7 @@ def _of_one_interface(log: Path, trace: Trace, machine: Profile) -> Iterator[Fra
 
 
 def _raw(files: Sequence[Path], topic: str) -> Iterator[Frame]:
-    """The frames of a bus with their monotonic stamps."""
+    """Yield the frames of a bus with their monotonic stamps."""
     try:
         for path in files:
             for record in scan(path, {topic}, partial(tell_end, path)):

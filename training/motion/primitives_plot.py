@@ -55,7 +55,7 @@ def plot_primitives(path: Path, profile: Profile, motions: Sequence[JointTrack],
 
 
 def _across_and_height(arm: Arm, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position across the bunk's length, and height [m]."""
+    """Compute the position across the bunk's length, and height [m]."""
     bunk = arm.profile.bunk
     pins = [arm.xy(Pose(slew, r, z, ext, 0.0)) for slew, r, z, ext, *_ in poses.tolist()]
     xy = np.array(pins) - np.array(bunk.center_m)

@@ -38,7 +38,7 @@ MIN_CONTRAST: Final = 45.0  # between logs and ground, in most plain pictures
 
 
 def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
-    """A picture of ``pile``, drawn from ``seed``; deterministic."""
+    """Draw a picture of ``pile`` from ``seed``; deterministic."""
     rng = random.Random(f"frame {pile.machine} {pile.number} {seed}")
     held = rng.random() < HELD_SHARE
     scene, keep = bare_scene(pile, rng, held)
@@ -58,7 +58,7 @@ def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
 
 
 def labelled(mask: np.ndarray, view: View, logs: tuple[LogPose, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """``ids`` and ``logs`` of a sample, from the renderer's instances (H, W)."""
+    """Compute ``ids`` and ``logs`` of a sample from the renderer's instances (H, W)."""
     ids = np.zeros(mask.shape, np.uint8)
     rows: list[tuple[float, ...]] = []
     pixels: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -113,7 +113,7 @@ def _row(u: np.ndarray, v: np.ndarray, view: View, log: LogPose, shape: tuple[in
 
 
 def bare_scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple[LogPose, ...]]:
-    """The pile without the logs already removed from the top; when one is held, the topmost log is in the air."""
+    """Build the pile without the logs already removed from the top; when one is held, the topmost log is in the air."""
     logs = sorted(pile.logs, key=lambda log: log.position_m[2])
     if len(logs) > 1 and rng.random() < 0.4:
         logs = logs[: rng.randint(1, len(logs))]
@@ -121,14 +121,15 @@ def bare_scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple
         x, y, z = logs[-1].position_m
         logs[-1] = replace(logs[-1], position_m=(x, y, z + 2.0 * rng.random() ** 2))
     b = SceneBuilder(ground_of(pile), rng.choice(("asphalt", "forest")))
-    one = [rng.uniform(0.75, 1.2) for _ in range(3)]
+    tint = [rng.uniform(0.75, 1.2) for _ in range(3)]
     for log in logs:
-        b.log(log, tuple(c * rng.uniform(0.85, 1.15) for c in one))
+        b.log(log, tuple(c * rng.uniform(0.85, 1.15) for c in tint))
     return b.build(), tuple(logs)
 
 
 def _pinhole(pile: Pile, camera: str, rng: random.Random, size_px: int) -> Intrinsics:
-    """The whole picture letterboxed, or a window with a zoom between 1 and MAX_ZOOM times that of the letterbox."""
+    """Choose the whole picture letterboxed, or a window with a zoom between 1 and MAX_ZOOM times that of the
+    letterbox."""
     pin = intrinsics(profile_of(pile.machine).cameras[camera])
     whole = size_px / max(pin.width_px, pin.height_px)
     if rng.random() < 0.1:
@@ -142,7 +143,7 @@ def _pinhole(pile: Pile, camera: str, rng: random.Random, size_px: int) -> Intri
 def random_view(
     pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random, size_px: int, ground: Ground
 ) -> View:
-    """A view of some of the logs from where a machine's cameras can be."""
+    """Draw a view of some of the logs from where a machine's cameras can be."""
     pin = _pinhole(pile, camera, rng, size_px)
     mark = rng.choice(logs)
     points, _ = mark.spine(8)
@@ -176,7 +177,7 @@ def random_view(
 
 
 def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) from unit vector ``a`` to ``b``."""
+    """Compute the smallest rotation (3, 3) from unit vector ``a`` to ``b``."""
     w, c = np.cross(a, b), float(a @ b)
     k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
     return np.asarray(np.eye(3) + k + k @ k / (1.0 + c))
@@ -215,7 +216,7 @@ def _ground_cover(ground: tuple[str, int, float], kind: int, seed: int) -> Groun
 
 
 def _clutter(pile: Pile, logs: tuple[LogPose, ...], rng: random.Random) -> Rods:
-    """Grass and branches; with few seeds, so that tiles are generated once and reused."""
+    """Strew grass and branches; with few seeds, so that tiles are generated once and reused."""
     kind = rng.choices((0, 1, 2), (0.3, 0.3, 0.4))[0]
     x, y, _ = rng.choice(logs).position_m
     seed = rng.randrange(3) if kind else 0
@@ -223,7 +224,7 @@ def _clutter(pile: Pile, logs: tuple[LogPose, ...], rng: random.Random) -> Rods:
 
 
 def _stereo_depth(machine: str, camera: str, picture: Picture, pin: Intrinsics, rng: random.Random) -> np.ndarray:
-    """Stereo depth, better or worse than nominal; sometimes nearly perfect or full of holes."""
+    """Compute stereo depth, better or worse than nominal; sometimes nearly perfect or full of holes."""
     sigma = math.exp(rng.uniform(math.log(0.25), math.log(1.6)))
     edges = (rng.uniform(0.3, 1.1), rng.uniform(0.3, 1.1))
     holes, plain_holes = math.exp(rng.uniform(-1.0, 2.0)), rng.uniform(0.01, 0.25)
@@ -242,7 +243,7 @@ def _stereo_depth(machine: str, camera: str, picture: Picture, pin: Intrinsics, 
 
 
 def _plain(picture: Picture, view: View, conditions: ImagingConditions, rng: random.Random) -> np.ndarray:
-    """The picture with ground, logs and sky in one colour each, lit by the sun; the rest is unchanged."""
+    """Paint ground, logs and sky of the picture in one colour each, lit by the sun; leave the rest unchanged."""
     pin, s = view.intrinsics, np.nan_to_num(1.0 / picture.depth_m, nan=0.0)
     h, w = s.shape
     u = ((np.arange(w) - pin.cx_px) / pin.fx_px).astype(np.float32)
@@ -271,7 +272,7 @@ def _plain(picture: Picture, view: View, conditions: ImagingConditions, rng: ran
 
 
 def _sky(rng: random.Random) -> np.ndarray:
-    """One colour (3,) uint8: white, bright or random."""
+    """Choose one colour (3,) uint8: white, bright or random."""
     kind = rng.random()
     if kind < 0.4:
         return np.full(3, 255, np.uint8)
@@ -280,7 +281,7 @@ def _sky(rng: random.Random) -> np.ndarray:
 
 
 def _colour(rng: random.Random) -> np.ndarray:
-    """Mostly the colour of earth or wood, sometimes random."""
+    """Choose a colour: mostly that of earth or wood, sometimes random."""
     if rng.random() < 0.25:
         return np.array([rng.uniform(20.0, 250.0) for _ in range(3)], np.float32)
     grey, warm = rng.uniform(60.0, 210.0), rng.uniform(0.0, 0.5)
@@ -288,7 +289,7 @@ def _colour(rng: random.Random) -> np.ndarray:
 
 
 def _lens_and_compression(rgb: np.ndarray, rng: random.Random) -> np.ndarray:
-    """Blur and compression of a real camera, each in half of the pictures."""
+    """Apply blur and compression of a real camera, each in half of the pictures."""
     picture = Image.fromarray(rgb)
     if rng.random() < 0.5:
         picture = picture.filter(ImageFilter.GaussianBlur(rng.uniform(0.3, 1.4)))

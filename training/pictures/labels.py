@@ -36,7 +36,7 @@ class Labelled:
 
 
 def seen_along(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> tuple[tuple[float, float], float]:
-    """Middle (u, v) of a log's visible pixels and their extent along the unit ``axis`` (2,) [px].
+    """Compute the middle (u, v) of a log's visible pixels and their extent along the unit ``axis`` (2,) [px].
 
     The middle is half-way along the axis and the median across it.
     """
@@ -47,12 +47,12 @@ def seen_along(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> tuple[tuple[fl
 
 
 def elongation(extent_px: float, width_px: float) -> float:
-    """0 for a log seen end-on, 1 for one that appears FULL_ELONGATION_WIDTHS widths long or more."""
+    """Return 0 for a log seen end-on, 1 for one that appears FULL_ELONGATION_WIDTHS widths long or more."""
     return min(1.0, max(0.0, (extent_px / max(width_px, 1.0) - 1.0) / (FULL_ELONGATION_WIDTHS - 1.0)))
 
 
 def mirrored(sample: Labelled) -> Labelled:
-    """The picture mirrored left to right."""
+    """Mirror the picture left to right."""
     w, pin = sample.rgb.shape[1], sample.intrinsics
     logs = sample.logs.copy()
     logs[:, (CENTRE_U, START_U, END_U)] = w - 1.0 - logs[:, (CENTRE_U, START_U, END_U)]
@@ -63,7 +63,7 @@ def mirrored(sample: Labelled) -> Labelled:
 
 
 def enlarged(sample: Labelled) -> Labelled:
-    """The picture at twice the size."""
+    """Enlarge the picture to twice the size."""
     rgb, depth, pin = doubled(sample.rgb, sample.depth_m, sample.intrinsics)
     logs = sample.logs.copy()
     logs[:, CENTRE_U : END_V + 1] = 2.0 * logs[:, CENTRE_U : END_V + 1] + 0.5
@@ -72,7 +72,7 @@ def enlarged(sample: Labelled) -> Labelled:
 
 
 def cropped(sample: Labelled, left: int, top: int, size_px: int) -> Labelled:
-    """A square window inside the picture; the visible part of every log is determined again."""
+    """Cut a square window inside the picture; the visible part of every log is determined again."""
     window = (slice(top, top + size_px), slice(left, left + size_px))
     ids, rows = sample.ids[window], []
     v, u = np.nonzero((ids > 0) & (ids != IGNORED))

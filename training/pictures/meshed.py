@@ -22,7 +22,7 @@ PER_FILE = 10
 
 
 def meshed(pile: Pile, seed: int, size_px: int) -> Sample:
-    """A picture of ``pile``, drawn from ``seed``; depth exact and as the machine's camera senses it."""
+    """Draw a picture of ``pile`` from ``seed``; depth exact and as the machine's camera senses it."""
     rng = random.Random(f"meshed {pile.machine} {pile.number} {seed}")
     scene, keep = drawing.bare_scene(pile, rng, held=False)
     camera = rng.choice(list(profile_of(pile.machine).cameras))
@@ -60,7 +60,7 @@ def main(folder: Path, files: int, number: int, count: int, size_px: int, chunks
 
 
 def one_file(folder: Path, number: int, piles: list[Pile], size_px: int) -> Path:
-    """The file of PER_FILE pictures of this number; drawn when it is missing."""
+    """Return the file of PER_FILE pictures of this number; draw it when it is missing."""
     file = folder / f"meshed{number:05d}.npz"
     if not file.is_file():
         rng = random.Random(f"meshed set {number}")

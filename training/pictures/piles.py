@@ -84,28 +84,28 @@ class Pile:
 
 @cache
 def profile_of(machine: str) -> Profile:
-    """The shipped profile of a machine, read once."""
+    """Read the shipped profile of a machine, once."""
     return load_profile(machine)
 
 
 @lru_cache(maxsize=2 * TERRAINS + 4)
 def terrain_of(kind: str, seed: int, datum_m: float) -> Terrain:
-    """The ground of a pile, cached."""
+    """Generate the ground of a pile, cached."""
     return Terrain(kind, seed, datum_m)
 
 
 def ground_of(pile: Pile) -> Ground:
-    """The ground of a pile for the renderer."""
+    """Return the ground of a pile for the renderer."""
     return Ground(*terrain_of(pile.terrain, pile.terrain_seed, pile.datum_m).grid)
 
 
 def cache_folder() -> Path:
-    """The default folder of piles: below XDG_CACHE_HOME or ~/.cache."""
+    """Return the default folder of piles: below XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "timberhand" / "piles"
 
 
 def settle(machine: str, number: int) -> Pile:
-    """One pile by its number; a draw without room or rest is repeated.
+    """Settle one pile by its number; a draw without room or rest is repeated.
 
     Raises:
         InputRefused: MAX_DRAWS draws in a row failed.
@@ -136,7 +136,7 @@ def settle(machine: str, number: int) -> Pile:
 
 
 def chunk(machine: str, index: int, folder: Path | None = None, tick: Callable[[], None] = lambda: None) -> list[Pile]:
-    """CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settled and written there.
+    """Return CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settled and written there.
 
     ``tick`` is called after each pile that is settled.
 
@@ -155,7 +155,7 @@ def chunk(machine: str, index: int, folder: Path | None = None, tick: Callable[[
 
 
 def piles(machine: str, first_chunk: int, chunks: int, folder: Path | None = None) -> Iterator[Pile]:
-    """The piles of several chunks, in order."""
+    """Yield the piles of several chunks, in order."""
     for index in range(first_chunk, first_chunk + chunks):
         yield from chunk(machine, index, folder)
 

@@ -88,7 +88,7 @@ class Steel:
         self.box(size, at_m + np.array([0.0, 0.0, size[2] / 3]), axes, colour, CARRIER)
 
     def build(self) -> Boxes:
-        """The packed boxes."""
+        """Pack the boxes."""
         n = len(self._rows)
         at, axes, half, colours, instances = zip(*self._rows, strict=True) if n else [()] * 5
         return Boxes(

@@ -42,7 +42,7 @@ def sample(
     pin: Intrinsics,
     sensed_m: np.ndarray | None = None,
 ) -> Sample:
-    """A sample from a picture's parts; depth NaN where unknown, everywhere in a photograph."""
+    """Make a sample from a picture's parts; depth NaN where unknown, everywhere in a photograph."""
     h, w = depth_m.shape
     u = ((np.arange(w) - pin.cx_px) / pin.fx_px).astype(np.float32)
     v = ((np.arange(h) - pin.cy_px) / pin.fy_px).astype(np.float32)
@@ -62,7 +62,7 @@ def sample(
 
 
 def in_mm(depth_m: np.ndarray) -> np.ndarray:
-    """Depth as int16 [mm], 0 unknown or too far."""
+    """Convert depth to int16 [mm], 0 unknown or too far."""
     mm = np.nan_to_num(depth_m.astype(np.float32) * MM, nan=0.0, posinf=0.0)
     return np.where(mm < FARTHEST_MM, mm, 0.0).astype(np.int16)
 
@@ -77,6 +77,6 @@ def write(file: Path, rows: Sequence[Sample], compressed: bool = True) -> None:
 
 
 def read(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file, by the names of ``Sample``."""
-    with np.load(file, allow_pickle=False) as kept:
-        return {f.name: kept[f.name] for f in fields(Sample)}
+    """Read the arrays of a file, by the names of ``Sample``."""
+    with np.load(file, allow_pickle=False) as archive:
+        return {f.name: archive[f.name] for f in fields(Sample)}

@@ -45,8 +45,7 @@ class Shard:
 
 
 def shard(folder: Path, number: int, size_px: int = 304, tick: Callable[[], None] = lambda: None) -> Shard:
-    """Shard ``number`` of ``folder``; it is drawn when it is missing, with a call of ``tick`` after each
-    picture.
+    """Open shard ``number`` of ``folder``; draw it when it is missing, with a call of ``tick`` after each picture.
 
     Shards from HELD_OUT on use piles that no training shard uses.
 
@@ -71,7 +70,7 @@ def shard(folder: Path, number: int, size_px: int = 304, tick: Callable[[], None
 
 
 def drawn_pictures(number: int, size_px: int) -> Iterator[Labelled]:
-    """The pictures of a shard."""
+    """Draw the pictures of a shard."""
     rng = random.Random(f"shard {number} {size_px}")
     piles = _piles(number, rng)
     for i in range(SHARD):
@@ -79,7 +78,7 @@ def drawn_pictures(number: int, size_px: int) -> Iterator[Labelled]:
 
 
 def _piles(number: int, rng: random.Random) -> list[Pile]:
-    """The piles of two chunks of each machine, so that a shard mixes many piles but reads few files."""
+    """Return the piles of two chunks of each machine, so that a shard mixes many piles but reads few files."""
     if number >= HELD_OUT:
         return [pile for machine in MACHINES for pile in chunk(machine, HELD_OUT + number % 2)]
     return [pile for machine in MACHINES for k in range(2) for pile in chunk(machine, rng.randrange(TRAINING_CHUNKS))]
@@ -119,7 +118,7 @@ def _to_millimetres(height_m: np.ndarray) -> np.ndarray:
 
 
 def picture(shards: Callable[[int], Shard], index: int) -> Labelled:
-    """Picture ``index``, counted over all shards; ``shards`` returns a shard by its number."""
+    """Read picture ``index``, counted over all shards; ``shards`` returns a shard by its number."""
     own, i = shards(index // SHARD), index % SHARD
     depth = own.depth_mm[i].astype(np.float32) * np.float32(1.0 / MM)
     height = own.height_mm[i].astype(np.float32) * np.float32(1.0 / MM)
@@ -132,6 +131,6 @@ def picture(shards: Callable[[int], Shard], index: int) -> Labelled:
 
 
 def pictures(folder: Path, size_px: int = 304) -> Callable[[int], Labelled]:
-    """A function that returns the pictures of ``folder`` by number; a missing shard is drawn on first use."""
+    """Make a function that returns the pictures of ``folder`` by number; a missing shard is drawn on first use."""
     shards = lru_cache(maxsize=None)(lambda number: shard(folder, number, size_px))
     return lambda index: picture(shards, index)

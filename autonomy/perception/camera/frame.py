@@ -39,23 +39,23 @@ class Pose:
     rotation: np.ndarray
 
     def to_base(self, points_m: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of the optical frame in the base frame."""
+        """Transform points (..., 3) of the optical frame into the base frame."""
         return np.asarray(np.asarray(points_m, float) @ self.rotation.T + self.position_m)
 
     def to_optical(self, points_m: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of the base frame in the optical frame."""
+        """Transform points (..., 3) of the base frame into the optical frame."""
         return np.asarray((np.asarray(points_m, float) - self.position_m) @ self.rotation)
 
 
 def rescaled(frame: RgbdFrame, depth_scale: float) -> RgbdFrame:
-    """The frame with its depth divided by ``depth_scale``, which a survey of the camera gives."""
+    """Return the frame with its depth divided by ``depth_scale``, which a survey of the camera gives."""
     if depth_scale == 1.0:
         return frame
     return replace(frame, depth_m=frame.depth_m / np.float32(depth_scale))
 
 
 def content_window(rgb: np.ndarray) -> tuple[int, int, int, int]:
-    """Top, bottom, left, right (bottom and right exclusive) of a picture (H, W, 3) uint8 without its black bars.
+    """Find top, bottom, left, right (bottom and right exclusive) of a picture (H, W, 3) uint8 without its black bars.
 
     The bars are those of a letterbox.  A picture that is black everywhere is returned whole.
     """
@@ -132,7 +132,7 @@ UNIT_VECTORS: Final = np.eye(3)
 
 
 def optical_pose(profile: Profile, camera: Camera, q: Sequence[float], articulation_rad: float = 0.0) -> Pose:
-    """The optical frame in the crane's base frame; ``q`` are joint positions in ``Joint`` order [rad, m].
+    """Compute the optical frame in the crane's base frame; ``q`` are joint positions in ``Joint`` order [rad, m].
 
     Raises:
         InputRefused: the camera's link is none of those above.
@@ -143,7 +143,7 @@ def optical_pose(profile: Profile, camera: Camera, q: Sequence[float], articulat
 
 
 def link_pose(profile: Profile, name: str, q: Sequence[float], articulation_rad: float = 0.0) -> Pose:
-    """The frame of a link that may carry a camera, in the crane's base frame.
+    """Compute the frame of a link that may carry a camera, in the crane's base frame.
 
     Raises:
         InputRefused: the link is none of those above.

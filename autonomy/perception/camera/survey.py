@@ -34,7 +34,7 @@ def surveyed(
     targets_m: np.ndarray,
     pixel_sigma_px: float = 0.3,
 ) -> Camera:
-    """The camera with the mount and the depth scale that fit ``MIN_TARGETS`` or more surveyed targets.
+    """Return the camera with the mount and the depth scale that fit ``MIN_TARGETS`` or more surveyed targets.
 
     Args:
         camera: as the profile has it; its mount is the prior.
@@ -85,7 +85,7 @@ def surveyed(
 
 
 def _depth_scale(true_m: np.ndarray, depths_m: np.ndarray) -> float:
-    """Ratio of measured to true depths (N,); 1 where no depth is known."""
+    """Compute the ratio of measured to true depths (N,); 1 where no depth is known."""
     known = np.isfinite(depths_m)
     if not known.any():
         return 1.0

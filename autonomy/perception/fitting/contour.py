@@ -47,7 +47,7 @@ class Contour:
     beside: np.ndarray
 
     def without(self, fitted: dict[int, Cylinder], pin: Intrinsics) -> Contour:
-        """The contour without the points on the outlines of neighbouring logs ``fitted`` (by mask number).
+        """Return the contour without the points on the outlines of neighbouring logs ``fitted`` (by mask number).
 
         A log in front is mostly seen whole and fitted well.  The initial cylinder of a half hidden log is not, and
         would take the neighbour's outline for its own.
@@ -63,7 +63,7 @@ class Contour:
 
 
 def mask_border(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points u, v (N,) [px] half-way between mask pixels and their neighbours outside, and the outward direction (N,).
+    """Find points u, v (N,) [px] half-way between mask pixels and neighbours outside, and the outward direction (N,).
 
     Half-way points err by less than half a pixel and without bias.  The edge of the picture is not part of the border.
     """
@@ -91,7 +91,7 @@ def log_contour(
     labels: np.ndarray | None = None,
     others: dict[int, Cylinder] | None = None,
 ) -> Contour:
-    """The contour of a mask (H, W) bool, thinned to ``MAX_CONTOUR_POINTS``, with the log's own outline marked.
+    """Find the contour of a mask (H, W) bool, thinned to ``MAX_CONTOUR_POINTS``, with the log's own outline marked.
 
     Args:
         mask: (H, W) bool.

@@ -43,21 +43,21 @@ class Cylinder:
         return self.point_m + 0.5 * (self.start_m + self.end_m) * self.axis
 
     def centered(self) -> Cylinder:
-        """The same body with its middle as the point."""
+        """Return the same body with its middle as the point."""
         half, move = 0.5 * self.length_m, 0.5 * (self.start_m + self.end_m)
         radius = self.radius_m + self.growth * move
         return Cylinder(self.center_m, self.axis, -half, half, radius, self.growth)
 
 
 def cross(a: Sequence[float], b: Sequence[float]) -> np.ndarray:
-    """Cross product (3,) of two vectors; ten times as fast as numpy's for single vectors."""
+    """Compute the cross product (3,) of two vectors; ten times as fast as numpy's for single vectors."""
     (a0, a1, a2), (b0, b1, b2) = a, b
     return np.array((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0))
 
 
 def across_view(axis: np.ndarray, point_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across the axis (3,): the first is across the line of sight to ``point_m``, the second as close
-    to the line of sight as possible."""
+    """Compute two unit vectors across the axis (3,): the first is across the line of sight to ``point_m``, the second
+    as close to the line of sight as possible."""
     along, sight = axis.tolist(), point_m.tolist()
     first = cross(sight, along)
     size = math.sqrt(float(first @ first))
@@ -79,12 +79,12 @@ class CylinderBatch:
 
     @classmethod
     def of(cls, body: Cylinder) -> CylinderBatch:
-        """A batch of one cylinder."""
+        """Make a batch of one cylinder."""
         return cls(np.array([[body.point_m, body.axis]]), _size(body))
 
     @classmethod
     def around(cls, body: Cylinder, steps: np.ndarray) -> CylinderBatch:
-        """``body`` changed by K steps (K, 8): across the view, along it, two tilts, start, end, radius, growth."""
+        """Change ``body`` by K steps (K, 8): across the view, along it, two tilts, start, end, radius, growth."""
         frame = np.array(across_view(body.axis, body.point_m))
         line = steps[:, :4].reshape(-1, 2, 2) @ frame + (body.point_m, body.axis)
         axis = line[:, 1]
@@ -92,7 +92,7 @@ class CylinderBatch:
         return cls(line, _size(body) + steps[:, 4:].T[:, :, None])
 
     def one(self, i: int) -> Cylinder:
-        """Cylinder ``i``."""
+        """Return cylinder ``i``."""
         start, end, radius, growth = self.size[:, i, 0].tolist()
         return Cylinder(self.line[i, 0], self.line[i, 1], start, end, radius, growth)
 
@@ -128,13 +128,13 @@ class _Closest:
         across = np.maximum((rays * rays).sum(axis=1) - along * along, _EPSILON)
         lean = lean - along * pa
         t = lean / across
-        place = t * along - pa
-        at = np.minimum(np.maximum(place, start), end)
+        axial_position_m = t * along - pa
+        at = np.minimum(np.maximum(axial_position_m, start), end)
         dist2 = np.maximum(inner[:, :1] - pa * pa - lean * t, 0.0)
-        return cls(along, across, t, place, dist2, radius + growth * at, pa)
+        return cls(along, across, t, axial_position_m, dist2, radius + growth * at, pa)
 
     def part(self, which: slice) -> _Closest:
-        """The same for some of the rays."""
+        """Return the same for some of the rays."""
         at = slice(None), which
         return _Closest(
             self.along[at], self.across[at], self.depth[at], self.place[at], self.dist2[at], self.radius[at], self.point
@@ -142,7 +142,7 @@ class _Closest:
 
 
 def outline_distance(bodies: CylinderBatch, rays: np.ndarray) -> np.ndarray:
-    """Signed distance (K, N) [m] of rays (N, 3) from the outlines of K cylinders: negative inside, 0 on the outline.
+    """Compute signed distances (K, N) [m] of rays (N, 3) from K cylinders' outlines: negative inside, 0 on them.
 
     It is the minimum over the ray of the larger of the distances beyond the side and beyond the ends.
     """
@@ -150,19 +150,19 @@ def outline_distance(bodies: CylinderBatch, rays: np.ndarray) -> np.ndarray:
 
 
 def surface_depth(bodies: CylinderBatch, rays: np.ndarray) -> np.ndarray:
-    """Depth (K, N) [m] of the surfaces of K cylinders along rays (N, 3); of the closest approach where a ray misses."""
+    """Compute surface depth (K, N) [m] of K cylinders along rays (N, 3); of the closest approach where a ray misses."""
     return _surface_depth(bodies, _Closest.of(bodies, rays))
 
 
 def distance_and_depth(bodies: CylinderBatch, rays: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
-    """``outline_distance`` of the first ``first`` rays and ``surface_depth`` of the others."""
+    """Compute ``outline_distance`` of the first ``first`` rays and ``surface_depth`` of the others."""
     near = _Closest.of(bodies, rays)
     return _outline_distance(bodies, near.part(slice(first))), _surface_depth(bodies, near.part(slice(first, None)))
 
 
 def axial_positions(body: Cylinder, rays: np.ndarray, first: int) -> np.ndarray:
-    """Positions (N,) [m] along the axis from the cylinder's point: of the closest approach of the first ``first`` rays,
-    and of the intersection of the other rays with the surface."""
+    """Compute positions (N,) [m] along the axis from the cylinder's point: of the closest approach of the first
+    ``first`` rays, and of the intersection of the other rays with the surface."""
     bodies = CylinderBatch.of(body)
     near = _Closest.of(bodies, rays)
     met = _surface_depth(bodies, near) * near.along - near.point
@@ -195,5 +195,5 @@ def _surface_depth(bodies: CylinderBatch, near: _Closest) -> np.ndarray:
 
 
 def pixel_rays(pin: Intrinsics, u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
-    """Rays (N, 3) with z = 1 of pixels (N,)."""
+    """Compute rays (N, 3) with z = 1 of pixels (N,)."""
     return np.stack([(u_px - pin.cx_px) / pin.fx_px, (v_px - pin.cy_px) / pin.fy_px, np.ones(len(u_px))], axis=1)

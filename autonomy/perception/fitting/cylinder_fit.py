@@ -93,7 +93,7 @@ class CylinderFit:
 def fit_cylinder(
     mask: np.ndarray, depth_m: np.ndarray, pin: Intrinsics, first: Cylinder, border_px: Contour, sensor: StereoSensor
 ) -> CylinderFit | None:
-    """The best cylinder near ``first``; None when the mask has too little depth or contour, or no cylinder fits."""
+    """Fit the best cylinder near ``first``; None when the mask has too little depth or contour, or no cylinder fits."""
     problem = _Problem.of(mask, depth_m, pin, first, border_px, sensor)
     if problem is None:
         return None
@@ -111,7 +111,7 @@ def fit_cylinder(
 
 
 def _minimised(problem: _Problem, body: Cylinder, scale_factor: float) -> Cylinder | None:
-    """Levenberg-Marquardt minimisation from ``body``; None when numbers overflow."""
+    """Minimise by Levenberg-Marquardt from ``body``; None when numbers overflow."""
     damping = 1e-3
     for i in range(MAX_ITERATIONS):
         if i in (0, 2):
@@ -126,32 +126,32 @@ def _minimised(problem: _Problem, body: Cylinder, scale_factor: float) -> Cylind
         for _ in range(4):
             step = -np.linalg.solve(normal + damping * stiff * _EYE, gradient)
             step *= min(1.0, 1.0 / float((np.abs(step) / _MAX_STEP).max()))
-            one = CylinderBatch.around(body, step[None]).one(0)
-            if one.radius_m > MIN_RADIUS_M and one.length_m > MIN_LENGTH_M and one.center_m[2] > MIN_DEPTH_M:
+            trial = CylinderBatch.around(body, step[None]).one(0)
+            if trial.radius_m > MIN_RADIUS_M and trial.length_m > MIN_LENGTH_M and trial.center_m[2] > MIN_DEPTH_M:
                 # Evaluate the derivatives as well: the step is mostly accepted, and the next iteration needs them.
-                raw = problem.residuals(CylinderBatch.around(one, _STEPS), metres_px)
+                raw = problem.residuals(CylinderBatch.around(trial, _STEPS), metres_px)
                 if problem.cost(raw[0], scale_factor) < cost:
                     break
             damping *= 10.0
         else:
             return body
-        body, damping = one, max(1e-6, damping * 0.1)
+        body, damping = trial, max(1e-6, damping * 0.1)
         if step @ normal @ step < CONVERGED_STEP2 * scale_factor * scale_factor:
             return body
     return body
 
 
 def _innermost(mask: np.ndarray) -> np.ndarray:
-    """The inner part of a mask (H, W), up to ``FATTENING_PX`` from its border, with at least 0.4 of its pixels."""
+    """Find the inner part of a mask (H, W), up to ``FATTENING_PX`` from its border, with at least 0.4 of its pixels."""
     sums = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int32)
     np.cumsum(np.cumsum(mask, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
-    wanted = 0.4 * int(sums[-1, -1])
+    min_pixel_count = 0.4 * int(sums[-1, -1])
     for reach in (FATTENING_PX, 5, 3, 2, 1):
         side = 2 * reach + 1
         if side > min(mask.shape):
             continue
         inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
-        if np.count_nonzero(inside == side**2) >= wanted:
+        if np.count_nonzero(inside == side**2) >= min_pixel_count:
             inner = np.zeros(mask.shape, bool)
             inner[reach:-reach, reach:-reach] = inside == side**2
             return inner
@@ -220,28 +220,28 @@ class _Problem:
         )
 
     def widened(self, first: Cylinder) -> Cylinder:
-        """``first``, or where one of its sides is hidden a log of mean radius with one side at the visible strip.
+        """Return ``first``, or where a side of it is hidden a log of mean radius with one side at the visible strip.
 
         The likeliest of the three is taken: the minimisation does not reach the wide log from the narrow strip.
         """
-        more = MEAN_RADIUS_M - first.radius_m
-        if more <= 0.0 or np.count_nonzero(self.own) > MIN_OWN_SHARE * len(self.own):
+        radius_change_m = MEAN_RADIUS_M - first.radius_m
+        if radius_change_m <= 0.0 or np.count_nonzero(self.own) > MIN_OWN_SHARE * len(self.own):
             return first
         steps = np.zeros((3, 8))
-        steps[1:, 6], steps[1:, 0] = more, (-more, more)
+        steps[1:, 6], steps[1:, 0] = radius_change_m, (-radius_change_m, radius_change_m)
         bodies = CylinderBatch.around(first, steps)
         raw = self.residuals(bodies, self.gradient(first))
         return bodies.one(int(np.argmin([self.cost(r, WIDE_SCALE_FACTOR) for r in raw])))
 
     def gradient(self, body: Cylinder) -> np.ndarray:
-        """Change of ``outline_distance`` per pixel (N,) [m/px]."""
-        one, p, rays = CylinderBatch.of(body), self.pixel, self.rays[: len(self.own)]
+        """Compute the change of ``outline_distance`` per pixel (N,) [m/px]."""
+        batch, p, rays = CylinderBatch.of(body), self.pixel, self.rays[: len(self.own)]
         shifts = np.array([(p, 0.0, 0.0), (0.0, p, 0.0), (-p, 0.0, 0.0), (0.0, -p, 0.0)])
-        g = outline_distance(one, (rays + shifts[:, None]).reshape(-1, 3))[0].reshape(4, -1)
+        g = outline_distance(batch, (rays + shifts[:, None]).reshape(-1, 3))[0].reshape(4, -1)
         return np.asarray(np.maximum(0.5 * np.hypot(g[0] - g[2], g[1] - g[3]), 1e-4))
 
     def residuals(self, bodies: CylinderBatch, metres_px: np.ndarray) -> np.ndarray:
-        """Residuals (K, N) of K cylinders in standard deviations: outline, depth, two ends, radius, taper."""
+        """Compute residuals (K, N) of K cylinders in standard deviations: outline, depth, two ends, radius, taper."""
         edge, deep_m = distance_and_depth(bodies, self.rays, len(self.own))
         edge /= metres_px
         edge = np.where(self.own, edge, np.maximum(edge, 0.0)) / OUTLINE_SIGMA_PX
@@ -254,13 +254,13 @@ class _Problem:
     def linearised(
         self, raw: np.ndarray, scale_factor: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Residuals (N,), their derivatives (N, 8), weights (N,) and cost, from residuals (9, N) around a cylinder."""
+        """Compute residuals (N,), derivatives (N, 8), weights (N,), cost from residuals (9, N) around a cylinder."""
         cauchy_scale = self._cauchy_scale(raw[0], scale_factor)
         far = (raw[0] / cauchy_scale) ** 2
         return raw[0], (raw[1:] - raw[0]).T / DERIVATIVE_STEP, self.weight / (1.0 + far), self._loss(cauchy_scale, far)
 
     def cost(self, residuals: np.ndarray, scale_factor: float = 1.0) -> float:
-        """The Cauchy loss; ``linearised`` returns its weights."""
+        """Compute the Cauchy loss; ``linearised`` returns its weights."""
         cauchy_scale = self._cauchy_scale(residuals, scale_factor)
         return self._loss(cauchy_scale, (residuals / cauchy_scale) ** 2)
 
@@ -268,26 +268,27 @@ class _Problem:
         return float((self.weight * cauchy_scale * cauchy_scale) @ np.log1p(far))
 
     def _cauchy_scale(self, residuals: np.ndarray, scale_factor: float) -> np.ndarray:
-        """Scale (N,) of the Cauchy loss: smaller for depth that is too near, because grass is."""
+        """Compute the scale (N,) of the Cauchy loss: smaller for depth that is too near, because grass is."""
         is_outline = self.cauchy_scale == OUTLINE_CAUCHY_SCALE
         wide = np.where(is_outline, scale_factor * OUTLINE_CAUCHY_SCALE, self.cauchy_scale)
         near = (self.cauchy_scale == DEPTH_CAUCHY_SCALE) & (residuals > 0.0)
         return np.asarray(np.where(near, NEAR_CAUCHY_SCALE, wide))
 
     def fit_of(self, body: Cylinder) -> CylinderFit | None:
-        """The fit with its covariance; None when the data do not determine it."""
+        """Compute the fit with its covariance; None when the data do not determine it."""
         ends = self._ends(body)
-        found = self._arch_fit(body, all(ends))
-        if found is None:
+        arch_fit = self._arch_fit(body, all(ends))
+        if arch_fit is None:
             return None
-        body, edge, covariance = found
+        body, edge, covariance = arch_fit
         own = edge[self.own] * OUTLINE_SIGMA_PX
         misfit = float(np.sqrt(np.mean(np.minimum(own * own, 25.0))))
         covariance *= max(1.0, (misfit / OUTLINE_SIGMA_PX) ** 2)
         systematic = self._systematic_sigmas(body)
         covariance[:7, :7] += np.diag(systematic**2)
-        for row, seen in zip((START, END), ends, strict=True):
-            covariance[row, row] += 0.0 if seen else END_SIGMA_M**2  # a few points of the sides say nothing of an end
+        for row, end_seen in zip((START, END), ends, strict=True):
+            # A few points of the sides say nothing of an end.
+            covariance[row, row] += 0.0 if end_seen else END_SIGMA_M**2
         move = 0.5 * (body.start_m + body.end_m)
         shift = np.eye(7, 8)
         shift[0, 2] = shift[1, 3] = shift[6, 7] = move
@@ -296,7 +297,7 @@ class _Problem:
         )
 
     def _arch_fit(self, body: Cylinder, whole: bool) -> tuple[Cylinder, np.ndarray, np.ndarray] | None:
-        """The fit of a bowed log: its straight cylinder, residuals of the contour and covariance (8, 8).
+        """Fit a bowed log: its straight cylinder, residuals of the contour and covariance (8, 8).
 
         A log that is not seen whole is kept straight.  None when the data do not determine the fit.
         """
@@ -316,13 +317,13 @@ class _Problem:
                     return None
         except np.linalg.LinAlgError:
             return None
-        left = self.residuals(CylinderBatch.of(body), metres_px)[0] + jacobian[:, 8:] @ bow
-        return body, left[: len(self.own)], covariance[:8, :8]
+        final_residuals = self.residuals(CylinderBatch.of(body), metres_px)[0] + jacobian[:, 8:] @ bow
+        return body, final_residuals[: len(self.own)], covariance[:8, :8]
 
     def _arch_system(
         self, body: Cylinder, bow: np.ndarray, metres_px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals (N,), derivatives (N, 10) and weights (N,) of a cylinder whose axis is an arch.
+        """Compute residuals (N,), derivatives (N, 10) and weights (N,) of a cylinder whose axis is an arch.
 
         ``bow`` (2,) [m] is the rise of the arch across the view and along it.  Locally, the arch is the straight
         cylinder shifted.
@@ -339,7 +340,7 @@ class _Problem:
         return raw[0], jacobian, weights
 
     def _systematic_sigmas(self, body: Cylinder) -> np.ndarray:
-        """Standard deviations (7,) of systematic errors.
+        """Compute standard deviations (7,) of systematic errors.
 
         Causes: bark and bow, a share of a pixel of the outline, grass in front of the log, which makes depth nearer,
         and foreground fattening: of objects in front, and of the nearer parts of a log that is seen along its axis.
@@ -355,12 +356,12 @@ class _Problem:
         return np.asarray(np.hypot(MODEL_SIGMA, (side, deep, side * tilt, tilt_deep, end, end, side)))
 
     def _ends(self, body: Cylinder) -> tuple[bool, bool]:
-        """Whether each end is visible: at least half of the contour points at it are the log's own."""
-        three = CylinderBatch.around(body, _LONGER_STEPS)
-        here, start, end = outline_distance(three, self.rays[: len(self.own)])
+        """Tell whether each end is visible: at least half of the contour points at it are the log's own."""
+        bodies = CylinderBatch.around(body, _LONGER_STEPS)
+        distance_m, start, end = outline_distance(bodies, self.rays[: len(self.own)])
         slack = 0.3 * self.pixel * float(body.center_m[2])
-        seen = []
+        ends_seen = []
         for moved in (start, end):
-            at = here - moved > slack  # contour points that a longer log would not have
-            seen.append(bool(np.count_nonzero(at & self.own) >= max(3, 0.5 * np.count_nonzero(at))))
-        return seen[0], seen[1]
+            at = distance_m - moved > slack  # contour points that a longer log would not have
+            ends_seen.append(bool(np.count_nonzero(at & self.own) >= max(3, 0.5 * np.count_nonzero(at))))
+        return ends_seen[0], ends_seen[1]

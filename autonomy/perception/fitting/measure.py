@@ -42,7 +42,7 @@ class Implausibility:
 
 
 def implausibility(fit: CylinderFit) -> Implausibility | None:
-    """Why a fit is not a log; None when it is plausible."""
+    """Tell why a fit is not a log; None when it is plausible."""
     body = fit.body
     if 2.0 * body.radius_m >= body.length_m:
         return Implausibility("too-wide", f"{2 * body.radius_m:.2f} m wide and {body.length_m:.2f} m long: not a log")
@@ -58,29 +58,29 @@ def implausibility(fit: CylinderFit) -> Implausibility | None:
 
 
 def same_log(a: CylinderFit, b: CylinderFit) -> bool:
-    """Whether two fits are fragments of one log whose middle is hidden."""
-    first, second = a.body, b.body
-    between = second.center_m - first.center_m
-    way = between / max(1e-9, float(np.linalg.norm(between)))
+    """Tell whether two fits are fragments of one log whose middle is hidden."""
+    body_a, body_b = a.body, b.body
+    between = body_b.center_m - body_a.center_m
+    direction = between / max(1e-9, float(np.linalg.norm(between)))
     tilt = MAX_ANGLE_RAD + 2.0 * math.sqrt(max(np.diag(a.covariance)[2:4].max(), 0.0))
     tilt_b = MAX_ANGLE_RAD + 2.0 * math.sqrt(max(np.diag(b.covariance)[2:4].max(), 0.0))
     # The shorter a fragment, the less certain its own axis: the line between the middles must lie along both.
-    if _angle(first.axis, way) > tilt or _angle(second.axis, way) > tilt_b:
+    if _angle(body_a.axis, direction) > tilt or _angle(body_b.axis, direction) > tilt_b:
         return False
-    wide, narrow = max(first.radius_m, second.radius_m), min(first.radius_m, second.radius_m)
+    wide, narrow = max(body_a.radius_m, body_b.radius_m), min(body_a.radius_m, body_b.radius_m)
     if wide - narrow > MAX_RADIUS_DIFFERENCE * wide:
         return False
-    gap = float(np.linalg.norm(between)) - 0.5 * (first.length_m + second.length_m)
-    facing_a = a.ends_seen[1] if first.axis @ way > 0.0 else a.ends_seen[0]
-    facing_b = b.ends_seen[0] if second.axis @ way > 0.0 else b.ends_seen[1]
+    gap = float(np.linalg.norm(between)) - 0.5 * (body_a.length_m + body_b.length_m)
+    facing_a = a.ends_seen[1] if body_a.axis @ direction > 0.0 else a.ends_seen[0]
+    facing_b = b.ends_seen[0] if body_b.axis @ direction > 0.0 else b.ends_seen[1]
     return gap < MAX_GAP_M and not facing_a and not facing_b
 
 
 def joined_cylinder(a: Cylinder, b: Cylinder) -> Cylinder:
-    """The initial cylinder of a log with two fragments: from the far end of one to the far end of the other."""
-    way = b.center_m - a.center_m
+    """Make the initial cylinder of a log with two fragments: from the far end of one to the far end of the other."""
+    direction = b.center_m - a.center_m
     ends = np.concatenate([_ends(a), _ends(b)])
-    along = ends @ way
+    along = ends @ direction
     start, end = ends[np.argmin(along)], ends[np.argmax(along)]
     length = float(np.linalg.norm(end - start))
     radius = (a.radius_m * a.length_m + b.radius_m * b.length_m) / (a.length_m + b.length_m)
@@ -88,7 +88,7 @@ def joined_cylinder(a: Cylinder, b: Cylinder) -> Cylinder:
 
 
 def fragment_groups(fits: Mapping[int, CylinderFit]) -> list[list[int]]:
-    """The numbers of the fits, in groups of one log each; the numbers ascend."""
+    """List the numbers of the fits, in groups of one log each; the numbers ascend."""
     owner = {i: i for i in fits}
     for i in owner:
         for j in owner:
@@ -120,7 +120,7 @@ _EPSILON: Final = 1e-12
 def initial_cylinder(
     mask: np.ndarray, depth_m: np.ndarray, pin: Intrinsics, slack_1_m: float, seed: int = 0
 ) -> Cylinder | None:
-    """A cylinder from a mask (H, W) bool and depth (H, W) [m]; None when too little depth is known.
+    """Estimate a cylinder from a mask (H, W) bool and depth (H, W) [m]; None when too little depth is known.
 
     The axis in the picture is the mask's principal axis.  A line through inverse depth along it is found by RANSAC over
     ``RANSAC_PAIRS`` pairs with inliers within ``slack_1_m`` [1/m].  The radius is half the mask's width.
@@ -131,8 +131,8 @@ def initial_cylinder(
     middle = np.array([u.mean(), v.mean()])
     du, dv = u - middle[0], v - middle[1]
     values, vectors = np.linalg.eigh(np.array([[du @ du, du @ dv], [du @ dv, dv @ dv]]) / len(u))
-    way = vectors[:, 1]
-    along, inverse = du * way[0] + dv * way[1], 1.0 / depth_m[v, u]
+    direction = vectors[:, 1]
+    along, inverse = du * direction[0] + dv * direction[1], 1.0 / depth_m[v, u]
     known = np.isfinite(inverse)
     if np.count_nonzero(known) < MIN_PIXELS:
         return None
@@ -142,7 +142,7 @@ def initial_cylinder(
     far = 0.02 * max(a, 0.02)
 
     def axis_point(t: float) -> np.ndarray:
-        return pin.deproject(middle[0] + t * way[0], middle[1] + t * way[1], 1.0 / max(a + b * t, far))
+        return pin.deproject(middle[0] + t * direction[0], middle[1] + t * direction[1], 1.0 / max(a + b * t, far))
 
     span = axis_point(high) - axis_point(low)
     mid = axis_point(0.5 * (low + high))
@@ -162,7 +162,7 @@ def initial_cylinder(
 
 
 def ransac_line(x: np.ndarray, y: np.ndarray, slack: float, seed: int) -> tuple[float, float]:
-    """Intercept a and slope b of y = a + b x through most of the points: RANSAC, then least squares over inliers."""
+    """Find a (intercept) and b (slope) of y = a + b x through most points: RANSAC, then least squares over inliers."""
     rng = np.random.default_rng(seed)
     i, j = rng.integers(0, len(x), (2, RANSAC_PAIRS))
     apart = x[j] - x[i]
@@ -206,7 +206,7 @@ class Rejection:
 def measure(
     frame: RgbdFrame, masks: Sequence[np.ndarray], sensor: StereoSensor
 ) -> tuple[list[CylinderFit], list[Rejection]]:
-    """Fits of all masks, with fragments of one log merged, and the rejected masks.
+    """Fit all masks, with fragments of one log merged, and list the rejected masks.
 
     Raises:
         InputRefused: a mask is not bool or not of the frame's size.
@@ -244,7 +244,7 @@ def measure(
 
 
 def _largest_part(mask: np.ndarray) -> np.ndarray:
-    """The largest connected part of a mask (H, W)."""
+    """Find the largest connected part of a mask (H, W)."""
     parts, count = label(mask)
     return mask if count < 2 else np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
 
@@ -296,12 +296,12 @@ class _MaskedFrame:
         )
 
     def initial(self, i: int) -> Cylinder | None:
-        """The initial cylinder of mask ``i``."""
+        """Estimate the initial cylinder of mask ``i``."""
         mask, depth_m, _, pin, _ = self._part([i])
         return initial_cylinder(mask, depth_m, pin, 3.0 * self.sensor.sigma_d_px / self.sensor.fb_px_m)
 
     def contour(self, group: list[int], first: Cylinder, known: dict[int, Cylinder]) -> Contour:
-        """The contour of one or several masks as one log, classified with the initial cylinders ``known``."""
+        """Find the contour of one or several masks as one log, classified with the initial cylinders ``known``."""
         mask, depth_m, labels, pin, (left, top) = self._part(group)
         content = self.window
         window = (content[0] - left, content[1] - top, content[2] - left, content[3] - top)
@@ -311,13 +311,13 @@ class _MaskedFrame:
     def fit(
         self, group: list[int], first: Cylinder, contour: Contour, fits: dict[int, CylinderFit]
     ) -> CylinderFit | None:
-        """The fit of one or several masks as one log; ``fits`` are those of all masks so far."""
+        """Fit one or several masks as one log; ``fits`` are those of all masks so far."""
         mask, depth_m, _, pin, _ = self._part(group)
         fitted = {i + 1: fits[i].body for i in sorted(fits) if i not in group}
         return fit_cylinder(mask, depth_m, pin, first, contour.without(fitted, pin), self.sensor)
 
     def _part(self, group: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, Intrinsics, tuple[int, int]]:
-        """Mask, depth, numbers of all masks, pinhole and top left corner of a group's part of the picture."""
+        """Return mask, depth, numbers of all masks, pinhole and top left corner of a group's part of the picture."""
         left, top, right, bottom = self._crop(group)
         labels, depth_m = self.labels[top:bottom, left:right], self.frame.depth_m[top:bottom, left:right]
         pin = self.frame.intrinsics.crop(left, top, right - left, bottom - top)

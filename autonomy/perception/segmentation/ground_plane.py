@@ -21,7 +21,7 @@ BELOW_PENALTY: Final = 1.0  # for a point clearly below the plane, so that the g
 
 
 def height_over_plane(depth_m: np.ndarray, pinhole: Intrinsics) -> np.ndarray:
-    """Height (H, W) float32 [m] over the dominant plane, positive towards the camera; NaN where depth is unknown."""
+    """Compute height (H, W) float32 [m] over the dominant plane, positive towards the camera; NaN without depth."""
     h, w = depth_m.shape
     u = ((np.arange(w) - pinhole.cx_px) / pinhole.fx_px).astype(np.float32)
     v = ((np.arange(h) - pinhole.cy_px) / pinhole.fy_px).astype(np.float32)
@@ -33,7 +33,7 @@ def height_over_plane(depth_m: np.ndarray, pinhole: Intrinsics) -> np.ndarray:
 
 
 def dominant_plane(depth_m: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Normal (3,) of the plane n x = 1 [1/m]; ``u`` (W,), ``v`` (H,) are the rays at z = 1.
+    """Estimate the normal (3,) of the plane n x = 1 [1/m]; ``u`` (W,), ``v`` (H,) are the rays at z = 1.
 
     Deterministic.  With too little depth it is the plane across the view at the median depth (1 m when there is none).
     """

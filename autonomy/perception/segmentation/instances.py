@@ -43,7 +43,7 @@ class Instance:
 def decode_instances(
     maps: np.ndarray, scale: int, depth_m: np.ndarray, scorers: SegmentScorers
 ) -> tuple[Instance, ...]:
-    """The logs of maps (8, h, w) in descending order of score.
+    """Decode the logs of maps (8, h, w) in descending order of score.
 
     A pixel of the maps is ``scale`` pixels wide in the picture, whose depth is ``depth_m`` (H, W).
     """
@@ -60,16 +60,16 @@ def decode_instances(
     nearest = ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
     labels = labels[tuple(nearest)]
     ends = sigmoid(maps[ENDS])
-    found = []
+    instances = []
     for number, log in enumerate(logs, 1):
         instance = instance_at(log, number, x, y, labels, probability, ends, scale, (shape[0], shape[1]))
         if instance is not None:
-            found.append(instance)
-    return tuple(sorted(found, key=lambda i: -i.score))
+            instances.append(instance)
+    return tuple(sorted(instances, key=lambda i: -i.score))
 
 
 def foreground_of(maps: np.ndarray, scale: int, depth_m: np.ndarray) -> Foreground:
-    """The foreground of maps (8, h, w), with depth from the middle of each of their pixels in the picture (H, W)."""
+    """Return the foreground of maps (8, h, w), with depth from the middle of each map pixel in the picture (H, W)."""
     probability = sigmoid(maps[MASK])
     inverse = np.full(probability.shape, np.nan, np.float32)
     middle = depth_m[scale // 2 :: scale, scale // 2 :: scale][: probability.shape[0], : probability.shape[1]]
@@ -89,7 +89,7 @@ def instance_at(
     scale: int,
     shape: tuple[int, int],
 ) -> Instance | None:
-    """The log at the resolution of the picture, ``scale`` pixels for each of a map's; None when it has no pixel."""
+    """Return the log at the picture's resolution, ``scale`` pixels for each of a map's; None when it has no pixel."""
     px, py = x[log.members], y[log.members]
     x0, x1 = max(0, int(px.min()) - 2), min(probability.shape[1], int(px.max()) + 3)
     y0, y1 = max(0, int(py.min()) - 2), min(probability.shape[0], int(py.max()) + 3)
@@ -108,19 +108,24 @@ def instance_at(
     along, side = u * axis[0] + v * axis[1], float(np.median(u * across[0] + v * across[1]))
     low, high = np.percentile(along, (0.5, 99.5))
     half_width = float(np.percentile(np.abs(u * across[0] + v * across[1] - side), 90))
-    points, seen = [], []
+    points, ends_seen = [], []
     for position in (low, high):
         point, visible = _end(position * axis + side * across, ends, scale, max(2.0 * scale, 1.2 * half_width))
         points.append(point)
-        seen.append(visible)
+        ends_seen.append(visible)
     box = (int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1)
     return Instance(
-        mask, box, log.score, math.atan2(float(axis[1]), float(axis[0])), (points[0], points[1]), (seen[0], seen[1])
+        mask,
+        box,
+        log.score,
+        math.atan2(float(axis[1]), float(axis[0])),
+        (points[0], points[1]),
+        (ends_seen[0], ends_seen[1]),
     )
 
 
 def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tuple[tuple[float, float], bool]:
-    """The end near ``point`` in the map of ends and True, or ``point`` and False when there is none."""
+    """Return the end near ``point`` in the map of ends and True, or ``point`` and False when there is none."""
     at, reach = (point + 0.5) / scale - 0.5, reach_px / scale
     x0, y0 = (max(0, math.floor(c - reach)) for c in at)
     patch = ends[y0 : math.ceil(at[1] + reach) + 1, x0 : math.ceil(at[0] + reach) + 1]
@@ -137,7 +142,7 @@ def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tu
 
 
 def shifted_instance(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
-    """An instance of a window with its corner at (left, top), in the whole picture of ``shape`` (H, W)."""
+    """Move an instance of a window with its corner at (left, top) into the whole picture of ``shape`` (H, W)."""
     mask = np.zeros(shape, bool)
     mask[top : top + found.mask.shape[0], left : left + found.mask.shape[1]] = found.mask
     x0, y0, x1, y1 = found.box_px

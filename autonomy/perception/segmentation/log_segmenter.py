@@ -85,7 +85,7 @@ class LogSegmenter:
         self._nets: dict[tuple[int, int], OpenVinoNet] = {}
 
     def segment(self, frame: RgbdFrame) -> tuple[Instance, ...]:
-        """The logs of a frame in descending order of score; empty when there is none.
+        """Find the logs of a frame in descending order of score; empty when there is none.
 
         Raises:
             InputRefused: the frame is invalid.
@@ -94,7 +94,7 @@ class LogSegmenter:
         return self.segment_picture(frame.rgb, frame.depth_m, frame.intrinsics)
 
     def segment_picture(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:
-        """As ``segment``; depth may be unknown everywhere (a photograph)."""
+        """Segment as ``segment`` does; depth may be unknown everywhere (a photograph)."""
         window = content_window(rgb)
         view = crop((rgb, depth_m, pinhole), window)
         factor, known = self._finest_factor(view), None
@@ -104,9 +104,9 @@ class LogSegmenter:
             inner, finer = self._finer_window(sigmoid(known[1][MASK]), coarse * STRIDE, view[1].shape, factor)
             if finer < factor:
                 corner = (window[0] + inner[0], window[2] + inner[2])
-                found = self._segment_view(crop(view, inner), finer, None, corner, depth_m)
-                if found and found[0].score > MIN_BEST_SCORE:
-                    return found
+                instances = self._segment_view(crop(view, inner), finer, None, corner, depth_m)
+                if instances and instances[0].score > MIN_BEST_SCORE:
+                    return instances
         # The coarse view misses thin logs: something else selected the window.
         return self._segment_view(view, factor, known, (window[0], window[2]), depth_m)
 
@@ -118,12 +118,12 @@ class LogSegmenter:
         corner: tuple[int, int],
         whole: np.ndarray,
     ) -> tuple[Instance, ...]:
-        """The logs of a part of a picture with its corner (row, column) in the ``whole`` (H, W)."""
+        """Find the logs of a part of a picture with its corner (row, column) in the ``whole`` (H, W)."""
         maps, scale = self.multi_scale_maps(*view, factor, known)
-        found = decode_instances(maps, scale, view[1], self._scorers)
+        instances = decode_instances(maps, scale, view[1], self._scorers)
         if view[1].shape == whole.shape:
-            return found
-        return tuple(shifted_instance(i, corner[1], corner[0], (whole.shape[0], whole.shape[1])) for i in found)
+            return instances
+        return tuple(shifted_instance(i, corner[1], corner[0], (whole.shape[0], whole.shape[1])) for i in instances)
 
     def multi_scale_maps(
         self,
@@ -133,7 +133,7 @@ class LogSegmenter:
         factor: float | None = None,
         known: tuple[int, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Fused maps (8, h, w) of a picture at one or more scales, and the width of their pixels in the picture [px].
+        """Fuse maps (8, h, w) of a picture at one or more scales; return also their pixels' width in the picture [px].
 
         ``factor``: by what the picture is shrunk at the finest scale (0.5: doubled); ``known``: a factor whose maps
         were computed before.
@@ -154,14 +154,14 @@ class LogSegmenter:
         return maps, round(finest * STRIDE)
 
     def _finest_factor(self, view: View) -> float:
-        """By what a whole picture is shrunk at its finest scale."""
+        """Compute by what a whole picture is shrunk at its finest scale."""
         longest = max(view[1].shape)
         return 0.5 if self.size_px >= COARSE_VIEW_RATIO * longest else max(1, round(longest / self.size_px))
 
     def _finer_window(
         self, wood: np.ndarray, scale: int, shape: tuple[int, ...], factor: float
     ) -> tuple[Window, float]:
-        """The window of a picture (H, W) that holds all wood at the finest possible scale, and its shrink factor.
+        """Find the window of a picture (H, W) that holds all wood at the finest possible scale, and its shrink factor.
 
         ``wood`` (h, w) is the probability of wood, in pixels that are ``scale`` pixels of the picture wide.
         """
@@ -170,12 +170,12 @@ class LogSegmenter:
         while len(rows) and at > MIN_FACTOR:
             at *= 0.5
             sizes = ((round(at * h), round(at * w)) for h, w in WINDOWS)
-            found = (window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
-            window, factor = next(((w, at) for w in found if w is not None), (window, factor))
+            windows = (window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
+            window, factor = next(((w, at) for w in windows if w is not None), (window, factor))
         return window, factor
 
     def maps(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> np.ndarray:
-        """Maps (8, h / 2, w / 2) of a picture of the network's size, which is padded to a multiple of MULTIPLE."""
+        """Compute maps (8, h / 2, w / 2) of a picture of the network's size, padded to a multiple of MULTIPLE."""
         image = network_input(rgb, depth_m, pinhole, self.variant)
         h, w = image.shape[1:]
         high, wide = -(-h // MULTIPLE) * MULTIPLE, -(-w // MULTIPLE) * MULTIPLE
@@ -193,36 +193,36 @@ def _shipped() -> LogSegmenter:
 
 
 def segment(frame: RgbdFrame) -> tuple[Instance, ...]:
-    """The logs of a frame by the shipped RGB-D weights; see ``LogSegmenter.segment``."""
+    """Find the logs of a frame by the shipped RGB-D weights; see ``LogSegmenter.segment``."""
     return _shipped().segment(frame)
 
 
 def window_around(
     rows: np.ndarray, columns: np.ndarray, scale: int, margin: int, size: tuple[int, int], shape: tuple[int, ...]
 ) -> Window | None:
-    """The window of ``size`` around these rows and columns, each ``scale`` pixels wide, clipped to the picture (H, W).
+    """Find the window of ``size`` around rows and columns, each ``scale`` pixels wide, clipped to the picture (H, W).
 
     None when it does not hold them with ``margin`` around them.
     """
     window: list[int] = []
     for at, long, whole in zip((rows, columns), size, shape, strict=True):
-        first, last = int(at[0]), int(at[-1]) + scale
-        if last - first + 2 * margin > long < whole:
+        start, stop = int(at[0]), int(at[-1]) + scale
+        if stop - start + 2 * margin > long < whole:
             return None
-        begin = min(max((first + last - long) // 2, 0), max(whole - long, 0))
+        begin = min(max((start + stop - long) // 2, 0), max(whole - long, 0))
         window += [begin, min(begin + long, whole)]
     return window[0], window[1], window[2], window[3]
 
 
 def crop(view: View, window: Window) -> View:
-    """A window of colour, depth and pinhole."""
+    """Cut a window out of colour, depth and pinhole."""
     (rgb, depth_m, pinhole), (top, bottom, left, right) = view, window
     at = slice(top, bottom), slice(left, right)
     return rgb[at], depth_m[at], pinhole.crop(left, top, right - left, bottom - top)
 
 
 def fuse_scales(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-    """Fused maps (8, h, w) of a picture and of the same picture at half the size.
+    """Fuse maps (8, h, w) of a picture and of the same picture at half the size.
 
     Votes come from the coarse maps, which show logs as wholes; ends from the fine maps; masks, angles and edges from
     both.  Structures too thin for the coarse maps come from the fine maps alone.
@@ -247,7 +247,7 @@ def fuse_scales(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def _opened(wood: np.ndarray, size: int) -> np.ndarray:
-    """The morphological opening of ``wood`` (h, w) bool with a square of ``size`` (odd) pixels."""
+    """Compute the morphological opening of ``wood`` (h, w) bool with a square of ``size`` (odd) pixels."""
     for grow in (False, True):
         for axis in (0, 1):
             lines = wood if axis == 0 else wood.T

@@ -37,7 +37,7 @@ MASKS: Final = Interface("logs", CHANNELS, {"maps": len(MAPS) + FEATURES, "kerne
 
 
 def mask_input(rgb: np.ndarray | None, depth_m: np.ndarray, pinhole: Intrinsics, height_m: np.ndarray) -> np.ndarray:
-    """Input (6, H, W) float32 of a picture; ``rgb`` (H, W, 3) uint8, None without colour; depth NaN where unknown."""
+    """Make a picture's input (6, H, W) float32; ``rgb`` (H, W, 3) uint8, None without colour; depth NaN if unknown."""
     known = np.isfinite(height_m)
     image = np.zeros((CHANNELS, *height_m.shape), np.float32)
     if rgb is not None:

@@ -67,7 +67,7 @@ class KernelLogs:
 
 
 def kernel_logs(maps: np.ndarray, kernels: np.ndarray) -> KernelLogs:
-    """The logs of ``maps`` (8 + FEATURES, h, w) and ``kernels`` (1 + KERNEL, k, l), the surest first."""
+    """Find the logs of ``maps`` (8 + FEATURES, h, w) and ``kernels`` (1 + KERNEL, k, l), the surest first."""
     wood = maps[MASK] > np.log(MIN_WOOD / (1.0 - MIN_WOOD))
     y, x = np.nonzero(wood)
     heat = sigmoid(kernels[0])
@@ -83,23 +83,23 @@ def kernel_logs(maps: np.ndarray, kernels: np.ndarray) -> KernelLogs:
     score = heat[rows, columns] * certainty
     dense = inside.astype(np.float32)
     shared = dense @ dense.T
-    kept: list[int] = []
+    selected_indices: list[int] = []
     for i in np.argsort(-score, kind="stable"):
         if size[i] < MIN_LOG_PX:
             continue
-        overlap = [shared[i, j] / (size[i] + size[j] - shared[i, j]) for j in kept]
-        within = [shared[i, j] / min(size[i], size[j]) for j in kept]
-        if not kept or (max(overlap) < MAX_OVERLAP and max(within) < MAX_INSIDE):
-            kept.append(int(i))
-    if not kept:
+        overlap = [shared[i, j] / (size[i] + size[j] - shared[i, j]) for j in selected_indices]
+        within = [shared[i, j] / min(size[i], size[j]) for j in selected_indices]
+        if not selected_indices or (max(overlap) < MAX_OVERLAP and max(within) < MAX_INSIDE):
+            selected_indices.append(int(i))
+    if not selected_indices:
         return KernelLogs(y, x, ())
-    own = logits[kept]
+    own = logits[selected_indices]
     claims = _shared_out(own, _segment_numbers(maps, x, y))
-    found = []
-    for k, i in enumerate(kept):
+    logs = []
+    for k, i in enumerate(selected_indices):
         members = np.flatnonzero(claims == k)
         if len(members) >= max(MIN_LOG_PX, MIN_OWN_SHARE * size[i]):
-            found.append(
+            logs.append(
                 KernelLog(
                     members,
                     own[k, members],
@@ -108,18 +108,18 @@ def kernel_logs(maps: np.ndarray, kernels: np.ndarray) -> KernelLogs:
                     len(members) / float(size[i]),
                 )
             )
-    return KernelLogs(y, x, tuple(found))
+    return KernelLogs(y, x, tuple(logs))
 
 
 def _segment_numbers(maps: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The watershed's segment of every pixel of the wood (N,), 0 for none."""
+    """Return the watershed's segment of every pixel of the wood (N,), 0 for none."""
     wood = np.zeros(maps.shape[1:], bool)
     wood[y, x] = True
     return np.asarray(watershed(boundary_map(maps[: len(MAPS)]), wood)[y, x])
 
 
 def _shared_out(logits: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """The kernel (N,) that each pixel belongs to, -1 none: a segment that is mostly one kernel's is wholly its.
+    """Find the kernel (N,) that each pixel belongs to, -1 none: a segment that is mostly one kernel's is wholly its.
 
     Kernels know which parts are one log; the watershed of the edges knows where it ends.
     """
@@ -140,11 +140,11 @@ def _shared_out(logits: np.ndarray, segment: np.ndarray) -> np.ndarray:
 def _logits(
     features: np.ndarray, x: np.ndarray, y: np.ndarray, kernels: np.ndarray, rows: np.ndarray, columns: np.ndarray
 ) -> np.ndarray:
-    """Logits (K, N) of kernels (KERNEL, K) at cells for pixels (N,) with features (FEATURES, N)."""
+    """Compute logits (K, N) of kernels (KERNEL, K) at cells for pixels (N,) with features (FEATURES, N)."""
     middle, half = KERNEL_STRIDE / 2.0 - 0.5, 0.5 * (STRIDE - 1)
     u, v = ((STRIDE * at + half) / PLACE_PX for at in (x, y))
     u0, v0 = ((KERNEL_STRIDE * at + middle) / PLACE_PX for at in (columns, rows))
-    a, b, c, d, e, one = kernels[FEATURES:]
+    a, b, c, d, e, constant = kernels[FEATURES:]
     # The polynomial about the kernel's place, written about the origin: one product for all pixels.
     about = np.stack(
         [
@@ -153,7 +153,7 @@ def _logits(
             c,
             d,
             e,
-            one - a * u0 - b * v0 + c * u0 * u0 + d * u0 * v0 + e * v0 * v0,
+            constant - a * u0 - b * v0 + c * u0 * u0 + d * u0 * v0 + e * v0 * v0,
         ]
     )
     places = np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)]).astype(np.float32)
@@ -209,7 +209,7 @@ class MaskSegmenter:
         self._nets: dict[tuple[int, int], OpenVinoNet] = {}
 
     def segment(self, frame: RgbdFrame) -> tuple[Instance, ...]:
-        """The logs of a frame in descending order of score; empty when there is none.
+        """Find the logs of a frame in descending order of score; empty when there is none.
 
         Raises:
             InputRefused: the frame is invalid.
@@ -218,7 +218,7 @@ class MaskSegmenter:
         return self.segment_picture(frame.rgb, frame.depth_m, frame.intrinsics)
 
     def segment_picture(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:
-        """As ``segment``; depth may be unknown everywhere (a photograph)."""
+        """Segment as ``segment`` does; depth may be unknown everywhere (a photograph)."""
         if self.mode == "colour":
             depth_m = np.full_like(depth_m, np.nan)
         outer = content_window(rgb)
@@ -232,21 +232,21 @@ class MaskSegmenter:
             inner, finer = finer_window(sigmoid(maps[MASK]), coarse * STRIDE, view[1].shape, factor)
             if finer < factor:
                 top, left = inner[0], inner[2]
-                found = self._logs(crop(view, inner), finer, (corner[0] + top, corner[1] + left), depth_m)
-                if found and found[0].score > MIN_BEST_SCORE:
-                    return found
+                instances = self._logs(crop(view, inner), finer, (corner[0] + top, corner[1] + left), depth_m)
+                if instances and instances[0].score > MIN_BEST_SCORE:
+                    return instances
         return self._logs(view, factor, corner, depth_m)
 
     def _logs(self, view: View, factor: float, corner: tuple[int, int], whole: np.ndarray) -> tuple[Instance, ...]:
-        """The logs of a part of a picture with its corner (row, column) in the ``whole`` (H, W)."""
+        """Find the logs of a part of a picture with its corner (row, column) in the ``whole`` (H, W)."""
         maps, kernels = self.answers(*(doubled(*view) if factor < 1.0 else shrunk(*view, round(factor))))
-        found = decoded(maps, kernels, round(factor * STRIDE), view[1])
+        instances = decoded(maps, kernels, round(factor * STRIDE), view[1])
         if view[1].shape == whole.shape:
-            return found
-        return tuple(shifted_instance(i, corner[1], corner[0], (whole.shape[0], whole.shape[1])) for i in found)
+            return instances
+        return tuple(shifted_instance(i, corner[1], corner[0], (whole.shape[0], whole.shape[1])) for i in instances)
 
     def answers(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-        """Maps and kernels of a picture of the network's size, which is padded to a multiple of MULTIPLE."""
+        """Compute maps and kernels of a picture of the network's size, which is padded to a multiple of MULTIPLE."""
         image = mask_input(None if self.mode == "depth" else rgb, depth_m, pinhole, height_over_plane(depth_m, pinhole))
         h, w = image.shape[1:]
         high, wide = -(-h // MULTIPLE) * MULTIPLE, -(-w // MULTIPLE) * MULTIPLE
@@ -264,14 +264,14 @@ def _shipped() -> MaskSegmenter:
 
 
 def segment(frame: RgbdFrame) -> tuple[Instance, ...]:
-    """The logs of a frame by the shipped weights; see ``MaskSegmenter.segment``."""
+    """Find the logs of a frame by the shipped weights; see ``MaskSegmenter.segment``."""
     return _shipped().segment(frame)
 
 
 def finer_window(
     wood: np.ndarray, scale: int, shape: tuple[int, ...], factor: float
 ) -> tuple[tuple[int, int, int, int], float]:
-    """The window of a picture (H, W) that holds all wood at the finest possible scale, and its shrink factor.
+    """Find the window of a picture (H, W) that holds all wood at the finest possible scale, and its shrink factor.
 
     ``wood`` (h, w) is the probability of wood, in pixels that are ``scale`` pixels of the picture wide.
     """
@@ -280,38 +280,40 @@ def finer_window(
     while len(rows) and at > MIN_FACTOR:
         at *= 0.5
         sizes = ((round(at * h), round(at * w)) for h, w in WINDOWS)
-        found = (window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
-        window, factor = next(((w, at) for w in found if w is not None), (window, factor))
+        windows = (window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
+        window, factor = next(((w, at) for w in windows if w is not None), (window, factor))
     return window, factor
 
 
 def decoded(maps: np.ndarray, kernels: np.ndarray, scale: int, depth_m: np.ndarray) -> tuple[Instance, ...]:
-    """The logs of maps (24, h, w) and kernels, whose pixels are ``scale`` pixels of the picture (H, W) wide."""
+    """Decode the logs of maps (24, h, w) and kernels, whose pixels are ``scale`` pixels of the picture (H, W) wide."""
     known = np.isfinite(depth_m[scale // 2 :: scale, scale // 2 :: scale])
-    found = kernel_logs(maps, kernels)
-    logs = [log for log in found.logs if _has_shape(found, log, known)]
+    candidates = kernel_logs(maps, kernels)
+    logs = [log for log in candidates.logs if _has_shape(candidates, log, known)]
     if not logs:
         return ()
     labels = np.zeros(maps.shape[1:], np.int32)
     probability = np.zeros(maps.shape[1:])
     for number, log in enumerate(logs, 1):
-        at = found.y[log.members], found.x[log.members]
+        at = candidates.y[log.members], candidates.x[log.members]
         labels[at] = number
         probability[at] = sigmoid(np.minimum(log.logits, maps[MASK][at] + WOOD_SHIFT))
     nearest = ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
     labels = labels[tuple(nearest)]
-    ends, out = sigmoid(maps[ENDS]), []
+    ends, instances = sigmoid(maps[ENDS]), []
     for number, log in enumerate(logs, 1):
-        x, y = found.x[log.members], found.y[log.members]
+        x, y = candidates.x[log.members], candidates.y[log.members]
         segment_ = LogSegment(log.members, _axis(maps, x, y), score(log))
-        one = instance_at(segment_, number, found.x, found.y, labels, probability, ends, scale, depth_m.shape)
-        if one is not None:
-            out.append(one)
-    return tuple(sorted(out, key=lambda i: -i.score))
+        instance = instance_at(
+            segment_, number, candidates.x, candidates.y, labels, probability, ends, scale, depth_m.shape
+        )
+        if instance is not None:
+            instances.append(instance)
+    return tuple(sorted(instances, key=lambda i: -i.score))
 
 
 def _has_shape(found: KernelLogs, log: KernelLog, known: np.ndarray) -> bool:
-    """Whether enough of a log's pixels have depth, in a picture that has any."""
+    """Tell whether enough of a log's pixels have depth, in a picture that has any."""
     if known.mean() < MIN_PICTURE_SHARE:
         return True
     y, x = found.y[log.members], found.x[log.members]
@@ -320,12 +322,12 @@ def _has_shape(found: KernelLogs, log: KernelLog, known: np.ndarray) -> bool:
 
 
 def _axis(maps: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Unit axis (2,) of a log by the network's angles at its pixels."""
+    """Compute the unit axis (2,) of a log by the network's angles at its pixels."""
     c, s = maps[COS2, y, x].sum(), maps[SIN2, y, x].sum()
     angle = 0.5 * math.atan2(float(s), float(c))
     return np.array([math.cos(angle), math.sin(angle)])
 
 
 def score(log: KernelLog) -> float:
-    """The probability that a log overlaps a true one by half, from heat and certainty."""
+    """Compute the probability that a log overlaps a true one by half, from heat and certainty."""
     return 1.0 / (1.0 + math.exp(-STEEPNESS * (log.heat * log.certainty - EVEN_ODDS)))

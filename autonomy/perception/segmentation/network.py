@@ -31,7 +31,7 @@ HEIGHT_RANGE_M: Final = (-0.5, 1.5)
 
 
 def interface_of(variant: str) -> Interface:
-    """The network of a variant in CHANNELS; its only output ``maps`` has a channel for each of MAPS.
+    """Return the network of a variant in CHANNELS; its only output ``maps`` has a channel for each of MAPS.
 
     Raises:
         InputRefused: the variant is unknown.
@@ -46,7 +46,7 @@ def interface_of(variant: str) -> Interface:
 def network_input(
     rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics, variant: str, height_m: np.ndarray | None = None
 ) -> np.ndarray:
-    """Input (C, H, W) float32 of a picture: normalised colour, height over the dominant plane, depth known.
+    """Make the input (C, H, W) float32 of a picture: normalised colour, height over the dominant plane, depth known.
 
     ``rgb`` is (H, W, 3) uint8; ``height_m`` (H, W) is used when it was computed before.
     """

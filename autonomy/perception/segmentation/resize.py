@@ -12,7 +12,7 @@ from machine.geometry.optics import Intrinsics
 def shrunk(
     rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics, factor: int
 ) -> tuple[np.ndarray, np.ndarray, Intrinsics]:
-    """The picture with every ``factor`` x ``factor`` block as one pixel: mean colour, depth of its middle pixel.
+    """Shrink the picture with every ``factor`` x ``factor`` block as one pixel: mean colour, depth of its middle pixel.
 
     A mean of depth would create points between near and far.  Incomplete blocks at the right and lower border are
     dropped.
@@ -28,7 +28,7 @@ def shrunk(
 
 
 def _means(rgb: np.ndarray, factor: int) -> np.ndarray:
-    """Mean colours (H / factor, W / factor, 3) uint8 of blocks, rounded down."""
+    """Compute mean colours (H / factor, W / factor, 3) uint8 of blocks, rounded down."""
     wide: type[np.uint16 | np.uint32] = np.uint16 if factor <= 16 else np.uint32  # 16 x 16 x 255 fits into 16 bits
     rows: np.ndarray = rgb[::factor].astype(wide)
     for i in range(1, factor):
@@ -43,17 +43,17 @@ def _means(rgb: np.ndarray, factor: int) -> np.ndarray:
 
 
 def doubled(rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, np.ndarray, Intrinsics]:
-    """The picture at twice the size: colour interpolated, depth repeated."""
+    """Return the picture at twice the size: colour interpolated, depth repeated."""
     return interpolated(rgb), repeated(depth_m), pinhole.scaled(2.0)
 
 
 def repeated(values: np.ndarray) -> np.ndarray:
-    """(H, W) repeated to (2 H, 2 W)."""
+    """Repeat (H, W) to (2 H, 2 W)."""
     return values.repeat(2, axis=0).repeat(2, axis=1)
 
 
 def interpolated(rgb: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 interpolated to (2 H, 2 W, 3), linear between pixel centres; the border repeats."""
+    """Interpolate (H, W, 3) uint8 to (2 H, 2 W, 3), linear between pixel centres; the border repeats."""
     wide = rgb.astype(np.uint16)
     for axis in (0, 1):
         near = 3 * wide
@@ -67,7 +67,7 @@ def interpolated(rgb: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=512)
 def bilinear(size: int, scale: int) -> np.ndarray:
-    """Matrix (size * scale, size) float32 that interpolates linearly between pixel centres and repeats the border."""
+    """Make a matrix (size * scale, size) float32: linear interpolation between pixel centres, the border repeated."""
     at = np.clip((np.arange(size * scale) + 0.5) / scale - 0.5, 0.0, size - 1.0)
     low = np.minimum(at.astype(int), max(size - 2, 0))
     share = (at - low).astype(np.float32)

@@ -48,7 +48,7 @@ class Scorer:
 
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray]) -> Scorer:
-        """From the arrays of a scoring network."""
+        """Make a scorer from the arrays of a scoring network."""
         return cls(
             arrays["first.weight"][:, :, 0, 0],
             arrays["first.bias"],
@@ -57,7 +57,7 @@ class Scorer:
         )
 
     def probability(self, features: np.ndarray) -> np.ndarray:
-        """Probabilities (N,) from features (N, inputs)."""
+        """Compute probabilities (N,) from features (N, inputs)."""
         return sigmoid(np.maximum(features @ self.first.T + self.bias, 0.0) @ self.second + self.offset)
 
 
@@ -70,7 +70,7 @@ class SegmentScorers:
 
 
 def load_scorers(folder: Path = SHIPPED) -> SegmentScorers:
-    """From ``segment_merging.onnx`` and ``segment_quality.onnx`` of a folder.
+    """Load the scorers from ``segment_merging.onnx`` and ``segment_quality.onnx`` of a folder.
 
     Raises:
         InputRefused: the files are missing, damaged or of other networks.
@@ -82,7 +82,7 @@ def load_scorers(folder: Path = SHIPPED) -> SegmentScorers:
 
 @cache
 def shipped_scorers() -> SegmentScorers:
-    """The scorers that are shipped with the package."""
+    """Load the scorers that are shipped with the package."""
     return load_scorers()
 
 
@@ -96,7 +96,7 @@ class LogSegment:
 
 
 def segment_logs(foreground: Foreground, scorers: SegmentScorers) -> list[LogSegment]:
-    """The logs of a foreground, in descending order of size."""
+    """Find the logs of a foreground, in descending order of size."""
     segments = over_segment(foreground)
     merger = SegmentMerger(foreground, segments)
     merger.merge_all(scorers.merge)
@@ -106,7 +106,7 @@ def segment_logs(foreground: Foreground, scorers: SegmentScorers) -> list[LogSeg
 
 
 def over_segment(foreground: Foreground) -> list[Segment]:
-    """Segments of the foreground, rather too many than too few, in descending order of size."""
+    """Divide the foreground into segments, rather too many than too few, in descending order of size."""
     labels = watershed(foreground.boundary, foreground.mask)[foreground.y, foreground.x]
     order = np.argsort(labels, kind="stable")
     cuts = np.searchsorted(labels[order], np.arange(1, labels.max(initial=0) + 2))
@@ -128,8 +128,11 @@ class SegmentMerger:
 
     def _update_pairs(self, i: np.ndarray, j: np.ndarray) -> None:
         """Update the features of the pairs of segments ``i`` (n,) and ``j`` (n,)."""
-        first = self._table.count[i] >= self._table.count[j]
-        big, small = self._table.take(np.where(first, i, j)), self._table.take(np.where(first, j, i))
+        first_is_bigger = self._table.count[i] >= self._table.count[j]
+        big, small = (
+            self._table.take(np.where(first_is_bigger, i, j)),
+            self._table.take(np.where(first_is_bigger, j, i)),
+        )
         border_px = self._border_px[i, j]
         may = may_merge(self.foreground, big, small, border_px)
         self._may[i, j] = self._may[j, i] = may
@@ -139,7 +142,7 @@ class SegmentMerger:
         self._features[i, j] = self._features[j, i] = features
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """All pairs (N, 2) that may be one log, and their PAIR_FEATURES (N, 19)."""
+        """Return all pairs (N, 2) that may be one log, and their PAIR_FEATURES (N, 19)."""
         pairs = np.argwhere(np.tril(self._may))
         return pairs, self._features[pairs[:, 0], pairs[:, 1]]
 
@@ -148,20 +151,20 @@ class SegmentMerger:
         probabilities = self.merge_probabilities(scorer)
         while probabilities.size and probabilities.max() >= MIN_MERGE_PROBABILITY:
             i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(probabilities)), probabilities.shape))
-            kept = self.merge_pair(i, j)
-            probabilities = probabilities[kept[:, None], kept]
+            remaining_indices = self.merge_pair(i, j)
+            probabilities = probabilities[remaining_indices[:, None], remaining_indices]
             updated = np.where(self._may[i], scorer.probability(self._features[i]), 0.0)
             probabilities[i] = probabilities[:, i] = updated
 
     def merge_probabilities(self, scorer: Scorer) -> np.ndarray:
-        """The probability that two segments are one log (n, n), 0 for a segment with itself."""
+        """Compute the probability that two segments are one log (n, n), 0 for a segment with itself."""
         pairs, features = self.pairs()
-        found = np.zeros(self._may.shape)
-        found[pairs[:, 0], pairs[:, 1]] = found[pairs[:, 1], pairs[:, 0]] = scorer.probability(features)
-        return found
+        probabilities = np.zeros(self._may.shape)
+        probabilities[pairs[:, 0], pairs[:, 1]] = probabilities[pairs[:, 1], pairs[:, 0]] = scorer.probability(features)
+        return probabilities
 
     def merge_pair(self, i: int, j: int) -> np.ndarray:
-        """Merge segment ``j`` into ``i``, ``i`` < ``j``; returns the former indices (n - 1,) of the segments."""
+        """Merge segment ``j`` into ``i``, ``i`` < ``j``, and return the former indices (n - 1,) of the segments."""
         members = np.concatenate([self.segments[i].members, self.segments[j].members])
         self.segments[i] = make_segment(self.foreground, members)
         for of in (self._border_px, self._boundary_sum):
@@ -169,18 +172,19 @@ class SegmentMerger:
             of[:, i] += of[:, j]
             of[i, i] = 0.0
         self._table.put(i, self.segments[i])
-        kept = np.flatnonzero(np.arange(len(self.segments)) != j)
+        remaining_indices = np.flatnonzero(np.arange(len(self.segments)) != j)
         del self.segments[j]
         self._border_px, self._boundary_sum, self._features, self._may = (
-            of[kept[:, None], kept] for of in (self._border_px, self._boundary_sum, self._features, self._may)
+            of[remaining_indices[:, None], remaining_indices]
+            for of in (self._border_px, self._boundary_sum, self._features, self._may)
         )
-        self._table = self._table.take(kept)
-        others = np.flatnonzero(np.arange(len(kept)) != i)
+        self._table = self._table.take(remaining_indices)
+        others = np.flatnonzero(np.arange(len(remaining_indices)) != i)
         self._update_pairs(np.full(len(others), i), others)
-        return kept
+        return remaining_indices
 
     def features(self, scorer: Scorer) -> np.ndarray:
-        """SEGMENT_FEATURES (n, 14) of the current segments."""
+        """Compute SEGMENT_FEATURES (n, 14) of the current segments."""
         merge_probability = self.merge_probabilities(scorer).max(axis=1, initial=0.0)
         border_px, around = self._border_px.sum(axis=1), self._boundary_sum.sum(axis=1)
         around = np.divide(around, border_px, out=np.ones_like(around), where=border_px > 0.0)
@@ -194,11 +198,11 @@ class SegmentMerger:
 
 
 def _borders(foreground: Foreground, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
-    """Length of the border that each pair of segments shares [px], and the sum of the boundary map along it (n, n)."""
+    """Compute the border that each pair of segments shares [px], and the sum of the boundary map along it (n, n)."""
     n = len(segments)
     labels = np.zeros(foreground.mask.shape, np.int64)
-    for number, one in enumerate(segments, 1):
-        labels[foreground.y[one.members], foreground.x[one.members]] = number
+    for number, segment in enumerate(segments, 1):
+        labels[foreground.y[segment.members], foreground.x[segment.members]] = number
     border, boundary = np.zeros((n + 1) ** 2), np.zeros((n + 1) ** 2)
     # There may be a pixel or two of boundary between segments that meet.
     for a, b in (

@@ -105,7 +105,7 @@ class SegmentTable:
 
     @classmethod
     def of(cls, segments: Sequence[Segment]) -> SegmentTable:
-        """The table of a list of segments."""
+        """Make the table of a list of segments."""
         rows = [
             (
                 len(s.members),
@@ -128,14 +128,14 @@ class SegmentTable:
         self.numbers[row] = SegmentTable.of([segment]).numbers[0]
 
     def take(self, which: np.ndarray) -> SegmentTable:
-        """The table of some rows."""
+        """Return the table of some rows."""
         return SegmentTable(self.numbers[which])
 
 
 def pair_features(
     foreground: Foreground, big: SegmentTable, small: SegmentTable, border_px: np.ndarray, boundary: np.ndarray
 ) -> np.ndarray:
-    """PAIR_FEATURES (n, 19) of n pairs of segments.
+    """Compute PAIR_FEATURES (n, 19) of n pairs of segments.
 
     They share borders of ``border_px`` (n,) pixels of the maps, along which the boundary map has the mean ``boundary``
     (n,).
@@ -176,7 +176,7 @@ def pair_features(
 
 
 def may_merge(foreground: Foreground, big: SegmentTable, small: SegmentTable, border_px: np.ndarray) -> np.ndarray:
-    """Whether (n,) the scorer must decide about a pair.
+    """Tell whether (n,) the scorer must decide about a pair.
 
     Two segments may be one log when they touch or lie near one line, and when nothing separates them: between them
     there is neither background that is clearly farther away nor an end of a log.
@@ -189,8 +189,10 @@ def may_merge(foreground: Foreground, big: SegmentTable, small: SegmentTable, bo
     middles = np.rint(big.middle + 0.5 * (start + end)[:, None] * big.axis).astype(int)
     for k in ask:
         (column, row), reach = middles[k], max(1, round(0.5 * float(small.half_width[k])))
-        here = foreground.ends[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
-        has_end = here.size and float(here.max()) > MIN_END_PROBABILITY
+        end_probabilities = foreground.ends[
+            max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1
+        ]
+        has_end = end_probabilities.size and float(end_probabilities.max()) > MIN_END_PROBABILITY
         may[k] = not (has_end and end[k] - start[k] < small.half_width[k])
     ask = ask[may[ask] & (end - start > MIN_GAP_PX)[ask]]
     hidden, inverse, line = _gap(foreground, big.take(ask), start[ask], end[ask])
@@ -207,7 +209,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _depth_difference(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> np.ndarray:
-    """Relative difference (n,) of inverse depth between one segment and the other's line; 0 where one has no depth."""
+    """Compute the relative difference (n,) of one's inverse depth and the other's line; 0 where one has no depth."""
     miss = np.abs(big.line_at + big.line_slope * along - small.line_at) / np.maximum(small.line_at, 1e-3)
     turned = np.where(_dot(big.axis, small.axis) > 0.0, 1.0, -1.0)
     back = np.abs(small.line_at - turned * small.line_slope * along - big.line_at) / np.maximum(big.line_at, 1e-3)
@@ -216,7 +218,7 @@ def _depth_difference(big: SegmentTable, small: SegmentTable, along: np.ndarray)
 
 
 def _between(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Start and end (n,) of the gap between two segments on the big one's axis; end before start when they overlap."""
+    """Find start and end (n,) of two segments' gap on the big one's axis; end before start when they overlap."""
     after = along > 0.0
     return np.where(after, big.high, along + small.high), np.where(after, along + small.low, big.low)
 
@@ -224,10 +226,10 @@ def _between(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> tuple
 def _gap(
     foreground: Foreground, big: SegmentTable, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Along gaps (n, GAP_SAMPLES): foreground, inverse depth, and that of the big segment's line, NaN unknown."""
+    """Read along gaps (n, GAP_SAMPLES): foreground, inverse depth, and that of the big segment's line, NaN unknown."""
     at = start[:, None] + (end - start)[:, None] * GAP_SHARES
-    place = np.rint(big.middle[:, None] + at[..., None] * big.axis[:, None]).astype(int)
-    row = np.clip(place[..., 1], 0, foreground.mask.shape[0] - 1)
-    column = np.clip(place[..., 0], 0, foreground.mask.shape[1] - 1)
+    pixels = np.rint(big.middle[:, None] + at[..., None] * big.axis[:, None]).astype(int)
+    row = np.clip(pixels[..., 1], 0, foreground.mask.shape[0] - 1)
+    column = np.clip(pixels[..., 0], 0, foreground.mask.shape[1] - 1)
     line = big.line_at[:, None] + big.line_slope[:, None] * at
     return foreground.mask[row, column], foreground.inverse[row, column], line

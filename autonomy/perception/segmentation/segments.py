@@ -82,7 +82,7 @@ class Segment:
 def make_foreground(
     maps: np.ndarray, probability: np.ndarray, mask: np.ndarray, inverse: np.ndarray | None, grain: int
 ) -> Foreground:
-    """The foreground ``mask`` (h, w) of maps (8, h, w) with the probability of wood (h, w)."""
+    """Make the foreground ``mask`` (h, w) of maps (8, h, w) with the probability of wood (h, w)."""
     y, x = np.nonzero(mask)
     votes = OFFSET_PX / STRIDE * maps[OFFSET_U : OFFSET_V + 1, y, x]
     values = np.stack([x, y, probability[y, x], *maps[COS2 : SIN2 + 1, y, x], x + votes[0], y + votes[1]])
@@ -91,7 +91,7 @@ def make_foreground(
 
 
 def make_segment(foreground: Foreground, members: np.ndarray) -> Segment:
-    """The segment of the foreground's pixels ``members`` (n,)."""
+    """Make the segment of the foreground's pixels ``members`` (n,)."""
     x, y, probability, c, s, *votes = foreground.values.take(members, axis=1)
     n = len(members)
     angle = 0.5 * math.atan2(float(s @ probability), float(c @ probability))
@@ -115,7 +115,7 @@ def make_segment(foreground: Foreground, members: np.ndarray) -> Segment:
 
 
 def _depth_line(along: np.ndarray, inverse: np.ndarray) -> tuple[tuple[float, float] | None, float]:
-    """Inverse depth along the axis, which is linear for a straight log, and its relative median error."""
+    """Fit inverse depth along the axis, which is linear for a straight log, and compute its relative median error."""
     known = np.isfinite(inverse)
     if np.count_nonzero(known) < MIN_KNOWN_PX:
         return None, 0.0
@@ -138,7 +138,7 @@ def _extent(values: np.ndarray) -> float:
 
 
 def _median(values: np.ndarray) -> float:
-    """The median of values (n,); for the few pixels of a segment ten times as fast as numpy's."""
+    """Compute the median of values (n,); for the few pixels of a segment ten times as fast as numpy's."""
     half = len(values) // 2
     if len(values) % 2:
         return float(np.partition(values, half)[half])
@@ -147,7 +147,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def _quantile(values: np.ndarray, share: float) -> float:
-    """The quantile of values (n,), interpolated as numpy's percentile."""
+    """Compute the quantile of values (n,), interpolated as numpy's percentile."""
     at = share * (len(values) - 1)
     low = int(at)
     parted = np.partition(values, (low, min(low + 1, len(values) - 1)))
@@ -156,7 +156,7 @@ def _quantile(values: np.ndarray, share: float) -> float:
 
 
 def _fitted_line(t: np.ndarray, s: np.ndarray) -> tuple[float, float]:
-    """Slope and value at 0 of the least-squares line through s (n,) over t (n,)."""
+    """Fit slope and value at 0 of the least-squares line through s (n,) over t (n,)."""
     t0, s0 = float(t.sum()) / len(t), float(s.sum()) / len(s)
     away = t - np.float32(t0)
     slope = float(away @ (s - np.float32(s0))) / float(away @ away)
@@ -166,7 +166,7 @@ def _fitted_line(t: np.ndarray, s: np.ndarray) -> tuple[float, float]:
 def segment_features(
     foreground: Foreground, one: Segment, border_px: float, boundary_around: float, merge_probability: float
 ) -> np.ndarray:
-    """SEGMENT_FEATURES (14,) of a segment.
+    """Compute SEGMENT_FEATURES (14,) of a segment.
 
     Args:
         foreground: that of the segment.
@@ -217,12 +217,12 @@ MAX_TURN_BOUNDARY: Final = 0.97
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
-    """1 / (1 + exp(-x))."""
+    """Compute 1 / (1 + exp(-x))."""
     return np.asarray(1.0 / (1.0 + np.exp(-np.maximum(x, -80.0))))
 
 
 def boundary_map(maps: np.ndarray) -> np.ndarray:
-    """Strength (h, w), 0..1, of the boundary between two logs at each pixel of maps (8, h, w)."""
+    """Compute the strength (h, w), 0..1, of the boundary between two logs at each pixel of maps (8, h, w)."""
     arrow = maps[COS2 : SIN2 + 1]
     arrow = arrow / (np.hypot(*arrow) + 1e-3)
     turn = np.zeros(maps.shape[1:], np.float32)
@@ -232,7 +232,7 @@ def boundary_map(maps: np.ndarray) -> np.ndarray:
 
 
 def watershed(boundary: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    """Labels (h, w) int32 of the basins of ``boundary`` (h, w), 0..1; 0 outside ``foreground`` (h, w) bool.
+    """Label (h, w) int32 the basins of ``boundary`` (h, w), 0..1; 0 outside ``foreground`` (h, w) bool.
 
     The water rises in ``LEVELS``.  A pool without a label becomes a new basin.  Where labelled pools meet, basins that
     are shallower than ``MIN_BASIN_DEPTH`` are removed, and from there on no pixels are labelled.  The remaining pixels
@@ -266,11 +266,11 @@ def _watershed(boundary: np.ndarray, foreground: np.ndarray) -> np.ndarray:
         into[of_pool[alone]] = of_label[alone]
         removed = np.zeros(len(birth), bool)
         for meeting in np.flatnonzero(label_count > 1):
-            here = sorted(of_label[of_pool == meeting].tolist(), key=lambda i: birth[i])
-            shallow = [i for i in here[1:] if level - birth[i] < MIN_BASIN_DEPTH]
+            meeting_labels = sorted(of_label[of_pool == meeting].tolist(), key=lambda i: birth[i])
+            shallow = [i for i in meeting_labels[1:] if level - birth[i] < MIN_BASIN_DEPTH]
             removed[shallow] = True
-            if len(shallow) == len(here) - 1:
-                into[meeting] = here[0]
+            if len(shallow) == len(meeting_labels) - 1:
+                into[meeting] = meeting_labels[0]
         label[removed[label]] = 0
         birth += [float(level)] * len(new)
         fill = (label == 0) & (pool > 0)

@@ -11,7 +11,7 @@ class CameraSource(Protocol):
     """A camera that delivers frames on request."""
 
     def frame(self) -> RgbdFrame | None:
-        """The newest frame; None when there is none yet, none in time, or none left.
+        """Return the newest frame; None when there is none yet, none in time, or none left.
 
         Raises:
             LinkError: the source cannot deliver frames.

@@ -61,7 +61,7 @@ class FrameFolder:
         return len(self.index.stamps_ns)
 
     def frame(self) -> RgbdFrame | None:
-        """The next frame.
+        """Return the next frame.
 
         Raises:
             LinkError: its pictures are missing, unreadable or of another size.
@@ -73,7 +73,7 @@ class FrameFolder:
         return frame
 
     def at(self, number: int) -> RgbdFrame:
-        """Frame ``number``, counted from 0; raises as ``frame``."""
+        """Read frame ``number``, counted from 0; raise as ``frame`` does."""
         i, stem = self.index, f"{number:06d}"
         try:
             with Image.open(self._folder / f"{stem}.png") as picture:
@@ -121,14 +121,14 @@ class FrameFolderWriter:
 
     def add(self, frame: RgbdFrame) -> None:
         """Write one frame."""
-        first = self._first or frame
-        if (frame.camera, frame.intrinsics) != (first.camera, first.intrinsics):
+        reference_frame = self._first or frame
+        if (frame.camera, frame.intrinsics) != (reference_frame.camera, reference_frame.intrinsics):
             raise LinkError(
                 "camera-source.other-camera",
-                f"a frame of camera {frame.camera!r} does not belong in a folder of camera {first.camera!r} or has "
-                "other intrinsics; write it to another folder",
+                f"a frame of camera {frame.camera!r} does not belong in a folder of camera {reference_frame.camera!r} "
+                "or has other intrinsics; write it to another folder",
             )
-        self._first, stem = first, f"{len(self._stamps_ns):06d}"
+        self._first, stem = reference_frame, f"{len(self._stamps_ns):06d}"
         Image.fromarray(frame.rgb).save(self._folder / f"{stem}.png")
         if self._depth == "npy":
             np.save(self._folder / f"{stem}.npy", frame.depth_m)

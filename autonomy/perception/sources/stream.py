@@ -37,7 +37,7 @@ class StreamCamera:
         """When the frame that was returned last was asked for; the server takes it at once and draws it afterwards."""
 
     def frame(self) -> RgbdFrame | None:
-        """The newest frame, or None with ``problem`` and ``problem_code`` set."""
+        """Return the newest frame, or None with ``problem`` and ``problem_code`` set."""
         end_s = time.monotonic() + self._timeout_s
         try:
             frame = self._receive(end_s)
@@ -67,18 +67,18 @@ class StreamCamera:
             self.asked_ns = time.monotonic_ns()
             sock.sendall(encode_request(self._camera))
             self._requested = True
-        wanted = HEADER_BYTES
+        message_bytes = HEADER_BYTES
         while True:
             if len(self._data) >= HEADER_BYTES:
-                wanted = HEADER_BYTES + decode_header(bytes(self._data[:HEADER_BYTES])).remaining_bytes
-            if len(self._data) >= wanted > HEADER_BYTES:
+                message_bytes = HEADER_BYTES + decode_header(bytes(self._data[:HEADER_BYTES])).remaining_bytes
+            if len(self._data) >= message_bytes > HEADER_BYTES:
                 break
             left_s = end_s - time.monotonic()
             if left_s <= 0.0:
                 return None
             sock.settimeout(left_s)
             try:
-                chunk = sock.recv(min(MAX_RECEIVE_BYTES, wanted - len(self._data)))
+                chunk = sock.recv(min(MAX_RECEIVE_BYTES, message_bytes - len(self._data)))
             except TimeoutError:
                 return None
             if not chunk:
@@ -113,7 +113,7 @@ def _left(end_s: float) -> float:
 
 
 def frame_from_message(sent: RgbdMessage) -> RgbdFrame:
-    """The frame of a message: depth in m, NaN where it is unknown."""
+    """Convert a message to a frame: depth in m, NaN where it is unknown."""
     shape = (sent.height_px, sent.width_px)
     depth_m = np.frombuffer(sent.depth_mm, "<u2").reshape(shape).astype(np.float32) / np.float32(MM_PER_M)
     depth_m[depth_m == 0.0] = np.nan

@@ -52,7 +52,7 @@ class ZedCamera:
         self._pin, self._lost = pin, False
 
     def frame(self) -> RgbdFrame | None:
-        """The next frame; None when the camera delivered none in time.
+        """Return the next frame; None when the camera delivered none in time.
 
         Raises:
             LinkError: the camera is disconnected, or not back yet.

@@ -77,8 +77,8 @@ class LogFilter:
         self._spread = np.linalg.inv(self._filter.P_inv)
 
     def _measurement(self, fit: CylinderFit, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The measurement of a fit: seven numbers (7,), their covariance (7, 7), the part of it that pictures from the
-        same place have in common (7, 7), and the measurement matrix H (7, STATES)."""
+        """Return the measurement of a fit: seven numbers (7,), their covariance (7, 7), the part of it that pictures
+        from the same place have in common (7, 7), and the measurement matrix H (7, STATES)."""
         body = fit.body
         center, axis = pose.to_base(body.center_m), pose.rotation @ body.axis
         along = float(axis @ self._axis)
@@ -113,7 +113,7 @@ class LogFilter:
         return z, jacobian @ fit.covariance @ jacobian.T + jitter @ jitter.T, shared @ shared.T, h
 
     def _h(self, pose: Pose, point: np.ndarray, start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
-        """Derivatives of the seven numbers by the state: by themselves, scale, rotations and shifts of the camera."""
+        """Differentiate the seven numbers by the state: by themselves, scale, rotations and shifts of the camera."""
         h = np.zeros((SIZE, STATES))
         h[:, :SIZE] = np.eye(SIZE)
         arms = np.array([point, point, self._axis, self._axis, start, end])
@@ -127,7 +127,7 @@ class LogFilter:
         return h
 
     def distance2(self, fit: CylinderFit, pose: Pose) -> float:
-        """Squared Mahalanobis distance of a fit; infinite when the fit is of another log."""
+        """Compute the squared Mahalanobis distance of a fit; infinite when the fit is of another log."""
         away = pose.to_base(fit.body.center_m) - self._anchor
         across_m = away - (away @ self._axis) * self._axis
         cosine = abs(float(pose.rotation @ fit.body.axis @ self._axis))
@@ -156,13 +156,13 @@ class LogFilter:
         self._filter.update(z[:, None])
         self._spread = np.linalg.inv(self._filter.P_inv)
         same = float(pose.rotation @ fit.body.axis @ self._axis) > 0.0
-        for i, seen in enumerate(fit.ends_seen if same else fit.ends_seen[::-1]):
-            self._end_hits[i] += seen
+        for i, end_seen in enumerate(fit.ends_seen if same else fit.ends_seen[::-1]):
+            self._end_hits[i] += end_seen
         self.hits, self.misses, self._stamp_ns = self.hits + 1, 0, stamp_ns
         self._score += (fit.explained - self._score) / self.hits
 
     def track(self) -> Track:
-        """The current estimate of the log."""
+        """Return the current estimate of the log."""
         x, covariance = self._filter.x[:SIZE, 0], self._spread[:SIZE, :SIZE]
         axis = self._axis + x[2] * self._e1 + x[3] * self._e2
         stretch = float(np.linalg.norm(axis))
@@ -171,9 +171,9 @@ class LogFilter:
         shift = np.eye(SIZE)
         shift[0, 2] = shift[1, 3] = middle
         covariance = shift @ (covariance + self._shared) @ shift.T
-        seen = (self._end_hits[0] > 0, self._end_hits[1] > 0)
+        ends_seen = (self._end_hits[0] > 0, self._end_hits[1] > 0)
         length, diameter = (x[5] - x[4]) * stretch, 2.0 * x[6]
         estimate = LogEstimate(
-            point + middle * axis, axis / stretch, float(length), float(diameter), covariance, seen, self._score
+            point + middle * axis, axis / stretch, float(length), float(diameter), covariance, ends_seen, self._score
         )
         return Track(self.id, estimate, self.hits, self._stamp_ns)

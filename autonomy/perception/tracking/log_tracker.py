@@ -29,19 +29,19 @@ NO_PAIR_COST: Final = 1e9  # in the assignment matrix
 
 
 def _never_displaced(log: LogEstimate, fit: CylinderFit) -> bool:
-    """Without a picture, no log is known to have moved."""
+    """Return False: without a picture, no log is known to have moved."""
     return False
 
 
 def _are_duplicates(log: LogEstimate, other: LogEstimate) -> bool:
-    """Whether two logs would occupy the same space, which two real logs cannot."""
+    """Tell whether two logs would occupy the same space, which two real logs cannot."""
     # A fragment of a log is no reason to delete the whole log: compare lengths.
     same_length = abs(log.length_m - other.length_m) < MAX_LENGTH_DIFFERENCE_M
     return same_length and _lies_in(log, other, DUPLICATE_DISTANCE_SHARE)
 
 
 def _lies_in(log: LogEstimate, other: LogEstimate, share: float) -> bool:
-    """Whether a log's middle lies in a parallel log, the distance of their axes below a share of the sum of radii."""
+    """Tell whether a log's middle lies in a parallel log, the axes' distance below a share of the sum of radii."""
     off = log.center_m - other.center_m
     along = float(off @ other.axis)
     apart_m = float(np.linalg.norm(off - along * other.axis))
@@ -50,12 +50,13 @@ def _lies_in(log: LogEstimate, other: LogEstimate, share: float) -> bool:
 
 
 def _without_fragments(tracks: Sequence[Track]) -> tuple[Track, ...]:
-    """The tracks that are not fragments of a longer one: a mask that splits shows one log as two in every picture."""
+    """Drop tracks that are fragments of a longer one: a mask that splits shows one log as two in every picture."""
 
     def is_fragment(log: Track) -> bool:
-        one = log.estimate
+        estimate = log.estimate
         return any(
-            o.estimate.length_m > one.length_m and _lies_in(one, o.estimate, FRAGMENT_DISTANCE_SHARE) for o in tracks
+            o.estimate.length_m > estimate.length_m and _lies_in(estimate, o.estimate, FRAGMENT_DISTANCE_SHARE)
+            for o in tracks
         )
 
     return tuple(log for log in tracks if not is_fragment(log))
@@ -75,7 +76,7 @@ class LogTracker:
         stamp_ns: int,
         displaced: Callable[[LogEstimate, CylinderFit], bool] = _never_displaced,
     ) -> tuple[Track, ...]:
-        """Update the logs with the fits of one picture; returns the confirmed logs in the order of their numbers.
+        """Update the logs with the fits of one picture and return the confirmed logs in the order of their numbers.
 
         ``displaced`` says whether a fit shows a log that is no longer where it was; such a log keeps its number.
         """
@@ -104,7 +105,7 @@ class LogTracker:
         return _without_fragments([log.track() for log in self._logs if log.hits >= CONFIRMED_HITS])
 
     def _associated(self, fits: Sequence[CylinderFit], pose: Pose) -> tuple[dict[int, int], set[int]]:
-        """The nearest fit of each log, and the logs that agree with theirs."""
+        """Find the nearest fit of each log, and the logs that agree with theirs."""
         costs = np.full((len(self._logs), len(fits)), NO_PAIR_COST)
         for i, log in enumerate(self._logs):
             for j, fit in enumerate(fits):
@@ -118,7 +119,7 @@ class LogTracker:
         fits: Sequence[CylinderFit],
         displaced: Callable[[LogEstimate, CylinderFit], bool],
     ) -> list[tuple[int, int]]:
-        """Confirmed logs that no longer lie where they were, each with the fit that shows it elsewhere."""
+        """Find confirmed logs that no longer lie where they were, each with the fit that shows it elsewhere."""
         moves, free = [], [j for j in range(len(fits)) if j not in matched.values()]
         for i, log in enumerate(self._logs):
             if i in matched or log.hits < CONFIRMED_HITS:
@@ -132,7 +133,7 @@ class LogTracker:
         return moves
 
     def _restarted(self, log: LogFilter, fit: CylinderFit, pose: Pose) -> LogFilter:
-        """The log with its number, initialised anew where a fit shows it."""
+        """Return the log with its number, initialised anew where a fit shows it."""
         return LogFilter(log.id, fit, pose, self._errors, log.hits if log.hits >= CONFIRMED_HITS else 0)
 
     def _delete_lost(self, matched: set[int]) -> None:
@@ -164,7 +165,7 @@ _MIN_GONE_SAMPLES: Final = 10
 
 
 def is_displaced(frame: RgbdFrame, pose: Pose, log: LogEstimate, fit: CylinderFit) -> bool:
-    """Whether ``fit`` is ``log`` in another place.
+    """Tell whether ``fit`` is ``log`` in another place.
 
     The two must have similar shapes, and along the old axis the picture must show what was behind the log, or ``fit``
     in front of it.
@@ -183,7 +184,7 @@ def _similar(pose: Pose, log: LogEstimate, fit: CylinderFit) -> bool:
 
 
 def _gone(frame: RgbdFrame, pose: Pose, log: LogEstimate, fit: CylinderFit) -> bool:
-    """Whether the old place shows something else, where no third object (the grapple, another log) hides it."""
+    """Tell whether the old place shows something else, where no third object (the grapple, another log) hides it."""
     line_m = pose.to_optical(log.center_m + np.outer(_SAMPLES * log.length_m, log.axis))
     line_m = line_m[line_m[:, 2] > log.diameter_m]
     surface_m = line_m * (1.0 - 0.5 * log.diameter_m / np.linalg.norm(line_m, axis=1, keepdims=True))
@@ -202,6 +203,6 @@ def _gone(frame: RgbdFrame, pose: Pose, log: LogEstimate, fit: CylinderFit) -> b
 
 
 def _distance_from_axis_m(points_m: np.ndarray, fit: CylinderFit) -> np.ndarray:
-    """Distances (N,) of optical-frame points (N, 3) from the axis of a fit."""
+    """Compute distances (N,) of optical-frame points (N, 3) from the axis of a fit."""
     off = points_m - fit.body.center_m
     return np.asarray(np.linalg.norm(off - np.outer(off @ fit.body.axis, fit.body.axis), axis=1))

@@ -43,12 +43,12 @@ class Bank:
         return len(self.ids)
 
     def to(self, device: torch.device | str) -> Bank:
-        """The same on a device."""
+        """Return the same pictures on a device."""
         return Bank(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 def joined(banks: Sequence[Bank]) -> Bank:
-    """All pictures of several banks of one size."""
+    """Join all pictures of several banks of one size."""
     return Bank(*(torch.cat([getattr(b, f.name) for b in banks]) for f in fields(Bank)))
 
 
@@ -74,7 +74,7 @@ class Windows:
 
 
 def windows(bank: Bank, count: int, side_px: int, generator: torch.Generator) -> Windows:
-    """Random windows: place, zoom, turn, mirror, a lens's distortion."""
+    """Cut random windows: place, zoom, turn, mirror, a lens's distortion."""
     device = bank.ids.device
 
     def rand(*shape: int) -> torch.Tensor:
@@ -160,7 +160,7 @@ def windows(bank: Bank, count: int, side_px: int, generator: torch.Generator) ->
 
 
 def bank_of(arrays: dict[str, np.ndarray]) -> Bank:
-    """A bank from numpy arrays of the same names; missing sensor depth is filled in as not sensed."""
+    """Make a bank from numpy arrays of the same names; missing sensor depth is filled in as not sensed."""
     n = len(arrays["ids"])
     made = dict(arrays)
     made.setdefault("sensed", np.zeros(n, bool))

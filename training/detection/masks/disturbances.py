@@ -22,25 +22,25 @@ class Chance:
         self._generator, self.device = generator, generator.device
 
     def uniform(self, *shape: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
-        """Uniform numbers."""
+        """Draw uniform numbers."""
         return low + (high - low) * torch.rand(*shape, generator=self._generator, device=self.device)
 
     def normal(self, *shape: int) -> torch.Tensor:
-        """Standard normal numbers."""
+        """Draw standard normal numbers."""
         return torch.randn(*shape, generator=self._generator, device=self.device)
 
     def some(self, count: int, share: float) -> torch.Tensor:
-        """Which of ``count`` it happens to, as 0 or 1."""
+        """Draw which of ``count`` it happens to, as 0 or 1."""
         return (self.uniform(count) < share).float()
 
     def smooth(self, count: int, side: int, cell: int) -> torch.Tensor:
-        """Smooth noise (count, side, side) of about unit variance, ``cell`` pixels wide."""
+        """Draw smooth noise (count, side, side) of about unit variance, ``cell`` pixels wide."""
         small = self.normal(count, 1, side // cell + 2, side // cell + 2)
         return 1.4 * F.interpolate(small, (side, side), mode="bicubic", align_corners=False)[:, 0]
 
 
 def disturbed_depth(w: Windows, chance: Chance) -> torch.Tensor:
-    """Depth (B, C, C) [m], NaN unknown, as a stereo camera of unknown quality delivers it."""
+    """Compute depth (B, C, C) [m], NaN unknown, as a stereo camera of unknown quality delivers it."""
     b, side = w.ids.shape[0], w.ids.shape[-1]
     z = w.depth_m
     rough = (1.0 - chance.some(b, EXACT_SHARE)) * (~w.sensed).float()  # a sensed picture has its own errors
@@ -75,7 +75,7 @@ def disturbed_depth(w: Windows, chance: Chance) -> torch.Tensor:
 
 
 def disturbed_colour(w: Windows, chance: Chance) -> torch.Tensor:
-    """Colours (B, 3, C, C), 0..1, of another camera, day and weather."""
+    """Compute colours (B, 3, C, C), 0..1, of another camera, day and weather."""
     b, side, x = w.ids.shape[0], w.ids.shape[-1], w.rgb
     many = (slice(None), None, None, None)
     # Each log in a colour of its own, now and then; the ground's hue apart from the logs'.
@@ -109,8 +109,8 @@ def disturbed_colour(w: Windows, chance: Chance) -> torch.Tensor:
     x = x + (soft - x) * (chance.uniform(b) * chance.some(b, 0.45))[many]
     line = F.avg_pool2d(x, (1, 9), 1, (0, 4), count_include_pad=False)
     tall = F.avg_pool2d(x, (9, 1), 1, (4, 0), count_include_pad=False)
-    which = chance.uniform(b)[many]
-    x = torch.where(which < 0.05, line, torch.where(which < 0.1, tall, x))
+    blur_choice = chance.uniform(b)[many]
+    x = torch.where(blur_choice < 0.05, line, torch.where(blur_choice < 0.1, tall, x))
     drop = (chance.smooth(b, side, 24) > 1.9 - 0.7 * chance.uniform(b)[:, None, None]).float() * chance.some(b, 0.1)[
         :, None, None
     ]
@@ -131,7 +131,7 @@ def disturbed_colour(w: Windows, chance: Chance) -> torch.Tensor:
 
 
 def inputs(w: Windows, chance: Chance, disturb: bool = True) -> torch.Tensor:
-    """The network's input (B, 6, C, C); as ``mask_network.mask_input`` with all disturbances."""
+    """Compute the network's input (B, 6, C, C); as ``mask_network.mask_input`` with all disturbances."""
     b = w.ids.shape[0]
     z = disturbed_depth(w, chance) if disturb else w.depth_m
     rgb = disturbed_colour(w, chance) if disturb else w.rgb

@@ -40,7 +40,7 @@ class Goals:
 
 @torch.no_grad()
 def goals(w: Windows) -> Goals:
-    """The goals of windows."""
+    """Compute the goals of windows."""
     b, side = w.ids.shape[0], w.ids.shape[-1]
     device, h = w.ids.device, side // STRIDE
     blocks = w.ids.view(b, h, STRIDE, h, STRIDE).permute(0, 1, 3, 2, 4).flatten(3)
@@ -71,7 +71,7 @@ def goals(w: Windows) -> Goals:
     there = counts >= MIN_LOG_PX
 
     def of(values: torch.Tensor) -> torch.Tensor:
-        """A value of every log at its pixels, (B, h, w)."""
+        """Return a value of every log at its pixels, (B, h, w)."""
         table = torch.cat([torch.zeros(b, 1, device=device), values, torch.zeros(b, 255 - MAX_LOGS, device=device)], 1)
         return table.gather(1, ids.flatten(1)).view(b, h, h)
 
@@ -113,7 +113,7 @@ def goals(w: Windows) -> Goals:
 
 
 def _peaks(u: torch.Tensor, v: torch.Tensor, there: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """Gaussian peaks (B, h, w) at points (B, K, P)."""
+    """Draw Gaussian peaks (B, h, w) at points (B, K, P)."""
     sigma = PEAK_SIGMA_PX * STRIDE
     out = torch.zeros(u.shape[0], *x.shape, device=x.device)
     for k in range(u.shape[-1]):

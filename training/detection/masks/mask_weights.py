@@ -32,18 +32,18 @@ MEAN, SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
 def trunk_arrays(file: Path) -> dict[str, np.ndarray]:
-    """The arrays by the mask network's names; the first layer is widened to its channels."""
+    """Read the arrays by the mask network's names; the first layer is widened to its channels."""
     state = torch.load(file, weights_only=True, map_location="cpu")
     names = [name for name in MaskNetwork().features.state_dict() if not name.endswith("batches_tracked")]
-    found = {f"features.{name}": state[f"features.{name}"].numpy().astype(np.float32) for name in names}
-    first = found["features.0.0.weight"]
-    wide = np.zeros((first.shape[0], CHANNELS, *first.shape[2:]), np.float32)
-    wide[:, :3] = first
+    arrays = {f"features.{name}": state[f"features.{name}"].numpy().astype(np.float32) for name in names}
+    first_layer = arrays["features.0.0.weight"]
+    widened_layer = np.zeros((first_layer.shape[0], CHANNELS, *first_layer.shape[2:]), np.float32)
+    widened_layer[:, :3] = first_layer
     # Height and pixels per metre begin as faint grey pictures, so that the trunk's filters see their edges.
-    grey = first.mean(axis=1)
-    wide[:, 3], wide[:, 4] = 0.3 * grey, 0.1 * grey
-    found["features.0.0.weight"] = wide
-    return found
+    grey = first_layer.mean(axis=1)
+    widened_layer[:, 3], widened_layer[:, 4] = 0.3 * grey, 0.1 * grey
+    arrays["features.0.0.weight"] = widened_layer
+    return arrays
 
 
 # -- The weight file of the mask network, its card and the log of its training
@@ -56,15 +56,15 @@ LIMITS = (
 
 
 def device_of(asked: str) -> str:
-    """The device by its name; "auto" is cuda where there is one.
+    """Return the device by its name; "auto" is cuda where there is one.
 
     Raises:
         InputRefused: there is no such device.
     """
-    there = torch.cuda.is_available()
+    has_cuda = torch.cuda.is_available()
     if asked == "auto":
-        return "cuda" if there else "cpu"
-    if asked == "cuda" and not there:
+        return "cuda" if has_cuda else "cpu"
+    if asked == "cuda" and not has_cuda:
         raise InputRefused("train.no-cuda", "torch finds no CUDA device; use --device cpu")
     return asked
 
@@ -79,14 +79,14 @@ def produce(
     command: str,
     console: Console,
 ) -> Path:
-    """Train on the sets of ``folder``; writes weights, card and log (JSON lines) and returns the card's path.
+    """Train on the sets of ``folder``; write weights, card and log (JSON lines) and return the card's path.
 
     An interrupted run continues from the checkpoint beside ``out``.
 
     Raises:
         InputRefused: the pictures, the trunk or the device are missing.
     """
-    where = device_of(device)
+    device_name = device_of(device)
     if trunk is not None and not trunk.is_file():
         raise InputRefused(
             "dataset.no-trunk", f"{trunk}: no such file; torchvision's mobilenet_v2-b0353104.pth is meant"
@@ -107,14 +107,15 @@ def produce(
     def keep(_: dict[str, np.ndarray], step: int) -> None:
         steps[0] = step
 
-    arrays = train(bank.to(where), run, start, tell, keep, checkpoint=out.with_suffix(".checkpoint"))
+    arrays = train(bank.to(device_name), run, start, tell, keep, checkpoint=out.with_suffix(".checkpoint"))
     shares = ", ".join(f"{name} {n} ({SHARES[name]:g})" for name, n in counts.items())
     card = Card(
         "Logs in pictures as masks, with depth or without",
         "Picture in; eight maps, features of every pixel and kernels of logs out, of which masks of logs are made.",
         f"pictures (share in which they are drawn): {shares}; those with hardly any wood a third as often",
-        f"{steps[0]} steps of {run.batch} windows of {run.side_px} px on {where}, AdamW with {run.learning_rate} and a "
-        f"cosine, average of the weights; the trunk began {'with ' + trunk.name if trunk else 'random'}",
+        f"{steps[0]} steps of {run.batch} windows of {run.side_px} px on {device_name}, AdamW with "
+        f"{run.learning_rate} and a cosine, average of the weights; the trunk began "
+        f"{'with ' + trunk.name if trunk else 'random'}",
         run.seed,
         {"loss, last record": str(last.get("loss", "none"))},
         LIMITS,
@@ -137,7 +138,7 @@ IGNORED: Final = 255
 def mixed(
     folder: Path, photographs: Sequence[tuple[np.ndarray, np.ndarray]] = (), shares: Mapping[str, float] = SHARES
 ) -> tuple[Bank, dict[str, int]]:
-    """The pictures of ``folder`` with photographs (rgb, wood), and how many there are of each set.
+    """Join the pictures of ``folder`` with photographs (rgb, wood), and count how many there are of each set.
 
     Raises:
         InputRefused: there are no traced pictures, or sizes differ.
@@ -146,9 +147,9 @@ def mixed(
     for name in ("traced", "drawn", "meshed"):
         rows = [read(file) for file in sorted(folder.glob(f"{name}*.npz"))]
         if rows:
-            if len({one["ids"].shape[1:] for one in rows}) > 1:
+            if len({picture_set["ids"].shape[1:] for picture_set in rows}) > 1:
                 raise InputRefused("dataset.sizes-differ", f"{folder}: pictures of {name}*.npz differ in size")
-            banks[name] = bank_of({key: np.concatenate([one[key] for one in rows]) for key in rows[0]})
+            banks[name] = bank_of({key: np.concatenate([picture_set[key] for picture_set in rows]) for key in rows[0]})
     if "traced" not in banks:
         raise InputRefused(
             "dataset.no-traced", f"{folder} holds no traced*.npz; make them: timberhand train traced-pictures {folder}"
@@ -159,21 +160,22 @@ def mixed(
         banks["photographs"] = bank_of(
             {key: np.stack([getattr(s, key) for s in shots]) for key in Sample.__dataclass_fields__}
         )
-    if any(one.ids.shape[-1] != side for one in banks.values()):
+    if any(picture_set.ids.shape[-1] != side for picture_set in banks.values()):
         raise InputRefused("dataset.sizes-differ", f"{folder}: the sets have pictures of different sizes")
-    for name, one in banks.items():
-        weight = torch.where(wood_share(one) < BARE_WOOD_SHARE, BARE_WEIGHT, 1.0)
-        one.share.copy_(shares[name] * weight / weight.sum())
-    return joined(list(banks.values())), {name: len(one) for name, one in banks.items()}
+    for name, picture_set in banks.items():
+        weight = torch.where(wood_share(picture_set) < BARE_WOOD_SHARE, BARE_WEIGHT, 1.0)
+        picture_set.share.copy_(shares[name] * weight / weight.sum())
+    return joined(list(banks.values())), {name: len(picture_set) for name, picture_set in banks.items()}
 
 
 def wood_share(bank: Bank) -> torch.Tensor:
-    """The share (N,) of each picture that is wood."""
+    """Compute the share (N,) of each picture that is wood."""
     return torch.stack([((ids > 0) & (ids != IGNORED)).float().mean() for ids in bank.ids])
 
 
 def photograph(rgb: np.ndarray, wood: np.ndarray, side_px: int) -> Sample:
-    """A photograph without depth, whose logs are not told apart, in a square that is ignored where it ends."""
+    """Make a sample of a photograph without depth, whose logs are not told apart, in a square that is ignored where it
+    ends."""
     factor = side_px / max(rgb.shape[:2])
     height, width = (min(side_px, max(1, round(factor * n))) for n in rgb.shape[:2])
     picture = np.zeros((side_px, side_px, 3), np.uint8)

@@ -41,7 +41,7 @@ class Run:
 
 
 def start_net(trunk: Mapping[str, np.ndarray] | None, seed: int) -> MaskNetwork:
-    """The network, its trunk from ``pretrained`` arrays."""
+    """Make the network, its trunk from pretrained arrays."""
     torch.manual_seed(seed)
     net = MaskNetwork()
     with torch.no_grad():
@@ -70,7 +70,7 @@ def train(
     more: Callable[[int], Bank | None] = lambda _: None,
     checkpoint: Path | None = None,
 ) -> dict[str, np.ndarray]:
-    """Train; returns the averaged arrays.
+    """Train and return the averaged arrays.
 
     ``tell`` gets a record now and then, ``keep`` the averaged arrays; ``more`` may replace the pictures.
     With ``checkpoint`` the same call continues where it was interrupted; Ctrl-C finishes the step first.
@@ -92,8 +92,8 @@ def train(
     mean = {k: v.detach().float().clone() for k, v in net.state_dict().items()}
     sums: dict[str, Any] = {}
     identity = f"{run} {len(bank)} {trunk is not None}"
-    step, before = _continued(checkpoint, identity, net, optimiser, mean, generator)
-    began, told, kept = time.monotonic() - before, before, before
+    step, elapsed_before_s = _continued(checkpoint, identity, net, optimiser, mean, generator)
+    began, last_report_s, last_save_s = time.monotonic() - elapsed_before_s, elapsed_before_s, elapsed_before_s
 
     def note() -> None:
         if checkpoint is not None:
@@ -146,20 +146,20 @@ def train(
                 decay = min(run.average, (step + 1) / (step + 10))
                 floats = [(mean[k], v.float()) for k, v in net.state_dict().items() if v.is_floating_point()]
                 torch._foreach_lerp_([a for a, _ in floats], [v for _, v in floats], 1.0 - decay)
-            for name, one in {"loss": value.detach(), **parts}.items():
-                sums[name] = sums.get(name, 0.0) + one
+            for name, loss_part in {"loss": value.detach(), **parts}.items():
+                sums[name] = sums.get(name, 0.0) + loss_part
             sums["n"] = sums.get("n", 0) + 1
             now = time.monotonic() - began
-            if now - told > 5.0 or step == run.steps:
+            if now - last_report_s > 5.0 or step == run.steps:
                 tell(
                     {"step": step, "s": round(now, 1), "rate": rate, "pictures": len(bank)}
                     | {k: round(float(v) / sums["n"], 4) for k, v in sums.items() if k != "n"}
                 )
-                sums, told = {}, now
-            if now - kept > 60.0:
+                sums, last_report_s = {}, now
+            if now - last_save_s > 60.0:
                 keep(_arrays(mean), step)
                 note()
-                kept = now
+                last_save_s = now
     done = _arrays(mean)
     keep(done, step)
     note()
@@ -174,7 +174,7 @@ def _continued(
     mean: dict[str, torch.Tensor],
     generator: torch.Generator,
 ) -> tuple[int, float]:
-    """Step and seconds of an interrupted run, whose state is restored; 0 without one."""
+    """Restore the state of an interrupted run and return its step and seconds; 0 without one."""
     if checkpoint is None or not checkpoint.is_file():
         return 0, 0.0
     try:
@@ -207,7 +207,7 @@ KERNELS_OF_A_PICTURE: Final = 20
 def loss(
     out: tuple[torch.Tensor, torch.Tensor], g: Goals, generator: torch.Generator
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The loss of a batch, and its parts for the record; ``out`` are maps and kernels."""
+    """Compute the loss of a batch, and its parts for the record; ``out`` are maps and kernels."""
     maps, kernels = (values.float() for values in out)
     parts = {
         "maps": maps_loss(maps, g),
@@ -219,7 +219,7 @@ def loss(
 
 
 def maps_loss(found: torch.Tensor, g: Goals) -> torch.Tensor:
-    """Cross entropy of mask, peaks and edges, distances of offsets and angles."""
+    """Compute cross entropy of mask, peaks and edges, distances of offsets and angles."""
     weight, angle_weight, meeting = g.weights.unbind(1)
     own = weight * g.valid
 
@@ -241,7 +241,7 @@ def maps_loss(found: torch.Tensor, g: Goals) -> torch.Tensor:
 
 
 def heat_loss(heat: torch.Tensor, g: Goals) -> torch.Tensor:
-    """Focal loss of a ridge, as for centres of objects."""
+    """Compute the focal loss of a ridge, as for centres of objects."""
     cell = KERNEL_STRIDE // STRIDE
     open_ = (F.avg_pool2d(g.valid[:, None], cell)[:, 0] > 0.6).float()
     p = torch.sigmoid(heat).clamp(1e-5, 1 - 1e-5)
@@ -252,7 +252,7 @@ def heat_loss(heat: torch.Tensor, g: Goals) -> torch.Tensor:
 
 
 def kernel_loss(features: torch.Tensor, kernels: torch.Tensor, g: Goals, generator: torch.Generator) -> torch.Tensor:
-    """Dice and cross entropy of the masks of a few kernels of every log."""
+    """Compute Dice and cross entropy of the masks of a few kernels of every log."""
     b, n = g.masks.shape[:2]
     columns = kernels.shape[3]
     # For every log, cells near its middle, at random.
@@ -262,8 +262,8 @@ def kernel_loss(features: torch.Tensor, kernels: torch.Tensor, g: Goals, generat
     value, cell = (own * (0.6 + 0.8 * noise)).flatten(2).topk(KERNELS_OF_A_LOG, dim=2)
     least = torch.tensor([0.05] + [0.35] * (KERNELS_OF_A_LOG - 1), device=value.device)
     value = torch.where((value > least) & (g.counts > 0)[..., None], value, torch.zeros_like(value))
-    value, which = value.flatten(1).topk(KERNELS_OF_A_PICTURE, dim=1)
-    use, log, at = (value > 0).float(), which // KERNELS_OF_A_LOG, cell.flatten(1).gather(1, which)
+    value, candidate_index = value.flatten(1).topk(KERNELS_OF_A_PICTURE, dim=1)
+    use, log, at = (value > 0).float(), candidate_index // KERNELS_OF_A_LOG, cell.flatten(1).gather(1, candidate_index)
     k = kernels.flatten(2).gather(2, at[:, None].expand(-1, kernels.shape[1], -1)).transpose(1, 2)
     logits = mask_logits(features, k, at // columns, at % columns)
     rows = torch.arange(b, device=log.device)[:, None]
@@ -278,12 +278,12 @@ def kernel_loss(features: torch.Tensor, kernels: torch.Tensor, g: Goals, generat
 
 
 def mask_logits(features: torch.Tensor, kernels: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
-    """Logits (B, K, h, w) of the masks of kernels (B, K, KERNEL) at cells (B, K)."""
+    """Compute logits (B, K, h, w) of the masks of kernels (B, K, KERNEL) at cells (B, K)."""
     h, w = features.shape[2:]
     middle, half = KERNEL_STRIDE / 2.0 - 0.5, 0.5 * (STRIDE - 1)
     x = torch.arange(w, device=features.device) * STRIDE + half - (column[..., None] * KERNEL_STRIDE + middle)
     y = torch.arange(h, device=features.device) * STRIDE + half - (row[..., None] * KERNEL_STRIDE + middle)
     x, y = (x / PLACE_PX)[:, :, None, :], (y / PLACE_PX)[:, :, :, None]
-    a, b, c, d, e, one = kernels[..., FEATURES:, None, None].unbind(2)
+    a, b, c, d, e, constant = kernels[..., FEATURES:, None, None].unbind(2)
     flat = torch.einsum("bkc,bchw->bkhw", kernels[..., :FEATURES], features)
-    return flat + (a * x + c * x * x) + (b * y + e * y * y + one) + (d * y) * x
+    return flat + (a * x + c * x * x) + (b * y + e * y * y + constant) + (d * y) * x

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def developed(light: np.ndarray, rng: random.Random) -> np.ndarray:
-    """The picture (H, W, 3) uint8 of linear light (H, W, 3), exposed as a camera would, not always well."""
+    """Develop the picture (H, W, 3) uint8 of linear light (H, W, 3), exposed as a camera would, not always well."""
     light = np.maximum(light.astype(np.float32), 0.0)
     grey = light.mean(axis=2)
     middle = float(np.exp(np.log(grey + 1e-5).mean()))

@@ -113,14 +113,14 @@ WOODS: Final[Sequence[Tones]] = (
 
 
 def varied(tones: Tones, rng: random.Random, spread: float = 0.2) -> Tones:
-    """Tones with another brightness and hue."""
+    """Give tones another brightness and hue."""
     gain = math.exp(rng.gauss(0.0, 1.3 * spread))
     tint = [math.exp(rng.gauss(0.0, 0.35 * spread)) for _ in range(3)]
     return [[min(0.85, gain * t * c) for t, c in zip(tint, tone, strict=True)] for tone in tones]
 
 
 def wild(rng: random.Random) -> list[float]:
-    """Stretches, sizes and thresholds of a surface that nobody named."""
+    """Draw stretches, sizes and thresholds of a surface that nobody named."""
     return [
         math.exp(rng.uniform(-3.0, 2.5)),
         rng.choice((0.0, 0.05, 0.2)),
@@ -134,7 +134,7 @@ def wild(rng: random.Random) -> list[float]:
 
 
 def bark(rng: random.Random, kind: str, snow: float, photos: Sequence[Path]) -> Look:
-    """The look of a log."""
+    """Draw the look of a log."""
     if kind == "photo" and not photos:
         kind = "furrowed"
     look: Look = {
@@ -168,7 +168,7 @@ def bark(rng: random.Random, kind: str, snow: float, photos: Sequence[Path]) -> 
 
 
 def soil(rng: random.Random, photos: Sequence[Path]) -> Look:
-    """One kind of ground."""
+    """Draw one kind of ground."""
     kinds = {
         "earth": 3.0,
         "grassy": 1.8,
@@ -198,7 +198,7 @@ def soil(rng: random.Random, photos: Sequence[Path]) -> Look:
 
 
 def ground(rng: random.Random, snow: float, photos: Sequence[Path]) -> Look:
-    """The look of the ground."""
+    """Draw the look of the ground."""
     return {
         "first": soil(rng, photos),
         "second": soil(rng, photos),
@@ -213,7 +213,7 @@ def ground(rng: random.Random, snow: float, photos: Sequence[Path]) -> Look:
 
 
 def light(rng: random.Random, eye: Sequence[float], target: Sequence[float]) -> Look:
-    """Sun and sky, or dusk with work lights at the camera."""
+    """Draw sun and sky, or dusk with work lights at the camera."""
     kind = rng.choices(("sunny", "low", "overcast", "photo", "dusk"), (3.0, 1.6, 1.6, 1.6, 0.7))[0]
     up = {
         "sunny": rng.uniform(18, 62),
@@ -261,7 +261,8 @@ def light(rng: random.Random, eye: Sequence[float], target: Sequence[float]) -> 
 
 
 def _own_sky(rng: random.Random, kind: str, look: Look, warm: float) -> Look:
-    """The same light for the tracer, which knows only its own skies: two tones, a glow, perhaps a forest's edge."""
+    """Describe the same light for the tracer, which knows only its own skies: two tones, a glow, perhaps a forest's
+    edge."""
     bright = {"sunny": 0.35, "low": 0.25, "overcast": 1.0, "photo": 0.7, "dusk": 0.05}[kind] * math.exp(
         rng.gauss(0, 0.3)
     )
@@ -290,11 +291,11 @@ def crowds(
     snow: float,
     photos: Sequence[Path],
 ) -> list[Look]:
-    """What grows and lies around: ``clear`` (x, y, radius) is kept free of big things, ``near`` of stems."""
-    found: list[Look] = []
+    """Draw what grows and lies around: ``clear`` (x, y, radius) is kept free of big things, ``near`` of stems."""
+    crowd_looks: list[Look] = []
 
     def add(kind: str, count: int, size_m: float, thick_m: float, tones: Tones, **more: Any) -> None:
-        found.append(
+        crowd_looks.append(
             {
                 "kind": kind,
                 "count": count,
@@ -390,4 +391,4 @@ def crowds(
                 reach_m=reach,
                 keep_clear_m=clear,
             )
-    return found
+    return crowd_looks

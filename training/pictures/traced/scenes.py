@@ -43,7 +43,7 @@ class Format:
 
 
 def describe(pile: Pile, seed: int, assets: Assets, form: Format) -> dict[str, Any]:
-    """The scene of a pile, drawn from ``seed``."""
+    """Describe the scene of a pile, drawn from ``seed``."""
     rng = random.Random(f"traced {VERSION} {pile.machine} {pile.number} {seed}")
     growth = math.exp(rng.uniform(math.log(0.7), math.log(MAX_GROWTH)))
     logs = _logs(pile, growth, rng)
@@ -73,13 +73,13 @@ def describe(pile: Pile, seed: int, assets: Assets, form: Format) -> dict[str, A
 
 
 def log_poses(scene: Mapping[str, Any]) -> tuple[LogPose, ...]:
-    """The logs of a described scene."""
+    """Return the logs of a described scene."""
     names = ("position_m", "quaternion", "length_m", "diameter_m", "taper_m_m", "sweep_m")
     return tuple(LogPose(log["number"], *(log[name] for name in names)) for log in scene["logs"])
 
 
 def view_of(view: Mapping[str, Any]) -> View:
-    """The camera of a described view."""
+    """Return the camera of a described view."""
     pin = Intrinsics(
         view["width_px"], view["height_px"], view["focal_px"], view["focal_px"], view["cx_px"], view["cy_px"]
     )
@@ -87,7 +87,7 @@ def view_of(view: Mapping[str, Any]) -> View:
 
 
 def _logs(pile: Pile, growth: float, rng: random.Random) -> list[LogPose]:
-    """The pile enlarged as a whole, so that logs still touch; some are gone from the top, some lengths differ."""
+    """Enlarge the pile as a whole, so that logs still touch; some are gone from the top, some lengths differ."""
     logs = sorted(pile.logs, key=lambda log: log.position_m[2])
     if len(logs) > 1 and rng.random() < 0.3:
         logs = logs[: rng.randint(1, len(logs))]
@@ -106,10 +106,10 @@ def _logs(pile: Pile, growth: float, rng: random.Random) -> list[LogPose]:
 
 
 def _loose(middle: np.ndarray, rng: random.Random) -> list[LogPose]:
-    """A crooked heap as a harvester leaves it; its logs may sink a little into each other and into soft ground."""
-    found, way = [], rng.uniform(-math.pi, math.pi)
-    away = rng.uniform(1.5, 3.5)
-    base = middle + np.array([away * math.cos(way), away * math.sin(way), 0.0])
+    """Draw a crooked heap as a harvester leaves it; its logs may sink a little into each other and into soft ground."""
+    heap_logs, azimuth_rad = [], rng.uniform(-math.pi, math.pi)
+    distance_m = rng.uniform(1.5, 3.5)
+    base = middle + np.array([distance_m * math.cos(azimuth_rad), distance_m * math.sin(azimuth_rad), 0.0])
     base[2] = min(base[2], middle[2])
     thick, long, main = rng.uniform(0.08, 0.3), rng.uniform(1.8, 4.5), rng.uniform(-math.pi, math.pi)
     for k in range(rng.randint(1, 6)):
@@ -121,8 +121,10 @@ def _loose(middle: np.ndarray, rng: random.Random) -> list[LogPose]:
         cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
         quaternion = (-s * sp, c * sp, s * cp, c * cp)
         sweep = rng.choice((0.0, 0.0, 0.05)) * rng.random()
-        found.append(LogPose(1, tuple(at), quaternion, long * rng.uniform(0.85, 1.1), d, 0.01 * rng.random(), sweep))
-    return found
+        heap_logs.append(
+            LogPose(1, tuple(at), quaternion, long * rng.uniform(0.85, 1.1), d, 0.01 * rng.random(), sweep)
+        )
+    return heap_logs
 
 
 def _log(log: LogPose, rng: random.Random, barks: int) -> dict[str, Any]:
@@ -149,7 +151,8 @@ def _log(log: LogPose, rng: random.Random, barks: int) -> dict[str, Any]:
 
 
 def _heights(pile: Pile, growth: float, middle: np.ndarray, snow: float, rng: random.Random) -> dict[str, Any]:
-    """The ground around the logs, with ruts beside them; it is a little higher where snow or soft soil took them in."""
+    """Describe the ground around the logs, with ruts beside them; it is a little higher where snow or soft soil took
+    them in."""
     ground = ground_of(pile)
     n = round(2 * REACH_M / CELL_M) + 1
     x0, y0 = float(middle[0]) - REACH_M, float(middle[1]) - REACH_M
@@ -172,12 +175,12 @@ def _heights(pile: Pile, growth: float, middle: np.ndarray, snow: float, rng: ra
 
 
 def _view(logs: Sequence[LogPose], number: int, rng: random.Random, form: Format) -> dict[str, Any]:
-    """A camera on a carrier, on the stick, or over the grapple."""
+    """Draw a camera on a carrier, on the stick, or over the grapple."""
     size, spines = form.size_px, [log.spine(8)[0] for log in logs]
     for _ in range(60):
         points = rng.choice(spines)
         target = points[rng.randrange(9)] + np.array([rng.gauss(0.0, 0.4), rng.gauss(0.0, 0.4), 0.0])
-        way, kind = rng.uniform(-math.pi, math.pi), rng.random()
+        azimuth_rad, kind = rng.uniform(-math.pi, math.pi), rng.random()
         if kind < 0.55:
             up, flat = rng.uniform(1.5, 3.4), rng.uniform(2.0, 7.5)
         elif kind < 0.85:
@@ -185,7 +188,7 @@ def _view(logs: Sequence[LogPose], number: int, rng: random.Random, form: Format
             up, flat = reach * math.sin(slope), reach * math.cos(slope)
         else:
             up, flat = rng.uniform(2.4, 4.2), rng.uniform(0.05, 0.8)
-        eye = target + np.array([flat * math.cos(way), flat * math.sin(way), up])
+        eye = target + np.array([flat * math.cos(azimuth_rad), flat * math.sin(azimuth_rad), up])
         if all(np.linalg.norm(s - eye, axis=1).min() > 1.2 for s in spines):
             break
     angle = math.radians(rng.uniform(52.0, 95.0))
@@ -216,7 +219,7 @@ def _view(logs: Sequence[LogPose], number: int, rng: random.Random, form: Format
 
 
 def _steel(pile: Pile, growth: float, middle: np.ndarray, rng: random.Random) -> list[dict[str, Any]]:
-    """The bunk around a load, and sometimes grapple, boom and boxes."""
+    """Describe the bunk around a load, and sometimes grapple, boom and boxes."""
     steel, profile = Steel(rng), profile_of(pile.machine)
     if pile.kind == "bunk":
         steel.bunk(profile, np.zeros(3), 0.0)

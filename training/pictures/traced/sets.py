@@ -44,17 +44,17 @@ def finished(
     view: Mapping[str, Any],
     matched_m: np.ndarray | None,
 ) -> Sample:
-    """The sample of a rendered view, whichever renderer it came from."""
-    seen = view_of(view)
-    ids, logs = labelled(numbers.astype(np.int16), seen, log_poses(scene))
+    """Make the sample of a rendered view, whichever renderer it came from."""
+    camera_view = view_of(view)
+    ids, logs = labelled(numbers.astype(np.int16), camera_view, log_poses(scene))
     rgb = developed(light, random.Random(view["seed"]))
-    return sample(rgb, depth_m, ids, logs, seen.intrinsics, matched_m)
+    return sample(rgb, depth_m, ids, logs, camera_view.intrinsics, matched_m)
 
 
 def traced_scene(scene: Mapping[str, Any], code: Any) -> list[Sample]:
-    """All views of a scene by the own tracer."""
+    """Draw all views of a scene by the own tracer."""
     tracer = Tracer(code, scene)
-    found = []
+    view_samples = []
     try:
         for view in scene["views"]:
             samples = view["samples"] or random.Random(view["seed"]).choice(SAMPLES)
@@ -63,14 +63,14 @@ def traced_scene(scene: Mapping[str, Any], code: Any) -> list[Sample]:
             if view["baseline_m"] and find_spec("cv2"):  # without OpenCV depth stays exact
                 other, _, _ = tracer.draw(view, samples, view["baseline_m"], seed=1)
                 matched = matched_depth(light, other, view["focal_px"], view["baseline_m"], view["seed"])
-            found.append(finished(light, depth, numbers, scene, view, matched))
+            view_samples.append(finished(light, depth, numbers, scene, view, matched))
     finally:
         tracer.close()
-    return found
+    return view_samples
 
 
 def traced_file(folder: Path, number: int, piles: Sequence[Pile], form: Format, code: Any) -> Path:
-    """The file of scene ``number``; drawn when it is missing."""
+    """Return the file of scene ``number``; draw it when it is missing."""
     file = folder / f"traced{number:05d}.npz"
     if not file.is_file():
         rng = random.Random(f"traced set {number}")
@@ -80,13 +80,15 @@ def traced_file(folder: Path, number: int, piles: Sequence[Pile], form: Format, 
 
 
 def drawn_file(folder: Path, number: int, piles: Sequence[Pile], size_px: int) -> Path:
-    """The file of DRAWN_OF_A_FILE pictures by the analytic renderer; drawn when it is missing."""
+    """Return the file of DRAWN_OF_A_FILE pictures by the analytic renderer; draw it when it is missing."""
     file = folder / f"drawn{number:05d}.npz"
     if not file.is_file():
         rng, rows = random.Random(f"drawn set {number}"), []
         for k in range(DRAWN_OF_A_FILE):
-            one = draw(rng.choice(list(piles)), 1_000_000 + number * DRAWN_OF_A_FILE + k, size_px)
-            rows.append(sample(one.rgb, one.depth_m, one.ids, one.logs, one.intrinsics, one.depth_m))
+            picture = draw(rng.choice(list(piles)), 1_000_000 + number * DRAWN_OF_A_FILE + k, size_px)
+            rows.append(
+                sample(picture.rgb, picture.depth_m, picture.ids, picture.logs, picture.intrinsics, picture.depth_m)
+            )
         write(file, rows, compressed=False)
     return file
 
@@ -156,13 +158,13 @@ class SetPlan:
     chunks: int = 2
 
     def numbers(self, pictures: int, of_a_file: int = 1) -> range:
-        """The numbers of the files that hold so many pictures."""
+        """Return the numbers of the files that hold so many pictures."""
         first = self.seed * NUMBERS_OF_A_SEED
         return range(first, first + -(-pictures // of_a_file))
 
 
 def renderer(asked: str, blender_python: Path | None = None) -> str:
-    """The path tracer to use: the one that is asked for, otherwise the first that is installed.
+    """Choose the path tracer to use: the one that is asked for, otherwise the first that is installed.
 
     Raises:
         InputRefused: it is not installed.
@@ -225,11 +227,11 @@ def blender_files(
     python: Path,
     tell: Callable[[str], None],
 ) -> None:
-    """The traced files, drawn by Blender in processes of their own: ``bpy`` is never imported here."""
-    wanted = [k for k in plan.numbers(plan.scenes) if not (folder / f"traced{k:05d}.npz").is_file()]
+    """Write the traced files, drawn by Blender in processes of their own: ``bpy`` is never imported here."""
+    missing_numbers = [k for k in plan.numbers(plan.scenes) if not (folder / f"traced{k:05d}.npz").is_file()]
     work = folder / "blender"
     (work / "scenes").mkdir(parents=True, exist_ok=True)
-    for k in wanted:
+    for k in missing_numbers:
         scene = describe(random.Random(f"traced set {k}").choice(piles), k, Assets(), form)
         (work / "scenes" / f"{k:05d}.json").write_text(json.dumps(scene))
     root = Path(__file__).parents[3]
@@ -237,18 +239,18 @@ def blender_files(
     environment = {**os.environ, "PYTHONPATH": str(root)}
     running = [
         subprocess.Popen([str(python), "-m", WORKER, str(work), str(threads), str(n), str(workers)], env=environment)
-        for n in range(workers if wanted else 0)
+        for n in range(workers if missing_numbers else 0)
     ]
     try:
-        failed = [one for one in running if one.wait()]
+        failed = [process for process in running if process.wait()]
     finally:
-        for one in running:
-            one.terminate()
+        for process in running:
+            process.terminate()
     if failed:
         raise InputRefused(
             "dataset.blender-failed", f"{len(failed)} of {workers} Blender processes failed; what they said is above"
         )
-    for k in wanted:
+    for k in missing_numbers:
         write(folder / f"traced{k:05d}.npz", list(blender_views(work, k)), compressed=False)
         (work / "scenes" / f"{k:05d}.json").unlink()
         tell(f"traced{k:05d}.npz")
@@ -256,10 +258,10 @@ def blender_files(
 
 
 def blender_views(work: Path, number: int) -> Iterator[Any]:
-    """The samples of a scene that Blender's worker drew in ``work``."""
+    """Yield the samples of a scene that Blender's worker drew in ``work``."""
     scene = json.loads((work / "scenes" / f"{number:05d}.json").read_text())
     for j, view in enumerate(scene["views"]):
-        with np.load(work / "pictures" / f"{number:05d}-{j}.npz", allow_pickle=False) as kept:
-            matched = kept["matched_m"] if "matched_m" in kept.files else None
-            light = kept["light"].astype(np.float32)
-            yield finished(light, kept["depth_m"], kept["ids"], scene, view, matched)
+        with np.load(work / "pictures" / f"{number:05d}-{j}.npz", allow_pickle=False) as archive:
+            matched = archive["matched_m"] if "matched_m" in archive.files else None
+            light = archive["light"].astype(np.float32)
+            yield finished(light, archive["depth_m"], archive["ids"], scene, view, matched)

@@ -28,20 +28,20 @@ class Shape:
 
 
 def shape_of(vertices: Any, faces: Any, slot: Any = 0, smooth: bool = False) -> Shape:
-    """A shape; faces may be rows of three or four."""
+    """Make a shape; faces may be rows of three or four."""
     rows = np.array([(*f, -1) if len(f) == 3 else tuple(f) for f in faces], np.int64).reshape(-1, 4)
     slots = np.broadcast_to(np.asarray(slot, np.int64), len(rows)).copy()
     return Shape(np.asarray(vertices, float).reshape(-1, 3), rows, slots, np.full(len(rows), smooth))
 
 
 def spin(angle_rad: float) -> np.ndarray:
-    """A turn (3, 3) about the vertical."""
+    """Return a turn (3, 3) about the vertical."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def lying(axis: np.ndarray) -> np.ndarray:
-    """A frame (3, 3) whose z is the axis (3,)."""
+    """Return a frame (3, 3) whose z is the axis (3,)."""
     z = axis / np.linalg.norm(axis)
     x = np.cross((0.0, 0.0, 1.0) if abs(z[2]) < 0.9 else (1.0, 0.0, 0.0), z)
     x /= np.linalg.norm(x)
@@ -58,7 +58,7 @@ def stem(
     flare: float = 0.0,
     knots: int = 0,
 ) -> Shape:
-    """A log in its own frame: spine (N, 3) along z, radii (N,); oval, uneven, butt flare, knots, slanted cuts.
+    """Make a log in its own frame: spine (N, 3) along z, radii (N,); oval, uneven, butt flare, knots, slanted cuts.
 
     Its bark is slot 0, its sawn ends slot 1.
     """
@@ -85,13 +85,13 @@ def stem(
     i, j = np.meshgrid(np.arange(n - 1), np.arange(sides), indexing="ij")
     a = (i * columns + j).ravel()
     faces = [np.stack([a, a + 1, a + 1 + columns, a + columns], 1)]
-    vertices, first, k = [side.reshape(-1, 3)], n * columns, np.arange(sides)
+    vertices, first_vertex, k = [side.reshape(-1, 3)], n * columns, np.arange(sides)
     for end in (0, -1):
         rim = side[end]
         vertices += [rim, rim[:-1].mean(axis=0)[None]]
-        turn = [first + k + 1, first + k] if end == 0 else [first + k, first + k + 1]
-        faces.append(np.stack([*turn, np.full(sides, first + columns), np.full(sides, -1)], 1))
-        first += columns + 1
+        turn = [first_vertex + k + 1, first_vertex + k] if end == 0 else [first_vertex + k, first_vertex + k + 1]
+        faces.append(np.stack([*turn, np.full(sides, first_vertex + columns), np.full(sides, -1)], 1))
+        first_vertex += columns + 1
     rows = np.concatenate(faces)
     bark = rows[:, 3] >= 0
     whole = np.concatenate(vertices)
@@ -103,7 +103,7 @@ def stem(
 def field(
     x0: float, y0: float, cell: float, heights: np.ndarray, finer: int, rough_m: float, rng: np.random.Generator
 ) -> Shape:
-    """A ground of a grid of heights, refined ``finer`` times and roughened."""
+    """Make a ground of a grid of heights, refined ``finer`` times and roughened."""
     nx, ny = heights.shape
     gx, gy = np.linspace(0, nx - 1, (nx - 1) * finer + 1), np.linspace(0, ny - 1, (ny - 1) * finer + 1)
     i, j = np.minimum(gx.astype(int), nx - 2), np.minimum(gy.astype(int), ny - 2)
@@ -129,7 +129,7 @@ def field(
 
 
 def tuft(rng: np.random.Generator, blades: int, height_m: float, width_m: float, lean: float) -> Shape:
-    """A tuft of grass: bent blades of three triangles."""
+    """Make a tuft of grass: bent blades of three triangles."""
     vertices: list[Any] = []
     faces: list[Any] = []
     for _ in range(blades):
@@ -148,7 +148,7 @@ def tuft(rng: np.random.Generator, blades: int, height_m: float, width_m: float,
 
 
 def fern(rng: np.random.Generator, fronds: int, reach_m: float) -> Shape:
-    """A fern: arching fronds with leaflets to both sides."""
+    """Make a fern: arching fronds with leaflets to both sides."""
     vertices: list[Any] = []
     faces: list[Any] = []
     for k in range(fronds):
@@ -170,7 +170,7 @@ def fern(rng: np.random.Generator, fronds: int, reach_m: float) -> Shape:
 
 
 def leaves(rng: np.random.Generator, count: int, reach_m: float, size_m: float) -> Shape:
-    """Loose leaves lying about."""
+    """Make loose leaves lying about."""
     vertices: list[Any] = []
     faces: list[Any] = []
     for _ in range(count):
@@ -191,7 +191,7 @@ def leaves(rng: np.random.Generator, count: int, reach_m: float, size_m: float) 
 def twig(
     rng: np.random.Generator, length_m: float, radius_m: float, forks: int, needles: bool = False, sides: int = 7
 ) -> Shape:
-    """A branch along x with forks (slot 0), perhaps with needles (slot 1): what is left of the crowns."""
+    """Make a branch along x with forks (slot 0), perhaps with needles (slot 1): what is left of the crowns."""
     vertices: list[Any] = []
     faces: list[Any] = []
 
@@ -216,13 +216,13 @@ def twig(
     for _ in range(forks):
         start, end, r = rods[rng.integers(len(rods))]
         at = start + (end - start) * rng.uniform(0.2, 0.9)
-        way = (end - start) * rng.uniform(0.25, 0.5) + rng.normal(0, 0.22, 3) * np.linalg.norm(end - start) * (
+        offset_m = (end - start) * rng.uniform(0.25, 0.5) + rng.normal(0, 0.22, 3) * np.linalg.norm(end - start) * (
             1,
             1,
             0.4,
         )
-        way[2] = abs(way[2])
-        rods.append((at, at + way, 0.5 * r))
+        offset_m[2] = abs(offset_m[2])
+        rods.append((at, at + offset_m, 0.5 * r))
     for start, end, r in rods:
         rod(start, end, r, 0.35 * r)
     split = len(faces)
@@ -230,32 +230,32 @@ def twig(
         for start, end, _ in rods[1:]:
             for _ in range(60):
                 at = start + (end - start) * rng.uniform(0.1, 1.0)
-                way, o = rng.normal(0, 1, 3), len(vertices)
-                way *= rng.uniform(0.02, 0.05) / np.linalg.norm(way)
-                wide = np.cross(way, rng.normal(0, 1, 3))
+                offset_m, o = rng.normal(0, 1, 3), len(vertices)
+                offset_m *= rng.uniform(0.02, 0.05) / np.linalg.norm(offset_m)
+                wide = np.cross(offset_m, rng.normal(0, 1, 3))
                 wide *= 0.0035 / np.linalg.norm(wide)
-                vertices += [at - wide, at + wide, at + way]
+                vertices += [at - wide, at + wide, at + offset_m]
                 faces.append((o, o + 1, o + 2))
     return shape_of(vertices, faces, np.arange(len(faces)) >= split)
 
 
 def stone(rng: np.random.Generator, size_m: Sequence[float]) -> Shape:
-    """A stone: an uneven ellipsoid."""
+    """Make a stone: an uneven ellipsoid."""
     u, v = np.meshgrid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(0.02, math.pi - 0.02, 12))
-    way = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    directions = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     r = np.ones(u.shape)
     for _ in range(9):
         side = rng.normal(0, 1, 3)
         side /= np.linalg.norm(side)
-        r = np.minimum(r, rng.uniform(0.65, 0.95) / np.maximum(way @ side, 0.05))
-    vertices = (way * r[..., None] * np.asarray(size_m)).reshape(-1, 3)
+        r = np.minimum(r, rng.uniform(0.65, 0.95) / np.maximum(directions @ side, 0.05))
+    vertices = (directions * r[..., None] * np.asarray(size_m)).reshape(-1, 3)
     a = (np.arange(11)[:, None] * 20 + np.arange(20)).ravel()
     b = (np.arange(11)[:, None] * 20 + (np.arange(20) + 1) % 20).ravel()
     return shape_of(vertices, np.stack([a, b, b + 20, a + 20], 1))
 
 
 def box(half: Sequence[float]) -> Shape:
-    """A box with its middle at the origin."""
+    """Make a box with its middle at the origin."""
     x, y, z = half
     corners = np.array([(i, j, k) for i in (-x, x) for j in (-y, y) for k in (-z, z)])
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

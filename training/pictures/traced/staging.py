@@ -32,7 +32,7 @@ class Piece:
 
 
 def pieces(scene: Mapping[str, Any]) -> Iterator[Piece]:
-    """Everything in a scene but camera and light."""
+    """Yield everything in a scene but camera and light."""
     rng = np.random.default_rng(scene["seed"])
     look, upright = scene["ground"], np.eye(3)
     h = np.array(look["heights_m"])
@@ -64,14 +64,14 @@ class _Surface:
         self.x0, self.y0, self.cell, self.h = look["x0_m"], look["y0_m"], look["cell_m"], heights
 
     def at(self, x: float, y: float) -> float:
-        """Height [m], outside the grid that of its edge."""
+        """Return the height [m], outside the grid that of its edge."""
         i = min(max(round((x - self.x0) / self.cell), 0), self.h.shape[0] - 1)
         j = min(max(round((y - self.y0) / self.cell), 0), self.h.shape[1] - 1)
         return float(self.h[i, j])
 
 
 def _far(look: Look, h: np.ndarray) -> Shape:
-    """The ground beyond the grid, out to FAR_M."""
+    """Make the ground beyond the grid, out to FAR_M."""
     half = 0.5 * look["cell_m"] * (min(h.shape) - 1)
     middle = (look["x0_m"] + half, look["y0_m"] + half, float(h.mean()))
     corners = ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -86,7 +86,7 @@ def _refined(spine: Any, radii: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crowd(crowd: Look, surface: _Surface, rng: np.random.Generator) -> Iterator[Piece]:
-    """Many things of one kind strewn over the ground."""
+    """Strew many things of one kind over the ground."""
     kinds = [_thing(crowd, rng) for _ in range(crowd["shapes"])]
     cx, cy = crowd["middle_m"]
     keep = np.array(crowd["keep_clear_m"], float).reshape(-1, 3)
@@ -111,7 +111,7 @@ def _crowd(crowd: Look, surface: _Surface, rng: np.random.Generator) -> Iterator
 
 
 def _thing(crowd: Look, rng: np.random.Generator) -> tuple[Shape, tuple[Look, ...]]:
-    """One shape of a crowd and the looks of its slots."""
+    """Make one shape of a crowd and the looks of its slots."""
     kind, size, tones = crowd["kind"], crowd["size_m"], crowd["tones"]
     leaf = {"what": "leaf", "tones": tones}
     if kind == "grass":

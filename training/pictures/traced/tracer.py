@@ -28,9 +28,9 @@ FLOATS: Final = 102
 
 
 def packed_look(look: Mapping[str, Any]) -> np.ndarray:
-    """A look as FLOATS float32."""
-    what = look["what"]
-    kind = look["kind"] if what in ("bark", "end") else what
+    """Pack a look as FLOATS float32."""
+    surface_type = look["what"]
+    kind = look["kind"] if surface_type in ("bark", "end") else surface_type
     row = [
         _number(kind),
         look.get("seed", 0.0),
@@ -67,7 +67,7 @@ def _number(kind: str) -> float:
 
 
 def _tones(tones: Any, count: int) -> list[float]:
-    """Exactly ``count`` colours; the last is repeated."""
+    """Return exactly ``count`` colours; the last is repeated."""
     rows = list(tones)[:count] or [[0.3, 0.3, 0.3]]
     rows += [rows[-1]] * (count - len(rows))
     return [float(c) for row in rows for c in row]
@@ -113,26 +113,26 @@ VIEW: Final = np.dtype(
 
 
 def compiler() -> str | None:
-    """The compiler of the tracer: nvcc beside a GPU, otherwise g++, None without either."""
+    """Find the compiler of the tracer: nvcc beside a GPU, otherwise g++, None without either."""
     nvcc = shutil.which("nvcc", path=f"{os.environ.get('PATH', '')}:/usr/local/cuda/bin") if GPU.exists() else None
     return nvcc or shutil.which("g++")
 
 
 def library(folder: Path) -> ctypes.CDLL:
-    """The compiled tracer, kept in ``folder``."""
+    """Load the compiled tracer, kept in ``folder``."""
     text = b"".join((SOURCES / name).read_bytes() for name in ("vector.h", "surfaces.h", "tracer.cu"))
-    found_compiler = compiler() or "g++"
-    nvcc = Path(found_compiler).name == "nvcc"
+    compiler_path = compiler() or "g++"
+    nvcc = Path(compiler_path).name == "nvcc"
     kind = "gpu" if nvcc else "cpu"
     file = folder / f"tracer-{kind}-{hashlib.sha256(text).hexdigest()[:12]}.so"
     if not file.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         draft = file.with_suffix(f".{os.getpid()}.part")
         if nvcc:
-            command = [found_compiler, "-O3", "--use_fast_math", "-arch=native", "-Xcompiler", "-fPIC"]
+            command = [compiler_path, "-O3", "--use_fast_math", "-arch=native", "-Xcompiler", "-fPIC"]
         else:
             command = [
-                found_compiler,
+                compiler_path,
                 "-x",
                 "c++",
                 "-O3",
@@ -143,9 +143,9 @@ def library(folder: Path) -> ctypes.CDLL:
             ]
         subprocess.run([*command, "-shared", "-o", str(draft), str(SOURCES / "tracer.cu")], check=True)
         draft.replace(file)
-    found = ctypes.CDLL(str(file))
-    found.scene_new.restype = ctypes.c_void_p
-    return found
+    tracer_library = ctypes.CDLL(str(file))
+    tracer_library.scene_new.restype = ctypes.c_void_p
+    return tracer_library
 
 
 class Tracer:
@@ -167,16 +167,21 @@ class Tracer:
     def draw(
         self, view: Mapping[str, Any], samples: int, shift_m: float = 0.0, seed: int = 0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Linear light (H, W, 3), optical depth (H, W) [m], NaN for the sky, and numbers (H, W) uint8 of a view."""
-        turn, one = np.array(view["turn"]), np.zeros((), VIEW)
-        one["eye"] = np.array(view["eye_m"]) + shift_m * turn[:, 0]
-        one["right"], one["down"], one["ahead"] = turn.T
-        one["lens"] = view["focal_px"], view["focal_px"], view["cx_px"], view["cy_px"]
-        one["size"], one["samples"], one["seed"] = (view["width_px"], view["height_px"]), samples, view["seed"] + seed
+        """Draw linear light (H, W, 3), optical depth (H, W) [m], NaN for the sky, and numbers (H, W) uint8 of a
+        view."""
+        turn, view_record = np.array(view["turn"]), np.zeros((), VIEW)
+        view_record["eye"] = np.array(view["eye_m"]) + shift_m * turn[:, 0]
+        view_record["right"], view_record["down"], view_record["ahead"] = turn.T
+        view_record["lens"] = view["focal_px"], view["focal_px"], view["cx_px"], view["cy_px"]
+        view_record["size"], view_record["samples"], view_record["seed"] = (
+            (view["width_px"], view["height_px"]),
+            samples,
+            view["seed"] + seed,
+        )
         shape = (view["height_px"], view["width_px"])
         light, depth, ids = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8)
         lit = packed_light(view["light"])
-        if self._code.render(self._scene, _at(lit), _at(one), _at(light), _at(depth), _at(ids)):
+        if self._code.render(self._scene, _at(lit), _at(view_record), _at(light), _at(depth), _at(ids)):
             raise RuntimeError("the tracer failed on the GPU")
         return light, depth, ids
 
@@ -186,7 +191,7 @@ def _at(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def packed(scene: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles (N, 3, 3), their details (N,), bodies (B,) and looks (L, floats) of a scene."""
+    """Pack triangles (N, 3, 3), their details (N,), bodies (B,) and looks (L, floats) of a scene."""
     tris: list[np.ndarray] = []
     fine: list[np.ndarray] = []
     bodies: list[Any] = []
@@ -219,7 +224,7 @@ def packed(scene: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners (N, 3, 3), normals (N, 3, 3) and slots (N,) of a shape's triangles."""
+    """Compute corners (N, 3, 3), normals (N, 3, 3) and slots (N,) of a shape's triangles."""
     quad = shape.faces[:, 3] >= 0
     rows = np.concatenate([shape.faces[:, :3], shape.faces[quad][:, [0, 2, 3]]])
     slots, smooth = (np.concatenate([a, a[quad]]) for a in (shape.slot, shape.smooth))
@@ -240,19 +245,26 @@ def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def packed_light(look: Mapping[str, Any]) -> np.ndarray:
-    """The light of a view for the kernel."""
-    one = np.zeros((), LIGHT)
+    """Pack the light of a view for the kernel."""
+    light_record = np.zeros((), LIGHT)
     own = look["own"]
     for name in ("zenith", "horizon", "below", "sun_tone", "trees"):
-        one[name] = own[name]
+        light_record[name] = own[name]
     for name in ("sun_edge", "glow", "backdrop", "backdrop_height", "backdrop_seed"):
-        one[name] = own[name]
-    up, way = look["elevation_rad"], look["azimuth_rad"]
-    one["sun_way"] = np.cos(up) * np.cos(way), np.cos(up) * np.sin(way), np.sin(up)
+        light_record[name] = own[name]
+    elevation_rad, azimuth_rad = look["elevation_rad"], look["azimuth_rad"]
+    light_record["sun_way"] = (
+        np.cos(elevation_rad) * np.cos(azimuth_rad),
+        np.cos(elevation_rad) * np.sin(azimuth_rad),
+        np.sin(elevation_rad),
+    )
     lamps: Sequence[Any] = look["lamps"][:4]
-    one["lamps"] = len(lamps)
+    light_record["lamps"] = len(lamps)
     for k, lamp in enumerate(lamps):
         ahead = np.array(lamp["target_m"]) - lamp["at_m"]
-        one["lamp"][k]["at"], one["lamp"][k]["way"] = lamp["at_m"], ahead / np.linalg.norm(ahead)
-        one["lamp"][k]["tone"], one["lamp"][k]["edge"] = np.array(lamp["tone"]) * lamp["watts"] * 0.025, 0.62
-    return one
+        light_record["lamp"][k]["at"], light_record["lamp"][k]["way"] = lamp["at_m"], ahead / np.linalg.norm(ahead)
+        light_record["lamp"][k]["tone"], light_record["lamp"][k]["edge"] = (
+            np.array(lamp["tone"]) * lamp["watts"] * 0.025,
+            0.62,
+        )
+    return light_record

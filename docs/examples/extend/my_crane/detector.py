@@ -22,7 +22,7 @@ class BarkColour:
     """Finds logs that lie apart (the contract of `experiments.common.plugins.LogPictureDetector`)."""
 
     def __call__(self, frame: RgbdFrame) -> Sequence[SeenLog]:
-        """The logs in this picture, in the optical frame: z forward, x right, y down."""
+        """Find the logs in this picture, in the optical frame: z forward, x right, y down."""
         red, green, blue = np.moveaxis(ndimage.uniform_filter(frame.rgb.astype(float), (SMOOTH_PX, SMOOTH_PX, 1)), 2, 0)
         bark = _between(red / np.maximum(blue, 1.0), RED_OVER_BLUE)
         bark &= _between(red / np.maximum(green, 1.0), RED_OVER_GREEN)
@@ -32,21 +32,21 @@ class BarkColour:
 
 
 def _log(frame: RgbdFrame, v: np.ndarray, u: np.ndarray) -> SeenLog | None:
-    """The cylinder under the pixels in rows ``v`` and columns ``u``; None if that is no log."""
+    """Fit a cylinder to the pixels in rows ``v`` and columns ``u``; None if that is no log."""
     pin, depth = frame.intrinsics, np.asarray(frame.depth_m, float)[v, u]
-    known = np.isfinite(depth)
-    if known.sum() < MIN_PIXELS:
+    valid = np.isfinite(depth)
+    if valid.sum() < MIN_PIXELS:
         return None
     rays = np.stack([(u - pin.cx_px) / pin.fx_px, (v - pin.cy_px) / pin.fy_px, np.ones(len(u))], axis=1)
-    points = rays * np.where(known, depth, np.median(depth[known]))[:, None]
-    near = points[known]
+    points = rays * np.where(valid, depth, np.median(depth[valid]))[:, None]
+    inliers = points[valid]
     for _ in range(5):  # a line through the bark, without what lies beside it
-        middle = near.mean(axis=0)
-        axis = np.linalg.svd(near - middle, full_matrices=False)[2][0]
-        apart = np.linalg.norm(np.cross(near - middle, axis), axis=1)
-        near = near[apart <= np.quantile(apart, 0.9)]
+        middle = inliers.mean(axis=0)
+        axis = np.linalg.svd(inliers - middle, full_matrices=False)[2][0]
+        distances_m = np.linalg.norm(np.cross(inliers - middle, axis), axis=1)
+        inliers = inliers[distances_m <= np.quantile(distances_m, 0.9)]
     across = np.cross(axis, middle / np.linalg.norm(middle))
-    ends, sides = (np.quantile((points - middle) @ way, (0.005, 0.995)) for way in (axis, across))
+    ends, sides = (np.quantile((points - middle) @ direction, (0.005, 0.995)) for direction in (axis, across))
     length_m, diameter_m = float(np.ptp(ends)), float(np.ptp(sides))
     if not LENGTH_OVER_DIAMETER[0] < length_m / diameter_m < LENGTH_OVER_DIAMETER[1]:
         return None

@@ -17,16 +17,16 @@ class LeakyPi:
     """
 
     def __init__(self, law: Law) -> None:
-        """``law`` is the table [joints.NAME.law] of the profile."""
+        """Take the gain from ``law``, the table [joints.NAME.law] of the profile."""
         self._kp, self._ki = law.kp_1_s, INTEGRAL_SHARE * law.kp_1_s**2
         self._integral = 0.0
 
     def reset(self) -> None:
-        """The valve is at neutral: forget the integral."""
+        """Forget the integral: the valve is at neutral."""
         self._integral = 0.0
 
     def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
-        """The velocity to add to the feed-forward [rad/s, m/s], for an error [rad, m].
+        """Compute the velocity to add to the feed-forward [rad/s, m/s], for an error [rad, m].
 
         ``frozen``: the command is at a limit, so an integral would wind up.
         """

@@ -34,18 +34,18 @@ class DeskCrane:
         self._acted_ns = self._moved_ns = clock_ns()
 
     def connect(self) -> None:
-        """A real machine opens its socket here; until the first command its valves are neutral."""
+        """Connect; a real machine opens its socket here.  Until the first command its valves are neutral."""
         self._connected, self._command = True, Command()
 
     def act(self, command: Command) -> None:
-        """The shares of full opening in ``command.reference`` are what the valves get from now on."""
+        """Give the valves the shares of full opening in ``command.reference`` from now on."""
         if not self._connected:
             raise OSError("the desk is not connected")
         self._move()
         self._command, self._acted_ns = command, self._clock_ns()
 
     def observe(self) -> Feedback:
-        """The joints as the encoders measure them now, and the safety module's frame."""
+        """Return the joints as the encoders measure them now, and the safety module's frame."""
         if not self._connected:
             raise OSError("the desk is not connected")
         self._move()
@@ -64,7 +64,7 @@ class DeskCrane:
         )
 
     def disconnect(self) -> None:
-        """Nothing moves any more."""
+        """Disconnect; nothing moves any more."""
         self._move()
         self._connected, self._command = False, Command()
 

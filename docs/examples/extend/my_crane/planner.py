@@ -27,7 +27,7 @@ class PcaPlanner:
     """Proposes one grasp (the contract of `autonomy.grasp.planner.GraspPlanner`)."""
 
     def __call__(self, request: GraspRequest) -> GraspCandidate:
-        """The grasp at the centroid of a group of logs, across their principal axis.
+        """Choose the grasp at the centroid of a group of logs, across their principal axis.
 
         Raises:
             NoGrasp: there is no log, or none that the crane can reach.
@@ -70,15 +70,15 @@ class PcaPlanner:
 
     @staticmethod
     def _beside(request: GraspRequest, first: int, free: list[int]) -> list[int]:
-        """The first log and those that lie along it, while all of them fit between the jaws."""
+        """List the first log and those that lie along it, while all of them fit between the jaws."""
         log = request.logs[first]
         across = np.array([-log.axis[1], log.axis[0]])
         across /= np.linalg.norm(across)
 
         def edges(i: int) -> tuple[float, float]:
-            it = request.logs[i]
-            at = float((np.asarray(it.center_m[:2]) - log.center_m[:2]) @ across)
-            return at - 0.5 * it.diameter_m, at + 0.5 * it.diameter_m
+            candidate = request.logs[i]
+            offset_m = float((np.asarray(candidate.center_m[:2]) - log.center_m[:2]) @ across)
+            return offset_m - 0.5 * candidate.diameter_m, offset_m + 0.5 * candidate.diameter_m
 
         group, (low, high) = [first], edges(first)
         for i in sorted(free, key=lambda i: abs(sum(edges(i)))):

@@ -14,7 +14,7 @@ SNOW = (0.86, 0.9, 0.95)
 
 
 def bark(look: Mapping[str, Any]) -> Any:
-    """The material of a bark: ``kind``, ``tones`` (dark to bright), ``seed``, shares of moss, lichen, snow, wet."""
+    """Make a bark's material: ``kind``, ``tones`` (dark to bright), ``seed``, shares of moss, lichen, snow, wet."""
     g = Graph(f"bark {look['kind']}")
     tones, s, kind = look["tones"], look["seed"], look["kind"]
     at = g.coordinates("Object", (1, 1, 1), s)
@@ -33,7 +33,7 @@ def bark(look: Mapping[str, Any]) -> Any:
 
 
 def covered(g: Graph, look: Mapping[str, Any], colour: Any, s: float) -> Any:
-    """A colour under moss and snow, which lie on what faces up."""
+    """Cover a colour with moss and snow, which lie on what faces up."""
     if look["moss"]:
         patch = g.noise(g.coordinates("World", (1, 1, 1), s), 4.0, 5)
         share = g.step(g.math("ADD", g.math("MULTIPLY", g.upward(), 0.35), patch), 0.95 - 0.45 * look["moss"], 1.0)
@@ -47,7 +47,7 @@ def covered(g: Graph, look: Mapping[str, Any], colour: Any, s: float) -> Any:
 
 
 def _scaly(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """Spruce: small flat scales."""
+    """Make spruce bark: small flat scales."""
     at = g.coordinates("Object", (1, 1, 0.55), s)
     scales = g.cells(at, look["scale"] * 45.0)
     fine = g.noise(at, look["scale"] * 28.0, 8, 0.7)
@@ -56,7 +56,7 @@ def _scaly(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any
 
 
 def _plated(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """Pine and larch: plates between furrows that run along."""
+    """Make the bark of pine and larch: plates between furrows that run along."""
     at = g.coordinates("Object", (1, 1, 0.28), s)
     bent = g.node("VectorMath", operation="ADD")
     wobble = g.node("TexNoise")
@@ -76,14 +76,14 @@ def _plated(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[An
 
 
 def _furrowed(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """Old spruce, oak, aspen foot: ridges along the log."""
+    """Make the bark of old spruce, oak, aspen foot: ridges along the log."""
     at = g.coordinates("Object", (1, 1, 0.13), s)
     ridges = g.noise(at, look["scale"] * 24.0, 9, 0.68, 0.6)
     return g.ramp(ridges, tones, 0.36, 0.64), ridges, 0.018
 
 
 def _birch(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """White bark with dark dashes around the log and black cracked patches."""
+    """Make white bark with dark dashes around the log and black cracked patches."""
     dash = g.noise(g.coordinates("Object", (1, 1, 9), s), look["scale"] * 5.0, 4, 0.6)
     long_dash = g.noise(g.coordinates("Object", (1, 1, 22), s + 5), look["scale"] * 3.0, 3)
     dark = g.math("MAXIMUM", g.step(dash, 0.6, 0.66), g.math("MULTIPLY", g.step(long_dash, 0.62, 0.66), 0.8))
@@ -94,7 +94,7 @@ def _birch(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any
 
 
 def _smooth(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """Aspen, alder, beech: smooth bark with dark diamonds and pale bands."""
+    """Make the bark of aspen, alder, beech: smooth, with dark diamonds and pale bands."""
     cells = g.cells(g.coordinates("Object", (1, 1, 0.7), s), look["scale"] * 9.0)
     spots = g.step(cells, 0.2, 0.1)
     bands = g.noise(g.coordinates("Object", (1, 1, 3.5), s), 5.0, 6)
@@ -103,7 +103,7 @@ def _smooth(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[An
 
 
 def _peeled(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """Wood without bark, with streaks of bast along it."""
+    """Make wood without bark, with streaks of bast along it."""
     at = g.coordinates("Object", (1, 1, 0.05), s)
     streak = g.noise(at, look["scale"] * 22.0, 8, 0.6)
     rest = g.step(g.noise(g.coordinates("Object", (1, 1, 0.25), s + 4), 5.0, 6), 0.56, 0.6)
@@ -112,10 +112,10 @@ def _peeled(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[An
 
 
 def _photo(g: Graph, look: Mapping[str, Any], tones: Any, s: float) -> tuple[Any, Any, float]:
-    """A photographed bark, wrapped around the log by its texture coordinates."""
-    place = g.node("TexCoord").outputs["UV"]
+    """Make a photographed bark, wrapped around the log by its texture coordinates."""
+    texture_uv = g.node("TexCoord").outputs["UV"]
     moved = g.node("Mapping")
-    g.link(place, moved.inputs["Vector"])
+    g.link(texture_uv, moved.inputs["Vector"])
     moved.inputs["Scale"].default_value = (look["repeat"], 0.8 * look["scale"], 1.0)
     moved.inputs["Location"].default_value = (s, 0.37 * s, 0.0)
     colour = g.image(look["image"], moved.outputs["Vector"])
@@ -137,7 +137,7 @@ _KINDS = {
 
 
 def end_grain(look: Mapping[str, Any]) -> Any:
-    """A sawn end: rings about the pith, cracks, bright sapwood, a rim of bark."""
+    """Make a sawn end: rings about the pith, cracks, bright sapwood, a rim of bark."""
     g = Graph("end")
     s, tones = look["seed"], look["end_tones"]
     at = g.coordinates("Object", (1, 1, 0.02), 0.0)

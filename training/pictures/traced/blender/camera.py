@@ -16,7 +16,7 @@ SKIES = Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / 
 
 
 def prepare(threads: int) -> None:
-    """Settings that all pictures share, with the camera and the sun as objects."""
+    """Apply the settings that all pictures share, and add the camera and the sun as objects."""
     sc = bpy.context.scene
     sc.render.engine, sc.cycles.device = "CYCLES", "CPU"
     sc.cycles.max_bounces, sc.cycles.diffuse_bounces, sc.cycles.glossy_bounces = 3, 2, 1
@@ -37,7 +37,7 @@ def prepare(threads: int) -> None:
 
 
 def aim(view: Mapping[str, Any], shift_m: float = 0.0) -> None:
-    """The camera at a view, moved ``shift_m`` to its right (the second eye)."""
+    """Place the camera at a view, moved ``shift_m`` to its right (the second eye)."""
     size = view["width_px"], view["height_px"]
     render = bpy.context.scene.render
     render.resolution_x, render.resolution_y = size
@@ -55,7 +55,7 @@ def aim(view: Mapping[str, Any], shift_m: float = 0.0) -> None:
 
 
 def light(look: Mapping[str, Any]) -> None:
-    """Sky, sun and lamps."""
+    """Set up sky, sun and lamps."""
     world = bpy.data.worlds.get("sky") or bpy.data.worlds.new("sky")
     bpy.context.scene.world = world
     world.use_nodes = True
@@ -78,15 +78,21 @@ def light(look: Mapping[str, Any]) -> None:
         picture.image = bpy.data.images.load(str(SKIES / f"{kind}.exr"), check_existing=True)
         spun = tree.nodes.new("ShaderNodeMapping")
         spun.inputs["Rotation"].default_value = (0.0, 0.0, look["azimuth_rad"])
-        place = tree.nodes.new("ShaderNodeTexCoord")
-        tree.links.new(place.outputs["Generated"], spun.inputs[0])
+        texture_coordinates = tree.nodes.new("ShaderNodeTexCoord")
+        tree.links.new(texture_coordinates.outputs["Generated"], spun.inputs[0])
         tree.links.new(spun.outputs[0], picture.inputs[0])
         tree.links.new(picture.outputs[0], back.inputs[0])
     lamp = bpy.data.objects["sun"]
     lamp.data.energy, lamp.data.angle = look["sun_strength"], look["sun_angle_rad"]
     lamp.data.color = look["sun_tone"]
-    up, way = look["elevation_rad"], look["azimuth_rad"]
-    ray = mathutils.Vector((math.cos(up) * math.cos(way), math.cos(up) * math.sin(way), math.sin(up)))
+    elevation_rad, direction = look["elevation_rad"], look["azimuth_rad"]
+    ray = mathutils.Vector(
+        (
+            math.cos(elevation_rad) * math.cos(direction),
+            math.cos(elevation_rad) * math.sin(direction),
+            math.sin(elevation_rad),
+        )
+    )
     lamp.rotation_euler = ray.to_track_quat("Z", "Y").to_euler()
     for old in [o for o in bpy.data.objects if o.name.startswith("work light")]:
         bpy.data.objects.remove(old)
@@ -95,13 +101,13 @@ def light(look: Mapping[str, Any]) -> None:
         spot.data.energy, spot.data.spot_size, spot.data.color = lit["watts"], 1.6, lit["tone"]
         spot.data.shadow_soft_size = 0.06
         spot.location = lit["at_m"]
-        way = mathutils.Vector(lit["at_m"]) - mathutils.Vector(lit["target_m"])
-        spot.rotation_euler = way.to_track_quat("Z", "Y").to_euler()
+        direction = mathutils.Vector(lit["at_m"]) - mathutils.Vector(lit["target_m"])
+        spot.rotation_euler = direction.to_track_quat("Z", "Y").to_euler()
         bpy.context.scene.collection.objects.link(spot)
 
 
 def shoot(folder: Path, samples: int, seed: int) -> np.ndarray:
-    """Linear colour (H, W, 3) float32, with noise removed."""
+    """Render linear colour (H, W, 3) float32, with noise removed."""
     sc = bpy.context.scene
     sc.cycles.samples, sc.cycles.seed, sc.cycles.use_denoising = samples, seed, True
     sc.cycles.pixel_filter_type, sc.cycles.filter_width = "BLACKMAN_HARRIS", 1.5
@@ -109,20 +115,21 @@ def shoot(folder: Path, samples: int, seed: int) -> np.ndarray:
 
 
 def measure(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Optical depth (H, W) float32 [m], NaN for the sky, and number (H, W) uint8 of the log at each pixel's middle."""
+    """Render optical depth (H, W) float32 [m], NaN for the sky, and number (H, W) uint8 of the log at each pixel's
+    middle."""
     sc = bpy.context.scene
     sc.cycles.samples, sc.cycles.use_denoising = 1, False
     sc.cycles.pixel_filter_type, sc.cycles.filter_width = "BOX", 0.01
     before = sc.cycles.max_bounces
     sc.cycles.max_bounces = 0
-    found = _rendered(folder, ("Depth", "IndexOB"))
+    passes = _rendered(folder, ("Depth", "IndexOB"))
     sc.cycles.max_bounces = before
-    depth = found["Depth"][..., 0]
-    return np.where(depth < FAR_M, depth, np.nan), np.round(found["IndexOB"][..., 0]).astype(np.uint8)
+    depth = passes["Depth"][..., 0]
+    return np.where(depth < FAR_M, depth, np.nan), np.round(passes["IndexOB"][..., 0]).astype(np.uint8)
 
 
 def _rendered(folder: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Passes (H, W, 4) float32 by name, first row at the top."""
+    """Render passes (H, W, 4) float32 by name, first row at the top."""
     sc = bpy.context.scene
     sc.use_nodes, sc.render.use_compositing = True, True
     tree = sc.node_tree
@@ -138,13 +145,13 @@ def _rendered(folder: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
     tree.links.new(layers.outputs["Image"], whole.inputs[0])
     sc.frame_set(1)
     bpy.ops.render.render()
-    found = {}
+    passes = {}
     for name in wanted:
         image = bpy.data.images.load(str(folder / f"{name}_0001.exr"))
         image.colorspace_settings.name = "Non-Color"
         width, height = image.size
         values = np.empty(width * height * 4, np.float32)
         image.pixels.foreach_get(values)
-        found[name] = values.reshape(height, width, 4)[::-1]
+        passes[name] = values.reshape(height, width, 4)[::-1]
         bpy.data.images.remove(image)
-    return found
+    return passes

@@ -10,7 +10,7 @@ from training.pictures.traced.blender.nodes import Graph
 
 
 def ground(look: Mapping[str, Any]) -> Any:
-    """The ground: two kinds of soil mixed by patches, small clods, perhaps snow and puddles."""
+    """Make the ground: two kinds of soil mixed by patches, small clods, perhaps snow and puddles."""
     g = Graph("ground")
     s = look["seed"]
     at = g.coordinates("World", (1, 1, 1), s)
@@ -38,7 +38,7 @@ def ground(look: Mapping[str, Any]) -> Any:
 
 
 def _soil(g: Graph, look: Mapping[str, Any], s: float) -> tuple[Any, Any]:
-    """Colour and height of one kind of soil: photographed, or of noise in two sizes, cells, or needles."""
+    """Make colour and height of one kind of soil: photographed, or of noise in two sizes, cells, or needles."""
     tones: Sequence[Any] = look["tones"]
     if look["kind"] == "photo":
         at = g.coordinates("World", (look["scale"],) * 3, s)
@@ -60,9 +60,11 @@ def _soil(g: Graph, look: Mapping[str, Any], s: float) -> tuple[Any, Any]:
         height = g.math("ADD", g.step(cell, 0.0, 0.25), g.math("MULTIPLY", fine, 0.5))
         return g.ramp(height, tones, 0.25, 1.2), height
     if look["kind"] == "needles":
-        one = g.noise(g.coordinates("World", (1, 0.12, 1), s), 60.0, 4, 0.6, 2.0)
-        two = g.noise(g.coordinates("World", (0.12, 1, 1), s + 2), 60.0, 4, 0.6, 2.0)
-        height = g.math("ADD", g.math("MULTIPLY", g.math("MAXIMUM", one, two), 0.8), g.math("MULTIPLY", fine, 0.4))
+        along_x = g.noise(g.coordinates("World", (1, 0.12, 1), s), 60.0, 4, 0.6, 2.0)
+        along_y = g.noise(g.coordinates("World", (0.12, 1, 1), s + 2), 60.0, 4, 0.6, 2.0)
+        height = g.math(
+            "ADD", g.math("MULTIPLY", g.math("MAXIMUM", along_x, along_y), 0.8), g.math("MULTIPLY", fine, 0.4)
+        )
         return g.ramp(height, tones, 0.45, 0.8), height
     coarse = g.noise(at, 5.0 * look["scale"], 6, 0.6)
     height = g.math("ADD", g.math("MULTIPLY", coarse, 0.5), g.math("MULTIPLY", fine, 0.5))
@@ -70,7 +72,7 @@ def _soil(g: Graph, look: Mapping[str, Any], s: float) -> tuple[Any, Any]:
 
 
 def plain(tones: Sequence[Any], scale: float = 6.0, rough: float = 0.9, relief: float = 0.3, metal: float = 0.0) -> Any:
-    """A simple material of noise between tones, for plants, stones and painted steel."""
+    """Make a simple material of noise between tones, for plants, stones and painted steel."""
     g = Graph("plain")
     at = g.coordinates("Object")
     fleck = g.noise(at, scale, 7, 0.65)
@@ -83,7 +85,7 @@ def plain(tones: Sequence[Any], scale: float = 6.0, rough: float = 0.9, relief: 
 
 
 def leafy(tones: Sequence[Any]) -> Any:
-    """Blades and leaves: each its own tone, some light shines through."""
+    """Make blades and leaves: each its own tone, some light shines through."""
     g = Graph("leaf")
     info = g.node("ObjectInfo")
     own = g.math("MULTIPLY", info.outputs["Random"], 0.6)

@@ -47,7 +47,7 @@ def main(folder: Path, threads: int, number: int, count: int, pictures: int, tex
 
 
 def picture(k: int, threads: int, scratch: Path, textures: Path | None) -> dict[str, np.ndarray]:
-    """Picture ``k``: every second one has a second eye."""
+    """Draw picture ``k``: every second one has a second eye."""
     rng = random.Random(f"judging world {k}")
     kind = KINDS[k % len(KINDS)]
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -57,7 +57,7 @@ def picture(k: int, threads: int, scratch: Path, textures: Path | None) -> dict[
     camera.aim(view)
     light = camera.shoot(scratch, SAMPLES, k)
     depth, ids = camera.measure(scratch)
-    found = {
+    arrays = {
         "light": np.clip(light, 0.0, 6e4).astype(np.float16),
         "depth_m": depth.astype(np.float32),
         "ids": ids,
@@ -66,8 +66,8 @@ def picture(k: int, threads: int, scratch: Path, textures: Path | None) -> dict[
     }
     if (k // len(KINDS)) % 2:
         camera.aim(view, 0.12)
-        found["matched_m"] = matched_depth(light, camera.shoot(scratch, SAMPLES, k + 1), view["focal_px"], 0.12, k)
-    return found
+        arrays["matched_m"] = matched_depth(light, camera.shoot(scratch, SAMPLES, k + 1), view["focal_px"], 0.12, k)
+    return arrays
 
 
 def _scene(kind: str, rng: random.Random, textures: Path | None) -> dict[str, Any]:
@@ -94,21 +94,25 @@ def _scene(kind: str, rng: random.Random, textures: Path | None) -> dict[str, An
     # Logs: rows upon rows, a fan, single ones, or thrown about.
     how = rng.choice(("rows", "rows", "fan", "apart", "thrown"))
     thick = math.exp(rng.uniform(math.log(0.09), math.log(0.36)))
-    long, count, main_way = rng.uniform(1.8, 4.4), rng.randint(1, 9), rng.uniform(-math.pi, math.pi)
+    long, count, main_azimuth_rad = rng.uniform(1.8, 4.4), rng.randint(1, 9), rng.uniform(-math.pi, math.pi)
     skins = [
         _skin(species if rng.random() < 0.8 else rng.choice(list(TONES)), rng, 0.8 if snowy else 0.0) for _ in range(2)
     ]
     cut = _noisy([(0.45, 0.3, 0.17), (0.6, 0.45, 0.28)], 14.0, (1, 1, 1), 0.1)
     for i in range(count):
         d = min(0.45, max(0.06, thick * rng.uniform(0.7, 1.3)))
-        turn, x, y, z = main_way + rng.gauss(0, 0.12), 0.0, 0.0, 0.5 * d
+        turn, x, y, z = main_azimuth_rad + rng.gauss(0, 0.12), 0.0, 0.0, 0.5 * d
         if how == "rows":
-            row, place = divmod(i, 3)
-            side = (place - 1 + 0.5 * (row % 2)) * 1.12 * thick
-            x, y, z = -side * math.sin(main_way), side * math.cos(main_way), 0.5 * d + 0.88 * thick * row
-            turn = main_way + rng.gauss(0, 0.04)
+            row, column = divmod(i, 3)
+            side = (column - 1 + 0.5 * (row % 2)) * 1.12 * thick
+            x, y, z = (
+                -side * math.sin(main_azimuth_rad),
+                side * math.cos(main_azimuth_rad),
+                0.5 * d + 0.88 * thick * row,
+            )
+            turn = main_azimuth_rad + rng.gauss(0, 0.04)
         elif how == "fan":
-            turn, z = main_way + 0.35 * (i - count / 2), 0.5 * d + 0.7 * thick * (i % 3)
+            turn, z = main_azimuth_rad + 0.35 * (i - count / 2), 0.5 * d + 0.7 * thick * (i % 3)
         elif how == "apart":
             x, y = rng.uniform(-2.2, 2.2), rng.uniform(-2.0, 2.0)
         else:
@@ -128,11 +132,11 @@ def _scene(kind: str, rng: random.Random, textures: Path | None) -> dict[str, An
     if not snowy:
         _grass(rng, height, 3500 if kind == "grass" else rng.choice((0, 300, 1200)))
     for _ in range(rng.choice((0, 0, 2, 5))):
-        away, way = rng.uniform(4.5, 9.0), rng.uniform(0, 6.28)
+        distance_m, azimuth_rad = rng.uniform(4.5, 9.0), rng.uniform(0, 6.28)
         tree = _log(rng.uniform(0.1, 0.2), 0.08, 9.0, rng, [skins[-1]])
-        tree.location = (away * math.cos(way), away * math.sin(way), 4.2)
-    eye_way, reach = rng.uniform(-math.pi, math.pi), rng.uniform(2.4, 5.5)
-    eye = np.array([reach * math.cos(eye_way), reach * math.sin(eye_way), rng.uniform(2.0, 2.9)])
+        tree.location = (distance_m * math.cos(azimuth_rad), distance_m * math.sin(azimuth_rad), 4.2)
+    eye_azimuth_rad, reach = rng.uniform(-math.pi, math.pi), rng.uniform(2.4, 5.5)
+    eye = np.array([reach * math.cos(eye_azimuth_rad), reach * math.sin(eye_azimuth_rad), rng.uniform(2.0, 2.9)])
     ahead = np.array([rng.gauss(0, 0.3), rng.gauss(0, 0.3), 0.1]) - eye
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
@@ -173,7 +177,7 @@ def _noisy(
     snow: float = 0.0,
     dashes: bool = False,
 ) -> Any:
-    """A material of stretched noise, perhaps with a photograph, lying snow, or the dashes of birch."""
+    """Make a material of stretched noise, perhaps with a photograph, lying snow, or the dashes of birch."""
     m = bpy.data.materials.new("m")
     m.use_nodes = True
     t = m.node_tree

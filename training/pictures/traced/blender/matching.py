@@ -9,7 +9,7 @@ GRAIN = 1.5  # of the eyes' sensors, of 255
 
 
 def matched_depth(left: np.ndarray, right: np.ndarray, focal_px: float, baseline_m: float, seed: int = 0) -> np.ndarray:
-    """Optical depth (H, W) float32 [m] of the left picture, NaN where the two do not agree.
+    """Compute optical depth (H, W) float32 [m] of the left picture, NaN where the two do not agree.
 
     ``left`` and ``right`` (H, W, 3) are linear light; their rows match.
     """

@@ -24,7 +24,7 @@ class Graph:
         self.set("Specular IOR Level", 0.25)
 
     def node(self, kind: str, **settings: Any) -> Any:
-        """A new node with attributes set."""
+        """Add a new node with attributes set."""
         made = self.tree.nodes.new(f"ShaderNode{kind}")
         for name, value in settings.items():
             setattr(made, name, value)
@@ -40,11 +40,11 @@ class Graph:
             socket.default_value = value
 
     def set(self, name: str, value: Any) -> None:
-        """An input of the surface."""
+        """Set an input of the surface."""
         self.link(value, self.surface.inputs[name])
 
     def coordinates(self, kind: str = "Object", scale: Sequence[float] = (1, 1, 1), shift: float = 0.0) -> Any:
-        """Object, generated or world coordinates, scaled and shifted."""
+        """Return object, generated or world coordinates, scaled and shifted."""
         out = self.node("NewGeometry").outputs["Position"] if kind == "World" else (self.node("TexCoord").outputs[kind])
         moved = self.node("Mapping")
         self.link(out, moved.inputs["Vector"])
@@ -53,7 +53,7 @@ class Graph:
         return moved.outputs["Vector"]
 
     def noise(self, at: Any, scale: float, detail: float = 6.0, rough: float = 0.6, warp: float = 0.0) -> Any:
-        """Fractal noise, about 0.3 to 0.7."""
+        """Add fractal noise, about 0.3 to 0.7."""
         made = self.node("TexNoise")
         self.link(at, made.inputs["Vector"])
         for name, value in (
@@ -66,14 +66,14 @@ class Graph:
         return made.outputs["Fac"]
 
     def cells(self, at: Any, scale: float, feature: str = "F1", out: str = "Distance") -> Any:
-        """Voronoi cells: the distance to a cell's point or edge."""
+        """Add Voronoi cells: the distance to a cell's point or edge."""
         made = self.node("TexVoronoi", feature=feature)
         self.link(at, made.inputs["Vector"])
         made.inputs["Scale"].default_value = scale
         return made.outputs[out]
 
     def ramp(self, value: Any, colours: Sequence[Colour], low: float = 0.35, high: float = 0.65) -> Any:
-        """Colours over a value."""
+        """Spread colours over a value."""
         made = self.node("ValToRGB")
         stops = made.color_ramp.elements
         stops[0].position, stops[1].position = low, high
@@ -84,7 +84,7 @@ class Graph:
         return made.outputs["Color"]
 
     def step(self, value: Any, low: float, high: float) -> Any:
-        """0 below ``low``, 1 above ``high``, smooth between; swapped bounds turn it round."""
+        """Return 0 below ``low``, 1 above ``high``, smooth between; swapped bounds turn it round."""
         made = self.node("MapRange", interpolation_type="SMOOTHSTEP")
         turned = low > high
         self.link(value, made.inputs["Value"])
@@ -93,14 +93,14 @@ class Graph:
         return made.outputs["Result"]
 
     def math(self, kind: str, a: Any, b: Any = 0.0) -> Any:
-        """A scalar operation."""
+        """Add a scalar operation."""
         made = self.node("Math", operation=kind)
         self.link(a, made.inputs[0])
         self.link(b, made.inputs[1])
         return made.outputs[0]
 
     def mix(self, share: Any, a: Any, b: Any, how: str = "MIX") -> Any:
-        """Colours ``a`` and ``b`` mixed."""
+        """Mix colours ``a`` and ``b``."""
         made = self.node("MixRGB", blend_type=how)
         self.link(share, made.inputs["Fac"])
         self.link(a, made.inputs["Color1"])
@@ -108,7 +108,7 @@ class Graph:
         return made.outputs["Color"]
 
     def bump(self, height: Any, strength: float, distance_m: float, before: Any = None) -> Any:
-        """A normal bent by a height; sets it on the surface and returns it."""
+        """Bend a normal by a height; set it on the surface and return it."""
         made = self.node("Bump")
         made.inputs["Strength"].default_value, made.inputs["Distance"].default_value = strength, distance_m
         self.link(height, made.inputs["Height"])
@@ -118,13 +118,13 @@ class Graph:
         return made.outputs["Normal"]
 
     def upward(self) -> Any:
-        """The vertical part of the true normal, -1 to 1."""
+        """Return the vertical part of the true normal, -1 to 1."""
         made = self.node("SeparateXYZ")
         self.link(self.node("NewGeometry").outputs["Normal"], made.inputs[0])
         return made.outputs["Z"]
 
     def image(self, path: str, at: Any, colour: bool = True) -> Any:
-        """An image's colour at coordinates."""
+        """Return an image's colour at coordinates."""
         made = self.node("TexImage", interpolation="Linear")
         made.image = bpy.data.images.load(path, check_existing=True)
         if not colour:
@@ -133,7 +133,7 @@ class Graph:
         return made.outputs["Color"]
 
     def tinted(self, colour: Any, hue: float, saturation: float, value: float) -> Any:
-        """A colour with its hue turned (0.5: not), saturation and value multiplied."""
+        """Return a colour with its hue turned (0.5: not), saturation and value multiplied."""
         made = self.node("HueSaturation")
         for name, number in (("Hue", hue), ("Saturation", saturation), ("Value", value)):
             made.inputs[name].default_value = number
@@ -142,5 +142,5 @@ class Graph:
 
 
 def rotation_z(angle_rad: float) -> tuple[float, float, float]:
-    """Euler angles of a turn about the vertical."""
+    """Return the Euler angles of a turn about the vertical."""
     return (0.0, 0.0, angle_rad % (2.0 * math.pi))

@@ -16,14 +16,14 @@ from training.pictures.traced.staging import Piece, pieces
 
 
 def build(scene: Mapping[str, Any]) -> None:
-    """Everything but camera and light, in an empty file."""
+    """Build everything but camera and light, in an empty file."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     materials: dict[str, Any] = {}
     meshes: dict[int, Any] = {}
-    kept: list[Shape] = []  # so that no other shape gets the identity of one that is gone
+    live_shapes: list[Shape] = []  # so that no other shape gets the identity of one that is gone
     for piece in pieces(scene):
         if id(piece.shape) not in meshes:
-            kept.append(piece.shape)
+            live_shapes.append(piece.shape)
             meshes[id(piece.shape)] = _mesh(piece, materials)
         _place(piece, meshes[id(piece.shape)])
 
@@ -58,13 +58,13 @@ def _place(piece: Piece, mesh: Any) -> None:
 
 
 def _material(look: Mapping[str, Any]) -> Any:
-    what = look["what"]
-    if what == "ground":
+    surface_type = look["what"]
+    if surface_type == "ground":
         return ground(look)
-    if what == "bark":
+    if surface_type == "bark":
         return bark(look)
-    if what == "end":
+    if surface_type == "end":
         return end_grain(look)
-    if what == "leaf":
+    if surface_type == "leaf":
         return leafy(look["tones"])
     return plain(look["tones"], 5.0 * look["scale"], look.get("rough", 0.9), look["relief"], look.get("metal", 0.0))

@@ -42,17 +42,17 @@ def main(folder: Path, threads: int, number: int, count: int) -> None:
 
 
 def draw(view: Mapping[str, Any], scratch: Path) -> dict[str, np.ndarray]:
-    """The arrays of one picture: light float16 (linear), depth_m, ids, and matched_m with a second eye."""
+    """Draw the arrays of one picture: light float16 (linear), depth_m, ids, and matched_m with a second eye."""
     camera.light(view["light"])
     camera.aim(view)
     light = camera.shoot(scratch, view["samples"], view["seed"])
     depth, ids = camera.measure(scratch)
-    found = {"light": np.clip(light, 0.0, 6e4).astype(np.float16), "depth_m": depth.astype(np.float32), "ids": ids}
+    arrays = {"light": np.clip(light, 0.0, 6e4).astype(np.float16), "depth_m": depth.astype(np.float32), "ids": ids}
     if view["baseline_m"]:
         camera.aim(view, view["baseline_m"])
         other = camera.shoot(scratch, view["samples"], view["seed"] + 1)
-        found["matched_m"] = matched_depth(light, other, view["focal_px"], view["baseline_m"], view["seed"])
-    return found
+        arrays["matched_m"] = matched_depth(light, other, view["focal_px"], view["baseline_m"], view["seed"])
+    return arrays
 
 
 def _keep(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
