@@ -12,7 +12,18 @@ from controller.config import load as load_settings
 from controller.crane.trajectory_check import WorkspaceCheck
 from controller.guard import seal
 from controller.guard.__main__ import DATABASES, build
-from controller.guard.envelope import RATES_HZ, SHIPPED, _axis, _limits, _number, _within, read_envelope
+from controller.guard.envelope import (
+    _ENCODER,
+    _LIMITS,
+    _VALVE,
+    RATES_HZ,
+    SHIPPED,
+    _axis,
+    _limits,
+    _number,
+    _within,
+    read_envelope,
+)
 from controller.guard.layout import GuardConfigError, read_layouts
 from machine.geometry.bunk import stake_walls
 from machine.geometry.grapple import lowest_pin_m
@@ -197,6 +208,34 @@ def test_a_number_may_be_at_either_end_of_its_range():
     assert _within(ends, {"a": (1.0, 2.0), "b": (1.0, 2.0)}) == ends
     with pytest.raises(ValueError):
         _within({"a": 2.1}, {"a": (1.0, 2.0)})
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "low", "high"),
+    [
+        (_VALVE, "deadband_plus_pct", 0.0, 49.99),
+        (_VALVE, "deadband_minus_pct", 0.0, 49.99),
+        (_VALVE, "full_speed_plus", 0.001, 20.0),
+        (_VALVE, "full_speed_minus", 0.001, 20.0),
+        (_VALVE, "delay_s", 0.0, 0.5),
+        (_VALVE, "lag_s", 0.0, 0.3),
+        (_ENCODER, "total_counts", 2, 4_294_967_296),
+        (_ENCODER, "zero_counts", -2_147_483_648, 4_294_967_296),
+        (_ENCODER, "unit_per_count", 1e-9, 0.1),
+        (_LIMITS, "lower", -20.0, 20.0),
+        (_LIMITS, "upper", -20.0, 20.0),
+        (_LIMITS, "speed_limit", 0.001, 10.0),
+        (_LIMITS, "acceleration_limit", 0.01, 20.0),
+    ],
+)
+def test_a_number_of_a_machine_is_refused_just_outside_its_range(table, key, low, high):
+    for value in (low, high):
+        assert _within({key: value}, {key: table[key]}) == {key: value}
+    below = low - 1 if isinstance(low, int) else low - 0.1 * (abs(low) or high)
+    above = high + 1 if isinstance(high, int) else 1.001 * high
+    for value in (below, above):
+        with pytest.raises(ValueError):
+            _within({key: value}, {key: table[key]})
 
 
 def test_a_joint_without_a_range_has_no_limits():

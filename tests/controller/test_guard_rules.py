@@ -6,7 +6,7 @@ import pytest
 
 from can_dbc.frame import Frame
 from controller.guard.guard import HEARTBEAT_KEY
-from controller.guard.verdicts import NO_AXIS, Verdict
+from controller.guard.verdicts import LATCHING, NO_AXIS, Verdict
 from tests.controller.bench import MS, T, count_until
 from tests.controller.guard_traffic import (
     BROKEN,
@@ -231,3 +231,10 @@ def test_a_bad_frame_makes_no_later_command_punctual() -> None:
     traffic.tick(2)
     traffic.dropped = set()
     assert traffic.tick() is Verdict.STALE
+
+
+def test_silence_does_not_latch_and_what_is_heard_does():
+    """Whatever merely stayed away may come back by itself; a rule that a frame has broken needs a person."""
+    silent = {"NO_COMMAND", "ENCODER", "STALE", "ESTOP_LOST", "CARRIER_LOST"}
+    states = {"GOOD", "CALMING", "LATCHED"}
+    assert {verdict.name for verdict in Verdict} - {verdict.name for verdict in LATCHING} == silent | states
