@@ -6,8 +6,9 @@ m).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
-from math import dist
+from math import cos, dist, pi, sin
 from typing import Final
 
 import msgspec
@@ -111,6 +112,7 @@ class Cycle:
         self._motion_planner, self._select_grasp = motion_planner, grasp_selector
         self._target = job.to(profile.bunk)
         self._quick_rotation = has_no_encoder(profile) and motion_planner.direct
+        self._turns_rotator = motion_planner.turns_rotator
         self._inbox = inbox
         self._arm = Arm(profile, free_telescope=motion_planner.free_telescope, slope=slope)
         """The arm with the load of the present phase."""
@@ -153,7 +155,24 @@ class Cycle:
         self._previous_grasp = None
         self._stirred = False
         job = msgspec.structs.replace(self._job, leave=self._job.leave + self._recovery.excluded_logs)
-        self.grasp = self._select_grasp(self._arm, job, self._inbox.logs, q[Joint.SLEW], q[Joint.ROT])
+        self.grasp = self._unturned_grasp(
+            self._select_grasp(self._arm, job, self._inbox.logs, q[Joint.SLEW], q[Joint.ROT]), q
+        )
+
+    def _unturned_grasp(self, grasp: Grasp, q: Axes) -> Grasp:
+        """Return the grasp with the rotator as it stands, where the planner does not turn it.
+
+        The jaws then turn the log that they close on: it comes to lie across their opening.
+        """
+        if self._turns_rotator:
+            return grasp
+        pose = self._unturned(grasp.pose, q)
+        across_rad = grapple_yaw(self._profile, (pose.slew_rad, 0.0, 0.0, 0.0, pose.rot_rad)) - pi / 2
+        log = dataclasses.replace(grasp.log, axis=(cos(across_rad), sin(across_rad), 0.0))
+        return dataclasses.replace(grasp, pose=pose, log=log)
+
+    def _unturned(self, pose: Pose, q: Axes) -> Pose:
+        return pose if self._turns_rotator else pose._replace(rot_rad=q[Joint.ROT])
 
     @property
     def sees_a_part(self) -> bool:
@@ -272,7 +291,7 @@ class Cycle:
             case Phase.ABOVE:
                 return approach_motion(arm, self._motion_planner, start, grasp, logs)
             case Phase.DESCEND:
-                self.grasp = grasp = corrected_grasp(arm, grasp, logs)
+                self.grasp = grasp = self._unturned_grasp(corrected_grasp(arm, grasp, logs), q)
                 deeper_m = EXTRACTION_DEPTH_M if grasp.extracts else 0.0
                 return straight_line(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
             case Phase.CLOSE:
@@ -296,10 +315,14 @@ class Cycle:
             case Phase.CARRY:
                 self.lifted_kg = arm.load_kg
                 logs = self._logs_with_load([q])
-                self.place = drop_pose = plan_place(
-                    arm, self._job, grasp, logs, grapple_yaw(self._profile, q), q[Joint.ROT]
-                )
-                if grasp.thinnest_m < THICK_LOG_M and self._horizontal_distance_m(q, drop_pose) < COLUMN_RADIUS_M:
+                hangs_at_rad = grapple_yaw(self._profile, q)
+                place = plan_place(arm, self._job, grasp, logs, hangs_at_rad, q[Joint.ROT])
+                self.place = drop_pose = self._unturned(place, q)
+                if (
+                    self._turns_rotator
+                    and grasp.thinnest_m < THICK_LOG_M
+                    and self._horizontal_distance_m(q, drop_pose) < COLUMN_RADIUS_M
+                ):
                     load = next((log for log in logs if log.seen and log.id == grasp.log.id), None)
                     if load is not None:
                         self._turn_count += 1
@@ -412,6 +435,8 @@ class Cycle:
         path is needed.
         """
         assert self.grasp is not None and self.place is not None
+        if not self._turns_rotator:
+            return 0.0
         corrected_pose = corrected_place(self._arm, self._job, self.grasp, self.place, self._logs_with_load([q]), q)
         if corrected_pose is None:
             return None

@@ -22,8 +22,12 @@ class MotionPlanner(Protocol):
 
     ``direct``: one motion leads down to a log, or with it up, over and down into the bunk; otherwise an activity
     requests each of these alone.  ``free_telescope``: the planner is fastest with the telescope far out at a log
-    (`Arm`).
+    (`Arm`).  ``turns_rotator``: whether the planner of the crane job may turn the grapple.
     """
+
+    @property
+    def turns_rotator(self) -> bool:
+        """Whether the rotator is turned for a log and for its place; otherwise it stays as it is."""
 
     @property
     def direct(self) -> bool:
@@ -58,6 +62,7 @@ class TimeOptimalPlanner:
     def __init__(self, direct: bool = True) -> None:
         self.direct: Final = direct
         self.free_telescope: Final = True
+        self.turns_rotator: Final = True
 
     def __call__(
         self,
@@ -89,6 +94,8 @@ class MovementPrimitivePlanner:
         self.direct: Final = False
         self.free_telescope: Final = False
         """The demonstrations have other postures."""
+        self.turns_rotator: Final = False
+        """Paper B neither measures nor controls it (3.1): logs lie at an angle to the path, as its grapple hangs."""
         self._shown = PrimitiveMotions(primitives)
 
     def __call__(

@@ -38,9 +38,11 @@ from autonomy.perception.driving_log_detector import (
     DrivingLogDetector,
     LogLocalizer,
     PaperBLocalizer,
+    Segmentation,
 )
 from autonomy.perception.driving_requests import DrivingRequests, StandingRequests, asked_ns
 from autonomy.perception.log_detector import LogDetector
+from autonomy.perception.papers import BoxSegmenter
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter
 from autonomy.perception.shown_picture import MeasuredPicture, NewestPicture
@@ -60,9 +62,11 @@ POLL_S: Final = 0.1
 FRAME_TIMEOUT_S: Final = 0.5
 FRAME_PX: Final = 608
 """Size of paper B's pictures."""
+PAPER_B: Final = "paper-b"
+"""Boxes, and the depth at their middles: `PaperBLocalizer`."""
 LOCALIZERS: Final[dict[str, Callable[[Profile], LogLocalizer]]] = {
     "ours": lambda profile: CylinderLocalizer(profile, SURVEYED_BY_GNSS),
-    "paper-b": lambda profile: PaperBLocalizer(),
+    PAPER_B: lambda profile: PaperBLocalizer(),
 }
 """Methods with a surveyed camera and a position from the receiver."""
 
@@ -164,7 +168,9 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=int, default=0, help="UDP port of the log list (default: any free port)")
     parser.add_argument("--variant", choices=("rgbd", "depth", *MASKS), default="rgbd", help="network and its input")
     parser.add_argument("--driving", action="store_true", help="the machine drives, and its planner says where it is")
-    parser.add_argument("--localizer", choices=LOCALIZERS, default="ours", help="with --driving: how masks become logs")
+    parser.add_argument(
+        "--localizer", choices=LOCALIZERS, default="ours", help="with --driving: ours, or paper B's boxes"
+    )
     parser.add_argument("--weights", type=Path, help="weights of the network (default: the shipped weights)")
     return parser
 
@@ -179,16 +185,19 @@ def main(argv: list[str] | None = None) -> int:
         if options.camera not in profile.cameras:
             known = ", ".join(profile.cameras) or "none"
             return _fail(f"{profile.name} has no camera {options.camera!r}; it has: {known}")
-        segmenter: LogSegmenter | MaskSegmenter
-        if options.variant in MASKS:
+        segmenter: LogSegmenter | MaskSegmenter | BoxSegmenter
+        if options.driving and options.localizer == PAPER_B:
+            segmenter = BoxSegmenter()
+        elif options.variant in MASKS:
             segmenter = MaskSegmenter(MASKS[options.variant], options.weights)
         else:
             segmenter = LogSegmenter(options.variant, options.weights)
         source = open_source(options.frames, options.camera, profile)
     except (ProfileError, InputRefused, LinkError) as error:
         return _fail(str(error), EXIT_PORT if error.code == COMES_BACK else EXIT_CONFIGURATION)
-    warm_up(segmenter)
-    segment = segmenter.segment
+    if not isinstance(segmenter, BoxSegmenter):
+        warm_up(segmenter)
+    segment: Segmentation = segmenter.segment
     signals: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: signals.append(number))

@@ -2,12 +2,13 @@
 
 The pose of the camera is that of the crane's base in the plane (from the GNSS receiver) with the kinematic chain from
 there to the camera: the half of the carrier that holds it and the articulation.  ``CylinderLocalizer`` fits cylinders
-to the network's masks and merges them over pictures.  ``PaperBLocalizer`` takes the depth at the middle of each mask's
-box (paper B 3.2.3), which gives a point only.
+to the network's masks and merges them over pictures.  ``PaperBLocalizer`` takes the depth at the middle of each box
+(paper B 3.2.3), which gives a point only.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, Protocol
@@ -18,7 +19,7 @@ from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, resc
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_detector import Perception
 from autonomy.perception.log_list import LogObservation
-from autonomy.perception.papers import log_from_mask, position_in_box
+from autonomy.perception.papers import position_in_box
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors
@@ -31,8 +32,6 @@ PAPER_B_LENGTH_M, PAPER_B_DIAMETER_M = 2.0, 0.25
 """Mean size of paper B's logs, because its boxes give no size."""
 MIN_HITS_WITH_HIDDEN_END: Final = 6
 """A log with a hidden end is reported after so many pictures: another log may hide the end in all of them."""
-MIN_LEVEL_PART: Final = 0.3
-"""An axis with a smaller horizontal component is not that of a log on the ground."""
 MIN_SCORE: Final = 0.25
 """Masks with a lower score are not logs: logs within ``MAX_RANGE_M`` score 0.5 and more, gaps in a shadow 0.2."""
 
@@ -86,27 +85,26 @@ class PaperBLocalizer:
     """``autonomy.perception.papers``, extended where the paper is silent.
 
     Half a diameter is added along the line of sight, because the grapple needs the log's middle and the camera sees its
-    surface.  The axis is that of the mask's points, as in paper A, because paper B does not say how the grapple turns.
+    surface.  A box tells nothing of the axis, and paper B's rotator does not turn (3.1): every log gets the
+    direction of the view.
     """
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
         """Return a log for every box whose middle has a depth."""
         logs = []
+        east, north, _ = (pose.rotation @ (0.0, 0.0, 1.0)).tolist()
+        heading_rad = math.atan2(north, east)
+        axis = (math.cos(heading_rad), math.sin(heading_rad), 0.0)
         for number, instance in enumerate(masks):
             rows, columns = np.flatnonzero(instance.mask.any(axis=1)), np.flatnonzero(instance.mask.any(axis=0))
             if not len(rows):
                 continue
             box = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
-            point, log = position_in_box(frame, box), log_from_mask(frame, instance.mask)
-            if point is None or log is None:
-                continue
-            range_m = float(np.linalg.norm(point))
-            level = (pose.rotation @ log.axis)[:2]
-            length = float(np.linalg.norm(level))
-            if range_m > MAX_RANGE_M or length < MIN_LEVEL_PART:
+            point = position_in_box(frame, box)
+            range_m = math.inf if point is None else float(np.linalg.norm(point))
+            if point is None or range_m > MAX_RANGE_M:
                 continue
             x, y, z = pose.to_base(point * (1.0 + 0.5 * PAPER_B_DIAMETER_M / range_m)).tolist()
-            axis = (float(level[0]) / length, float(level[1]) / length, 0.0)
             logs.append(
                 LogObservation(number, (x, y, z), axis, PAPER_B_LENGTH_M, PAPER_B_DIAMETER_M, _PAPER_B_COVARIANCE)
             )
@@ -116,7 +114,7 @@ class PaperBLocalizer:
 
 
 _PAPER_B_SIGMAS: Final = (0.10, 0.10, 0.6, 0.6, 0.2, 0.2, 0.05)
-"""Of a box [m, rad]: the position as in the paper's own errors; the axis of a log seen end-on is arbitrary."""
+"""Of a box [m, rad]: the position as in the paper's own errors; the axis is arbitrary."""
 _PAPER_B_COVARIANCE: Final = tuple(np.diag(np.square(_PAPER_B_SIGMAS))[np.triu_indices(len(_PAPER_B_SIGMAS))].tolist())
 
 

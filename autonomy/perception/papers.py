@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from PIL import Image
 from scipy import ndimage
 
 from autonomy.networks import SHIPPED, Interface, OpenVinoNet, load
@@ -90,22 +92,27 @@ def position_in_box(frame: RgbdFrame, box_px: Box) -> np.ndarray | None:
     return frame.intrinsics.deproject(u, v, float(known.mean())) if len(known) else None
 
 
+def centres_of(frame: RgbdFrame, pose: Pose, boxes_px: Iterable[Box], radius_m: float) -> list[np.ndarray]:
+    """Compute the points (3,) [m] of the boxes whose middle has a depth, in the frame of ``pose``.
+
+    ``radius_m`` is added along the line of sight, from the surface to the middle (not in the paper).
+    """
+    points = (position_in_box(frame, box) for box in boxes_px)
+    return [pose.to_base(p * (1.0 + radius_m / float(np.linalg.norm(p)))) for p in points if p is not None]
+
+
 class RunningAverage:
     """The averaged positions of the logs so far."""
 
     def __init__(self, radius_m: float = 0.0, association_m: float = MAX_ASSOCIATION_M) -> None:
-        """Start empty; ``radius_m`` is added along the line of sight, from surface to middle (not in the paper)."""
+        """Start empty; ``radius_m`` as in `centres_of`."""
         self._radius_m, self._association_m = radius_m, association_m
         self._sums: list[np.ndarray] = []
         self._counts: list[int] = []
 
     def add(self, frame: RgbdFrame, pose: Pose, boxes_px: list[Box]) -> None:
         """Add the boxes of one frame."""
-        for box in boxes_px:
-            point = position_in_box(frame, box)
-            if point is None:
-                continue
-            base = pose.to_base(point * (1.0 + self._radius_m / float(np.linalg.norm(point))))
+        for base in centres_of(frame, pose, boxes_px, self._radius_m):
             apart = [float(np.linalg.norm(s / n - base)) for s, n in zip(self._sums, self._counts, strict=True)]
             if apart and min(apart) < self._association_m:
                 i = int(np.argmin(apart))
@@ -146,6 +153,8 @@ def end_on_error_m(
 SIZE_PX: Final = 608
 STRIDE: Final = 8
 MIN_SCORE: Final = 0.05
+SURE_SCORE: Final = 0.5
+"""A box with a lower score is no log: logs within ten metres score 0.7 and more, parts of the machine up to 0.3."""
 MAX_OVERLAP: Final = 0.75  # intersection over union of two logs' boxes: those of slanting neighbours overlap a lot
 SIDE_COUNT: Final = 4  # left, top, right, bottom: logarithms of distances in STRIDE
 
@@ -180,6 +189,42 @@ class BoxDetector:
                 f"shape {rgb.shape}",
             )
         return decode_boxes(self._net(network_input(rgb)[None])["boxes"][0])
+
+
+@dataclass(frozen=True, slots=True)
+class BoxMask:
+    """A box as a mask (H, W) bool of whole pixels, with its score 0..1."""
+
+    mask: np.ndarray
+    score: float
+
+
+class BoxSegmenter:
+    """Paper B's detector where others segment: every box of a frame is a mask.
+
+    Raises:
+        InputRefused: the weights are missing, damaged or of another network.
+    """
+
+    def __init__(self) -> None:
+        self._detector = BoxDetector()
+
+    def segment(self, frame: RgbdFrame) -> tuple[BoxMask, ...]:
+        """Detect the boxes in a frame of any size, which is shrunk to the letterbox of 608 x 608 px."""
+        letterbox, picture = frame.intrinsics.letterbox(SIZE_PX), Image.fromarray(frame.rgb)
+        inner_size = letterbox.inner.width_px, letterbox.inner.height_px
+        if picture.size != inner_size:
+            picture = picture.resize(inner_size, Image.Resampling.BOX)
+        boxes, scores = self._detector.detect(letterbox.pad(np.asarray(picture), 0))
+        masks = []
+        for box, score in zip(boxes.tolist(), scores.tolist(), strict=True):
+            if score < SURE_SCORE:
+                continue
+            left, top, right, bottom = (max(0, round(edge)) for edge in box_in_picture(tuple(box), frame.intrinsics))
+            mask = np.zeros(frame.depth_m.shape, bool)
+            mask[top:bottom, left:right] = True
+            masks.append(BoxMask(mask, score))
+        return tuple(masks)
 
 
 def network_input(rgb: np.ndarray) -> np.ndarray:

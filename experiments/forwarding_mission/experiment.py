@@ -1,4 +1,4 @@
-"""The forwarding-mission experiment: paper B's trial by both methods, then ours on other machines and fields."""
+"""The forwarding-mission experiment: paper B's trial by both methods, then on more fields, ours on other machines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, Point
 from experiments.common import pool
 from experiments.common.individuals import calibrated
-from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG, run_mission, shuffled
+from experiments.common.mission_trial import (
+    ACROSS_M,
+    ALONG_M,
+    LOG_ANGLE_DEG,
+    PAPER_B,
+    TURN_DEG,
+    at_an_angle,
+    run_mission,
+    shuffled,
+)
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
@@ -29,9 +38,12 @@ from hil.missions.site import site_of
 
 TRIALS: Final = 20
 """Missions on sampled machines; each takes a quarter of an hour of simulated time."""
+PAPER_B_TRIALS: Final = 9
+"""Missions by paper B's method besides the one on the original field."""
 MACHINES: Final = 5
 """Individuals that alternate."""
 FIRST_SEED: Final = 60_000
+FIRST_FIELD: Final = 60_500
 SEEDS_PER_RUN: Final = 1000
 DETECTORS: Final = {"ours": "ours", "paper-b": "faithful"}
 """Detector of each method."""
@@ -76,7 +88,11 @@ def run(options: Options, console: Console) -> Result:
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """Make the result page; ``trials``: outcomes of the missions, for the error table."""
     introduction = INTRODUCTION.format(
-        machines=result.environment["machines"], along=CM * ALONG_M, across=CM * ACROSS_M, turn=TURN_DEG
+        machines=result.environment["machines"],
+        along=CM * ALONG_M,
+        across=CM * ACROSS_M,
+        turn=TURN_DEG,
+        angle=LOG_ANGLE_DEG,
     )
     return Page("Forwarding mission", CONCLUSION, introduction, sections(trials))
 
@@ -88,20 +104,31 @@ def failed(trial: Trial) -> bool:
 
 
 def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[Job]:
-    """Plan one mission of the nominal machine on the original field by each method."""
+    """Plan a mission of the nominal machine on the original field by each method, and more by paper B's on others."""
     job_options: dict[str, Any] = {
         "profile": profile,
         "truth": "nominal",
         "file": str(PAPER_B),
         "shuffled": False,
+        "angled": True,
         "short": options.quick,
         "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None,
         "limit_s": LIMIT_S,
     }
+    by_method = {method: {"way": method, "eyes": eyes} for method, eyes in DETECTORS.items()}
     methods = ("ours",) if options.quick else ("ours", "paper-b")
-    return [
-        Job(f"first/{method}", "mission", options.seed, job_options | {"way": method, "eyes": DETECTORS[method]})
-        for method in methods
+    first_missions = [
+        Job(f"first/{method}", "mission", options.seed, job_options | by_method[method]) for method in methods
+    ]
+    first_field = FIRST_FIELD + SEEDS_PER_RUN * options.seed
+    return first_missions + [
+        Job(
+            f"paper-b/{i}",
+            "mission",
+            options.seed + 1 + i,
+            job_options | by_method["paper-b"] | {"shuffled": True, "field": first_field + i},
+        )
+        for i in range(0 if options.quick else min(PAPER_B_TRIALS, options.trials or PAPER_B_TRIALS))
     ]
 
 
@@ -155,11 +182,13 @@ def drive(job: Job) -> dict[str, Any]:
     """Drive one mission.
 
     ``options``: profile (shipped name), truth, way (method), eyes (detector), file (of the mission), shuffled (whether
-    the logs are shifted, with the seed ``field``), short (whether only the first log is loaded), text (of the
-    calibrated profile; None: as shipped), limit_s.
+    the logs are shifted, with the seed ``field``), angled (whether they lie as paper B's, before they are), short
+    (whether only the first log is loaded), text (of the calibrated profile; None: as shipped), limit_s.
     """
     o = job.options
     mission = load_mission(Path(o["file"]), route_wanted=True).mission
+    if o.get("angled"):
+        mission = at_an_angle(mission)
     if o.get("short"):
         mission = short(mission)
     if o["shuffled"]:

@@ -13,7 +13,15 @@ from autonomy.perception import papers
 from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_detector import Perception
-from autonomy.perception.papers import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
+from autonomy.perception.papers import (
+    DETECTOR_PX,
+    MAX_ASSOCIATION_M,
+    Box,
+    RunningAverage,
+    box_in_picture,
+    centres_of,
+    position_in_box,
+)
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS, Track
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
@@ -28,6 +36,7 @@ MIN_MASK_PX: Final = 60  # smaller masks are ignored
 MEAN_RADIUS_M: Final = 0.125  # of paper B's logs
 FOUND_M: Final = 1.0  # an estimate farther from a log does not belong to it
 RANGES_M: Final = (3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+HISTOGRAM_BIN_M: Final = 0.05  # as in Figs 17 and 18 of paper B
 
 Segmenter = Callable[[RgbdFrame, Shot], Sequence[Masked]]
 
@@ -72,6 +81,7 @@ def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
     """Approach log 1, stop, remove it, approach log 2: errors of each log at its stop."""
     ours = Perception(site.profile, SURVEYED_BY_GNSS)
     faithful, centred = RunningAverage(), RunningAverage(MEAN_RADIUS_M)
+    observations: list[np.ndarray] = []
     clock, out = 0, []
     start = -MAX_RANGE_M
     for number, log in enumerate(site.logs):
@@ -87,10 +97,27 @@ def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
             boxes = [detected(frame, i.mask) for i in instances]
             faithful.add(frame, pose, boxes)
             centred.add(frame, pose, boxes)
+            observations += centres_of(frame, pose, boxes, MEAN_RADIUS_M)
         mask = _mask_of(log, number, standing, instances)
-        out.append(_log_errors(log, tracks, faithful.positions_m(), centred.positions_m(), frame, pose, mask))
+        row = _log_errors(log, tracks, faithful.positions_m(), centred.positions_m(), frame, pose, mask)
+        out.append(row | {"faithful_peak_m": peak_error_m(observations, log.center_m, site.logs[0].center_m)})
+        observations.clear()
         start = stop + STEP_M
     return {"logs": out}
+
+
+def peak_error_m(observations: Sequence[np.ndarray], center_m: np.ndarray, origin_m: np.ndarray) -> float:
+    """Compute paper B's own error of a log [m] (5.1.2, Figs 17 and 18); NaN without an observation near the log.
+
+    Every observation (3,) gives a horizontal distance from the origin, which is log 1; the error is that of the peak of
+    their histogram.
+    """
+    near = [p for p in observations if np.linalg.norm(p - center_m) < MAX_ASSOCIATION_M]
+    if not near:
+        return math.nan
+    bins = np.floor(np.linalg.norm((np.array(near) - origin_m)[:, :2], axis=1) / HISTOGRAM_BIN_M).astype(int)
+    peak_m = (int(np.bincount(bins).argmax()) + 0.5) * HISTOGRAM_BIN_M
+    return abs(peak_m - float(np.linalg.norm((center_m - origin_m)[:2])))
 
 
 def _near(frame: RgbdFrame, instances: Sequence[Masked]) -> list[Masked]:

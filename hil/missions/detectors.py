@@ -1,8 +1,8 @@
 """Log detectors of a mission in lockstep: a perfect one, or the front camera of the plant.
 
 ``perfect`` reports the true poses of the logs around the crane and in front of the machine.  ``faithful`` and ``ours``
-take pictures with the surveyed front camera while the crane rests, segment the logs with the shipped network and
-localize them as paper B does (``faithful``) or with our own method (``ours``); the crane works from the map of logs.
+take pictures with the surveyed front camera while the crane rests; the crane works from the map of logs.  ``faithful``
+finds boxes and takes the depth at their middles, as paper B does, ``ours`` finds masks and fits cylinders.
 """
 
 from __future__ import annotations
@@ -11,8 +11,15 @@ from collections.abc import Sequence
 from typing import Final
 
 from autonomy.manager.activity_manager import ActivityManager
-from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingLogDetector, PaperBLocalizer
+from autonomy.perception.driving_log_detector import (
+    CylinderLocalizer,
+    DrivingLogDetector,
+    LogLocalizer,
+    PaperBLocalizer,
+    Segmentation,
+)
 from autonomy.perception.log_list import LogObservation
+from autonomy.perception.papers import BoxSegmenter
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
 from hil.calibration import surveyed_profile
@@ -80,5 +87,10 @@ def make_detector(kind: str, plant: Plant, profile: Profile, manager: ActivityMa
     check_camera(profile)
     surveyed = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
     source = RigCamera(CameraRig(plant.world, profile, plant.world.truth, seed), CAMERA)
-    localizer = CylinderLocalizer(surveyed, SURVEYED_BY_GNSS) if kind == "ours" else PaperBLocalizer()
-    return FrontCameraDetector(DrivingLogDetector(surveyed, CAMERA, source, LogSegmenter().segment, localizer), manager)
+    segment: Segmentation
+    localizer: LogLocalizer
+    if kind == "ours":
+        segment, localizer = LogSegmenter().segment, CylinderLocalizer(surveyed, SURVEYED_BY_GNSS)
+    else:
+        segment, localizer = BoxSegmenter().segment, PaperBLocalizer()
+    return FrontCameraDetector(DrivingLogDetector(surveyed, CAMERA, source, segment, localizer), manager)

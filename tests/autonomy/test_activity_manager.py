@@ -13,10 +13,11 @@ from autonomy.grasp.planner import BunkFull
 from autonomy.manager.activity_manager import MAX_OUTSIDE_M, ActivityManager
 from autonomy.manager.crane_executor import MAX_STOPS
 from autonomy.manager.tally import Tally
-from autonomy.manager.transition_table import OURS, PAPER_B, RULES, State
+from autonomy.manager.transition_table import OURS, PAPER_B, RULES, State, Table
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Point
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.perception.log_list import LogObservation
+from machine.joints import Joint
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder
@@ -108,7 +109,7 @@ def test_a_log_in_the_wheel_path_that_the_crane_cannot_lift_past_the_front_ends_
 
 @whole
 def test_paper_b_loads_a_log_by_the_states_of_its_flowchart() -> None:
-    forwarder, manager = begin(LOGS[:1], PAPER_B)
+    forwarder, manager = begin(((1, 15.0, 4.2, -0.9),), PAPER_B)
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.in_bunk == 1
     steps = "RAISE SEARCH HALT LOOK APPROACH PASS STOP CHECK LOWER COLLECT STOW RAISE SEARCH DONE"
@@ -116,8 +117,24 @@ def test_paper_b_loads_a_log_by_the_states_of_its_flowchart() -> None:
 
 
 @whole
+@pytest.mark.parametrize(("table", "turns"), [(PAPER_B, False), (OURS, True)])
+def test_paper_b_leaves_its_rotator_as_it_stands(table: Table, turns: bool) -> None:
+    """It neither measures nor controls it (3.1); ours turns it to a log across the crane."""
+    forwarder, manager = begin(((1, 13.0, 2.8, 1.2),), table)
+    angles_rad = set()
+
+    def watched(manager: ActivityManager) -> bool:
+        angles_rad.add(forwarder.crane.q[Joint.ROT])
+        return ended(manager)
+
+    forwarder.run(manager, watched)
+    assert manager.state is State.DONE
+    assert (len(angles_rad) > 1) is turns
+
+
+@whole
 def test_paper_b_loads_a_second_log_that_it_passed_meanwhile() -> None:
-    forwarder, manager = begin(((1, 13.0, 2.8, 0.0), (2, 17.0, -2.8, 0.0)), PAPER_B, end_m=32.0)
+    forwarder, manager = begin(((1, 13.0, 2.8, -0.53), (2, 17.0, -2.8, 0.53)), PAPER_B, end_m=32.0)
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.in_bunk == manager.tally.loaded == 2
 

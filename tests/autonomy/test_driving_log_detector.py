@@ -115,7 +115,7 @@ def test_the_paper_b_localizer_gives_a_point_with_the_size_of_a_mean_log() -> No
     (log,) = detect(field, at, 0.0, PaperBLocalizer())
     assert plane_error_m(log, at, field) < 0.15
     assert (log.length_m, log.diameter_m) == (2.0, 0.25) and log.axis[2] == pytest.approx(0.0)
-    assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(10.0))
+    assert (at.rotation @ np.array(log.axis))[:2] == pytest.approx((1.0, 0.0)), "a box tells no axis: that of the view"
 
 
 def test_the_paper_b_localizer_falls_short_of_a_log_seen_end_on_as_in_the_paper() -> None:

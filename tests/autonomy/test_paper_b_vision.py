@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame
-from autonomy.perception.papers import RunningAverage, box_in_picture, end_on_error_m, position_in_box
+from autonomy.perception.papers import (
+    BoxDetector,
+    BoxSegmenter,
+    RunningAverage,
+    box_in_picture,
+    end_on_error_m,
+    position_in_box,
+)
 from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics
 
 PIN = Intrinsics(1280, 720, 530.0, 530.0, 640.0, 360.0)
@@ -85,3 +92,21 @@ def test_the_error_for_a_two_metre_log_end_on_is_decimetres() -> None:
     harmonic = 0.5 * (4.2 + 6.2) - 2.0 / (1.0 / 4.2 + 1.0 / 6.2)
     assert harmonic == pytest.approx(0.19, abs=0.005)
     assert back > harmonic and 0.3 < math.hypot(back, high) < 0.6
+
+
+def test_the_boxes_of_a_detector_become_masks_in_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The letterbox shrinks a picture of 1280 px by 608 / 1280 and puts 133 px of bar above it."""
+    shown = []
+
+    def detect(self: BoxDetector, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        shown.append(rgb)
+        return np.array([[152.0, 209.0, 304.0, 304.0], [0.0, 133.0, 19.0, 152.0]]), np.array([0.9, 0.3])
+
+    monkeypatch.setattr(BoxDetector, "detect", detect)
+    rgb = np.zeros((720, 1280, 3), np.uint8)
+    rgb[:, 640:] = 200
+    (found,) = BoxSegmenter().segment(replace(FRAME, rgb=rgb))
+    rows, columns = np.nonzero(found.mask)
+    assert found.score == 0.9 and found.mask.shape == (720, 1280)
+    assert (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1) == (320, 640, 160, 360)
+    assert shown[0].shape == (608, 608, 3) and not shown[0][:133].any() and shown[0][300, 400].tolist() == [200] * 3

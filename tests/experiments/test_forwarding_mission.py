@@ -13,13 +13,13 @@ import pytest
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
-from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG, shuffled
+from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG, at_an_angle, shuffled
 from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, perform, short, trial
 from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw
 from tests.codes import numbers_in
 
-OPTIONS = SimpleNamespace(seed=3, quick=False)
+OPTIONS = SimpleNamespace(seed=3, quick=False, trials=None)
 MISSION = load_mission(PAPER_B, route_wanted=True).mission
 
 
@@ -133,7 +133,9 @@ def test_every_mission_has_a_field_of_its_own_and_the_individuals_take_turns() -
     texts["machine/1"]["profile"] = None
     assert len(missions(OPTIONS, "aoro_fc8", "sampled", 20, texts)) == 16
     first = trial(OPTIONS, "aoro_fc8", texts)
-    assert [job.options["way"] for job in first] == ["ours", "paper-b"]
+    assert [job.options["way"] for job in first] == ["ours", *["paper-b"] * 10]
+    assert len({job.options.get("field") for job in first}) == len({job.seed for job in first}) == 10
+    assert all(job.options["angled"] for job in first) and not any(job.options.get("angled") for job in jobs)
     assert {job.options["text"] for job in first} == {f"text {NOMINAL}"}
     assert not calibrations(OPTIONS, "aoro_fc8", "sampled", 0)
 
@@ -151,6 +153,35 @@ def test_a_shuffled_field_can_be_driven_and_differs_by_seed() -> None:
             assert abs(math.remainder(log.bearing_deg - was.bearing_deg, 360.0)) <= TURN_DEG + 1e-9
         seen.add(other.logs[0].position)
     assert len(seen) == 5
+
+
+def test_paper_b_s_logs_lie_as_its_grapple_hangs_when_the_crane_has_passed_them() -> None:
+    """Along the line from the crane's base, which stops 4.6 m after a log."""
+    first, second, *_ = MISSION.waypoints
+    plane = LocalPlane(first.latitude_deg, first.longitude_deg)
+    laid = at_an_angle(MISSION)
+    assert not list(problems_of(laid, True))
+    east, north, _ = plane.local(second.latitude_deg, second.longitude_deg)
+    ahead = np.array([east, north]) / math.hypot(east, north)
+    sides = set()
+    for log in laid.logs:
+        x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
+        if abs(y) > 5.0:
+            continue  # beside the other long side
+        assert log.bearing_deg is not None
+        base = ahead * (np.array([x, y]) @ ahead + 4.6)
+        seen_at_deg = math.degrees(math.atan2(x - base[0], y - base[1]))
+        assert abs(math.remainder(seen_at_deg - log.bearing_deg, 180.0)) < 5.0
+        sides.add(y > 0.0)
+    assert sides == {True, False}
+
+
+def test_the_missions_by_paper_b_s_method_count_together() -> None:
+    missed = outcome()
+    missed["logs"][0]["in_bunk"] = False
+    metrics = gather({"first/ours": outcome(), "first/paper-b": outcome(), "paper-b/0": missed})
+    assert metrics["faithful.missions"] == 2.0 and metrics["first.missions"] == 1.0
+    assert metrics["faithful.loaded"] == pytest.approx(5 / 6) and metrics["loaded"] == 1.0
 
 
 def test_a_short_mission_has_one_log_on_a_straight_path() -> None:

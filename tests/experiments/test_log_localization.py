@@ -13,7 +13,7 @@ from experiments.common.worlds import profile_named
 from experiments.log_localization.experiment import plan
 from experiments.log_localization.metrics import explanation, gather, sections
 from experiments.log_localization.site import APART_M, STOP_M, Site
-from experiments.log_localization.trial import detected, true_masks
+from experiments.log_localization.trial import detected, peak_error_m, true_masks
 from host.exit_codes import CommandFailed, ExitCode
 from tests.codes import numbers_in
 from timberhand.cli import app
@@ -33,6 +33,7 @@ def row(error: float, faithful: float = 0.2) -> dict:
         "error_m": error,
         "faithful_error_m": faithful,
         "faithful_centred_m": faithful - 0.1,
+        "faithful_peak_m": 0.03,
         "parts_m": [0.0] * 3,
     }
 
@@ -49,6 +50,15 @@ def test_medians_are_of_all_logs_and_a_missed_log_counts_as_far_off() -> None:
     assert metrics["deg0.median_m"] == pytest.approx(0.025) and metrics["deg45.median_m"] == 0.04
     assert metrics["p95_m"] == math.inf and metrics["found"] == pytest.approx(5 / 6)
     assert metrics["faithful.deg90.median_m"] == 0.2 and metrics["axis_median_deg"] == 0.5
+
+
+def test_the_paper_s_error_is_that_of_the_peak_of_the_distances() -> None:
+    """Ten observations are 5.08 m from the origin, three 5.3 m; one is of another log."""
+    origin, center = np.array([1.0, 0.0, 0.3]), np.array([6.2, 0.0, 0.1])
+    near, far = np.add(origin, (5.08, 0.0, 0.4)), np.add(origin, (5.3, 0.0, 0.0))
+    observations = [near] * 10 + [far] * 3 + [origin] * 20
+    assert peak_error_m(observations, center, origin) == pytest.approx(5.2 - 5.075)
+    assert math.isnan(peak_error_m([], center, origin))
 
 
 def test_every_metric_is_computed() -> None:
