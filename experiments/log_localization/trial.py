@@ -36,7 +36,7 @@ MIN_MASK_PX: Final = 60  # smaller masks are ignored
 MEAN_RADIUS_M: Final = 0.125  # of paper B's logs
 FOUND_M: Final = 1.0  # an estimate farther from a log does not belong to it
 RANGES_M: Final = (3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
-HISTOGRAM_BIN_M: Final = 0.05  # as in Figs 17 and 18 of paper B
+HISTOGRAM_BIN_M: Final = 0.05  # as in Fig. 17 of paper B
 
 Segmenter = Callable[[RgbdFrame, Shot], Sequence[Masked]]
 
@@ -107,7 +107,7 @@ def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
 
 
 def peak_error_m(observations: Sequence[np.ndarray], center_m: np.ndarray, origin_m: np.ndarray) -> float:
-    """Compute paper B's own error of a log [m] (5.1.2, Figs 17 and 18); NaN without an observation near the log.
+    """Compute paper B's own error of a log [m] (5.1.2, Fig. 17); NaN without an observation near the log.
 
     Every observation (3,) gives a horizontal distance from the origin, which is log 1; the error is that of the peak of
     their histogram.

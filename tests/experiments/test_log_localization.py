@@ -62,7 +62,8 @@ def test_the_paper_s_error_is_that_of_the_peak_of_the_distances() -> None:
 
 
 def test_every_metric_is_computed() -> None:
-    metrics = gather({f"approach/{d}/0": {"logs": [row(0.01)]} for d in (0, 45, 90)})
+    metrics = gather({f"approach/{d}/0": {"logs": [row(0.01)] * 2} for d in (0, 45, 90)})
+    assert [metrics[f"faithful.deg{d}.peak_m"] for d in (0, 45, 90)] == [0.03] * 3
     for prefix in ("", "faithful."):
         for name in (
             "deg0.median_m",
