@@ -12,9 +12,9 @@ from typing import Final
 
 import msgspec
 
-from experiments.common.published import LATER, PAPER_A, UNSEEN
+from experiments.common.published import COMPARISONS, LATER, UNSEEN, Comparison
 from experiments.common.registry import EXPERIMENTS
-from experiments.common.result import Metric, Result
+from experiments.common.result import Metric, Result, wilson
 from experiments.common.standing import Standing, judge
 
 TITLE: Final = "Results at a glance"
@@ -23,6 +23,14 @@ INTRODUCTION: Final = (
     "set before the measurement. Each linked page states how every metric is measured, with which command and on which "
     "machine. `timberhand report` writes this page from the saved results; `timberhand report --check` names the files "
     "that make a result stale."
+)
+
+
+COLUMNS: Final = ("", "the paper", "its method here", "ours, its rules", "ours, everything")
+"""Columns of a comparison: the question, and four answers."""
+LIKE_FOR_LIKE: Final = (
+    "The paper's own figure on a real machine, its method rebuilt here, our method under the paper's rules, and ours "
+    "with everything that it has. A dash: not measured. Rates have 95 % intervals and their number of trials."
 )
 
 
@@ -64,13 +72,10 @@ def page(results: Mapping[str, Result], pages: Collection[str], standings: Mappi
             f"| {links[name]} | {EXPERIMENTS[name].sentence} | {met} of {len(result.limits)}{unsure} "
             f"| `{result.commit}` | {standings[name]} |"
         )
-    lines += ["", "## Compared with the papers", ""]
-    lines += ["| | metric | paper A | paper B | here | command |", "|---|---|---|---|---|---|"]
-    for name, result, metric in metrics_of(results):
-        if metric.name in result.paper:
-            value = metric.text(result.paper[metric.name])
-            papers = f"{value} | " if (name, metric.name) in PAPER_A else f" | {value}"
-            lines.append(f"| {links[name]} | {metric.title} | {papers} | {_here(result, metric)} | {_command(name)} |")
+    lines += ["", "## Compared with the papers", "", LIKE_FOR_LIKE, ""]
+    lines += [f"| {' | '.join((*COLUMNS, 'what differs', 'command'))} |", "|---" * (len(COLUMNS) + 2) + "|"]
+    for entry, cells in compared(results):
+        lines.append(f"| {' | '.join((*cells, entry.differs, _command(entry.experiment)))} |")
     lines += ["", *_later(results, links)]
     lines += ["", "## Missed limits", "", "| | metric | measured | limit |", "|---|---|---|---|"]
     for name, result, metric in metrics_of(results):
@@ -78,6 +83,27 @@ def page(results: Mapping[str, Result], pages: Collection[str], standings: Mappi
             lines.append(f"| {links[name]} | {metric.title} | {_here(result, metric)} | {metric.limit_text()} |")
     lines += ["", "## What a plant cannot show", "", *(f"- {sentence}" for sentence in UNSEEN)]
     return "\n".join(lines) + "\n"
+
+
+def compared(results: Mapping[str, Result]) -> Iterator[tuple[Comparison, tuple[str, ...]]]:
+    """List the comparisons with papers A and B to which there is a result, each with its cells of `COLUMNS`."""
+    metrics = {(name, metric.name): metric for name, _, metric in metrics_of(results)}
+    for entry in COMPARISONS:
+        result = results.get(entry.experiment)
+        paper_metric = metrics.get((entry.experiment, entry.paper_metric))
+        if result is None or paper_metric is None or entry.paper_metric not in result.paper:
+            continue
+        value = result.paper[entry.paper_metric]
+        paper = f"{paper_metric.text(value)} (paper {entry.paper}{_interval(value, entry.trials)})"
+        ours = (metrics.get((entry.experiment, name)) for name in (entry.method, entry.rules, entry.everything))
+        yield entry, (entry.question, paper, *("–" if metric is None else _here(result, metric) for metric in ours))
+
+
+def _interval(value: float, trials: int) -> str:
+    if not trials:
+        return ""
+    low, high = wilson(round(value * trials), trials)
+    return f", {100.0 * low:.1f} to {100.0 * high:.1f}, n = {trials}"
 
 
 def _here(result: Result, metric: Metric) -> str:

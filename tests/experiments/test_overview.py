@@ -6,8 +6,10 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
-from experiments.common.overview import page, read
-from experiments.common.published import LATER
+import pytest
+
+from experiments.common.overview import compared, page, read
+from experiments.common.published import COMPARISONS, LATER
 from experiments.common.registry import EXPERIMENTS
 from experiments.common.result_page import conclusion
 from experiments.common.standing import Standing
@@ -40,10 +42,27 @@ def test_a_later_system_stands_beside_the_nearest_figure_with_its_interval_and_c
     (kurinov,) = (line for line in later.splitlines() if "Kurinov" in line)
     assert {94, 92.4, 95.3, 1024, 98.81, 97.4, 99.5, 504} <= set(numbers_in(kurinov))
     assert "`timberhand experiment forwarding-mission --docs docs`" in kurinov
-    rows = [[numbers_in(cell)[:1] for cell in line.split("|")] for line in text.split("## ")[1].splitlines()]
-    for values in ([[98.33], [], [100]], [[], [87.5], [98.81]]):
-        columns = (row[i : i + 3] for row in rows for i in range(len(row)))
-        assert values in columns, "paper A and paper B have their columns"
+
+
+def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and_ours_with_everything() -> None:
+    results = {n: read(DOCS / "results" / f"{n}.json") for n in ("grasp-configs", "forwarding-mission")}
+    metrics = results["forwarding-mission"].metrics
+    rows = {entry.paper_metric: cells for entry, cells in compared(results)}
+    assert set(rows) == {"paper60_success", "optimal", "loaded", "detected", "grasp_offset_mean_m"}
+    question, paper, method, rules, everything = rows["loaded"]
+    assert question and numbers_in(paper) == [87.5, 69.0, 95.7, 24], "Wilson's interval of 21 of 24"
+    for cell, name in ((method, "faithful.loaded"), (rules, "first.loaded"), (everything, "loaded")):
+        shown = numbers_in(cell)
+        assert shown[0] == pytest.approx(100.0 * metrics[name], abs=0.01) and shown[-1] == metrics[f"{name}_n"]
+    assert not numbers_in(rows["optimal"][4]), "not measured so"
+
+
+def test_every_comparison_names_metrics_that_its_experiment_has() -> None:
+    for entry in COMPARISONS:
+        module = import_module(EXPERIMENTS[entry.experiment].module)
+        result = read(DOCS / "results" / f"{entry.experiment}.json")
+        names = {metric.name for metric in module.page_of(result, {}).metrics}
+        assert {entry.paper_metric, entry.method, entry.rules, entry.everything} - {""} <= names, entry.question
 
 
 def test_a_conclusion_leaves_out_a_sentence_without_a_value() -> None:
