@@ -1,11 +1,14 @@
 """Work on the cores of this computer: joblib's processes, which outlive one call and are replaced when one is killed.
 
-Workers ignore Ctrl-C: the parent ends them.
+Workers ignore Ctrl-C: the parent ends them.  One whose parent was killed ends itself.
 """
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -18,6 +21,7 @@ from runtime.errors import InputRefused
 from runtime.memory import keep_memory
 
 WAITING_PER_WORKER: Final = 2
+PARENT_CHECK_S: Final = 1.0
 DEATHS: Final = 3
 """So many times in a row, without a finished trial in between, workers may be killed."""
 
@@ -61,4 +65,12 @@ def _named(name: str, do: Callable[[], Any]) -> tuple[str, Any]:
 
 def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     keep_memory()  # as the detector process of the machine does, whose time is measured
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone: the trial it computes for nobody may take a quarter of an hour."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_CHECK_S)
+    os._exit(1)

@@ -45,6 +45,12 @@ def slow_square(job: Job) -> int:
     return job.seed**2
 
 
+def endless(marker: Path, job: Job) -> None:
+    """A trial that lasts for an hour once the marker exists."""
+    marker.touch()
+    time.sleep(3600.0)  # noqa: TID251  in the processes of a live test
+
+
 def square_jobs(count: int) -> list[Job]:
     return [Job(f"square/{i}", "square", i, {}) for i in range(count)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import shutil
@@ -50,6 +51,20 @@ if __name__ == "__main__":
         pool.run(slow_square, square_jobs(200), kept, Workers(2), "squares", Console(quiet=True))
 """
 
+ORPHANING = """
+import sys
+from functools import partial
+from pathlib import Path
+from rich.console import Console
+from experiments.common import pool
+from experiments.common.checkpoint import Checkpoint
+from experiments.common.workers import Workers
+from tests.experiments.mortal_trials import endless, square_jobs
+if __name__ == "__main__":
+    with Checkpoint(Path(sys.argv[1]), "run") as kept:
+        pool.run(partial(endless, Path(sys.argv[2])), square_jobs(2), kept, Workers(2), "", Console(quiet=True))
+"""
+
 
 def table(path: Path, function: Any, workers: Workers, jobs: list[Job]) -> bytes:
     with Checkpoint(path, "run") as kept:
@@ -90,6 +105,24 @@ def test_ctrl_c_keeps_the_finished_trials_and_leaves_no_process(tmp_path: Path) 
             lambda job: ran.append(job.seed) or job.seed**2, square_jobs(20), again, Workers(), "", QUIET
         )
     assert done >= 3 and len(ran) == 20 - done and list(outcomes.values()) == [i * i for i in range(20)]
+
+
+def test_workers_whose_parent_is_killed_end_with_it(tmp_path: Path) -> None:
+    began = tmp_path / "began"
+    command = [sys.executable, "-c", ORPHANING, str(tmp_path / "trials.jsonl"), str(began)]
+    with subprocess.Popen(command, cwd=ROOT, start_new_session=True) as process:
+        try:
+            while process.poll() is None and not began.exists():
+                time.sleep(0.05)
+            process.kill()
+            process.wait(timeout=30)
+            with pytest.raises(ProcessLookupError):  # nobody is left in the session
+                for _ in range(100):
+                    os.killpg(process.pid, 0)
+                    time.sleep(0.1)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def test_every_trial_comes_with_its_cost_and_a_kept_one_with_that_of_then(tmp_path: Path) -> None:
