@@ -25,6 +25,9 @@ from autonomy.grasp.quality import Jaws, blade_sections, jaws_of, rests_upon, sc
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from runtime.errors import InputRefused
 
+VIRTUAL_PATH_M: Final = 0.7
+"""Radius of the virtual camera's path: of 60 grasps on true cylinders 32, 44, 50 and 53 are optimal with 0.15, 0.3, 0.5
+and 0.7 m; the paper does not state one."""
 TIP_DEPTH_M: Final = 0.25
 """Depth of the tips below the surface of the pile."""
 
@@ -52,8 +55,8 @@ class CnnPlanner:
 
     ``by_rule`` takes the height from the capture rule that also makes the physical labels, where that rule holds.
     ``cameras`` over 1 moves the virtual camera on a circle of ``reach_m`` and averages the predictions (II-C); the
-    paper's results use one camera that stands still.  ``pictures``: a folder that gets a picture of every plan,
-    that of the first camera.
+    paper's results use one camera that stands still.  A grasp that is best from all sides is seldom at an edge.
+    ``pictures``: a folder that gets a picture of every plan, that of the first camera.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class CnnPlanner:
         network: Network,
         by_rule: bool = False,
         cameras: int = 1,
-        reach_m: float = 0.3,
+        reach_m: float = VIRTUAL_PATH_M,
         pictures: Path | None = None,
     ) -> None:
         self._network, self._by_rule, self._cameras, self._reach_m = network, by_rule, cameras, reach_m

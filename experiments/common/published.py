@@ -115,8 +115,9 @@ class Comparison:
 
 
 CHAIN: Final = (
-    "Its chain: plainest reading of its perception, its network trained on 80 of 885 Cornell pictures. Its rules: one "
-    "plan, one closing, one lift; ours with everything grips again. Rendered pictures; each method's own detector"
+    "Its chain: masks of our network, its perception as a practitioner reads it, its network trained on 80 of 885 "
+    "Cornell pictures. Its rules, which its chain keeps here too: one plan, one closing, one lift; ours with "
+    "everything grips again. Rendered pictures"
 )
 MISSION: Final = (
     "Its method: box detector, depth at the middle of the box, uncontrolled rotator, movement primitives, P law. Its "
@@ -131,7 +132,7 @@ COMPARISONS: Final = (
         "grasp-configs",
         "paper60_success",
         60,
-        "faithful.cnn.success",
+        "faithful.cnn.first_closing",
         "first_closing",
         "success",
         CHAIN,

@@ -133,7 +133,6 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
             for kind, sampled in (("nominal", False), ("individuals", True)):
                 hits = [succeeded(o) for _, o in trials if o["individual"] is sampled]
                 metrics |= rate(f"{kind}.success", sum(hits), len(hits)) if hits else {}
-            metrics["first_closing"] = _mean([float(at_first(o)) for _, o in trials])
             metrics["stopped"] = float(sum(o["stops"] > 0 for _, o in trials))
             for number in CONFIGURATIONS:
                 its = [o for _, o in trials if o["configuration"] == number]
@@ -176,6 +175,7 @@ def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]
     planned = [o for o in trials if math.isfinite(o["plan_ms"])]
     return {
         **rate(f"{prefix}success", len(up), len(trials)),
+        **rate(f"{prefix}first_closing", sum(map(at_first, trials)), len(trials)),
         **rate(f"{prefix}optimal", sum(o["category"] == "optimal" for o in up), len(up)),
         **{f"{prefix}{c.lower()}": float(sum(o["category"] == c for o in up)) for c in ("NI", "SE", "MA")},
         f"{prefix}logs_per_grasp_10_12": _mean(piles),

@@ -1,7 +1,7 @@
 """Sources of the log poses for a grasp planner: the plant itself, or the camera on the stick and a perception.
 
 ``true``: a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
-same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of the points of each mask).  The
+same with true masks.  ``faithful``: paper A's steps on our masks (`autonomy.perception.papers.log_from_mask`).  The
 camera is surveyed.  It sees the logs from the start position of the crane, and again from above when the activity waits
 for that.
 """
@@ -36,6 +36,10 @@ TRUE: Final = "true"
 """The source that takes the poses from the plant."""
 PICTURE_COUNT: Final = 3
 MIN_MASK_PX: Final = 60
+HIGHEST_LOG_M: Final = 1.0
+"""Over the ground: what paper A's perception finds higher is the grapple, or an edge between near and far."""
+SURE_SCORE: Final = 0.5
+"""Masks with a lower score are left out of paper A's perception, as is usual for its network."""
 RATE_NS: Final = 66_666_667
 DETECTION_NS: Final = PICTURE_COUNT * RATE_NS
 MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
@@ -93,13 +97,14 @@ class OurPerception:
 
 
 class PaperPerception:
-    """Paper A's perception of one picture: middle, main direction and extents of the points under each mask.
+    """Paper A's perception of one picture: middle, main direction, width and trimmed ends of what is under each mask.
 
-    It does not combine detections.
+    It does not combine detections, and takes nothing that hangs for a log that lies.
     """
 
     def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._camera = _Surveyed(plant, profile, seed)
+        self._highest_m = profile.workspace.ground_z_m + HIGHEST_LOG_M
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
         """Detect the logs in one picture."""
@@ -107,16 +112,14 @@ class PaperPerception:
 
         capture, begun = self._camera.detect(stamp_ns, q), time.process_time()
         frame, pose = capture.frames[0], capture.pose
-        estimates = [papers.log_from_mask(frame, one.mask) for one in segment(frame)]
+        estimates = [papers.log_from_mask(frame, one.mask) for one in segment(frame) if one.score >= SURE_SCORE]
         logs: list[LogObservation] = []
         for log in estimates:
-            if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
-                center_m, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
-                logs.append(
-                    LogObservation(
-                        len(logs), _triple(center_m), _triple(axis), float(log.length_m), float(log.diameter_m)
-                    )
-                )
+            if log is None:
+                continue
+            center_m, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
+            if center_m[2] < self._highest_m:
+                logs.append(LogObservation(len(logs), _triple(center_m), _triple(axis), log.length_m, log.diameter_m))
         return Detection(tuple(logs), time.process_time() - begun)
 
 

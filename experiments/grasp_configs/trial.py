@@ -60,6 +60,9 @@ BUNK_GAP_M: Final = 1.0
 PLACES: Final = 100
 NETWORKS: Final = {"cnn": "cnn", "cnn_physical": "cnn-physical"}
 """Names of the networks' planners in the results, and in `autonomy.grasp.planners`."""
+PAPER_A: Final = "cnn"
+VIRTUAL_CAMERAS: Final = 8
+"""Places of paper A's virtual camera, over which its network's predictions are averaged (II-C)."""
 
 
 @dataclass(slots=True)
@@ -147,7 +150,7 @@ def planner_named(name: str) -> GraspPlanner:
         InputRefused: there is no such planner.
     """
     if name == SEARCH or name in NETWORKS:
-        return PlannerChoice(NETWORKS.get(name, name)).make()
+        return PlannerChoice(NETWORKS.get(name, name), VIRTUAL_CAMERAS if name == PAPER_A else 1).make()
     return plugins.load(GRASP_PLANNERS, name)  # type: ignore[no-any-return]
 
 
