@@ -11,7 +11,7 @@ from autonomy.perception.camera.frame import RgbdFrame, content_window
 from autonomy.perception.segmentation.instances import decode_instances
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter, fuse_scales
 from autonomy.perception.segmentation.network import OFFSET_PX, STRIDE, interface_of
-from autonomy.perception.segmentation.resize import doubled, shrunk
+from autonomy.perception.segmentation.resize import bilinear, doubled, interpolated_map, shrunk
 from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
@@ -232,3 +232,10 @@ def test_corrupt_or_foreign_weights_are_refused(untrained, tmp_path):
         LogSegmenter("rgbd", cut)
     with pytest.raises(InputRefused, check=coded("weights.other-network")):
         LogSegmenter("depth", untrained)
+
+
+@pytest.mark.parametrize("shape", [(7, 12), (1, 3), (3, 1), (2, 2)])
+def test_a_map_is_interpolated_as_by_the_matrices(shape: tuple[int, int]) -> None:
+    values = np.random.default_rng(3).normal(size=shape).astype(np.float32)
+    by_matrices = bilinear(shape[0], 2) @ values @ bilinear(shape[1], 2).T
+    assert interpolated_map(values) == pytest.approx(by_matrices, abs=1e-6)

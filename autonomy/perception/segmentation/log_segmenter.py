@@ -29,7 +29,7 @@ from autonomy.perception.segmentation.network import (
     interface_of,
     network_input,
 )
-from autonomy.perception.segmentation.resize import bilinear, doubled, shrunk
+from autonomy.perception.segmentation.resize import doubled, interpolated_map, shrunk
 from autonomy.perception.segmentation.segment_merging import SegmentScorers, shipped_scorers
 from autonomy.perception.segmentation.segments import sigmoid
 from machine.geometry.optics import Intrinsics
@@ -235,10 +235,10 @@ def fuse_scales(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     pixel = np.float32(STRIDE / OFFSET_PX)
     maps[OFFSET_U] = 2.0 * east + pixel * (2.0 * x + 0.5 - np.arange(w)).astype(np.float32)
     maps[OFFSET_V] = 2.0 * south + pixel * (2.0 * y + 0.5 - np.arange(h)).astype(np.float32)[:, None]
-    down, across = (bilinear(n2, 2) for n2 in coarse.shape[1:])
-    rows, columns = np.minimum(np.arange(h), len(down) - 1), np.minimum(np.arange(w), len(across) - 1)
     for i, share in ((MASK, FINE_MASK_SHARE), (EDGE, FINE_EDGE_SHARE)):
-        smooth = (down[rows] @ coarse[i] @ across[columns].T).astype(np.float32)
+        smooth = interpolated_map(coarse[i])
+        if smooth.shape != (h, w):  # an odd picture has one more row or column, which repeats
+            smooth = smooth[np.minimum(np.arange(h), len(smooth) - 1)][:, np.minimum(np.arange(w), smooth.shape[1] - 1)]
         maps[i] = share * fine[i] + (1.0 - share) * smooth
     wood = fine[MASK] > 0.0
     thin = wood & ~_opened(wood, THIN_PX)
