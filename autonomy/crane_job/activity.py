@@ -78,7 +78,7 @@ class ActivityState:
         """Whether the gripped logs have no room in the bunk."""
         self.rotator = self._count = rotator or RotatorEstimate()
         self._counts = has_no_encoder(profile)
-        self._profile = planning_profile(profile, self._count)
+        self._machine, self._profile = profile, planning_profile(profile, self._count)
         self._view, self._viewed = view, False
         self.load_unseen = False
         """Whether a load was held before the camera and no picture showed it."""
@@ -521,6 +521,9 @@ class Activity(ActivityState):
         stands = rotator_angle_of_hanging_log(self._profile, load, q[Joint.SLEW])
         self.rotator = self._count = self.rotator.corrected(counts[Joint.ROT], stands)
         self._tracker.begin(hold(self._count.to_angles(counts)))
+        # A rotator that proves slower than its count takes a faster count for the same turn: plan slower turns.
+        self._profile = planning_profile(self._machine, self._count)
+        self._cycle.plan_for(self._profile)
         self._arrived_ns, self._viewed = self._last_ns, True  # the way on needs a list that remembers the load so
         return load
 

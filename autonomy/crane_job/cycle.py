@@ -139,6 +139,10 @@ class Cycle:
         """The arm with the load of the present phase."""
         return self._arm
 
+    def plan_for(self, profile: Profile) -> None:
+        """Plan motions for this profile of the machine from now on: its rotator is known better."""
+        self._profile, self._arm = profile, self._arm.of(profile)
+
     @property
     def is_bundle(self) -> bool:
         """Whether the grasp is a bundle: its logs settle when it is lifted, and the jaws follow."""

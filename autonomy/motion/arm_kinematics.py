@@ -284,6 +284,10 @@ class Arm(ArmKinematics):
         self._free_telescope = free_telescope
         self._extension_cache: dict[tuple[int, int, int], float | None] = {}
 
+    def of(self, profile: Profile) -> Arm:
+        """Return the same arm of another profile of the machine."""
+        return Arm(profile, self.load_kg, self._free_telescope, self.slope)
+
     def loaded(self, load_kg: float) -> Arm:
         """Return the same machine with another load."""
         return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope, self.slope)

@@ -128,6 +128,21 @@ def test_a_load_that_nothing_shows_is_held_before_the_camera_until_the_rotator_i
 
 
 @pytest.mark.long
+def test_a_rotator_that_proves_slow_while_its_load_is_viewed_gets_slower_plans() -> None:
+    """Its count must be faster for the same turn: at the speed that was planned before, the controller refuses it."""
+    crane, spec = Remembered(FORWARDER, [birch(0)], q=HOME), FORWARDER.joints["rot"]
+    crane.made = (0.65, 0.65)
+    planner = Activity(FORWARDER, profile_hash(FORWARDER), view=load_view(FORWARDER, 0.0))
+    while not crane.views:
+        crane.step(planner)
+    pace = min(planner.rotator.paces)
+    assert pace < 0.9
+    assert planner.profile.joints["rot"].speed_limit == pytest.approx(pace * spec.speed_limit)
+    crane.run(planner)
+    assert planner.done, planner.failure
+
+
+@pytest.mark.long
 def test_a_load_that_no_picture_shows_is_laid_down_all_the_same_and_said() -> None:
     crane = Blind(FORWARDER, [birch(0)], q=HOME)
     planner = Activity(FORWARDER, profile_hash(FORWARDER), view=load_view(FORWARDER, 0.0))
