@@ -37,6 +37,7 @@ TURN_SIGMA_RAD: Final = 0.04
 VIEW_SIGMA_RAD: Final = 0.08
 """1-sigma of a viewed angle: a log may hang a little askew, and its axis is measured to 4 degrees."""
 SCALE_BOUNDS: Final = (0.6, 1.5)
+ROUNDING_RAD: Final = 1e-9
 
 Covariance = tuple[float, float, float, float, float, float]
 """Upper triangle, by rows, of angle and both paces."""
@@ -135,7 +136,9 @@ class _CountMotion:
     def at(self, time_s: float) -> tuple[Axes, Axes]:
         (*q, angle), (*v, speed) = self._motion.at(time_s)
         rotator = self._rotator
-        side = angle - rotator.angle_rad or speed
+        # Where the rotator stands now, rounding must not choose the pace: knots of two paces make a kink too fast.
+        ahead_rad = angle - rotator.angle_rad
+        side = ahead_rad if abs(ahead_rad) > ROUNDING_RAD else speed
         return (*q, rotator.sent(angle)), (*v, speed / rotator.paces[side > 0.0])
 
 

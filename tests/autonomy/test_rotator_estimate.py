@@ -183,6 +183,19 @@ def test_repeated_observations_find_the_ratio_of_angle_to_count() -> None:
     assert remainder(rotator.angle(sent) - true, pi) == pytest.approx(0.0, abs=0.02)
 
 
+@pytest.mark.parametrize("rounding_rad", [0.0, 4e-16, -4e-16])
+@pytest.mark.parametrize(("speed", "pace"), [(-1.0, 0.8), (1.0, 1.25)])
+def test_a_turn_has_one_pace_from_where_the_rotator_stands(rounding_rad: float, speed: float, pace: float) -> None:
+    class Turn:
+        duration_s = 1.0
+
+        def at(self, time_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+            return (0.0,) * 4 + (2.0 + rounding_rad,), (0.0,) * 4 + (speed,)
+
+    _, velocity = RotatorEstimate(1.0, 2.0, (0.8, 1.25)).motion(Turn()).at(0.0)
+    assert velocity[4] == pytest.approx(speed / pace)
+
+
 def test_a_rotator_without_encoder_is_planned_within_half_its_range_and_its_command_limit() -> None:
     whole, slow = FORWARDER.joints["rot"], planning_profile(FORWARDER, RotatorEstimate(paces=(0.9, 0.8))).joints["rot"]
     assert (slow.lower, slow.upper) == (whole.lower / 2, whole.upper / 2)
