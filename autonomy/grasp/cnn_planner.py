@@ -26,8 +26,8 @@ from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, op
 from runtime.errors import InputRefused
 
 VIRTUAL_PATH_M: Final = 0.7
-"""Radius of the virtual camera's path: of 60 grasps on true cylinders 32, 44, 50 and 53 are optimal with 0.15, 0.3, 0.5
-and 0.7 m; the paper does not state one."""
+"""Radius of the virtual camera's path, which the paper does not state: the network's best pixel in a single picture is
+often at an edge, and averages over half a metre and more agree on the middle of a log."""
 TIP_DEPTH_M: Final = 0.25
 """Depth of the tips below the surface of the pile."""
 

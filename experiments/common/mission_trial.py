@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 from rich.console import Console
 
 from autonomy.localization.local_plane import LocalPlane
@@ -35,10 +34,11 @@ ACROSS_M: Final = 0.25
 """Maximum shift of a log across the route on a shuffled field."""
 TURN_DEG: Final = 15.0
 """Maximum turn of a log on a shuffled field."""
-LOG_ANGLE_DEG: Final = 30.0
-"""Angle between a log and the path of paper B's machine: its crane reaches so far to the side of straight back."""
 PAPER_B: Final = ROOT / "docs" / "examples" / "paper_b.geojson"
 """Paper B's field with 24 logs, and its route."""
+PAPER_B_ANGLED: Final = PAPER_B.with_name("paper_b_angled.geojson")
+"""The same with every log at 30 degrees to the path, its far end outward behind a machine that has passed it: so paper
+B's logs lie (3.1), for its rotator does not turn and its crane reaches obliquely backwards."""
 LANDED_M: Final = 3.0
 """A log this near to the middle of a landing counts as delivered."""
 
@@ -109,35 +109,6 @@ def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:
     first = mission.waypoints[0]
     plane = LocalPlane(first.latitude_deg, first.longitude_deg)
     return msgspec.structs.replace(mission, logs=tuple(_elsewhere(log, plane, rng) for log in mission.logs))
-
-
-def at_an_angle(mission: ForwardingMission) -> ForwardingMission:
-    """Lay every log at ``LOG_ANGLE_DEG`` to the leg beside it, its far end outward behind a machine that has passed it.
-
-    Paper B's logs lie so (3.1): its rotator does not turn, and the crane reaches obliquely backwards for them.
-    """
-    first = mission.waypoints[0]
-    plane = LocalPlane(first.latitude_deg, first.longitude_deg)
-    corners = [np.array(plane.local(p.latitude_deg, p.longitude_deg)[:2]) for p in mission.waypoints]
-    legs = list(zip(corners, [*corners[1:], corners[0]], strict=True))
-
-    def turned(log: KnownLog) -> KnownLog:
-        at = np.array(plane.local(log.position.latitude_deg, log.position.longitude_deg)[:2])
-        start, end = min(legs, key=lambda leg: _distance_m(at, *leg))
-        east, north = (end - start).tolist()
-        left = east * (at[1] - start[1]) - north * (at[0] - start[0]) > 0.0
-        heading_deg = math.degrees(math.atan2(east, north))
-        bearing_deg = heading_deg + (LOG_ANGLE_DEG if left else -LOG_ANGLE_DEG)
-        return msgspec.structs.replace(log, bearing_deg=bearing_deg % 360.0)
-
-    return msgspec.structs.replace(mission, logs=tuple(map(turned, mission.logs)))
-
-
-def _distance_m(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
-    """Compute the distance of a point (2,) from a leg."""
-    along = end - start
-    share = float(np.clip((point - start) @ along / (along @ along), 0.0, 1.0))
-    return float(np.linalg.norm(point - start - share * along))
 
 
 def _elsewhere(log: KnownLog, plane: LocalPlane, rng: random.Random) -> KnownLog:

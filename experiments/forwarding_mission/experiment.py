@@ -18,10 +18,9 @@ from experiments.common.individuals import calibrated
 from experiments.common.mission_trial import (
     ACROSS_M,
     ALONG_M,
-    LOG_ANGLE_DEG,
     PAPER_B,
+    PAPER_B_ANGLED,
     TURN_DEG,
-    at_an_angle,
     run_mission,
     shuffled,
 )
@@ -49,7 +48,7 @@ DETECTORS: Final = {"ours": "ours", "paper-b": "faithful"}
 """Detector of each method."""
 NOMINAL: Final = "machine/nominal"
 LIMIT_S: Final = 5400.0
-SOURCES: Final = (*LOCKSTEP_SOURCES, "docs/examples/paper_b.geojson")
+SOURCES: Final = (*LOCKSTEP_SOURCES, "docs/examples/paper_b.geojson", "docs/examples/paper_b_angled.geojson")
 PUBLISHED_TRIALS: Final = "results/forwarding-mission/trials.jsonl.xz"
 """Outcomes of all missions, in the docs."""
 
@@ -92,7 +91,6 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
         along=CM * ALONG_M,
         across=CM * ACROSS_M,
         turn=TURN_DEG,
-        angle=LOG_ANGLE_DEG,
     )
     return Page("Forwarding mission", CONCLUSION, introduction, sections(trials))
 
@@ -108,9 +106,8 @@ def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[J
     job_options: dict[str, Any] = {
         "profile": profile,
         "truth": "nominal",
-        "file": str(PAPER_B),
+        "file": str(PAPER_B_ANGLED),
         "shuffled": False,
-        "angled": True,
         "short": options.quick,
         "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None,
         "limit_s": LIMIT_S,
@@ -182,13 +179,11 @@ def drive(job: Job) -> dict[str, Any]:
     """Drive one mission.
 
     ``options``: profile (shipped name), truth, way (method), eyes (detector), file (of the mission), shuffled (whether
-    the logs are shifted, with the seed ``field``), angled (whether they lie as paper B's, before they are), short
-    (whether only the first log is loaded), text (of the calibrated profile; None: as shipped), limit_s.
+    the logs are shifted, with the seed ``field``), short (whether only the first log is loaded), text (of the
+    calibrated profile; None: as shipped), limit_s.
     """
     o = job.options
     mission = load_mission(Path(o["file"]), route_wanted=True).mission
-    if o.get("angled"):
-        mission = at_an_angle(mission)
     if o.get("short"):
         mission = short(mission)
     if o["shuffled"]:

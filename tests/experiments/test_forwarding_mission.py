@@ -13,7 +13,7 @@ import pytest
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
-from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, TURN_DEG, at_an_angle, shuffled
+from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, PAPER_B_ANGLED, TURN_DEG, shuffled
 from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, perform, short, trial
 from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw
@@ -135,7 +135,8 @@ def test_every_mission_has_a_field_of_its_own_and_the_individuals_take_turns() -
     first = trial(OPTIONS, "aoro_fc8", texts)
     assert [job.options["way"] for job in first] == ["ours", *["paper-b"] * 10]
     assert len({job.options.get("field") for job in first}) == len({job.seed for job in first}) == 10
-    assert all(job.options["angled"] for job in first) and not any(job.options.get("angled") for job in jobs)
+    assert {job.options["file"] for job in first} == {str(PAPER_B_ANGLED)}
+    assert {job.options["file"] for job in jobs} == {str(PAPER_B)}
     assert {job.options["text"] for job in first} == {f"text {NOMINAL}"}
     assert not calibrations(OPTIONS, "aoro_fc8", "sampled", 0)
 
@@ -159,8 +160,9 @@ def test_paper_b_s_logs_lie_as_its_grapple_hangs_when_the_crane_has_passed_them(
     """Along the line from the crane's base, which stops 4.6 m after a log."""
     first, second, *_ = MISSION.waypoints
     plane = LocalPlane(first.latitude_deg, first.longitude_deg)
-    laid = at_an_angle(MISSION)
-    assert not list(problems_of(laid, True))
+    laid = load_mission(PAPER_B_ANGLED, route_wanted=True).mission
+    assert not list(problems_of(laid, True)) and laid.waypoints == MISSION.waypoints
+    assert [log.position for log in laid.logs] == [log.position for log in MISSION.logs]
     east, north, _ = plane.local(second.latitude_deg, second.longitude_deg)
     ahead = np.array([east, north]) / math.hypot(east, north)
     sides = set()

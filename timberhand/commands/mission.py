@@ -116,7 +116,7 @@ def run(
 
       timberhand mission run docs/examples/paper_b.geojson --detector perfect
 
-      timberhand mission run docs/examples/paper_b.geojson --manager paper-b
+      timberhand mission run docs/examples/paper_b_angled.geojson --manager paper-b
     """
     from dataclasses import asdict
 
