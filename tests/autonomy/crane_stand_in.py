@@ -29,6 +29,8 @@ HOME = (0.0, 0.75, -1.6, 0.30, 0.0)
 TICK_NS = 50_000_000
 GRIP_RAD = 1.15
 DROP_RAD = 0.95
+TURNED_RAD = 0.5
+"""Greatest angle between the jaws and across the log at which they grip it and turn it."""
 
 
 @dataclass
@@ -193,13 +195,14 @@ class StandIn:
             across = dx * log.axis[1] - dy * log.axis[0]
             yaw = atan2(log.axis[1], log.axis[0]) + pi / 2 - grapple_yaw(self.profile, self.q)
             under = tip_z < log.center_m[2]
-            if abs(along) < 0.35 and abs(across) < 0.05 and abs(remainder(yaw, pi)) < 0.1 and under:
+            if abs(along) < 0.35 and abs(across) < 0.05 and abs(remainder(yaw, pi)) < TURNED_RAD and under:
                 if self.slippery > 0:
                     self.slippery -= 1
                 else:
                     self.held, self._along = log.id, along
                     self._hangs_m = z - tip_z - log.diameter_m / 2  # its underside at the tips
-                    self._psi = atan2(log.axis[1], log.axis[0]) - grapple_yaw(self.profile, self.q)
+                    heading = atan2(log.axis[1], log.axis[0]) - remainder(yaw, pi)  # the jaws turn it
+                    self._psi = heading - grapple_yaw(self.profile, self.q)
 
     def _carry(self) -> None:
         if self.held is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,8 @@ CARRIER = PROFILE.carrier
 assert CARRIER is not None
 PLANE = LocalPlane(63.657853, 19.895562, 100.0)
 LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
+ANGLED_RAD = 0.52
+"""Angle of paper B's logs to the path (3.1): its grapple does not turn."""
 
 
 def place(x_m: float, y_m: float) -> Point:
@@ -69,6 +72,11 @@ def again(
 
 
 LISTED_LOGS = ((15.0, 4.2), (36.0, -4.2))
+
+
+def outward_rad(y_m: float) -> float:
+    """Yaw of a log of paper B's: its far end points outward behind a machine that has passed it."""
+    return -math.copysign(ANGLED_RAD, y_m)
 
 
 def listed_mission(landing=None, lie=LISTED_LOGS, end_m: float = 50.0, **options) -> ForwardingMission:

@@ -21,7 +21,19 @@ from machine.joints import Joint
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.manager_missions import CARRIER, LOGS, PLANE, PROFILE, at, begin, ended, place, states, whole
+from tests.autonomy.manager_missions import (
+    CARRIER,
+    LOGS,
+    PLANE,
+    PROFILE,
+    at,
+    begin,
+    ended,
+    outward_rad,
+    place,
+    states,
+    whole,
+)
 from tests.autonomy.mapped_logs import lying
 from tests.codes import numbers_in
 
@@ -336,7 +348,10 @@ def test_a_bunk_without_room_ends_the_collecting(table, monkeypatch) -> None:
         return plan_place(arm, mission, grasp, logs, *held)
 
     monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", place)
-    forwarder, manager = begin((*LOGS, (3, 40.0, 4.2, 0.0)), table, end_m=50.0)
+    lie = (*LOGS, (3, 40.0, 4.2, 0.0))
+    if table is PAPER_B:
+        lie = tuple((number, x, y, outward_rad(y)) for number, x, y, _ in lie)
+    forwarder, manager = begin(lie, table, end_m=50.0)
     forwarder.run(manager, ended, 900.0)
     assert manager.state is State.DONE, (manager.failure, states(manager)[-6:])
     assert forwarder.in_bunk == manager.tally.loaded == 1

@@ -33,6 +33,7 @@ from tests.autonomy.manager_missions import (
     at,
     ended,
     listed_mission,
+    outward_rad,
     place,
     states,
     whole,
@@ -43,7 +44,7 @@ from tests.autonomy.mapped_logs import lying
 def begun(told: ForwardingMission, lie=LISTED_LOGS, table=OURS) -> tuple[Forwarder, ActivityManager]:
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, plane=PLANE)
     manager.auto()
-    logs = [lying(i, x, y, 0.0) for i, (x, y) in enumerate(lie, 1)]
+    logs = [lying(i, x, y, outward_rad(y) if table is PAPER_B else 0.0) for i, (x, y) in enumerate(lie, 1)]
     return Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05)), manager
 
 

@@ -112,6 +112,20 @@ VIEW: Final = np.dtype(
 )
 
 
+CPU_FLAGS: Final = (
+    "-O3",
+    "-march=native",
+    "-fPIC",
+    "-fno-math-errno",
+    "-fno-signed-zeros",
+    "-fno-trapping-math",
+    "-fassociative-math",
+    "-freciprocal-math",
+)
+"""What ``-ffast-math`` allows, one by one: with that word the linker adds code that rounds subnormal numbers to zero in
+the thread that loads the library, for everything that the process computes afterwards."""
+
+
 def compiler() -> str | None:
     """Find the compiler of the tracer: nvcc beside a GPU, otherwise g++, None without either."""
     nvcc = shutil.which("nvcc", path=f"{os.environ.get('PATH', '')}:/usr/local/cuda/bin") if GPU.exists() else None
@@ -121,6 +135,7 @@ def compiler() -> str | None:
 def library(folder: Path) -> ctypes.CDLL:
     """Load the compiled tracer, kept in ``folder``."""
     text = b"".join((SOURCES / name).read_bytes() for name in ("vector.h", "surfaces.h", "tracer.cu"))
+    text += " ".join(CPU_FLAGS).encode()
     compiler_path = compiler() or "g++"
     nvcc = Path(compiler_path).name == "nvcc"
     kind = "gpu" if nvcc else "cpu"
@@ -131,16 +146,7 @@ def library(folder: Path) -> ctypes.CDLL:
         if nvcc:
             command = [compiler_path, "-O3", "--use_fast_math", "-arch=native", "-Xcompiler", "-fPIC"]
         else:
-            command = [
-                compiler_path,
-                "-x",
-                "c++",
-                "-O3",
-                "-ffast-math",
-                "-fno-finite-math-only",
-                "-march=native",
-                "-fPIC",
-            ]
+            command = [compiler_path, "-x", "c++", *CPU_FLAGS]
         subprocess.run([*command, "-shared", "-o", str(draft), str(SOURCES / "tracer.cu")], check=True)
         draft.replace(file)
     tracer_library = ctypes.CDLL(str(file))
