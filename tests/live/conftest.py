@@ -1,7 +1,7 @@
 """Live tests: what a test starts ends with it, and a failure beside a stall of the host is inconclusive.
 
 A witness on every processor tells when it stood still (`experiments.common.stall_witness`).  A test that fails while
-the host stood still for longer than the test bears (15 ms, or its mark ``bears``) has found nothing; it is reported as
+the host stood still for longer than the test bears (10 ms, or its mark ``bears``) has found nothing; it is reported as
 inconclusive, with the stall.  Any other failure is a failure.  A test in simulated time bears any standstill:
 nothing in it depends on the host's clock.
 """
@@ -24,8 +24,9 @@ from experiments.common.stall_witness import Witness
 TAG = "TIMBERHAND_TEST_RUN"
 """In the environment of everything that this run starts."""
 IN_THE_LAB = "TIMBERHAND_LAB" in os.environ
-BEARS_MS = 15.0
-"""The shortest time-out of an input: an encoder may be silent for so long."""
+BEARS_MS = 10.0
+"""The shortest time-out of an input, less the age of its newest frame: an encoder may be silent for 15 ms, and sends
+every 5 ms."""
 PATIENCE_S = 5.0
 """For processes that are ending."""
 SHARED_MEMORY = Path("/dev/shm")

@@ -180,12 +180,18 @@ class Browser:
         """Wait until an expression is true; its value."""
         return self.wait(lambda: self.value(script), script)
 
+    def shows(self, element: str, words: str) -> None:
+        """Wait until an element shows words; raises AssertionError with what it shows instead."""
+        self.wait(lambda: words in self.text(element), lambda: f"{element}: {words}, not {self.text(element)}")
+
     @staticmethod
-    def wait(so: Callable[[], Any], what: str) -> Any:
-        """Wait until something is so; raises AssertionError after ``PATIENCE_S``."""
+    def wait(so: Callable[[], Any], what: str | Callable[[], str]) -> Any:
+        """Wait until something is so; raises AssertionError after ``PATIENCE_S`` with ``what`` is awaited, or what a
+        call says then.
+        """
         limit = time.monotonic() + PATIENCE_S
         while not (value := so()):
-            assert time.monotonic() < limit, what
+            assert time.monotonic() < limit, what if isinstance(what, str) else what()
             time.sleep(0.05)
         return value
 

@@ -27,8 +27,3 @@ def draw(browser: Browser, tool: str, *places: tuple[float, float], last: int = 
         at = window(browser, *place)
         for count in range(1, 1 + (last if i == len(places) - 1 else 1)):
             browser.press(*at, count)
-
-
-def shows(browser: Browser, element: str, words: str) -> None:
-    """Wait until an element shows words."""
-    browser.wait(lambda: words in browser.text(element), f"{element}: {words}")

@@ -30,10 +30,6 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
         made.close()
 
 
-def shows(browser: Browser, element: str, words: str) -> None:
-    browser.wait(lambda: words in browser.text(element), f"{element}: {words}, not {browser.text(element)}")
-
-
 def arm(browser: Browser) -> None:
     browser.until("!document.getElementById('arm').disabled")
     browser.click("arm")
@@ -43,16 +39,16 @@ def arm(browser: Browser) -> None:
 
 @pytest.mark.timeout(300)
 def test_a_joint_is_stepped_a_calibration_stopped_and_a_protocol_kept(browser: Browser, tmp_path: Path) -> None:
-    shows(browser, "mode", "STANDBY")
+    browser.shows("mode", "STANDBY")
     assert browser.value("document.getElementById('step').disabled"), "nobody has control"
     take_control(browser)
     browser.until("!document.getElementById('step').disabled")
     browser.click("step")
-    shows(browser, "doing", "waits: the controller is in STANDBY")
+    browser.shows("doing", "waits: the controller is in STANDBY")
     assert browser.value("document.getElementById('calibrate').disabled"), "one at a time"
     arm(browser)
-    shows(browser, "doing", "runs")
-    shows(browser, "doing", "The step of the slew is done.")
+    browser.shows("doing", "runs")
+    browser.shows("doing", "The step of the slew is done.")
     error, command = browser.text("largest-error"), browser.text("command")
     assert 0.0 < float(error.rstrip("°")) < 5.0 and 10 < float(command.rstrip(" %")) <= 100
     assert "°" in browser.text("margins") and "dB" in browser.text("margins")
@@ -77,30 +73,30 @@ def test_a_joint_is_stepped_a_calibration_stopped_and_a_protocol_kept(browser: B
     browser.click("calibrate")
     browser.until("document.getElementById('confirm').open")
     browser.click("confirm-yes")
-    shows(browser, "doing", "The calibration runs")
+    browser.shows("doing", "The calibration runs")
     browser.until("document.getElementById('share').value > 0")
     browser.keys("Escape")
-    shows(browser, "doing", "has ended early")
+    browser.shows("doing", "has ended early")
     assert not list((tmp_path / "kept").glob("*.toml"))
 
     browser.value("document.getElementById('name').value = 'crane-1'")
     browser.click("save")
-    shows(browser, "verdict", "INCOMPLETE")
+    browser.shows("verdict", "INCOMPLETE")
     browser.value(
         "for (const s of document.querySelectorAll('#checks select')) s.value = 'pass';"
         "for (const id of ['machine', 'inspector']) document.getElementById(id).value = 'x ' + id;"
         "document.getElementById('name').value = 'crane-2'"
     )
     browser.click("save")
-    shows(browser, "verdict", "ACCEPTED")
+    browser.shows("verdict", "ACCEPTED")
     kept = json.loads((tmp_path / "kept" / "crane-2.protocol.json").read_text())
     assert kept["verdict"] == "accepted" and [e["id"] for e in kept["entries"]] == list(IDS)
     assert kept["steps"]["slew"]["largest_error"] > 0.0 and kept["saved_by"] == "this machine"
     browser.click("save")
-    shows(browser, "alarm", "a protocol is never changed")
+    browser.shows("alarm", "a protocol is never changed")
     browser.value("document.getElementById('saved').value = 'crane-1'")
     browser.click("open")
-    shows(browser, "verdict", "INCOMPLETE")
+    browser.shows("verdict", "INCOMPLETE")
     paper = browser._ask("Page.printToPDF")["data"]
     assert len(paper) > 5000
     assert "POST /api/commission/step" in audited(tmp_path) and "POST /api/operator/stop" in audited(tmp_path)
@@ -127,9 +123,9 @@ def test_a_joint_is_calibrated_to_the_end_and_the_page_shows_what_was_found(brow
                 time.sleep(0.2)
         shares.append(browser.value("document.getElementById('share').value"))
         time.sleep(1.0)
-    shows(browser, "doing", "The calibration is done.")
+    browser.shows("doing", "The calibration is done.")
     assert len(set(shares)) > 4, f"its progress was shown: {shares}"
-    shows(browser, "said", ".toml is written")
+    browser.shows("said", ".toml is written")
     (written,) = (tmp_path / "kept").glob("*.toml")
     calibrated, shipped = load_profile(written), load_profile("palms_471")
     assert calibrated.joints["lift"] != shipped.joints["lift"] and calibrated.joints["tilt"] == shipped.joints["tilt"]
@@ -150,10 +146,10 @@ def test_a_step_ends_when_its_page_has_gone(browser: Browser, tmp_path: Path) ->
     take_control(browser)
     browser.value("document.getElementById('amount').value = 15")
     browser.click("step")
-    shows(browser, "doing", "waits")
+    browser.shows("doing", "waits")
     browser.open(browser.value("location.origin") + "/")  # to the machine's page in the same tab: control stays
     browser.until("document.body?.dataset.control === 'mine'")
     browser.click("lease-button")
     browser.until("document.body?.dataset.control === 'nobody'")
     browser.open(browser.value("location.origin") + "/commission")
-    shows(browser, "doing", "has ended early: the page that began it has no control any more")
+    browser.shows("doing", "has ended early: the page that began it has no control any more")

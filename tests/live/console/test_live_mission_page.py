@@ -20,7 +20,7 @@ from autonomy.missions.model import ForwardingMission, KnownLog
 from tests.autonomy.mission_texts import at
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
-from tests.live.console.plan_drawing import draw, shows
+from tests.live.console.plan_drawing import draw
 from tests.live.console.started import SIZE, TUTORIAL, Started, keep, opened, pictured
 
 pytestmark = [
@@ -96,7 +96,7 @@ def plan(browser: Browser) -> None:
     draw(browser, "waypoint", *ROUTE)
     draw(browser, "fence", (-22, -14), (22, -14), (22, 14), (-22, 14), last=2)
     draw(browser, "log", *LOGS)
-    shows(browser, "check-state", "can be driven")
+    browser.shows("check-state", "can be driven")
 
 
 def test_a_mission_is_planned_driven_broken_stopped_and_replayed(folder: Path, person: Browser) -> None:
@@ -106,8 +106,8 @@ def test_a_mission_is_planned_driven_broken_stopped_and_replayed(folder: Path, p
     )
     try:
         opened(live, person)
-        shows(person, "mode", "STANDBY")
-        shows(person, "mission-words", "The machine waits for a mission.")
+        person.shows("mode", "STANDBY")
+        person.shows("mission-words", "The machine waits for a mission.")
         person.click("plan-link")
         plan(person)
         upload_and_start(person, live.url)
@@ -117,7 +117,7 @@ def test_a_mission_is_planned_driven_broken_stopped_and_replayed(folder: Path, p
         breaks(live, person)
         stops(live, person)
         go_on_until(live, person, lambda: live.process.poll() is not None, "the end of the run")
-        shows(person, "alarm", f"timberhand console --replay {RUN}")
+        person.shows("alarm", f"timberhand console --replay {RUN}")
     finally:
         live.interrupt()
     assert live.process.returncode == 0, live.said.read_text()
@@ -134,11 +134,11 @@ def upload_and_start(browser: Browser, url: str) -> None:
     take_control(browser)
     browser.until("!document.getElementById('upload').disabled")
     browser.click("upload")
-    shows(browser, "run-note", "The planner has the mission")
+    browser.shows("run-note", "The planner has the mission")
     browser.open(url)
     browser.until("document.body.dataset.control === 'mine'")  # the next page of a tab keeps its control
     arm(browser)
-    shows(browser, "mode", "ARMED")
+    browser.shows("mode", "ARMED")
     browser.until("!document.getElementById('auto').disabled")
     browser.click("auto")
 
@@ -156,7 +156,7 @@ def breaks(live: Started, browser: Browser) -> None:
     assert card.startswith(FAULT)
     after, *ways = browser.value("[...document.querySelectorAll('.fault-card dd')].map(e => e.textContent)")
     assert after.endswith(" ms") and all(way.endswith(" mm") for way in ways), (after, ways)
-    shows(browser, "reason", "[LEASE_LOST]")
+    browser.shows("reason", "[LEASE_LOST]")
     browser.value("document.querySelector('.fault-card').scrollIntoView()")
     keep(browser, TUTORIAL / "broken.png")
 
@@ -166,7 +166,7 @@ def stops(live: Started, browser: Browser) -> None:
     for _ in range(TRIES):
         works(live, browser)
         browser.click("stop")
-        shows(browser, "mode", "STOPPED")
+        browser.shows("mode", "STOPPED")
         if "[OPERATOR_STOP]" in browser.text("reason"):
             return
     raise AssertionError(f"STOP never came first: {browser.text('reason')}")
@@ -184,7 +184,7 @@ def replays(folder: Path, browser: Browser) -> None:
         opened(again, browser)
         browser.until("document.body?.dataset.recording === 'yes'")
         browser.click("tab-timeline")
-        shows(browser, "panel-timeline", "OPERATOR_STOP")
+        browser.shows("panel-timeline", "OPERATOR_STOP")
         stop_s = browser.value(
             "fetch('api/timeline').then(a => a.json()).then(all => all.find(e => e.title === 'OPERATOR_STOP').at_s)"
         )
@@ -193,7 +193,7 @@ def replays(folder: Path, browser: Browser) -> None:
         shown_s = float(browser.wait(lambda: browser.text("replay"), "the replay") and clock(browser))
         assert -10.5 < shown_s + begin_s - stop_s < -5.0, "it plays from ten seconds before"
         browser.until("document.body.dataset.mode === 'ACTIVE'")
-        shows(browser, "reason", "[OPERATOR_STOP]")
+        browser.shows("reason", "[OPERATOR_STOP]")
         assert clock(browser) + begin_s - stop_s < 3.0
     finally:
         again.interrupt()

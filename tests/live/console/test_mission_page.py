@@ -110,12 +110,8 @@ def browser(stage: Stage, tmp_path: Path) -> Iterator[Browser]:
     made.close()
 
 
-def shows(browser: Browser, element: str, words: str) -> None:
-    browser.wait(lambda: words in browser.text(element), f"{element}: {words}")
-
-
 def test_mission_and_vehicle_are_shown_as_text(stage: Stage, browser: Browser) -> None:
-    shows(browser, "mission-words", "The machine drives up to the log.")
+    browser.shows("mission-words", "The machine drives up to the log.")
     told = {
         "mission-age": "Test field",
         "on-board": "3 · 0.29 m³",
@@ -129,14 +125,14 @@ def test_mission_and_vehicle_are_shown_as_text(stage: Stage, browser: Browser) -
     }
     for element, words in told.items():
         assert browser.text(element) == words, element
-    shows(browser, "speed", "2.3 km/h")
+    browser.shows("speed", "2.3 km/h")
     assert browser.text("heading") == "90°" and browser.text("bend") == "11.5° left"
     assert browser.text("roll") == "1.1° right" and browser.text("pitch") == "1.7° down"
     assert browser.text("fix") == "RTK fixed, ±1 cm" and browser.text("arm-3") == "32 cm"
 
 
 def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Browser) -> None:
-    shows(browser, "mission-words", "drives up")
+    browser.shows("mission-words", "drives up")
     for name in ("route", "log", "target", "good"):
         browser.wait(lambda name=name: browser.value(f"{INK}('{name}')") > 15, name)
     stage.mission = msgspec.structs.replace(MISSION_REPORT, targets=(), logs=(), landings=())
@@ -157,7 +153,7 @@ def test_a_click_sends_the_command(
     stage: Stage, browser: Browser, button: str, before: dict, order: MissionAction
 ) -> None:
     stage.mission = msgspec.structs.replace(MISSION_REPORT, state="SEARCH", words="is another", **before)
-    shows(browser, "mission-words", "is another")
+    browser.shows("mission-words", "is another")
     if button != "pause":  # which only stops
         take_control(browser)
     browser.until(f"!document.getElementById('{button}').disabled")
@@ -171,7 +167,7 @@ def test_an_abort_must_be_confirmed(stage: Stage, browser: Browser) -> None:
     take_control(browser)
     browser.until("!document.getElementById('abort').disabled")
     browser.click("abort")
-    shows(browser, "end", "Abort the mission?")
+    browser.shows("end", "Abort the mission?")
     browser.click("end-no")
     browser.until("!document.getElementById('end').open")
     browser.click("abort")
@@ -192,7 +188,7 @@ def test_the_note_gives_the_reason_of_a_pause(stage: Stage, browser: Browser) ->
         ({"ended": True, "failure": "aborted by the operator"}, "aborted by the operator"),
     ):
         stage.mission = msgspec.structs.replace(MISSION_REPORT, **fields)
-        shows(browser, "mission-note", words)
+        browser.shows("mission-note", words)
     browser.until("['auto', 'pause', 'single', 'next-step', 'abort'].every(b => document.getElementById(b).disabled)")
 
 
@@ -210,7 +206,7 @@ def test_an_outdated_mission_is_grey_and_accepts_no_commands(stage: Stage, brows
 
 @pytest.mark.parametrize("stage", [("palms_471", MISSION_REPORT), ("aoro_fc8", None)], indirect=True)
 def test_without_a_mission_or_a_carrier_their_cards_are_hidden(stage: Stage, browser: Browser) -> None:
-    shows(browser, "mode", "ACTIVE")
+    browser.shows("mode", "ACTIVE")
     for element in ("mission", "vehicle", "site"):
         assert not browser.text(element) and not browser.value(
             f"document.getElementById('{element}').checkVisibility()"

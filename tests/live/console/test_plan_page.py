@@ -31,7 +31,7 @@ from tests.autonomy.mission_texts import SITE, at
 from tests.live.autonomy.waiting_planner import HASH, PROFILE, planner_process, report_machine
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
-from tests.live.console.plan_drawing import draw, shows, window
+from tests.live.console.plan_drawing import draw, window
 from tests.live.console.served_page import served
 from tests.operator_end import OperatorEnd
 
@@ -123,7 +123,7 @@ def metres(browser: Browser, list_name: str) -> list[tuple[int, int]]:
 
 
 def test_a_mission_is_planned_by_mouse_and_driven(stage: Stage, browser: Browser) -> None:
-    shows(browser, "findings", "has no waypoints")
+    browser.shows("findings", "has no waypoints")
     draw(browser, "waypoint", (-20, 0), (10, 0), (10, 30))
     draw(browser, "fence", (-35, -20), (35, -20), (35, 12), (-35, 12), last=2)
     draw(browser, "log", (-5, 4))
@@ -131,7 +131,7 @@ def test_a_mission_is_planned_by_mouse_and_driven(stage: Stage, browser: Browser
     assert metres(browser, "waypoints") == [(-20, 0), (10, 0), (10, 30)]
     assert metres(browser, "fences[0].corners") == [(-35, -20), (35, -20), (35, 12), (-35, 12)]
     assert (metres(browser, "logs"), metres(browser, "landings")) == ([(-5, 4)], [(-15, -8)])
-    shows(browser, "findings", "waypoint 3 is 18.0 m outside of the fence")
+    browser.shows("findings", "waypoint 3 is 18.0 m outside of the fence")
     assert browser.value("document.querySelectorAll('.mark.error').length") == 1, "on the map, too"
 
     browser.value("document.querySelector('[data-tool=move]').click()")
@@ -139,12 +139,12 @@ def test_a_mission_is_planned_by_mouse_and_driven(stage: Stage, browser: Browser
     browser.until("plan.model.mission.waypoints.length === 3")
     browser.wait(lambda: metres(browser, "waypoints")[2] == (30, 5), "the dragged waypoint")
     assert metres(browser, "waypoints")[:2] == [(-20, 0), (10, 0)]
-    shows(browser, "check-state", "can be driven")
+    browser.shows("check-state", "can be driven")
     assert (browser.text("duration").endswith("min") and browser.text("route") == "51 m") or browser.text("length")
 
     before = browser.value("JSON.stringify(plan.model.mission)")
     browser.click("save")
-    shows(browser, "file-note", "Saved as mission.geojson.")
+    browser.shows("file-note", "Saved as mission.geojson.")
     browser.click("clear")
     browser.until("plan.model.mission.waypoints.length === 0")
     browser.click("open-saved")
@@ -159,15 +159,15 @@ def test_a_mission_is_planned_by_mouse_and_driven(stage: Stage, browser: Browser
     )
 
     stage.mode = Mode.ARMED
-    shows(browser, "mode", "ARMED")
+    browser.shows("mode", "ARMED")
     take_control(browser)
     browser.until("!document.getElementById('upload').disabled")
     browser.click("upload")
-    shows(browser, "run-note", "the machine is armed; disarm it first")
+    browser.shows("run-note", "the machine is armed; disarm it first")
     stage.mode = Mode.STANDBY
-    shows(browser, "mode", "STANDBY")
+    browser.shows("mode", "STANDBY")
     browser.click("upload")
-    shows(browser, "run-note", "The planner has the mission")
+    browser.shows("run-note", "The planner has the mission")
     browser.until("!document.getElementById('auto').disabled")
     browser.click("auto")
     browser.until("!document.getElementById('pause').disabled")
@@ -182,9 +182,9 @@ def test_exchanged_axes_are_named_and_put_right(browser: Browser) -> None:
         p | {"latitude_deg": p["longitude_deg"], "longitude_deg": p["latitude_deg"]} for p in mission["waypoints"]
     ]
     browser.value(f"plan.model.commit({json.dumps(mission)})")
-    shows(browser, "findings", "latitude and longitude look swapped")
+    browser.shows("findings", "latitude and longitude look swapped")
     browser.click("exchange")
-    shows(browser, "check-state", "can be driven")
+    browser.shows("check-state", "can be driven")
     assert metres(browser, "waypoints") == [(-20, -15), (20, -15), (20, 15), (-20, 15)]
 
 
@@ -222,7 +222,7 @@ def test_a_plan_is_made_with_the_keyboard_alone(browser: Browser) -> None:
     enter("[data-tab=fence]")
     enter("#add")
     enter("#add-corner")
-    shows(browser, "check-state", "can be driven")
+    browser.shows("check-state", "can be driven")
     assert metres(browser, "waypoints") == [(0, 0), (5, 0), (10, 0)]
     assert metres(browser, "fences[0].corners") == [(-10, -10), (5, -10), (20, -10), (20, 10), (-10, 10)]
 
@@ -253,18 +253,18 @@ def test_a_page_with_another_source_or_style_is_not_needed(browser: Browser) -> 
 
 def test_files_are_read_and_written_by_the_page(stage: Stage, browser: Browser, tmp_path: Path) -> None:
     browser.choose_file("import", EXAMPLES / "paper_b.geojson")
-    shows(browser, "file-note", "paper_b.geojson: GeoJSON.")
+    browser.shows("file-note", "paper_b.geojson: GeoJSON.")
     browser.choose_file("import", EXAMPLES / "harvest.hpr")
-    shows(browser, "file-note", "logs added")
+    browser.shows("file-note", "logs added")
     assert browser.value("plan.model.mission.waypoints.length") == 4
     assert browser.value("plan.model.mission.logs.length") > 12
     (tmp_path / "bad.gpx").write_text("<gpx><rte><rtept/></rte></gpx>")
     browser.choose_file("import", tmp_path / "bad.gpx")
-    shows(browser, "file-note", "bad.gpx:1: this rtept has no lat")
+    browser.shows("file-note", "bad.gpx:1: this rtept has no lat")
     browser._ask("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / "down"))
     browser.value("document.getElementById('format').value = 'kml'")
     browser.click("export")
-    shows(browser, "file-note", "mission.kml does not hold: option laps.")
+    browser.shows("file-note", "mission.kml does not hold: option laps.")
     browser.wait(lambda: (tmp_path / "down" / "mission.kml").exists(), "the download")
     assert len(load_mission(tmp_path / "down" / "mission.kml").mission.waypoints) == 4
 
@@ -288,10 +288,10 @@ def test_a_picture_lies_under_the_grid_where_it_is_placed(browser: Browser, tmp_
 
 def test_the_machine_s_page_links_here_and_shows_a_planner_that_waits(stage: Stage, browser: Browser) -> None:
     browser.open(f"http://127.0.0.1:{stage.port}/")
-    shows(browser, "mission-words", "The machine waits for a mission.")
+    browser.shows("mission-words", "The machine waits for a mission.")
     browser.click("plan-link")
     browser.until("document.body?.dataset.ready === 'yes'")
-    shows(browser, "planner-words", "The machine waits for a mission.")
+    browser.shows("planner-words", "The machine waits for a mission.")
 
 
 @pytest.mark.parametrize("browser", [(size, light) for size in SIZES for light in (False, True)], indirect=True)
@@ -307,7 +307,7 @@ def test_nothing_is_cut_off_at_the_usual_sizes(browser: Browser) -> None:
     )
     mission = msgspec.to_builtins(changed)
     browser.value(f"plan.model.commit({json.dumps(mission)}); document.getElementById('fit').click()")
-    shows(browser, "findings", "waypoint 3 is 1.0 m from the fence")
+    browser.shows("findings", "waypoint 3 is 1.0 m from the fence")
     browser.value("plan.model.choose(['waypoint', 2])")
     assert browser.value("document.documentElement.scrollWidth <= innerWidth")
     assert browser.value(

@@ -17,7 +17,7 @@ import pytest
 
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
-from tests.live.console.plan_drawing import draw, shows
+from tests.live.console.plan_drawing import draw
 from tests.live.console.started import SIZE, SOLID_S, TUTORIAL, Started, keep, opened, pictured
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
@@ -45,9 +45,9 @@ def plan(folder: Path, tmp_path: Path) -> None:
         draw(browser, "log", (-1, 3.5), (3, 3.5))
         browser.value("document.querySelector('[data-tool=move]').click()")
         browser.value("document.getElementById('fit').click()")
-        shows(browser, "check-state", "can be driven")
+        browser.shows("check-state", "can be driven")
         browser.click("save")
-        shows(browser, "file-note", "Saved as mission.geojson.")
+        browser.shows("file-note", "Saved as mission.geojson.")
         assert browser.text("command") == "timberhand mission run missions/mission.geojson"
         browser.value("document.querySelector('aside').scrollTop = 0")
         keep(browser, TUTORIAL / "plan.png")
@@ -148,7 +148,7 @@ def test_a_newcomer_watches_it_live_and_breaks_it(folder: Path, tmp_path: Path) 
         audit = folder / "runs" / "second" / "audit.jsonl"
         browser.wait(lambda: "POST /api/operator/stop" in audit.read_text(), "STOP in the audit log")
         started.interrupt()
-        shows(browser, "alarm", "timberhand console --replay runs/second")
+        browser.shows("alarm", "timberhand console --replay runs/second")
     finally:
         browser.close()
         started.interrupt()
