@@ -159,6 +159,12 @@ EXPERIMENTS: Final = {
         (*_MACHINE, "experiments/navigation"),
         scale=10.0,
     ),
+    "parts": Entry(
+        "What do single parts do? Movement primitives, swing arms and float valve, levelling, pictures while driving.",
+        "experiments.parts.experiment",
+        (*_MACHINE, "experiments/parts"),
+        scale=5.0,
+    ),
     "forwarding-mission": Entry(
         "Does the forwarder load 24 logs by itself? Paper B's trial by both methods; other fields, other machines.",
         "experiments.forwarding_mission.experiment",

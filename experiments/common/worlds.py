@@ -11,12 +11,17 @@ from typing import Any, Final
 from machine.geometry.kinematics import Point, inverse, solve
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint_limits
+from sim.mechanics.carrier import PARKED
+from sim.plant import Plant
 from sim.scenes.arrangements import arrangement
 from sim.wood.log_shape import LogSpec
 from sim.world import World, open_world
 
 CARRIER_PROFILE: Final = "aoro_fc8"
 ARM: Final = ("slew", "lift", "tilt", "ext")
+SETTLE_STEP_COUNT: Final = 800
+CarrierPose = tuple[float, float, float]
+"""Middle of the front axle [m] and direction [rad] in the world frame."""
 
 
 @cache
@@ -94,3 +99,15 @@ def step_neutral(world: World, steps: int) -> None:
     neutral = [0.0] * len(world.functions)
     for _ in range(steps):
         world.step(neutral)
+
+
+def place(plant: Plant, pose: CarrierPose) -> None:
+    """Place the machine at rest with its front axle at a pose in the world frame."""
+    world, carrier = plant.world, plant.profile.carrier
+    assert world.carrier is not None and carrier is not None
+    x, y, yaw = pose
+    lf = carrier.front_axle_m
+    world.carrier.place(x - lf * math.cos(yaw), y - lf * math.sin(yaw), yaw, carrier.arm_transport_m)
+    neutral = [0.0] * len(world.functions)
+    for _ in range(SETTLE_STEP_COUNT):
+        world.step(neutral, PARKED)

@@ -15,10 +15,10 @@ from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, sampled_unless_given
 from experiments.common.workers import Trial
-from experiments.common.worlds import carrier_profile, profile_named
+from experiments.common.worlds import CarrierPose, carrier_profile, profile_named
 from experiments.navigation.metrics import CONCLUSION, GROUNDS, INTRODUCTION, LAP, METRICS, PAPER, SECTIONS, gather
 from experiments.navigation.plots import draw
-from experiments.navigation.trial import Pose, perform
+from experiments.navigation.trial import perform
 
 TRIALS: Final = 1
 """Individual machines; each makes 36 drives of five minutes."""
@@ -100,5 +100,5 @@ def plan(options: Options, profile: str, truth: str, trials: int, points: list[t
     ]
 
 
-def _pose(start: tuple[float, float, float]) -> Pose:
+def _pose(start: tuple[float, float, float]) -> CarrierPose:
     return start[0], start[1], math.radians(start[2])

@@ -26,19 +26,16 @@ from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.recording import recorder_of
-from experiments.common.worlds import profile_named
+from experiments.common.worlds import CarrierPose, place, profile_named
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
 from recorder.recorder import Recorder
-from sim.mechanics.carrier import PARKED
 from sim.plant import Plant
 
-Pose = tuple[float, float, float]
 LIMIT_NS: Final = 1_200_000_000_000
-SETTLE_STEP_COUNT: Final = 800
 REST_NS: Final = 1_000_000_000
 KEEP_EVERY: Final = 2
 """Every second report is stored."""
@@ -72,7 +69,7 @@ class NavigationPlanner:
         self.way: PathDrive | WaypointDrive | None = None
         self.location: Location | None = None
         self._carrier, self._plane, self._points, self._kind = profile.carrier, plane, points, way
-        self.begin: Pose = (math.nan,) * 3
+        self.begin: CarrierPose = (math.nan,) * 3
         self._fresh: VehicleReport | None = None
         self._armed = False
         self._count = 0
@@ -182,15 +179,3 @@ def _driven(job: Job, profile: Profile, recorder: Recorder | None) -> dict[str, 
         }
     finally:
         plant.close()
-
-
-def place(plant: Plant, pose: Pose) -> None:
-    """Place the machine at rest with its front axle at a pose in the world frame."""
-    world, carrier = plant.world, plant.profile.carrier
-    assert world.carrier is not None and carrier is not None
-    x, y, yaw = pose
-    lf = carrier.front_axle_m
-    world.carrier.place(x - lf * math.cos(yaw), y - lf * math.sin(yaw), yaw, carrier.arm_transport_m)
-    neutral = [0.0] * len(world.functions)
-    for _ in range(SETTLE_STEP_COUNT):
-        world.step(neutral, PARKED)
