@@ -11,19 +11,15 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from autonomy.localization.local_plane import LocalPlane
-from autonomy.localization.localizer import Localizer
-from autonomy.localization.location import Location, Status
+from autonomy.localization.location import Location
 from autonomy.navigation.joining_path import joining_path
 from autonomy.navigation.navigator import Navigator, Phase
 from autonomy.navigation.path_drive import PathDrive
 from autonomy.navigation.waypoint_drive import Waypoint, WaypointDrive
-from autonomy.perception.log_list import LogObservation
-from can_dbc.messages.crane import StateReport
-from can_dbc.messages.datagrams import encode
-from can_dbc.messages.vehicle import VehicleReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
+from experiments.common.carrier_driver import CarrierDriver, Drive
 from experiments.common.pool import Job
 from experiments.common.recording import recorder_of
 from experiments.common.worlds import CarrierPose, place, profile_named
@@ -31,7 +27,6 @@ from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
-from machine.status.modes import Mode
 from recorder.recorder import Recorder
 from sim.plant import Plant
 
@@ -58,64 +53,37 @@ COLUMNS: Final = (
 )
 
 
-class NavigationPlanner:
-    """Waits until the machine is armed and located, drives, and stores the samples."""
+class NavigationPlanner(CarrierDriver):
+    """Drives along the points, and stores the samples."""
 
     def __init__(self, profile: Profile, plane: LocalPlane, points: Sequence[tuple[float, float]], way: str) -> None:
         assert profile.carrier is not None
+        super().__init__(profile.carrier, plane, Navigator(profile.carrier, profile_hash(profile)))
         self.rows: list[list[float]] = []
-        self.navigator = Navigator(profile.carrier, profile_hash(profile))
-        self.localizer = Localizer(profile.carrier, plane)
-        self.way: PathDrive | WaypointDrive | None = None
-        self.location: Location | None = None
-        self._carrier, self._plane, self._points, self._kind = profile.carrier, plane, points, way
+        self._plane, self._points, self._kind = plane, points, way
         self.begin: CarrierPose = (math.nan,) * 3
-        self._fresh: VehicleReport | None = None
-        self._armed = False
         self._count = 0
         self.truth: Any = None
         """The plant's carrier, for the samples only."""
 
-    def receive(self, report: VehicleReport) -> None:
-        """Receive a report of the vehicle."""
-        self._fresh = report
-
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """Return the setpoint to send now."""
-        vehicle, self._fresh = self._fresh, None
-        if report is not None:
-            self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)
-        if vehicle is None:
-            return None
-        self.location = location = self.localizer.step(vehicle)
-        if self.way is None and location.status is Status.TRACKING and self._armed:
-            self.way = self._begin(location)
-            self.navigator.drive(self.way)
-        setpoint = self.navigator.step(now_ns, vehicle, location)
-        self._keep(now_ns, location)
-        return None if setpoint is None else encode(setpoint)
-
-    @property
-    def over(self) -> bool:
-        """Whether the drive has ended."""
-        return self.navigator.phase in (Phase.ARRIVED, Phase.STOPPED)
-
-    def _begin(self, location: Location) -> PathDrive | WaypointDrive:
+    def begin_drive(self, location: Location) -> Drive:
+        """Return the drive from a location along the points."""
         position = (location.x_m, location.y_m)
         self.begin = (*position, location.yaw_rad)
         if self._kind == "faithful":
             geodetic_points = [self._plane.geodetic(*point)[:2] for point in self._points]
-            return WaypointDrive(self._carrier, [Waypoint(*geodetic_point) for geodetic_point in geodetic_points])
-        return PathDrive(self._carrier, joining_path(position, location.yaw_rad, self._points, self._carrier))
+            return WaypointDrive(self.carrier, [Waypoint(*geodetic_point) for geodetic_point in geodetic_points])
+        return PathDrive(self.carrier, joining_path(position, location.yaw_rad, self._points, self.carrier))
 
-    def _keep(self, now_ns: int, location: Location) -> None:
+    def sample(self, now_ns: int, location: Location) -> None:
+        """Store every second sample of the drive."""
         self._count += 1
-        if self.way is None or self._count % KEEP_EVERY:
+        if self.drive is None or self._count % KEEP_EVERY:
             return
         c = self.truth
         x, y, _ = c.front_axle()
-        steer = self.way.steer if isinstance(self.way, PathDrive) else None
-        goal = self.way.number if isinstance(self.way, WaypointDrive) else -1
+        steer = self.drive.steer if isinstance(self.drive, PathDrive) else None
+        goal = self.drive.number if isinstance(self.drive, WaypointDrive) else -1
         own = (steer.s_m, steer.off_m) if steer else (math.nan, math.nan)
         target_articulation_rad = steer.articulation_rad if steer else math.nan
         self.rows.append(

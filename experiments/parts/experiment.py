@@ -19,7 +19,7 @@ from experiments.parts.trial import demonstrations, perform
 from runtime.plot_style import OIL, TIMBER, sheet
 
 TRIALS: Final = 4
-"""Individual machines that drive, level and take pictures; each demonstration is repeated once."""
+"""Individual machines, each calibrated first; they take turns with the demonstrations."""
 FIRST_SEED: Final = 9400
 SEEDS_PER_RUN: Final = 100
 SLOPES: Final = {"side": ("slope", 0.0), "uphill": ("slope", 90.0)}
@@ -53,7 +53,13 @@ PRIMITIVES: Final = (
         "Pin by the encoders from its reference while the crane repeats the primitive in lockstep.",
     ),
     Metric("true_rms_m", "Tip from the primitive, truly, RMS", "cm", "The same with sag and lean of the column."),
-    Metric("rest_m", "Tip at rest from its goal", "cm", "By the encoders, in the last of three seconds.", most=0.03),
+    Metric(
+        "rest_m",
+        "Tip at rest from its goal",
+        "cm",
+        "By the encoders, in the last of three seconds; mean.",
+        most=0.03,
+    ),
     Metric("refused", "Demonstrations out of reach for the primitives", "", "Of all.", most=0.0),
 )
 GROUND: Final = tuple(
@@ -104,7 +110,7 @@ PICTURES: Final = (
 BOTH: Final = (Metric("stops", "Stops by the supervisor", "", "All trials.", most=0.0),)
 METRICS: Final = (*PRIMITIVES, *GROUND, *LEVEL, *PICTURES, *BOTH)
 INTRODUCTION: Final = (
-    "Each part works with the whole machine on its buses in lockstep, with its profile as shipped: movement primitives "
+    "Each part works with the whole machine on its buses in lockstep, calibrated: movement primitives "
     "(paper B 3.2.5), each demonstration left out once; the swing arms' law and the front axle's float valve (3.2.4) "
     "on a straight drive of 20 m over undulating ground; levelling on a plane that rises by a tenth; and the front "
     "camera's pictures of logs beside the drive."
@@ -120,8 +126,10 @@ def run(options: Options, console: Console) -> Result:
     name, truth = carrier_profile(options.profile), sampled_unless_given(options.truth)
     check_truth(name, truth)
     trials = 1 if options.quick else options.trials or TRIALS
-    jobs = plan(options, name, truth, trials)
+    machines = calibrations(options, name, truth, trials)
     with checkpoint(options, (), [name], truth, LOCKSTEP_SOURCES) as trial_store:
+        texts = pool.run(perform, machines, trial_store, options.workers, "calibrations", console)
+        jobs = plan(options, name, truth, [texts[machine.name]["profile"] for machine in machines])
         outcomes = pool.run(perform, jobs, trial_store, options.workers, "trials of parts", console)
         result = make_result(
             "parts",
@@ -160,21 +168,34 @@ def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     return Page("Parts of the machine", CONCLUSION, INTRODUCTION, sections)
 
 
-def plan(options: Options, profile: str, truth: str, trials: int) -> list[Job]:
-    """Plan every trial, named PART/VARIANT/NUMBER."""
+def calibrations(options: Options, profile: str, truth: str, count: int) -> list[Job]:
+    """List the calibration of every individual."""
     first_seed = FIRST_SEED + options.seed * SEEDS_PER_RUN
-    common = {"profile": profile, "truth": truth}
+    job_options = {"profile": profile, "truth": truth}
+    return [Job(f"machine/{i}", "calibration", first_seed + i, job_options) for i in range(count)]
+
+
+def plan(options: Options, profile: str, truth: str, texts: Sequence[str | None]) -> list[Job]:
+    """Plan every trial, named PART/VARIANT/NUMBER; ``texts``: the calibrated profiles, None where that failed.
+
+    The individuals take turns with the demonstrations; one that could not be calibrated has its shipped profile.
+    """
+    first_seed = FIRST_SEED + options.seed * SEEDS_PER_RUN
     numbers = range(2 if options.quick else len(demonstrations(profile)))
-    jobs = [Job(f"primitive/own/{i}", "primitive", first_seed + i, common | {"number": i}) for i in numbers]
-    for i in range(trials):
-        seed = first_seed + i
+    jobs = []
+
+    def add(name: str, kind: str, machine: int, **more: Any) -> None:
+        job_options = {"profile": profile, "truth": truth, "text": texts[machine]}
+        jobs.append(Job(name, kind, first_seed + machine, job_options | more))
+
+    for i in numbers:
+        add(f"primitive/own/{i}", "primitive", i % len(texts), number=i)
+    for i in range(len(texts)):
         for key in ("float", "arms"):
-            rough = common | {"terrain": "rough", "floats": key == "float"}
-            jobs.append(Job(f"ground/{key}/{i}", "ground", seed, rough))
+            add(f"ground/{key}/{i}", "ground", i, terrain="rough", floats=key == "float")
         for key, (terrain, heading_deg) in SLOPES.items():
-            slope = common | {"terrain": terrain, "heading_deg": heading_deg}
-            jobs.append(Job(f"level/{key}/{i}", "level", seed, slope))
-        jobs.append(Job(f"pictures/own/{i}", "pictures", seed, common))
+            add(f"level/{key}/{i}", "level", i, terrain=terrain, heading_deg=heading_deg)
+        add(f"pictures/own/{i}", "pictures", i)
     return jobs
 
 
@@ -237,12 +258,12 @@ def draw(outcomes: Mapping[str, Any], options: Options) -> None:
         for name, outcome in outcomes.items():
             if name.startswith("primitive/") and not outcome.get("failure"):
                 for key, colour in (("demonstrated", OIL), ("planned", TIMBER)):
-                    axis.plot(*np.array(outcome[key]).T, color=colour, lw=0.9)
+                    axis.plot(*np.array(outcome[key]).T, color=colour, lw=0.9, ls="-")
         axis.set(xlabel="distance from the slew axis [m]", ylabel="height [m]")
     with sheet(options.out / "levelling.png") as axis:
         for name, outcome in outcomes.items():
             if name.startswith("level/"):
                 colour = OIL if "/side/" in name else TIMBER
                 time_s, tilt_rad = np.array(outcome["curve"]).T
-                axis.plot(time_s, np.degrees(tilt_rad), color=colour, lw=0.9)
+                axis.plot(time_s, np.degrees(tilt_rad), color=colour, lw=0.9, ls="-")
         axis.set(xlabel="time [s]", ylabel="tilt [deg] (dark: side slope, light: uphill)")

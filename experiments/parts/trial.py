@@ -18,8 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.localization.local_plane import LocalPlane
-from autonomy.localization.localizer import Localizer
-from autonomy.localization.location import Location, Status
+from autonomy.localization.location import Location
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.demonstration import JointTrack, joint_vectors, read_demonstrations
 from autonomy.motion.movement_primitives import SHIPPED_FOLDER, PrimitiveMotions, learn_primitives
@@ -36,11 +35,12 @@ from autonomy.perception.log_list import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.tracking.log_filter import SURVEYED_BY_GNSS
 from can_dbc.messages.crane import GrappleCommand, StateReport
-from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, VehicleReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
+from experiments.common.carrier_driver import CarrierDriver, Drive
+from experiments.common.individuals import calibrated, controller_profile
 from experiments.common.pool import Job
 from experiments.common.worlds import place, profile_named
 from hil.calibration import surveyed_profile
@@ -50,7 +50,7 @@ from hil.missions.detectors import CAMERA
 from hil.plant.camera import RigCamera
 from machine.geometry.kinematics import Unreachable, pin_position
 from machine.joints import JOINTS, Joint
-from machine.loading.profile_file import profile_hash
+from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Carrier, Profile
 from machine.status.modes import Mode
 from sim.camera.geometry import quaternion_matrix
@@ -72,7 +72,7 @@ LOG_COUNT: Final = 8
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """Run one trial; options: profile, truth, and those of its kind."""
+    """Run one trial; options: profile, truth, text (of the calibrated profile), and those of its kind."""
     return KINDS[job.kind](job)
 
 
@@ -108,21 +108,37 @@ class _Repetition:
             start = (*report.position[: Joint.ROT], self._motion.position[0][Joint.ROT])  # which nothing measures
             self._approach = joint_motion(Arm(self._profile), start, self._motion.position[0])
             self._begin_ns = now_ns
-        elapsed_s = (now_ns - self._begin_ns) * 1e-9
         begins_s = self._approach.duration_s + REST_S
-        self._sample(report, elapsed_s - begins_s)
+        self._sample(report, (report.stamp_ns - self._begin_ns) * 1e-9 - begins_s)
+        elapsed_s = (now_ns - self._begin_ns) * 1e-9
         if not self._stream.due(now_ns):
             return None
         if elapsed_s < begins_s:
             return self._stream.datagram(now_ns, self._approach, elapsed_s, GrappleCommand.NEUTRAL)
         return self._stream.datagram(now_ns, self._motion, elapsed_s - begins_s, GrappleCommand.NEUTRAL)
 
+    def figures(self, joints: np.ndarray, demonstrated_s: float) -> dict[str, Any]:
+        """Compare the motion with the demonstration of joint vectors (n, 5) and that duration [s]."""
+        motion = self._motion
+        demonstrated, planned = (_pin_path(self._profile, q) for q in (joints, np.array(motion.position)))
+        apart_m = [float(np.linalg.norm(demonstrated - point, axis=1).min()) for point in planned]
+        return {
+            "shape_rms_m": _rms(apart_m),
+            "shape_max_m": max(apart_m),
+            "time_share": motion.duration_s / demonstrated_s,
+            "tip_rms_m": _rms(self.errors_m),
+            "true_rms_m": _rms(self.true_errors_m),
+            "rest_m": self.rest_m,
+            "demonstrated": _plane(demonstrated),
+            "planned": _plane(planned),
+        }
+
     def _sample(self, report: StateReport, time_s: float) -> None:
         if time_s < 0.0:
             return
         kinematics = self._profile.kinematics
         asked_m = pin_position(kinematics, self._motion.at(time_s)[0])
-        error_m = math.dist(pin_position(kinematics, report.position), asked_m)  # the rotator does not move the pin
+        error_m = math.dist(pin_position(kinematics, report.position), asked_m)
         if time_s < self._motion.duration_s:
             self.errors_m.append(error_m)
             self.true_errors_m.append(math.dist(self._tip(), asked_m))
@@ -142,32 +158,22 @@ def primitive(job: Job) -> dict[str, Any]:
 
     The shape is the distance of the primitive's path of the pin from the demonstrated one, whatever the time on it.
     """
-    o = job.options
-    profile = profile_named(o["profile"])
-    shown = list(demonstrations(profile.name))
-    own = shown.pop(o["number"])
-    arm = Arm(profile)
+    shown = list(demonstrations(job.options["profile"]))
+    own = shown.pop(job.options["number"])
     joints = joint_vectors(own)
-    try:
+
+    def repetition(profile: Profile, _: LocalPlane, plant: Plant) -> _Repetition:
+        arm = Arm(profile)
         plan = PrimitiveMotions(learn_primitives(profile, shown))
-        motion = plan(arm, arm.pose(joints[0].tolist()), arm.pose(joints[-1].tolist()))
+        return _Repetition(profile, plan(arm, arm.pose(joints[0].tolist()), arm.pose(joints[-1].tolist())), plant.tip)
+
+    try:
+        with _system(job, repetition) as (system, repeated):
+            _run(system, repeated)
+            figures: dict[str, Any] = repeated.figures(joints, float(own.time_s[-1]))
+            return figures | {"stops": system.operator.stops}
     except Unreachable as refused:
         return {"failure": str(refused), "stops": 0}
-    demonstrated, planned = (_pin_path(profile, q) for q in (joints, np.array(motion.position)))
-    apart_m = [float(np.linalg.norm(demonstrated - point, axis=1).min()) for point in planned]
-    with _system(job, lambda plant, _: _Repetition(profile, motion, plant.tip)) as (system, repetition):
-        _run(system, repetition)
-        return {
-            "shape_rms_m": _rms(apart_m),
-            "shape_max_m": max(apart_m),
-            "time_share": motion.duration_s / float(own.time_s[-1]),
-            "tip_rms_m": _rms(repetition.errors_m),
-            "true_rms_m": _rms(repetition.true_errors_m),
-            "rest_m": repetition.rest_m,
-            "demonstrated": _plane(demonstrated),
-            "planned": _plane(planned),
-            "stops": system.operator.stops,
-        }
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -211,60 +217,38 @@ class _OnArms(Navigator):
         return None if setpoint is None else dataclasses.replace(setpoint, float_front=False, float_rear=False)
 
 
-class _Driver:
-    """Planner that drives straight on once the machine is armed and located; without a ``drive_m`` it holds heights."""
+class _Straight(CarrierDriver):
+    """Drives ``DRIVE_M`` straight on."""
 
-    def __init__(self, profile: Profile, plane: LocalPlane, navigator: Navigator, drive_m: float = 0.0) -> None:
-        self._carrier, self._drive_m = carrier_of(profile), drive_m
-        self._localizer, self.navigator = Localizer(self._carrier, plane), navigator
-        navigator.holds_heights = not drive_m
-        self._fresh: VehicleReport | None = None
-        self._armed = False
-
-    @property
-    def over(self) -> bool:
-        """Whether the drive has ended."""
-        return self.navigator.phase in (NavigatorPhase.ARRIVED, NavigatorPhase.STOPPED)
-
-    def receive(self, report: VehicleReport) -> None:
-        """Receive a report of the vehicle."""
-        self._fresh = report
-
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """Return the setpoint to send now."""
-        vehicle, self._fresh = self._fresh, None
-        if report is not None:
-            self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)
-        if vehicle is None:
-            return None
-        location = self._localizer.step(vehicle)
-        ready = self._armed and location.status is Status.TRACKING
-        if self._drive_m and ready and self.navigator.active is None:
-            x, y, yaw = location.x_m, location.y_m, location.yaw_rad
-            goal = (x + self._drive_m * math.cos(yaw), y + self._drive_m * math.sin(yaw))
-            self.navigator.drive(PathDrive(self._carrier, joining_path((x, y), yaw, [goal], self._carrier)))
-        setpoint = self.navigator.step(now_ns, vehicle, location)
-        return None if setpoint is None else encode(setpoint)
+    def begin_drive(self, location: Location) -> Drive:
+        """Return the drive from a location."""
+        x, y, yaw = location.x_m, location.y_m, location.yaw_rad
+        goal = (x + DRIVE_M * math.cos(yaw), y + DRIVE_M * math.sin(yaw))
+        return PathDrive(self.carrier, joining_path((x, y), yaw, [goal], self.carrier))
 
 
 @contextmanager
 def _system(
-    job: Job, make: Callable[[Plant, LocalPlane], Any], logs: tuple[LogSpec, ...] = ()
+    job: Job, make: Callable[[Profile, LocalPlane, Plant], Any], logs: tuple[LogSpec, ...] = ()
 ) -> Iterator[tuple[Lockstep, Any]]:
-    """Open the whole machine in lockstep on its ground, and the planner that ``make`` makes."""
+    """Open the whole machine in lockstep on its ground, and the planner that ``make`` makes.
+
+    Controller, guard and planner have the calibrated profile; the plant is that of the shipped one.
+    """
     o = job.options
-    profile = profile_named(o["profile"])
-    carrier = carrier_of(profile)
-    plant = Plant(profile, job.seed, o["truth"], scene=logs, terrain=o.get("terrain", "flat"))
-    try:
-        place(plant, (0.0, 0.0, math.radians(o.get("heading_deg", 0.0))))
-        planner = make(plant, LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg, 0.0))
-        settings = Settings(profile, profile_hash(profile), profile.rate_hz)
-        guard = build_guard(profile_path(o["profile"]))
-        operator = Operator(profile_hash(profile), lambda *_: None)
-        yield Lockstep(settings, guard, plant, planner, operator, Observer(None, [], [planner.receive])), planner
-    finally:
-        plant.close()
+    with controller_profile(o["profile"], o["text"]) as name:
+        profile = load_profile(name)
+        carrier = carrier_of(profile)
+        plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=logs, terrain=o.get("terrain", "flat"))
+        try:
+            place(plant, (0.0, 0.0, math.radians(o.get("heading_deg", 0.0))))
+            planner = make(profile, LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg, 0.0), plant)
+            digest = profile_hash(profile)
+            settings, operator = Settings(profile, digest, profile.rate_hz), Operator(digest, lambda *_: None)
+            observer = Observer(None, [], [planner.receive])
+            yield Lockstep(settings, build_guard(profile_path(name)), plant, planner, operator, observer), planner
+        finally:
+            plant.close()
 
 
 def _run(system: Lockstep, planner: Any, sample: Callable[[], None] = lambda: None, every_ns: int = SAMPLE_NS) -> None:
@@ -277,9 +261,18 @@ def _run(system: Lockstep, planner: Any, sample: Callable[[], None] = lambda: No
             sample()
 
 
-def _driver(plant: Plant, plane: LocalPlane, navigator: type[Navigator] = Navigator) -> _Driver:
-    carrier = carrier_of(plant.profile)
-    return _Driver(plant.profile, plane, navigator(carrier, profile_hash(plant.profile)), DRIVE_M)
+def _straight(profile: Profile, plane: LocalPlane, _: Plant) -> CarrierDriver:
+    return _Straight(carrier_of(profile), plane, Navigator(carrier_of(profile), profile_hash(profile)))
+
+
+def _straight_on_arms(profile: Profile, plane: LocalPlane, _: Plant) -> CarrierDriver:
+    return _Straight(carrier_of(profile), plane, _OnArms(carrier_of(profile), profile_hash(profile)))
+
+
+def _standing(profile: Profile, plane: LocalPlane, _: Plant) -> CarrierDriver:
+    navigator = Navigator(carrier_of(profile), profile_hash(profile), level=True)
+    navigator.holds_heights = True
+    return CarrierDriver(carrier_of(profile), plane, navigator)
 
 
 def ground(job: Job) -> dict[str, Any]:
@@ -289,7 +282,7 @@ def ground(job: Job) -> dict[str, Any]:
     of a quarter of their sum, and the roll of the rear half [rad].
     """
     floats = job.options["floats"]
-    with _system(job, lambda plant, at: _driver(plant, at, Navigator if floats else _OnArms)) as (system, driver):
+    with _system(job, _straight if floats else _straight_on_arms) as (system, driver):
         body, transport_m = body_of(system.plant), carrier_of(system.plant.profile).arm_transport_m
         heights, loads, rolls = [], [], []
 
@@ -310,12 +303,7 @@ def ground(job: Job) -> dict[str, Any]:
 
 def level(job: Job) -> dict[str, Any]:
     """Level the standing machine on a slope; the greater tilt of roll and pitch [rad] over the time [s]."""
-
-    def standing(plant: Plant, plane: LocalPlane) -> _Driver:
-        carrier = carrier_of(plant.profile)
-        return _Driver(plant.profile, plane, Navigator(carrier, profile_hash(plant.profile), level=True))
-
-    with _system(job, standing) as (system, _):
+    with _system(job, _standing) as (system, _):
         body = body_of(system.plant)
         before_rad = _tilt_rad(body)
         curve = []
@@ -355,7 +343,7 @@ class _Timed:
 def pictures(job: Job) -> dict[str, Any]:
     """Take a picture twice a second while the machine drives past logs: logs in it, processor time without drawing."""
     logs = tuple(_log(k) for k in range(LOG_COUNT))
-    with _system(job, _driver, logs) as (system, driver):
+    with _system(job, _straight, logs) as (system, driver):
         plant, profile = system.plant, system.plant.profile
         body = body_of(plant)
         surveyed = surveyed_profile(profile, plant.world.truth, CAMERA, job.seed)
@@ -386,6 +374,7 @@ def _log(number: int) -> LogSpec:
 
 
 KINDS: Final[dict[str, Callable[[Job], dict[str, Any]]]] = {
+    "calibration": calibrated,
     "primitive": primitive,
     "ground": ground,
     "level": level,

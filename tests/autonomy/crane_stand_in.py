@@ -29,8 +29,6 @@ HOME = (0.0, 0.75, -1.6, 0.30, 0.0)
 TICK_NS = 50_000_000
 GRIP_RAD = 1.15
 DROP_RAD = 0.95
-TURNED_RAD = 0.5
-"""Greatest angle between the jaws and across the log at which they grip it and turn it."""
 
 
 @dataclass
@@ -55,6 +53,7 @@ class StandIn:
     feedback: bool = True
     log_kg: float = nan  # what a load cell shows of a held log, and what the column feels
     slippery: int = 0  # so many grips come up empty
+    turned_rad: float = 0.1  # the jaws grip a log that lies so far from across them, and turn it
     now_ns: int = 5_000_000_000
     tong_rad: float = 0.0
     gripped: bool = False
@@ -195,7 +194,7 @@ class StandIn:
             across = dx * log.axis[1] - dy * log.axis[0]
             yaw = atan2(log.axis[1], log.axis[0]) + pi / 2 - grapple_yaw(self.profile, self.q)
             under = tip_z < log.center_m[2]
-            if abs(along) < 0.35 and abs(across) < 0.05 and abs(remainder(yaw, pi)) < TURNED_RAD and under:
+            if abs(along) < 0.35 and abs(across) < 0.05 and abs(remainder(yaw, pi)) < self.turned_rad and under:
                 if self.slippery > 0:
                     self.slippery -= 1
                 else:

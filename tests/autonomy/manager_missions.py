@@ -10,7 +10,8 @@ import pytest
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.checkpoint import CheckpointFile, read_checkpoint
-from autonomy.manager.transition_table import FINAL_STATES, OURS, State
+from autonomy.manager.log_map import MappedLog
+from autonomy.manager.transition_table import FINAL_STATES, OURS, PAPER_B, State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
@@ -22,7 +23,9 @@ assert CARRIER is not None
 PLANE = LocalPlane(63.657853, 19.895562, 100.0)
 LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
 ANGLED_RAD = 0.52
-"""Angle of paper B's logs to the path (3.1): its grapple does not turn."""
+"""Angle of paper B's logs to the path (3.1): its grapple does not turn, ..."""
+TURNED_RAD = 0.5
+"""... but its jaws turn a log that lies at such an angle to them."""
 
 
 def place(x_m: float, y_m: float) -> Point:
@@ -38,7 +41,14 @@ def begin(
     mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
     manager.auto()
-    return Forwarder(PROFILE, PLANE, [lying(*log) for log in lie], (0.0, 0.1, 0.05)), manager
+    return forwarder([lying(*log) for log in lie], table), manager
+
+
+def forwarder(logs: list[MappedLog], table=OURS) -> Forwarder:
+    machine = Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05))
+    if table is PAPER_B:
+        machine.crane.turned_rad = TURNED_RAD
+    return machine
 
 
 def whole(test):

@@ -32,6 +32,7 @@ from tests.autonomy.manager_missions import (
     again,
     at,
     ended,
+    forwarder,
     listed_mission,
     outward_rad,
     place,
@@ -45,7 +46,7 @@ def begun(told: ForwardingMission, lie=LISTED_LOGS, table=OURS) -> tuple[Forward
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, plane=PLANE)
     manager.auto()
     logs = [lying(i, x, y, outward_rad(y) if table is PAPER_B else 0.0) for i, (x, y) in enumerate(lie, 1)]
-    return Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05)), manager
+    return forwarder(logs, table), manager
 
 
 def loaded(count: int, state: State):

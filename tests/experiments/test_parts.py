@@ -19,13 +19,14 @@ TILT = math.radians(5.0)
 
 
 def test_every_demonstration_is_left_out_once_and_variants_share_a_machine() -> None:
-    jobs = plan(SimpleNamespace(seed=1, quick=False), "aoro_fc8", "sampled", 3)
+    jobs = plan(SimpleNamespace(seed=1, quick=False), "aoro_fc8", "sampled", ["one", None, "three"])
     assert len(jobs) == len({job.name for job in jobs})
     shown = [job for job in jobs if job.kind == "primitive"]
     assert sorted(job.options["number"] for job in shown) == list(range(len(demonstrations("aoro_fc8"))))
     driven = [job for job in jobs if job.kind == "ground"]
     assert len(driven) == 6 and {job.options["floats"] for job in driven} == {True, False}
     assert len({job.seed for job in driven}) == 3
+    assert {job.seed: job.options["text"] for job in jobs} == {job.seed: job.options["text"] for job in driven}
     assert {job.name.split("/")[1] for job in jobs if job.kind == "level"} == set(SLOPES)
 
 
