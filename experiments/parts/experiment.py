@@ -83,7 +83,7 @@ GROUND: Final = tuple(
             f"{key}.arrived",
             f"{title}: drives that arrived",
             "%",
-            "The others were stuck.",
+            "The machine ended the others: a lifted wheel spins, and the receiver denies it.",
         ),
         Metric(f"{key}.roll_deg", f"{title}: roll of the rear half, RMS about its mean", "deg", "True roll."),
     )

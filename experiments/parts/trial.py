@@ -296,9 +296,14 @@ def ground(job: Job) -> dict[str, Any]:
             rolls.append(round(body.roll_rad, 4))
 
         _run(system, driver, sample)
-        arrived = driver.navigator.phase is NavigatorPhase.ARRIVED
-        stops = system.operator.stops
-        return {"heights_m": heights, "loads": loads, "roll_rad": rolls, "arrived": arrived, "stops": stops}
+        return {
+            "heights_m": heights,
+            "loads": loads,
+            "roll_rad": rolls,
+            "arrived": driver.navigator.phase is NavigatorPhase.ARRIVED,
+            "reason": driver.navigator.reason,
+            "stops": system.operator.stops,
+        }
 
 
 def level(job: Job) -> dict[str, Any]:
