@@ -88,8 +88,8 @@ export function createCamera(container) {
 
   function tell(state, chosen) {
     const items = state.logs.map((log) => {
-      const seen = log.seen ? "" : ", remembered", mark = chosen.has(log.id) ? "● " : "";
-      return `${mark}log ${log.id}: ${log.length_m.toFixed(2)} m × ${(100 * log.diameter_m).toFixed(0)} cm${seen}`;
+      const seen = log.seen ? "" : ", remembered", mark = chosen.has(log.id) ? ", chosen" : "";
+      return `log ${log.id}: ${log.length_m.toFixed(2)} m × ${(100 * log.diameter_m).toFixed(0)} cm${mark}${seen}`;
     });
     if (list.dataset.shown === items.join()) return;
     list.dataset.shown = items.join();
