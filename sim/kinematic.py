@@ -134,6 +134,7 @@ class KinematicWorld:
         self._functions = {name: _ValveModel(spec.valve, spec.valve.sign, step_ns) for name, spec in joints.items()}
         self._range = {name: (spec.lower, spec.upper) for name, spec in joints.items()}
         self.q = {name: low + START_SHARE * (high - low) for name, (low, high) in self._range.items()}
+        self._range |= {name: (-math.inf, math.inf) for name in joints if truth.functions[name].cylinder.endless}
         if profile.carrier is not None:
             c = profile.carrier
             self._functions["articulation"] = _ValveModel(c.steer_valve, 1, step_ns)

@@ -163,10 +163,12 @@ class LinkDef:
 
 @dataclass(frozen=True, slots=True)
 class JointDef:
-    """A joint: pose of the child frame in the parent's at 0, axis in the child frame, stops [rad, m]."""
+    """A joint: pose of the child frame in the parent's at 0, axis in the child frame, stops [rad, m]; a continuous one
+    has none.
+    """
 
     name: str
-    kind: Literal["revolute", "prismatic", "fixed"]
+    kind: Literal["revolute", "continuous", "prismatic", "fixed"]
     parent: str
     child: str
     origin_m: Vector = (0.0, 0.0, 0.0)

@@ -106,8 +106,8 @@ class Hydraulics:
     def stored_j(self) -> float:
         """Energy in the compressed oil of chambers and hoses now."""
         s, c = self._states, self._constants
-        volume_a = c["dead_volume"] + c["area_a"] * s["travel"]
-        volume_b = c["dead_volume"] + c["area_b"] * (c["stroke"] - s["travel"])
+        volume_a = c["dead_volume"] + c["swept_a"] * s["travel"]
+        volume_b = c["dead_volume"] + c["swept_b"] * (c["stroke"] - s["travel"])
         hose = c["relaxation"] * STEADY_S
         total = volume_a * (s["pressure_a"] ** 2 + hose * s["hose_a"] ** 2)
         total += volume_b * (s["pressure_b"] ** 2 + hose * s["hose_b"] ** 2)

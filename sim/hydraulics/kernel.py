@@ -208,8 +208,8 @@ def advance_function(
     s.speed += change
     speed = s.arm * s.speed
     rub += rub_slope * s.arm * change
-    volume_a = c.dead_volume + c.area_a * s.travel
-    volume_b = c.dead_volume + c.area_b * (c.stroke - s.travel)
+    volume_a = c.dead_volume + c.swept_a * s.travel
+    volume_b = c.dead_volume + c.swept_b * (c.stroke - s.travel)
     stiff_a, stiff_b = h * pump.bulk / volume_a, h * pump.bulk / volume_b
     if c.check_ratio > 0.0:
         pilot = max(0.0, min(1.0, (c.check_ratio * a - b) / UNIT_PA))
@@ -266,8 +266,8 @@ def begin(
     balance.energy_out += s.driven * (q - s.q)
     s.arm, travel = look_up(c, table, q)
     missed = travel - s.travel
-    s.pressure_a -= pump.bulk * c.area_a * missed / (c.dead_volume + c.area_a * travel)
-    s.pressure_b += pump.bulk * c.area_b * missed / (c.dead_volume + c.area_b * (c.stroke - travel))
+    s.pressure_a -= pump.bulk * c.area_a * missed / (c.dead_volume + c.swept_a * travel)
+    s.pressure_b += pump.bulk * c.area_b * missed / (c.dead_volume + c.swept_b * (c.stroke - travel))
     s.pressure_a, s.pressure_b = max(0.0, s.pressure_a), max(0.0, s.pressure_b)
     s.travel = travel
     s.outer = (qd - s.qd) / step_s - s.torque / c.inertia
@@ -286,8 +286,8 @@ def cross_connect(
     """Let oil flow between equal chambers of an axle's swing arms by its float valve; return the power lost [W]."""
     stiff_a = stiff_b = 0.0
     for s in (left, right):
-        stiff_a += h * pump.bulk / (constant.dead_volume + constant.area_a * s.travel)
-        stiff_b += h * pump.bulk / (constant.dead_volume + constant.area_b * (constant.stroke - s.travel))
+        stiff_a += h * pump.bulk / (constant.dead_volume + constant.swept_a * s.travel)
+        stiff_b += h * pump.bulk / (constant.dead_volume + constant.swept_b * (constant.stroke - s.travel))
     drop_a, drop_b = left.pressure_a - right.pressure_a, left.pressure_b - right.pressure_b
     flow_a = FLOAT_M3_S_PA * drop_a / (1.0 + FLOAT_M3_S_PA * stiff_a)
     flow_b = FLOAT_M3_S_PA * drop_b / (1.0 + FLOAT_M3_S_PA * stiff_b)

@@ -29,11 +29,14 @@ Records = NDArray[np.void]
 class FunctionConstants(Protocol):
     """One function.
 
-    ``in_*`` and ``out_*``: flow [m^3/s] through the fully open edge per unit of ``kernel.orifice``.
+    ``swept_*``: what a chamber grows by with the travel [m^3/m]; 0 for an endless motor, whose chambers stay as large
+    as halfway.  ``in_*`` and ``out_*``: flow [m^3/s] through the fully open edge per unit of ``kernel.orifice``.
     """
 
     area_a: float
     area_b: float
+    swept_a: float
+    swept_b: float
     dead_volume: float
     coulomb: float
     stiction: float
@@ -164,7 +167,9 @@ def functions(truth: Truth, step_s: float) -> tuple[Records, Array]:
         values = {
             "area_a": c.area_a,
             "area_b": c.area_b,
-            "dead_volume": c.dead_volume_m3,
+            "swept_a": 0.0 if c.endless else c.area_a,
+            "swept_b": 0.0 if c.endless else c.area_b,
+            "dead_volume": c.dead_volume_m3 + (0.5 * c.area_a * table[1].max() if c.endless else 0.0),
             "coulomb": c.coulomb,
             "stiction": c.stiction,
             "stribeck_speed": c.stribeck_speed,
@@ -187,8 +192,8 @@ def functions(truth: Truth, step_s: float) -> tuple[Records, Array]:
             "lever_low": c.arm_at[0],
             "lever_step": (c.arm_at[-1] - c.arm_at[0]) / (LEVER_POINT_COUNT - 1),
             "stroke": table[1].max(),
-            "low": c.arm_at[0] + CUSHION_LENGTH,
-            "high": c.arm_at[-1] - CUSHION_LENGTH,
+            "low": -np.inf if c.endless else c.arm_at[0] + CUSHION_LENGTH,
+            "high": np.inf if c.endless else c.arm_at[-1] - CUSHION_LENGTH,
             "delay_steps": max(1, round(v.delay_s / step_s)),
         }
         for key in CONSTANTS.names or ():

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, Literal
 
 from machine.profile import Kinematics, Profile
 from sim.bullet.body import JointDef, LinkDef
@@ -89,11 +89,11 @@ def crane_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[Joi
         t = truth.links["tong" if name.startswith("tong") else name]
         com = (-t.com_m[0], t.com_m[1], t.com_m[2]) if name == "tong_left" else t.com_m
         links.append(LinkDef(name, t.mass_kg, com, t.inertia_kg_m2, own))
-    return links, _joints(profile, truth.steel)
+    return links, _joints(profile, truth)
 
 
-def _joints(profile: Profile, steel: Steel) -> list[JointDef]:
-    k = profile.kinematics
+def _joints(profile: Profile, truth: Truth) -> list[JointDef]:
+    k, steel = profile.kinematics, truth.steel
     _, along, frame, pin = _telescope(k, steel)
     jaws = jaw_geometry(profile)
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -117,10 +117,12 @@ def _joints(profile: Profile, steel: Steel) -> list[JointDef]:
         PASSIVE_JOINTS, (-math.pi, math.pi)
     )
     stops |= dict.fromkeys(("tong_left", "tong_right"), (-STOP_MARGIN, jaws.closed_rad + STOP_MARGIN))
+    kinds: dict[str, Literal["prismatic", "continuous"]] = {"ext": "prismatic"}
+    kinds |= {name: "continuous" for name in profile.joints if truth.functions[name].cylinder.endless}
     return [
         JointDef(
             name,
-            "prismatic" if name == "ext" else "revolute",
+            kinds.get(name, "revolute"),
             parent,
             child,
             origin,

@@ -5,7 +5,8 @@ docs/reference/plant-model.md section 2, docs/reference/machines.md section 3.
 
 from __future__ import annotations
 
-from typing import Final, Literal
+import math
+from typing import ClassVar, Final, Literal
 
 import msgspec
 
@@ -57,6 +58,9 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     it.
     """
 
+    ENDLESS_RAD: ClassVar[float] = 3.0 * math.pi
+    """Hoses bear a turn at most: a drive with a longer range has a rotary union, and turns on beyond it."""
+
     area_a: float
     area_b: float
     dead_volume_m3: float
@@ -69,6 +73,11 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     viscous: float
     relaxation_1_s: float
     least_inertia: float
+
+    @property
+    def endless(self) -> bool:
+        """Whether the drive has no stops: ``arm_at`` is where its lever arm is tabulated."""
+        return self.arm_at[-1] - self.arm_at[0] > self.ENDLESS_RAD
 
     def sampled(self, draw: VariationSampler) -> Cylinder:
         """Draw the cylinder of an individual: its seals have more or less friction, its load is lighter or heavier."""

@@ -10,6 +10,8 @@ import pytest
 from experiments.common.worlds import hang, home_at, step_neutral
 from machine.loading.profile_file import load_profile
 from sim.bullet.client import GRAVITY_M_S2
+from sim.kinematic import KinematicWorld
+from sim.nodes.valve import FUNCTIONS
 from sim.truth.load import load_truth
 from sim.world import STEP_S, World, home_pose
 
@@ -51,6 +53,22 @@ def test_half_command_gives_the_speed_of_the_profile(crane, joint, home, sign):
     run(w, 0.8, **{joint: 0.56 * sign})
     full = valve.full_speed_plus if sign > 0 else valve.full_speed_minus
     assert (w.q[joint] - before) / 0.8 == pytest.approx(sign * 0.5 * full, rel=0.2)
+
+
+def test_the_endless_rotator_turns_on_and_the_one_with_hoses_stops():
+    forwarder, turns = load_profile("aoro_fc8"), {}
+    worlds = {name: PROFILE if name == "palms_471" else forwarder for name in ("palms_471", "aoro_fc8")}
+    for name, profile in worlds.items():
+        w = World(profile, load_truth("nominal", 0, name), 0, (), home=home_pose(profile) | {"rot": 3.0})
+        run(w, 12.0, rot=1.0)
+        turns[name] = w.q["rot"] / math.tau
+        w.close()
+    assert turns["palms_471"] < 0.51
+    assert turns["aoro_fc8"] > 3.5
+    kinematic = KinematicWorld(forwarder, load_truth("nominal", 0, "aoro_fc8"), 5_000_000)
+    for _ in range(1000):
+        kinematic.step([1.0 if name == "rot" else 0.0 for name in FUNCTIONS] + [0.0] * 5)
+    assert kinematic.q["rot"] > math.tau + 1.0
 
 
 def test_a_stretched_crane_stands_still_with_neutral_valves(crane):
