@@ -54,7 +54,6 @@ from experiments.generalization.metrics import (
     INTRODUCTION,
     OVERALL,
     gather,
-    of_truth,
     sections,
     sentences,
     succeeded,
@@ -204,7 +203,7 @@ def run(options: Options, console: Console) -> Result:
         draw(options.out / "truths.png", truths, metrics)
         result = make_result(
             "generalization",
-            (*OVERALL, *(m for t in truths for m in of_truth(t))),
+            OVERALL,
             metrics,
             profile=profile_named(options.profile).name,
             seed=options.seed,
@@ -224,8 +223,7 @@ def failed(trial: Trial) -> bool:
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """Make the result page."""
-    truths = [key.removesuffix(".calibrated") for key in result.metrics if key.endswith(".calibrated")]
-    return Page("A world it has never seen", CONCLUSION, INTRODUCTION, sections(truths))
+    return Page("A world it has never seen", CONCLUSION, INTRODUCTION, sections(result))
 
 
 def draw(path: Path, truths: Sequence[str], metrics: Mapping[str, float]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from experiments.common.result import Metric, mean, rate
+from experiments.common.result import Metric, Result, mean, rate
 from experiments.common.result_page import Section
 from experiments.generalization.matrix import MISSION, is_drawn, is_mission, title_of
 
@@ -70,39 +71,43 @@ OVERALL: Final = (
 )
 
 
-def of_truth(name: str) -> tuple[Metric, ...]:
-    """Define the metrics of one truth."""
-    title, whole = title_of(name), is_mission(name)
-    return (
-        Metric(f"{name}.calibrated", f"{title}: calibrated", "%", "Share of its machines."),
-        Metric(
-            f"{name}.success",
-            f"{title}: logs in the bunk",
-            "%",
-            "By the plant's physics." if whole else "Without a stop.",
-        ),
-        Metric(f"{name}.seconds", f"{title}: duration", "s", "The mission." if whole else "Mean of its jobs."),
-    )
-
-
-def sections(truths: Sequence[str]) -> tuple[Section, ...]:
-    """Make the sections of a page about these truths."""
+def sections(result: Result) -> tuple[Section, ...]:
+    """Make the sections of the page: all machines, then a row for every truth."""
+    truths = [key.removesuffix(".calibrated") for key in result.metrics if key.endswith(".calibrated")]
     singles, missions = ([t for t in truths if is_mission(t) is kind] for kind in (False, True))
     plots = (("truths.png", "Logs in the bunk, for every truth; hollow: no profile was written."),)
     return (
         Section("All machines", "Every truth counts alike.", OVERALL),
         Section(
             "Truth by truth",
-            "The nominal machine with one parameter changed, or with all drawn.",
-            tuple(m for name in singles for m in of_truth(name)),
+            "The nominal machine with one parameter changed, or with all drawn. A log that needed a stop does not "
+            "count; the time is that of one log.\n\n" + _table("truth", "time of a log", singles, result.metrics),
+            (),
             plots,
         ),
         Section(
             "Mission by mission",
-            "Every mission has another machine, route and wood.",
-            tuple(m for name in missions for m in of_truth(name)),
+            "Every mission has another machine, route and wood; in the bunk is by the plant's physics.\n\n"
+            + _table("mission", "duration", missions, result.metrics),
+            (),
         ),
     )
+
+
+def _table(first: str, last: str, truths: Sequence[str], metrics: Mapping[str, float]) -> str:
+    """Write what became of each truth as a Markdown table; the worst ones come first."""
+    lines = [f"| {first} | result | logs in the bunk | {last} |", "|---|---|---|---|"]
+    for name in sorted(truths, key=lambda truth: metrics.get(f"{truth}.success", -1.0)):
+        logs, seconds = metrics.get(f"{name}.success_n", 0.0), metrics.get(f"{name}.seconds", math.nan)
+        if not logs:
+            lines.append(f"| {title_of(name)} | refuses: not calibrated | – | – |")
+            continue
+        in_bunk = round(logs * metrics[f"{name}.success"])
+        stops = round(metrics.get(f"{name}.stops", 0.0))
+        verdict = "works" if in_bunk == logs else "loses logs"
+        verdict += f", {stops} stops" if stops else ""
+        lines.append(f"| {title_of(name)} | {verdict} | {in_bunk} of {logs:.0f} | {seconds:.0f} s |")
+    return "\n".join(lines)
 
 
 def succeeded(job: Mapping[str, Any]) -> bool:
@@ -157,7 +162,7 @@ def gather(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         metrics |= rate(f"{name}.calibrated", int(o["calibrated"]), 1)
         if MISSION in o:
             metrics |= rate(f"{name}.success", o[MISSION]["in_bunk"], o[MISSION]["logs"])
-            metrics[f"{name}.seconds"] = o[MISSION]["seconds"]
+            metrics[f"{name}.seconds"], metrics[f"{name}.stops"] = o[MISSION]["seconds"], float(o[MISSION]["stops"])
         elif o["jobs"]:
             metrics |= rate(f"{name}.success", sum(map(succeeded, o["jobs"])), len(o["jobs"]))
             metrics[f"{name}.seconds"] = mean([job["seconds"] for job in o["jobs"]])

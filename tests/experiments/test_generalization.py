@@ -198,11 +198,16 @@ def test_values_that_differ_from_the_truth_are_named(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_every_truth() -> None:
-    metrics = gather([outcome("mass-low"), outcome("delay-high", calibrated=False), mission(4)])
-    page = page_of(SimpleNamespace(metrics=metrics), {})  # type: ignore[arg-type]
-    told = {m.name for m in page.metrics}
-    assert {m.name for m in OVERALL} <= told and {
-        "mass-low.success",
-        "delay-high.calibrated",
-        "unseen-4.success",
-    } <= told
+    outcomes = [outcome("mass-low"), outcome("delay-high", calibrated=False), mission(4), mission(5, stops=2)]
+    page = page_of(SimpleNamespace(metrics=gather(outcomes)), {})  # type: ignore[arg-type]
+    assert {m.name for m in page.metrics} == {m.name for m in OVERALL}
+    rows = {cells[0]: cells[1:] for cells in table_cells("\n".join(section.text for section in page.sections))}
+    assert rows[title_of("mass-low")][:2] == ["works", "1 of 1"]
+    assert rows[title_of("delay-high")][0] == "refuses: not calibrated"
+    assert rows[title_of("unseen-4")][:2] == ["works", "8 of 8"]
+    assert rows[title_of("unseen-5")][0] == "works, 2 stops"
+
+
+def table_cells(markdown: str) -> list[list[str]]:
+    lines = [line for line in markdown.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
