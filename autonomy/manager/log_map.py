@@ -37,6 +37,8 @@ LISTED_SIGMA_M: Final = 0.3
 """Assumed for a log that a mission lists without a sigma."""
 DEFAULT_SIZE_M: Final = (3.0, 0.2)
 """Assumed length and diameter of a listed log without a size."""
+UNKNOWN_END_M: Final = 0.6
+"""An end with a greater 1-sigma along the axis was not seen: the log may reach farther there."""
 CONFIRMED_HITS: Final = 2
 """Observations that confirm a log."""
 _BAR_COST: Final = 1e9
@@ -111,8 +113,8 @@ class LogMap:
 
     def observe(self, observations: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
         """Merge a list of observations; return the map number of each list number."""
-        observed = [_observed_log(o, base, now_ns) for o in observations if not lies_in_bunk(self._bunk, o)]
-        names = [o.id for o in observations if not lies_in_bunk(self._bunk, o)]
+        lying = [o for o in observations if not lies_in_bunk(self._bunk, o)]
+        observed = [_observed_log(o, base, now_ns) for o in lying]
         known = list(self._logs.values())
         costs = np.full((len(known), len(observed)), _BAR_COST)
         for i, log in enumerate(known):
@@ -120,14 +122,14 @@ class LogMap:
                 costs[i, j] = _distance_m(log, sighting)
         pairs = {int(j): int(i) for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < _BAR_COST}
         numbers = {}
-        for j, sighting in enumerate(observed):
+        for j, (o, sighting) in enumerate(zip(lying, observed, strict=True)):
             if j in pairs:
                 before = known[pairs[j]]
-                self._logs[before.number] = _averaged(before, sighting)
-                numbers[names[j]] = before.number
+                self._logs[before.number] = _averaged(before, _completed(sighting, o, before))
+                numbers[o.id] = before.number
             else:
                 self._logs[self._next] = replace(sighting, number=self._next)
-                numbers[names[j]] = self._next
+                numbers[o.id] = self._next
                 self._next += 1
         return numbers
 
@@ -198,6 +200,33 @@ def _distance_m(log: MappedLog, sighting: MappedLog) -> float:
     if abs(along) > MAX_ALONG_M + tolerance_m or across > MAX_ACROSS_M + tolerance_m:
         return _BAR_COST
     return math.hypot(along, across)
+
+
+def _completed(sighting: MappedLog, o: LogObservation, known: MappedLog) -> MappedLog:
+    """Return a sighting of which one end was not seen, with this end where the map knows it, if that is farther out.
+
+    A log beside the route leaves the picture as the machine passes: without this its middle moved by 0.3 m towards the
+    end that is seen last.
+    """
+    if o.covariance is None or not known.seen_ns or not known.hits:
+        return sighting
+    c = unpack_covariance(o.covariance)
+    unknown_start, unknown_end = (c[row, row] >= UNKNOWN_END_M**2 for row in (START, END))
+    if unknown_start == unknown_end:
+        return sighting
+    known_middle_m = float((known.center_m - sighting.center_m) @ sighting.axis)
+    start_m, end_m = -0.5 * sighting.length_m, 0.5 * sighting.length_m
+    if unknown_start:
+        start_m, seen = min(start_m, known_middle_m - 0.5 * known.length_m), END
+    else:
+        end_m, seen = max(end_m, known_middle_m + 0.5 * known.length_m), START
+    along = 0.25 * (c[seen, seen] + known.sigma_m**2)
+    return replace(
+        sighting,
+        center_m=sighting.center_m + 0.5 * (start_m + end_m) * sighting.axis,
+        length_m=end_m - start_m,
+        sigma_m=max(MIN_SIGMA_M, math.sqrt(max(c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along))),
+    )
 
 
 def _averaged(log: MappedLog, sighting: MappedLog) -> MappedLog:

@@ -16,9 +16,10 @@ from typing import Final, Protocol
 import numpy as np
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, rescaled
+from autonomy.perception.fitting.cylinder_fit import END_SIGMA_M
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_detector import Perception
-from autonomy.perception.log_list import LogObservation
+from autonomy.perception.log_list import END, SIZE, START, LogEstimate, LogObservation
 from autonomy.perception.papers import position_in_box
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource
@@ -67,7 +68,7 @@ class CylinderLocalizer:
         tracks = self._perception.step(frame, pose, masks)
         fresh = [t for t in tracks if t.last_seen_ns == frame.stamp_ns]
         return [
-            t.estimate.observation(t.id)
+            _with_unknown_ends(t.estimate).observation(t.id)
             for t in fresh
             if all(t.estimate.ends_seen) or t.hits >= MIN_HITS_WITH_HIDDEN_END
         ]
@@ -79,6 +80,16 @@ class CylinderLocalizer:
             (x, y, z), (ax, ay, az) = pose.to_base(fit.body.center_m).tolist(), (pose.rotation @ fit.body.axis).tolist()
             logs.append(LogObservation(number, (x, y, z), (ax, ay, az), fit.body.length_m, 2.0 * fit.body.radius_m))
         return [log for log in logs if log.diameter_m < log.length_m]
+
+
+def _with_unknown_ends(estimate: LogEstimate) -> LogEstimate:
+    """Return the estimate with the uncertainty of an end that no picture shows: that many pictures hide it, because the
+    log leaves the picture as the machine passes, does not tell where it is.
+    """
+    unknown = [0.0 if seen else END_SIGMA_M**2 for seen in estimate.ends_seen]
+    variances = np.zeros(SIZE)
+    variances[[START, END]] = unknown
+    return replace(estimate, covariance=estimate.covariance + np.diag(variances))
 
 
 class PaperBLocalizer:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from autonomy.manager.log_map import UNKNOWN_END_M
 from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose
 from autonomy.perception.driving_log_detector import (
     MAX_RANGE_M,
@@ -16,7 +17,7 @@ from autonomy.perception.driving_log_detector import (
     DrivingLogDetector,
     PaperBLocalizer,
 )
-from autonomy.perception.log_list import LogObservation
+from autonomy.perception.log_list import END, START, LogObservation, unpack_covariance
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
 from runtime.errors import LinkError
@@ -145,6 +146,14 @@ def test_a_log_cut_off_by_the_edge_of_the_picture_is_reported_only_after_many_pi
     assert detect(beside, at, 0.0, CylinderLocalizer(PROFILE), MIN_HITS_WITH_HIDDEN_END - 1) == ()
     assert beside.mask.any() and beside.mask[:, 0].any(), "the edge of the picture cuts it"
     assert len(detect(Scene(7.5, 0.5, 1.5), at, 0.0, CylinderLocalizer(PROFILE), MIN_HITS_WITH_HIDDEN_END - 1)) == 1
+
+
+def test_an_end_that_no_picture_shows_stays_unknown_however_many_pictures_there_are() -> None:
+    (log,) = detect(Scene(4.9, 2.6, 0.0), base(0.0, 0.0, math.pi), 0.0, CylinderLocalizer(PROFILE), 60)
+    assert log.covariance is not None
+    spread = unpack_covariance(log.covariance)
+    seen_m, unknown_m = sorted(math.sqrt(spread[end, end]) for end in (START, END))
+    assert unknown_m > UNKNOWN_END_M > 5.0 * seen_m
 
 
 def test_a_failed_camera_is_reported_and_gives_no_logs() -> None:

@@ -53,6 +53,28 @@ def test_a_more_certain_observation_has_more_weight() -> None:
     assert np.linalg.norm(field.logs[0].center_m - true.center_m) < 0.01
 
 
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_an_end_that_leaves_the_picture_does_not_move_the_middle(sense: float) -> None:
+    field, at, true = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), lying(1, 6.0, 5.0)
+    (whole,) = seen([true], at)
+
+    def sighting(length_m: float, sigmas_m: tuple[float, float]) -> LogObservation:
+        spread = np.diag(np.square([0.02, 0.02, 0.02, 0.02, *sigmas_m, 0.01]))
+        cut_m = 0.5 * (whole.length_m - length_m)
+        x, y, z = (c - cut_m * a for c, a in zip(whole.center_m, whole.axis, strict=True))
+        axis = tuple(sense * a for a in whole.axis)
+        known = tuple(spread[np.triu_indices(7)].tolist())
+        return LogObservation(1, (x, y, z), axis, length_m, whole.diameter_m, known)  # type: ignore[arg-type]
+
+    for k in range(20):
+        field.observe([sighting(whole.length_m, (0.3, 0.3))], at, 1 + k)
+    for k in range(30):  # the end towards +axis of the whole log is cut off
+        field.observe([sighting(0.6 * whole.length_m, (0.02, 0.61) if sense > 0.0 else (0.61, 0.02))], at, 30 + k)
+    (log,) = field.logs
+    assert np.linalg.norm(log.center_m - true.center_m) < 0.02
+    assert log.length_m == pytest.approx(whole.length_m, abs=0.02)
+
+
 def test_one_observation_does_not_confirm_a_log() -> None:
     field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     field.observe(seen([lying(1, 6.0, 5.0)], at), at, 10)
