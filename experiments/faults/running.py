@@ -37,7 +37,7 @@ from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.plc import BridgedPlant, write_plc_profile
 from machine.geometry.kinematics import pin_position
-from machine.joints import JOINTS
+from machine.joints import JOINTS, Joint
 from machine.profile import Profile
 from machine.status.modes import Mode
 from runtime.errors import InputRefused
@@ -86,10 +86,11 @@ class Swing:
 
     def __init__(self, profile: Profile, start: Sequence[float]) -> None:
         self._joints = []
+        pose = [q if math.isfinite(q) else 0.0 for q in start]
         for j, q in zip(JOINTS, start, strict=True):
             s = profile.joints[j.name.lower()]
             known = s.encoder is not None and math.isfinite(q)
-            half = SWING_SHARE * (s.upper - s.lower) * (1.0 if s.upper - q > q - s.lower else -1.0) if known else 0.0
+            half = SWING_SHARE * (s.upper - s.lower) * _side(profile, pose, j) if known else 0.0
             w = (
                 SPEED_SHARE * min(s.speed_limit / abs(half), math.sqrt(s.acceleration_limit / abs(half)))
                 if half
@@ -102,6 +103,18 @@ class Swing:
         t = max(0.0, time_s)
         q = tuple(start + half * (1.0 - math.cos(w * t)) for start, half, w in self._joints)
         return q, tuple(half * w * math.sin(w * t) for _, half, w in self._joints)
+
+
+def _side(profile: Profile, pose: Sequence[float], j: Joint) -> float:
+    """Choose to which side a joint swings, 1 or -1: the pin rises, for below is the ground; else to the middle."""
+    spec = profile.joints[j.name.lower()]
+    middle = 0.5 * (spec.lower + spec.upper)
+    ahead = [q + SWING_SHARE * (spec.upper - spec.lower) * (i == j) for i, q in enumerate(pose)]
+    rise_m = pin_position(profile.kinematics, ahead)[2] - pin_position(profile.kinematics, pose)[2]
+    room = spec.upper if rise_m > 0.0 else spec.lower
+    if rise_m == 0.0 or abs(room - pose[j]) < 2.0 * SWING_SHARE * (spec.upper - spec.lower):
+        return math.copysign(1.0, middle - pose[j])
+    return math.copysign(1.0, rise_m)
 
 
 class HeldSwing:

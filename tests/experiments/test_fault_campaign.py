@@ -188,6 +188,13 @@ def test_a_held_swing_ends_at_rest_without_a_step() -> None:
     assert any(motion.at(4.0)[1])
 
 
+@pytest.mark.parametrize("scene", ["crane palms_471", "crane aoro_fc8", "drive aoro_fc8"])
+def test_work_without_faults_does_not_stop(scene: str) -> None:
+    done = nominal.perform(Job("nominal", "nominal", 3, {"scene": scene, "seconds": 10.0}))
+    assert done["trips"] == []
+    assert done["working_s"] > 8.0, "armed within two seconds, and never refused since"
+
+
 def test_the_plan_spreads_the_trials_over_the_scenes_and_leaves_none_out() -> None:
     jobs = plan(1, 100)
     counts: dict[int, int] = {}
