@@ -109,12 +109,11 @@ CASES: Final[tuple[Case, ...]] = (
         "encoder-drift",
         "Encoder drifts by 0.5 deg/s",
         "H, at the next hold",
-        "3000 ms of holding",
+        "6000 ms of holding",
         (_C, Work.HOLD),
         draws.encoder_drift,
         physics=True,
         blind_in=(_C,),
-        blind_as=("late",),
         blind_most_m=0.15,
         blind="In motion: 0.5 deg/s is 2 to 6 % of a joint's speed, and the flow through a valve "
         "is known no better. It is seen once the crane holds its pose and nothing else has moved for a second; until "

@@ -105,7 +105,7 @@ def encoder_drift(random: Random, scene: Scene) -> Injection:
     """Draw a drift, bounded by the drift monitor for a crane that holds its pose (docs/reference/safety.md case 3)."""
     joint = random.choice(("slew", "lift", "tilt", "ext"))
     rate = random.choice((-1.0, 1.0)) * (0.5 * _DEG if joint != "ext" else 0.01)
-    return _one(random, "encoder-drift", "D", 3000.0, joint, rate)
+    return _one(random, "encoder-drift", "D", 6000.0, joint, rate)
 
 
 def encoder_noise(random: Random, scene: Scene) -> Injection:

@@ -36,8 +36,10 @@ def wire_fault(order: Order, profile: Profile, start_ns: int, end_ns: int) -> tu
         probability = order.sized() if kind is Kind.DROP else 1.0
         shift_ns = round(order.sized() * 1e6) if kind is Kind.REPEAT else 0
         count = 2 if kind is Kind.CORRUPT else 1
+        # Less than a period is meant for one frame: late by a few others, the next one may start within it, too.
+        most = 1 if end_ns - start_ns < codec.cycle_time_ns else 0
         return bus, Fault(
-            kind, start_ns, end_ns, codec.key, _EXACT, None, probability, shift_ns, count, seed=order.seed
+            kind, start_ns, end_ns, codec.key, _EXACT, None, probability, shift_ns, count, seed=order.seed, most=most
         )
     if order.part not in (profile.crane_bus, profile.machine_bus):
         raise InputRefused("fault.no-bus", f"{profile.name} has no bus {order.part!r}")

@@ -44,7 +44,8 @@ class Fault:
     """One fault, active from `start_ns` up to `end_ns` on frames whose key equals `key` under `mask`.
 
     Times are those of the core: virtual in lockstep, CLOCK_MONOTONIC in the daemon.  Mask 0 selects every frame; `node`
-    restricts the fault to frames sent by participants of that name.  Each frame is hit with `probability`.
+    restricts the fault to frames sent by participants of that name.  Each frame is hit with `probability`, and at most
+    `most` of them where that is not 0.
     """
 
     kind: Kind
@@ -58,13 +59,15 @@ class Fault:
     count: int = 1
     data: bytes = bytes(8)
     seed: int = 0
+    most: int = 0
 
     def __post_init__(self) -> None:
-        if self.end_ns <= self.start_ns or self.shift_ns < 0 or self.count < 1 or len(self.data) > 8:
+        short = self.shift_ns < 0 or self.count < 1 or self.most < 0
+        if self.end_ns <= self.start_ns or short or len(self.data) > 8:
             raise InputRefused(
                 "wire.fault-fields",
-                f"The wire fault {self.kind} needs end_ns after start_ns, shift_ns of 0 or more, count of 1 "
-                "or more and at most 8 data bytes.",
+                f"The wire fault {self.kind} needs end_ns after start_ns, shift_ns and most of 0 or more, "
+                "count of 1 or more and at most 8 data bytes.",
             )
 
     @classmethod
@@ -87,17 +90,26 @@ class Fate(NamedTuple):
     data: bytes
 
 
+@dataclass(slots=True)
+class _Acting:
+    """A fault with its random stream, and the number of frames that it has hit."""
+
+    fault: Fault
+    random: Random
+    hits: int = 0
+
+
 class Damage:
     """The faults that act on single frames, with one random stream each."""
 
     def __init__(self) -> None:
-        self._faults: list[tuple[Fault, Random]] = []
+        self._faults: list[_Acting] = []
 
     def __bool__(self) -> bool:
         return bool(self._faults)
 
     def add(self, fault: Fault) -> None:
-        self._faults.append((fault, Random(fault.seed)))
+        self._faults.append(_Acting(fault, Random(fault.seed)))
 
     def clear(self) -> None:
         self._faults.clear()
@@ -106,15 +118,18 @@ class Damage:
         """Decide the fate of a frame that starts at `at_ns`; faults apply in the order in which they were added."""
         error = False
         offsets: tuple[int, ...] = (0,)
-        self._faults = [entry for entry in self._faults if at_ns < entry[0].end_ns]
-        for fault, random in self._faults:
+        self._faults = [acting for acting in self._faults if at_ns < acting.fault.end_ns]
+        for acting in self._faults:
+            fault, random = acting.fault, acting.random
             if (
                 at_ns < fault.start_ns
                 or (key ^ fault.key) & fault.mask
                 or fault.node not in (None, sender)
+                or 0 < fault.most <= acting.hits
                 or random.random() >= fault.probability
             ):
                 continue
+            acting.hits += 1
             match fault.kind:
                 case Kind.DROP:
                     offsets = ()

@@ -232,9 +232,8 @@ def test_burst_and_overload_of_a_machine_with_physics_are_answered_in_time() -> 
     assert (burst["verdict"], burst["reason"], burst["due_ms"]) == ("ok", "HOSE_BURST", 0.0)
     assert "R0" in burst["reached"]
     load = in_child(lambda: inject(machine, BY_NAME["overload"].number, "a seed"))
-    assert load["verdict"] == "ok" and load["reason"] in ("OVERLOAD", "OVERLOADED", "JOINT_RUNAWAY"), (
-        "a lift that yields"
-    )
+    yielding = ("OVERLOAD", "OVERLOADED", "JOINT_RUNAWAY", "JOINT_REVERSED")  # the last one while it rises
+    assert load["verdict"] == "ok" and load["reason"] in yielding
     assert 150.0 < load["due_ms"] < 300.0 and load["detect_ms"] < load["due_ms"]
     assert "overload" in "".join(_example({**load, "scene": "crane"}))
 

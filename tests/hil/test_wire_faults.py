@@ -11,8 +11,11 @@ from hypothesis import strategies as st
 
 from can_dbc.bus.base import BusState
 from can_dbc.frame import ERROR, Frame
+from hil.faults.table import parse
+from hil.faults.wire_faults import wire_fault
 from hil.wire.core import Node, WireCore
 from hil.wire.faults import Fault, Kind
+from machine.loading.profile_file import load_profile
 
 MS = 1_000_000
 
@@ -43,6 +46,20 @@ def test_drop_hits_its_key_in_its_window() -> None:
     assert [frame.data[7] for frame in frames if frame.key == 0x100] == [0, 1, 2, 6, 7, 8, 9]
     assert [frame.data[7] for frame in frames if frame.key == 0x200] == list(range(10))
     assert (a.done, a.tec) == (20, 0)  # the sender has not noticed
+
+
+def test_a_fault_meant_for_one_frame_hits_the_first_in_its_window() -> None:
+    core, a, b = setup(Fault(Kind.DROP, 3 * MS, 6 * MS, key=0x100, mask=0x7FF, most=1))
+    traffic(core, a, 10 * MS)
+    frames = data_frames(b)
+    assert [frame.data[7] for frame in frames if frame.key == 0x100] == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+
+
+def test_a_window_shorter_than_the_period_is_meant_for_one_frame() -> None:
+    profile = load_profile("palms_471")
+    for length_ns, most in ((4_500_000, 1), (300 * MS, 0)):
+        order = parse(f"bus-corrupt/ValveFbA+{length_ns / MS}ms")
+        assert wire_fault(order, profile, 0, length_ns)[1].most == most
 
 
 def test_delay_and_repeat_shift_the_reception_and_its_stamp() -> None:
@@ -203,6 +220,7 @@ def test_a_fault_survives_json(fault: Fault) -> None:
         {"kind": "drop", "start_ns": 5, "end_ns": 5},
         {"kind": "delay", "shift_ns": -1},
         {"kind": "repeat", "count": 0},
+        {"kind": "drop", "most": -1},
         {"kind": "babble", "data": "00" * 9},
     ],
 )
