@@ -114,7 +114,7 @@ CASES: Final[tuple[Case, ...]] = (
         draws.encoder_drift,
         physics=True,
         blind_in=(_C,),
-        blind_most_m=0.15,
+        blind_most_m=0.25,
         blind="In motion: 0.5 deg/s is 2 to 6 % of a joint's speed, and the flow through a valve "
         "is known no better. It is seen once the crane holds its pose and nothing else has moved for a second; until "
         "then the tip strays with the encoder.",
