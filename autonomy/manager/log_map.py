@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -39,6 +40,10 @@ DEFAULT_SIZE_M: Final = (3.0, 0.2)
 """Assumed length and diameter of a listed log without a size."""
 UNKNOWN_END_M: Final = 0.6
 """An end with a greater 1-sigma along the axis was not seen: the log may reach farther there."""
+TYPICAL_COUNT: Final = 3
+"""Logs that were seen whole before their median length is that of a log with an unknown end."""
+TYPICAL_SIGMA_M: Final = 0.3
+"""1-sigma of an unknown end that is placed by it: logs of one stand are cut alike."""
 CONFIRMED_HITS: Final = 2
 """Observations that confirm a log."""
 _BAR_COST: Final = 1e9
@@ -77,6 +82,8 @@ class LogMap:
     def __init__(self, bunk: Bunk) -> None:
         self._bunk = bunk
         self._logs: dict[int, MappedLog] = {}
+        self._whole_lengths_m: dict[int, float] = {}
+        """Length of each log, collected ones too, when both its ends were last seen."""
         self._next = 1
 
     @property
@@ -122,15 +129,17 @@ class LogMap:
                 costs[i, j] = _distance_m(log, sighting)
         pairs = {int(j): int(i) for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < _BAR_COST}
         numbers = {}
+        lengths_m = self._whole_lengths_m.values()
+        typical_m = median(lengths_m) if len(lengths_m) >= TYPICAL_COUNT else 0.0
         for j, (o, sighting) in enumerate(zip(lying, observed, strict=True)):
-            if j in pairs:
-                before = known[pairs[j]]
-                self._logs[before.number] = _averaged(before, _completed(sighting, o, before))
-                numbers[o.id] = before.number
-            else:
-                self._logs[self._next] = replace(sighting, number=self._next)
-                numbers[o.id] = self._next
-                self._next += 1
+            before = known[pairs[j]] if j in pairs else None
+            whole = _completed(sighting, o, before, typical_m)
+            number = self._next if before is None else before.number
+            self._logs[number] = replace(whole, number=number) if before is None else _averaged(before, whole)
+            if not any(_unknown_ends(o)):
+                self._whole_lengths_m[number] = self._logs[number].length_m
+            numbers[o.id] = number
+            self._next += before is None
         return numbers
 
     def restart_average(self, number: int) -> None:
@@ -202,25 +211,33 @@ def _distance_m(log: MappedLog, sighting: MappedLog) -> float:
     return math.hypot(along, across)
 
 
-def _completed(sighting: MappedLog, o: LogObservation, known: MappedLog) -> MappedLog:
-    """Return a sighting of which one end was not seen, with this end where the map knows it, if that is farther out.
+def _unknown_ends(o: LogObservation) -> tuple[bool, bool]:
+    """Tell which ends, the start and the end, were not seen."""
+    if o.covariance is None:
+        return False, False
+    c = unpack_covariance(o.covariance)
+    return bool(c[START, START] >= UNKNOWN_END_M**2), bool(c[END, END] >= UNKNOWN_END_M**2)
 
-    A log beside the route leaves the picture as the machine passes: without this its middle moved by 0.3 m towards the
-    end that is seen last.
+
+def _completed(sighting: MappedLog, o: LogObservation, known: MappedLog | None, typical_m: float) -> MappedLog:
+    """Return a sighting of which one end was not seen, with this end where the map knows it, or where a log of the
+    typical length would have it (0: no such length is known), if that is farther out.
+
+    A log beside the route leaves the picture as the machine passes, and may never be in it whole: without this its
+    middle moved by 0.3 m towards the end that is seen.
     """
-    if o.covariance is None or not known.seen_ns or not known.hits:
+    unknown_start, unknown_end = _unknown_ends(o)
+    if o.covariance is None or unknown_start == unknown_end:
         return sighting
     c = unpack_covariance(o.covariance)
-    unknown_start, unknown_end = (c[row, row] >= UNKNOWN_END_M**2 for row in (START, END))
-    if unknown_start == unknown_end:
-        return sighting
-    known_middle_m = float((known.center_m - sighting.center_m) @ sighting.axis)
-    start_m, end_m = -0.5 * sighting.length_m, 0.5 * sighting.length_m
-    if unknown_start:
-        start_m, seen = min(start_m, known_middle_m - 0.5 * known.length_m), END
-    else:
-        end_m, seen = max(end_m, known_middle_m + 0.5 * known.length_m), START
-    along = 0.25 * (c[seen, seen] + known.sigma_m**2)
+    half_m, sense = 0.5 * sighting.length_m, -1.0 if unknown_start else 1.0
+    reach_m, sigma_m = typical_m - half_m, TYPICAL_SIGMA_M
+    if known is not None and known.seen_ns and known.hits:
+        known_middle_m = float((known.center_m - sighting.center_m) @ sighting.axis)
+        reach_m, sigma_m = sense * known_middle_m + 0.5 * known.length_m, known.sigma_m
+    start_m, end_m = (-max(half_m, reach_m), half_m) if unknown_start else (-half_m, max(half_m, reach_m))
+    seen = END if unknown_start else START
+    along = 0.25 * (c[seen, seen] + sigma_m**2)
     return replace(
         sighting,
         center_m=sighting.center_m + 0.5 * (start_m + end_m) * sighting.axis,

@@ -53,26 +53,45 @@ def test_a_more_certain_observation_has_more_weight() -> None:
     assert np.linalg.norm(field.logs[0].center_m - true.center_m) < 0.01
 
 
+def sighting(
+    whole: LogObservation, length_m: float, sigmas_m: tuple[float, float], sense: float = 1.0
+) -> LogObservation:
+    """The log with its end towards its axis cut off; ``sigmas_m`` of its start and its end."""
+    spread = np.diag(np.square([0.02, 0.02, 0.02, 0.02, *sigmas_m[:: int(sense)], 0.01]))
+    cut_m = 0.5 * (whole.length_m - length_m)
+    x, y, z = (c - cut_m * a for c, a in zip(whole.center_m, whole.axis, strict=True))
+    axis = tuple(sense * a for a in whole.axis)
+    known = tuple(spread[np.triu_indices(7)].tolist())
+    return LogObservation(whole.id, (x, y, z), axis, length_m, whole.diameter_m, known)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_an_end_that_leaves_the_picture_does_not_move_the_middle(sense: float) -> None:
     field, at, true = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), lying(1, 6.0, 5.0)
     (whole,) = seen([true], at)
-
-    def sighting(length_m: float, sigmas_m: tuple[float, float]) -> LogObservation:
-        spread = np.diag(np.square([0.02, 0.02, 0.02, 0.02, *sigmas_m, 0.01]))
-        cut_m = 0.5 * (whole.length_m - length_m)
-        x, y, z = (c - cut_m * a for c, a in zip(whole.center_m, whole.axis, strict=True))
-        axis = tuple(sense * a for a in whole.axis)
-        known = tuple(spread[np.triu_indices(7)].tolist())
-        return LogObservation(1, (x, y, z), axis, length_m, whole.diameter_m, known)  # type: ignore[arg-type]
-
     for k in range(20):
-        field.observe([sighting(whole.length_m, (0.3, 0.3))], at, 1 + k)
-    for k in range(30):  # the end towards +axis of the whole log is cut off
-        field.observe([sighting(0.6 * whole.length_m, (0.02, 0.61) if sense > 0.0 else (0.61, 0.02))], at, 30 + k)
+        field.observe([sighting(whole, whole.length_m, (0.3, 0.3), sense)], at, 1 + k)
+    for k in range(30):
+        field.observe([sighting(whole, 0.6 * whole.length_m, (0.02, 0.61), sense)], at, 30 + k)
     (log,) = field.logs
     assert np.linalg.norm(log.center_m - true.center_m) < 0.02
     assert log.length_m == pytest.approx(whole.length_m, abs=0.02)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+@pytest.mark.parametrize("others", [2, 3])
+def test_a_log_never_seen_whole_is_as_long_as_the_others_once_there_are_some(sense: float, others: int) -> None:
+    field, at, true = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), lying(9, 6.0, 5.0)
+    for other in seen([lying(1 + i, 9.0 + 3.0 * i, 8.0) for i in range(others)], at):
+        field.observe([sighting(other, other.length_m, (0.05, 0.05))], at, 1)
+    field.remove(1)  # a collected log counts
+    (whole,) = seen([true], at)
+    for k in range(10):
+        field.observe([sighting(whole, 1.2, (0.02, 0.61), sense)], at, 2 + k)
+    log = nearest(field.logs, true.center_m[:2])
+    assert log is not None
+    off_m = float(np.linalg.norm(log.center_m - true.center_m))
+    assert (off_m < 0.02) == (others >= 3) and (others >= 3 or off_m == pytest.approx(0.4, abs=0.02))
 
 
 def test_one_observation_does_not_confirm_a_log() -> None:
