@@ -21,7 +21,16 @@ from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import KnownLog
 from autonomy.perception.camera.frame import Pose
-from autonomy.perception.log_list import ACROSS_1, ACROSS_2, END, START, TILT_1, LogObservation, unpack_covariance
+from autonomy.perception.log_list import (
+    ACROSS_1,
+    ACROSS_2,
+    END,
+    HIDDEN_END_SIGMA_M,
+    START,
+    TILT_1,
+    LogObservation,
+    unpack_covariance,
+)
 from machine.profile import Bunk
 
 MAX_ALONG_M: Final = 0.8
@@ -38,8 +47,6 @@ LISTED_SIGMA_M: Final = 0.3
 """Assumed for a log that a mission lists without a sigma."""
 DEFAULT_SIZE_M: Final = (3.0, 0.2)
 """Assumed length and diameter of a listed log without a size."""
-UNKNOWN_END_M: Final = 0.6
-"""An end with a greater 1-sigma along the axis was not seen: the log may reach farther there."""
 TYPICAL_COUNT: Final = 3
 """Logs that were seen whole before their median length is that of a log with an unknown end."""
 TYPICAL_SIGMA_M: Final = 0.3
@@ -216,7 +223,7 @@ def _unknown_ends(o: LogObservation) -> tuple[bool, bool]:
     if o.covariance is None:
         return False, False
     c = unpack_covariance(o.covariance)
-    return bool(c[START, START] >= UNKNOWN_END_M**2), bool(c[END, END] >= UNKNOWN_END_M**2)
+    return bool(c[START, START] >= HIDDEN_END_SIGMA_M**2), bool(c[END, END] >= HIDDEN_END_SIGMA_M**2)
 
 
 def _completed(sighting: MappedLog, o: LogObservation, known: MappedLog | None, typical_m: float) -> MappedLog:
@@ -235,13 +242,14 @@ def _completed(sighting: MappedLog, o: LogObservation, known: MappedLog | None, 
     if known is not None and known.seen_ns and known.hits:
         known_middle_m = float((known.center_m - sighting.center_m) @ sighting.axis)
         reach_m, sigma_m = sense * known_middle_m + 0.5 * known.length_m, known.sigma_m
-    start_m, end_m = (-max(half_m, reach_m), half_m) if unknown_start else (-half_m, max(half_m, reach_m))
+    if reach_m <= half_m:
+        return sighting
     seen = END if unknown_start else START
     along = 0.25 * (c[seen, seen] + sigma_m**2)
     return replace(
         sighting,
-        center_m=sighting.center_m + 0.5 * (start_m + end_m) * sighting.axis,
-        length_m=end_m - start_m,
+        center_m=sighting.center_m + 0.5 * sense * (reach_m - half_m) * sighting.axis,
+        length_m=half_m + reach_m,
         sigma_m=max(MIN_SIGMA_M, math.sqrt(max(c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along))),
     )
 

@@ -16,10 +16,9 @@ from typing import Final, Protocol
 import numpy as np
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose, rescaled
-from autonomy.perception.fitting.cylinder_fit import END_SIGMA_M
 from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_detector import Perception
-from autonomy.perception.log_list import END, SIZE, START, LogEstimate, LogObservation
+from autonomy.perception.log_list import END, HIDDEN_END_SIGMA_M, SIZE, START, LogEstimate, LogObservation
 from autonomy.perception.papers import position_in_box
 from autonomy.perception.shown_picture import MeasuredPicture, ignore_picture
 from autonomy.perception.sources.camera_source import CameraSource
@@ -86,7 +85,7 @@ def _with_unknown_ends(estimate: LogEstimate) -> LogEstimate:
     """Return the estimate with the uncertainty of an end that no picture shows: that many pictures hide it, because the
     log leaves the picture as the machine passes, does not tell where it is.
     """
-    unknown = [0.0 if seen else END_SIGMA_M**2 for seen in estimate.ends_seen]
+    unknown = [0.0 if seen else HIDDEN_END_SIGMA_M**2 for seen in estimate.ends_seen]
     variances = np.zeros(SIZE)
     variances[[START, END]] = unknown
     return replace(estimate, covariance=estimate.covariance + np.diag(variances))

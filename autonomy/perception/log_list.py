@@ -44,6 +44,8 @@ class LogObservation:
 
 ACROSS_1, ACROSS_2, TILT_1, TILT_2, START, END, RADIUS = range(7)
 SIZE: Final = 7
+HIDDEN_END_SIGMA_M: Final = 0.6
+"""1-sigma of an end that no picture shows; an end with as great a one counts as not seen."""
 
 
 @dataclass(frozen=True, slots=True)

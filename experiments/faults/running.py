@@ -109,10 +109,10 @@ def _side(profile: Profile, pose: Sequence[float], j: Joint) -> float:
     """Choose to which side a joint swings, 1 or -1: the pin rises, for below is the ground; else to the middle."""
     spec = profile.joints[j.name.lower()]
     middle = 0.5 * (spec.lower + spec.upper)
-    ahead = [q + SWING_SHARE * (spec.upper - spec.lower) * (i == j) for i, q in enumerate(pose)]
-    rise_m = pin_position(profile.kinematics, ahead)[2] - pin_position(profile.kinematics, pose)[2]
-    room = spec.upper if rise_m > 0.0 else spec.lower
-    if rise_m == 0.0 or abs(room - pose[j]) < 2.0 * SWING_SHARE * (spec.upper - spec.lower):
+    moved = [q + SWING_SHARE * (spec.upper - spec.lower) * (i == j) for i, q in enumerate(pose)]
+    rise_m = pin_position(profile.kinematics, moved)[2] - pin_position(profile.kinematics, pose)[2]
+    limit = spec.upper if rise_m > 0.0 else spec.lower
+    if rise_m == 0.0 or abs(limit - pose[j]) < 2.0 * SWING_SHARE * (spec.upper - spec.lower):
         return math.copysign(1.0, middle - pose[j])
     return math.copysign(1.0, rise_m)
 

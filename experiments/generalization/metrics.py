@@ -94,9 +94,9 @@ def sections(result: Result) -> tuple[Section, ...]:
     )
 
 
-def _table(first: str, last: str, truths: Sequence[str], metrics: Mapping[str, float]) -> str:
+def _table(subject: str, time_title: str, truths: Sequence[str], metrics: Mapping[str, float]) -> str:
     """Write what became of each truth as a Markdown table; the worst ones come first."""
-    lines = [f"| {first} | result | logs in the bunk | {last} |", "|---|---|---|---|"]
+    lines = [f"| {subject} | result | logs in the bunk | {time_title} |", "|---|---|---|---|"]
     for name in sorted(truths, key=lambda truth: metrics.get(f"{truth}.success", -1.0)):
         logs, seconds = metrics.get(f"{name}.success_n", 0.0), metrics.get(f"{name}.seconds", math.nan)
         if not logs:

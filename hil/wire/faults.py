@@ -62,8 +62,8 @@ class Fault:
     most: int = 0
 
     def __post_init__(self) -> None:
-        short = self.shift_ns < 0 or self.count < 1 or self.most < 0
-        if self.end_ns <= self.start_ns or short or len(self.data) > 8:
+        out_of_range = self.shift_ns < 0 or self.count < 1 or self.most < 0
+        if self.end_ns <= self.start_ns or out_of_range or len(self.data) > 8:
             raise InputRefused(
                 "wire.fault-fields",
                 f"The wire fault {self.kind} needs end_ns after start_ns, shift_ns and most of 0 or more, "

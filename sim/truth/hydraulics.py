@@ -6,7 +6,7 @@ docs/reference/plant-model.md section 2, docs/reference/machines.md section 3.
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 import msgspec
 
@@ -45,6 +45,10 @@ class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
+ENDLESS_RAD: Final = 3.0 * math.pi
+"""Hoses bear a turn at most: a drive with a longer range has a rotary union, and turns on beyond it."""
+
+
 class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A double-acting cylinder (or motor) and its linkage to the joint.
 
@@ -57,9 +61,6 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     smallest inertia that the joint shows its drive in any pose while the other drives push too; the solver depends on
     it.
     """
-
-    ENDLESS_RAD: ClassVar[float] = 3.0 * math.pi
-    """Hoses bear a turn at most: a drive with a longer range has a rotary union, and turns on beyond it."""
 
     area_a: float
     area_b: float
@@ -77,7 +78,7 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def endless(self) -> bool:
         """Whether the drive has no stops: ``arm_at`` is where its lever arm is tabulated."""
-        return self.arm_at[-1] - self.arm_at[0] > self.ENDLESS_RAD
+        return self.arm_at[-1] - self.arm_at[0] > ENDLESS_RAD
 
     def sampled(self, draw: VariationSampler) -> Cylinder:
         """Draw the cylinder of an individual: its seals have more or less friction, its load is lighter or heavier."""

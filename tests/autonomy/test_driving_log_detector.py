@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from autonomy.manager.log_map import UNKNOWN_END_M
 from autonomy.perception.camera.frame import Pose, RgbdFrame, optical_pose
 from autonomy.perception.driving_log_detector import (
     MAX_RANGE_M,
@@ -17,7 +16,7 @@ from autonomy.perception.driving_log_detector import (
     DrivingLogDetector,
     PaperBLocalizer,
 )
-from autonomy.perception.log_list import END, START, LogObservation, unpack_covariance
+from autonomy.perception.log_list import END, HIDDEN_END_SIGMA_M, START, LogObservation, unpack_covariance
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
 from runtime.errors import LinkError
@@ -153,7 +152,7 @@ def test_an_end_that_no_picture_shows_stays_unknown_however_many_pictures_there_
     assert log.covariance is not None
     spread = unpack_covariance(log.covariance)
     seen_m, unknown_m = sorted(math.sqrt(spread[end, end]) for end in (START, END))
-    assert unknown_m > UNKNOWN_END_M > 5.0 * seen_m
+    assert unknown_m > HIDDEN_END_SIGMA_M > 5.0 * seen_m
 
 
 def test_a_failed_camera_is_reported_and_gives_no_logs() -> None:

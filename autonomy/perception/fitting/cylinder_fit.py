@@ -31,7 +31,7 @@ from autonomy.perception.fitting.cylinder import (
     outline_distance,
     pixel_rays,
 )
-from autonomy.perception.log_list import END, START
+from autonomy.perception.log_list import END, HIDDEN_END_SIGMA_M, START
 from machine.geometry.optics import Intrinsics
 
 MAX_DEPTH_POINTS: Final = 80
@@ -42,7 +42,6 @@ FATTENING_PX: Final = 8  # width of the foreground fattening of stereo matching
 FOREGROUND_BIAS_SIGMA_M: Final = 0.15  # of depth that stereo matching pulled to a nearer object
 MEAN_RADIUS_M, RADIUS_SIGMA_M = 0.12, 0.05  # prior for a log with one visible side
 MIN_OWN_SHARE: Final = 0.8  # below this share of own contour, one side of the log may be hidden
-END_SIGMA_M: Final = 0.6  # of a hidden end
 # Scales of the Cauchy loss, in standard deviations.
 OUTLINE_CAUCHY_SCALE: Final = 3.0
 DEPTH_CAUCHY_SCALE, NEAR_CAUCHY_SCALE = 2.5, 1.5
@@ -248,7 +247,7 @@ class _Problem:
         deep = (self.inverse - 1.0 / deep_m) / self.spread
         start, end, radius, growth = bodies.size
         usual = (radius - MEAN_RADIUS_M) / RADIUS_SIGMA_M
-        ends = ((start - self.prior.start_m) / END_SIGMA_M, (end - self.prior.end_m) / END_SIGMA_M)
+        ends = ((start - self.prior.start_m) / HIDDEN_END_SIGMA_M, (end - self.prior.end_m) / HIDDEN_END_SIGMA_M)
         return np.concatenate([edge, deep, *ends, usual, growth / TAPER_SIGMA], axis=1)
 
     def linearised(
@@ -288,7 +287,7 @@ class _Problem:
         covariance[:7, :7] += np.diag(systematic**2)
         for row, end_seen in zip((START, END), ends, strict=True):
             # A few points of the sides say nothing of an end.
-            covariance[row, row] += 0.0 if end_seen else END_SIGMA_M**2
+            covariance[row, row] += 0.0 if end_seen else HIDDEN_END_SIGMA_M**2
         move = 0.5 * (body.start_m + body.end_m)
         shift = np.eye(7, 8)
         shift[0, 2] = shift[1, 3] = shift[6, 7] = move
