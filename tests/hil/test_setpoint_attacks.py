@@ -74,10 +74,14 @@ def test_no_joint_is_driven_beyond_its_speed_limit(
 
 
 @pytest.mark.long
-def test_what_an_individual_that_is_not_calibrated_exceeds_its_limit_by() -> None:
-    """The worst of six individuals under seven attacks on single joints: the figure in ``docs/reference/safety.md``."""
-    share = shares_of_the_speed_limit("palms_471", "sampled", 2, "field", (0,), 10)
-    assert 1.05 < share.max() <= 1.11, share
+@pytest.mark.parametrize(
+    ("machine", "seed", "kind", "axis"),
+    [("palms_471", 2, "field", 0), ("palms_471", 2, "lag, then go", 2), ("aoro_fc8", 6, "field", 0)],
+)
+def test_nor_is_an_individual_that_is_not_calibrated(machine: str, seed: int, kind: str, axis: int) -> None:
+    """The worst of twelve individuals: the figure in ``docs/reference/safety.md``."""
+    share = shares_of_the_speed_limit(machine, "sampled", seed, kind, (axis,), 10)
+    assert 0.9 < share.max() <= 1.05, share
 
 
 def shares_of_the_speed_limit(
