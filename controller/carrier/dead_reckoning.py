@@ -38,7 +38,12 @@ MIN_COURSE_SHARE: Final = 0.8
 """A machine that is slower over ground than this share of its wheels' speed slips: it may slide to any side, and its
 mast rocks."""
 MAX_COURSE_ERROR_RAD: Final = 1.2
-"""Greatest angle between course and heading; beyond it the heading is wrong."""
+"""Greatest angle between course and heading; beyond it the heading is wrong, ..."""
+CROSSWISE_SAMPLES_COUNT: Final = 8
+"""... after so many samples of the course (2 s): for half a second a front half that slides aside on rough ground moves
+crosswise as fast as its wheels turn, ..."""
+REVERSED_SAMPLES_COUNT: Final = 2
+"""... and after so many where the antenna goes backwards as fast as that."""
 MAX_BEND_RAD: Final = 1.2
 """No articulation bends further; an encoder value beyond it is not an angle."""
 TRUE_REFERENCE: Final = 0
@@ -52,10 +57,10 @@ class DeadReckoning:
     """``yaw_rad`` of the front half and the front axle's position, NaN while unknown; ``finding`` of this tick."""
 
     __slots__ = (
-        "_against",
         "_arms",
         "_axle_m",
         "_carrier",
+        "_crosswise",
         "_frozen",
         "_heading",
         "_heading_off",
@@ -68,6 +73,7 @@ class DeadReckoning:
         "_pitch",
         "_position_off",
         "_reference",
+        "_reversed",
         "_roll",
         "_speed",
         "east_m",
@@ -120,7 +126,7 @@ class DeadReckoning:
 
     def _forget_heading(self) -> None:
         self.yaw_rad = self._heading_rad = math.nan
-        self._heading_off = self._frozen = self._against = 0
+        self._heading_off = self._frozen = self._crosswise = self._reversed = 0
 
     @property
     def fix(self) -> int:
@@ -221,7 +227,10 @@ class DeadReckoning:
             return
         goes = self.speed_m_s > MIN_COURSE_SPEED_M_S
         goes = goes and ground > max(MIN_COURSE_SPEED_M_S, MIN_COURSE_SHARE * self.speed_m_s)
-        against = abs(math.remainder(0.5 * math.pi - course - self.yaw_rad, math.tau)) > MAX_COURSE_ERROR_RAD
-        self._against = self._against + 1 if goes and against else 0
-        if self._against >= 2 and not self.finding:
+        error_rad = math.remainder(0.5 * math.pi - course - self.yaw_rad, math.tau)
+        reversed_ = goes and -ground * math.cos(error_rad) > MIN_COURSE_SHARE * self.speed_m_s
+        self._reversed = self._reversed + 1 if reversed_ else 0
+        self._crosswise = self._crosswise + 1 if goes and abs(error_rad) > MAX_COURSE_ERROR_RAD else 0
+        wrong = self._reversed >= REVERSED_SAMPLES_COUNT or self._crosswise >= CROSSWISE_SAMPLES_COUNT
+        if wrong and not self.finding:
             self.finding = Reason.HEADING_REVERSED

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from can_dbc.messages.vehicle import Driving
-from controller.carrier.dead_reckoning import MAX_JUMP_M, MAX_REPEATED_JUMP_M
+from controller.carrier.dead_reckoning import CROSSWISE_SAMPLES_COUNT, MAX_JUMP_M, MAX_REPEATED_JUMP_M
 from controller.carrier.monitors import ARM_STUCK_NS, DISAGREE_RAD, OVERSPEED_M_S, OVERSPEED_RATIO
 from controller.carrier.vehicle import RTK_FLOAT_SPEED_SHARE
 from machine.joints import ARTICULATION
@@ -259,6 +259,19 @@ def test_a_machine_that_slips_back_on_spinning_wheels_is_no_antenna_fault():
     bench.lies["CogSogRapidUpdate"] = {"Cog": 3 * math.pi / 2, "Sog": 0.7 * bench.speed_m_s}
     go(bench, 400)
     assert bench.mode is Mode.ACTIVE
+
+
+@pytest.mark.parametrize(("more", "stops"), [(-2, False), (0, True)])
+def test_a_front_half_that_slides_aside_for_a_moment_is_no_antenna_fault(more, stops):
+    """On rough ground a turning forwarder's front slid aside at 0.5 m/s, its heading 110 degrees off the course."""
+    bench = straight()
+    go(bench, 200)
+    assert bench.speed_m_s > 0.3
+    bench.lies["CogSogRapidUpdate"] = {"Cog": math.pi / 2 + math.radians(110.0), "Sog": 1.2 * bench.speed_m_s}
+    go(bench, (CROSSWISE_SAMPLES_COUNT + more) * 50)  # four samples of the course in a second
+    del bench.lies["CogSogRapidUpdate"]
+    go(bench, 100)
+    assert (bench.reason == Reason.HEADING_REVERSED) is stops
 
 
 def test_rtk_float_slows_only_waypoint_driving():
