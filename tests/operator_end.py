@@ -1,4 +1,4 @@
-"""The controller's end of an operator's socket, with its credential, for what sends there."""
+"""Ends of datagrams: the controller's of an operator's socket, with its credential, and any on a free port."""
 
 from __future__ import annotations
 
@@ -20,3 +20,11 @@ class OperatorEnd(socket.socket):
     def recv(self, size: int, flags: int = 0, /) -> bytes:
         """One command."""
         return admitted(super().recv(size + MAC_BYTES, flags), self._credential)
+
+
+def udp_end(timeout_s: float | None = 0.0) -> socket.socket:
+    """A socket on a free port of this machine; without a time it waits for nothing, with None for ever."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.bind(("127.0.0.1", 0))
+    made.settimeout(timeout_s)
+    return made

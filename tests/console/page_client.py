@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from starlette.testclient import TestClient
 
 from console.access_guards import TOKEN_HEADER
@@ -12,6 +14,16 @@ HERE = "http://127.0.0.1:8471"
 WS = "ws://127.0.0.1:8471/ws"
 BROWSING = {"origin": HERE}
 """What a browser says with a websocket of the page."""
+
+
+@dataclass
+class Clock:
+    """A clock that a test moves."""
+
+    now_ns: int = 10**10
+
+    def __call__(self) -> int:
+        return self.now_ns
 
 
 def page_client(console: Console, peer: str = "127.0.0.1", leads: bool = False, **options: object) -> TestClient:

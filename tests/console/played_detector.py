@@ -1,22 +1,23 @@
-"""A log detector with one answer to every request for a picture."""
+"""A program with one answer to every request: a log detector, or a plant."""
 
 from __future__ import annotations
 
-import socket
 import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from can_dbc.messages.picture import picture_request
+from tests.operator_end import udp_end
 
 
 @contextmanager
-def detector(answer: bytes) -> Iterator[tuple[tuple[str, int], list[int]]]:
-    """A detector that gives one answer, and the requests that it got."""
-    asked: list[int] = []
-    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as link:
-        link.bind(("127.0.0.1", 0))
-        link.settimeout(0.1)
+def detector(
+    answer: bytes, read: Callable[[bytes], Any] = picture_request
+) -> Iterator[tuple[tuple[str, int], list[Any]]]:
+    """One that gives one answer, and the requests that it got; what ``read`` makes None of is none."""
+    asked: list[Any] = []
+    with udp_end(0.1) as link:
         over = threading.Event()
 
         def serve() -> None:
@@ -25,9 +26,9 @@ def detector(answer: bytes) -> Iterator[tuple[tuple[str, int], list[int]]]:
                     data, sender = link.recvfrom(2048)
                 except TimeoutError:
                     continue
-                since = picture_request(data)
-                if since is not None:
-                    asked.append(since)
+                request = read(data)
+                if request is not None:
+                    asked.append(request)
                     link.sendto(answer, sender)
 
         thread = threading.Thread(target=serve)

@@ -8,12 +8,12 @@ from typing import Any
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import StateReport
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
+from tests.console.state_reports import at
 
 PROFILE = load_profile("palms_471")
-HASH = profile_hash(PROFILE)
 BEGIN_NS, STOP_S, LENGTH_S = 5_000 * 10**9, 40, 60
 PERIOD_NS = 20_000_000
 
@@ -25,30 +25,8 @@ def report_at(stamp_ns: int) -> StateReport:
     reference = (q[0] + 0.01, *q[1:])
     mode, reason = (Mode.STOP, pack(Reason.JOINT_STUCK, 1)) if stopped else (Mode.ACTIVE, 0)
     since_ns, numbers = (BEGIN_NS + STOP_S * 10**9, (0.4, 0.1, 0.0)) if stopped else (0, ())
-    return StateReport(
-        1,
-        HASH,
-        stamp_ns,
-        mode,
-        1,
-        reason,
-        1,
-        0,
-        0,
-        0,
-        q,
-        (0.01, 0.0, 0.0, 0.0, 0.0),
-        reference,
-        60.0,
-        10.0,
-        0.0,
-        600_000,
-        50_000,
-        0,
-        100,
-        since_ns,
-        numbers,
-    )
+    changes = {"reference": reference, "velocity": (0.01, 0.0, 0.0, 0.0, 0.0), "reason": reason}
+    return at(q, stamp_ns, mode, since_ns=since_ns, numbers=numbers, **changes)
 
 
 class RecordedRun:

@@ -1,6 +1,9 @@
-"""A state report for tests of the console."""
+"""State reports for tests."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 from can_dbc.messages.crane import StateReport
 from machine.loading.profile_file import load_profile, profile_hash
@@ -29,3 +32,25 @@ REPORT = StateReport(
     missed_ticks=2,
     frames_received=1000,
 )
+STANDING = replace(
+    REPORT,
+    sequence=1,
+    grapple_state=0,
+    reason=0,
+    setpoint_sequence=1,
+    refused=0,
+    stale_mask=0,
+    opening_pct=50.0,
+    clamp_bar=12.0,
+    load_kg=0.0,
+    tick_ns=0,
+    late_ns=0,
+    missed_ticks=0,
+    frames_received=0,
+)
+"""Nothing is wrong, and nothing is held."""
+
+
+def at(q: tuple[float, ...], stamp_ns: int, mode: int = Mode.ACTIVE, **changes: Any) -> StateReport:
+    """Of a crane that stands where it should: at ``q``."""
+    return replace(STANDING, **{"position": q, "reference": q, "stamp_ns": stamp_ns, "mode": mode} | changes)

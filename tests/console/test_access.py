@@ -26,8 +26,8 @@ from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from runtime.errors import ConfigError
 from tests.codes import coded
-from tests.console.page_client import BROWSING, HERE, WS, page_client, socket_of, visitor
-from tests.operator_end import OperatorEnd
+from tests.console.page_client import BROWSING, HERE, WS, Clock, page_client, socket_of, visitor
+from tests.operator_end import OperatorEnd, udp_end
 
 PROFILE = load_profile("aoro_fc8")
 HASH = profile_hash(PROFILE)
@@ -38,14 +38,6 @@ TRIES = [
     *("/api/mission/abort", "/api/mission/single-step", "/api/mission/run-through"),
 ]
 """What needs the lease."""
-
-
-@dataclass
-class Clock:
-    now_ns: int = 10**10
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 @dataclass
@@ -70,11 +62,7 @@ class Stage:
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    with (
-        OperatorEnd(tmp_path / "operator") as operator,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner,
-    ):
-        planner.bind(("127.0.0.1", 0))
+    with OperatorEnd(tmp_path / "operator") as operator, udp_end(None) as planner:
         clock = Clock()
         log = AuditLog(tmp_path / "audit.jsonl", clock)
         console = Console(

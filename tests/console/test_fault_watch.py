@@ -13,11 +13,12 @@ from machine.loading.profile_file import load_profile
 from machine.status.explanation import explain
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
+from tests.console import state_reports
 
 PROFILE = load_profile("palms_471")
 Q = (0.1, 0.4, -1.6, 0.5, 0.0)
 MS = 1_000_000
-REPORT = StateReport(1, 2, 0, Mode.ACTIVE, 1, 0, 0, 0, 0, 0, Q, Q, Q, 0.0, 0.0, 0.0, 0, 0, 0, 0)
+REPORT = state_reports.at(Q, 0)
 STUCK = pack(Reason.JOINT_STUCK, 1)
 
 

@@ -5,19 +5,20 @@ from __future__ import annotations
 import itertools
 import socket
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import pytest
 from starlette.testclient import TestClient
 
-from can_dbc.messages.crane import LinkWatch, OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.crane import LinkWatch, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode, encode
 from console.console import CLOSED_PAGES, MIN_BEAT_NS, Console, PageWatch
 from console.state import CraneState
 from machine.loading.profile_file import load_profile, profile_hash
-from tests.console.page_client import BROWSING, page_client, socket_of
+from tests.console.page_client import BROWSING, Clock, page_client, socket_of
+from tests.console.state_reports import at
 from tests.operator_end import OperatorEnd
 
 MS = 1_000_000
@@ -100,14 +101,6 @@ def test_memory_is_bounded() -> None:
 
 
 # -- the server
-
-
-@dataclass
-class Clock:
-    now_ns: int = 10_000 * MS
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 @dataclass
@@ -226,8 +219,6 @@ def test_a_profile_without_a_limit_sends_no_heartbeat(served: Served) -> None:
     ("link", "words"), [(LinkWatch.OFF, "not watched"), (LinkWatch.WATCHED, "watched"), (LinkWatch.LOST, "lost")]
 )
 def test_the_page_tells_whether_the_link_is_watched(link: LinkWatch, words: str) -> None:
-    known = (0.1,) * 5
-    report = StateReport(1, 2, 3, 2, 0, 0, 0, 0, 0, 0, known, known, known, 0.0, 0.0, 0.0, 1, 2, 3, 4)
     crane_state = CraneState(PROFILE)
-    crane_state.on_report(encode(replace(report, operator_link=link)), 0)
+    crane_state.on_report(encode(at((0.1,) * 5, 3, operator_link=link)), 0)
     assert crane_state.state(0)["operator_link"] == words

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import socket
 import threading
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from machine.loading.profile_file import load_profile, profile_hash
 from tests.autonomy.mission_checks import EXAMPLES
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.console.page_client import page_client
+from tests.operator_end import udp_end
 
 PROFILE = load_profile("aoro_fc8")
 PAPER_B = load_mission(EXAMPLES / "paper_b.geojson").mission
@@ -190,9 +190,7 @@ def test_a_console_without_folder_planner_or_carrier_says_so(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("refusal", [("", ""), ("the machine is armed; disarm it first", "upload.armed")])
 def test_a_mission_is_offered_to_the_planner(tmp_path: Path, refusal: tuple[str, str]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
-        planner.bind(("127.0.0.1", 0))
-        planner.settimeout(5)
+    with udp_end(5) as planner:
         console = Console(PROFILE, 77, missions=tmp_path, planner=planner.getsockname(), clock=lambda: 10**12)
         offered = []
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from collections.abc import Iterator
 
@@ -11,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from console.plant_link import create_plant_app
+from tests.operator_end import udp_end
 
 ANSWERS = {"scene": {"title": "a plant"}, "view": {"time_s": 1.5}, "lever": {"ok": True}}
 
@@ -19,8 +19,7 @@ ANSWERS = {"scene": {"title": "a plant"}, "view": {"time_s": 1.5}, "lever": {"ok
 def plant() -> Iterator[tuple[tuple[str, int], list[dict[str, str]]]]:
     """A stand-in for the plant's request port; it keeps the requests."""
     asked: list[dict[str, str]] = []
-    port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    port.bind(("127.0.0.1", 0))
+    port = udp_end(None)
 
     def answer() -> None:
         while True:
@@ -71,8 +70,9 @@ def test_levers_are_refused_to_other_machines(plant) -> None:
 
 
 def test_a_silent_plant_is_reported() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
-        deaf.bind(("127.0.0.1", 0))
-        with TestClient(create_plant_app(deaf.getsockname()), base_url="http://127.0.0.1") as page:
-            answer = page.get("/api/plant")
+    with (
+        udp_end(None) as deaf,
+        TestClient(create_plant_app(deaf.getsockname()), base_url="http://127.0.0.1") as page,
+    ):
+        answer = page.get("/api/plant")
     assert answer.status_code == 504 and answer.text

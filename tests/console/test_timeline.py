@@ -15,9 +15,9 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.codes import numbers_in
+from tests.console.state_reports import at
 
-Q = (0.0,) * 5
-REPORT = StateReport(1, 2, 10**9, Mode.STANDBY, 1, 0, 0, 0, 0, 0, Q, Q, Q, 0.0, 0.0, 240.0, 0, 0, 0, 0)
+REPORT = at((0.0,) * 5, 10**9, Mode.STANDBY, grapple_state=1, load_kg=240.0)
 STUCK = pack(Reason.JOINT_STUCK, 1)
 
 

@@ -2,44 +2,17 @@
 
 from __future__ import annotations
 
-import socket
-import threading
-from collections.abc import Iterator
-
-import pytest
 from starlette.testclient import TestClient
 
 from autonomy.perception.log_list import LogObservation, encode_logs
 from console.console import Console
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
+from tests.console.played_detector import detector
+from tests.operator_end import udp_end
 
 PROFILE = load_profile("palms_471")
 LOG = LogObservation(2, (0.5, 3.0, -0.4), (1.0, 0.0, 0.0), 3.0, 0.2)
-
-
-@pytest.fixture
-def plant() -> Iterator[tuple[tuple[str, int], list[bytes]]]:
-    asked: list[bytes] = []
-    over = threading.Event()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        link.bind(("127.0.0.1", 0))
-        link.settimeout(0.1)
-
-        def serve() -> None:
-            while not over.is_set():
-                try:
-                    data, sender = link.recvfrom(2048)
-                except TimeoutError:
-                    continue
-                asked.append(data)
-                link.sendto(encode_logs([LOG]), sender)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield link.getsockname(), asked
-        over.set()
-        thread.join()
 
 
 def client_of(truth: tuple[str, int] | None) -> TestClient:
@@ -48,9 +21,8 @@ def client_of(truth: tuple[str, int] | None) -> TestClient:
     )
 
 
-def test_the_plants_logs_are_served_and_asked_for_once(plant) -> None:
-    address, asked = plant
-    with client_of(address) as client:
+def test_the_plants_logs_are_served_and_asked_for_once() -> None:
+    with detector(encode_logs([LOG]), bytes) as (address, asked), client_of(address) as client:
         assert not asked, "no page shows them"
         told = [client.get("/api/true-logs").json() for _ in range(5)]
         assert told[0] == told[-1] and told[0][0]["center_m"] == [0.5, 3.0, -0.4] and told[0][0]["id"] == 2
@@ -65,8 +37,6 @@ def test_a_machine_has_no_true_logs() -> None:
 
 
 def test_a_silent_plant_is_said_to_be_silent() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
-        deaf.bind(("127.0.0.1", 0))
-        with client_of(deaf.getsockname()) as client:
-            answer = client.get("/api/true-logs")
-            assert answer.status_code == 504
+    with udp_end(None) as deaf, client_of(deaf.getsockname()) as client:
+        answer = client.get("/api/true-logs")
+        assert answer.status_code == 504

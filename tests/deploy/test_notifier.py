@@ -26,6 +26,7 @@ from controller.step import Controller
 from machine.status.modes import Mode
 from runtime.notifier import Notifier
 from tests.codes import numbers_in
+from tests.operator_end import udp_end
 
 MS = 1_000_000
 T = 5 * MS
@@ -76,9 +77,7 @@ class SilentBus(NullBus):
 
 @pytest.fixture
 def loop() -> Iterator[Loop]:
-    port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    port.bind(("127.0.0.1", 0))
-    port.setblocking(False)
+    port = udp_end()
     settings = load("palms_471")
     controller = Controller(settings)
     made = Loop(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
 from pathlib import Path
 
 from timberhand.reference.__main__ import BUILT
@@ -15,3 +17,12 @@ PAGES = sorted({*NAMES, *BUILT})
 def text_of(page: str) -> str:
     """The text of a page, which is named by its path in the repository."""
     return BUILT[page]() if page in BUILT else (ROOT / page).read_text()
+
+
+@cache
+def headings(page: str) -> tuple[str, ...]:
+    return tuple(re.findall(r"(?m)^#+ (.+)$", (ROOT / page).read_text()))
+
+
+def has_section(page: str, number: str) -> bool:
+    return any(heading.startswith((f"{number}. ", f"{number} ")) for heading in headings(page))

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from tests.docs.pages import PAGES, ROOT, text_of
+from tests.docs.pages import PAGES, ROOT, has_section, text_of
 
 PACKAGES = sorted(path.parent.name for path in ROOT.glob("*/__init__.py"))
 CODE = re.compile(r"`([^`\n]+)`")
@@ -65,3 +65,9 @@ def test_a_walk_of_the_tour_names_at_most_twelve_files() -> None:
 def test_the_glossary_is_short_enough_to_be_read() -> None:
     terms = re.findall(r"(?m)^\| (?!term \|)[^|]+ \|", (ROOT / "docs" / "glossary.md").read_text())
     assert 100 < len(terms) <= 150
+
+
+def test_a_missing_section_is_noticed() -> None:
+    """By what judges every citation in the sources."""
+    assert has_section("docs/reference/machines.md", "7.2")
+    assert not has_section("docs/reference/machines.md", "7.9")

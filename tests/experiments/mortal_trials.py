@@ -9,9 +9,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
+from experiments.common import pool
+from experiments.common.campaign import line_of
+from experiments.common.checkpoint import Checkpoint
 from experiments.common.pool import Job
+from experiments.common.workers import Workers
 from experiments.plant.experiment import perform
 
+QUIET = Console(quiet=True)
 KINDS = ("sag", "pendulum", "sharing", "cylinder")
 """Kinds of the plant experiment that take about a second each."""
 
@@ -63,3 +70,15 @@ def mortal(marker: Path) -> Any:
 def process_id() -> str:
     """An installation that no other process has."""
     return str(os.getpid())
+
+
+def table(path: Path, function: Any, workers: Workers, jobs: list[Job]) -> bytes:
+    """The outcomes of a run, line by line."""
+    with Checkpoint(path, "run") as kept:
+        outcomes = pool.run(function, jobs, kept, workers, "trials", QUIET)
+    return "\n".join(line_of(name, outcome, ()) for name, outcome in outcomes.items()).encode()
+
+
+def table_of_one_process(folder: Path) -> bytes:
+    """The table of the pieces of the plant experiment."""
+    return table(folder / "alone.jsonl", perform, Workers(), plant_jobs())

@@ -28,13 +28,6 @@ def test_a_profile_of_ones_own_is_calibrated_alone(tmp_path: Path) -> None:
     assert NAME in conclusion(found)[0]
 
 
-def test_the_published_page_has_both_shipped_machines_in_their_order() -> None:
-    found = {f"{short}_complete": 1.0 for short in ("aoro", "palms")} | {"aoro_rot_gain_max": 0.0}
-    assert [section.title for section in sections(found)] == ["PALMS 4.71", "AORO, CRANAB FC8"]
-    assert any(metric.name == "aoro_rot_gain_max" for metric in metrics_in(found))
-    assert "AORO" in conclusion(found)[0]
-
-
 @pytest.mark.parametrize(("pin_m", "stands"), [((3.0, 0.8, 1.6), True), ((4.4, -2.4, 2.8), False)])
 def test_a_pose_with_the_grapple_on_a_stake_is_seen(tmp_path: Path, pin_m: tuple[float, ...], stands: bool) -> None:
     profile = made(tmp_path)

@@ -13,27 +13,20 @@ from typer.testing import CliRunner
 from experiments.common import all_experiments, campaign
 from experiments.common.all_experiments import Pass
 from experiments.common.pool import Job
-from experiments.common.registry import EXPERIMENTS, Entry, Options
-from experiments.common.workers import Workers
+from experiments.common.registry import EXPERIMENTS
 from experiments.grasp_configs.trial import attempt
 from hil.replay.recording import files_of, manifest_of
 from host.exit_codes import CommandFailed, ExitCode
+from tests.experiments.toy_experiment import enter, options
 from timberhand.cli import app
 
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXPERIMENTS, "toy", Entry("?", "tests.experiments.toy_experiment", (), clocked=("clock",)))
-
-
-def options(out: Path, workers: int = 1, trials: int = 4) -> Options:
-    return Options(1, "nominal", "palms_471", out, trials=trials, workers=Workers(workers))
-
-
-@pytest.mark.usefixtures("toy")
-def test_failed_trials_are_recorded_once_and_one_that_does_not_repeat_is_told(tmp_path: Path) -> None:
+def test_failed_trials_are_recorded_once_and_one_that_does_not_repeat_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(monkeypatch)
     _, found = campaign.run("toy", options(tmp_path, trials=6), 10, QUIET)
     assert [(f.name, f.repeated) for f in found.recorded] == [("n/3", True), ("n/5", False)] and found.failures == 2
     recording = campaign.recording_of(Path(found.recorded[0].recording))

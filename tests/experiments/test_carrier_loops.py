@@ -17,8 +17,7 @@ from controller.laws.drive import AngleLaw, WaypointLaw
 from experiments.loop_design import carrier as loops
 from experiments.loop_design.carrier import CarrierCase, angle_spec, arm_loop, heading_loop, natural
 from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins
-from experiments.loop_design.page import write
-from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, CaseSet, case_set, study
+from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, CaseSet
 from machine.geometry.carrier import heading_rate_rad_s
 from machine.loading.profile_file import load_profile
 
@@ -135,9 +134,3 @@ def test_twice_the_gains_lose_their_margins():
     assert {loop.name for loop in made if not loop.holds} == {"heading", "swing arm"}
     late = arm_loop(CARRIER, replace(VALVE, delay_s=0.15))
     assert margins(FREQUENCY_RAD_S, late).phase_deg < margins(FREQUENCY_RAD_S, arm_loop(CARRIER, VALVE)).phase_deg
-
-
-@pytest.mark.long
-def test_the_page_shows_the_carrier(tmp_path):
-    few = replace(case_set("aoro_fc8"), delays_s=(0.08,), gains=(1.0,))
-    assert write([(PROFILE, study(PROFILE, few) + loops.studies(PROFILE, few), few)], tmp_path)

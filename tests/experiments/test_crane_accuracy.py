@@ -42,6 +42,7 @@ from machine.geometry.kinematics import pin_position
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Sag
 from machine.status.modes import Mode
+from tests.console.state_reports import at
 
 AORO = load_profile("aoro_fc8")
 TICK_NS = 20_000_000
@@ -221,29 +222,8 @@ class Echo:
             age_ns = now_ns - self._setpoint.stamp_ns
             reference = self._setpoint.knots[min(age_ns // 50_000_000, 8)].position
             self.position = (reference[0], reference[1] + self.off_rad, *reference[2:4], math.nan)
-        unknown = math.nan
-        return StateReport(
-            1,
-            profile_hash(AORO),
-            now_ns,
-            self.mode,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            self.position,
-            (0.0,) * 5,
-            reference,
-            unknown,
-            unknown,
-            self.load_kg,
-            0,
-            0,
-            0,
-            0,
-        )
+        told = {"profile_hash": profile_hash(AORO), "reference": reference, "load_kg": self.load_kg}
+        return at(self.position, now_ns, self.mode, opening_pct=math.nan, clamp_bar=math.nan, **told)
 
 
 def drive(cycles: ReachCycles, echo: Echo, seconds: float, from_ns: int = 1_000_000_000) -> int:

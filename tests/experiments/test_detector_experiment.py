@@ -5,10 +5,7 @@ import pytest
 from rich.console import Console
 
 from experiments.common.registry import Options
-from experiments.common.result import make_result
-from experiments.common.result_page import markdown
 from experiments.detector import experiment, photos, trial, worlds
-from experiments.detector.metrics import METRICS, PAPER
 from host.exit_codes import CommandFailed, ExitCode
 from tests.codes import coded
 
@@ -51,10 +48,6 @@ def test_metrics_follow_from_the_detections():
     assert metrics["map50_95"] < metrics["map50"]
     assert metrics["parted.map50"] == 1.0 and metrics["parted.map50_95"] == pytest.approx(0.9)
     assert metrics["found_large"] == 1.0 and metrics["found_small"] == 0.0
-    result = make_result(
-        "detector", METRICS, metrics, profile="p", seed=1, trials=1, more={"truth": "nominal"}, paper=PAPER
-    )
-    assert result.missed and markdown(result, experiment.page_of(result, {}))
 
 
 def test_perfectly_separated_wood_is_as_good_as_its_pixels():

@@ -1,11 +1,10 @@
-"""Shared parts of the experiments: metrics and limits, Wilson intervals, the pool with its checkpoint, the page."""
+"""Shared parts of the experiments: metrics and limits, Wilson intervals, the pool with its checkpoint."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -18,12 +17,10 @@ from experiments.common.overview import read
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
 from experiments.common.result import ROOT, Metric, Result, evaluate, limits_of, rate, wilson
-from experiments.common.result_page import Page, Section, markdown
-from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint
+from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
 from experiments.common.workers import Workers
 from experiments.plant.runs import ringing
-from host.exit_codes import CommandFailed
-from tests.codes import numbers_in
+from tests.experiments.mortal_trials import square_jobs
 
 QUIET = Console(quiet=True)
 SPEED = Metric("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
@@ -45,10 +42,6 @@ def interrupted(job: Job) -> dict[str, int]:
 def failing(job: Job) -> None:
     """A trial with a defect."""
     raise ZeroDivisionError
-
-
-def jobs(n: int) -> list[Job]:
-    return [Job(f"square/{i}", "square", i, {}) for i in range(n)]
 
 
 @pytest.mark.parametrize(
@@ -82,15 +75,17 @@ def test_a_wilson_interval_holds_the_rate(n, data):
     assert 0.0 <= low <= hits / n + 1e-12 and hits / n - 1e-12 <= high <= 1.0
 
 
-def test_metrics_are_compared_with_their_limits():
-    definitions = (SPEED, SHARE)
-    assert evaluate(definitions, {"speed": 2.0, "share": 0.02}, noisy=False) == ((), ())
-    assert evaluate(definitions, {"speed": 1.9, "share": 0.03}, noisy=False) == (("speed", "share"), ())
-    assert evaluate(definitions, {"speed": math.nan}, noisy=False) == (("speed",), ())
-
-
-def test_a_noisy_host_leaves_only_clocked_metrics_inconclusive():
-    assert evaluate((SPEED, SHARE), {"speed": 1.9, "share": 0.03}, noisy=True) == (("share",), ("speed",))
+@pytest.mark.parametrize(
+    ("metrics", "noisy", "verdict"),
+    [
+        ({"speed": 2.0, "share": 0.02}, False, ((), ())),
+        ({"speed": 1.9, "share": 0.03}, False, (("speed", "share"), ())),
+        ({"speed": math.nan}, False, (("speed",), ())),
+        pytest.param({"speed": 1.9, "share": 0.03}, True, (("share",), ("speed",)), id="only clocked ones are open"),
+    ],
+)
+def test_metrics_are_compared_with_their_limits(metrics, noisy, verdict):
+    assert evaluate((SPEED, SHARE), metrics, noisy=noisy) == verdict
 
 
 def test_no_trials_make_no_rate():
@@ -100,12 +95,14 @@ def test_no_trials_make_no_rate():
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path):
     path = tmp_path / "trials.jsonl"
     with pytest.raises(KeyboardInterrupt), Checkpoint(path, "run") as checkpoint:
-        pool.run(interrupted, jobs(6), checkpoint, Workers(), "trials", QUIET)
+        pool.run(interrupted, square_jobs(6), checkpoint, Workers(), "trials", QUIET)
     path.write_text(path.read_text() + '["square/5", {"squ')  # cut off while writing
     ran = []
     with Checkpoint(path, "run") as again:
         assert sorted(again.done) == ["square/0", "square/1", "square/2"]
-        outcomes = pool.run(lambda job: ran.append(job.seed) or square(job), jobs(6), again, Workers(), "trials", QUIET)
+        outcomes = pool.run(
+            lambda job: ran.append(job.seed) or square(job), square_jobs(6), again, Workers(), "trials", QUIET
+        )
     assert ran == [3, 4, 5] and [o["square"] for o in outcomes.values()] == [0, 1, 4, 9, 16, 25]
     assert not path.exists()
 
@@ -155,7 +152,7 @@ def test_a_run_with_another_truth_starts_anew(tmp_path):
     options = Options(seed=1, truth=str(truth), profile="palms_471", out=tmp_path / "run")
 
     def begun() -> Checkpoint:
-        return checkpoint(options, jobs(2), ["palms_471"], options.truth)
+        return checkpoint(options, square_jobs(2), ["palms_471"], options.truth)
 
     first = begun()
     first.add("square/0", 0)
@@ -165,16 +162,10 @@ def test_a_run_with_another_truth_starts_anew(tmp_path):
     assert begun().done == {}
 
 
-def test_an_unusable_truth_stops_before_any_trial(tmp_path):
-    with pytest.raises(CommandFailed) as caught:
-        check_truth("palms_471", str(tmp_path / "none.toml"))
-    assert "none.toml" in str(caught.value)
-
-
 def test_an_error_names_the_trial(tmp_path):
     checkpoint = Checkpoint(tmp_path / "trials.jsonl", "run")
     with pytest.raises(ZeroDivisionError) as caught:
-        pool.run(failing, jobs(1), checkpoint, Workers(), "trials", QUIET)
+        pool.run(failing, square_jobs(1), checkpoint, Workers(), "trials", QUIET)
     assert "in trial square/0" in caught.value.__notes__
 
 
@@ -199,45 +190,14 @@ def made(metrics: dict[str, float], missed: tuple[str, ...] = ()) -> Result:
     )
 
 
-def test_a_saved_result_tells_never_from_not_measured(tmp_path):
-    made({"speed": math.inf, "broken": math.nan}).save(tmp_path / "result.json")
-    metrics = read(tmp_path / "result.json").metrics
-    assert metrics["speed"] == math.inf and math.isnan(metrics["broken"])
-
-
-def test_result_json_is_flat_and_without_nan(tmp_path):
-    made({"speed": 2.5, "broken": math.nan}).save(tmp_path / "deep" / "result.json")
-    document = json.loads((tmp_path / "deep" / "result.json").read_text())
-    assert document["metrics"] == {"speed": 2.5, "broken": None}
+def test_a_saved_result_is_flat_without_nan_and_tells_never_from_not_measured(tmp_path):
+    path = tmp_path / "deep" / "result.json"
+    made({"speed": math.inf, "broken": math.nan, "share": 0.5}).save(path)
+    document = json.loads(path.read_text())
+    assert document["metrics"].keys() == {"speed", "broken", "share"} and document["metrics"]["broken"] is None
     assert {"experiment", "commit", "profile", "seed", "trials", "paper", "environment"} <= document.keys()
-
-
-def row_of(text: str, title: str) -> list[str]:
-    """The cells of a metric's row."""
-    (row,) = [line for line in text.splitlines() if line.startswith(f"| {title} |")]
-    return [cell.strip() for cell in row.split("|")[1:-1]]
-
-
-def test_the_page_shows_conclusion_and_plot_first_and_then_the_table():
-    sections = (Section("Motion", "It moves.", (SPEED, SHARE), (("a.png", "A plot."), ("b.png", "Another."))),)
-    page = Page("Thing", ("It moves at {speed} (paper: {paper:speed}).", "Never {missing}."), "About it.", sections)
-    text = markdown(made({"speed": 2.5, **rate("share", 1, 20)}, ("share",)), page)
-    fast, often = row_of(text, "How fast"), row_of(text, "How often")
-    assert numbers_in(text[: text.index("a.png")])[:2] == [2.5, 3] and "Never" not in text
-    assert [numbers_in(cell) for cell in fast[1:3]] == [[2.5, 3], [2]]
-    assert [numbers_in(cell) for cell in often[1:3]] == [[5, 0.9, 23.6, 20], [2]]
-    assert fast[3] and often[3] and fast[3] != often[3], "one limit is met, one is missed"
-    places = [text.index(part) for part in ("It moves at", "A plot.", "About it.", "How fast", "Another.")]
-    assert places == sorted(places) and text.count("a.png") == 1
-
-
-def test_a_page_shows_the_limits_against_which_its_result_was_judged():
-    result = replace(made({"x": 3.0, "y": 4.0}), limits={"x": (None, 5.0)})
-    today = (Metric("x", "X", "us", "", most=2.0), Metric("y", "Y", "us", "", most=1.0))
-    text = markdown(result, Page("T", (), "", (Section("S", "", today),)))
-    assert [numbers_in(cell) for cell in row_of(text, "X")[1:3]] == [[3], [5]]
-    later = row_of(text, "Y")
-    assert numbers_in(later[1]) == [4] and later[2:] == ["", ""], "a limit that came later has not judged this result"
+    metrics = read(path).metrics
+    assert metrics["speed"] == math.inf and math.isnan(metrics["broken"]) and metrics["share"] == 0.5
 
 
 def test_every_source_of_a_fingerprint_exists_and_a_missing_one_does_not_fail():

@@ -15,10 +15,9 @@ from experiments.faults import nominal
 from experiments.faults.evidence import Evidence
 from experiments.faults.experiment import nominal_plan, plan, scenes_of
 from experiments.faults.metrics import METRICS, gather, is_blind
-from experiments.faults.pages import _example, blind_spots, evidence, separations, table, work_page
 from experiments.faults.running import HeldSwing, Swing, build, warm
 from experiments.faults.separation import Separation, merged
-from experiments.faults.trial import in_child, inject, judge
+from experiments.faults.trial import in_child, inject
 from hil.faults.catalogue import BY_NAME, CASES
 from hil.faults.table import parse
 from hil.harness.lockstep import START_NS
@@ -26,29 +25,8 @@ from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from runtime.errors import InputRefused
-from tests.codes import coded, numbers_in
-
-
-def outcome(**changed: Any) -> dict[str, Any]:
-    row = {
-        "seed": "s",
-        "at_ms": 1.0,
-        "orders": ["encoder-stuck/lift"],
-        "expected": "R1",
-        "bound_ms": 20.0,
-        "seen_ms": 0.0,
-        "tip_limit_m": None,
-        "reached": {"R1": 15.0},
-        "reason": "ENCODER_LOST",
-        "refused_ms": None,
-        "neutral_ms": 80.0,
-        "valves_ms": 70.0,
-        "travel_m": 0.02,
-        "astray_m": 0.02,
-        "standing": True,
-        "timeline": [[1.0, "STOP"]],
-    } | changed
-    return row | judge(row)
+from tests.codes import coded
+from tests.experiments.fault_outcomes import outcome
 
 
 @pytest.mark.parametrize(
@@ -88,8 +66,8 @@ def test_a_missed_injection_is_counted_and_a_blind_spot_is_told_apart() -> None:
     assert {m.name for m in METRICS} <= metrics.keys()
     with_draw = sum(c.draw is not None for c in CASES)
     assert metrics["injections"] == 2 * with_draw and metrics["missed"] == with_draw
-    named = 0  # 0.4 m are more than a drift or a scale explains
-    assert (metrics["blind_missed"], metrics["unexplained"]) == (named, with_draw - named)
+    # 0.4 m are more than a drift or a scale explains.
+    assert (metrics["blind_missed"], metrics["unexplained"]) == (0, with_draw)
     assert math.isinf(metrics["neutral_max_ms"]), "valves that never became neutral"
     assert (metrics["nominal_hours"], metrics["false_trips"]) == (2.0, 1.0)
     assert metrics["c06_harm_m"] == 0.4 and metrics["c06_max_ms"] == 15.0
@@ -100,10 +78,6 @@ def test_a_missed_injection_is_counted_and_a_blind_spot_is_told_apart() -> None:
     assert not is_blind(BY_NAME["valve-stuck-open"], crane | near | {"verdict": "undetected"})
     assert is_blind(BY_NAME["encoder-scale"], crane | near | {"verdict": "undetected"})
     assert not is_blind(BY_NAME["encoder-scale"], crane | far | {"verdict": "undetected"}), "more harm than it explains"
-    case = BY_NAME["message-off"]
-    page = evidence(case, [row | {"scene": "crane"} for row in rows], metrics)
-    assert page.startswith("---\norphan: true")
-    assert table(metrics).count("\n") == len(CASES) + 1
 
 
 def test_a_miss_is_a_named_blind_spot_only_in_the_works_that_the_catalogue_names() -> None:
@@ -113,8 +87,6 @@ def test_a_miss_is_a_named_blind_spot_only_in_the_works_that_the_catalogue_names
         metrics = gather({scene: {"case": case.number, "scene": scene, "outcomes": [missed, outcome()]}})
         assert (metrics["c03_missed"], metrics["c03_blind_missed"], metrics["blind_missed"]) == (1.0, blind, blind)
         assert metrics["unexplained"] == 1.0 - blind
-        said = blind_spots(metrics)
-        assert {1, blind, 8.0} <= set(numbers_in(said))
     assert all(case.blind for case in CASES if case.blind_in)
 
 
@@ -134,7 +106,6 @@ def test_work_without_faults_tells_how_near_each_monitor_came_and_where() -> Non
     total = merged(runs)["a"]
     assert total["bins"] == [4000, 2500, 30, 4, 3, 2, 1]
     assert (total["most"], total["run"]) == (0.95, "crane, seed 2, after 12 s")
-    assert numbers_in(separations(runs)[-2])[1:4] == [40.0, 6.0, 1.0]
 
 
 def test_an_armed_machine_tells_the_shares_of_its_monitors_and_a_disarmed_one_none() -> None:
@@ -173,7 +144,7 @@ def test_a_mission_counts_as_work_with_what_it_believes_and_what_lies_in_the_bun
     monkeypatch.setattr(nominal, "calibrated", lambda job: {"profile": None, "failure": "a stuck valve"})
     if text:
         failed = nominal.perform(Job("m", "nominal", 3, {"scene": f"mission aoro_fc8 {scene}", "seconds": 1.0}))
-        assert "trips" not in failed and "a stuck valve" in work_page([failed])
+        assert "trips" not in failed and "a stuck valve" in str(failed)
 
 
 def test_a_held_swing_ends_at_rest_without_a_step() -> None:
@@ -235,7 +206,6 @@ def test_burst_and_overload_of_a_machine_with_physics_are_answered_in_time() -> 
     yielding = ("OVERLOAD", "OVERLOADED", "JOINT_RUNAWAY", "JOINT_REVERSED")  # the last one while it rises
     assert load["verdict"] == "ok" and load["reason"] in yielding
     assert 150.0 < load["due_ms"] < 300.0 and load["detect_ms"] < load["due_ms"]
-    assert "overload" in "".join(_example({**load, "scene": "crane"}))
 
 
 @pytest.mark.long

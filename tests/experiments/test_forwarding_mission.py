@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,9 +14,7 @@ from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
 from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, PAPER_B_ANGLED, TURN_DEG, shuffled
 from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, perform, short, trial
-from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
-from experiments.forwarding_mission.plots import PAPER_MM, draw
-from tests.codes import numbers_in
+from experiments.forwarding_mission.metrics import METRICS, by_log, gather
 
 OPTIONS = SimpleNamespace(seed=3, quick=False, trials=None)
 MISSION = load_mission(PAPER_B, route_wanted=True).mission
@@ -99,26 +96,10 @@ def test_metrics_of_paper_b_have_their_own_prefix() -> None:
     assert metrics["grasp_offset_mean_m"] == metrics["first.grasp_offset_mean_m"] == pytest.approx(0.05)
 
 
-def test_the_table_is_like_the_paper_s_with_a_dash_without_a_grasp() -> None:
-    ours = outcome()
-    ours["grasps"] = ours["grasps"][:2]
-    ours["logs"][2]["in_bunk"] = False
-    lines = table({"first/ours": ours}).splitlines()
-    assert numbers_in(lines[4]) == [1, 30, 40, 0, 50]
-    assert numbers_in(lines[6]) == [3]
-    assert numbers_in(lines[7])[:6] == [30, 40, 0, 50, 2, 3]
-    assert [row["off_m"] for row in by_log(ours)][2] is None
-
-
-def test_the_paper_s_numbers_are_consistent() -> None:
-    assert len(PAPER_MM) == 23
-    assert np.mean(PAPER_MM) == pytest.approx(PAPER_TABLE_MM["distance"], abs=15.0)
-
-
-def test_the_last_grasp_of_a_log_is_in_the_table() -> None:
+def test_the_last_grasp_of_a_log_is_in_the_table_and_none_is_a_dash() -> None:
     again = outcome()
-    again["grasps"].append(grasp(0, (0.0, 0.0, 0.02)))
-    assert by_log(again)[0]["off_m"] == [0.0, 0.0, 0.02]
+    again["grasps"] = [*again["grasps"][:2], grasp(0, (0.0, 0.0, 0.02))]
+    assert [row["off_m"] for row in by_log(again)] == [[0.0, 0.0, 0.02], [0.03, 0.04, 0.0], None]
 
 
 def test_every_mission_has_a_field_of_its_own_and_the_individuals_take_turns() -> None:
@@ -189,13 +170,6 @@ def test_the_missions_by_paper_b_s_method_count_together() -> None:
 def test_a_short_mission_has_one_log_on_a_straight_path() -> None:
     mission = short(MISSION)
     assert len(mission.waypoints) == 2 and len(mission.logs) == mission.options.laps == 1
-
-
-def test_plots_are_drawn(tmp_path: Path) -> None:
-    nothing = outcome(1, path=[], stands=[], grasps=[])
-    draw({"first/ours": outcome(), "first/paper-b": outcome(), "mission/0": nothing}, tmp_path)
-    draw({"first/ours": nothing}, tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {"map.png", "offsets.png"}
 
 
 @pytest.mark.long

@@ -14,7 +14,6 @@ from experiments.generalization.experiment import (
     MISSIONS,
     drawn_mission,
     jobs_of,
-    page_of,
     scenes_of,
     wrong_values,
 )
@@ -28,7 +27,7 @@ from experiments.generalization.matrix import (
     title_of,
     write_truth,
 )
-from experiments.generalization.metrics import OVERALL, gather, sentences
+from experiments.generalization.metrics import gather, sentences
 from hil.missions.site import site_of
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
@@ -195,19 +194,3 @@ def test_values_that_differ_from_the_truth_are_named(tmp_path: Path) -> None:
 
     assert wrong_values(found(0.29, valve["delay_s"]), truth) == []
     assert len(wrong_values(found(0.25, valve["delay_s"] + 0.05), truth)) == 2
-
-
-def test_the_page_shows_every_truth() -> None:
-    outcomes = [outcome("mass-low"), outcome("delay-high", calibrated=False), mission(4), mission(5, stops=2)]
-    page = page_of(SimpleNamespace(metrics=gather(outcomes)), {})  # type: ignore[arg-type]
-    assert {m.name for m in page.metrics} == {m.name for m in OVERALL}
-    rows = {cells[0]: cells[1:] for cells in table_cells("\n".join(section.text for section in page.sections))}
-    assert rows[title_of("mass-low")][:2] == ["works", "1 of 1"]
-    assert rows[title_of("delay-high")][0] == "refuses: not calibrated"
-    assert rows[title_of("unseen-4")][:2] == ["works", "8 of 8"]
-    assert rows[title_of("unseen-5")][0] == "works, 2 stops"
-
-
-def table_cells(markdown: str) -> list[list[str]]:
-    lines = [line for line in markdown.splitlines() if line.startswith("| ")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]

@@ -97,14 +97,8 @@ def test_a_folder_without_samples_is_refused(tmp_path: Path) -> None:
 def test_a_checkpoint_belongs_to_its_seed_schedule_and_data(tmp_path: Path) -> None:
     few = load_samples(layout(tmp_path / "a", (1, 2)))
     other = load_samples(layout(tmp_path / "b", (1, 3)))
-    names = {
-        folds.identity(few, 1, 2),
-        folds.identity(few, 2, 2),
-        folds.identity(few, 1, 3),
-        folds.identity(other, 1, 2),
-    }
-    assert len(names) == 4
-    assert folds.identity(few, 1, 2) in names
+    names = {folds.identity(*of) for of in ((few, 1, 2), (few, 2, 2), (few, 1, 3), (other, 1, 2))}
+    assert len(names) == 4 and folds.identity(few, 1, 2) in names
 
 
 def test_the_shipped_weights_close_across_a_log() -> None:

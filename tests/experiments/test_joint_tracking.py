@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 
 import msgspec
 import numpy as np
@@ -13,11 +12,10 @@ from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.joint_tracking import experiment, individuals, motions
 from experiments.joint_tracking.individuals import CORNERS
-from experiments.joint_tracking.metrics import LAWS, best_laws, sections, table
+from experiments.joint_tracking.metrics import LAWS, sections
 from experiments.joint_tracking.testbed import NAMES, Calibration
 from experiments.joint_tracking.trial import _slow, perform
 from machine.loading.profile_file import load_profile
-from tests.codes import numbers_in
 
 PALMS = load_profile("palms_471")
 START = [0.0, 0.4, -1.2, 0.6, 0.0]
@@ -110,15 +108,6 @@ def test_machines_that_never_settle_miss_the_limit():
         {"palms/pd/shipped/wide/0": {"shut_share": math.nan, "unsettled_share": 1.0, "diverged": False}}
     )
     assert found["palms_pd_shipped_shut_share"] == 0.0 and found["palms_pd_shipped_unsettled_share"] == 1.0
-
-
-def test_the_table_marks_the_best_law_and_leaves_out_what_was_not_measured():
-    metrics = {f"palms_{law}_calibrated_cycle_tip_rms_m": 0.01 * (i + 1) for i, law in enumerate(LAWS)}
-    metrics |= {f"palms_{law}_calibrated_shut_share": 0.9 + 0.01 * i for i, law in enumerate(LAWS)}
-    rows = [line for line in table("palms", metrics).splitlines() if line][2:]
-    assert len(rows) == 2 and all(f" {value} " in rows[0] for value in (20, 30, 40, 50, 60))
-    assert [re.findall(r"\*\*(\d+)\*\*", row) for row in rows] == [["10"], ["95"]]
-    assert numbers_in(best_laws("palms", "pd", metrics))[:6] == [1, 0, 0, 0, 0, 1]
 
 
 def test_every_metric_has_its_own_name():

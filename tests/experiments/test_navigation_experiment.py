@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +15,6 @@ from experiments.navigation import measure
 from experiments.navigation.experiment import CORNERS, LAPS, QUICK_START, STARTS, plan
 from experiments.navigation.measure import Drive
 from experiments.navigation.metrics import GROUNDS, LAP, METRICS, gather
-from experiments.navigation.plots import draw
 from experiments.navigation.trial import COLUMNS, perform
 from machine.loading.profile_file import load_profile
 
@@ -189,13 +187,6 @@ def test_a_first_bend_ends_where_the_path_is_straight_again() -> None:
     end = measure.corner_end_m(path, (30.0, 0.0))
     assert path.corners_m[0] < end < path.corners_m[0] + 10.0
     assert path.at(end + 0.1)[3] == 0.0 and path.at(end - 0.3)[3] != 0.0
-
-
-def test_plots_are_drawn(tmp_path: Path) -> None:
-    outcomes = {"ours/mud/0/0": ours(0.02, points=POINTS[:2]), "faithful/mud/0/0": faithful()}
-    draw(outcomes, POINTS, CARRIER, tmp_path)
-    names = {"paths.png", "heading.png", "all.png", "steering.png", "lateral.png"}
-    assert {p.name for p in tmp_path.iterdir()} == names
 
 
 @pytest.mark.long

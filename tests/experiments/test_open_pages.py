@@ -14,6 +14,7 @@ from controller.process.warm_up import NullBus
 from controller.step import Controller
 from experiments.timing.open_pages import Window, judge
 from tests.controller.bench import DATABASE, SETTINGS, T
+from tests.operator_end import udp_end
 
 TICKS = 3000
 SECOND_NS = 10**9
@@ -35,13 +36,7 @@ def ticks_of(folder: Path, reads: bool) -> tuple[KeptBus, Loop, list[bytes], int
     """Ticks of a loop whose console reads every report, or none; the reports, and how many the kernel let go."""
     folder.mkdir()
     bus, controller, got, now = KeptBus(), Controller(SETTINGS, DATABASE), list[bytes](), SECOND_NS
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as setpoints,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as console,
-    ):
-        for each in (setpoints, console):
-            each.bind(("127.0.0.1", 0))
-            each.setblocking(False)
+    with udp_end() as setpoints, udp_end() as console:
         console.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         timing = LoopTiming(controller, None, lambda: now, lambda: now)
         loop = Loop(

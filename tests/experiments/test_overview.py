@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from experiments.common.overview import compared, page, read
-from experiments.common.published import COMPARISONS, LATER
+from experiments.common.published import COMPARISONS
 from experiments.common.registry import EXPERIMENTS
 from experiments.common.result_page import conclusion
 from experiments.common.standing import Standing
@@ -32,16 +32,6 @@ def test_missed_and_inconclusive_limits_are_not_met_and_paper_values_are_shown()
     assert "9 deg/m" in papers and "50 cm" not in papers
     assert "50 cm" in missed and 8 in numbers_in(missed) and missed.count("\n| [") == 1
     assert later.count("\n| [") == 0, "without our figure there is nothing to compare with"
-
-
-def test_a_later_system_stands_beside_the_nearest_figure_with_its_interval_and_command() -> None:
-    names = ("grasp-configs", "forwarding-mission")
-    text = page({n: read(DOCS / "results" / f"{n}.json") for n in names}, names, dict.fromkeys(names, Standing.STALE))
-    later = text.split("## ")[2]
-    assert later.count("\n| [") == len(LATER)
-    (kurinov,) = (line for line in later.splitlines() if "Kurinov" in line)
-    assert {94, 92.4, 95.3, 1024, 98.81, 97.4, 99.5, 504} <= set(numbers_in(kurinov))
-    assert "`timberhand experiment forwarding-mission --docs docs`" in kurinov
 
 
 def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and_ours_with_everything() -> None:

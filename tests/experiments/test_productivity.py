@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from autonomy.missions.validation import problems_of
-from experiments.productivity.experiment import AMOUNTS, KINDS, QUICK, draw, plan, task
+from experiments.productivity.experiment import AMOUNTS, KINDS, QUICK, plan, task
 from experiments.productivity.metrics import METRICS, cycles, gather
 from machine.loading.profile_file import load_profile
 
@@ -102,9 +101,3 @@ def test_a_task_can_be_driven_and_its_logs_do_not_touch_the_machine(kind: str) -
         else:
             ends = log.y_m + np.array([-0.5, 0.5]) * log.length_m * math.sin(log.yaw_rad)
             assert np.abs(ends).min() - 0.5 * log.diameter_m > half
-
-
-def test_the_plot_is_drawn(tmp_path: Path) -> None:
-    draw({"singles/0": run([grasp(0.0, 20.0)]), "landing/0": run([grasp(0.0, 9.0, 2, "UNLOAD", "x")])}, 5.0, tmp_path)
-    draw({"singles/0": run([])}, 5.0, tmp_path / "none")
-    assert (tmp_path / "cycles.png").exists() and (tmp_path / "none" / "cycles.png").exists()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from experiments.common.result import evaluate
-from experiments.vcan.experiment import METRICS, command, gather, noisy, read_output, read_summary
+from experiments.vcan.experiment import METRICS, gather, noisy, read_output, read_summary
 from machine.status.explanation import describe
 from machine.status.reasons import Reason
 
@@ -72,22 +71,3 @@ def test_a_stop_on_a_quiet_host_misses_the_limit_and_simulated_time_never_counts
 def test_a_run_that_is_not_done_is_missed_on_any_host() -> None:
     failed = {"demo-1": outcome(done=False, clock="simulated")}
     assert "demo_done" in evaluate(METRICS, gather(failed), noisy(failed))[0]
-
-
-def test_the_command_is_the_one_that_a_user_types() -> None:
-    assert command("mission", 4, Path("x"))[3:] == [
-        "mission",
-        "run",
-        "docs/examples/paper_b.geojson",
-        "--logs",
-        "3",
-        "--detector",
-        "perfect",
-        "--bus",
-        "vcan",
-        "--seed",
-        "4",
-        "--no-console",
-        "--out",
-        "x",
-    ]

@@ -9,41 +9,27 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from experiments.common import pool, ray_workers
-from experiments.common.campaign import line_of
 from experiments.common.checkpoint import Checkpoint
 from experiments.common.pool import Job
 from experiments.common.workers import TrialCost, Workers, overhead_s
-from experiments.plant.experiment import perform
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.experiments.mortal_trials import (
+    QUIET,
     mortal,
     plant_jobs,
     square_jobs,
+    table,
+    table_of_one_process,
 )
-
-QUIET = Console(quiet=True)
-
-
-def table(path: Path, function: Any, workers: Workers, jobs: list[Job]) -> bytes:
-    with Checkpoint(path, "run") as kept:
-        outcomes = pool.run(function, jobs, kept, workers, "trials", QUIET)
-    return "\n".join(line_of(name, outcome, ()) for name, outcome in outcomes.items()).encode()
-
-
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The table of one process."""
-    return table(tmp_path_factory.mktemp("alone") / "trials.jsonl", perform, Workers(), plant_jobs())
 
 
 @pytest.mark.long
-def test_two_processes_of_which_one_is_killed_give_the_same_table(tmp_path: Path, alone: bytes) -> None:
+def test_two_processes_of_which_one_is_killed_give_the_same_table(tmp_path: Path) -> None:
     there = table(tmp_path / "trials.jsonl", mortal(tmp_path / "marker"), Workers(2), plant_jobs())
-    assert (tmp_path / "marker").exists() and there == alone
+    assert (tmp_path / "marker").exists() and there == table_of_one_process(tmp_path)
 
 
 def test_a_run_with_more_trials_or_sources_changed_back_loses_none(tmp_path: Path) -> None:

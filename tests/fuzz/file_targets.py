@@ -168,16 +168,8 @@ def decoded(path: Path) -> Hashable:
     for entry in decoder.run(read_trace(path)):
         assert entry.text() is not None and entry.as_dict()
     told = decoder.summary()
-    names = (
-        "frames",
-        "broken",
-        "refused",
-        "lost_fast_packets",
-        "transported",
-        "lost_transported",
-        "unopened_transported",
-    )
-    return tuple(min(told[name], 2) for name in names)
+    names = "frames broken refused lost_fast_packets transported lost_transported unopened_transported"
+    return tuple(min(told[name], 2) for name in names.split())
 
 
 def bus_seeds() -> list[bytes]:
@@ -354,6 +346,7 @@ _TOML = (
     *(b"[1, 2]", b"{a = 1}"),
 )
 _DBC = (*_NUMBERS.split(), *b'64 7x @1+ @0- | m0 M " ; (0,0) [0|0]'.split(), b"BO_ ", b" SG_ ", b"BA_ ", b"VAL_ ")
+_XML_VALUE = rb'="([^"]*)"'
 _XML_NUMBERS = (*_XML, *_NUMBERS.split())
 _DBC_VALUE = rb"(-?[0-9.]+|[+-] )"
 _TOML_VALUE = rb"= *([^\n#]+)"
@@ -384,21 +377,8 @@ FILES = (
     _files("trace-blf", of_file("trace.blf", (), read_trace, counted), lambda: [blf_seed(), *reports(".blf")]),
     _files("trace-decoded", of_file("trace.log", (), decoded, tuple), bus_seeds),
     _files("dbc", of_file("fuzz.dbc", ConfigError, load_dbc, used), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),
-    _files(
-        "kcd",
-        of_file("fuzz.kcd", ConfigError, load_dbc, used),
-        kcd_seeds,
-        _XML_NUMBERS,
-        rb'="([^"]*)"',
-        1 << 14,
-    ),
-    _files(
-        "urdf",
-        of_file("fuzz.urdf", InputRefused, urdf_answers, all_finite),
-        urdf_seeds,
-        _XML_NUMBERS,
-        rb'="([^"]*)"',
-    ),
+    _files("kcd", of_file("fuzz.kcd", ConfigError, load_dbc, used), kcd_seeds, _XML_NUMBERS, _XML_VALUE, 1 << 14),
+    _files("urdf", of_file("fuzz.urdf", InputRefused, urdf_answers, all_finite), urdf_seeds, _XML_NUMBERS, _XML_VALUE),
     _files("checkpoint", _CHECKPOINT, checkpoint_seeds, _JSON, rb"[:,\[] *([-0-9.e+]+|\"[^\"]*\")"),
     _files("profile", _PROFILE, profile_seeds, _TOML, _TOML_VALUE),
     _files("guard-dbc", of_file("guard.dbc", (), guard_dbc, tuple), dbc_seeds, _DBC, _DBC_VALUE, 1 << 14),

@@ -7,32 +7,9 @@ import zlib
 from collections.abc import Hashable
 
 from autonomy.process.operator_commands import CommandReceiver, CommandRefused
-from can_dbc.messages import rgbd, tick_record
-from can_dbc.messages.crane import (
-    CraneSetpoint,
-    GrappleCommand,
-    Knot,
-    OperatorAction,
-    OperatorCommand,
-    SpoolKnot,
-    SpoolTest,
-)
+from can_dbc.messages import crane, mission, rgbd, tick_record
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused, is_operator_command
-from can_dbc.messages.mission import (
-    ChosenGrasp,
-    MissionAction,
-    MissionCommand,
-    MissionUpload,
-    decode_grasp,
-    decode_mission,
-    decode_mission_command,
-    decode_mission_upload,
-    encode_grasp,
-    encode_mission,
-    encode_mission_command,
-    encode_mission_upload,
-)
 from can_dbc.messages.record_ring import MAGIC as RING_MAGIC
 from can_dbc.messages.record_ring import RecordRing, RingReader
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
@@ -60,14 +37,14 @@ def with_crc(data: bytes) -> bytes:
 def datagrams() -> list[bytes]:
     """One of each kind, all valid at `NOW_NS`."""
     common = (5, HASH, NOW_NS)
-    knots = tuple(Knot(k * 100 * MS, (0.0, 0.5, -1.2, 0.6, 0.0), ZERO) for k in range(3))
+    knots = tuple(crane.Knot(k * 100 * MS, (0.0, 0.5, -1.2, 0.6, 0.0), ZERO) for k in range(3))
     drive = (200 * MS, Steering.WAYPOINT, 63.66, 19.9, 0.0, 0.0, 0.5, (0.3,) * 4, False, False)
     made = [
-        CraneSetpoint(*common, 200 * MS, GrappleCommand.HOLD, True, knots),
-        SpoolTest(*common, 200 * MS, 2, (SpoolKnot(0, 0.0), SpoolKnot(100 * MS, 20.0))),
+        crane.CraneSetpoint(*common, 200 * MS, crane.GrappleCommand.HOLD, True, knots),
+        crane.SpoolTest(*common, 200 * MS, 2, (crane.SpoolKnot(0, 0.0), crane.SpoolKnot(100 * MS, 20.0))),
         DriveSetpoint(*common, *drive),
-        OperatorCommand(*common, OperatorAction.ARM),
-        OperatorCommand(*common, OperatorAction.STOP),
+        crane.OperatorCommand(*common, crane.OperatorAction.ARM),
+        crane.OperatorCommand(*common, crane.OperatorAction.STOP),
         VehicleReport(
             *common, 1, 1, 0, 0, 5, 63.0, 19.0, 100.0, 4, 12, 0.02, 6, 1.0, 0.0, 7, 0.5, 0.1, 0.0, 0.0, (0.3,) * 4, 0
         ),
@@ -77,21 +54,27 @@ def datagrams() -> list[bytes]:
 
 def missions() -> list[bytes]:
     """Mission report, grasp, commands and an upload."""
-    commands = [MissionCommand(3, HASH, NOW_NS, action) for action in MissionAction]
-    grasp = ChosenGrasp(1, (0.1, 4.0, 0.5), 1.2, (3, 8), "two logs")
-    upload = MissionUpload(3, HASH, NOW_NS, "a mission.geojson", bytes(32))
+    commands = [mission.MissionCommand(3, HASH, NOW_NS, action) for action in mission.MissionAction]
+    grasp = mission.ChosenGrasp(1, (0.1, 4.0, 0.5), 1.2, (3, 8), "two logs")
+    upload = mission.MissionUpload(3, HASH, NOW_NS, "a mission.geojson", bytes(32))
     return [
-        encode_mission(MISSION_REPORT, 1, HASH, NOW_NS),
-        encode_grasp(grasp, 1, HASH, NOW_NS),
-        *map(encode_mission_command, commands),
-        encode_mission_upload(upload),
+        mission.encode_mission(MISSION_REPORT, 1, HASH, NOW_NS),
+        mission.encode_grasp(grasp, 1, HASH, NOW_NS),
+        *map(mission.encode_mission_command, commands),
+        mission.encode_mission_upload(upload),
     ]
 
 
 def decoded(data: bytes) -> Hashable:
     is_operator_command(data)
     found: list[Hashable] = []
-    for what in (decode, decode_mission, decode_mission_command, decode_mission_upload, decode_grasp):
+    for what in (
+        decode,
+        mission.decode_mission,
+        mission.decode_mission_command,
+        mission.decode_mission_upload,
+        mission.decode_grasp,
+    ):
         try:
             message = what(data)
             found.append(type(message).__name__)
@@ -117,7 +100,7 @@ def start_gate() -> Run:
             try:
                 message = gate.accept(data, now_ns, 0, operator)
                 found.append(type(message).__name__)
-                if isinstance(message, CraneSetpoint | SpoolTest):
+                if isinstance(message, crane.CraneSetpoint | crane.SpoolTest):
                     gate.mark_accepted(message)
             except RequestRefused as refused:
                 gate.count_refusal(refused.reason, refused.detail, now_ns)

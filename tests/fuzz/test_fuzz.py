@@ -39,6 +39,10 @@ def test_an_input_that_once_broke_a_contract(name: str, path: object) -> None:
     replay(TARGETS[name], unpacked(path.read_bytes()))  # type: ignore[attr-defined]
 
 
+def _target(run, *seeds: bytes) -> Target:
+    return Target("made", "inputs", lambda: run, lambda: seeds)
+
+
 def _fragile(limit: int = FOREVER) -> Target:
     def start():
         count = 0
@@ -79,35 +83,27 @@ def test_the_same_seed_gives_the_same_run_and_another_one_does_not() -> None:
 def test_a_hang_is_a_broken_contract(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.fuzz.engine.HANG_S", 0.05)
 
-    def start():
-        def run(data: bytes) -> object:
-            while True:
-                pass
+    def hangs(data: bytes) -> object:
+        while True:
+            pass
 
-        return run
-
-    target = Target("hangs", "inputs", start, lambda: [b""])
-    result = fuzz(target, runs=1)
-    assert result.failure
+    assert fuzz(_target(hangs, b""), runs=1).failure
     assert judged(lambda data: data, b"x") == b"x"
 
 
 @pytest.mark.parametrize("hidden", [False, True])
 def test_an_input_that_takes_much_memory_is_a_broken_contract(hidden: bool) -> None:
-    def start():
-        def run(data: bytes) -> object:
-            if not data.startswith(b"bomb"):
-                return 0
-            try:
-                return len(bytes(1000 << 20))
-            except MemoryError:
-                if not hidden:
-                    raise
-                return len(b"x" * (300 << 20))
+    def takes(data: bytes) -> object:
+        if not data.startswith(b"bomb"):
+            return 0
+        try:
+            return len(bytes(1000 << 20))
+        except MemoryError:
+            if not hidden:
+                raise
+            return len(b"x" * (300 << 20))
 
-        return run
-
-    target = Target("takes", "inputs", start, lambda: [b"", b"bomb"])
+    target = _target(takes, b"", b"bomb")
     assert fuzz(target, runs=1).failure == "" and fuzz(target, runs=2).failure
 
 
@@ -115,13 +111,9 @@ def test_a_result_that_grows_memory_is_a_broken_contract(monkeypatch: pytest.Mon
     monkeypatch.setattr("tests.fuzz.engine.GROWTH_BYTES", 1 << 20)
     kept: list[bytes] = []
 
-    def start():
-        def run(data: bytes) -> object:
-            kept.append(b"x" * (1 << 14))  # written, and more than a test before can have left free
-            return 0
+    def grows(data: bytes) -> object:
+        kept.append(b"x" * (1 << 14))  # written, and more than a test before can have left free
+        return 0
 
-        return run
-
-    target = Target("grows", "inputs", start, lambda: [b"x"])
-    found = fuzz(target, runs=6000)
+    found = fuzz(_target(grows, b"x"), runs=6000)
     assert found.failure and found.grown_bytes >> 20 in numbers_in(found.failure)

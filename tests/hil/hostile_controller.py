@@ -21,25 +21,12 @@ from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.status.modes import Mode
 from sim.plant import Plant
+from tests.hil.stand_ins import Idle
 
 CRANE = load("crane")
 FORGED = {CRANE.message(name).key: CRANE.message(name) for name in ("ValveCmdA", "ValveCmdB", "CtrlStatus")}
 ARM_KEY, SPOOL, RUN = 0xA, 2, 3
 MS = 1_000_000
-
-
-class Idle:
-    """A planner that wants nothing."""
-
-    def step(self, now_ns: int, report: Any, logs: Any) -> None:
-        return None
-
-
-class Nobody(Operator):
-    """An operator who presses nothing."""
-
-    def step(self, report: Any) -> None:
-        return None
 
 
 @dataclass

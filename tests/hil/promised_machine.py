@@ -26,6 +26,7 @@ from machine.joints import JOINTS
 from machine.profile import SPEED_HEADROOM_SHARE, joint
 from machine.status.modes import Mode
 from sim.kinematic import KinematicMachine
+from tests.hil.stand_ins import Blind
 
 MS: Final = 1_000_000
 PROFILE: Final = "palms_471"
@@ -119,13 +120,6 @@ class Person:
         return encode(OperatorCommand(self._sequence, SETTINGS.profile_hash, report.stamp_ns, action))
 
 
-class NoLogs:
-    """There are no logs to see."""
-
-    def detect(self, q: object, now_ns: int) -> None:
-        return None
-
-
 class PromiseBroken(AssertionError):
     """The spools did what the promise excludes."""
 
@@ -140,7 +134,7 @@ class PromisedMachine:
         self.mode, self.reason = Mode.BOOT, 0
         self.observer.on_report.append(self._note_report)
         self.system = Lockstep(
-            SETTINGS, build(profile_path(PROFILE)), self.plant, self.planner, self.person, self.observer, NoLogs()
+            SETTINGS, build(profile_path(PROFILE)), self.plant, self.planner, self.person, self.observer, Blind()
         )  # type: ignore[arg-type]
         self.planner.system = self.system
         self.lost: dict[str, int] = {}

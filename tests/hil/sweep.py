@@ -72,14 +72,6 @@ class Sweep:
 
 
 @dataclass
-class Quiet:
-    """Planner that asks for nothing."""
-
-    def step(self, now_ns: int, report: StateReport | None, logs: Any) -> None:
-        return None
-
-
-@dataclass
 class Watched:
     """A lockstep run with what happened on the bus and at the tip."""
 
@@ -126,6 +118,12 @@ class Watched:
 
     def tip(self) -> tuple[float, float, float]:
         return self.plant.world.tip()
+
+    def __enter__(self) -> Watched:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.plant.close()
 
 
 def watched(

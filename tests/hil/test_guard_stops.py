@@ -10,28 +10,14 @@ from controller.config import load as load_settings
 from controller.guard.__main__ import build, profile_path
 from controller.guard.verdicts import Verdict
 from hil.harness.lockstep import Lockstep, Observer
-from hil.harness.operator import Operator
 from sim.plant import Plant
+from tests.hil.stand_ins import Idle, Nobody
 
 pytestmark = pytest.mark.long
 SETTINGS = load_settings("palms_471")
 VALVE_NS = 150_000_000
 """Dead time and lag of a valve that closes."""
 DEADBAND = 0.12
-
-
-class Idle:
-    """A planner that wants nothing."""
-
-    def step(self, now_ns, report, logs):
-        return None
-
-
-class Nobody(Operator):
-    """An operator who presses nothing: the controller stays in STANDBY."""
-
-    def step(self, report):
-        return None
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.hil.hostile_controller import Hostile, Nobody, attack, is_armed, standing
+from tests.hil.hostile_controller import Hostile, attack, is_armed, standing
+from tests.hil.stand_ins import Nobody
 from tests.hil.sweep import Sweep, watched
 
 pytestmark = pytest.mark.long
@@ -89,12 +90,9 @@ def test_a_controller_that_goes_on_after_a_person_s_stop_is_cut_within_100_ms() 
 @pytest.mark.parametrize("machine", ["palms_471", "aoro_fc8"])
 def test_an_honest_stop_from_full_speed_is_not_cut(machine: str, joint: Joint) -> None:
     profile = load_profile(machine)
-    run = watched(machine, Sweep(profile, joint))
-    try:
+    with watched(machine, Sweep(profile, joint)) as run:
         limit = profile.joints[joint.name.lower()].speed_limit
         assert run.run(12.0, lambda: bool(run.reports) and abs(run.reports[-1].velocity[joint]) > 0.9 * limit)
         run.system.press(stop_at(run.system.now_ns, run.system._settings.profile_hash))
         assert not run.run(1.0, lambda: not run.system._guard.enabled), run.system._guard.verdict
         assert run.mode == Mode.STOP and run.reason == Reason.OPERATOR_STOP
-    finally:
-        run.plant.close()

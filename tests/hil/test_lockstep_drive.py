@@ -11,8 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from can_dbc.messages.crane import StateReport
-from can_dbc.messages.datagrams import encode
-from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
+from can_dbc.messages.vehicle import Driving, Steering, VehicleReport
 from controller.config import load as load_settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
@@ -29,6 +28,7 @@ from recorder.recorder import Recorder
 from sim.geometry import LocalFrame
 from sim.kinematic import KinematicMachine
 from sim.plant import Plant
+from tests.hil.stand_ins import Blind, Drives
 
 pytestmark = pytest.mark.long
 MS = 1_000_000
@@ -37,53 +37,6 @@ PROFILE = SETTINGS.profile
 CARRIER = PROFILE.carrier
 assert isinstance(CARRIER, Carrier)
 SITE = LocalFrame(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 0.0)
-HIGH = CARRIER.arm_transport_m
-
-
-class Drives:
-    """A planner that asks for what ``say`` gives every 50 ms, as long as it gives something."""
-
-    def __init__(self, say: Callable[[VehicleReport, int], dict[str, object] | None]) -> None:
-        self.vehicle: VehicleReport | None = None
-        self.heard: list[VehicleReport] = []
-        self._say, self._sequence, self._sent_ns, self._begin_ns = say, 0, 0, 0
-
-    def hear(self, report: VehicleReport) -> None:
-        self.vehicle = report
-        self.heard.append(report)
-
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple) -> bytes | None:
-        armed = report is not None and report.mode in (Mode.ARMED, Mode.ACTIVE)
-        if not armed or self.vehicle is None or now_ns - self._sent_ns < 50 * MS:
-            return None
-        self._begin_ns = self._begin_ns or now_ns
-        asked = self._say(self.vehicle, now_ns - self._begin_ns)
-        if asked is None:
-            return None
-        self._sequence, self._sent_ns = self._sequence + 1, now_ns
-        values = {
-            "sequence": self._sequence,
-            "profile_hash": SETTINGS.profile_hash,
-            "stamp_ns": now_ns,
-            "lease_ns": 200 * MS,
-            "steering": Steering.WAYPOINT,
-            "latitude_deg": CARRIER.site_lat_deg,
-            "longitude_deg": CARRIER.site_lon_deg,
-            "articulation_rad": 0.0,
-            "articulation_rate_rad_s": 0.0,
-            "speed_m_s": 0.0,
-            "heights_m": (HIGH,) * 4,
-            "float_front": False,
-            "float_rear": False,
-        } | asked
-        return encode(DriveSetpoint(**values))  # type: ignore[arg-type]
-
-
-class Blind:
-    """Eyes that see no logs."""
-
-    def detect(self, q, now_ns):
-        return None
 
 
 def system_of(plant, planner: Drives, recorder: Recorder | None = None) -> tuple[Lockstep, list[StateReport]]:

@@ -1,18 +1,37 @@
-"""A short mission on the plant, with both activity managers."""
+"""Short missions on the plant: with both activity managers, sorted, and with a guard that wakes at every frame."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from rich.console import Console
 from typer.testing import CliRunner
 
+import hil.missions.lockstep as lockstep
+from autonomy.grasp.pile_planner import PilePlanner
 from autonomy.grasp.planners import PlannerChoice
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.checkpoint import CheckpointFile, read_checkpoint
+from autonomy.manager.transition_table import State
+from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options
+from can_dbc.frame import Frame, RawFrame
+from controller.guard.__main__ import build as build_guard
+from controller.guard.guard import Guard
+from controller.guard.verdicts import Verdict
+from hil.harness.display import Display
+from hil.missions.lockstep import MissionRun
+from hil.missions.site import site_of
 from hil.missions.summary import MissionSummary
 from host.exit_codes import ExitCode
-from tests.hil.short_missions import mission_file
+from machine.loading.profile_file import load_profile, profile_hash
+from tests.hil.short_missions import PLANE, mission_file, point
+from tests.hil.stand_ins import Idle
 from timberhand.cli import app
 
 
@@ -82,3 +101,87 @@ def test_a_log_beside_the_route_is_brought_to_its_end(tmp_path: Path, manager: s
         maps = [message for _, _, message in make_reader(file).iter_messages(["/logs"])]
     assert len(maps) > told["seconds"] / 3, "the log map, as in a live run"
     assert len(maps[0].data) < max(len(found.data) for found in maps), "the log is found on the way"
+
+
+class FrameByFrame:
+    """The guard of a run, one step for each frame; ``refused`` are the verdicts after it first was GOOD."""
+
+    def __init__(self, guard: Guard) -> None:
+        self.keys_of_buses = guard.keys_of_buses
+        self.refused: list[tuple[Verdict, int]] = []
+        self._guard, self._ready = guard, False
+        self.hear = guard.hear
+
+    def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
+        sent: list[RawFrame] = []
+        for dealt in (*([frame] for frame in frames), []):
+            sent += self._guard.step(now_ns, dealt)
+            self._ready = self._ready or self._guard.enabled
+            if self._ready and not self._guard.enabled:
+                self.refused.append((self._guard.verdict, self._guard.axis))
+        return sent
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_a_mission_with_a_step_of_the_guard_for_every_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Driving, swing arms and crane: the keys and the motions of a tick are in several frames."""
+    guards: list[FrameByFrame] = []
+
+    def built(profile: Path) -> FrameByFrame:
+        guards.append(FrameByFrame(build_guard(profile)))
+        return guards[-1]
+
+    monkeypatch.setattr(lockstep, "build_guard", built)
+    path = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0))
+    result = CliRunner().invoke(app, ["mission", "run", str(path), "--lockstep", "--out", str(tmp_path / "run")])
+    assert [guard.refused for guard in guards] == [[]], result.output[-2000:]
+    told = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert result.exit_code == 0 and told["loaded"] == 1 and told["stops"] == 0
+
+
+LIE = (("saw logs", 8.0, 4.2), ("pulpwood", 16.0, -4.2))
+LANDINGS = (("saw logs", 34.0, 14.0), ("pulpwood", 34.0, -14.0))
+DEAD_S = 3.0
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_each_assortment_reaches_its_landing_although_the_planner_restarts(tmp_path: Path) -> None:
+    """It dies with the load on board; another resumes from the checkpoint file."""
+    known = tuple(KnownLog(point(x, y), "", 90.0, 2.0, 0.25, "", kind) for kind, x, y in LIE)
+    landings = tuple(Landing(point(x, y), kind, None, (kind,)) for kind, x, y in LANDINGS)
+    way = (point(0.0, 0.0), point(26.0, 0.0))
+    told = ForwardingMission("sorted", way, (), landings, known, Options(logs="listed", sort_by_assortment=True))
+    profile, book = load_profile("aoro_fc8"), tmp_path / "progress.json"
+    site = site_of(told, profile, 1, "nominal")
+    plant = site.plant(profile, "nominal", 1)
+    with Display(Console(quiet=True), "sorted") as display:
+        run = MissionRun(told, "aoro_fc8", profile, plant, None, display, "ours", site)
+        system, first = run.system, run.manager
+        while first.state is not State.HAUL and system.now_ns < 400e9:
+            system.advance()
+        assert first.state is State.HAUL and first.tally.loaded == 1, (first.state, first.failure)
+        CheckpointFile(book).write(first.progress(), system.now_ns, 10**18)
+        run.manager = Idle()  # type: ignore[assignment]
+        dead_ns = system.now_ns
+        while system.now_ns < dead_ns + int(DEAD_S * 1e9):
+            system.advance()
+        assert plant.world.carrier.speed_m_s == pytest.approx(0.0, abs=0.01), "the machine does not drive"
+        progress = read_checkpoint(book, told, system.now_ns, 10**18 + int(DEAD_S * 1e9))
+        run.manager = ActivityManager(
+            profile,
+            profile_hash(profile),
+            told,
+            selector=PlannerSelection(SamplingPlanner()),
+            unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
+            progress=progress,
+        )
+        run.manager.auto()
+        summary = run.run(1500.0, str(tmp_path))
+    assert summary.finished, summary.failure
+    assert summary.loaded == 2 and not summary.given_up and summary.in_bunk == 0
+    east, north, _ = PLANE.local(site.latitude_deg, site.longitude_deg)
+    for state, (_, x, y) in zip(plant.world.log_bodies.states(), LANDINGS, strict=True):
+        there = (state.position_m[0] + east, state.position_m[1] + north)
+        assert math.dist(there, (x, y)) < 1.6, "on the pile of its assortment"

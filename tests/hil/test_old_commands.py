@@ -10,11 +10,9 @@ from collections.abc import Iterator
 import pytest
 
 from autonomy.crane_job.activity import Activity
-from can_dbc.messages.crane import StateReport
-from can_dbc.messages.datagrams import encode
-from can_dbc.messages.vehicle import DriveSetpoint, Steering
+from can_dbc.messages.vehicle import Steering
 from can_dbc.protocols.punctuality import MAX_DELAY_NS
-from controller.config import Settings, load
+from controller.config import load
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import START_NS, Lockstep, Observer
@@ -24,6 +22,7 @@ from hil.wire.node import Flight, Segment
 from machine.status.modes import Mode
 from sim.kinematic import KinematicMachine
 from sim.plant import Plant
+from tests.hil.stand_ins import Blind, Drives
 
 pytestmark = pytest.mark.long
 
@@ -151,38 +150,6 @@ def test_an_open_cable_to_the_controller_stops_the_valves_within_100_ms_for_good
     assert max(age_ns for _, age_ns in crane.executed) <= 30 * MS, "nothing old has left the queue"
 
 
-class Drives:
-    """A planner that drives ahead."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._settings, self._sequence, self._sent_ns = settings, 0, 0
-
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[object, ...]) -> bytes | None:
-        armed = report is not None and report.mode in (Mode.ARMED, Mode.ACTIVE)
-        if not armed or now_ns - self._sent_ns < 50 * MS:
-            return None
-        self._sequence, self._sent_ns = self._sequence + 1, now_ns
-        carrier = self._settings.profile.carrier
-        assert carrier is not None
-        return encode(
-            DriveSetpoint(
-                sequence=self._sequence,
-                profile_hash=self._settings.profile_hash,
-                stamp_ns=now_ns,
-                lease_ns=200 * MS,
-                steering=Steering.ARTICULATION,
-                latitude_deg=carrier.site_lat_deg,
-                longitude_deg=carrier.site_lon_deg,
-                articulation_rad=0.0,
-                articulation_rate_rad_s=0.0,
-                speed_m_s=0.5,
-                heights_m=(carrier.arm_transport_m,) * 4,
-                float_front=False,
-                float_rear=False,
-            )
-        )
-
-
 def test_bus_off_of_the_controller_stops_the_valves_within_100_ms_for_good(crane: Crane) -> None:
     """Its frames fail 32 times; it recovers by itself after 0.1 s, and does not go on."""
     crane.start()
@@ -196,26 +163,13 @@ def test_bus_off_of_the_controller_stops_the_valves_within_100_ms_for_good(crane
     assert max(age_ns for _, age_ns in crane.executed) <= 30 * MS, "nothing old has left the queue"
 
 
-class Blind:
-    """Eyes that see no logs."""
-
-    def detect(self, q: object, now_ns: int) -> None:
-        return None
-
-
 def test_the_carrier_brakes_when_its_commands_come_60_ms_late_in_order() -> None:
     settings = load("aoro_fc8")
     plant = KinematicMachine(settings.profile, 3, step_ns=2_500_000)
     operator = Operator(settings.profile_hash, lambda *_: None, 0)
-    system = Lockstep(
-        settings,
-        build_guard(profile_path("aoro_fc8")),
-        plant,
-        Drives(settings),
-        operator,
-        Observer(),
-        Blind(),  # type: ignore[arg-type]
-    )
+    planner = Drives(lambda *_: {"steering": Steering.ARTICULATION, "speed_m_s": 0.5})
+    observer, guard = Observer(None, [], [planner.hear]), build_guard(profile_path("aoro_fc8"))
+    system = Lockstep(settings, guard, plant, planner, operator, observer, Blind())  # type: ignore[arg-type]
     node, arms = plant.vehicle_node, plant.arms
     assert node is not None and arms is not None
     while node.drive_m_s == 0.0:

@@ -27,6 +27,7 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.console.vehicle_reports import VEHICLE
+from tests.operator_end import udp_end
 
 PROFILE = load_profile("palms_471")
 HASH = profile_hash(PROFILE)
@@ -58,9 +59,7 @@ def wall() -> Wall:
 @pytest.fixture
 def hears() -> Iterator[socket.socket]:
     """What a page hears."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
-        heard.bind(("127.0.0.1", 0))
-        heard.setblocking(False)
+    with udp_end() as heard:
         yield heard
 
 

@@ -6,15 +6,18 @@ import math
 
 import pytest
 
+from can_dbc.dbc.codec import load
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
+from hil.harness.lockstep import SLICE_NS
 from machine.geometry.kinematics import max_reach_m
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.hil.sweep import LEASE_NS, Hold, Quiet, Sweep, Watched, watched
+from tests.hil.stand_ins import Idle
+from tests.hil.sweep import LEASE_NS, Hold, Sweep, Watched, watched
 
 pytestmark = pytest.mark.long
 MS = 1_000_000
@@ -35,8 +38,7 @@ def press(run: Watched, action: OperatorAction, sequence: int = 1000) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_planner_that_freezes_at_full_speed_costs_its_lease_and_a_ramp(name, record_property):
     planner = Sweep(load_profile(name), Joint.SLEW, silent_s=2.0)
-    run = watched(name, planner)
-    try:
+    with watched(name, planner) as run:
         assert run.run(20.0, lambda: planner.last_ns and run.system.now_ns > planner.last_ns + 60 * MS)
         assert full_speed(run, planner)
         begin, turned = run.tip(), run.reports[-1].position[Joint.SLEW]
@@ -56,30 +58,24 @@ def test_a_planner_that_freezes_at_full_speed_costs_its_lease_and_a_ramp(name, r
         still_s = (LEASE_NS + ramp_ns) * 1e-9 + spec.valve.delay_s + spec.valve.lag_s + spec.valve.oil_s
         assert travel_rad < spec.speed_limit * still_s
         assert (run.mode, run.reason) == (Mode.STOP, Reason.LEASE_LOST), "and nothing is said to run away"
-    finally:
-        run.plant.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("j", [Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT])
 def test_a_hard_stop_at_full_speed_rings_and_nothing_is_said_to_run_away(name, j):
     planner = Sweep(load_profile(name), j, silent_s=20.0)
-    run = watched(name, planner, seed=2 + j)
-    try:
+    with watched(name, planner, seed=2 + j) as run:
         assert run.run(20.0, lambda: full_speed(run, planner)), run.reports[-1]
         press(run, OperatorAction.STOP)
         run.run(8.0)
         assert (run.mode, run.reason) == (Mode.STOP, Reason.OPERATOR_STOP)
-    finally:
-        run.plant.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("share", [0.04, 0.3, 1.0])
 def test_a_valve_stuck_open_is_cut_while_armed_and_while_stopped(name, share, record_property):
-    run = watched(name, Quiet(), seed=4, blind=True)
-    spec = joint(run.plant.profile, Joint.SLEW)
-    try:
+    with watched(name, Idle(), seed=4, blind=True) as run:
+        spec = joint(run.plant.profile, Joint.SLEW)
         assert run.run(20.0, lambda: run.mode == Mode.ARMED)
         run.run(3.0)
         assert run.mode == Mode.ARMED
@@ -94,16 +90,13 @@ def test_a_valve_stuck_open_is_cut_while_armed_and_while_stopped(name, share, re
         record_property("travel_m", travel_m)
         print(name, share, found_ms, travel_m)
         assert travel_m < 0.20
-    finally:
-        run.plant.close()
 
 
 @pytest.mark.parametrize("blind", [True, False])
 @pytest.mark.parametrize("name", NAMES)
 def test_hand_levers_move_a_machine_in_standby_without_a_fault(name, blind):
     """The levers work although the guard, which sees them too, has taken its part of the pilot supply away."""
-    run = watched(name, Quiet(), seed=5, blind=blind)
-    try:
+    with watched(name, Idle(), seed=5, blind=blind) as run:
         assert run.run(20.0, lambda: run.mode == Mode.ARMED)
         press(run, OperatorAction.DISARM)
         run.system.operator._max_stops = -1  # nobody arms it again
@@ -122,15 +115,12 @@ def test_hand_levers_move_a_machine_in_standby_without_a_fault(name, blind):
         run.plant.estop.reset()
         run.run(1.0)
         assert run.reason == Reason.NONE
-    finally:
-        run.plant.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("j", [Joint.SLEW, Joint.LIFT, Joint.TILT])
 def test_an_encoder_that_drifts_half_a_degree_a_second_holds_before_the_tip_wanders(name, j):
-    run = watched(name, Hold(load_profile(name)), seed=3)
-    try:
+    with watched(name, Hold(load_profile(name)), seed=3) as run:
         assert run.run(20.0, lambda: run.mode == Mode.ACTIVE)
         run.run(4.0)
         assert run.mode == Mode.ACTIVE
@@ -144,5 +134,23 @@ def test_an_encoder_that_drifts_half_a_degree_a_second_holds_before_the_tip_wand
         assert run.reason in (Reason.ENCODER_DRIFT, Reason.JOINT_RUNAWAY)
         print(name, j.name, run.reason, (run.system.now_ns - since_ns) / MS, math.dist(begin, run.tip()))
         assert math.dist(begin, run.tip()) < 0.02
-    finally:
-        run.plant.close()
+
+
+@pytest.mark.parametrize("lost", ["ValveCmdA", "ValveCmdB"])
+def test_neutral_within_100_ms_of_losing_half_a_command(lost: str) -> None:
+    """Of every spool, whichever of the two valve commands is gone."""
+    with watched("palms_471", Sweep(load_profile("palms_471"), Joint.SLEW), truth="nominal") as run:
+        key, gone = load("crane").message(lost).key, []
+        assert run.run(8.0, lambda: abs(run.plant.valve.outputs_pct[0]) > 30.0)
+        run.system._observer.on_outputs.append(
+            lambda outputs, now_ns: outputs.frames.__setitem__(
+                slice(None), [frame for frame in outputs.frames if frame[0] != key]
+            )
+        )
+        lost_ns = run.system.now_ns
+        for _ in range(200_000_000 // SLICE_NS):
+            run.system.advance()
+            gone.append(any(run.plant.valve.outputs_pct))
+        neutral_ms = (gone.index(False) + 1) * SLICE_NS / 1e6
+        assert not any(gone[gone.index(False) :]) and run.system.now_ns > lost_ns
+        assert neutral_ms < 100.0

@@ -138,6 +138,8 @@ def test_the_preemption_model_is_read_from_the_kernel(
 
 
 # ------------------------------------------------------------------------------- findings
+CPUS, CPU3 = "sys__devices__system__cpu__", "sys__devices__system__cpu__cpu3__"
+CONF = "etc__timberhand__timberhand.conf"
 PINNED = "etc__systemd__system__timberhand-controller.service.d__50-processor.conf"
 CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
     ("priority", {"proc__self__limits": "Max realtime priority  0  0\n"}, Severity.CHANGE, "FIFO 0", "rtprio 90"),
@@ -152,63 +154,45 @@ CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
     ("machine", {"proc__cpuinfo": "flags : fpu hypervisor"}, Severity.ADVICE, "", ""),
     (
         "clock rate",
-        {"sys__devices__system__cpu__cpu3__cpufreq__scaling_governor": "powersave"},
+        {CPU3 + "cpufreq__scaling_governor": "powersave"},
         Severity.CHANGE,
         "powersave",
         "tune.sh --apply --cpu 3",
     ),
-    ("processor", {"sys__devices__system__cpu__isolated": ""}, Severity.CHANGE, "3", "isolcpus=managed_irq,domain,3"),
+    ("processor", {CPUS + "isolated": ""}, Severity.CHANGE, "3", "isolcpus=managed_irq,domain,3"),
     (
         "processor",
-        {"sys__devices__system__cpu__nohz_full": "", "proc__cmdline": "rcu_nocbs=3"},
+        {CPUS + "nohz_full": "", "proc__cmdline": "rcu_nocbs=3"},
         Severity.ADVICE,
         "nohz_full",
         "nohz_full=3",
     ),
     (
         "processor",
-        {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n", "sys__devices__system__cpu__isolated": ""},
+        {CONF: "CONTROLLER_OPTIONS=\n", CPUS + "isolated": ""},
         Severity.ADVICE,
         "",
         "service install --cpu 3",
     ),
+    ("processor", {CONF: "CONTROLLER_OPTIONS=\n"}, Severity.CHANGE, "3", "service install --cpu 3"),
     (
         "processor",
-        {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n"},
-        Severity.CHANGE,
-        "3",
-        "service install --cpu 3",
-    ),
-    (
-        "processor",
-        {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n", PINNED: "[Service]\nCPUAffinity=2\n"},
+        {CONF: "CONTROLLER_OPTIONS=\n", PINNED: "[Service]\nCPUAffinity=2\n"},
         Severity.CHANGE,
         "2",
         "service install --cpu any",
     ),
-    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "9", "nano"),
-    (
-        "sibling",
-        {"sys__devices__system__cpu__cpu3__topology__thread_siblings_list": "1,3"},
-        Severity.ADVICE,
-        "1",
-        "cpu1/online",
-    ),
+    ("processor", {CONF: "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "9", "nano"),
+    ("sibling", {CPU3 + "topology__thread_siblings_list": "1,3"}, Severity.ADVICE, "1", "cpu1/online"),
     ("interrupts", {"proc__irq__130__smp_affinity_list": "0-3"}, Severity.CHANGE, "130", "tune.sh"),
     (
         "irqbalance",
-        {"proc__901__stat": "901 (irqbalance) S 1", "sys__devices__system__cpu__isolated": ""},
+        {"proc__901__stat": "901 (irqbalance) S 1", CPUS + "isolated": ""},
         Severity.CHANGE,
         "3",
         "IRQBALANCE_BANNED_CPULIST=3",
     ),
-    (
-        "sleep",
-        {"sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0"},
-        Severity.ADVICE,
-        "890 us",
-        "--dma-latency",
-    ),
+    ("sleep", {CPU3 + "cpuidle__state1__disable": "0"}, Severity.ADVICE, "890 us", "--dma-latency"),
     ("delivery", {"proc__15__stat": GOOD["proc/15/stat"].replace(" 60 1 ", " 0 0 ")}, Severity.ADVICE, "", "chrt"),
     ("task groups", {"proc__sys__kernel__sched_autogroup_enabled": "1"}, Severity.ADVICE, "session", "=0"),
     ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "-1"}, Severity.ADVICE, "", "950000"),
@@ -252,13 +236,7 @@ def test_a_suggested_change_names_its_values_and_its_command(
             },
             "memory",
         ),
-        (
-            {
-                "etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n",
-                "sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0",
-            },
-            "sleep",
-        ),
+        ({CONF: "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n", CPU3 + "cpuidle__state1__disable": "0"}, "sleep"),
         (
             {"proc__901__stat": "901 (irqbalance) S 1", "etc__default__irqbalance": "IRQBALANCE_BANNED_CPULIST=2-3"},
             "irqbalance",

@@ -1,4 +1,4 @@
-"""The control loop on Debian's PREEMPT_RT kernel, in qemu."""
+"""The labs: what a run on Debian's PREEMPT_RT kernel must have shown, and the moving states of the service lab."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import pytest
 
 from host.rt_lab import guest, host
 from host.rt_lab.host import EXPECTED, POSITIVE, evaluate
+from host.service_lab.trial import MOVING
+from sim.nodes.valve import ValveState
 
 GOOD: dict[str, Any] = {
     **EXPECTED,
@@ -43,3 +45,7 @@ def test_each_check_can_fail(name: str, value: object) -> None:
 
 def test_guest_and_host_name_the_same_modules() -> None:
     assert guest.MODULES == host.MODULES
+
+
+def test_the_moving_states_of_the_service_lab_are_those_of_the_valve_node() -> None:
+    assert set(MOVING) == {ValveState.ACTIVE, ValveState.RAMP}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import pytest
 
 from machine.loading.profile_file import load_profile
@@ -12,35 +14,42 @@ from sim.wood.log_shape import LogSpec
 from sim.world import World
 
 
-def watched(machine: str, scene, steps: int, before=None) -> tuple[World, Evaluation]:
-    profile, truth = load_profile(machine), load_truth("nominal", 0, machine)
-    world = World(profile, truth, 0, scene(profile, truth.wood))
-    evaluator = Evaluator(world)
-    if before:
-        before(world)
-    still = [0.0] * len(world.functions)
-    for _ in range(steps):
-        world.step(still)
-        evaluator.watch()
-    return world, evaluator.evaluate()
+@pytest.fixture
+def watched() -> Iterator[Callable[..., tuple[World, Evaluation]]]:
+    """Makes worlds that are stepped and evaluated."""
+    worlds: list[World] = []
+
+    def watch(machine: str, scene, steps: int, before=None) -> tuple[World, Evaluation]:
+        profile, truth = load_profile(machine), load_truth("nominal", 0, machine)
+        worlds.append(world := World(profile, truth, 0, scene(profile, truth.wood)))
+        evaluator = Evaluator(world)
+        if before:
+            before(world)
+        still = [0.0] * len(world.functions)
+        for _ in range(steps):
+            world.step(still)
+            evaluator.watch()
+        return world, evaluator.evaluate()
+
+    yield watch
+    for world in worlds:
+        world.close()
 
 
-def test_logs_in_the_bunk_are_done_once_at_rest_and_one_beside_it_is_not():
+def test_logs_in_the_bunk_are_done_once_at_rest_and_one_beside_it_is_not(watched):
     def scene(profile, wood):
         ground = LogSpec(-1.8, 4.4, 0.3, 2.6, 0.2, 600.0, z_m=0.004)
         return (*arrangement("bunk", profile, wood, 0, 6), ground)
 
-    world, early = watched("palms_471", scene, 40)
+    _, early = watched("palms_471", scene, 40)
     assert not early.success and early.loaded == 0 and all(v.in_bunk for v in early.logs[:6])
-    world.close()
-    world, verdict = watched("palms_471", scene, 160)
+    _, verdict = watched("palms_471", scene, 160)
     assert [v.done for v in verdict.logs] == [True] * 6 + [False] and verdict.loaded == 6 and not verdict.success
     assert not any(v.lifted or v.left_ground for v in verdict.logs) and verdict.time_s == pytest.approx(0.4)
     assert verdict.tip_margin_m is None and verdict.max_grip_n == 0.0 and verdict.max_penetration_m == 0.0
-    world.close()
 
 
-def test_a_log_leaning_out_of_the_bunk_is_not_in_it():
+def test_a_log_leaning_out_of_the_bunk_is_not_in_it(watched):
     def across(world):
         b = world.profile.bunk
         world.log_bodies.wake()
@@ -48,32 +57,28 @@ def test_a_log_leaning_out_of_the_bunk_is_not_in_it():
         at = (*b.center_m, b.floor_z_m + b.stake_height_m - 0.2)
         world.client.resetBasePositionAndOrientation(world.log_bodies.body_ids[0], at, turn)
 
-    world, verdict = watched("palms_471", lambda p, w: arrangement("bunk", p, w, 0, 1), 1, across)
+    _, verdict = watched("palms_471", lambda p, w: arrangement("bunk", p, w, 0, 1), 1, across)
     assert not verdict.logs[0].in_bunk
-    world.close()
 
 
-def test_the_tip_sags_under_a_load_unlike_the_rigid_chain():
+def test_the_tip_sags_under_a_load_unlike_the_rigid_chain(watched):
     def load(world):
         link = world.crane.link["rotator"]
         own = world.client.getDynamicsInfo(world.crane.body, link)[0]
         world.client.changeDynamics(world.crane.body, link, mass=own + 250.0)
 
-    world, verdict = watched("palms_471", lambda p, w: (), 1200, load)
-    empty_world, empty = watched("palms_471", lambda p, w: (), 40)
+    _, verdict = watched("palms_471", lambda p, w: (), 1200, load)
+    _, empty = watched("palms_471", lambda p, w: (), 40)
     assert empty.sag_m < 2e-3 and 0.02 < verdict.sag_m <= verdict.max_sag_m < 0.3
     assert verdict.tip_m[2] < verdict.rigid_tip_m[2] - 0.01
     reach = (verdict.tip_m[0] ** 2 + verdict.tip_m[1] ** 2) ** 0.5
     assert verdict.max_foot_moment_nm - empty.max_foot_moment_nm > 0.9 * 250.0 * 9.81 * reach
     assert verdict.max_load_kg > 240.0 > 20.0 > empty.max_load_kg
-    world.close()
-    empty_world.close()
 
 
-def test_a_loaded_carrier_is_evaluated_in_its_own_frame():
+def test_a_loaded_carrier_is_evaluated_in_its_own_frame(watched):
     world, verdict = watched("aoro_fc8", lambda p, w: arrangement("bunk", p, w, 1, 8), 400)
     assert all(v.in_bunk and v.released for v in verdict.logs)
     assert verdict.tip_margin_m is not None and 0.3 < verdict.tip_margin_m < 1.5
     base, _ = world.base_pose()
     assert base[2] > 0.8  # so the bunk's heights are not the world's
-    world.close()

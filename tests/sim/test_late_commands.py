@@ -95,6 +95,15 @@ def arms() -> Line:
     return Line(ArmNode(MACHINE, [], lambda: True), MACHINE, 20 * MS, commands, ALIVE)
 
 
+@pytest.fixture(params=[valve, vehicle, arms])
+def line(request: pytest.FixtureRequest) -> Line:
+    """Each node, which its commander has moved for 200 ms."""
+    made: Line = request.param()
+    made.run(200)
+    assert moves(made)
+    return made
+
+
 def moves(line: Line) -> bool:
     node = line.node
     if isinstance(node, ValveNode):
@@ -102,26 +111,23 @@ def moves(line: Line) -> bool:
     return node.drive_m_s != 0.0 if isinstance(node, VehicleNode) else any(node.spools)
 
 
-NODES: list[Callable[[], Line]] = [valve, vehicle, arms]
+def timed_out(line: Line) -> bool:
+    node = line.node
+    if isinstance(node, ValveNode):
+        return (node.exit, node.valve_state) == (ExitCode.COMMAND_TIMEOUT, ValveState.FAULT)
+    return node.fault is VehicleFault.COMMAND_TIMEOUT if isinstance(node, VehicleNode) else node.state is ArmState.FAULT
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_commands_that_are_delayed_by_60_ms_in_order_are_not_executed(make: Callable[[], Line]) -> None:
+def test_commands_that_are_delayed_by_60_ms_in_order_are_not_executed(line: Line) -> None:
     """The delay grows slowly, as behind a queue that fills; no gap is long enough to be a time-out."""
-    line = make()
-    line.run(200)
-    assert moves(line)
     line.run(300, per_ms=0.2)
     line.run(100)
-    assert line.delay_ns == 60 * MS and not moves(line)
+    assert line.delay_ns == 60 * MS and not moves(line) and timed_out(line)
     line.run(500)
     assert not moves(line)
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_a_node_is_neutral_within_100_ms_of_the_command_that_came_too_late(make: Callable[[], Line]) -> None:
-    line = make()
-    line.run(200)
+def test_a_node_is_neutral_within_100_ms_of_the_command_that_came_too_late(line: Line) -> None:
     while line.age_ns <= 40 * MS:
         line.run(2.5, per_ms=0.5)
         assert moves(line) or line.age_ns > 40 * MS
@@ -131,19 +137,13 @@ def test_a_node_is_neutral_within_100_ms_of_the_command_that_came_too_late(make:
     assert line.now_ns - began_ns <= 100 * MS
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_commands_that_are_delayed_by_30_ms_are_executed(make: Callable[[], Line]) -> None:
-    line = make()
-    line.run(200)
+def test_commands_that_are_delayed_by_30_ms_are_executed(line: Line) -> None:
     line.run(300, per_ms=0.1)
     line.run(1000)
     assert moves(line)
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_punctual_commands_move_again_only_after_a_disarm(make: Callable[[], Line]) -> None:
-    line = make()
-    line.run(200)
+def test_punctual_commands_move_again_only_after_a_disarm(line: Line) -> None:
     line.run(300, per_ms=0.2)
     line.delay_ns = 0
     line.run(1000)
@@ -155,26 +155,8 @@ def test_punctual_commands_move_again_only_after_a_disarm(make: Callable[[], Lin
     assert moves(line)
 
 
-def test_the_nodes_name_the_time_out() -> None:
-    crane, carrier, swing = valve(), vehicle(), arms()
-    for line in (crane, carrier, swing):
-        line.run(200)
-        line.run(300, per_ms=0.2)
-        line.run(100)
-    assert (crane.node.exit, crane.node.valve_state) == (ExitCode.COMMAND_TIMEOUT, ValveState.FAULT)
-    assert (carrier.node.fault, swing.node.state) == (VehicleFault.COMMAND_TIMEOUT, ArmState.FAULT)
-
-
-def with_checksum(data: bytes, data_ids: bytes) -> bytes:
-    return bytes((frame_crc(data, data_ids),)) + data[1:]
-
-
-@pytest.mark.parametrize("make", NODES)
-def test_repeated_commands_only_grow_old(make: Callable[[], Line]) -> None:
+def test_repeated_commands_only_grow_old(line: Line) -> None:
     """The same counter again, with a good checksum."""
-    line = make()
-    line.run(200)
-    assert moves(line)
     kept: dict[int, bytes] = {}
     line.damage = lambda n, key, data: [kept.setdefault(key, data)]
     began_ns = line.now_ns
@@ -185,42 +167,31 @@ def test_repeated_commands_only_grow_old(make: Callable[[], Line]) -> None:
     assert not moves(line)
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_a_single_lost_or_corrupt_command_is_tolerated(make: Callable[[], Line]) -> None:
-    line = make()
-    line.run(200)
+def test_a_single_lost_or_corrupt_command_is_tolerated(line: Line) -> None:
     line.damage = lambda n, key, data: [] if n % 40 == 0 else [data[:-1] + b"\xff"] if n % 40 == 20 else [data]
     for _ in range(800):
         line.step()
         assert moves(line)
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_commands_of_which_three_of_four_are_lost_are_not_executed(make: Callable[[], Line]) -> None:
-    line = make()
-    line.run(200)
-    line.damage = lambda n, key, data: [data] if n % 4 == 0 else []
-    line.run(200)
-    assert not moves(line)
-    line.run(500)
-    assert not moves(line)
+def with_checksum(data: bytes, data_ids: bytes) -> bytes:
+    return bytes((frame_crc(data, data_ids),)) + data[1:]
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_commands_with_the_data_id_of_another_message_are_not_executed(make: Callable[[], Line]) -> None:
-    """A masquerade: a good checksum by another message's list."""
-    line = make()
-    line.run(200)
-    foreign = CRANE.message("EstopStat").data_ids or b""
-    line.damage = lambda n, key, data: [with_checksum(data, foreign)]
-    line.run(200)
-    assert not moves(line)
+FOREIGN = CRANE.message("EstopStat").data_ids or b""
 
 
-@pytest.mark.parametrize("make", NODES)
-def test_corrupt_commands_are_not_executed(make: Callable[[], Line]) -> None:
-    line = make()
-    line.run(200)
-    line.damage = lambda n, key, data: [bytes((data[0] ^ 0x40,)) + data[1:]]
-    line.run(200)
-    assert not moves(line)
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda n, key, data: [data] if n % 4 == 0 else [], id="three of four lost"),
+        pytest.param(lambda n, key, data: [with_checksum(data, FOREIGN)], id="the data id of another message"),
+        pytest.param(lambda n, key, data: [bytes((data[0] ^ 0x40,)) + data[1:]], id="a wrong checksum"),
+        pytest.param(lambda n, key, data: [data[:5]], id="cut short"),
+    ],
+)
+def test_damaged_commands_are_not_executed(line: Line, damage: Callable[[int, int, bytes], list[bytes]]) -> None:
+    line.damage = damage
+    for ms in (200, 500):
+        line.run(ms)
+        assert not moves(line)

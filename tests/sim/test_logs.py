@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -67,9 +67,15 @@ class Stand:
 
 
 @pytest.fixture
-def stands() -> Iterator[list[Stand]]:
+def stand_of() -> Iterator[Callable[..., Stand]]:
+    """Makes stands."""
     made: list[Stand] = []
-    yield made
+
+    def make(*arguments: object) -> Stand:
+        made.append(Stand(*arguments))
+        return made[-1]
+
+    yield make
     for stand in made:
         stand.client.disconnect()
 
@@ -82,10 +88,9 @@ def of(kind: str, seed: int, logs: int, machine: str = "palms_471") -> tuple[Log
     ("kind", "logs", "machine"),
     [("separate", 3, "palms_471"), ("crossed", 3, "palms_471"), ("pile", 6, "palms_471"), ("pile", 5, "aoro_fc8")],
 )
-def test_logs_are_still_at_the_start_and_overlap_nothing(stands, kind, logs, machine):
+def test_logs_are_still_at_the_start_and_overlap_nothing(stand_of, kind, logs, machine):
     for seed in range(2):
-        stand = Stand(of(kind, seed, logs, machine), machine)
-        stands.append(stand)
+        stand = stand_of(of(kind, seed, logs, machine), machine)
         stand.client.performCollisionDetection()
         assert all(c[8] > -0.003 for log in stand.log_bodies.body_ids for c in stand.client.getContactPoints(log))
         before = [log.position_m for log in stand.log_bodies.states()]
@@ -94,18 +99,16 @@ def test_logs_are_still_at_the_start_and_overlap_nothing(stands, kind, logs, mac
         assert max(math.dist(a, b) for a, b in zip(before, after, strict=True)) < 2e-3
 
 
-def test_a_pile_is_stable_without_sleep(stands):
-    stand = Stand(of("pile", 0, 6))
-    stands.append(stand)
+def test_a_pile_is_stable_without_sleep(stand_of):
+    stand = stand_of(of("pile", 0, 6))
     stand.awake()
     assert stand.fastest(3.0) < 5e-3
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "logs"), [("separate", 3), ("pile", 6), ("bunk", 20)])
-def test_logs_rest_for_a_minute(stands, kind, logs):
-    stand = Stand(of(kind, 1, logs))
-    stands.append(stand)
+def test_logs_rest_for_a_minute(stand_of, kind, logs):
+    stand = stand_of(of(kind, 1, logs))
     assert stand.fastest(60.0) < 5e-3
 
 
@@ -124,15 +127,13 @@ def test_woken_logs_beside_a_crane_rest_for_a_minute_and_kept_awake_for_another(
             assert max(math.dist(a, log.position_m) for a, log in zip(before, bodies.states(), strict=True)) < 5e-3
 
 
-def test_the_same_scene_comes_to_rest_in_the_same_place_to_the_bit(stands):
-    stands += [Stand(of("pile", 4, 5)), Stand(of("pile", 4, 5))]
-    one, two = (stand.log_bodies.states() for stand in stands)
+def test_the_same_scene_comes_to_rest_in_the_same_place_to_the_bit(stand_of):
+    one, two = (stand_of(of("pile", 4, 5)).log_bodies.states() for _ in range(2))
     assert one == two
 
 
-def test_a_tapered_log_rests_with_its_axis_falling_to_the_thin_end_and_a_bowed_one_on_its_side(stands):
-    stand = Stand((LogSpec(-2.0, 4.0, 0.3, 2.6, 0.2, 600.0, 0.012, 0.02, z_m=0.004, roll_rad=0.4),))
-    stands.append(stand)
+def test_a_tapered_log_rests_with_its_axis_falling_to_the_thin_end_and_a_bowed_one_on_its_side(stand_of):
+    stand = stand_of((LogSpec(-2.0, 4.0, 0.3, 2.6, 0.2, 600.0, 0.012, 0.02, z_m=0.004, roll_rad=0.4),))
     (log,) = stand.log_bodies.states()
     assert log.axis[2] == pytest.approx(-0.006, rel=0.25)
     p = stand.client
@@ -144,10 +145,9 @@ def test_a_tapered_log_rests_with_its_axis_falling_to_the_thin_end_and_a_bowed_o
     assert math.dist(butt, top) == pytest.approx(2.6) and log.sweep_m == pytest.approx(0.052)
 
 
-def test_bullet_moves_the_real_wood(stands):
+def test_bullet_moves_the_real_wood(stand_of):
     spec = LogSpec(-2.0, 4.0, 0.3, 2.6, 0.2, 600.0, 0.012, 0.03, z_m=0.004, roll_rad=1.57)
-    stand = Stand((spec,))
-    stands.append(stand)
+    stand = stand_of((spec,))
     p, wood = stand.client, mass_of(spec)
     mass, _, inertia, *_ = p.getDynamicsInfo(stand.log_bodies.body_ids[0], -1)
     assert mass == wood.mass_kg == stand.log_bodies.masses[0] and inertia == pytest.approx(wood.inertia_kg_m2)
@@ -157,9 +157,8 @@ def test_bullet_moves_the_real_wood(stands):
 
 
 @pytest.mark.parametrize("diameter", [0.1, 0.3])
-def test_a_rolling_log_comes_to_a_stop(stands, diameter):
-    stand = Stand((LogSpec(-2.0, 4.0, 0.0, 2.6, diameter, 600.0, z_m=0.004),))
-    stands.append(stand)
+def test_a_rolling_log_comes_to_a_stop(stand_of, diameter):
+    stand = stand_of((LogSpec(-2.0, 4.0, 0.0, 2.6, diameter, 600.0, z_m=0.004),))
     stand.log_bodies.wake()
     v = 0.3
     stand.client.resetBaseVelocity(stand.log_bodies.body_ids[0], [0.0, v, 0.0], [-2 * v / diameter, 0.0, 0.0])
@@ -169,9 +168,8 @@ def test_a_rolling_log_comes_to_a_stop(stands, diameter):
     assert log.speed_m_s < 5e-3 and 0.02 < math.dist(start, log.position_m) < 0.6
 
 
-def test_a_touch_wakes_a_sleeping_log(stands):
-    stand = Stand(of("single", 0, 1))
-    stands.append(stand)
+def test_a_touch_wakes_a_sleeping_log(stand_of):
+    stand = stand_of(of("single", 0, 1))
     p = stand.client
     assert stand.fastest(0.1) == 0.0
     x, y, z = stand.log_bodies.states()[0].position_m
@@ -180,12 +178,11 @@ def test_a_touch_wakes_a_sleeping_log(stands):
     assert stand.fastest(0.6) > 0.05
 
 
-def test_sleeping_ground_carries_logs_like_awake_ground(stands):
+def test_sleeping_ground_carries_logs_like_awake_ground(stand_of):
     """To the bit: while both sleep Bullet computes no contacts; when a log is touched they are unchanged."""
     ways = []
     for awake in (False, True):
-        stand = Stand(of("pile", 1, 2))
-        stands.append(stand)
+        stand = stand_of(of("pile", 1, 2))
         p = stand.client
         if awake:
             state = p.ACTIVATION_STATE_DISABLE_SLEEPING | p.ACTIVATION_STATE_WAKE_UP
@@ -201,9 +198,8 @@ def test_sleeping_ground_carries_logs_like_awake_ground(stands):
 
 @pytest.mark.long
 @pytest.mark.parametrize("machine", MACHINES)
-def test_a_full_bunk_holds_its_logs(stands, machine):
-    stand = Stand(of("bunk", 1, 20, machine), machine)
-    stands.append(stand)
+def test_a_full_bunk_holds_its_logs(stand_of, machine):
+    stand = stand_of(of("bunk", 1, 20, machine), machine)
     b = PROFILES[machine].bunk
     p = stand.client
     inward = p.invertTransform(*stand.base)
@@ -215,9 +211,8 @@ def test_a_full_bunk_holds_its_logs(stands, machine):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["rough", "slope"])
-def test_logs_lie_on_uneven_ground(stands, kind):
-    stand = Stand(of("row", 0, 3, "aoro_fc8"), "aoro_fc8", kind)
-    stands.append(stand)
+def test_logs_lie_on_uneven_ground(stand_of, kind):
+    stand = stand_of(of("row", 0, 3, "aoro_fc8"), "aoro_fc8", kind)
     for log in stand.log_bodies.states():
         air = [x[2] - log.diameter_m / 2 - stand.terrain.height(x[0], x[1]) for x in (log.position_m, *log.ends_m)]
         assert min(air) < 0.03 and max(air) < 0.3 and min(air) > -0.05

@@ -174,23 +174,6 @@ def test_the_emergency_stop_stops_crane_carrier_and_arms(bench):
     assert bench.plant.vehicle().speed_m_s > 0.1
 
 
-@pytest.mark.parametrize("guard", [None, 0, 0xB])
-def test_carrier_and_arms_stop_without_the_guard_and_need_a_new_arming(bench, guard):
-    moving = {"drive": (0.1, 0.5, 0.0), "arms": (20.0,) * 4}
-    bench.cycle(75, **moving)
-    node, arms = bench.plant.vehicle_node, bench.plant.arms
-    assert not node.brake and arms.spools[0] > 0.0
-    bench.cycle(6 if guard is None else 1, guard=guard, **moving)
-    assert node.brake and node.steer == 0.0 and arms.spools == [0.0] * 4
-    bench.cycle(2, guard=guard, **moving)
-    assert bench.last("VehStat")["Fault"] == 3 and bench.last("ArmHeightA")["State"] == 3
-    bench.cycle(10, **moving)
-    assert node.brake, "the fault remains until a frame disarms"
-    bench.cycle(2, key=0)
-    bench.cycle(30, **moving)
-    assert bench.plant.vehicle().speed_m_s > 0.1
-
-
 def test_the_bus_carries_measured_values_only(bench):
     bench.cycle(5)
     raw = next(d for _, k, d in reversed(bench.sent) if k == CRANE.message("GrappleStat").key)

@@ -1,17 +1,22 @@
-"""The command line as a whole: threads, version, errors, and the page of the saved results."""
+"""The command line as a whole: version, errors and their codes, directories of runs, what is handed on."""
 
 from __future__ import annotations
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+import deploy.__main__ as installer
 from experiments.common.result import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.cli import app
+from timberhand.commands.runs import new_directory
+from timberhand.reference import __main__
+from timberhand.reference.__main__ import REPOSITORY
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -41,3 +46,46 @@ def test_a_command_failure_crosses_process_boundaries() -> None:
     failure = CommandFailed("area.what", "a sentence", ExitCode.BUS)
     copy = pickle.loads(pickle.dumps(failure))
     assert (copy.code, str(copy), copy.exit_code) == ("area.what", "a sentence", ExitCode.BUS)
+
+
+def test_a_code_belongs_to_one_area_of_the_program() -> None:
+    """Codes begin with their area; one area is one package, or the program's own commands about it."""
+    for code, places in __main__.codes(REPOSITORY).items():
+        assert __main__.CODE.fullmatch(code), code
+        assert len({taker for taker, _, _ in places}) <= 2, f"{code} is raised as {places}"
+
+
+def test_runs_that_begin_side_by_side_get_directories_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda _: new_directory("run"), range(40)))
+    assert len(set(made)) == 40 and all(one.is_dir() for one in made)
+    assert Path("runs/LAST").resolve().name.startswith("run-")
+    assert sorted(p.name for p in Path("runs").iterdir() if p.name.startswith(".")) == []
+
+
+def test_the_last_run_is_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for number in (1, 2):
+        assert new_directory("a") == Path(f"runs/a-{number}")
+        assert Path("runs/LAST").resolve().name == f"a-{number}"
+
+
+@pytest.mark.parametrize(
+    ("given", "handed_on"),
+    [
+        (["install"], []),
+        (["install", "--wheel", "a.whl", "--cpu", "0", "--dry-run"], ["--wheel", "a.whl", "--cpu", "0", "--dry-run"]),
+        (["install", "--from-environment", "/e"], ["--from-environment", "/e"]),
+        (["uninstall", "--root", "/r"], ["--uninstall", "--root", "/r"]),
+    ],
+)
+def test_the_installer_is_given_the_options_by_their_own_names(
+    monkeypatch: pytest.MonkeyPatch, given: list[str], handed_on: list[str]
+) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(installer, "install", lambda words: seen.extend(words) or 7)
+    assert CliRunner().invoke(app, ["service", *given]).exit_code == 7
+    assert seen == handed_on

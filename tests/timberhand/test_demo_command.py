@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -30,26 +32,31 @@ def test_a_computer_that_cannot_hold_the_period_gets_a_paced_run_where_there_is_
 
 
 @pytest.fixture
-def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The looks and runs of the command, none of which takes place."""
-    done: list[str] = []
+def given(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
+    """What each run of the command is given; none takes place."""
+    seen: list[tuple[object, ...]] = []
+
+    def run(*words: object, **more: object) -> Summary:
+        seen.append((*words, *more.values()))
+        return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
+
+    for kind in ("live", "lockstep", "paced"):
+        monkeypatch.setattr(f"hil.demo.{kind}.run_{kind}", partial(run, kind))
+    return seen
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch, given: list[tuple[object, ...]]) -> Callable[[], list[object]]:
+    """The looks, and then the runs of the command."""
+    looks: list[object] = []
 
     def look() -> Finding:
-        done.append("look")
+        looks.append("look")
         return BUSY
-
-    def run(kind: str) -> object:
-        def take_place(*_: object, **__: object) -> Summary:
-            done.append(kind)
-            return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
-
-        return take_place
 
     monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
     monkeypatch.setattr("host.real_time.look", look)
-    for kind in ("live", "lockstep", "paced"):
-        monkeypatch.setattr(f"hil.demo.{kind}.run_{kind}", run(kind))
-    return done
+    return lambda: looks + [kind for kind, *_ in given]
 
 
 @pytest.mark.parametrize(
@@ -64,50 +71,49 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ("--lockstep", ["lockstep"]),
     ],
 )
-def test_the_look_is_taken_only_where_it_decides(words: str, kinds: list[str], ran: list[str], tmp_path: Path) -> None:
+def test_the_look_is_taken_only_where_it_decides(
+    words: str, kinds: list[str], ran: Callable[[], list[object]], tmp_path: Path
+) -> None:
     done = CliRunner().invoke(app, ["demo", *words.split(), "--out", str(tmp_path)])
     assert done.exit_code == 0, done.output
-    assert ran == kinds
+    assert ran() == kinds
 
 
 @pytest.mark.parametrize("kind", ["lockstep", "no-live", "live"])
 def test_the_planner_and_paper_as_machine_reach_the_run(
-    kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    kind: str, given: list[tuple[object, ...]], tmp_path: Path
 ) -> None:
-    seen: list[object] = []
-
-    def take_place(*given: object, **more: object) -> Summary:
-        seen.extend((*given, *more.values()))
-        return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
-
-    for name in ("live", "lockstep", "paced"):
-        monkeypatch.setattr(f"hil.demo.{name}.run_{name}", take_place)
-    words = ["demo", f"--{kind}", "--out", str(tmp_path)]
-    if kind == "live":
-        words += ["--bus", "wire"]
+    words = ["demo", f"--{kind}", "--out", str(tmp_path), *(["--bus", "wire"] if kind == "live" else [])]
     CliRunner().invoke(app, [*words, "--planner", "cnn-physical", "--virtual-cameras", "3"])
-    assert PlannerChoice("cnn-physical", 3) in seen
-    seen.clear()
     CliRunner().invoke(app, [*words, "--paper-a"])
+    own, paper_a = given
+    assert PlannerChoice("cnn-physical", 3) in own
     for value in (PlannerChoice("cnn", 1), "stick", str(tmp_path / "palms_471_plc.toml")):
-        assert value in seen
+        assert value in paper_a
 
 
-def test_inside_the_lab_no_look_is_taken(ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_inside_the_lab_no_look_is_taken(
+    ran: Callable[[], list[object]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("TIMBERHAND_LAB", "uml")
     CliRunner().invoke(app, ["demo", "--bus", "wire", "--out", str(tmp_path)])
-    assert ran == ["live"]
+    assert ran() == ["live"]
 
 
 @pytest.mark.parametrize(
     ("free", "detector", "kind"), [(2.0, "perfect", "live"), (2.0, "own", "paced"), (2.6, "own", "live")]
 )
 def test_a_computer_that_holds_the_period_runs_live(
-    free: float, detector: str, kind: str, ran: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    free: float,
+    detector: str,
+    kind: str,
+    ran: Callable[[], list[object]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.setattr("host.real_time.look", lambda: msgspec.structs.replace(QUIET, free=free))
     CliRunner().invoke(app, ["demo", "--bus", "wire", "--detector", detector, "--out", str(tmp_path)])
-    assert ran == [kind]
+    assert ran() == [kind]
 
 
 @pytest.mark.parametrize(
@@ -120,17 +126,10 @@ def test_a_computer_that_holds_the_period_runs_live(
     ],
 )
 def test_a_camera_that_sees_the_cranes_work_finds_the_log(
-    words: str, camera: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    words: str, camera: str, given: list[tuple[object, ...]], tmp_path: Path
 ) -> None:
-    seen: list[object] = []
-
-    def take_place(*given: object, **_: object) -> Summary:
-        seen.append(given[6])
-        return Summary(True, "", "", 1.0, 0, 200, 0, 0, 0, "", 1, "")
-
-    monkeypatch.setattr("hil.demo.lockstep.run_lockstep", take_place)
     done = CliRunner().invoke(app, ["demo", *words.split(), "--out", str(tmp_path)])
-    assert seen == [camera]
+    assert [arguments[7] for arguments in given] == [camera]
     assert ("the planner is told" in done.output) is (camera == "")
 
 
@@ -143,6 +142,7 @@ def test_a_camera_that_sees_the_cranes_work_finds_the_log(
         ("--bus vcan --no-live", "demo.live-vcan"),
         ("--no-live --plc --plc-link udp", "demo.paced-udp"),
         ("--no-live --inject encoder-lift:stuck@1s", "demo.inject-live"),
+        ("--bus wire --inject encoder-stuck@1", "demo.inject-live"),
         ("--planner nobody", "planner.unknown"),
         ("--virtual-cameras 5", "planner.no-virtual-camera"),
         ("--planner cnn --virtual-cameras 0", "planner.virtual-cameras"),
@@ -150,8 +150,10 @@ def test_a_camera_that_sees_the_cranes_work_finds_the_log(
         ("--paper-a --plc-role valves", "demo.paper-a"),
     ],
 )
-def test_what_would_be_ignored_is_refused(words: str, code: str, ran: list[str], tmp_path: Path) -> None:
+def test_what_would_be_ignored_is_refused(
+    words: str, code: str, ran: Callable[[], list[object]], tmp_path: Path
+) -> None:
     refused = CliRunner().invoke(app, ["demo", *words.split(), "--out", str(tmp_path / "run")])
     assert isinstance(refused.exception, CommandFailed)
     assert (refused.exception.code, refused.exception.exit_code) == (code, ExitCode.USAGE)
-    assert ran == [] and not (tmp_path / "run").exists()
+    assert ran() == [] and not (tmp_path / "run").exists()

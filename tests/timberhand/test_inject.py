@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from host.exit_codes import CommandFailed
 from machine.loading.profile_file import load_profile
 from runtime.errors import InputRefused
 from tests.codes import coded
+from tests.operator_end import udp_end
 from timberhand.cli import app
 
 PALMS = load_profile("palms_471")
@@ -50,11 +50,6 @@ def test_what_cannot_be_injected_is_one_sentence_with_a_code(arguments: list[str
     assert isinstance(result.exception, CommandFailed) and result.exception.code == code
 
 
-def test_a_live_demo_takes_no_orders_in_advance() -> None:
-    result = CliRunner().invoke(app, ["demo", "--bus", "wire", "--inject", "encoder-stuck@1"])
-    assert isinstance(result.exception, CommandFailed) and result.exception.code == "demo.inject-live"
-
-
 def test_a_real_bus_is_left_alone() -> None:
     for order, code in (
         (make("bus-babble", length_s=0.01), "fault.real-bus"),
@@ -67,9 +62,7 @@ def test_a_real_bus_is_left_alone() -> None:
 
 
 def test_the_plant_is_asked_and_its_refusal_is_passed_on(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plant:
-        plant.bind(("127.0.0.1", 0))
-        plant.settimeout(10)
+    with udp_end(10) as plant:
         asked: list[dict[str, str]] = []
 
         def answer() -> None:

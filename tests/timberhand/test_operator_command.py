@@ -15,9 +15,6 @@ LIMIT_NS = 1000 * MS
 THERE = b"\x1b[0n"
 
 
-# -- the pure part
-
-
 def test_an_answer_is_a_heartbeat_with_the_stamp_of_its_question() -> None:
     terminal = TerminalWatch(LIMIT_NS)
     assert terminal.ask(1000 * MS) and not terminal.ask(1199 * MS) and terminal.ask(1200 * MS)
@@ -63,6 +60,3 @@ def test_a_pipe_is_no_terminal() -> None:
         watch(lambda stamp_ns: None, LIMIT_NS, reading, writing)
     os.close(reading)
     os.close(writing)
-
-
-# -- the command

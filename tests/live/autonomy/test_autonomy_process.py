@@ -22,6 +22,7 @@ from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn
 from tests.codes import numbers_in
+from tests.operator_end import udp_end
 
 PROFILE = load_profile("palms_471")
 LOGS = [{"position_m": [-1.8, 4.4, -1.29], "axis": [0.6, 0.8, 0.0], "length_m": 2.6, "diameter_m": 0.2}]
@@ -35,25 +36,15 @@ class World:
         self.setpoints: list[CraneSetpoint] = []
         self.joints: tuple[float, ...] = ()
         self._control, self._scene = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
+        with udp_end(None) as probe:
             self._planner = probe.getsockname()
         for link in (self._control, self._scene):
             link.bind(("127.0.0.1", 0))
             link.setblocking(False)
         ports = [link.getsockname()[1] for link in (self._control, self._scene)]
+        words = f"--controller 127.0.0.1:{ports[0]} --scene 127.0.0.1:{ports[1]} --report-port {self._planner[1]}"
         self.process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "autonomy",
-                "--controller",
-                f"127.0.0.1:{ports[0]}",
-                "--scene",
-                f"127.0.0.1:{ports[1]}",
-                "--report-port",
-                str(self._planner[1]),
-            ],
+            [sys.executable, "-m", "autonomy", *words.split()],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -163,8 +154,7 @@ def test_a_configuration_error_is_one_sentence(
 
 
 def test_a_port_in_use_has_its_own_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
+    with udp_end(None) as other:
         port = str(other.getsockname()[1])
         arguments = ["--controller", "127.0.0.1:1", "--scene", "127.0.0.1:2", "--report-port", port]
         assert main(arguments) == BUSY

@@ -15,6 +15,7 @@ from autonomy.process.controller_link import ControllerLink
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from machine.status.modes import Mode
+from tests.operator_end import udp_end
 
 NAN5 = (0.0,) * 5
 
@@ -25,15 +26,12 @@ def report(mode: Mode, profile_hash: int = 7) -> bytes:
 
 @pytest.fixture
 def far() -> socket.socket:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        peer.bind(("127.0.0.1", 0))
-        peer.settimeout(5.0)
+    with udp_end(5.0) as peer:
         yield peer
 
 
 def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
+    with udp_end(None) as probe:
         return probe.getsockname()[1]
 
 

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import socket
 import time
 from collections.abc import Callable, Iterator
 
-import numpy as np
 import pytest
 
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.driving_requests import DrivingRequests
 from autonomy.perception.log_list import LogObservation, decode_logs, encode_request
 from autonomy.perception.shown_picture import NewestPicture
-from autonomy.perception.standpoint import MAX_AGE_NS, Standpoint, standpoint
+from autonomy.perception.standpoint import MAX_AGE_NS, standpoint
 from can_dbc.messages.picture import decode_picture, encode_picture_request
 from runtime.errors import InputRefused
+from tests.autonomy.test_driving_requests import LOG, Q, driving, turned
 from tests.codes import coded
-
-Q = (0.0, 1.2, -2.4, 0.1, math.nan)
-LOG = LogObservation(3, (12.0, 5.0, 0.1), (0.0, 1.0, 0.0), 2.0, 0.2)
-
-
-def turned(x_m: float, y_m: float, yaw_rad: float) -> Pose:
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return Pose(np.array([x_m, y_m, 1.5]), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
-
-
-def driving(stamp_ns: int = 0) -> Standpoint:
-    """At 1 m/s to the east and 0.1 rad/s to the left, the articulation bending by 0.05 rad/s."""
-    return standpoint(stamp_ns, turned(2.0, 0.0, 0.3), turned(1.8, 0.0, 0.28), (0.09, 0.1), 0.2)
+from tests.operator_end import udp_end
 
 
 class Detector:
@@ -54,8 +41,7 @@ class Served:
     def __init__(self) -> None:
         self.detector, self.troubles = Detector(), list[str]()
         self.taken_ns: int | None = None
-        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._link.bind(("127.0.0.1", 0))
+        self._link = udp_end(None)
         self.planner = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.planner.connect(self._link.getsockname())
         self.planner.settimeout(5.0)

@@ -32,6 +32,7 @@ from tests.autonomy.mission_checks import EXAMPLES
 from tests.autonomy.mission_texts import collection, line
 from tests.codes import coded
 from tests.live.autonomy.waiting_planner import HASH, planner_process, report_machine
+from tests.operator_end import udp_end
 
 KEY = b"key"
 PAPER_B = (EXAMPLES / "paper_b.geojson").read_bytes()
@@ -71,9 +72,7 @@ class Planner:
 @pytest.fixture
 def planner(tmp_path: Path) -> Iterator[Planner]:
     (tmp_path / "m.geojson").write_bytes(PAPER_B)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as console:
-        console.bind(("127.0.0.1", 0))
-        console.settimeout(5)
+    with udp_end(5) as console:
         made = Planner(tmp_path, console, "--missions", str(tmp_path))
         yield made
         made.process.close()
@@ -119,9 +118,7 @@ def test_a_file_other_than_the_uploaded_one_is_refused(planner: Planner) -> None
 
 
 def test_a_planner_with_a_mission_takes_no_other(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as console:
-        console.bind(("127.0.0.1", 0))
-        console.settimeout(5)
+    with udp_end(5) as console:
         planner = Planner(tmp_path, console, "--mission", str(EXAMPLES / "paper_b.geojson"))
         planner.machine()
         assert planner.upload().refusal_code == "upload.not-awaited"

@@ -25,6 +25,7 @@ from can_dbc.messages.mission import (
 from machine.status.reasons import Reason
 from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.console.state_reports import REPORT
+from tests.operator_end import udp_end
 
 HASH, KEY = 77, b"key"
 
@@ -61,9 +62,7 @@ class Jobless:
 
 @pytest.fixture
 def watcher() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
-        s.settimeout(5)
+    with udp_end(5) as s:
         yield s
 
 
@@ -71,22 +70,8 @@ def watcher() -> Iterator[socket.socket]:
 def process(watcher) -> Iterator[tuple[PlannerProcess, Jobless]]:
     there = "127.0.0.1:9"
     told = f"127.0.0.1:{watcher.getsockname()[1]}"
-    options = arguments(
-        [
-            "--controller",
-            there,
-            "--scene",
-            there,
-            "--report-port",
-            "0",
-            "--order-port",
-            "0",
-            "--tell",
-            told,
-            "--tell",
-            there,
-        ]
-    )
+    words = f"--controller {there} --scene {there} --report-port 0 --order-port 0 --tell {told} --tell {there}"
+    options = arguments(words.split())
     job = Jobless()
     made = PlannerProcess(job, HASH, options, KEY)  # type: ignore[arg-type]
     yield made, job

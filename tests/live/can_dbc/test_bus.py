@@ -1,4 +1,4 @@
-"""Opening a bus, choosing an address, error frames, and a kernel queue without room."""
+"""Opening a bus with the standard library only, and a flush."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import subprocess
 import sys
 import time
 
-from can_dbc.bus import factory as factory
-from can_dbc.bus.base import (
-    BaseBus,
-)
 from can_dbc.frame import Frame
+from tests.can_dbc.test_bus import Waiting
 
 
 def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_only() -> None:
@@ -21,18 +18,6 @@ def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_only() 
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
-
-
-class Waiting(BaseBus):
-    """A bus with groups of waiting frames, one for each drain."""
-
-    def __init__(self) -> None:
-        super().__init__("test")
-        self.bunches: list[list[Frame]] = []
-
-    def _receive(self, frames: list[Frame]) -> None:
-        if self.bunches:
-            frames += self.bunches.pop(0)
 
 
 def test_after_a_flush_an_older_frame_is_recognized_by_its_stamp() -> None:

@@ -2,39 +2,15 @@
 
 from __future__ import annotations
 
-import socket
-import struct
 import time
 from collections.abc import Iterator
 
 import pytest
 
-from can_dbc.bus.base import BusStats
-from can_dbc.bus.batch import Batch
 from can_dbc.bus.factory import open_bus
-from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
 from can_dbc.bus.receive_clock import DRIFT_PPM
 from can_dbc.frame import EXTENDED, REMOTE, Frame
-
-LIMIT = 1024
-SO_TIMESTAMPNS, SO_TIMESTAMPING, SO_RXQ_OVFL = 35, 37, 40
-
-
-class Pair:
-    """A fast path and its far end."""
-
-    def __init__(self) -> None:
-        near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.link = FrameSocket(near)
-        self.stats = BusStats()
-
-    def put(self, key: int, data: bytes) -> None:
-        self.far.send(CAN_FRAME.pack(key, len(data), data))
-
-    def take(self, limit: int = LIMIT) -> list[Frame]:
-        frames: list[Frame] = []
-        self.link.receive(frames, limit, self.stats.note_error)
-        return frames
+from tests.can_dbc.test_bus_fast_path import Pair, control_data, deliver
 
 
 @pytest.fixture
@@ -58,31 +34,6 @@ def test_frames_keep_key_payload_order_and_time(pair: Pair) -> None:
     assert stamps == sorted(stamps)
     slack_ns = 1_000_000  # two clocks are read one after the other, and somebody may take the processor in between
     assert before_ns - slack_ns <= stamps[0] and stamps[-1] <= between_ns + slack_ns
-
-
-def control_data(stamp_ns: int, hardware_ns: int | None = None, dropped: int | None = None) -> bytes:
-    """What the kernel writes beside a frame (struct cmsghdr: length, level, kind)."""
-    second = 1_000_000_000
-    text = struct.pack("@Niiqq", 32, 1, SO_TIMESTAMPNS, *divmod(stamp_ns, second))
-    if hardware_ns is not None:
-        text += struct.pack("@Niiqqqqqq", 64, 1, SO_TIMESTAMPING, 0, 0, 0, 0, *divmod(hardware_ns, second))
-    if dropped is not None:
-        text += struct.pack("@NiiI4x", 20, 1, SO_RXQ_OVFL, dropped)
-    return text
-
-
-def deliver(pair: Pair, monkeypatch: pytest.MonkeyPatch, controls: list[bytes]) -> list[Frame]:
-    """A drain that finds frames with this control data."""
-
-    def receive(batch: Batch, _: int) -> int:
-        batch.control[:] = bytes(len(batch.control))
-        for i, text in enumerate(controls):
-            batch.control[i * batch.ancillary : i * batch.ancillary + len(text)] = text
-            CAN_FRAME.pack_into(batch.data, i * batch.size, i, 0, b"")
-        return len(controls)
-
-    monkeypatch.setattr(Batch, "receive", receive)
-    return pair.take()
 
 
 @pytest.mark.parametrize("hardware_ns", [None, 5_000_000_000])

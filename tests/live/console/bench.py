@@ -31,42 +31,14 @@ def bench(folder: Path, profile: str = "palms_471") -> Iterator[str]:
         group.await_message("sim", "ready", START_S)
         for name, priority in HARDWARE_PRIORITY.items():
             group.set_fifo_priority(name, priority)
-        group.start(
-            "console",
-            "console",
-            *named,
-            "--port",
-            0,
-            "--report-port",
-            reports,
-            "--operator",
-            operator,
-            *bus,
-            "--controller",
-            f"127.0.0.1:{setpoints}",
-            "--commission",
-            folder / "kept",
-            "--audit",
-            folder / "audit.jsonl",
-            *keyed,
-        )
+        ends = ("--port", 0, "--report-port", reports, "--controller", f"127.0.0.1:{setpoints}")
+        files = ("--operator", operator, "--commission", folder / "kept", "--audit", folder / "audit.jsonl")
+        group.start("console", "console", *named, *bus, *ends, *files, *keyed)
         url = note(str(group.await_message("console", "url", START_S)["url"]))
         group.start("guard", "controller.guard", *named, *bus, "--operator", operator, "--state", folder / "latched")
-        group.start(
-            "controller",
-            "controller",
-            *named,
-            *bus,
-            "--setpoint-port",
-            setpoints,
-            "--operator",
-            operator,
-            "--timing",
-            folder / "timing",
-            "--report",
-            f"127.0.0.1:{reports}",
-            *keyed,
-        )
+        ends = ("--setpoint-port", setpoints, "--report", f"127.0.0.1:{reports}")
+        files = ("--operator", operator, "--timing", folder / "timing")
+        group.start("controller", "controller", *named, *bus, *ends, *files, *keyed)
         yield url
     finally:
         group.stop_all(("controller", "guard", "console", "sim", "wire"))

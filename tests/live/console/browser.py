@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from websockets.sync.client import connect
 
@@ -44,6 +44,7 @@ class Browser:
     ) -> None:
         program = installed()
         assert program is not None, MISSING
+        folder.mkdir(exist_ok=True)
         self._said = (folder / "chromium.err").open("wb")
         options = (
             "--headless",
@@ -78,6 +79,12 @@ class Browser:
         self._ask("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=False)
         scheme = {"name": "prefers-color-scheme", "value": "light" if light else "dark"}
         self._ask("Emulation.setEmulatedMedia", features=[scheme])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """End it."""

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from autonomy.perception.log_list import LogObservation, decode_logs, encode_request
-from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import ChosenGrasp, encode_grasp
 from console.console import Console
@@ -27,8 +26,8 @@ from console.server import create_app
 from hil.harness.processes import free_udp_ports
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from runtime.errors import InputRefused
+from tests.console.state_reports import at
 from tests.live.console.served_page import served
 
 PROFILE = load_profile("palms_471")
@@ -70,34 +69,12 @@ def perceived_run(folder: Path, logs: int = 4, **more: Any) -> Iterator[Perceive
     reports.setblocking(False)
     with ExitStack() as stack:
         stack.callback(reports.close)
-        plant = _start(
-            stack,
-            folder,
-            "sim",
-            "--seed",
-            3,
-            "--logs",
-            logs,
-            "--bus",
-            "crane0=virtual:perceived",
-            "--port",
-            sim,
-            "--camera",
-            pictures,
-        )
+        words = f"--seed 3 --logs {logs} --bus crane0=virtual:perceived --port {sim} --camera {pictures}"
+        plant = _start(stack, folder, "sim", *words.split())
         _await(plant, "ready")
         q = (*_ask(sim, "state")["joints"][:4], nan)
-        seeing = _start(
-            stack,
-            folder,
-            "autonomy.perception",
-            "--camera",
-            CAMERA,
-            "--frames",
-            f"{HOST}:{pictures}",
-            "--port",
-            detector,
-        )
+        words = f"--camera {CAMERA} --frames {HOST}:{pictures} --port {detector}"
+        seeing = _start(stack, folder, "autonomy.perception", *words.split())
         _await(seeing, '"ready"')
         console = Console(PROFILE, HASH, scene=(HOST, detector), reports=reports, truth=(HOST, sim), **more)
         url = stack.enter_context(served(create_app(console)))
@@ -124,28 +101,7 @@ def _play(run: PerceivedRun, page: tuple[str, int]) -> None:
             now = time.monotonic_ns()
             out.sendto(
                 encode(
-                    StateReport(
-                        n,
-                        HASH,
-                        now,
-                        Mode.ACTIVE,
-                        1,
-                        0,
-                        n,
-                        0,
-                        0,
-                        0,
-                        shown,
-                        (0.0,) * 5,
-                        shown,
-                        100.0,
-                        0.0,
-                        0.0,
-                        700_000,
-                        20_000,
-                        0,
-                        11 * n,
-                    )
+                    at(shown, now, profile_hash=HASH, sequence=n, grapple_state=1, opening_pct=100.0, clamp_bar=0.0)
                 ),
                 page,
             )

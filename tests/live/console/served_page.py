@@ -1,11 +1,12 @@
-"""An application of the console, served in a thread on a free port."""
+"""An application of the console, served in a thread on a free port, and what it is told."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 
 import uvicorn
 from starlette.applications import Starlette
@@ -31,4 +32,24 @@ def served(app: Starlette) -> Iterator[str]:
         yield url
     finally:
         server.should_exit = True
+        thread.join()
+
+
+@contextlib.contextmanager
+def fed(to: tuple[str, int], period_s: float, told: Callable[[int], Iterable[bytes]]) -> Iterator[None]:
+    """Send the datagrams that are told at a time, again and again, in a thread."""
+    over = threading.Event()
+
+    def feed() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            while not over.wait(period_s):
+                for data in told(time.monotonic_ns()):
+                    out.sendto(data, to)
+
+    thread = threading.Thread(target=feed)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
         thread.join()

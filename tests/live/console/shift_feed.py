@@ -6,7 +6,7 @@ takes the states, and stands still while ``paused``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import cos, pi, radians, sin
 from typing import Any
@@ -31,6 +31,8 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
 from tests.can_dbc.example_mission_report import HERE, MISSION_REPORT
 from tests.conftest import a_timing
+from tests.console.state_reports import at
+from tests.console.vehicle_reports import VEHICLE
 
 PROFILE = load_profile("aoro_fc8")
 HASH = profile_hash(PROFILE)
@@ -106,28 +108,11 @@ class ShiftFeed:
         reference = tuple(v + 0.003 * sin(t) for v in q)
         holds = 12.0 < work < 20.0
         mode, reason = (Mode.STOP, pack(Reason.JOINT_STUCK, 1)) if stopped else (Mode.ACTIVE, 0)
-        return StateReport(
-            self.steps,
-            HASH,
-            self.now_ns,
-            mode,
-            HOLDING if holds else 1,
-            reason,
-            self.steps,
-            0,
-            0,
-            0,
-            q,
-            (0.0,) * 5,
-            reference,
-            20.0 if holds else 100.0,
-            120.0 if holds else 0.0,
-            105.0 if holds else 0.0,
-            700_000,
-            60_000,
-            0,
-            11 * self.steps,
-        )
+        grip = {"opening_pct": 20.0, "clamp_bar": 120.0, "load_kg": 105.0, "grapple_state": HOLDING}
+        free = {"opening_pct": 100.0, "clamp_bar": 0.0, "load_kg": 0.0, "grapple_state": 1}
+        count = {"sequence": self.steps, "setpoint_sequence": self.steps, "frames_received": 11 * self.steps}
+        told = (grip if holds else free) | count | {"profile_hash": HASH, "reference": reference, "reason": reason}
+        return at(q, self.now_ns, mode, tick_ns=700_000, late_ns=60_000, **told)
 
     def _vehicle_report(self, drives: bool) -> VehicleReport:
         """Round and round a circle, a little beside the track of the lap before."""
@@ -136,32 +121,10 @@ class ShiftFeed:
         latitude, longitude = HERE[0] + radius * sin(angle) / NORTH_M_DEG, HERE[1] + radius * cos(angle) / EAST_M_DEG
         speed, driving = (SPEED_M_S, Driving.DRIVING) if drives else (0.0, Driving.STANDING)
         heading = radians(-((360.0 * along / LAP_M) % 360.0)) % (2 * pi)
-        return VehicleReport(
-            self.steps,
-            HASH,
-            self.now_ns,
-            self.steps,
-            driving,
-            0,
-            0,
-            self.now_ns,
-            latitude,
-            longitude,
-            102.0,
-            4,
-            18,
-            0.014,
-            self.now_ns,
-            heading,
-            0.0,
-            self.now_ns,
-            speed,
-            0.1,
-            0.02 * sin(angle),
-            0.0,
-            (0.35, 0.34, 0.33, 0.32),
-            0,
-        )
+        told = dict.fromkeys(("stamp_ns", "position_ns", "heading_ns", "motion_ns"), self.now_ns)
+        told |= {"sequence": self.steps, "drive_sequence": self.steps, "profile_hash": HASH, "driving": driving}
+        told |= {"latitude_deg": latitude, "longitude_deg": longitude, "heading_rad": heading, "speed_m_s": speed}
+        return replace(VEHICLE, articulation_rad=0.1, roll_rad=0.02 * sin(angle), pitch_rad=0.0, **told)
 
     def _mission_report(self, loaded: int, drives: bool) -> MissionReport:
         logs = tuple(_known(loaded + k) for k in range(LOGS))

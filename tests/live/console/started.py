@@ -15,6 +15,7 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
+from typing import Self
 
 from PIL import Image
 
@@ -56,6 +57,12 @@ class Started:
                 env=environment,
             )
         self.url = f"http://127.0.0.1:{port}/"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.interrupt()
 
     def answers(self) -> bool:
         """Whether the page is served and its address is printed.

@@ -5,8 +5,7 @@ Deque's axe-core is loaded into the page by the browser's debugger, so that the 
 
 from __future__ import annotations
 
-import socket
-import threading
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -32,12 +31,14 @@ from tests.console.recorded_run import RecordedRun
 from tests.console.state_reports import REPORT
 from tests.console.vehicle_reports import VEHICLE
 from tests.live.console.browser import MISSING, Browser, installed
-from tests.live.console.served_page import served
+from tests.live.console.served_page import fed, served
+from tests.operator_end import udp_end
 
 pytestmark = [pytest.mark.skipif(installed() is None, reason=MISSING), pytest.mark.timeout(300)]
 AXE = (Path(__file__).with_name("axe") / "axe.min.js").read_text()
 PROFILE = load_profile("aoro_fc8")
 HASH = profile_hash(PROFILE)
+COUNT = itertools.count(1)
 RUN = """axe.run(document, {resultTypes: ['violations']}).then(found => found.violations.map(v => {
   const where = n => `${n.target.join(' ')} [${[...n.any, ...n.all, ...n.none].map(a => a.message).join('; ')}]`;
   return `${v.id}: ${v.nodes.map(where).join(' | ')}`; }))"""
@@ -48,10 +49,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """Every page that is served: a live machine with a stop, its sign-in, a recording, a silent plant."""
     folder = tmp_path_factory.mktemp("pages")
     with ExitStack() as stack:
-        reports, silent = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
-        reports.bind(("127.0.0.1", 0))
-        reports.setblocking(False)
-        silent.bind(("127.0.0.1", 0))
+        reports, silent = (stack.enter_context(udp_end()) for _ in range(2))
         nobody = silent.getsockname()
         console = Console(
             PROFILE,
@@ -69,11 +67,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
         )
         guarded = Console(PROFILE, HASH, accounts=Accounts({"anna": (Role.VIEWER, "")}))
         (folder / "missions").mkdir()
-        over = threading.Event()
-        feeding = threading.Thread(target=_feed, args=(reports.getsockname(), over))
-        feeding.start()
-        stack.callback(feeding.join)
-        stack.callback(over.set)
+        stack.enter_context(fed(reports.getsockname(), 0.05, _told))
         live = stack.enter_context(served(create_app(console)))
         replay = stack.enter_context(served(create_replay_app(RecordedRun(), RECORDED, name="runs/demo-1")))
         yield {
@@ -86,23 +80,20 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
         }
 
 
-def _feed(to: tuple[str, int], over: threading.Event) -> None:
-    stopped = replace(REPORT, profile_hash=HASH, mode=Mode.STOP, reason=pack(Reason.JOINT_STUCK, 1))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        n = 0
-        while not over.wait(0.05):
-            n, now = n + 1, time.monotonic_ns()
-            out.sendto(encode(replace(stopped if n % 400 > 200 else REPORT, profile_hash=HASH, stamp_ns=now)), to)
-            out.sendto(encode(replace(VEHICLE, stamp_ns=now)), to)
-            if n % 5 == 0:
-                out.sendto(encode_mission(MISSION_REPORT, n, HASH, now), to)
+def _told(now_ns: int) -> Iterator[bytes]:
+    """Ten seconds of work and ten of a stop, in turn, and a mission every 0.25 s."""
+    n = next(COUNT)
+    stopped = replace(REPORT, mode=Mode.STOP, reason=pack(Reason.JOINT_STUCK, 1))
+    yield encode(replace(stopped if n % 400 > 200 else REPORT, profile_hash=HASH, stamp_ns=now_ns))
+    yield encode(replace(VEHICLE, stamp_ns=now_ns))
+    if n % 5 == 0:
+        yield encode_mission(MISSION_REPORT, n, HASH, now_ns)
 
 
 @pytest.fixture(params=[False, True], ids=["dark", "light"])
 def browser(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Browser]:
-    opened = Browser(tmp_path, (1280, 800), request.param)
-    yield opened
-    opened.close()
+    with Browser(tmp_path, (1280, 800), request.param) as opened:
+        yield opened
 
 
 def _panels(browser: Browser) -> list[str]:
@@ -136,10 +127,7 @@ def test_axe_finds_nothing(pages: dict[str, str], browser: Browser, name: str) -
 
 
 def test_axe_would_find_a_button_without_a_name(pages: dict[str, str], tmp_path: Path) -> None:
-    browser = Browser(tmp_path, (1280, 800))
-    try:
+    with Browser(tmp_path, (1280, 800)) as browser:
         browser.open(pages["plant"])
         browser.value(AXE + "; document.body.append(document.createElement('button')); 0")
         assert any(each.startswith("button-name") for each in browser.value(RUN))
-    finally:
-        browser.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import socketserver
 import threading
 import time
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from console.console import Console
 from console.server import create_app
@@ -21,9 +19,11 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
 from tests.console.page_client import HERE, page_client
+from tests.console.state_reports import at
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
-from tests.live.console.served_page import served
+from tests.live.console.served_page import fed, served
+from tests.operator_end import udp_end
 
 PROFILE = load_profile("palms_471")
 HASH = profile_hash(PROFILE)
@@ -100,114 +100,66 @@ def test_a_silent_desk_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(installed() is None, reason=MISSING)
 def test_a_button_breaks_the_run_and_the_card_says_what_happened(desk, tmp_path: Path) -> None:
-    reports, over = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), threading.Event()
-    reports.bind(("127.0.0.1", 0))
-    reports.setblocking(False)
-    to = reports.getsockname()
+    reports, since_ns = udp_end(), 0
 
-    def feed() -> None:
-        q, reason = (0.4, 0.9, -1.6, 0.5, 0.0), pack(Reason.ESTOP_PRESSED, 0)
-        since_ns = 0
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while not over.wait(0.02):
-                now = time.monotonic_ns()
-                since_ns = since_ns or (now if desk[1] else 0)
-                mode = Mode.STOP if since_ns else Mode.ACTIVE
-                out.sendto(
-                    encode(
-                        StateReport(
-                            1,
-                            HASH,
-                            now,
-                            mode,
-                            0,
-                            reason if since_ns else 0,
-                            1,
-                            0,
-                            0,
-                            0,
-                            q,
-                            (0.0,) * 5,
-                            q,
-                            50.0,
-                            12.0,
-                            0.0,
-                            0,
-                            0,
-                            0,
-                            0,
-                            since_ns,
-                            (0.0, 0.0, 0.0) if since_ns else (),
-                        )
-                    ),
-                    to,
-                )
+    def told(now_ns: int) -> Iterator[bytes]:
+        nonlocal since_ns
+        since_ns = since_ns or (now_ns if desk[1] else 0)
+        stopped = {"reason": pack(Reason.ESTOP_PRESSED, 0), "since_ns": since_ns, "numbers": (0.0, 0.0, 0.0)}
+        mode, more = (Mode.STOP, stopped) if since_ns else (Mode.ACTIVE, {})
+        yield encode(at((0.4, 0.9, -1.6, 0.5, 0.0), now_ns, mode, profile_hash=HASH, **more))
 
-    thread = threading.Thread(target=feed)
-    thread.start()
     console = Console(PROFILE, HASH, tmp_path / "operator", reports=reports, faults=desk[0])
-    with served(create_app(console)) as url:
-        browser = Browser(tmp_path, (1280, 800))
-        try:
-            browser.open(url)
-            browser.wait(lambda: browser.text("tab-faults"), "the page is ready")
-            browser.click("tab-faults")
-            assert browser.value("[...document.querySelectorAll('.fault-buttons button')].every(b => b.disabled)")
-            assert desk[1] == []
-            take_control(browser)
-            ready = "document.querySelector('.fault-buttons button:not(:disabled)')"
-            browser.until(f"Boolean({ready})")
-            desk[2].clear()
-            browser.value(f"{ready}.click()")
-            browser.wait(lambda: "Is being injected" in browser.text("panel-faults"), "it is on its way")
-            assert not browser.value(f"Boolean({ready})"), "one at a time"
-            desk[2].set()
-            browser.until(f"Boolean({ready})")
-            browser.wait(lambda: "ESTOP_PRESSED" in browser.text("panel-faults"), "what stopped it")
-            assert "ms" in browser.text("panel-faults") and "0.0 mm" in browser.text("panel-faults")
-        finally:
-            browser.close()
-    over.set()
-    thread.join()
+    feeding = fed(reports.getsockname(), 0.02, told)
+    with feeding, served(create_app(console)) as url, Browser(tmp_path, (1280, 800)) as browser:
+        browser.open(url)
+        browser.wait(lambda: browser.text("tab-faults"), "the page is ready")
+        browser.click("tab-faults")
+        assert browser.value("[...document.querySelectorAll('.fault-buttons button')].every(b => b.disabled)")
+        assert desk[1] == []
+        take_control(browser)
+        ready = "document.querySelector('.fault-buttons button:not(:disabled)')"
+        browser.until(f"Boolean({ready})")
+        desk[2].clear()
+        browser.value(f"{ready}.click()")
+        browser.wait(lambda: "Is being injected" in browser.text("panel-faults"), "it is on its way")
+        assert not browser.value(f"Boolean({ready})"), "one at a time"
+        desk[2].set()
+        browser.until(f"Boolean({ready})")
+        browser.wait(lambda: "ESTOP_PRESSED" in browser.text("panel-faults"), "what stopped it")
+        assert "ms" in browser.text("panel-faults") and "0.0 mm" in browser.text("panel-faults")
 
 
 @pytest.mark.skipif(installed() is None, reason=MISSING)
 def test_a_page_opened_before_the_run_is_up_gets_its_buttons(tmp_path: Path) -> None:
     path = tmp_path / "desk"
     console = Console(PROFILE, HASH, tmp_path / "operator", faults=path)
-    with served(create_app(console)) as url:
-        browser = Browser(tmp_path, (1280, 800))
-        try:
-            browser.open(url)
-            browser.wait(lambda: browser.text("tab-faults"), "the page is ready")
-            browser.click("tab-faults")
-            browser.wait(lambda: "does not answer" in browser.text("panel-faults"), "why there are no buttons")
-            with socketserver.UnixStreamServer(str(path), _Desk) as server:
-                server.ordered = []
-                thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-                thread.start()
-                browser.wait(lambda: OFFER["title"] in browser.text("panel-faults"), "the buttons")
-                assert "does not answer" not in browser.text("panel-faults")
-                server.shutdown()
-                thread.join()
-        finally:
-            browser.close()
+    with served(create_app(console)) as url, Browser(tmp_path, (1280, 800)) as browser:
+        browser.open(url)
+        browser.wait(lambda: browser.text("tab-faults"), "the page is ready")
+        browser.click("tab-faults")
+        browser.wait(lambda: "does not answer" in browser.text("panel-faults"), "why there are no buttons")
+        with socketserver.UnixStreamServer(str(path), _Desk) as server:
+            server.ordered = []
+            thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+            thread.start()
+            browser.wait(lambda: OFFER["title"] in browser.text("panel-faults"), "the buttons")
+            assert "does not answer" not in browser.text("panel-faults")
+            server.shutdown()
+            thread.join()
 
 
 @pytest.mark.skipif(installed() is None, reason=MISSING)
 def test_a_fault_that_is_refused_does_not_stay_on_its_way(desk, tmp_path: Path) -> None:
     desk[1].append(REFUSED)
-    with served(create_app(Console(PROFILE, HASH, tmp_path / "operator", faults=desk[0]))) as url:
-        browser = Browser(tmp_path, (1280, 800))
-        try:
-            browser.open(url)
-            browser.wait(lambda: browser.text("tab-faults"), "the page is ready")
-            browser.click("tab-faults")
-            take_control(browser)
-            ready = "document.querySelector('.fault-buttons button:not(:disabled)')"
-            browser.until(f"Boolean({ready})")
-            browser.value(f"{ready}.click()")
-            browser.wait(lambda: REFUSED in browser.text("panel-faults"), "why not")
-            browser.until(f"Boolean({ready})")
-        finally:
-            browser.close()
+    console = Console(PROFILE, HASH, tmp_path / "operator", faults=desk[0])
+    with served(create_app(console)) as url, Browser(tmp_path, (1280, 800)) as browser:
+        browser.open(url)
+        browser.wait(lambda: browser.text("tab-faults"), "the page is ready")
+        browser.click("tab-faults")
+        take_control(browser)
+        ready = "document.querySelector('.fault-buttons button:not(:disabled)')"
+        browser.until(f"Boolean({ready})")
+        browser.value(f"{ready}.click()")
+        browser.wait(lambda: REFUSED in browser.text("panel-faults"), "why not")
+        browser.until(f"Boolean({ready})")

@@ -26,13 +26,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PerceivedRun]:
 @pytest.fixture
 def browser(run: PerceivedRun, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Browser]:
     size, light = getattr(request, "param", ((1280, 800), False))
-    opened = Browser(tmp_path, size, light)
-    try:
+    with Browser(tmp_path, size, light) as opened:
         opened.open(run.url)
         opened.wait(lambda: opened.text("tab-camera"), "the page is ready")
         yield opened
-    finally:
-        opened.close()
 
 
 def test_the_picture_has_the_logs_and_the_grasp_that_the_planner_chose(run: PerceivedRun, browser: Browser) -> None:

@@ -22,12 +22,10 @@ SIZES = [(1280, 800), (800, 1280), (390, 844)]
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Browser]:
-    with bench(tmp_path) as url:
-        made = Browser(tmp_path, SIZES[0])
+    with bench(tmp_path) as url, Browser(tmp_path, SIZES[0]) as made:
         made.open(f"{url}commission")
         made.until("document.body?.dataset.ready === 'yes'")
         yield made
-        made.close()
 
 
 def arm(browser: Browser) -> None:

@@ -23,25 +23,10 @@ PASSWORD = "hemlock and spruce"
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with accounts, a self-signed certificate and its key, named as the service's credentials are."""
     folder = tmp_path_factory.mktemp("exposure")
+    words = "req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=timberhand -addext subjectAltName=IP:127.0.0.1"
+    files = ("-keyout", folder / "console-key", "-out", folder / "console-cert")
     subprocess.run(
-        [
-            "openssl",
-            "req",
-            "-x509",
-            "-newkey",
-            "rsa:2048",
-            "-nodes",
-            "-days",
-            "2",
-            "-subj",
-            "/CN=timberhand",
-            "-addext",
-            "subjectAltName=IP:127.0.0.1",
-            "-keyout",
-            folder / "console-key",
-            "-out",
-            folder / "console-cert",
-        ],
+        ["openssl", *words.split(), *files],
         check=True,
         capture_output=True,
         timeout=60,

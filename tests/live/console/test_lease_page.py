@@ -13,18 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction, StateReport
+from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction
 from can_dbc.messages.datagrams import decode, encode
 from console.accounts import Accounts, Role, account_line
 from console.console import Console
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
+from tests.console.state_reports import at
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
 from tests.live.console.entries import entered
 from tests.live.console.served_page import served
-from tests.operator_end import OperatorEnd
+from tests.operator_end import OperatorEnd, udp_end
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 PROFILE = load_profile("aoro_fc8")
@@ -47,9 +48,7 @@ class Stage:
         self._open = ExitStack()
         self._operator = self._open.enter_context(OperatorEnd(self.folder / "operator"))
         self._operator.settimeout(0.05)
-        reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        reports.bind(("127.0.0.1", 0))
-        reports.setblocking(False)
+        reports = udp_end()
         self._to = reports.getsockname()
         console = Console(PROFILE, HASH, self.folder / "operator", reports=reports, accounts=self.accounts)
         self.url = self._open.enter_context(served(create_app(console)))
@@ -65,30 +64,7 @@ class Stage:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             while not self.over:
                 out.sendto(
-                    encode(
-                        StateReport(
-                            1,
-                            HASH,
-                            time.monotonic_ns(),
-                            Mode.STANDBY,
-                            0,
-                            0,
-                            1,
-                            0,
-                            0,
-                            0,
-                            Q,
-                            (0.0,) * 5,
-                            Q,
-                            50.0,
-                            12.0,
-                            0.0,
-                            0,
-                            0,
-                            0,
-                            0,
-                        )
-                    ),
+                    encode(at(Q, time.monotonic_ns(), Mode.STANDBY, profile_hash=HASH)),
                     self._to,
                 )
                 try:
@@ -112,7 +88,6 @@ def browsers(stage: Stage, tmp_path: Path) -> Iterator[list[Browser]]:
     """Two browsers at the machine's page."""
     made = []
     for name in ("a", "b"):
-        (tmp_path / name).mkdir()
         made.append(Browser(tmp_path / name, (1280, 800)))
         made[-1].open(stage.url)
         made[-1].until("document.body.dataset.control === 'nobody'")
@@ -161,8 +136,7 @@ def accounts() -> Accounts:
 
 @pytest.mark.parametrize("stage", [accounts()], indirect=True)
 def test_a_person_signs_in_and_out_and_stop_works_before(stage: Stage, tmp_path: Path) -> None:
-    browser = Browser(tmp_path, (390, 844))
-    try:
+    with Browser(tmp_path, (390, 844)) as browser:
         browser.open(stage.url)
         browser.until("document.body?.className === 'sign-in' && Boolean(document.getElementById('enter'))")
         pictures = os.environ.get("TIMBERHAND_PICTURES")
@@ -184,13 +158,10 @@ def test_a_person_signs_in_and_out_and_stop_works_before(stage: Stage, tmp_path:
         assert browser.value("document.documentElement.scrollWidth <= innerWidth")
         browser.click("sign-out")
         browser.until("document.body?.className === 'sign-in'")
-    finally:
-        browser.close()
 
 
 def test_who_opens_the_bare_address_looks_and_stops_and_enters_by_the_token(stage: Stage, tmp_path: Path) -> None:
-    browser = Browser(tmp_path, (1280, 800))
-    try:
+    with Browser(tmp_path, (1280, 800)) as browser:
         browser.open(stage.url, enters=False)
         browser.until(
             "document.getElementById('sign-in')?.checkVisibility() && !document.getElementById('stop').disabled"
@@ -213,14 +184,11 @@ def test_who_opens_the_bare_address_looks_and_stops_and_enters_by_the_token(stag
         take_control(browser)
         browser.click("reset")
         browser.wait(lambda: stage.pressed[2:] == [OperatorAction.RESET], "a command of who has entered")
-    finally:
-        browser.close()
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (800, 1280), (390, 844)])
 def test_the_header_has_room_for_control_and_stop(stage: Stage, tmp_path: Path, size: tuple[int, int]) -> None:
-    browser = Browser(tmp_path, size)
-    try:
+    with Browser(tmp_path, size) as browser:
         for path in ("", "plan"):
             browser.open(stage.url + path)
             browser.until("document.body?.dataset.control === 'nobody' || document.body?.dataset.control === 'mine'")
@@ -234,5 +202,3 @@ def test_the_header_has_room_for_control_and_stop(stage: Stage, tmp_path: Path, 
             )
             if pictures := os.environ.get("TIMBERHAND_PICTURES"):
                 browser.picture(Path(pictures, f"control-{path or 'machine'}-{size[0]}x{size[1]}.png"))
-    finally:
-        browser.close()

@@ -52,11 +52,10 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def person(tmp_path: Path) -> Iterator[Browser]:
-    browser = Browser(tmp_path, SIZE, solid=pictured())
-    if pictured():
-        browser.draw_every(DRAW_MS)
-    yield browser
-    browser.close()
+    with Browser(tmp_path, SIZE, solid=pictured()) as browser:
+        if pictured():
+            browser.draw_every(DRAW_MS)
+        yield browser
 
 
 def arm(browser: Browser) -> None:
@@ -101,10 +100,8 @@ def plan(browser: Browser) -> None:
 
 def test_a_mission_is_planned_driven_broken_stopped_and_replayed(folder: Path, person: Browser) -> None:
     run = folder / RUN
-    live = Started(
-        folder, "tests.live.console.awaited_mission", "forest.geojson", "--out", RUN, option="--console-port"
-    )
-    try:
+    arguments = ("tests.live.console.awaited_mission", "forest.geojson", "--out", RUN)
+    with Started(folder, *arguments, option="--console-port") as live:
         opened(live, person)
         person.shows("mode", "STANDBY")
         person.shows("mission-words", "The machine waits for a mission.")
@@ -118,8 +115,6 @@ def test_a_mission_is_planned_driven_broken_stopped_and_replayed(folder: Path, p
         stops(live, person)
         go_on_until(live, person, lambda: live.process.poll() is not None, "the end of the run")
         person.shows("alarm", f"timberhand console --replay {RUN}")
-    finally:
-        live.interrupt()
     assert live.process.returncode == 0, live.said.read_text()
     told = json.loads((run / "summary.json").read_text())
     assert (told["finished"], told["loaded"], told["in_bunk"]) == (True, 2, 2)
@@ -179,8 +174,7 @@ def works(live: Started, browser: Browser) -> None:
 
 def replays(folder: Path, browser: Browser) -> None:
     """Open the recording at the ten seconds before STOP was pressed, and see it stop once more."""
-    again = Started(folder, "timberhand", "console", "--replay", RUN)
-    try:
+    with Started(folder, "timberhand", "console", "--replay", RUN) as again:
         opened(again, browser)
         browser.until("document.body?.dataset.recording === 'yes'")
         browser.click("tab-timeline")
@@ -195,8 +189,6 @@ def replays(folder: Path, browser: Browser) -> None:
         browser.until("document.body.dataset.mode === 'ACTIVE'")
         browser.shows("reason", "[OPERATOR_STOP]")
         assert clock(browser) + begin_s - stop_s < 3.0
-    finally:
-        again.interrupt()
 
 
 def clock(browser: Browser) -> float:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -15,18 +13,18 @@ from urllib.parse import urlsplit
 import msgspec
 import pytest
 
-from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import MissionAction, MissionReport, decode_mission_command, encode_mission
 from console.console import Console
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from tests.can_dbc.example_mission_report import MISSION_REPORT
+from tests.console.state_reports import at
 from tests.console.vehicle_reports import VEHICLE
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
-from tests.live.console.served_page import served
+from tests.live.console.served_page import fed, served
+from tests.operator_end import udp_end
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 INK = """(name => {
@@ -51,49 +49,33 @@ class Stage:
     port: int = 0
     mission: MissionReport | None = MISSION_REPORT
     speaks: bool = True
-    over: bool = False
 
     def begin(self) -> None:
         profile = load_profile(self.profile)
         self.hash = profile_hash(profile)
-        reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        reports.bind(("127.0.0.1", 0))
-        reports.setblocking(False)
-        self._to = reports.getsockname()
+        reports = udp_end()
         console = Console(profile, self.hash, ("127.0.0.1", 9), reports=reports, planner=self.orders.getsockname())
         self._serving = ExitStack()
         self.port = urlsplit(self._serving.enter_context(served(create_app(console)))).port or 0
-        self._thread = threading.Thread(target=self._feed)
-        self._thread.start()
+        self._serving.enter_context(fed(reports.getsockname(), 0.1, self._told))
 
     def end(self) -> None:
-        self.over = True
-        self._thread.join()
         self._serving.close()
 
     def ordered(self) -> MissionAction:
         return decode_mission_command(self.orders.recv(100)).action
 
-    def _feed(self) -> None:
+    def _told(self, now_ns: int) -> Iterator[bytes]:
         q = (0.4, 0.9, -1.6, 0.5, 0.0)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while not self.over:
-                now = time.monotonic_ns()
-                state = StateReport(
-                    1, self.hash, now, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, q, (0.0,) * 5, q, nan, nan, nan, 0, 0, 0, 0
-                )
-                out.sendto(encode(state), self._to)
-                out.sendto(encode(VEHICLE), self._to)
-                if self.mission is not None and self.speaks:
-                    out.sendto(encode_mission(self.mission, 1, self.hash, now), self._to)
-                time.sleep(0.1)
+        yield encode(at(q, now_ns, profile_hash=self.hash, opening_pct=nan, clamp_bar=nan, load_kg=nan))
+        yield encode(VEHICLE)
+        if self.mission is not None and self.speaks:
+            yield encode_mission(self.mission, 1, self.hash, now_ns)
 
 
 @pytest.fixture
 def stage(request) -> Iterator[Stage]:
-    orders = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    orders.bind(("127.0.0.1", 0))
-    orders.settimeout(10)
+    orders = udp_end(10)
     profile, told = getattr(request, "param", ("aoro_fc8", MISSION_REPORT))
     made = Stage(profile, orders, mission=told)
     made.begin()
@@ -104,10 +86,9 @@ def stage(request) -> Iterator[Stage]:
 
 @pytest.fixture
 def browser(stage: Stage, tmp_path: Path) -> Iterator[Browser]:
-    made = Browser(tmp_path)
-    made.open(f"http://127.0.0.1:{stage.port}/")
-    yield made
-    made.close()
+    with Browser(tmp_path) as made:
+        made.open(f"http://127.0.0.1:{stage.port}/")
+        yield made
 
 
 def test_mission_and_vehicle_are_shown_as_text(stage: Stage, browser: Browser) -> None:

@@ -73,11 +73,10 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 @pytest.fixture
 def browser(stage: Stage, tmp_path: Path) -> Iterator[Browser]:
-    made = Browser(tmp_path)
-    made.open(f"http://127.0.0.1:{stage.port}/")
-    made.wait(lambda: stage.count(OperatorAction.WATCH) >= 10, "heartbeats")
-    yield made
-    made.close()
+    with Browser(tmp_path) as made:
+        made.open(f"http://127.0.0.1:{stage.port}/")
+        made.wait(lambda: stage.count(OperatorAction.WATCH) >= 10, "heartbeats")
+        yield made
 
 
 def test_an_open_page_watches_about_five_times_a_second(stage: Stage, browser: Browser) -> None:

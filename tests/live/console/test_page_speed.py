@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import random
-import socket
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,6 +23,7 @@ from machine.loading.profile_file import load_profile, profile_hash
 from tests.console.state_reports import REPORT
 from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.served_page import served
+from tests.operator_end import udp_end
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 PROFILE = load_profile("palms_471")
@@ -52,9 +52,7 @@ class Detector(threading.Thread):
     def __init__(self, reports: tuple[str, int]) -> None:
         super().__init__()
         self.count, self.over, self._reports = 1, threading.Event(), reports
-        self.link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.link.bind(("127.0.0.1", 0))
-        self.link.settimeout(0.05)
+        self.link = udp_end(0.05)
 
     def run(self) -> None:
         moment = 0
@@ -72,9 +70,7 @@ class Detector(threading.Thread):
 
 @pytest.fixture
 def detector() -> Iterator[tuple[Detector, str]]:
-    reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    reports.bind(("127.0.0.1", 0))
-    reports.setblocking(False)
+    reports = udp_end()
     seen = Detector(reports.getsockname())
     seen.start()
     console = Console(PROFILE, profile_hash(PROFILE), reports=reports, scene=seen.link.getsockname())
@@ -89,8 +85,7 @@ def test_little_blocks_the_first_paint_and_200_logs_are_drawn_at_once(
     detector: tuple[Detector, str], tmp_path: Path
 ) -> None:
     seen, url = detector
-    browser = Browser(tmp_path, (1280, 800), solid=True)
-    try:
+    with Browser(tmp_path, (1280, 800), solid=True) as browser:
         browser.open(url)
         browser.until(f"{DRAWN}[0] > 0")
         browser.until("performance.getEntriesByName('first-contentful-paint').length > 0")
@@ -112,5 +107,3 @@ def test_little_blocks_the_first_paint_and_200_logs_are_drawn_at_once(
         )
         print(f"\nfirst paint {paint_ms:.0f} ms, {calls} draw calls, {frame_ms:.0f} ms a frame with 200 logs")
         browser.picture(tmp_path / "logs.png")
-    finally:
-        browser.close()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +10,6 @@ import pytest
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.dbc.codec import load
-from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.protocols.e2e import Sender
 from can_dbc.timing.page import TimingWriter
@@ -22,8 +19,10 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.explanation import explain
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
+from tests.console.state_reports import at
 from tests.live.console.browser import MISSING, Browser, installed
-from tests.live.console.served_page import served
+from tests.live.console.served_page import fed, served
+from tests.operator_end import udp_end
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 PROFILE, BUS = load_profile("palms_471"), "virtual:panels"
@@ -34,68 +33,33 @@ Q = (0.4, 0.9, -1.6, 0.5, 0.0)
 @pytest.fixture
 def page(tmp_path: Path, timing) -> Iterator[tuple[Console, str]]:
     """A console with a bus on which a valve node and an encoder send, and a controller that stops."""
-    reports, over = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), threading.Event()
-    reports.bind(("127.0.0.1", 0))
-    reports.setblocking(False)
-    times, to = tmp_path / "controller.timing", reports.getsockname()
+    times = tmp_path / "controller.timing"
+    reports = udp_end()
     console = Console(
         PROFILE, profile_hash(PROFILE), reports=reports, timing_page=times, buses={PROFILE.crane_bus: BUS}
     )
 
-    def feed() -> None:
-        crane, writer, began = load("crane"), TimingWriter(times), time.monotonic_ns()
-        valve, lift = crane.message("ValveFbA"), crane.message("EncLift")
-        sender = Sender(valve.data_ids)
-        with open_bus(BUS) as bus, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while not over.wait(0.05):
-                now = time.monotonic_ns()
-                mode, reason = (Mode.STOP, STOPPED) if now - began > 10**9 else (Mode.ACTIVE, 0)
-                out.sendto(
-                    encode(
-                        StateReport(
-                            1,
-                            profile_hash(PROFILE),
-                            now,
-                            mode,
-                            0,
-                            reason,
-                            1,
-                            0,
-                            0,
-                            0,
-                            Q,
-                            (0.0,) * 5,
-                            Q,
-                            50.0,
-                            12.0,
-                            0.0,
-                            0,
-                            0,
-                            0,
-                            0,
-                        )
-                    ),
-                    to,
-                )
-                bus.send(valve.key, sender.protect(bytes(valve.length)))
-                bus.send(lift.key, bytes(lift.length))
-                written = timing(400, written_ns=now)
-                writer.publish(written.facts, written.durations)
-        writer.close()
+    crane, writer, began = load("crane"), TimingWriter(times), time.monotonic_ns()
+    valve, lift = crane.message("ValveFbA"), crane.message("EncLift")
+    sender = Sender(valve.data_ids)
 
-    thread = threading.Thread(target=feed)
-    thread.start()
-    with served(create_app(console)) as url:
+    def told(now_ns: int) -> Iterator[bytes]:
+        mode, reason = (Mode.STOP, STOPPED) if now_ns - began > 10**9 else (Mode.ACTIVE, 0)
+        yield encode(at(Q, now_ns, mode, reason=reason))
+        bus.send(valve.key, sender.protect(bytes(valve.length)))
+        bus.send(lift.key, bytes(lift.length))
+        written = timing(400, written_ns=now_ns)
+        writer.publish(written.facts, written.durations)
+
+    with open_bus(BUS) as bus, fed(reports.getsockname(), 0.05, told), served(create_app(console)) as url:
         yield console, url
-    over.set()
-    thread.join()
+    writer.close()
     reports.close()
 
 
 def test_the_panels_show_bus_stop_and_ticks(page: tuple[Console, str], tmp_path: Path) -> None:
     console, url = page
-    browser = Browser(tmp_path, (1280, 800))
-    try:
+    with Browser(tmp_path, (1280, 800)) as browser:
         browser.open(url)
         browser.wait(lambda: browser.text("tab-timeline"), "the page is ready")
         browser.click("tab-timeline")
@@ -110,5 +74,3 @@ def test_the_panels_show_bus_stop_and_ticks(page: tuple[Console, str], tmp_path:
         browser.wait(lambda: "median" in browser.text("panel-ticks"), "the histograms")
         assert browser.value("document.querySelectorAll('#panel-ticks canvas').length") == 4
         browser.wait(lambda: not console.can_tap.tables()[0].get("rows"), "the bus is closed again")
-    finally:
-        browser.close()

@@ -33,7 +33,7 @@ from tests.live.console.browser import MISSING, Browser, installed
 from tests.live.console.control import take_control
 from tests.live.console.plan_drawing import draw, window
 from tests.live.console.served_page import served
-from tests.operator_end import OperatorEnd
+from tests.operator_end import OperatorEnd, udp_end
 
 pytestmark = pytest.mark.skipif(installed() is None, reason=MISSING)
 SIZES = [(1280, 800), (800, 1280), (390, 844)]
@@ -51,9 +51,7 @@ class Stage:
     port: int = 0
 
     def begin(self) -> None:
-        reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        reports.bind(("127.0.0.1", 0))
-        reports.setblocking(False)
+        reports = udp_end()
         self._to = reports.getsockname()
         self.planner: PlannerProcess = planner_process(self._to[1], None, "--missions", str(self.folder))
         console = Console(
@@ -104,10 +102,9 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 @pytest.fixture
 def browser(stage: Stage, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Browser]:
-    made = Browser(tmp_path, *getattr(request, "param", ((1280, 800),)))
-    begin(made, stage)
-    yield made
-    made.close()
+    with Browser(tmp_path, *getattr(request, "param", ((1280, 800),))) as made:
+        begin(made, stage)
+        yield made
 
 
 def begin(browser: Browser, stage: Stage) -> None:

@@ -51,17 +51,13 @@ def shift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Fed
             clock=lambda: feed.now_ns,
             feed=feed,
         )
-        with served(create_app(console)) as url:
-            browser = Browser(tmp_path, (1280, 800), solid=True)
-            try:
-                browser.draw_every(DRAW_MS)
-                browser.open(url)
-                browser.wait(lambda: browser.text("tab-timeline"), "the page is ready")
-                browser.until("document.querySelector('#scene canvas') !== null")
-                browser.wait(lambda: console.answered_ms, "the page answers")
-                yield console, browser
-            finally:
-                browser.close()
+        with served(create_app(console)) as url, Browser(tmp_path, (1280, 800), solid=True) as browser:
+            browser.draw_every(DRAW_MS)
+            browser.open(url)
+            browser.wait(lambda: browser.text("tab-timeline"), "the page is ready")
+            browser.until("document.querySelector('#scene canvas') !== null")
+            browser.wait(lambda: console.answered_ms, "the page answers")
+            yield console, browser
 
 
 def work_until(hours: float, console: FedConsole, browser: Browser) -> None:

@@ -10,7 +10,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,18 +25,18 @@ LOADED_S = 900.0
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+def folder(tmp_path: Path) -> Path:
     """The empty folder of the tutorial."""
     made = tmp_path / "forest"
     made.mkdir()
-    yield made
+    return made
 
 
 def plan(folder: Path, tmp_path: Path) -> None:
-    started = Started(folder, "timberhand", "console", "--profile", "aoro_fc8")
-    (tmp_path / "planner").mkdir()
-    browser = Browser(tmp_path / "planner", SIZE)
-    try:
+    with (
+        Started(folder, "timberhand", "console", "--profile", "aoro_fc8") as started,
+        Browser(tmp_path / "planner", SIZE) as browser,
+    ):
         opened(started, browser, "plan")
         browser.until("document.body?.dataset.ready === 'yes'")
         draw(browser, "waypoint", (-8, 0), (8, 0))
@@ -51,9 +50,6 @@ def plan(folder: Path, tmp_path: Path) -> None:
         assert browser.text("command") == "timberhand mission run missions/mission.geojson"
         browser.value("document.querySelector('aside').scrollTop = 0")
         keep(browser, TUTORIAL / "plan.png")
-    finally:
-        browser.close()
-        started.interrupt()
     assert (folder / "missions" / "mission.geojson").is_file() and started.process.returncode in (0, 130)
 
 
@@ -74,10 +70,10 @@ def drive(folder: Path) -> None:
 
 
 def replay(folder: Path, tmp_path: Path) -> None:
-    started = Started(folder, "timberhand", "console", "--replay", "runs/first")
-    (tmp_path / "replayer").mkdir()
-    browser = Browser(tmp_path / "replayer", SIZE, solid=pictured())
-    try:
+    with (
+        Started(folder, "timberhand", "console", "--replay", "runs/first") as started,
+        Browser(tmp_path / "replayer", SIZE, solid=pictured()) as browser,
+    ):
         opened(started, browser)
         browser.until("document.body?.dataset.recording === 'yes'")
         browser.click("tab-timeline")
@@ -95,17 +91,14 @@ def replay(folder: Path, tmp_path: Path) -> None:
         keep(browser, TUTORIAL / "replay.png")
         assert browser.value("document.getElementById('speed').checkVisibility()"), "the vehicle is shown"
         assert browser.value("fetch('api/operator/arm', {method: 'POST'}).then(a => a.status)") == 409
-    finally:
-        browser.close()
-        started.interrupt()
 
 
 def find_out_why(folder: Path, tmp_path: Path) -> None:
     """Replay the live run at the ten seconds before it stopped."""
-    started = Started(folder, "timberhand", "console", "--replay", "runs/second")
-    (tmp_path / "asker").mkdir()
-    browser = Browser(tmp_path / "asker", SIZE, solid=pictured())
-    try:
+    with (
+        Started(folder, "timberhand", "console", "--replay", "runs/second") as started,
+        Browser(tmp_path / "asker", SIZE, solid=pictured()) as browser,
+    ):
         opened(started, browser)
         browser.until("document.body?.dataset.recording === 'yes'")
         browser.click("tab-timeline")
@@ -114,9 +107,6 @@ def find_out_why(folder: Path, tmp_path: Path) -> None:
         if pictured():
             time.sleep(SOLID_S)
         keep(browser, TUTORIAL / "stopped.png")
-    finally:
-        browser.close()
-        started.interrupt()
 
 
 @pytest.mark.timeout(1500)
@@ -132,10 +122,10 @@ def test_a_newcomer_watches_it_live_and_breaks_it(folder: Path, tmp_path: Path) 
     """In real time on the wire: what is asserted is what the page says, also where a busy host stops the machine."""
     plan(folder, tmp_path)
     arguments = ("mission", "run", "missions/mission.geojson", "--bus", "wire", "--out", "runs/second")
-    started = Started(folder, "timberhand", *arguments, option="--console-port")
-    (tmp_path / "watcher").mkdir()
-    browser = Browser(tmp_path / "watcher", SIZE)
-    try:
+    with (
+        Started(folder, "timberhand", *arguments, option="--console-port") as started,
+        Browser(tmp_path / "watcher", SIZE) as browser,
+    ):
         opened(started, browser)
         browser.until("document.body.dataset.mode === 'ACTIVE'")  # the stand-in has pressed ARM
         take_control(browser)
@@ -149,8 +139,5 @@ def test_a_newcomer_watches_it_live_and_breaks_it(folder: Path, tmp_path: Path) 
         browser.wait(lambda: "POST /api/operator/stop" in audit.read_text(), "STOP in the audit log")
         started.interrupt()
         browser.shows("alarm", "timberhand console --replay runs/second")
-    finally:
-        browser.close()
-        started.interrupt()
     assert started.process.returncode == 130, started.said.read_text()
     find_out_why(folder, tmp_path)

@@ -21,44 +21,16 @@ from host.release.gate import LIMIT_NS
 from host.release.services import RESUME
 from host.release.trees import TRIAL
 from host.release.updater import PLACE
+from tests.deploy.unit_files import CONF, DEPLOY, EXPOSURE, UNITS, setting, short
 from timberhand.cli import app
 from timberhand.service_status import NAMES, SERVICE_PAGE
 from timberhand.why.stops import SERVICE_STOPS
 
-DEPLOY = Path(__file__).parents[3] / "deploy"
-UNITS = sorted((DEPLOY / "units").glob("*.service"))
-CONF = dict(
-    line.split("=", 1)
-    for line in (DEPLOY / "timberhand.conf").read_text().splitlines()
-    if not line.startswith("#") and line
-)
-EXPOSURE = {
-    "controller": 1.3,
-    "guard": 1.0,
-    "autonomy": 1.0,
-    "recorder": 1.1,
-    "console": 1.1,
-    "plc": 1.4,
-    "can@": 1.1,
-    "update": 1.2,
-    "perception": 1.5,
-}
-"""Exposure of each unit by systemd-analyze, of 10; at most 1.5."""
 CREDENTIALS = "/run/credentials"
 
 needs_systemd = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing (apt-get install systemd)"
 )
-
-
-def short(unit: Path) -> str:
-    """The name without what all names have."""
-    return unit.stem.removeprefix("timberhand-")
-
-
-def setting(unit: Path, name: str) -> list[str]:
-    """Every value of a setting."""
-    return re.findall(rf"^{name}=(.*)$", unit.read_text(), re.MULTILINE)
 
 
 def words(unit: Path, **settings: str) -> list[str]:

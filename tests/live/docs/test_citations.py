@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 import subprocess
-from functools import cache
 from pathlib import Path
 
+from tests.docs.pages import ROOT, has_section, headings
 from timberhand.reference.__main__ import BUILT
 
-ROOT = Path(__file__).resolve().parents[3]
 TEXTS = ("*.py", "*.toml", "*.dbc", "*.eds", "*.js", "*.sh", "*.service", "*.md", "Makefile")
 ELSEWHERE = re.compile(
     r"(?<!reference/)\b(machines|can_bus|realtime|safety_faults|ecosystem)\.md\b"
@@ -32,15 +31,6 @@ def sources() -> list[Path]:
 def prose(path: Path) -> str:
     """The text with line breaks and comment marks folded, so that a citation may run over two lines."""
     return re.sub(r"\s*\n\s*(#|//|\*)?\s*", " ", path.read_text())
-
-
-@cache
-def headings(page: str) -> tuple[str, ...]:
-    return tuple(re.findall(r"(?m)^#+ (.+)$", (ROOT / page).read_text()))
-
-
-def has_section(page: str, number: str) -> bool:
-    return any(heading.startswith((f"{number}. ", f"{number} ")) for heading in headings(page))
 
 
 def problems(path: Path) -> list[str]:

@@ -10,23 +10,15 @@ import pytest
 from rich.console import Console
 
 from experiments.common import campaign
-from experiments.common.registry import EXPERIMENTS, Entry, Options
-from experiments.common.workers import Workers
+from tests.experiments.toy_experiment import enter, options
 
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXPERIMENTS, "toy", Entry("?", "tests.experiments.toy_experiment", (), clocked=("clock",)))
-
-
-def options(out: Path, workers: int = 1, trials: int = 4) -> Options:
-    return Options(1, "nominal", "palms_471", out, trials=trials, workers=Workers(workers))
-
-
-@pytest.mark.usefixtures("toy")
-def test_the_table_is_the_same_by_one_process_two_and_in_two_parts(tmp_path: Path) -> None:
+def test_the_table_is_the_same_by_one_process_two_and_in_two_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(monkeypatch)
     _, one = campaign.run("toy", options(tmp_path / "a"), 0, QUIET)
     _, two = campaign.run("toy", options(tmp_path / "b", workers=2), 0, QUIET)
     campaign.run("toy", options(tmp_path / "c", trials=2), 0, QUIET)
@@ -38,8 +30,8 @@ def test_the_table_is_the_same_by_one_process_two_and_in_two_parts(tmp_path: Pat
     assert [json.loads(line)[0] for line in lines] == ["n/0", "n/1", "n/2", "n/3"], "no trial ran twice"
 
 
-@pytest.mark.usefixtures("toy")
-def test_the_summary_says_what_a_trial_costs(tmp_path: Path) -> None:
+def test_the_summary_says_what_a_trial_costs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(monkeypatch)
     _, found = campaign.run("toy", options(tmp_path, workers=2), 0, QUIET)
     document = json.loads((tmp_path / campaign.SUMMARY).read_text())
     assert document["trials"] == 4 and document["table_sha256"] == found.table_sha256

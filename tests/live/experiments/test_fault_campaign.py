@@ -13,32 +13,11 @@ from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
 from experiments.faults import experiment, files
 from experiments.faults.experiment import _limited, plan
-from experiments.faults.trial import in_child, judge
+from experiments.faults.trial import in_child
 from hil.faults.catalogue import BY_NAME
 from runtime.errors import InputRefused
 from tests.codes import coded
-
-
-def outcome(**changed: Any) -> dict[str, Any]:
-    row = {
-        "seed": "s",
-        "at_ms": 1.0,
-        "orders": ["encoder-stuck/lift"],
-        "expected": "R1",
-        "bound_ms": 20.0,
-        "seen_ms": 0.0,
-        "tip_limit_m": None,
-        "reached": {"R1": 15.0},
-        "reason": "ENCODER_LOST",
-        "refused_ms": None,
-        "neutral_ms": 80.0,
-        "valves_ms": 70.0,
-        "travel_m": 0.02,
-        "astray_m": 0.02,
-        "standing": True,
-        "timeline": [[1.0, "STOP"]],
-    } | changed
-    return row | judge(row)
+from tests.experiments.fault_outcomes import outcome
 
 
 def test_the_time_limit_ends_a_run_and_keeps_what_is_done(tmp_path: Path) -> None:

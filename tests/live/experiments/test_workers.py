@@ -17,26 +17,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from experiments.common import pool, ray_workers
-from experiments.common.campaign import line_of
 from experiments.common.checkpoint import Checkpoint
-from experiments.common.pool import Job
 from experiments.common.workers import Trial, Workers
-from experiments.plant.experiment import perform
 from runtime.errors import InputRefused
 from tests.codes import coded
 from tests.experiments.mortal_trials import (
+    QUIET,
     always_killed,
     mortal,
     plant_jobs,
     process_id,
     slow_square,
     square_jobs,
+    table,
+    table_of_one_process,
 )
 
-QUIET = Console(quiet=True)
 ROOT = Path(__file__).parents[3]
 INTERRUPTED = """
 import sys
@@ -64,18 +62,6 @@ if __name__ == "__main__":
     with Checkpoint(Path(sys.argv[1]), "run") as kept:
         pool.run(partial(endless, Path(sys.argv[2])), square_jobs(2), kept, Workers(2), "", Console(quiet=True))
 """
-
-
-def table(path: Path, function: Any, workers: Workers, jobs: list[Job]) -> bytes:
-    with Checkpoint(path, "run") as kept:
-        outcomes = pool.run(function, jobs, kept, workers, "trials", QUIET)
-    return "\n".join(line_of(name, outcome, ()) for name, outcome in outcomes.items()).encode()
-
-
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The table of one process."""
-    return table(tmp_path_factory.mktemp("alone") / "trials.jsonl", perform, Workers(), plant_jobs())
 
 
 def test_workers_that_are_killed_again_and_again_end_the_run_with_a_sentence(tmp_path: Path) -> None:
@@ -198,13 +184,13 @@ def meet(folder: Path, name: str) -> str:
 @needs_ray
 @pytest.mark.timeout(600)
 def test_a_cluster_of_two_nodes_gives_the_same_bytes_with_a_worker_killed_on_the_way(
-    tmp_path: Path, alone: bytes, cluster: Any
+    tmp_path: Path, cluster: Any
 ) -> None:
     trials: list[Trial] = []
     there = table(
         tmp_path / "a.jsonl", mortal(tmp_path / "marker"), Workers(ray=cluster.address, trials=trials), plant_jobs()
     )
-    assert (tmp_path / "marker").exists() and there == alone
+    assert (tmp_path / "marker").exists() and there == table_of_one_process(tmp_path)
     met = ray_workers.completed({name: partial(meet, tmp_path, name) for name in "ab"}, cluster.address, lambda: "ours")
     assert len({node for _, node in met}) == 2, "each node works, at the same time"
     with pytest.raises(InputRefused, check=coded("experiment.node-differs")):

@@ -20,50 +20,39 @@ from hil.wire.launch import wire_daemon
 from tests.live.hil.bus_backends import BITRATE, TIMEOUT_S, Backend, counted_receives
 
 
-@pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
-def test_a_full_queue_refuses_and_never_sends_later(
-    address: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No node acknowledges a lone sender, so its queue fills up; refused frames never reach the bus."""
+@pytest.fixture(params=["in-process", "wire:lone", "timberhand:lone"])
+def lone(request: pytest.FixtureRequest, wire_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Backend:
+    """A bus on which nobody acknowledges a first sender, so that its queue fills up."""
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
-    backend = Backend(address, address, WireCore(BITRATE) if address == "in-process" else None)
-    with backend.open() as a:
-        assert [a.send(0x100 + i, b"") for i in range(14)] == [True] * 10 + [False] * 4
+    core = WireCore(BITRATE) if request.param == "in-process" else None
+    return Backend(request.param, request.param, core)
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_full_queue_refuses_and_never_sends_later(lone: Backend, at_once: bool) -> None:
+    """Refused frames never reach the bus, also those of a tick with too little room for it."""
+    frames = [(0x100 + i, b"") for i in range(14)]
+    with lone.open() as a:
+        if at_once:
+            assert a.send_all(frames) == 10
+        else:
+            assert [a.send(*frame) for frame in frames] == [True] * 10 + [False] * 4
         assert (a.stats.sent, a.stats.refused) == (10, 4)
-        with backend.open() as b:
-            backend.send(a, 0x200, b"")
-            assert [frame.key for frame in backend.receive(b, 11)] == [*range(0x100, 0x10A), 0x200]
+        with lone.open() as b:
+            lone.send(a, 0x200, b"")
+            assert [frame.key for frame in lone.receive(b, 11)] == [*range(0x100, 0x10A), 0x200]
 
 
-@pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
-def test_a_tick_with_too_little_room_is_refused_from_there_on(
-    address: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
-    backend = Backend(address, address, WireCore(BITRATE) if address == "in-process" else None)
-    with backend.open() as a:
-        assert a.send_all([(0x100 + i, b"") for i in range(14)]) == 10
-        assert (a.stats.sent, a.stats.refused) == (10, 4)
-        with backend.open() as b:
-            backend.send(a, 0x200, b"")
-            assert [frame.key for frame in backend.receive(b, 11)] == [*range(0x100, 0x10A), 0x200]
-
-
-@pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
-def test_a_flush_cancels_frames_not_yet_on_the_bus(
-    address: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
-    backend = Backend(address, address, WireCore(BITRATE) if address == "in-process" else None)
-    with backend.open() as a:
+def test_a_flush_cancels_frames_not_yet_on_the_bus(lone: Backend) -> None:
+    with lone.open() as a:
         a.send_all([(0x100 + i, b"") for i in range(10)])
-        backend.settle()
+        lone.settle()
         a.flush()
-        with backend.open() as b:
-            backend.send(a, 0x200, b"")
-            seen = backend.receive(b, 1)
+        with lone.open() as b:
+            lone.send(a, 0x200, b"")
+            seen = lone.receive(b, 1)
             while seen[-1].key != 0x200:
-                seen += backend.receive(b, 1)
+                seen += lone.receive(b, 1)
     assert [frame.key for frame in seen] in ([0x200], [0x100, 0x200])  # the first one may have begun
 
 

@@ -45,18 +45,8 @@ def demo(tmp_path: Path) -> Iterator[Demo]:
     wire.mkdir()
 
     def start(*arguments: str) -> subprocess.Popen[str]:
-        command = [
-            sys.executable,
-            "-m",
-            "timberhand",
-            "demo",
-            "--detector",
-            "perfect",
-            "--no-console",
-            "--out",
-            str(tmp_path / "run"),
-            *arguments,
-        ]
+        words = f"-m timberhand demo --detector perfect --no-console --out {tmp_path / 'run'}"
+        command = [sys.executable, *words.split(), *arguments]
         started.append(
             subprocess.Popen(
                 command,

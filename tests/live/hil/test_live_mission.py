@@ -6,19 +6,14 @@ operator has armed it again.
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from host.vcan_lab import uml
 from tests.hil.short_missions import mission_file
+from tests.live.host.lab_runs import in_simulated_time
 
-ROOT = Path(__file__).parents[3]
 FROZEN = """
 import os, signal, sys, time
 from pathlib import Path
@@ -56,22 +51,10 @@ sys.exit(summary.exit_code)
 @pytest.mark.timeout(900)
 @pytest.mark.bears(math.inf)
 def test_a_log_is_loaded_although_the_planner_freezes_on_the_route(tmp_path: Path) -> None:
-    if uml.find(uml.user_cache()) is None:
-        pytest.skip(uml.MISSING)
     path, out = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0)), tmp_path / "run"
-    done = subprocess.run(
-        [sys.executable, "-m", "host.vcan_lab", "--time-travel", "--", sys.executable, "-c", FROZEN, path, out],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])
-    told = json.loads((out / "summary.json").read_text())
+    lines, told = in_simulated_time(out, "-c", FROZEN, path, out)
     assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 1
     assert told["stops"] == 1, "the lease ran out once, and nothing else was wrong"
-    lines = done.stdout.splitlines()
     freeze, thaw = (next(i for i, line in enumerate(lines) if word in line) for word in ("FREEZE", "THAW"))
     stopped = next(i for i, line in enumerate(lines) if "STOP: " in line)
     assert freeze < stopped < thaw

@@ -1,7 +1,8 @@
-"""Runs of the vcan lab as a person starts them, for tests."""
+"""Runs of the labs as a person starts them, for tests."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,9 +10,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from host.vcan_lab import uml
 from host.vcan_lab.choose import choose, survey
 from host.vcan_lab.spec import LabError
 from tests.host.vcan_request import REQUEST
@@ -72,3 +75,36 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
     while not condition():
         assert time.monotonic() < deadline, what
         time.sleep(0.02)
+
+
+def completed(module: str, timeout_s: int) -> dict[str, Any]:
+    """The result of a lab whose checks all passed."""
+    done = subprocess.run(
+        [sys.executable, "-m", module, "--timeout", str(timeout_s)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout, done.stderr
+    result = json.loads(done.stdout)
+    assert result["failed"] == [], done.stderr
+    assert done.returncode == 0
+    return dict(result)
+
+
+def in_simulated_time(out: Path, *command: object, memory_mb: int = 0) -> tuple[list[str], dict[str, Any]]:
+    """The lines and the summary in ``out`` of a mission that a Python command drove in the lab; skips without one."""
+    if uml.find(uml.user_cache()) is None:
+        pytest.skip(uml.MISSING)
+    memory = ["--mem", str(memory_mb)] if memory_mb else []
+    done = subprocess.run(
+        [*LAB, "--time-travel", *memory, "--", sys.executable, *map(str, command)],
+        cwd=ROOT,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])
+    return done.stdout.splitlines(), json.loads((out / "summary.json").read_text())

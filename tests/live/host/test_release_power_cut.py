@@ -47,6 +47,11 @@ def installed(made: tuple[list[Path], Path], tmp_path_factory: pytest.TempPathFa
     return trees.place
 
 
+@pytest.fixture
+def trees(tmp_path: Path) -> Trees:
+    return Trees(tmp_path / "opt")
+
+
 def version(name: str | None) -> str:
     return (name or "none").partition("-")[0]
 
@@ -116,18 +121,16 @@ def boot(trees: Trees, signer: Path, broken: str = "no release") -> None:
 
 
 def test_an_update_cut_off_at_any_moment_leaves_the_old_release_or_the_new_one(
-    made: tuple[list[Path], Path], installed: Path, tmp_path: Path
+    made: tuple[list[Path], Path], installed: Path, trees: Trees
 ) -> None:
     (_, _, bundle), signer = made
-    place = tmp_path / "opt"
-    trees = Trees(place)
 
     def change(note: Callable[[str], None]) -> None:
         services, program = NotedServices(trees, note=note), NotedProgram(note)
         updater(trees, signer, services, program, note).update(bundle)
 
     left: list[str] = []
-    for moment in moments(installed, place, change):
+    for moment in moments(installed, trees.place, change):
         found = is_whole(trees)
         left.append(found)
         boot(trees, signer)
@@ -142,19 +145,17 @@ def test_an_update_cut_off_at_any_moment_leaves_the_old_release_or_the_new_one(
 
 
 def test_a_bad_release_cut_off_at_any_moment_ends_in_the_old_one(
-    made: tuple[list[Path], Path], installed: Path, tmp_path: Path
+    made: tuple[list[Path], Path], installed: Path, trees: Trees
 ) -> None:
     """Also when the power fails on the way back."""
     (_, _, bundle), signer = made
-    place = tmp_path / "opt"
-    trees = Trees(place)
 
     def change(note: Callable[[str], None]) -> None:
         services = NotedServices(trees, "3.0", note)
         with pytest.raises(CommandFailed, check=coded("update.gate")):
             updater(trees, signer, services, NotedProgram(note), note).update(bundle)
 
-    for moment in moments(installed, place, change):
+    for moment in moments(installed, trees.place, change):
         is_whole(trees)
         boot(trees, signer, broken="3.0")
         assert is_whole(trees) == "2.0", f"moment {moment}"
@@ -162,17 +163,15 @@ def test_a_bad_release_cut_off_at_any_moment_ends_in_the_old_one(
 
 
 def test_a_rollback_cut_off_at_any_moment_leaves_the_one_or_the_other(
-    made: tuple[list[Path], Path], installed: Path, tmp_path: Path
+    made: tuple[list[Path], Path], installed: Path, trees: Trees
 ) -> None:
     _, signer = made
-    place = tmp_path / "opt"
-    trees = Trees(place)
 
     def change(note: Callable[[str], None]) -> None:
         updater(trees, signer, NotedServices(trees, note=note), NotedProgram(note), note).rollback()
 
     left = []
-    for _ in moments(installed, place, change):
+    for _ in moments(installed, trees.place, change):
         left.append(is_whole(trees))
         boot(trees, signer)
         assert is_whole(trees) == left[-1] and trees.state().trial is None

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,8 +11,7 @@ from host.rt_lab import host
 from host.rt_lab.host import missing
 from host.vcan_lab.spec import LabError
 from tests.codes import coded
-
-ROOT = Path(__file__).parents[3]
+from tests.live.host.lab_runs import completed
 
 
 @pytest.mark.timeout(700)
@@ -25,17 +22,7 @@ def test_the_control_loop_runs_on_a_real_time_kernel_and_the_valves_are_neutral_
         host.kernel_package(lambda _line: None)
     except LabError as reason:
         pytest.skip(f"rt lab: {reason}")
-    done = subprocess.run(
-        [sys.executable, "-m", "host.rt_lab", "--timeout", "600"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.stdout, done.stderr
-    result = json.loads(done.stdout)
-    assert result["failed"] == [], done.stderr
-    assert done.returncode == 0
+    result = completed("host.rt_lab", 600)
     assert "PREEMPT_RT" in result["kernel"] and result["realtime"] == "1"
     assert result["refused"] == [] and result["controller_locked_kb"] > 0
     assert result["ticks"] > 100 and result["neutral_ms"] <= 100.0

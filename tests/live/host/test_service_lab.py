@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from host.service_lab.host import missing
-
-ROOT = Path(__file__).parents[3]
+from tests.live.host.lab_runs import completed
 
 
 @pytest.mark.timeout(5000)
@@ -20,17 +15,7 @@ ROOT = Path(__file__).parents[3]
 def test_a_log_is_loaded_and_the_valves_are_neutral_after_every_failure_of_controller_guard_and_bus() -> None:
     if fault := missing():
         pytest.skip(f"service lab: {fault}")
-    done = subprocess.run(
-        [sys.executable, "-m", "host.service_lab", "--timeout", "2400"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.stdout, done.stderr
-    result = json.loads(done.stdout)
-    assert result["failed"] == [], done.stderr
-    assert done.returncode == 0
+    result = completed("host.service_lab", 2400)
     ways = {"kill", "hang", "stop", "guard_kill", "guard_hang", "down", "unplugged"}
     assert {trial["way"] for trial in result["trials"]} == ways
     figures = result["figures"]

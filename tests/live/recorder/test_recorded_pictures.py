@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 
 from can_dbc.messages.picture import PictureFacts, encode_picture
 from recorder.__main__ import InputCollector, udp_socket
 from tests.console.played_detector import detector
+from tests.operator_end import udp_end
 
 JPEG = b"\xff\xd8\xff" + bytes(99)
 
@@ -44,8 +44,7 @@ def test_a_picture_is_recorded_once_and_asked_for_once_a_second() -> None:
 
 
 def test_a_detector_that_is_not_there_or_has_no_camera_costs_nothing() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
-        gone.bind(("127.0.0.1", 0))
+    with udp_end(None) as gone:
         address = gone.getsockname()
     assert collected(address, 1.5) == []
     with detector(b'{"error":"unknown op"}') as (address, _):

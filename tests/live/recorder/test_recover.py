@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -22,6 +21,7 @@ from recorder import manifest as manifests
 from recorder.__main__ import FLUSH_PERIOD_S, InputCollector, udp_socket, write_all
 from recorder.recorder import CHUNK_NS, TICK, Recorder
 from recorder.recover import Stored, is_complete, recover, scan
+from tests.operator_end import udp_end
 from tests.recorder.recordings import PROFILE, T_NS, manifest
 
 
@@ -35,8 +35,7 @@ def ticks_of(path):
 
 
 def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
+    with udp_end(None) as s:
         return s.getsockname()[1]
 
 

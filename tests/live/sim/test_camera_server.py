@@ -1,40 +1,12 @@
-"""The plant's cameras on a socket: rendered on request, refusals, and no ground truth in the frames."""
+"""The plant's cameras on a socket: rendered on request."""
 
-import socket
-import threading
 import time
 
 import numpy as np
 
-from can_dbc.messages.rgbd import HEADER_BYTES, decode, encode_request
-from machine.geometry.optics import Intrinsics
-from sim.camera.rig import Mount, RgbdFrame
+from can_dbc.messages.rgbd import HEADER_BYTES, decode
 from sim.camera.server import CameraServer
-
-PIN = Intrinsics(4, 2, 3.0, 3.0, 1.5, 0.5)
-
-
-class Rig:
-    names = ("front",)
-
-    def __init__(self) -> None:
-        self.drawn: list[tuple[object, int]] = []
-
-    def scene(self, name: str) -> object:
-        assert threading.current_thread() is threading.main_thread()  # only the loop may touch the physics
-        return name.upper()
-
-    def capture(self, name: str, scene: object, now_ns: int) -> RgbdFrame:
-        self.drawn.append((scene, now_ns))
-        depth = np.array([[1.0, np.nan, 2.0004, 99.0], [0.3, 5.0, 6.0, 7.0]], np.float32)
-        rgb = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-        return RgbdFrame(name, now_ns, rgb, depth, PIN, Mount("front", (0, 0, 0), (0, 0, 0)), np.ones(3), np.eye(3))
-
-
-def asked(server: CameraServer, camera: str) -> socket.socket:
-    client = socket.create_connection(("127.0.0.1", server.port), timeout=10.0)
-    client.sendall(encode_request(camera))
-    return client
+from tests.sim.test_camera_server import Rig, asked
 
 
 def test_a_picture_is_rendered_on_request_only() -> None:

@@ -20,14 +20,14 @@ from machine.loading.profile_file import load_profile
 from sim.__main__ import main
 from sim.plant import Plant
 from sim.process.live_plant import LivePlant
+from tests.operator_end import udp_end
 
 PROFILE = load_profile("palms_471")
 _channels = itertools.count()
 
 
 def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
+    with udp_end(None) as s:
         return s.getsockname()[1]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import select
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ from hil.faults.wire_faults import BABBLE_KEY
 from hil.wire.launch import wire_daemon
 from machine.loading.profile_file import load_profile
 from tests.codes import numbers_in
+from tests.operator_end import udp_end
 
 PALMS = load_profile("palms_471")
 
@@ -44,8 +44,7 @@ def test_a_process_is_stopped_for_a_while_and_killed() -> None:
 
 def test_forged_datagrams_reach_the_controllers_port_with_the_runs_key(tmp_path: Path) -> None:
     key_file = write_key(tmp_path / "key")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
-        controller.bind(("127.0.0.1", 0))
+    with udp_end(None) as controller:
         there = target(ports={"control": controller.getsockname()[1]}, key_file=key_file)
         for fault in ("planner-garbage", "planner-arms", "planner-replay"):
             assert fault in inject(make(fault, length_s=0.03), there)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 
 import pytest
@@ -10,14 +9,13 @@ import pytest
 from can_dbc.messages.mission import MissionAction
 from host.exit_codes import CommandFailed, ExitCode
 from tests.codes import coded
+from tests.operator_end import udp_end
 from timberhand import mission_orders
 
 
 def test_what_comes_back_is_received_until_nothing_more_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mission_orders, "ANSWER_S", 0.5)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
-        planner.bind(("127.0.0.1", 0))
-        planner.settimeout(5)
+    with udp_end(5) as planner:
 
         def answer() -> None:
             data, sender = planner.recvfrom(100)
@@ -31,8 +29,7 @@ def test_what_comes_back_is_received_until_nothing_more_comes(monkeypatch: pytes
 
 
 def test_a_port_at_which_nobody_listens_is_named() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
+    with udp_end(None) as free:
         port = free.getsockname()[1]
     with pytest.raises(CommandFailed, check=coded("mission.no-planner")) as refused:
         mission_orders.PlannerOrders(port, 1, None).order(MissionAction.PAUSE)

@@ -60,23 +60,9 @@ class Run:
         self.start("guard", sys.executable, "-m", "controller.guard", *bus, *heard)
         key_file = write_key(directory / "key")
         self.pilot = Pilot(PROFILE, SETPOINTS, directory / "operator", REPORTS, BUS, read_key(key_file))
-        self.start(
-            "controller",
-            sys.executable,
-            "-m",
-            "controller",
-            *bus,
-            "--setpoint-port",
-            str(SETPOINTS),
-            "--report",
-            f"127.0.0.1:{REPORTS}",
-            "--timing",
-            str(directory / "timing"),
-            "--operator",
-            str(directory / "operator"),
-            "--key-file",
-            str(key_file),
-        )
+        links = ("--setpoint-port", str(SETPOINTS), "--report", f"127.0.0.1:{REPORTS}", *heard[:2])
+        files = ("--timing", str(directory / "timing"), "--key-file", str(key_file))
+        self.start("controller", sys.executable, "-m", "controller", *bus, *links, *files)
 
     def start(self, name: str, *command: str, out: str = "") -> None:
         """Start a process; what it says goes into files."""
@@ -139,19 +125,16 @@ def main(directory: Path) -> None:
     run.until(Mode.STOP)
     run.wait(1.0)
 
-    run.swing()
-    run.tell("nodes", signal.SIGUSR1, "estop")
-    run.wait(0.5)
-    run.pilot.rest()
-    run.tell("nodes", signal.SIGUSR2, "released")
-    run.wait(0.2)
-
-    run.swing()
-    run.tell("controller", signal.SIGSTOP, "frozen")
-    run.wait(0.5)
-    run.pilot.rest()
-    run.tell("controller", signal.SIGCONT, "thawed")
-    run.wait(0.5)
+    for process, begins, ends, marks, pause_s in (
+        ("nodes", signal.SIGUSR1, signal.SIGUSR2, ("estop", "released"), 0.2),
+        ("controller", signal.SIGSTOP, signal.SIGCONT, ("frozen", "thawed"), 0.5),
+    ):
+        run.swing()
+        run.tell(process, begins, marks[0])
+        run.wait(0.5)
+        run.pilot.rest()
+        run.tell(process, ends, marks[1])
+        run.wait(pause_s)
 
     run.swing()
     run.tell("guard", signal.SIGKILL, "guard_killed")
