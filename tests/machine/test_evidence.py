@@ -8,7 +8,7 @@ import pytest
 
 from machine.joints import ARTICULATION, JOINTS, Joint
 from machine.status.evidence import EVIDENCE, quantities
-from machine.status.explanation import describe, explain, message_id, priority, sentence_of
+from machine.status.explanation import describe, explain, message_id, part_of, priority, sentence_of
 from machine.status.faults import FAULTS
 from machine.status.reasons import DetailKind, Reaction, Reason, pack
 from machine.status.stale_inputs import CARRIER_BIT, CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
@@ -66,6 +66,20 @@ def test_the_one_text_has_sentence_numbers_advice_and_code() -> None:
     found = explain(reason, (20.0, 15.0, 0.0))
     assert found.text == describe(reason, numbers=(20.0, 15.0, 0.0))
     assert (found.code, found.sentence) == ("ENCODER_LOST", f"{sentence}.")
+
+
+@pytest.mark.parametrize(
+    ("reason", "detail", "part"),
+    [
+        (Reason.ENCODER_LOST, Joint.TILT, "tilt"),
+        (Reason.POSITION_OUTSIDE, ARTICULATION, "articulation"),
+        (Reason.SAFETY_NODE_LOST, 0x10, part_of(DetailKind.NODE, 0x10)),
+        (Reason.FOREIGN_CONTROLLER, 1, part_of(DetailKind.BUS, 1)),
+        (Reason.ARM_STUCK, 1, part_of(DetailKind.ARM, 1)),
+    ],
+)
+def test_a_description_names_the_part(reason: Reason, detail: int, part: str) -> None:
+    assert part.lower() in describe(pack(reason, detail)).lower()
 
 
 def test_every_text_is_made_for_every_reason_and_detail() -> None:
