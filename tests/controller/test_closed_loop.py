@@ -9,10 +9,9 @@ from can_dbc.messages.crane import GrappleCommand
 from controller.guard.__main__ import build, profile_path
 from controller.laws.grapple import GrappleState
 from controller.laws.valve_map import ValveMap
-from machine.joints import JOINTS, Joint
-from machine.profile import SPEED_HEADROOM_SHARE, joint
+from machine.joints import Joint
+from machine.profile import SPEED_HEADROOM_SHARE
 from machine.status.modes import Mode
-from tests.controller import bench as bench_module
 from tests.controller.bench import AORO, SETTINGS, SPECS, Bench, settings_of
 from tests.controller.smooth_motion import GOALS, drive
 
@@ -72,8 +71,7 @@ def test_half_speed_slows_the_trajectory():
 
 
 @pytest.fixture
-def forwarder(monkeypatch) -> Bench:
-    monkeypatch.setattr(bench_module, "SPECS", [joint(AORO.profile, j) for j in JOINTS])
+def forwarder() -> Bench:
     return Bench(settings=AORO, home=(0.0, 0.9, -2.0, 0.5, 0.0))
 
 
@@ -98,8 +96,7 @@ def test_opening_on_the_bus_is_ignored_without_a_sensor(forwarder):
     assert forwarder.controller.crane.grapple.state is GrappleState.OPEN
 
 
-def test_guard_enables_the_forwarder(monkeypatch):
-    monkeypatch.setattr(bench_module, "SPECS", [joint(AORO.profile, j) for j in JOINTS])
+def test_guard_enables_the_forwarder():
     watched = Bench(settings=AORO, home=(0.0, 0.9, -2.0, 0.5, 0.0), guard=build(profile_path("aoro_fc8")))
     watched.active(Joint.ROT, 0.1, 200)
     assert watched.mode is Mode.ACTIVE and watched.q[Joint.ROT] > 0.07
