@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import factory as factory
-from can_dbc.bus import python_can_bus, socketcan
+from can_dbc.bus import factory, python_can_bus, socketcan
 from can_dbc.bus.base import (
     CRTL_ACTIVE,
     CRTL_PASSIVE,
@@ -31,32 +31,27 @@ from runtime.errors import LinkError
 from tests.codes import coded
 
 
-@pytest.mark.parametrize("address", ["", "crane0", "wire:", ":crane0"])
-def test_an_address_names_backend_and_channel(address: str) -> None:
-    with pytest.raises(LinkError, check=coded("bus.address")):
-        open_bus(address)
-
-
-def test_a_missing_daemon_is_reported(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("address", "code"),
+    [
+        *((address, "bus.address") for address in ("", "crane0", "wire:", ":crane0")),
+        *((f"python-can:{rest}", "bus.address") for rest in ("", "socketcan", "socketcan:")),
+        ("wire:crane0", "wire.no-daemon"),
+        ("socketcan:nocan9", "bus.interface" if factory.kernel_has_can() else "bus.no-can"),
+        ("nosuch:1", "bus.adapter"),
+    ],
+)
+def test_a_bus_that_cannot_be_opened_is_reported(
+    address: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
-    with pytest.raises(LinkError, check=coded("wire.no-daemon")):
-        open_bus("wire:crane0")
-
-
-def test_a_missing_interface_is_reported() -> None:
-    expected = "bus.interface" if factory.kernel_has_can() else "bus.no-can"
-    with pytest.raises(LinkError, check=coded(expected)):
-        open_bus("socketcan:nocan9")
+    with pytest.raises(LinkError, check=coded(code)):
+        open_bus(address)
 
 
 def test_too_many_filters_for_the_kernel_are_reported() -> None:
     with pytest.raises(LinkError, check=coded("bus.too-many-filters")):
         open_bus("socketcan:can0", filters=range(513))
-
-
-def test_an_unknown_python_can_interface_is_reported() -> None:
-    with pytest.raises(LinkError, check=coded("bus.adapter")):
-        open_bus("nosuch:1")
 
 
 @pytest.mark.parametrize(
@@ -187,9 +182,3 @@ def test_an_address_chooses_our_socket_or_python_cans(
     for module, name in ((socketcan, "SocketCanBus"), (python_can_bus, "PythonCanBus")):
         monkeypatch.setattr(module, name, lambda *given, name=name: (name, *(g for g in given if isinstance(g, str))))
     assert open_bus(address) == opened
-
-
-@pytest.mark.parametrize("address", ["python-can:", "python-can:socketcan", "python-can:socketcan:"])
-def test_python_can_without_an_interface_is_no_address(address: str) -> None:
-    with pytest.raises(LinkError, check=coded("bus.address")):
-        open_bus(address)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import chain
 from pathlib import Path
 
@@ -12,193 +13,37 @@ from can_dbc.dbc import check, codec
 from can_dbc.frame import EXTENDED
 
 CRANE, MACHINE, GNSS = (codec.load(name) for name in codec.SHIPPED)
-HEADER = "Crc Counter "
-CATALOGUE = [
-    # name, identifier, length, cycle ms, timeout ms, signals with start bits
-    ("Nmt", 0x000, 2, 0, 0, {"Command": 0, "Node": 8}),
-    ("Sync", 0x080, 1, 5, 15, {"Counter": 0}),
-    (
-        "EstopStat",
-        0x181,
-        8,
-        10,
-        30,
-        {
-            "Crc": 0,
-            "Counter": 8,
-            "ChannelA": 12,
-            "ChannelB": 14,
-            "Source": 16,
-            "ResetReq": 24,
-            "PilotSupply": 26,
-            "Person": 28,
-            "Lever": 30,
-            "PilotPress": 32,
-            "EventSeq": 44,
-            "ModeSwitch": 52,
-        },
-    ),
-    ("EncSlew", 0x182, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
-    ("EncLift", 0x183, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
-    ("EncTilt", 0x184, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
-    ("EncExt", 0x185, 8, 5, 15, {"Position": 0, "Speed": 32, "SystemReg": 48, "Flags": 56}),
-    ("EncRot", 0x186, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
-    ("EncArtic", 0x187, 8, 5, 15, {"Position": 0, "TimeStamp": 32, "Alarms": 48}),
-    (
-        "ValveFbA",
-        0x190,
-        8,
-        5,
-        15,
-        {"Crc": 0, "Counter": 8, "State": 12, "SpoolSlew": 16, "SpoolLift": 28, "SpoolTilt": 40, "SpoolExt": 52},
-    ),
-    (
-        "ValveFbB",
-        0x290,
-        8,
-        5,
-        15,
-        {
-            "Crc": 0,
-            "Counter": 8,
-            "FaultAxis": 12,
-            "SpoolRot": 16,
-            "SpoolGrapple": 28,
-            "SpoolAux": 40,
-            "ExitCode": 52,
-            "EchoCounter": 58,
-            "Limit": 62,
-        },
-    ),
-    (
-        "PressA",
-        0x1A0,
-        8,
-        5,
-        100,
-        {"Crc": 0, "Counter": 8, "Status": 12, "LiftA": 16, "LiftB": 28, "TiltA": 40, "TiltB": 52},
-    ),
-    (
-        "PressB",
-        0x1A1,
-        8,
-        5,
-        100,
-        {"Crc": 0, "Counter": 8, "Status": 12, "ExtA": 16, "ExtB": 28, "SlewA": 40, "SlewB": 52},
-    ),
-    (
-        "PressC",
-        0x1A2,
-        8,
-        20,
-        100,
-        {"Crc": 0, "Counter": 8, "Status": 12, "Pump": 16, "Tank": 28, "GrappleA": 40, "GrappleB": 52},
-    ),
-    (
-        "GrappleImu",
-        0x1A3,
-        8,
-        10,
-        50,
-        {
-            "Crc": 0,
-            "Counter": 8,
-            "Status": 12,
-            "LeanRadial": 16,
-            "LeanTangential": 28,
-            "RateRadial": 40,
-            "RateTangential": 52,
-        },
-    ),
-    (
-        "GuardStat",
-        0x1FD,
-        8,
-        10,
-        50,
-        {
-            "Crc": 0,
-            "Counter": 8,
-            "Enable": 12,
-            "Verdict": 16,
-            "FaultAxis": 24,
-            "SeenCounter": 28,
-            "EventCount": 32,
-            "ProfileCheck": 40,
-        },
-    ),
-    ("GuardPilot", 0x2FD, 8, 10, 50, {"Crc": 0, "Counter": 8, "Supply": 12, "Verdict": 16, "EventCount": 32}),
-    (
-        "ValveCmdA",
-        0x210,
-        8,
-        5,
-        50,
-        {"Crc": 0, "Counter": 8, "Mode": 12, "Slew": 16, "Lift": 28, "Tilt": 40, "Ext": 52},
-    ),
-    (
-        "ValveCmdB",
-        0x310,
-        8,
-        5,
-        50,
-        {
-            "Crc": 0,
-            "Counter": 8,
-            "ArmKey": 12,
-            "Rot": 16,
-            "Grapple": 28,
-            "Aux": 40,
-            "GrappleMode": 52,
-            "PumpReq": 54,
-            "MaxFlow": 56,
-        },
-    ),
-    (
-        "GrappleStat",
-        0x390,
-        8,
-        20,
-        100,
-        {"Crc": 0, "Counter": 8, "State": 12, "Opening": 16, "ClampPress": 28, "Load": 40, "RotAngle": 52},
-    ),
-    (
-        "PlcStatus",
-        0x490,
-        8,
-        20,
-        100,
-        {"Crc": 0, "Counter": 8, "Mode": 12, "WatchdogCounter": 16, "LongestCycle": 24, "FaultBits": 40},
-    ),
-    ("PlcOut", 0x491, 8, 10, 50, {"Crc": 0, "Counter": 8, "Slew": 12, "Lift": 22, "Tilt": 32, "Ext": 42, "Rot": 52}),
-    (
-        "CtrlStatus",
-        0x4FE,
-        8,
-        20,
-        100,
-        {
-            "Crc": 0,
-            "Counter": 8,
-            "Mode": 12,
-            "SafeState": 16,
-            "Reason": 20,
-            "StaleMask": 28,
-            "LoopLate": 44,
-            "BusErr": 52,
-        },
-    ),
-    (
-        "JointRefA",
-        0x1FE,
-        8,
-        5,
-        50,
-        {"Crc": 0, "Counter": 8, "Slew": 12, "SlewRate": 27, "Lift": 38, "LiftRate": 53},
-    ),
-    ("JointRefB", 0x2FE, 8, 5, 50, {"Crc": 0, "Counter": 8, "Tilt": 12, "TiltRate": 27, "Ext": 38, "ExtRate": 53}),
-    ("JointRefC", 0x3FE, 8, 5, 50, {"Crc": 0, "Counter": 8, "Rot": 12, "RotRate": 32}),
-]
+# name, identifier, length, cycle ms, timeout ms, signals with their start bits; E2E is Crc:0 Counter:8
+CATALOGUE = """
+Nmt         0x000 2  0   0  Command:0 Node:8
+Sync        0x080 1  5  15  Counter:0
+EstopStat   0x181 8 10  30  E2E ChannelA:12 ChannelB:14 Source:16 ResetReq:24 PilotSupply:26 Person:28 Lever:30
+                            PilotPress:32 EventSeq:44 ModeSwitch:52
+EncSlew     0x182 8  5  15  Position:0 TimeStamp:32 Alarms:48
+EncLift     0x183 8  5  15  Position:0 TimeStamp:32 Alarms:48
+EncTilt     0x184 8  5  15  Position:0 TimeStamp:32 Alarms:48
+EncExt      0x185 8  5  15  Position:0 Speed:32 SystemReg:48 Flags:56
+EncRot      0x186 8  5  15  Position:0 TimeStamp:32 Alarms:48
+EncArtic    0x187 8  5  15  Position:0 TimeStamp:32 Alarms:48
+ValveFbA    0x190 8  5  15  E2E State:12 SpoolSlew:16 SpoolLift:28 SpoolTilt:40 SpoolExt:52
+ValveFbB    0x290 8  5  15  E2E FaultAxis:12 SpoolRot:16 SpoolGrapple:28 SpoolAux:40 ExitCode:52 EchoCounter:58
+                            Limit:62
+PressA      0x1A0 8  5 100  E2E Status:12 LiftA:16 LiftB:28 TiltA:40 TiltB:52
+PressB      0x1A1 8  5 100  E2E Status:12 ExtA:16 ExtB:28 SlewA:40 SlewB:52
+PressC      0x1A2 8 20 100  E2E Status:12 Pump:16 Tank:28 GrappleA:40 GrappleB:52
+GrappleImu  0x1A3 8 10  50  E2E Status:12 LeanRadial:16 LeanTangential:28 RateRadial:40 RateTangential:52
+GuardStat   0x1FD 8 10  50  E2E Enable:12 Verdict:16 FaultAxis:24 SeenCounter:28 EventCount:32 ProfileCheck:40
+GuardPilot  0x2FD 8 10  50  E2E Supply:12 Verdict:16 EventCount:32
+ValveCmdA   0x210 8  5  50  E2E Mode:12 Slew:16 Lift:28 Tilt:40 Ext:52
+ValveCmdB   0x310 8  5  50  E2E ArmKey:12 Rot:16 Grapple:28 Aux:40 GrappleMode:52 PumpReq:54 MaxFlow:56
+GrappleStat 0x390 8 20 100  E2E State:12 Opening:16 ClampPress:28 Load:40 RotAngle:52
+PlcStatus   0x490 8 20 100  E2E Mode:12 WatchdogCounter:16 LongestCycle:24 FaultBits:40
+PlcOut      0x491 8 10  50  E2E Slew:12 Lift:22 Tilt:32 Ext:42 Rot:52
+CtrlStatus  0x4FE 8 20 100  E2E Mode:12 SafeState:16 Reason:20 StaleMask:28 LoopLate:44 BusErr:52
+JointRefA   0x1FE 8  5  50  E2E Slew:12 SlewRate:27 Lift:38 LiftRate:53
+JointRefB   0x2FE 8  5  50  E2E Tilt:12 TiltRate:27 Ext:38 ExtRate:53
+JointRefC   0x3FE 8  5  50  E2E Rot:12 RotRate:32
+"""
 MACHINE_IDS = {
     "ArmHeightA": 0x0CFF2030,
     "ArmHeightB": 0x0CFF2130,
@@ -216,16 +61,19 @@ MACHINE_IDS = {
 }
 
 
-@pytest.mark.parametrize(("name", "identifier", "length", "cycle", "timeout", "signals"), CATALOGUE)
-def test_crane_catalogue(
-    name: str, identifier: int, length: int, cycle: int, timeout: int, signals: dict[str, int]
-) -> None:
+ROWS = re.sub(r"\n +", " ", CATALOGUE).split("\n")[1:-1]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.split()[0])
+def test_crane_catalogue(row: str) -> None:
+    name, identifier, length, cycle_ms, timeout_ms, *places = row.replace("E2E", "Crc:0 Counter:8").split()
+    signals = {signal: int(bit) for signal, bit in (place.split(":") for place in places)}
     message = CRANE.messages[name]
-    assert (message.key, message.length) == (identifier, length)
-    assert (message.cycle_time_ns, message.timeout_ns) == (cycle * 1_000_000, timeout * 1_000_000)
+    assert (message.key, message.length) == (int(identifier, 16), int(length))
+    assert (message.cycle_time_ns, message.timeout_ns) == (int(cycle_ms) * 1_000_000, int(timeout_ms) * 1_000_000)
     assert {s.name: s.shift for s in message.signals} == signals
     assert (message.data_ids is not None) == ("Crc" in signals)
-    assert CRANE.by_key[identifier] is message
+    assert CRANE.by_key[message.key] is message
 
 
 def test_heartbeats_of_all_fourteen_nodes() -> None:
@@ -233,7 +81,7 @@ def test_heartbeats_of_all_fourteen_nodes() -> None:
     assert sorted(beats) == [1, 2, 3, 4, 5, 6, 7, 0x10, 0x20, 0x21, 0x22, 0x23, 0x7D, 0x7E]
     assert {m.timeout_ns for node, m in beats.items() if node != 0x7E} == {250_000_000}
     assert beats[0x7E].timeout_ns == 150_000_000
-    assert len(CRANE.messages) == len(CATALOGUE) + 14
+    assert len(CRANE.messages) == len(ROWS) + 14
 
 
 def test_machine_catalogue() -> None:
@@ -241,6 +89,10 @@ def test_machine_catalogue() -> None:
     own = [m for m in MACHINE.messages.values() if m.name not in ("EEC1", "CCVS", "DM1", "AddressClaim", "Request")]
     assert all(m.data_ids and not m.by_pgn and m.signals[0].name == "Crc" for m in own)
     assert MACHINE.messages["EEC1"].by_pgn and GNSS.messages["VesselHeading"].by_pgn
+
+
+def physical(signal) -> tuple:
+    return signal.scale, signal.minimum, signal.maximum, signal.unit, signal.policy
 
 
 def test_swing_arms_are_commanded_as_spools_and_reported_as_heights() -> None:
@@ -259,13 +111,7 @@ def test_swing_arms_are_commanded_as_spools_and_reported_as_heights() -> None:
         # A receiver must be neutral 100 ms after the last command; it looks every few milliseconds.
         assert message.timeout_ns == (90_000_000 if name.startswith("ArmCmd") else 100_000_000)
     spool, height = MACHINE.messages["ArmCmdA"].signals[3], MACHINE.messages["ArmHeightA"].signals[3]
-    assert (spool.scale, spool.minimum, spool.maximum, spool.unit, spool.policy) == (
-        0.05,
-        -100,
-        100,
-        "%",
-        codec.Policy.REFUSE,
-    )
+    assert physical(spool) == (0.05, -100, 100, "%", codec.Policy.REFUSE)
     assert (height.scale, height.offset, height.unit, height.policy) == (1, -2048, "mm", codec.Policy.SATURATE)
     assert MACHINE.messages["ArmCmdB"].signals[3].bits == 2
 
@@ -277,9 +123,9 @@ def test_a_request_is_matched_by_pgn_for_any_destination() -> None:
 
 def test_physical_units() -> None:
     a = CRANE.messages["ValveCmdA"].signals[3]
-    assert (a.scale, a.minimum, a.maximum, a.unit, a.policy) == (0.05, -100, 100, "%", codec.Policy.REFUSE)
+    assert physical(a) == (0.05, -100, 100, "%", codec.Policy.REFUSE)
     p = CRANE.messages["PressA"].signals[3]
-    assert (p.scale, p.minimum, p.maximum, p.unit, p.policy) == (0.1, 0, 400, "bar", codec.Policy.SATURATE)
+    assert physical(p) == (0.1, 0, 400, "bar", codec.Policy.SATURATE)
     assert CRANE.messages["ValveCmdB"].signals[2].choices[0xA] == "Armed"
     assert CRANE.messages["GuardStat"].signals[2].choices[0xA] == "Enabled"
 
@@ -343,40 +189,10 @@ ENCODERS = [
         16,
     ),
 ]
-OBJECTS = [
-    0x1000,
-    0x1001,
-    0x1005,
-    0x1008,
-    0x1010,
-    0x1014,
-    0x1016,
-    0x1017,
-    0x1018,
-    0x1019,
-    0x1029,
-    0x1800,
-    0x1801,
-    0x1A00,
-    0x1A01,
-    0x6000,
-    0x6002,
-    0x6003,
-    0x6004,
-    0x6030,
-    0x6200,
-    0x6500,
-    0x6501,
-    0x6502,
-    0x6503,
-    0x6504,
-    0x6505,
-    0x6506,
-    0x6507,
-    0x6509,
-    0x650A,
-    0x650B,
-]
+OBJECTS = (
+    "1000 1001 1005 1008 1010 1014 1016 1017 1018 1019 1029 1800 1801 1A00 1A01 "
+    "6000 6002 6003 6004 6030 6200 6500 6501 6502 6503 6504 6505 6506 6507 6509 650A 650B"
+)
 
 
 @pytest.mark.parametrize(("file", "device_type", "mapping", "signed", "speed_bits"), ENCODERS)
@@ -391,7 +207,7 @@ def test_encoder_eds_over_sdo(
         local = device.create_node(5, path)
         remote = master.add_node(5, path)
         assert remote.object_dictionary.device_information.vendor_number == 0
-        assert [i for i in OBJECTS if i not in remote.object_dictionary] == []
+        assert [i for i in OBJECTS.split() if int(i, 16) not in remote.object_dictionary] == []
         assert remote.sdo[0x1000].raw == device_type
         assert remote.sdo[0x1018][1].raw == 0
         assert remote.sdo[0x1014].raw == 0x85

@@ -6,16 +6,20 @@ import math
 import os
 import random
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.dbc import check, codec
+from can_dbc.dbc import check, codec, codegen
+from can_dbc.dbc.ahead_of_time import module_source
+from can_dbc.dbc.codegen import key_of
 from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import EXTENDED
 from runtime.errors import ConfigError, InputRefused
@@ -431,3 +435,63 @@ def test_a_kcd_message_or_signal_without_a_name_is_refused(tmp_path: Path, what:
     path.write_text(text.replace(' name="M"' if what == "Message" else ' name="X"', ""))
     with pytest.raises(ConfigError, check=coded("dbc.invalid")):
         codec.load(path)
+
+
+# -- the typed codecs for the compiler give the same, here run as plain Python
+
+CODECS = [one for name in codec.SHIPPED for one in shipped(name).messages.values()]
+UNUSUAL = (None, math.nan, math.inf, -math.inf, -0.0, 1e300, 10**30, 2**53 + 1, True, "7", 0.5, 2.5)
+
+
+@pytest.fixture(scope="module")
+def classes() -> dict[str, Any]:
+    # As a Python int a word has no sign.
+    space: dict[str, Any] = {"__name__": "generated"}
+    exec(module_source(CODECS).replace('Struct("<q")', 'Struct("<Q")'), space)
+    found: dict[str, Any] = space["CODECS"]
+    return found
+
+
+def compiled(one: codec.MessageCodec, classes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> codec.MessageCodec:
+    """The same message, made while the classes are there."""
+    path = next(shipped(name).path for name in codec.SHIPPED if one.name in shipped(name).messages)
+    monkeypatch.setattr(codegen, "AHEAD_OF_TIME", classes)
+    return codec.compile_one(codec.parse(path).get_message_by_name(one.name), path)
+
+
+def outcome(function: Callable[..., Any], *arguments: object) -> tuple[str, ...]:
+    try:
+        return (repr(function(*arguments)),)
+    except (ValueError, TypeError, OverflowError) as error:
+        return type(error).__name__, str(error)
+
+
+def test_all_shipped_messages_are_covered_but_those_longer_than_a_frame(classes: dict[str, Any]) -> None:
+    assert {one.name for one in CODECS if key_of(one.source) not in classes} == {
+        one.name for one in CODECS if one.length > 8
+    }
+
+
+@pytest.mark.parametrize("name", ["EncSlew", "EncTilt", "ValveFbA", "EEC1", "GuardStat", "CtrlStatus", "ValveCmdA"])
+def test_they_agree_with_the_interpreters_codecs(
+    name: str, classes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = next(one for one in CODECS if one.name == name)
+    other = compiled(one, classes, monkeypatch)
+    assert other.receive != one.receive and other.source == one.source
+    rng = random.Random(name)
+    for _ in range(1500):
+        data = rng.randbytes(one.length if rng.random() < 0.95 else rng.randrange(9))
+        data = bytes(rng.choice((0, 1, 127, 128, 255)) for _ in data) if rng.random() < 0.3 else data
+        assert outcome(one.receive, data) == outcome(other.receive, data)
+        if len(data) != one.length:
+            continue
+        values = list(one.decode(data))
+        for i, s in enumerate(one.signals):
+            choice = rng.random()
+            if choice < 0.1:
+                values[i] = rng.choice((*UNUSUAL, s.minimum, s.maximum))
+            elif choice < 0.5:
+                values[i] = rng.choice((values[i], s.minimum or 0, s.maximum or 0))
+                values[i] += rng.choice((0.5, -0.5, 1e-7, -1e-7, 1e-6, rng.uniform(-1, 1))) * s.scale
+        assert outcome(one.encode, *values) == outcome(other.encode, *values), values

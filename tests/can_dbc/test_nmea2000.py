@@ -226,28 +226,19 @@ def test_a_lost_first_frame_costs_its_message_alone() -> None:
     assert reassembler.lost == 1
 
 
-def test_frames_of_two_sequences_are_not_joined() -> None:
-    old, new = stream([bytes(43), bytes(range(43))], [2, 3])
+@pytest.mark.parametrize(
+    ("sequences", "begins_ms"),
+    [((2, 3), (0, 200)), ((0, 0), (5_000, 1_000)), ((0, 0), (0, 751))],
+    ids=["two sequences", "a clock that goes back", "after the time-out"],
+)
+def test_frames_of_two_messages_are_not_joined(sequences: tuple[int, int], begins_ms: tuple[int, int]) -> None:
+    old, new = packet(bytes(43), sequences[0]), packet(bytes(range(43)), sequences[1])
+    torn = [(begins_ms[0], frame) for frame in old[:3]] + [(begins_ms[1], frame) for frame in new[3:]]
     reassembler = n2k.Reassembler()
-    assert received(reassembler, old[:3] + new[3:]) == []
+    assert received(reassembler, torn) == []
     reassembler.end()
     assert reassembler.lost == 2
-
-
-def test_a_clock_that_goes_back_loses_the_message() -> None:
-    old, new = packet(bytes(43)), packet(bytes(range(43)))
-    reassembler = n2k.Reassembler()
-    torn = [(5_000, frame) for frame in old[:3]] + [(1_000, frame) for frame in new[3:]]
-    assert received(reassembler, torn) == []
-    assert reassembler.lost == 2
-    assert received(reassembler, [(1_000, frame) for frame in new]) == [bytes(range(43))]
-    assert reassembler.lost == 2
-
-
-def test_frames_after_the_time_out_are_not_joined() -> None:
-    old, new = packet(bytes(43)), packet(bytes(range(43)))
-    reassembler = n2k.Reassembler()
-    assert received(reassembler, [(0, frame) for frame in old[:3]] + [(751, frame) for frame in new[3:]]) == []
+    assert received(reassembler, [(begins_ms[1], frame) for frame in new]) == [bytes(range(43))]
     assert reassembler.lost == 2
 
 

@@ -7,11 +7,15 @@ Faults are injected by name: ``dropped`` messages, ``changed`` signals, ``corrup
 
 from __future__ import annotations
 
+import gc
 import math
 import random
+import tracemalloc
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Literal
+
+import msgspec
 
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
@@ -30,6 +34,7 @@ from can_dbc.protocols.canopen import (
 )
 from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import frames as packet
+from controller.config import Settings
 from controller.config import load as load_settings
 from controller.guard.__main__ import split
 from controller.guard.operator import action_of
@@ -37,9 +42,11 @@ from controller.laws.valve_map import ValveMap
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from machine.joints import JOINTS, N_JOINTS
-from machine.profile import encoders, joint
+from machine.loading.profile_file import profile_hash
+from machine.profile import Plc, Profile, encoders, joint
 from machine.sensing import counts_from_position
 from machine.status.modes import Mode
+from machine.status.reasons import Reason
 
 DATABASE = load("crane")
 MACHINE, GNSS = load("machine"), load("gnss")
@@ -99,6 +106,48 @@ def count_until(tick: Callable[[], Any], done: Callable[[], bool], limit: int = 
         if done():
             return k
     raise AssertionError(f"not after {limit} ticks")
+
+
+def settings_of(profile: Profile) -> Settings:
+    """The settings of a changed profile."""
+    return Settings(profile, profile_hash(profile), profile.rate_hz)
+
+
+def behind_plc(role: Literal["references", "valves"]) -> Settings:
+    """The settings of a crane whose valves a PLC drives."""
+    return settings_of(msgspec.structs.replace(PROFILE, plc=Plc(role)))
+
+
+def with_pump(flow_m3_s: float) -> Profile:
+    """The profile of a crane with another pump."""
+    hydraulics = msgspec.structs.replace(PROFILE.hydraulics, pump_flow_m3_s=flow_m3_s)
+    return msgspec.structs.replace(PROFILE, hydraulics=hydraulics)
+
+
+def bytes_kept(ticks: Callable[[int], None], count: int) -> int:
+    """Of several windows of ``count`` ticks the least that one keeps; fails for reference cycles.
+
+    What a tick keeps shows in every window; what other threads of the test run keep, in one.
+    """
+    ticks(200)
+    gc.collect()
+    tracemalloc.start(1)
+    ticks(200)
+    gc.collect()  # also empties the interpreter's free lists, which count as memory
+    kept = []
+    for _ in range(3):
+        before, _ = tracemalloc.get_traced_memory()
+        ticks(count)
+        gc.collect()
+        kept.append(tracemalloc.get_traced_memory()[0] - before)
+    tracemalloc.stop()
+    gc.disable()
+    try:
+        ticks(200)
+        assert gc.collect() == 0, "a tick must not make reference cycles"
+    finally:
+        gc.enable()
+    return min(kept)
 
 
 class EncoderNode:
@@ -245,10 +294,16 @@ class Bench:
         self.count += 1
         return outputs
 
-    def run(self, ticks: int, **measured: int) -> Outputs:
+    def run(self, ticks: int, **measured: int) -> Mode:
+        """The mode after some ticks."""
         for _ in range(ticks):
-            outputs = self.tick(**measured)
-        return outputs
+            self.tick(**measured)
+        return self.mode
+
+    def press(self, action: OperatorAction, **fields: int) -> Mode:
+        """The mode after the tick in which a person presses a button."""
+        self.tick([self.operator(action, **fields)])
+        return self.mode
 
     def _answers(self) -> list[tuple[int, bytes]]:
         frames, self.pending = self.pending, []
@@ -415,21 +470,34 @@ class Bench:
 
     def armed(self) -> Bench:
         self.boot()
-        self.tick([self.operator(OperatorAction.ARM)])
-        assert self.mode is Mode.ARMED, self.controller.gate.refusal
+        assert self.press(OperatorAction.ARM) is Mode.ARMED, self.controller.gate.refusal
         return self
 
     def active(self, j: int = 0, speed: float = 0.08, ticks: int = 60) -> Bench:
         """ACTIVE and moving: the planner renews its setpoint every 50 ms."""
         self.armed()
         self.tick([self.hold()])
-        self.drive(j, speed, ticks)
-        assert self.mode is Mode.ACTIVE, self.controller.supervisor.reason
+        assert self.drive(j, speed, ticks) is Mode.ACTIVE, self.controller.supervisor.reason
         return self
 
-    def drive(self, j: int, speed: float, ticks: int) -> None:
+    def drive(self, j: int, speed: float, ticks: int) -> Mode:
         for k in range(ticks):
             self.tick([self.moving(j, speed)] if k % 10 == 0 else ())
+        return self.mode
+
+    def keep(self, ticks: int, **fields) -> Mode:
+        """The mode after the crane was kept where it is, with a setpoint every 50 ms."""
+        for k in range(ticks):
+            self.tick([self.hold(**fields)] if k % 10 == 0 else ())
+        return self.mode
+
+    def until(self, reason: Reason, limit: int = 120, **measured: int) -> int:
+        """Number of ticks until the reason is set; the planner goes on as long as it may."""
+        for k in range(1, limit + 1):
+            self.tick([self.moving(0, 0.08)] if k % 10 == 0 and self.mode is Mode.ACTIVE else (), **measured)
+            if self.reason == reason:
+                return k
+        raise AssertionError(f"{reason.name} not seen; {self.mode.name} {self.reason!r}")
 
     @property
     def mode(self) -> Mode:

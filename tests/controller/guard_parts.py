@@ -49,3 +49,17 @@ def resting(number: int = 1) -> tuple[MotionWatch, Joint]:
     assert watch.check(1.0, None, 1000 * MS, 0.005) is FINE
     assert watch.check(0.0, None, 1500 * MS, 0.005) is FINE
     return watch, joint
+
+
+# tables of a profile and its envelope
+VALVE = {
+    "signal": "Tilt",
+    "deadband_plus_pct": 12.0,
+    "deadband_minus_pct": 7.0,
+    "full_speed_plus": 0.5,
+    "full_speed_minus": 0.25,
+    "delay_s": 0.2,
+    "lag_s": 0.0,
+    "sign": 1,
+}
+AXIS_LIMITS = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}

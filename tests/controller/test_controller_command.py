@@ -3,13 +3,9 @@
 import pytest
 
 from can_dbc.messages.envelope import write_key
-from can_dbc.messages.udp_address import address_argument
-from controller.config import load
-from controller.process.command import bus_address, main, parser
+from controller.process.command import main
 from controller.process.setpoint_port import listen
-from runtime.errors import ConfigError
-from tests.codes import coded, numbers_in
-from tests.controller.bench import MS
+from tests.codes import numbers_in
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
@@ -48,12 +44,3 @@ def test_busy_port_is_one_sentence_and_exit_4(capsys, udp, tmp_path):
 def test_setpoint_socket_is_on_loopback_only():
     with listen(0) as made:
         assert made.getsockname()[0] == "127.0.0.1"
-
-
-def test_addresses_and_settings():
-    assert address_argument("127.0.0.1:5006") == ("127.0.0.1", 5006)
-    assert bus_address("mach0=wire:mach0") == ("mach0", "wire:mach0")
-    assert parser().parse_args(["--profile", "x", "--setpoint-port", "1", "--key-file", "key"]).report == []
-    assert load("palms_471", 100).period_ns == 10 * MS
-    with pytest.raises(ConfigError, check=coded("config.rate")):
-        load("palms_471", 2000)

@@ -105,12 +105,10 @@ def test_measured_load_means_holding():
 
 def test_load_cell_sets_loaded():
     bench = Bench().armed()
-    for k in range(1100):
-        bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
+    bench.keep(1100, grapple=GrappleCommand.CLOSE)
     assert not bench.controller.crane.grapple.loaded
-    bench.changed["GrappleStat"] = {**bench.changed.get("GrappleStat", {}), "Load": 80.0}
-    for k in range(200):
-        bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
+    bench.changed["GrappleStat"] = {"Load": 80.0}
+    bench.keep(200, grapple=GrappleCommand.CLOSE)
     assert bench.controller.crane.grapple.loaded and bench.reports[-1].load_kg == 80.0
 
 
@@ -161,10 +159,9 @@ def test_jaws_of_unknown_state_are_not_shaken():
 
 def test_grapple_holds_through_stop_and_fault():
     bench = Bench().armed()
-    for k in range(1100):
-        bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
-        if k == 300:
-            assert bench.commands_b["Grapple"] == -100.0
+    bench.keep(300, grapple=GrappleCommand.CLOSE)
+    assert bench.commands_b["Grapple"] == -100.0
+    bench.keep(800, grapple=GrappleCommand.CLOSE)
     assert bench.commands_b["GrappleMode"] == GrappleCommand.HOLD
     for change in ({"ChannelA": 1}, {"ChannelA": 0, "ChannelB": 0}):
         bench.changed["EstopStat"] = change

@@ -13,24 +13,15 @@ from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.e2e import Sender, crc8
 from controller.guard.__main__ import build, main
 from controller.guard.envelope import read_envelope
-from controller.guard.guard import CALM_NS, Guard
+from controller.guard.guard import Guard
 from controller.guard.layout import GuardConfigError, read_layouts
 from controller.guard.stream import checksum
 from controller.guard.verdicts import Verdict
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.codes import coded
-from tests.controller.bench import DATABASE, MS, Bench, T, count_until
-from tests.controller.guard_traffic import (
-    BROKEN,
-    MOVING,
-    PROFILE,
-    Traffic,
-    encoder_frozen,
-    encoder_gone,
-    outside,
-    spoil,
-)
+from tests.controller.bench import DATABASE, MACHINE, MS, Bench, T
+from tests.controller.guard_traffic import PROFILE, Traffic, encoder_frozen, outside, spoil
 
 
 def test_enables_after_200_ms_without_a_broken_rule():
@@ -45,30 +36,6 @@ def test_enables_after_200_ms_without_a_broken_rule():
         sent += traffic.sent
     assert len(traffic.status) - n == 100, "every 10 ms"
     assert sum(key == 0x77D for key, _ in sent) == 10
-    assert traffic.status[-1]["SeenCounter"] == (traffic.senders["ValveCmdA"].counter - 1) % 16
-
-
-def test_first_heartbeat_is_the_boot_up_frame():
-    traffic = Traffic()
-    traffic.tick()
-    assert (0x77D, b"\x00") in traffic.sent
-    traffic.tick(20)
-    assert (0x77D, b"\x05") in traffic.sent
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_each_rule(name):
-    verdict, axis, bound_ms, break_it = BROKEN[name]
-    traffic = Traffic().good()
-    events = traffic.guard.events
-    break_it(traffic)
-    k = count_until(traffic.tick, lambda: traffic.guard.verdict is not Verdict.GOOD, limit=500)
-    assert (traffic.guard.verdict, traffic.guard.axis) == (verdict, axis)
-    assert k * T <= bound_ms * MS
-    status = traffic.status[-1]
-    assert (status["Enable"], status["Verdict"], status["FaultAxis"]) == (0, verdict, axis)
-    assert any(key == 0x1FD for key, _ in traffic.sent), "sent at once"
-    assert traffic.guard.events == events + 1
 
 
 def test_frozen_encoder_counts_as_lost():
@@ -118,18 +85,6 @@ def test_reversal_counts_as_growth():
     assert traffic.tick() is Verdict.RATE
 
 
-@pytest.mark.parametrize("times", [1, 2])
-def test_one_bad_checksum_is_dropped_two_break_trust(times):
-    traffic = Traffic().good()
-    for _ in range(times):
-        traffic.dropped.add("ValveCmdA")
-        frame = traffic.frame("ValveCmdA", traffic.a)
-        traffic.extra.append(Frame(frame.stamp_ns, frame.key, bytes([frame.data[0] ^ 1]) + frame.data[1:]))
-        traffic.tick()
-        traffic.dropped.clear()
-    assert traffic.guard.verdict is (Verdict.GOOD if times == 1 else Verdict.CORRUPT)
-
-
 @pytest.mark.parametrize("message", ["ValveCmdA", "ValveCmdB"])
 @pytest.mark.parametrize("pattern", ["GB", "GGB", "GGGB", "G" * 30 + "B"])
 def test_a_share_of_bad_checksums_breaks_trust(message, pattern):
@@ -170,6 +125,22 @@ def test_lost_frames_in_a_row_and_a_second_controller_break_trust():
     for _ in range(60):
         traffic.extra.append(Frame(traffic.now_ns, codec.key, other.protect(codec.encode(0, 0, 0, 0, 0, 0, 0))))
         assert traffic.tick() in (Verdict.STALE, Verdict.NO_COMMAND)
+
+
+def test_a_frame_that_comes_twice_is_neither_new_nor_a_break():
+    traffic = Traffic().good()
+    for _ in range(20):
+        frame = traffic.frame("ValveCmdA", traffic.a)
+        traffic.dropped.add("ValveCmdA")
+        traffic.extra += [frame, frame, frame]
+        assert traffic.tick() is Verdict.GOOD
+    traffic.extra = []
+    frame = traffic.frame("ValveCmdA", traffic.a)
+    verdicts = set()
+    for _ in range(20):
+        traffic.extra.append(frame)
+        verdicts.add(traffic.tick())
+    assert Verdict.NO_COMMAND in verdicts, "a frame that only repeats grows old"
 
 
 def commands_with_delays(delays_ms, skipped=()):
@@ -232,31 +203,25 @@ def test_another_guard(key):
     assert traffic.tick() is Verdict.OTHER_GUARD
 
 
-def test_enable_returns_after_a_silence_and_200_ms_of_neutral_commands():
-    traffic = Traffic().good()
-    traffic.dropped.add("ValveCmdB")
-    traffic.tick(20)
-    traffic.dropped.clear()
-    traffic.a.update(MOVING)
-    assert traffic.tick(100) is Verdict.CALMING, "still commanding"
-    traffic.a.update({"Mode": 0, "Slew": 0.0})
-    k = count_until(traffic.tick, lambda: traffic.guard.verdict is Verdict.GOOD)
-    assert abs(k * T - CALM_NS) <= 2 * T
-
-
-def test_own_checksum_and_layout_agree_with_the_codecs():
-    generator = random.Random(1)
-    for name in ("ValveCmdA", "ValveCmdB", "EstopStat"):
-        codec = DATABASE.message(name)
-        layout = read_layouts(DATABASE.path, [name])[name]
-        assert (layout.key, layout.length, layout.data_ids) == (codec.key, codec.length, codec.data_ids)
-        assert layout.timeout_ns == codec.timeout_ns
-        for _ in range(300):
-            data = generator.randbytes(8)
-            word = int.from_bytes(data, "little")
-            for signal, value in zip(codec.signals, codec.decode(data), strict=True):
-                field = layout.fields[signal.name]
-                assert field.raw(word) * field.scale == pytest.approx(value)
+@pytest.mark.parametrize(
+    ("database", "name"),
+    [
+        *((DATABASE, name) for name in ("ValveCmdA", "ValveCmdB", "EstopStat", "EncSlew")),
+        *((MACHINE, name) for name in ("VehCmd", "ArmCmdA", "ArmCmdB", "VehStat", "GuardAlive")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_own_checksum_and_layout_agree_with_the_codecs(database, name):
+    generator, codec, layout = random.Random(1), database.message(name), read_layouts(database.path, [name])[name]
+    assert (layout.key, layout.length, layout.data_ids) == (codec.key, codec.length, codec.data_ids or b"")
+    assert layout.timeout_ns == codec.timeout_ns
+    for _ in range(200):
+        data = generator.randbytes(8)
+        word = int.from_bytes(data, "little")
+        for signal, value in zip(codec.signals, codec.decode(data), strict=True):
+            field = layout.fields[signal.name]
+            assert field.raw(word) * field.scale == pytest.approx(value)
+        if layout.data_ids:
             data_id = codec.data_ids[data[1] & 15]
             assert checksum(data, data_id) == crc8(data[1:] + bytes([data_id]))
 
@@ -283,18 +248,16 @@ def test_guard_enables_and_stops_the_controller():
         assert bench.guard.enabled, bench.guard.verdict
     assert bench.mode is Mode.ACTIVE and bench.v[0] > 0.25
     bench.guard.step(bench.now_ns, [Frame(bench.now_ns, 0x1FD, bytes(8))])
-    bench.run(4)
-    assert bench.mode is Mode.FAULT and bench.reason == Reason.GUARD_REFUSES and bench.neutral
-    bench.tick([bench.operator(OperatorAction.RESET)])
+    assert bench.run(4) is Mode.FAULT and bench.reason == Reason.GUARD_REFUSES and bench.neutral
+    bench.press(OperatorAction.RESET)
     bench.run(100)
-    bench.tick([bench.operator(OperatorAction.ARM)])
+    bench.press(OperatorAction.ARM)
     assert not bench.guard.enabled and bench.mode is not Mode.ARMED, "a datagram resets the controller alone"
     bench.changed["EstopStat"] = {"ResetReq": 1}
     bench.run(60)
     bench.changed.clear()
     assert bench.guard.enabled
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def test_emergency_stop_keeps_its_reason_with_guard_and_controller():
@@ -302,13 +265,6 @@ def test_emergency_stop_keeps_its_reason_with_guard_and_controller():
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
     bench.run(4)
     assert bench.reason == Reason.ESTOP_PRESSED and not bench.guard.enabled
-
-
-def test_guard_stops_a_controller_that_ignores_a_lost_encoder():
-    traffic = Traffic().good()
-    encoder_gone(traffic)
-    assert traffic.tick(16) is Verdict.GOOD, "the controller has time to react first"
-    assert traffic.tick(4) is Verdict.ENCODER
 
 
 def test_configuration_errors_have_codes_and_exit_codes(tmp_path, capsys):
@@ -356,15 +312,12 @@ def test_what_judges_has_at_most_650_lines_of_code():
 def test_opening_or_closing_grapple_is_not_neutral(mode):
     """The grapple moves by its mode alone, so the mode must be armed like any other motion."""
     traffic = Traffic()
-    traffic.tick(60)
-    assert traffic.guard.verdict is Verdict.GOOD
+    assert traffic.tick(60) is Verdict.GOOD
     traffic.b = {"ArmKey": 0, "GrappleMode": mode}
-    traffic.tick(2)
-    assert traffic.guard.verdict is Verdict.NOT_ARMED
+    assert traffic.tick(2) is Verdict.NOT_ARMED
 
 
 def test_held_grapple_is_neutral():
     traffic = Traffic()
     traffic.b = {"ArmKey": 0, "GrappleMode": 3}
-    traffic.tick(60)
-    assert traffic.guard.verdict is Verdict.GOOD
+    assert traffic.tick(60) is Verdict.GOOD

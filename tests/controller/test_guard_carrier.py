@@ -1,6 +1,4 @@
-"""The guard on mach0: each rule on the carrier, its frame GuardAlive, and a controller that lies on both buses."""
-
-import random
+"""The guard on mach0: what passes, its frame GuardAlive, and a controller that lies on both buses."""
 
 import pytest
 from hypothesis import example, given, settings
@@ -8,27 +6,13 @@ from hypothesis import strategies as st
 
 from can_dbc.frame import EXTENDED
 from controller.guard.__main__ import split
-from controller.guard.layout import read_layouts
 from controller.guard.verdicts import Verdict
-from tests.controller.bench import MACHINE, MS, T, count_until
-from tests.controller.guard_traffic import DRIVE_BROKEN, DRIVING, STANDING, Traffic, press_reset
+from tests.controller.bench import MS, T, count_until
+from tests.controller.guard_traffic import DRIVING, STANDING, Traffic, press_reset
 
 
 def forwarder():
     return Traffic("aoro_fc8").good()
-
-
-@pytest.mark.parametrize("name", DRIVE_BROKEN)
-def test_each_rule(name):
-    verdict, axis, bound_ms, break_it = DRIVE_BROKEN[name]
-    traffic = forwarder()
-    break_it(traffic)
-    k = count_until(traffic.tick, lambda: traffic.guard.verdict is not Verdict.GOOD, limit=500)
-    assert (traffic.guard.verdict, traffic.guard.axis) == (verdict, axis)
-    assert k * T <= bound_ms * MS
-    for frame in (traffic.status[-1], traffic.alive[-1]):
-        assert (frame["Enable"], frame["Verdict"], frame["FaultAxis"]) == (0, verdict, axis)
-    assert {key & EXTENDED for key, _ in traffic.sent} == {0, EXTENDED}, "on both buses at once"
 
 
 def test_alive_goes_out_every_20_ms_and_only_where_there_is_a_carrier():
@@ -60,8 +44,7 @@ def test_a_normal_drive_passes():
 
 def test_a_carrier_that_nobody_armed_does_not_raise_its_frame():
     traffic = Traffic("aoro_fc8")
-    traffic.tick(700)
-    assert traffic.guard.verdict is Verdict.GOOD
+    assert traffic.tick(700) is Verdict.GOOD
     traffic.arms_a = {"ArmKey": 0xA, "Arm1": 40.0}
     count_until(traffic.tick, lambda: not traffic.guard.enabled)
     assert traffic.guard.verdict is Verdict.NOT_ARMED
@@ -86,20 +69,6 @@ def test_the_crane_may_be_held_while_the_carrier_drives():
         traffic.drive["Speed"] = min(0.6, 0.002 * k)
         traffic.a["Slew"] = min(20.0, 0.5 * k)
         assert traffic.tick() is Verdict.GOOD
-
-
-def test_own_layouts_of_mach0_agree_with_the_codecs():
-    generator = random.Random(2)
-    for name in ("VehCmd", "ArmCmdA", "ArmCmdB", "VehStat", "GuardAlive"):
-        codec, layout = MACHINE.message(name), read_layouts(MACHINE.path, [name])[name]
-        assert (layout.key, layout.length, layout.data_ids) == (codec.key, codec.length, codec.data_ids)
-        assert layout.timeout_ns == codec.timeout_ns
-        for _ in range(100):
-            data = generator.randbytes(8)
-            word = int.from_bytes(data, "little")
-            for signal, value in zip(codec.signals, codec.decode(data), strict=True):
-                field = layout.fields[signal.name]
-                assert field.raw(word) * field.scale == pytest.approx(value)
 
 
 lies = st.fixed_dictionaries(

@@ -1,8 +1,9 @@
-"""The guard's envelope file: sealed, apart from the profile, and never exceeded by it."""
+"""The guard's envelope file: sealed, apart from the profile, and never exceeded by it; and the databases it demands."""
 
 import itertools
 import math
 import re
+import shutil
 import zlib
 
 import pytest
@@ -16,7 +17,6 @@ from controller.guard.envelope import (
     _ENCODER,
     _LIMITS,
     _VALVE,
-    RATES_HZ,
     SHIPPED,
     _axis,
     _limits,
@@ -29,6 +29,7 @@ from machine.geometry.bunk import stake_walls
 from machine.geometry.grapple import lowest_pin_m
 from machine.loading.profile_file import shipped_profiles
 from tests.codes import coded
+from tests.controller.guard_parts import AXIS_LIMITS, VALVE
 from tests.controller.guard_traffic import PROFILE
 
 
@@ -150,11 +151,26 @@ def resealed(envelope, old, new):
     assert seal.main([str(envelope)]) == 0
 
 
-@pytest.mark.parametrize("high", ["[9.0, 9.0, -9.0]", "[-1.0, 9.0, 9.0]"])
-def test_one_box_of_several_without_a_volume_stops_the_start(files, high):
-    """The first has its corners the wrong way round or on one face; the others are those of the machine."""
+GROUND = "ground_m = -0.565"
+FIRST_BOX = "[[boxes]]\nlow_m = [-1.0, -1.0, -1.0]\nhigh_m = {}\n\n[[boxes]]"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *((GROUND, f"ground_m = {value}") for value in ("nan", "inf", '"a text"', "[1.0]", 5000 * "[" + 5000 * "]")),
+        ("lower = -1.74533\nupper = 1.74533", "lower = 1.74533\nupper = -1.74533"),
+        ("speed_limit = 0.35", "speed_limit = -0.35"),
+        ("acceleration_limit = 0.4", "acceleration_limit = 0.0"),
+        ("high_m = [0.4, 0.4, 1.5]", "high_m = [0.4, -0.5, 1.5]"),
+        ("[[boxes]]", FIRST_BOX.format("[9.0, 9.0, -9.0]")),  # one of several, with its corners the wrong way round
+        ("[[boxes]]", FIRST_BOX.format("[-1.0, 9.0, 9.0]")),  # or on one face
+    ],
+    ids=lambda text: text[:30],
+)
+def test_a_sealed_envelope_that_no_machine_has_stops_the_start(files, old, new):
     profile, envelope = files
-    resealed(envelope, "[[boxes]]", f"[[boxes]]\nlow_m = [-1.0, -1.0, -1.0]\nhigh_m = {high}\n\n[[boxes]]")
+    resealed(envelope, old, new)
     with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
         build(profile)
 
@@ -244,18 +260,15 @@ def test_a_joint_without_a_range_has_no_limits():
 
 
 def test_a_spool_s_time_to_close_is_exact_to_the_nanosecond():
-    ends = {f"{name}_{side}": 1.0 for name in ("full_speed",) for side in ("plus", "minus")}
-    ends |= {f"deadband_{side}_pct": 10.0 for side in ("plus", "minus")}
-    valve = {"signal": "Slew", "sign": 1, "delay_s": 0.5, "lag_s": 0.25} | ends
-    limits = {"acceleration_limit": 0.5, "lower": -1.0, "upper": 2.0, "speed_limit": 0.2}
-    assert _axis(0, {"valve": valve}, limits).closing_ns == 1_500_000_000
+    valve = {"valve": VALVE | {"delay_s": 0.5, "lag_s": 0.25}}
+    assert _axis(2, valve, AXIS_LIMITS).closing_ns == 1_500_000_000
 
 
-@pytest.mark.parametrize("rate_hz", RATES_HZ)
-def test_a_control_rate_may_be_at_either_end_of_its_range(rate_hz):
+@pytest.mark.parametrize(("rate_hz", "beyond_hz"), [(50, 49), (1000, 1001)])
+def test_a_control_rate_may_be_at_either_end_of_its_range(rate_hz, beyond_hz):
     build(PROFILE, rate_hz=rate_hz)
     with pytest.raises(GuardConfigError, check=coded("guard.rate")):
-        build(PROFILE, rate_hz=rate_hz - 1 if rate_hz == min(RATES_HZ) else rate_hz + 1)
+        build(PROFILE, rate_hz=beyond_hz)
 
 
 @pytest.mark.parametrize("damage", [b"\x81", b"@1+ (x,0)", b"0|99999999999@1+ (1,0)"])
@@ -267,46 +280,12 @@ def test_a_database_with_numbers_or_bytes_that_cannot_be_read_stops_the_start(tm
         read_layouts(path, ["ValveCmdA"])
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", '"a text"', "[1.0]"])
-def test_a_sealed_limit_that_is_no_finite_number_stops_the_start(files, value):
-    profile, envelope = files
-    envelope.write_text(envelope.read_text().replace("ground_m = -0.565", f"ground_m = {value}"))
-    assert seal.main([str(envelope)]) == 0
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
-        build(profile)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("lower = -1.74533\nupper = 1.74533", "lower = 1.74533\nupper = -1.74533"),
-        ("speed_limit = 0.35", "speed_limit = -0.35"),
-        ("acceleration_limit = 0.4", "acceleration_limit = 0.0"),
-        ("high_m = [0.4, 0.4, 1.5]", "high_m = [0.4, -0.5, 1.5]"),
-        ("ground_m = -0.565", "ground_m = " + 5000 * "[" + 5000 * "]"),
-    ],
-)
-def test_a_sealed_envelope_that_no_machine_has_stops_the_start(files, old, new):
-    profile, envelope = files
-    assert old in envelope.read_text()
-    envelope.write_text(envelope.read_text().replace(old, new))
-    assert seal.main([str(envelope)]) == 0
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
-        build(profile)
-
-
 @pytest.mark.parametrize("text", ["rate_hz = 2" + 5000 * "0", "x = " + 5000 * "[" + 5000 * "]"])
 def test_a_profile_that_no_reader_can_read_stops_the_start(files, text):
     profile, _ = files
     profile.write_text(text)
     with pytest.raises(GuardConfigError, check=coded("guard.profile-unreadable")):
         build(profile)
-
-
-@pytest.mark.parametrize("rate_hz", [49, 1001])
-def test_a_rate_that_no_controller_runs_at_stops_the_start(rate_hz):
-    with pytest.raises(GuardConfigError, check=coded("guard.rate")):
-        build(PROFILE, rate_hz=rate_hz)
 
 
 def test_guard_and_controller_have_one_check_of_one_file(files):
@@ -332,3 +311,39 @@ def test_the_guard_stops_nothing_that_the_controller_lets_pass(name):
         for x, y, z in itertools.product((low[0], -2.0, high[0]), (low[1], 0.0, high[1]), heights):
             assert check._box_at(x, y, z) >= len(stake_walls(profile.bunk)), (x, y, z)
     assert lowest_pin_m(profile) >= read_envelope(SHIPPED / f"{name}.toml").ground_m + 0.04
+
+
+# -- databases
+
+
+@pytest.fixture
+def databases(tmp_path):
+    for name in ("crane.dbc", "machine.dbc"):
+        shutil.copy(DATABASES / name, tmp_path)
+    return tmp_path
+
+
+ESTOP = f"BO_ {load_database('crane').message('EstopStat').key} "
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code"),
+    [
+        (f'BA_ "E2EDataIds" {ESTOP}"', f'BA_ "E2EDataIds" {ESTOP}"01 ', "guard.data-ids"),
+        (f'BA_ "TimeoutMs" {ESTOP}', f'BA_ "Other" {ESTOP}', "guard.message-unprotected"),
+        (" SG_ Slew : ", " SG_ Swing : ", "guard.no-command-signal"),
+    ],
+)
+def test_a_database_without_protection_time_out_or_signal_stops_the_start(databases, old, new, code):
+    path = databases / "crane.dbc"
+    text = path.read_text(encoding="cp1252")
+    assert old in text and not build(PROFILE, databases).enabled
+    path.write_text(text.replace(old, new, 1), encoding="cp1252")
+    with pytest.raises(GuardConfigError, check=coded(code)):
+        build(PROFILE, databases)
+
+
+def test_a_database_that_is_not_there_stops_the_start(databases):
+    (databases / "crane.dbc").unlink()
+    with pytest.raises(GuardConfigError, check=coded("guard.dbc-unreadable")):
+        build(PROFILE, databases)

@@ -34,8 +34,8 @@ def corrupt(traffic):
 
 LATCHED = {name: case for name, case in (BROKEN | DRIVE_BROKEN).items() if case[0] in LATCHING}
 LATCHED |= {
-    "other guard": (Verdict.OTHER_GUARD, 15, 10, other_guard),
-    "corrupt": (Verdict.CORRUPT, 15, 10, corrupt),
+    "other guard": (Verdict.OTHER_GUARD, 15, 1, other_guard),
+    "corrupt": (Verdict.CORRUPT, 15, 1, corrupt),
 }
 
 
@@ -81,8 +81,9 @@ def test_a_button_that_is_held_a_moving_command_and_a_lost_module_give_no_reset(
     traffic.a.update(MOVING)
     assert press_reset(traffic) is Verdict.LATCHED, "a motion is commanded"
     traffic.a = dict(GOOD_A)
+    assert traffic.tick(9) is Verdict.LATCHED and traffic.pilot[-1]["Supply"] == 0, "that press does not count later"
     assert press_reset(traffic) is Verdict.CALMING
-    assert traffic.tick(60) is Verdict.GOOD
+    assert traffic.tick(60) is Verdict.GOOD and traffic.pilot[-1]["Supply"] == 0xA
 
 
 values = st.sampled_from([-100.0, -13.0, 0.0, 13.0, 100.0, None])
@@ -178,7 +179,7 @@ def test_a_joint_that_was_moved_far_by_hand_lever_can_be_reset_where_it_stands()
     for _ in range(100):
         traffic.encoder["EncSlew"] += 20
         traffic.tick()
-    assert traffic.guard.verdict is Verdict.MOVING or traffic.guard.verdict is Verdict.LATCHED
+    assert traffic.guard.verdict in (Verdict.MOVING, Verdict.LATCHED)
     assert traffic.tick(100) is Verdict.LATCHED
     press_reset(traffic)
     assert count_until(traffic.tick, lambda: traffic.guard.enabled) * T <= CALM_NS + 2 * T

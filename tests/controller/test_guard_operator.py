@@ -84,20 +84,15 @@ def test_a_second_stop_gives_no_more_time() -> None:
         assert (traffic.tick() is Verdict.GOOD) is (k < 17), k
 
 
-def test_a_carrier_has_the_time_of_its_brake_after_a_stop() -> None:
+@pytest.mark.parametrize("by", ["the person", "its controller"])
+def test_a_carrier_has_the_time_of_its_brake_after_a_stop(by: str) -> None:
     traffic = Traffic("aoro_fc8").good()
     traffic.drive = dict(DRIVING)
     traffic.tick(40)
-    assert traffic.press(STOP).tick(439) is Verdict.GOOD
-    count_until(traffic.tick, lambda: not traffic.guard.enabled, 3)
-    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.NOT_ARMED, DRIVE_AXIS)
-
-
-def test_a_carrier_has_that_time_after_its_controller_s_own_stop_too() -> None:
-    traffic = Traffic("aoro_fc8").good()
-    traffic.drive = dict(DRIVING)
-    traffic.tick(40)
-    traffic.controller = {"Mode": Mode.STOP}
+    if by == "the person":
+        traffic.press(STOP)
+    else:
+        traffic.controller = {"Mode": Mode.STOP}
     assert traffic.tick(439) is Verdict.GOOD
     count_until(traffic.tick, lambda: not traffic.guard.enabled, 3)
     assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.NOT_ARMED, DRIVE_AXIS)

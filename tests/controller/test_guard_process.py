@@ -32,6 +32,7 @@ class World:
         self.cores: dict[str, WireCore] = {}
         self.heard: dict[str, InProcessBus] = {}
         self.deadlines: list[int] = []
+        self.called: list[str] = []
 
     def open_bus(self, address: str, **options) -> InProcessBus:
         core = self.cores.setdefault(address, WireCore(1_000_000, address))
@@ -56,7 +57,7 @@ class World:
         return found
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def handlers():
     """The process sets its own handlers; the tests get theirs back."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
@@ -65,14 +66,16 @@ def handlers():
         signal.signal(number, handler)
 
 
-def run_guard(monkeypatch, world: World, *arguments: str) -> int:
+def run_guard(
+    monkeypatch, world: World, *arguments: str, profile: str = "palms_471", buses=("--bus", "crane0=here")
+) -> int:
     monkeypatch.setattr(process, "open_bus", world.open_bus)
     monkeypatch.setattr(process, "sleep_until", world.sleep_until)
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: world.now_ns))
     monkeypatch.setattr(process, "prepare", lambda priority: [f"FIFO {priority}"])
     for name in ("stop_garbage_collection", "keep_memory"):
-        monkeypatch.setattr(process, name, lambda: None)
-    return main(["--profile", "palms_471", "--bus", "crane0=here", *arguments])
+        monkeypatch.setattr(process, name, lambda name=name: world.called.append(name))
+    return main(["--profile", profile, *buses, *arguments])
 
 
 @pytest.fixture(autouse=True)
@@ -83,7 +86,6 @@ def state(monkeypatch, tmp_path):
     return tmp_path / "state" / "latched"
 
 
-@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_it_sends_its_status_every_10_ms_until_it_is_ended(monkeypatch, capsys, number, code):
     world = World(100, number)
@@ -95,13 +97,11 @@ def test_it_sends_its_status_every_10_ms_until_it_is_ended(monkeypatch, capsys, 
     assert "FIFO 85" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("handlers")
 def test_without_real_time_it_asks_for_nothing(monkeypatch, capsys):
     assert run_guard(monkeypatch, World(3), "--no-realtime") == 0
     assert "FIFO" not in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("handlers")
 def test_a_late_guard_skips_periods_and_never_catches_up(monkeypatch):
     world = World(12, late_ticks={5: 3 * T + 1 * MS, 8: T - 1})
     assert run_guard(monkeypatch, world) == 0
@@ -109,7 +109,6 @@ def test_a_late_guard_skips_periods_and_never_catches_up(monkeypatch):
     assert gaps == [T] * 4 + [4 * T] + [T] * 6
 
 
-@pytest.mark.usefixtures("handlers")
 def test_its_status_text_names_verdict_and_bus(monkeypatch):
     seen = []
 
@@ -130,7 +129,6 @@ def test_its_status_text_names_verdict_and_bus(monkeypatch):
     assert seen[-1][0] == "stopping"
 
 
-@pytest.mark.usefixtures("handlers")
 def test_a_bus_that_cannot_be_opened_ends_it(monkeypatch, capsys):
     def refuses(address, **_options):
         raise LinkError("bus.no-such", f"no {address}")
@@ -141,24 +139,24 @@ def test_a_bus_that_cannot_be_opened_ends_it(monkeypatch, capsys):
     assert "no here" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("given", ["crane1=x", "crane0=", "crane0"])
-def test_a_bus_without_name_or_address_is_a_usage_error(capsys, given):
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        *((["--profile", "palms_471", "--bus", given], given) for given in ("crane1=x", "crane0=", "crane0")),
+        (["--profile", "palms_471", "--bus", "crane0=here", "--rate", "-1"], "--rate -1"),
+        (["--bus", "crane0=here"], "--profile"),
+    ],
+)
+def test_a_bad_bus_or_rate_or_no_profile_is_a_usage_error(capsys, arguments, told):
     with pytest.raises(SystemExit) as ended:
-        main(["--profile", "palms_471", "--bus", given])
-    assert ended.value.code == 2
-    assert given in capsys.readouterr().err
+        main(arguments)
+    assert ended.value.code == 2 and told in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("handlers")
 def test_without_an_address_it_uses_the_usual_one(monkeypatch):
     world = World(2)
     monkeypatch.setattr(process, "default_address", lambda name: f"usual {name}")
-    monkeypatch.setattr(process, "open_bus", world.open_bus)
-    monkeypatch.setattr(process, "sleep_until", world.sleep_until)
-    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: world.now_ns))
-    for name in ("stop_garbage_collection", "keep_memory"):
-        monkeypatch.setattr(process, name, lambda: None)
-    assert main(["--profile", "palms_471", "--no-realtime"]) == 0
+    assert run_guard(monkeypatch, world, "--no-realtime", buses=()) == 0
     assert "usual crane0" in world.cores
 
 
@@ -167,19 +165,6 @@ def test_a_profile_is_found_by_its_name_or_its_path(tmp_path):
     assert profile_path(str(tmp_path / "x.toml")) == tmp_path / "x.toml"
 
 
-def test_a_negative_rate_is_a_usage_error(monkeypatch, capsys):
-    with pytest.raises(SystemExit) as ended:
-        run_guard(monkeypatch, World(1), "--rate", "-1")
-    assert ended.value.code == 2 and "--rate -1" in capsys.readouterr().err
-
-
-def test_without_a_profile_it_does_not_start(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["--bus", "crane0=here"])
-    assert ended.value.code == 2 and "--profile" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize(("options", "rate_hz"), [((), 0), (("--rate", "500"), 500)])
 def test_the_rate_is_that_of_the_profile_or_the_option(monkeypatch, options, rate_hz):
     asked = []
@@ -196,18 +181,10 @@ def test_commands_at_another_rate_have_its_period(monkeypatch):
     assert build(profile_path("palms_471"), rate_hz=1000).period_ns == 1_000_000
 
 
-@pytest.mark.usefixtures("handlers")
 def test_it_keeps_its_memory_and_stops_the_collector(monkeypatch):
-    called = []
-    world = World(2)
-    monkeypatch.setattr(process, "open_bus", world.open_bus)
-    monkeypatch.setattr(process, "sleep_until", world.sleep_until)
-    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic_ns=lambda: world.now_ns))
-    for name in ("stop_garbage_collection", "keep_memory"):
-        monkeypatch.setattr(process, name, lambda name=name: called.append(name))
-    buses = ("--bus", "crane0=here", "--bus", "mach0=there")
-    assert main(["--profile", "aoro_fc8", "--no-realtime", *buses]) == 0
-    assert called == ["keep_memory", "stop_garbage_collection"] and set(world.cores) == {"here", "there"}
+    world, buses = World(2), ("--bus", "crane0=here", "--bus", "mach0=there")
+    assert run_guard(monkeypatch, world, "--no-realtime", profile="aoro_fc8", buses=buses) == 0
+    assert world.called == ["keep_memory", "stop_garbage_collection"] and set(world.cores) == {"here", "there"}
 
 
 def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch):
@@ -262,7 +239,6 @@ def test_a_tick_judges_what_both_buses_have_brought_and_watches_them(monkeypatch
     assert punctual == [True, False, True]
 
 
-@pytest.mark.usefixtures("handlers")
 def test_the_latch_survives_the_process_until_a_person_resets_it(monkeypatch, capsys, state):
     world = World(20)
     assert run_guard(monkeypatch, world) == 0 and not state.exists(), "nothing has happened"
@@ -282,7 +258,6 @@ def test_the_latch_survives_the_process_until_a_person_resets_it(monkeypatch, ca
     assert state.exists(), "nobody has pressed reset"
 
 
-@pytest.mark.usefixtures("handlers")
 def test_a_latch_that_cannot_be_kept_stops_the_start(monkeypatch, capsys, tmp_path):
     (tmp_path / "file").touch()
     assert run_guard(monkeypatch, World(3), "--state", str(tmp_path / "file" / "latched")) == 3
@@ -310,7 +285,6 @@ def test_without_a_service_the_latch_is_kept_in_shared_memory(monkeypatch, tmp_p
     assert default_path() == tmp_path / "guard.latched"
 
 
-@pytest.mark.usefixtures("handlers")
 def test_its_socket_for_the_operator_is_removed_at_the_end(monkeypatch, tmp_path):
     assert run_guard(monkeypatch, World(3)) == 0
     assert not any((tmp_path / "run-guard").iterdir())

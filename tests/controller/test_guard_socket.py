@@ -11,6 +11,7 @@ import os
 import select
 import socket
 import struct
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -125,29 +126,34 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     return made
 
 
+@pytest.fixture
+def bus(kernel: Kernel) -> Iterator[GuardSocket]:
+    with GuardSocket("can0", KEYS) as made:
+        yield made
+
+
 def drained(bus: GuardSocket) -> list[Frame]:
     frames: list[Frame] = []
     assert bus.drain(frames) == len(frames)
     return frames
 
 
-def test_frames_go_both_ways_with_their_length_and_their_time(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        kernel.clock.now_ns += MS
-        came_ns = kernel.clock.now_ns
-        kernel.send(0x181, b"abc")
-        kernel.clock.now_ns += 100 * MS
-        kernel.send(0x18F0_0400 | EXTENDED, b"12345678")
-        assert select.select([bus.fileno()], [], [], 1.0)[0]
-        first, second = drained(bus)
-        assert first[1:] == (0x181, b"abc") and second[1:] == (0x18F0_0400 | EXTENDED, b"12345678")
-        kernel.clock.now_ns += MS
-        assert first.stamp_ns == came_ns, "the kernel's time, not that of the look"
-        assert second.stamp_ns == came_ns + 100 * MS
-        assert bus.send_all([(0x77F, b"\x05"), (0x381, b"")]) == 2 and bus.send(0x1, b"x")
-        assert kernel.far is not None
-        assert [FRAME.unpack(kernel.far.recv(16))[:2] for _ in range(3)] == [(0x77F, 1), (0x381, 0), (0x1, 1)]
-        assert (bus.stats.received, bus.stats.sent, bus.stats.refused, bus.discard()) == (2, 3, 0, 0)
+def test_frames_go_both_ways_with_their_length_and_their_time(kernel: Kernel, bus: GuardSocket) -> None:
+    kernel.clock.now_ns += MS
+    came_ns = kernel.clock.now_ns
+    kernel.send(0x181, b"abc")
+    kernel.clock.now_ns += 100 * MS
+    kernel.send(0x18F0_0400 | EXTENDED, b"12345678")
+    assert select.select([bus.fileno()], [], [], 1.0)[0]
+    first, second = drained(bus)
+    assert first[1:] == (0x181, b"abc") and second[1:] == (0x18F0_0400 | EXTENDED, b"12345678")
+    kernel.clock.now_ns += MS
+    assert first.stamp_ns == came_ns, "the kernel's time, not that of the look"
+    assert second.stamp_ns == came_ns + 100 * MS
+    assert bus.send_all([(0x77F, b"\x05"), (0x381, b"")]) == 2 and bus.send(0x1, b"x")
+    assert kernel.far is not None
+    assert [FRAME.unpack(kernel.far.recv(16))[:2] for _ in range(3)] == [(0x77F, 1), (0x381, 0), (0x1, 1)]
+    assert (bus.stats.received, bus.stats.sent, bus.stats.refused, bus.discard()) == (2, 3, 0, 0)
 
 
 def test_only_the_watched_identifiers_and_all_error_frames_are_asked_for(kernel: Kernel) -> None:
@@ -168,24 +174,24 @@ def test_leaving_the_bus_closes_the_socket(kernel: Kernel) -> None:
     assert bus.fileno() == -1 and kernel.links[0].near.fileno() == -1
 
 
-def test_frames_are_added_to_those_that_are_there_and_only_they_are_counted(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        frames = [Frame(1, 0x7, b""), Frame(2, 0x8, b"")]
-        kernel.send(0x181, b"a")
-        assert bus.drain(frames) == 1 and len(frames) == 3 and bus.stats.received == 1
+def test_frames_are_added_to_those_that_are_there_and_only_they_are_counted(kernel: Kernel, bus: GuardSocket) -> None:
+    frames = [Frame(1, 0x7, b""), Frame(2, 0x8, b"")]
+    kernel.send(0x181, b"a")
+    assert bus.drain(frames) == 1 and len(frames) == 3 and bus.stats.received == 1
 
 
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0])
-def test_a_step_of_the_wall_clock_moves_no_time_by_more_than_one_look(kernel: Kernel, step_s: float) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        drained(bus)
-        looked_ns = kernel.clock.now_ns
-        kernel.clock.now_ns += MS
-        kernel.send(0x181, b"a")
-        kernel.clock.ahead_ns += round(step_s * 1e9)
-        kernel.clock.now_ns += MS
-        (frame,) = drained(bus)
-        assert looked_ns <= frame.stamp_ns <= kernel.clock.now_ns
+def test_a_step_of_the_wall_clock_moves_no_time_by_more_than_one_look(
+    kernel: Kernel, bus: GuardSocket, step_s: float
+) -> None:
+    drained(bus)
+    looked_ns = kernel.clock.now_ns
+    kernel.clock.now_ns += MS
+    kernel.send(0x181, b"a")
+    kernel.clock.ahead_ns += round(step_s * 1e9)
+    kernel.clock.now_ns += MS
+    (frame,) = drained(bus)
+    assert looked_ns <= frame.stamp_ns <= kernel.clock.now_ns
 
 
 def test_the_clocks_are_read_again_after_a_pause_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,98 +208,94 @@ def test_the_clocks_are_read_again_after_a_pause_between_them(monkeypatch: pytes
     assert can_socket._clocks() == (5_000_000, 5_000_000 - 7), "a machine that is never quiet gets the last reading"
 
 
-def test_error_frames_change_the_state_and_never_arrive(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        for flags, state in ((0x08, BusState.WARNING), (0x20, BusState.PASSIVE), (0x40, BusState.ACTIVE)):
-            kernel.error(0x04, flags)
-            assert drained(bus) == [] and bus.stats.state is state
-        kernel.send(0x181, b"before")
-        kernel.error(0x02, 0x20)
-        assert [f.data for f in drained(bus)] == [b"before"], "an error of a single frame takes nothing else"
-        assert bus.stats.state is BusState.ACTIVE and bus.stats.error_frames == 4
-        kernel.error(0x40)
-        kernel.error(0x04, 0x40)
-        drained(bus)
-        assert bus.stats.state is BusState.OFF, "only a restart ends it"
-        assert bus.send_all([(1, b"")]) == 0 and bus.stats.refused == 1
-        assert not bus.reopen(), "the kernel restarts the node"
-        kernel.send(0x181, b"old")
-        kernel.error(0x100)
-        kernel.send(0x181, b"new")
-        assert [f.data for f in drained(bus)] == [b"new"]
-        assert bus.stats.state is BusState.ACTIVE and bus.stats.recoveries == 1 and bus.reopen()
+def test_error_frames_change_the_state_and_never_arrive(kernel: Kernel, bus: GuardSocket) -> None:
+    for flags, state in ((0x08, BusState.WARNING), (0x20, BusState.PASSIVE), (0x40, BusState.ACTIVE)):
+        kernel.error(0x04, flags)
+        assert drained(bus) == [] and bus.stats.state is state
+    kernel.send(0x181, b"before")
+    kernel.error(0x02, 0x20)
+    assert [f.data for f in drained(bus)] == [b"before"], "an error of a single frame takes nothing else"
+    assert bus.stats.state is BusState.ACTIVE and bus.stats.error_frames == 4
+    kernel.error(0x40)
+    kernel.error(0x04, 0x40)
+    drained(bus)
+    assert bus.stats.state is BusState.OFF, "only a restart ends it"
+    assert bus.send_all([(1, b"")]) == 0 and bus.stats.refused == 1
+    assert not bus.reopen(), "the kernel restarts the node"
+    kernel.send(0x181, b"old")
+    kernel.error(0x100)
+    kernel.send(0x181, b"new")
+    assert [f.data for f in drained(bus)] == [b"new"]
+    assert bus.stats.state is BusState.ACTIVE and bus.stats.recoveries == 1 and bus.reopen()
 
 
-def test_a_flooded_bus_does_not_hold_the_guard_up_and_is_flushed(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        assert kernel.far is not None
-        kernel.far.setblocking(False)
-        count = 0
-        waiting: list[Frame] = []
-        for _ in range(3):
-            with pytest.raises(BlockingIOError):
-                while True:
-                    kernel.send(0x181)
-                    count += 1
-            bus.drain(waiting)
-        assert 0 < len(waiting) <= min(count, 3 * MOST_FRAMES)
-        bus.flush()
-        assert drained(bus) == []
+def test_a_flooded_bus_does_not_hold_the_guard_up_and_is_flushed(kernel: Kernel, bus: GuardSocket) -> None:
+    assert kernel.far is not None
+    kernel.far.setblocking(False)
+    count = 0
+    waiting: list[Frame] = []
+    for _ in range(3):
+        with pytest.raises(BlockingIOError):
+            while True:
+                kernel.send(0x181)
+                count += 1
+        bus.drain(waiting)
+    assert 0 < len(waiting) <= min(count, 3 * MOST_FRAMES)
+    bus.flush()
+    assert drained(bus) == []
 
 
-def test_one_look_reads_a_bounded_number_of_frames(kernel: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_look_reads_a_bounded_number_of_frames(
+    kernel: Kernel, bus: GuardSocket, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(can_socket, "MOST_FRAMES", 3)
-    with GuardSocket("can0", KEYS) as bus:
-        for k in range(7):
-            kernel.send(0x181, bytes((k,)))
-        assert [f.data[0] for f in drained(bus)] == [0, 1, 2]
-        bus.flush()
-        assert drained(bus) == []
+    for k in range(7):
+        kernel.send(0x181, bytes((k,)))
+    assert [f.data[0] for f in drained(bus)] == [0, 1, 2]
+    bus.flush()
+    assert drained(bus) == []
 
 
-def test_other_words_of_the_kernel_about_a_frame_are_no_time(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        bus._socket.told = [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_CAN_RAW, 35, bytes(16))]
-        kernel.clock.now_ns += MS
-        came_ns = kernel.clock.now_ns
-        kernel.send(0x181, b"a")
-        kernel.clock.now_ns += MS
-        (frame,) = drained(bus)
-        assert frame.stamp_ns == came_ns
+def test_other_words_of_the_kernel_about_a_frame_are_no_time(kernel: Kernel, bus: GuardSocket) -> None:
+    bus._socket.told = [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_CAN_RAW, 35, bytes(16))]
+    kernel.clock.now_ns += MS
+    came_ns = kernel.clock.now_ns
+    kernel.send(0x181, b"a")
+    kernel.clock.now_ns += MS
+    (frame,) = drained(bus)
+    assert frame.stamp_ns == came_ns
 
 
-def test_without_a_time_of_the_kernel_a_frame_has_that_of_the_look(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        link = kernel.links[0]
-        link.stamps, link.told = False, [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_CAN_RAW, 35, bytes(16))]
-        kernel.send(0x181, b"a")
-        kernel.clock.now_ns += 2 * MS
-        (frame,) = drained(bus)
-        assert frame.stamp_ns == kernel.clock.now_ns
+def test_without_a_time_of_the_kernel_a_frame_has_that_of_the_look(kernel: Kernel, bus: GuardSocket) -> None:
+    link = kernel.links[0]
+    link.stamps, link.told = False, [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_CAN_RAW, 35, bytes(16))]
+    kernel.send(0x181, b"a")
+    kernel.clock.now_ns += 2 * MS
+    (frame,) = drained(bus)
+    assert frame.stamp_ns == kernel.clock.now_ns
 
 
-def test_no_frame_is_older_than_the_last_look_or_the_opening(kernel: Kernel) -> None:
+def test_no_frame_is_older_than_the_last_look_or_the_opening(kernel: Kernel, bus: GuardSocket) -> None:
     def old(link: Link) -> None:
         link.stamps, link.told = False, [(socket.SOL_SOCKET, 35, struct.pack("@qq", 0, 0))]
         kernel.send(0x181, b"a")
 
-    with GuardSocket("can0", KEYS) as bus:
-        kernel.clock.now_ns += 2 * MS
-        looked_ns = kernel.clock.now_ns
-        drained(bus)
-        old(kernel.links[0])
-        kernel.clock.now_ns += 2 * MS
-        (frame,) = drained(bus)
-        assert frame.stamp_ns == looked_ns
-        kernel.links[0].fails = errno.ENETDOWN
-        drained(bus)
-        kernel.clock.now_ns += 2 * MS
-        opened_ns = kernel.clock.now_ns
-        assert bus.reopen()
-        old(kernel.links[1])
-        kernel.clock.now_ns += 2 * MS
-        (frame,) = drained(bus)
-        assert frame.stamp_ns == opened_ns
+    kernel.clock.now_ns += 2 * MS
+    looked_ns = kernel.clock.now_ns
+    drained(bus)
+    old(kernel.links[0])
+    kernel.clock.now_ns += 2 * MS
+    (frame,) = drained(bus)
+    assert frame.stamp_ns == looked_ns
+    kernel.links[0].fails = errno.ENETDOWN
+    drained(bus)
+    kernel.clock.now_ns += 2 * MS
+    opened_ns = kernel.clock.now_ns
+    assert bus.reopen()
+    old(kernel.links[1])
+    kernel.clock.now_ns += 2 * MS
+    (frame,) = drained(bus)
+    assert frame.stamp_ns == opened_ns
 
 
 def test_a_lost_link_may_be_closed(kernel: Kernel) -> None:
@@ -306,26 +308,24 @@ def test_a_lost_link_may_be_closed(kernel: Kernel) -> None:
 
 
 @pytest.mark.parametrize("side", ["receive", "send"])
-def test_a_lost_link_is_opened_again_when_it_is_back(kernel: Kernel, side: str) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        bus._socket.fails = errno.ENETDOWN
-        assert drained(bus) == [] if side == "receive" else bus.send_all([(1, b""), (2, b"")]) == 0
-        assert (bus.stats.state, bus.fileno()) == (BusState.DOWN, -1)
-        assert drained(bus) == [] and not bus.send(1, b"")
-        kernel.flags = UP
-        assert bus.reopen() is False, "up, but nothing is plugged in"
-        assert [link.near.fileno() for link in kernel.links] == [-1, -1], "what cannot be used is closed"
-        kernel.flags = UP | RUNNING
-        assert bus.reopen() and bus.stats.recoveries == 1 and kernel.opened == 3
-        kernel.send(0x181, b"again")
-        assert [f.data for f in drained(bus)] == [b"again"]
+def test_a_lost_link_is_opened_again_when_it_is_back(kernel: Kernel, bus: GuardSocket, side: str) -> None:
+    bus._socket.fails = errno.ENETDOWN
+    assert drained(bus) == [] if side == "receive" else bus.send_all([(1, b""), (2, b"")]) == 0
+    assert (bus.stats.state, bus.fileno()) == (BusState.DOWN, -1)
+    assert drained(bus) == [] and not bus.send(1, b"")
+    kernel.flags = UP
+    assert bus.reopen() is False, "up, but nothing is plugged in"
+    assert [link.near.fileno() for link in kernel.links] == [-1, -1], "what cannot be used is closed"
+    kernel.flags = UP | RUNNING
+    assert bus.reopen() and bus.stats.recoveries == 1 and kernel.opened == 3
+    kernel.send(0x181, b"again")
+    assert [f.data for f in drained(bus)] == [b"again"]
 
 
-def test_a_full_queue_refuses_and_keeps_the_link(kernel: Kernel) -> None:
-    with GuardSocket("can0", KEYS) as bus:
-        bus._socket.fails = errno.ENOBUFS
-        assert bus.send_all([(1, b""), (2, b"")]) == 0
-        assert (bus.stats.refused, bus.stats.state) == (2, BusState.ACTIVE)
+def test_a_full_queue_refuses_and_keeps_the_link(kernel: Kernel, bus: GuardSocket) -> None:
+    bus._socket.fails = errno.ENOBUFS
+    assert bus.send_all([(1, b""), (2, b"")]) == 0
+    assert (bus.stats.refused, bus.stats.state) == (2, BusState.ACTIVE)
 
 
 def test_an_interface_that_is_down_or_missing_is_told(kernel: Kernel) -> None:

@@ -21,6 +21,7 @@ from tests.controller.bench import MS, SPECS, T
 
 SLEW = SPECS[0]
 PERIOD_S = T * 1e-9
+H = np.array([[1.0, 0.0]])
 SENSED = [s for name in ("palms_471", "aoro_fc8") for s in load_profile(name).joints.values() if s.encoder]
 
 
@@ -30,42 +31,23 @@ def model(period_s, density):
     return np.array([[1.0, period_s], [0.0, 1.0]]), q
 
 
+def riccati_gains(period_s, density, variance):
+    f, q = model(period_s, density)
+    p = solve_discrete_are(f.T, H.T, q, np.array([[variance]]))
+    return p @ H.T / (p[0, 0] + variance)
+
+
 @pytest.mark.parametrize("spec", SENSED, ids=lambda s: s.encoder.message)
 def test_gains_are_the_solution_of_the_riccati_equation(spec):
-    density, variance = acceleration_density(spec), measurement_variance(spec.encoder)
-    f, q = model(PERIOD_S, density)
-    h = np.array([[1.0, 0.0]])
-    p = solve_discrete_are(f.T, h.T, q, np.array([[variance]]))
-    wanted = p @ h.T / (p[0, 0] + variance)
-    assert steady_gains(PERIOD_S, density, variance) == pytest.approx(wanted.ravel().tolist(), rel=1e-6)
+    wanted = riccati_gains(PERIOD_S, acceleration_density(spec), measurement_variance(spec.encoder))
+    found = steady_gains(PERIOD_S, acceleration_density(spec), measurement_variance(spec.encoder))
+    assert found == pytest.approx(wanted.ravel().tolist(), rel=1e-6)
 
 
 @given(st.floats(1e-3, 0.02), st.floats(1e-6, 1.0), st.floats(1e-10, 1e-4))
 def test_gains_are_stable_for_any_noise(period_s, density, variance):
-    f, q = model(period_s, density)
-    h = np.array([[1.0, 0.0]])
-    p = solve_discrete_are(f.T, h.T, q, np.array([[variance]]))
-    wanted = p @ h.T / (p[0, 0] + variance)
-    assert steady_gains(period_s, density, variance) == pytest.approx(wanted.ravel().tolist(), rel=1e-4)
-
-
-def test_estimates_agree_with_a_settled_kalman_filter():
-    density, variance = acceleration_density(SLEW), measurement_variance(SLEW.encoder)
-    reference = KalmanFilter(2, 1)
-    reference.F, reference.Q = model(PERIOD_S, density)
-    reference.H, reference.R = np.array([[1.0, 0.0]]), np.array([[variance]])
-    predicted = solve_discrete_are(reference.F.T, reference.H.T, reference.Q, reference.R)
-    reference.P = predicted - predicted @ reference.H.T @ reference.H @ predicted / (predicted[0, 0] + variance)
-    ours = JointEstimator(SLEW, PERIOD_S)
-    ours.update(0.0, 0)
-    reference.x = np.zeros((2, 1))
-    for k in range(1, 600):
-        measured = round(0.2 * math.sin(0.01 * k) / 4e-4) * 4e-4
-        ours.predict(k * T)
-        ours.update(measured, k * T)
-        reference.predict()
-        reference.update(measured)
-        assert [ours.position, ours.velocity] == pytest.approx(reference.x.ravel().tolist(), abs=1e-9)
+    wanted = riccati_gains(period_s, density, variance).ravel().tolist()
+    assert steady_gains(period_s, density, variance) == pytest.approx(wanted, rel=1e-4)
 
 
 @given(st.sampled_from(SENSED), st.floats(-0.9, 0.9), st.floats(0.05, 2.0), st.sets(st.integers(1, 199), max_size=60))
@@ -74,9 +56,8 @@ def test_estimates_agree_with_filterpy_on_quantised_samples(spec, share, hz, los
     """Sines of any joint, rounded to its encoder's counts, some samples lost: two scalar recurrences, one filter."""
     density, variance = acceleration_density(spec), measurement_variance(spec.encoder)
     reference = KalmanFilter(2, 1)
-    reference.F, reference.H = model(PERIOD_S, density)[0], np.array([[1.0, 0.0]])
-    p = solve_discrete_are(reference.F.T, reference.H.T, model(PERIOD_S, density)[1], np.array([[variance]]))
-    reference.K = p @ reference.H.T / (p[0, 0] + variance)
+    reference.F, reference.H = model(PERIOD_S, density)[0], H
+    reference.K = riccati_gains(PERIOD_S, density, variance)
     ours, amplitude = JointEstimator(spec, PERIOD_S), share * spec.speed_limit / (2.0 * math.pi * hz)
     for k in range(200):
         true = 0.5 * (spec.lower + spec.upper) + amplitude * math.sin(2.0 * math.pi * hz * k * PERIOD_S)
@@ -90,7 +71,7 @@ def test_estimates_agree_with_filterpy_on_quantised_samples(spec, share, hz, los
         elif k not in lost:
             ours.update(measured, k * T)
             reference.update_steadystate(np.array([[measured]]))
-        assert abs(ours.position - reference.x[0, 0]) < 1e-7 and abs(ours.velocity - reference.x[1, 0]) < 1e-6
+        assert [ours.position, ours.velocity] == pytest.approx(reference.x.ravel().tolist(), abs=1e-9)
     assert ours.refused == 0
 
 

@@ -4,6 +4,7 @@ import math
 import random
 from collections import deque
 
+import msgspec
 import pytest
 
 from controller.estimation.joint_estimator import JointEstimator
@@ -12,12 +13,14 @@ from controller.estimation.joint_monitors import (
     EARLY_DELAY_S,
     LATE_DELAY_S,
     SETTLE_S,
+    USUAL_SPEED,
     YIELD_LIMIT_RAD,
     DriftMonitor,
     MotionMonitor,
     SlopeYield,
     StandstillMonitor,
 )
+from controller.estimation.valve_monitors import SPEED_WINDOW_S, SpeedMonitor
 from controller.laws.joint import INCH_SHARE
 from machine.loading.profile_file import load_profile
 from machine.sensing import counts_from_position, position_from_counts
@@ -31,7 +34,7 @@ SLEW = SPECS[0]
 
 # -- Motion monitor: no fault on any valve within the spread, and a fault when a joint does not follow
 
-JOINTS = SPECS[:4]
+of_each_joint = pytest.mark.parametrize("spec", SPECS[:4], ids=["slew", "lift", "tilt", "ext"])
 
 
 class Valve:
@@ -79,7 +82,7 @@ def there_and_back(spec, total_s=2.5, rest_s=0.3):
     return out + [-v for v in out] + rest + inch + rest + jerky + [0.0] * 400
 
 
-@pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
+@of_each_joint
 @pytest.mark.parametrize("delay_s", [0.03, 0.04, 0.095, 0.15])
 @pytest.mark.parametrize(
     ("gain", "exponent", "missing"), [(1.0, 1.04, 0.0), (0.8, 1.1, 0.027), (1.2, 1.0, -0.027), (0.7, 1.1, 0.0)]
@@ -89,7 +92,7 @@ def test_valves_within_the_spread_raise_no_fault(spec, delay_s, gain, exponent, 
     assert alarm(spec, valve, there_and_back(spec)) is Reason.NONE
 
 
-@pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
+@of_each_joint
 def test_stuck_joint_is_detected_in_time(spec):
     monitor, valve = MotionMonitor(spec, PERIOD_S), Valve(spec, 0.08)
     command = 0.8 * spec.speed_limit
@@ -99,14 +102,14 @@ def test_stuck_joint_is_detected_in_time(spec):
     assert ticks * T <= FAULTS[Reason.JOINT_STUCK].bound_ms * 1_000_000 * 1.6, "from full motion"
 
 
-@pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
+@of_each_joint
 def test_uncommanded_motion_is_detected_in_time(spec):
     monitor = MotionMonitor(spec, PERIOD_S)
     ticks = next(k for k in range(200) if monitor.step(0.0, spec.speed_limit) is Reason.JOINT_RUNAWAY)
     assert ticks * T <= FAULTS[Reason.JOINT_RUNAWAY].bound_ms * 1_000_000
 
 
-@pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
+@of_each_joint
 def test_motion_against_the_command_is_detected(spec):
     monitor, valve = MotionMonitor(spec, PERIOD_S), Valve(spec, 0.08)
     command = 0.4 * spec.speed_limit
@@ -150,9 +153,9 @@ def test_a_rotator_that_a_log_turns_back_is_not_stuck(yields: bool, stuck: bool)
 # -- Standstill monitor: slow motion without a command is found, and a joint that only shakes is not
 
 SENSED = [
-    pytest.param(spec, id=f"{name} {joint}")
+    pytest.param(spec, id=f"{name} {which}")
     for name in ("palms_471", "aoro_fc8")
-    for joint, spec in load_profile(name).joints.items()
+    for which, spec in load_profile(name).joints.items()
     if spec.encoder
 ]
 BOUND_S = 0.6
@@ -394,3 +397,177 @@ def test_what_goes_on_until_just_now_still_shakes():
     for _ in range(20):
         held.hold(0.2, 0.0, calm=False)
         assert held.hold(0.9 * SETTLE_S, DRIFT) is None
+
+
+# -- Noise monitor: encoders that become worse than their profile, or than they were; and what is no noise
+#    (ten times the noise within 500 ms: docs/reference/safety.md case 4)
+
+SECOND = round(1e9 / T)
+BOUND = round(0.5 * SECOND)
+
+
+class Rig:
+    """An encoder with white noise on a joint that swings at half its limits, or stands."""
+
+    def __init__(self, spec, noise_share, seed=1, swings=True):
+        self.spec, self.noise = spec, noise_share * spec.encoder.noise
+        self.random, self.estimator, self.k = random.Random(seed), JointEstimator(spec, T * 1e-9), 0
+        w = 0.5 * spec.acceleration_limit / spec.speed_limit
+        self.half, self.w = (0.5 * spec.speed_limit / w, w) if swings else (0.0, 0.0)
+
+    def run(self, ticks, factor=1.0, knock_at=-1, knock=0.0):
+        """Number of samples until it is noisy, or jumps, which is worse; None if it never was."""
+        encoder = self.spec.encoder
+        for k in range(1, ticks + 1):
+            self.k += 1
+            true = 0.3 * encoder.unit_per_count + self.half * math.sin(self.w * self.k * T * 1e-9)
+            true += self.random.gauss(0.0, factor * self.noise) + (knock if k == knock_at else 0.0)
+            self.estimator.predict(self.k * T)
+            self.estimator.update(position_from_counts(encoder, counts_from_position(encoder, true)), self.k * T)
+            if self.estimator.noisy or self.estimator.jumped:
+                return k
+        return None
+
+
+@pytest.mark.parametrize("spec", SENSED)
+@pytest.mark.parametrize("swings", [True, False])
+@pytest.mark.parametrize("warm_s", [1, 20])
+def test_an_encoder_far_better_than_its_profile_is_noisy_at_ten_times_its_noise(spec, swings, warm_s):
+    for seed in range(8):
+        rig = Rig(spec, 0.15, seed, swings)
+        assert rig.run(warm_s * SECOND) is None
+        found = rig.run(BOUND, 10.0)
+        assert found is not None and found <= BOUND
+
+
+@pytest.mark.parametrize("spec", SENSED)
+def test_an_encoder_as_noisy_as_its_profile_is_not_noisy_and_ten_times_that_is(spec):
+    rig = Rig(spec, 1.0)
+    assert rig.run(60 * SECOND) is None
+    assert rig.run(BOUND, 10.0) is not None
+
+
+@pytest.mark.parametrize("spec", SENSED)
+def test_motion_rest_and_double_noise_are_no_noise(spec):
+    for swings in (True, False):
+        rig = Rig(spec, 0.15, swings=swings)
+        assert rig.run(20 * SECOND) is None
+        assert rig.run(20 * SECOND, 2.0) is None
+
+
+@pytest.mark.parametrize("spec", SENSED)
+def test_a_joint_that_rests_between_two_counts_is_not_noisy(spec):
+    rig = Rig(spec, 0.0, swings=False)
+    encoder = spec.encoder
+    assert rig.run(5 * SECOND) is None
+    for _ in range(20 * SECOND):
+        rig.k += 1
+        rig.estimator.predict(rig.k * T)
+        rig.estimator.update(rig.random.randrange(2) * encoder.unit_per_count, rig.k * T)
+        assert not rig.estimator.noisy
+
+
+@pytest.mark.parametrize("spec", SENSED)
+def test_one_knock_is_no_noise(spec):
+    rig = Rig(spec, 0.15)
+    assert rig.run(20 * SECOND) is None
+    assert rig.run(SECOND, knock_at=100, knock=3.0 * spec.encoder.noise) is None
+
+
+def test_noise_that_stays_is_not_learned_away():
+    rig = Rig(SENSED[0].values[0], 0.15)
+    rig.run(20 * SECOND)
+    rig.run(BOUND, 10.0)
+    for _ in range(60):
+        rig.run(1, 10.0)
+    quiet = sum(rig.run(1, 10.0) is None for _ in range(60 * SECOND))
+    assert quiet < 0.02 * 60 * SECOND
+
+
+@pytest.mark.parametrize("punctual", [True, False])
+def test_samples_that_come_late_scatter_and_behind_a_plc_that_is_no_noise(punctual):
+    """A PLC's samples are stamped 1 ms early or late, from some moment on, while the joint moves at its speed limit."""
+    spec = load_profile("palms_471").joints["slew"]
+    encoder, jitter, found = spec.encoder, random.Random(1), False
+    estimator = JointEstimator(spec, T * 1e-9, punctual)
+    for k in range(1, 4 * SECOND):
+        late_s = jitter.choice((-1e-3, 1e-3)) if k > 2 * SECOND else 0.0
+        measured = spec.speed_limit * (k * T * 1e-9 + late_s) - 1.0 + jitter.gauss(0.0, 0.1 * encoder.noise)
+        estimator.predict(k * T)
+        estimator.update(measured, k * T)
+        found = found or estimator.noisy
+    assert found is punctual
+
+
+# -- A machine a third as fast as usual: its oil and steel yield as far as those of any other, and no monitor minds
+
+LIFT = SPECS[1]
+SLOW_VALVE = msgspec.structs.replace(
+    LIFT.valve, full_speed_plus=LIFT.valve.full_speed_plus / 3, full_speed_minus=LIFT.valve.full_speed_minus / 3
+)
+SLOW = msgspec.structs.replace(LIFT, speed_limit=LIFT.speed_limit / 3, valve=SLOW_VALVE)
+USUAL = USUAL_SPEED[1]
+
+
+def test_the_usual_speed_is_that_of_the_slower_shipped_machine() -> None:
+    limits = [[spec.speed_limit for spec in load_profile(name).joints.values()] for name in ("palms_471", "aoro_fc8")]
+    assert list(USUAL_SPEED) == [min(pair) for pair in zip(*limits, strict=True)], "no shipped machine is judged anew"
+
+
+def yields_s(least_speed: float, mrad: float = 4.0) -> float | None:
+    """The boom rises on its oil as jaws let a log go, and stays there; when that counts as motion without a command."""
+    monitor = StandstillMonitor(SLOW, PERIOD_S, least_speed=least_speed)
+    for k in range(round(3.0 / PERIOD_S)):
+        t = k * PERIOD_S - 1.0
+        risen = 0.0 if t < 0.0 else 1e-3 * mrad * (1.0 - math.exp(-t / 0.15))
+        if monitor.step(True, True, risen):
+            return t
+    return None
+
+
+def test_a_boom_that_a_log_leaves_does_not_run_away() -> None:
+    assert yields_s(USUAL) is None
+    assert yields_s(0.0) is not None, "it was one by the speed limit of the slow machine"
+    assert yields_s(USUAL, 12.0) is not None, "three times as far is a motion on any machine"
+
+
+def reacts(least_speed: float, command: float, velocity: float, seconds: float) -> Reason:
+    monitor = MotionMonitor(SLOW, PERIOD_S, least_speed=least_speed)
+    found = (monitor.step(command, velocity) for _ in range(round(seconds / PERIOD_S)))
+    return next((reason for reason in found if reason is not Reason.NONE), Reason.NONE)
+
+
+def test_ringing_oil_is_no_runaway_and_a_fast_joint_is() -> None:
+    assert reacts(USUAL, 0.0, 0.03, 0.25) is Reason.NONE
+    assert reacts(0.0, 0.0, 0.03, 0.25) is Reason.JOINT_RUNAWAY
+    assert reacts(USUAL, 0.0, 0.10, 0.25) is Reason.JOINT_RUNAWAY
+
+
+def test_oil_that_is_pressed_first_is_no_stuck_joint_and_one_that_never_moves_is() -> None:
+    assert reacts(USUAL, 0.02, 0.0, 1.0) is Reason.NONE
+    assert reacts(0.0, 0.02, 0.0, 1.0) is Reason.JOINT_STUCK
+    assert reacts(USUAL, SLOW.speed_limit, 0.0, 1.0) is Reason.JOINT_STUCK
+
+
+@pytest.mark.parametrize(("least_speed", "reason"), [(USUAL, Reason.NONE), (0.0, Reason.JOINT_STUCK)])
+def test_the_spool_of_a_slow_joint_is_open_before_it_moves(least_speed: float, reason: Reason) -> None:
+    monitor = SpeedMonitor(SLOW_VALVE, SLOW.speed_limit, PERIOD_S, SPEED_WINDOW_S, least_speed)
+    found = (monitor.step(0.018, 0.001) for _ in range(round(0.6 / PERIOD_S)))
+    assert next((r for r in found if r is not Reason.NONE), Reason.NONE) is reason
+    stuck = (monitor.step(SLOW.speed_limit, 0.0) for _ in range(round(0.6 / PERIOD_S)))
+    assert Reason.JOINT_STUCK in stuck
+
+
+def test_an_encoder_drifts_when_it_drifts_as_far_as_on_any_machine() -> None:
+    def drifts(least_speed: float, mrad_s: float) -> bool:
+        monitor, position = DriftMonitor(SLOW, PERIOD_S, least_speed), 0.0
+        for k in range(round(6.0 / PERIOD_S)):
+            opens = k * PERIOD_S % 1.5 >= 1.4
+            speed = -15e-3 * mrad_s if opens else 0.0
+            position += (1e-3 * mrad_s + speed) * PERIOD_S
+            if monitor.step(not opens, speed, position, calm=True):
+                return True
+        return False
+
+    assert not drifts(USUAL, 1.8) and drifts(0.0, 1.8)
+    assert drifts(USUAL, 3.0)

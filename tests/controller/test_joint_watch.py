@@ -2,19 +2,15 @@
 
 import random
 
-import msgspec
 import pytest
 
 from can_dbc.messages.crane import GrappleCommand, OperatorAction
-from controller.config import Settings
 from controller.laws.grapple import GrappleLaw
 from machine.joints import Joint
-from machine.loading.profile_file import profile_hash
-from machine.profile import Plc
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, count_until
+from tests.controller.bench import MS, SPECS, Bench, T, behind_plc, count_until
 
 SHARES = (0.03, 0.1, 0.25)
 SLOW_MS = 600
@@ -38,8 +34,7 @@ def test_slow_motion_without_a_command_cuts_while_armed(j, share):
     bench.run(500)
     drifts(bench, j, share)
     if j == Joint.ROT and share <= 0.25:  # as slowly as tongs that close about logs turn it
-        bench.run(100)
-        assert bench.mode is Mode.ARMED
+        assert bench.run(100) is Mode.ARMED
         return
     k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, j)
@@ -53,8 +48,7 @@ def test_jaws_that_press_move_a_joint_and_a_valve_that_stuck_open_moves_it_on(mo
     bench = dithering(Bench()).armed()
     bench.run(500)
     drifts(bench, Joint.SLEW, 0.1)
-    bench.run(80)
-    assert bench.mode is Mode.ARMED
+    assert bench.run(80) is Mode.ARMED
     assert count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 250) * T >= 500 * MS
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.JOINT_RUNAWAY, Joint.SLEW)
 
@@ -62,8 +56,7 @@ def test_jaws_that_press_move_a_joint_and_a_valve_that_stuck_open_moves_it_on(mo
 @pytest.mark.parametrize(("output_pct", "cut"), [(9.0, False), (0.0, True)])
 def test_slow_motion_is_a_correction_where_a_plc_closes_the_loop_and_says_that_it_does_something(output_pct, cut):
     """Our own law rests then: its reference stands, and the joint is within its stop band."""
-    profile = msgspec.structs.replace(PROFILE, plc=Plc("references"))
-    bench = dithering(Bench(Settings(profile, profile_hash(profile), profile.rate_hz))).armed()
+    bench = dithering(Bench(behind_plc("references"))).armed()
     bench.run(500)
     bench.plc_output[0] = output_pct / 100.0
     drifts(bench, 0, 0.03)
@@ -74,9 +67,8 @@ def test_slow_motion_is_a_correction_where_a_plc_closes_the_loop_and_says_that_i
 @pytest.mark.parametrize("share", [0.03, 0.5, 1.0])
 def test_motion_in_stop_latches_and_cuts_whoever_causes_it(share):
     bench = dithering(Bench()).active()
-    bench.tick([bench.operator(OperatorAction.STOP)])
-    bench.run(600)
-    assert bench.mode is Mode.STOP
+    bench.press(OperatorAction.STOP)
+    assert bench.run(600) is Mode.STOP
     drifts(bench, 0, share)
     k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
     assert bench.reason == Reason.MOVES_WHILE_STOPPED and bench.controller.supervisor.detail == 0
@@ -87,7 +79,7 @@ def test_motion_in_stop_latches_and_cuts_whoever_causes_it(share):
 def test_a_joint_that_does_not_come_to_rest_after_the_end_latches(end):
     bench = dithering(Bench()).active()
     drifts(bench, 0, 0.3)
-    bench.tick([bench.operator(end)])
+    bench.press(end)
     count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 300)
     assert bench.reason in (Reason.MOVES_WHILE_STOPPED, Reason.JOINT_RUNAWAY)
 
@@ -115,43 +107,37 @@ def test_hand_levers_are_not_punished_but_prevent_arming(mode):
     bench.run(600)
     before = bench.reason
     bench.moves_alone[2] = 0.3
-    bench.run(200)
-    assert bench.mode is mode
+    assert bench.run(200) is mode
     if mode is Mode.FAULT:
         assert bench.reason == before, "its cause stays to be read"
         bench.moves_alone.clear()
         bench.run(300)
-        bench.tick([bench.operator(OperatorAction.RESET)])
-        bench.run(10)
-        assert bench.mode is Mode.STANDBY
+        bench.press(OperatorAction.RESET)
+        assert bench.run(10) is Mode.STANDBY
         return
     assert bench.reason == Reason.JOINT_MOVES and bench.controller.supervisor.detail == 2
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.JOINT_MOVES
+    assert bench.press(OperatorAction.ARM) is Mode.STANDBY and bench.controller.gate.refusal is Reason.JOINT_MOVES
     bench.moves_alone.clear()
     bench.run(300)
     assert bench.reason == Reason.NONE
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    bench.run(300)
-    assert bench.mode is Mode.ARMED, "what the lever did before does not count"
+    bench.press(OperatorAction.ARM)
+    assert bench.run(300) is Mode.ARMED, "what the lever did before does not count"
 
 
 def test_reset_while_it_still_moves_latches_again_and_afterwards_frees():
     bench = dithering(Bench()).active()
-    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.press(OperatorAction.STOP)
     bench.run(400)
     drifts(bench, 0, 0.2)
     count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 200)
-    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.press(OperatorAction.RESET)
     count_until(bench.tick, lambda: bench.mode is Mode.FAULT, 400)
     assert bench.reason == Reason.MOVES_WHILE_STOPPED
     bench.moves_alone.clear()
     bench.run(200)
-    bench.tick([bench.operator(OperatorAction.RESET)])
-    bench.run(600)
-    assert bench.mode is Mode.STANDBY
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    bench.press(OperatorAction.RESET)
+    assert bench.run(600) is Mode.STANDBY
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def move(bench: Bench, j: int, share: float, ticks: int, until=lambda: False) -> int:
@@ -178,8 +164,7 @@ def test_an_encoder_that_stands_still_to_the_count_is_frozen_and_not_a_stuck_val
 
 
 def test_behind_a_plc_the_same_count_is_no_evidence():
-    profile = msgspec.structs.replace(PROFILE, plc=Plc("valves"))
-    bench = dithering(Bench(Settings(profile, profile_hash(profile), profile.rate_hz))).armed()
+    bench = dithering(Bench(behind_plc("valves"))).armed()
     move(bench, 0, 0.4, 100)
     bench.frozen_counts.add(0)
     move(bench, 0, 0.4, 400)
@@ -208,28 +193,18 @@ def test_one_repeated_frame_is_no_frozen_encoder():
         bench.frozen.add("EncSlew")
         bench.tick()
         bench.frozen.clear()
-        bench.drive(0, 0.08, 10)
-    assert bench.mode is Mode.ACTIVE
+        assert bench.drive(0, 0.08, 10) is Mode.ACTIVE
 
 
 def test_an_encoder_at_rest_may_give_the_same_count_for_ever():
     bench = Bench().armed()
-    bench.tick([bench.hold()])
-    for k in range(1000):
-        bench.tick([bench.hold()] if k % 10 == 0 else ())
-    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
+    assert bench.keep(1000) is Mode.ACTIVE and bench.reason == Reason.NONE
 
 
 def test_ten_times_the_noise_halves_the_speed_in_time():
     bench = dithering(Bench()).active()
     bench.noise_factor[2] = 10.0
-    seen = 0
-    for k in range(1, 101):
-        bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else ())
-        if bench.reason == Reason.ENCODER_NOISY:
-            seen = k
-            break
-    assert seen and seen * T <= FAULTS[Reason.ENCODER_NOISY].bound_ms * MS
+    assert bench.until(Reason.ENCODER_NOISY) * T <= FAULTS[Reason.ENCODER_NOISY].bound_ms * MS
     assert bench.controller.supervisor.half_speed and bench.controller.supervisor.detail == 2
 
 
@@ -276,16 +251,6 @@ def test_a_drifting_encoder_holds_although_the_law_follows_it(j):
     assert k * T <= FAULTS[Reason.ENCODER_DRIFT].bound_ms * MS
 
 
-def test_a_reversed_joint_keeps_its_cause_through_the_ramp():
-    bench = dithering(Bench()).armed()
-    bench.backward.add(0)
-    for k in range(200):
-        bench.tick([bench.moving(0, 0.13)] if k % 10 == 0 and bench.mode in (Mode.ARMED, Mode.ACTIVE) else ())
-        if bench.mode is Mode.FAULT:
-            break
-    assert bench.reason == Reason.JOINT_REVERSED
-
-
 @pytest.mark.parametrize("grapple", [GrappleCommand.NEUTRAL, GrappleCommand.CLOSE])
 def test_a_rotator_that_logs_between_the_tongs_turn_back_is_not_reversed(grapple):
     bench = dithering(Bench()).armed()
@@ -330,24 +295,22 @@ def test_a_person_who_took_over_by_hand_lever_moves_the_machine(after):
     bench.changed["EstopStat"] = {"Lever": 1}
     bench.run(2)
     if after:
-        bench.tick([bench.operator(OperatorAction.DISARM)])
+        bench.press(OperatorAction.DISARM)
     bench.moves_alone[0] = 0.15
-    bench.run(200)
-    assert bench.mode is (Mode.STANDBY if after else Mode.STOP)
+    assert bench.run(200) is (Mode.STANDBY if after else Mode.STOP)
     assert bench.controller.supervisor.moving_joint == 0
     del bench.changed["EstopStat"]
     bench.run(60)  # the oil moves on for a while
     assert bench.mode is (Mode.STANDBY if after else Mode.STOP)
-    bench.tick([bench.operator(OperatorAction.ARM)])
+    bench.press(OperatorAction.ARM)
     assert bench.controller.gate.refusal is Reason.JOINT_MOVES
 
 
 def test_motion_in_a_stop_that_no_lever_explains_is_cut():
     bench = dithering(Bench()).active()
-    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.press(OperatorAction.STOP)
     bench.moves_alone[0] = 0.15
-    bench.run(200)
-    assert bench.mode is Mode.FAULT and bench.reason == Reason.MOVES_WHILE_STOPPED
+    assert bench.run(200) is Mode.FAULT and bench.reason == Reason.MOVES_WHILE_STOPPED
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from controller.laws.joint import (
 from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, Joint
 from machine.profile import SPEED_HEADROOM_SHARE
-from tests.controller.bench import PROFILE, SPECS, T
+from tests.controller.bench import SPECS, T, with_pump
 
 SLEW = SPECS[0]
 T_S = T * 1e-9
@@ -122,9 +122,8 @@ def test_paper_as_pd_has_no_lead_and_holds_its_command_for_a_cycle_of_the_plc():
     law = LAWS["pd_plain"](spec_of("pd_plain", kd=0.0).law)
     given = [law.step(1e-3 * k, 0.0, T_S, False) for k in range(1, 9)]
     cycle = round(PLAIN_PERIOD_S / T_S)
-    assert given == [given[0]] * cycle + [given[cycle]] * cycle and given[cycle] == pytest.approx(
-        (cycle + 1) * given[0]
-    )
+    assert given == [given[0]] * cycle + [given[cycle]] * cycle
+    assert given[cycle] == pytest.approx((cycle + 1) * given[0])
 
 
 class Followed:
@@ -375,8 +374,7 @@ def test_reference_jump_uses_the_law_and_noise_is_ignored():
 
 
 def crane(flow_m3_s=1.0):
-    hydraulics = msgspec.structs.replace(PROFILE.hydraulics, pump_flow_m3_s=flow_m3_s)
-    return CraneLaw(msgspec.structs.replace(PROFILE, hydraulics=hydraulics), T_S)
+    return CraneLaw(with_pump(flow_m3_s), T_S)
 
 
 def standing(positions):

@@ -6,7 +6,6 @@ import math
 import msgspec
 import pytest
 
-from controller.config import Settings
 from controller.crane.load import (
     CHANGE_KG,
     CHANGE_MEAN_S,
@@ -20,13 +19,13 @@ from controller.crane.motion import LOAD_PERIOD_NS
 from machine.geometry.kinematics import max_reach_m
 from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.joints import Joint
-from machine.loading.profile_file import load_profile, profile_hash
-from machine.profile import Sag, Stability
+from machine.loading.profile_file import load_profile
+from machine.profile import Sag
 from machine.sensing import MIN_LEVER_ARM_M, bearable_load_kg, empty_moment_nm, lever_share
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import HOME, MS, PROFILE, SETTINGS, Bench, T, count_until
+from tests.controller.bench import HOME, MS, PROFILE, SETTINGS, Bench, T, count_until, settings_of
 
 PERIOD_S = LOAD_PERIOD_NS * 1e-9
 
@@ -125,12 +124,20 @@ def overloaded_bench():
     moment = LoadMoment(PROFILE, PROFILE.stability).moment_nm(HOME, 100.0, 0.0, 0.0)
     stability = msgspec.structs.replace(PROFILE.stability, share=1.0, stabilising_nm=moment * 1.01)
     profile = msgspec.structs.replace(PROFILE, stability=stability)
-    return Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
+    return Bench(settings_of(profile))
 
 
 def drive(bench, j, v, ticks):
     for k in range(ticks):
         bench.tick([bench.moving(j, v)] if k % 10 == 0 and bench.mode in (Mode.ARMED, Mode.ACTIVE) else ())
+
+
+def holds_after(bench):
+    """Ticks until the overload holds a crane that goes on outward."""
+    planned = (bench.moving(Joint.EXT, 0.02) if k % 10 == 9 else b"" for k in range(100))
+    k = count_until(lambda: bench.tick([d for d in [next(planned)] if d]), lambda: bench.mode is not Mode.ACTIVE)
+    assert bench.reason == Reason.OVERLOAD and bench.mode is Mode.STOP
+    return k
 
 
 def test_a_crane_that_moves_outward_into_overload_holds_in_time():
@@ -142,9 +149,7 @@ def test_a_crane_that_moves_outward_into_overload_holds_in_time():
     drive(bench, Joint.EXT, 0.02, 20)
     assert bench.mode is Mode.ACTIVE
     bench.changed["GrappleStat"] = {"Load": 140.0}
-    planned = (bench.moving(Joint.EXT, 0.02) if k % 10 == 9 else b"" for k in range(100))
-    k = count_until(lambda: bench.tick([d for d in [next(planned)] if d]), lambda: bench.mode is not Mode.ACTIVE)
-    assert bench.reason == Reason.OVERLOAD and bench.mode is Mode.STOP
+    k = holds_after(bench)
     frame_ms = 20
     assert k * T <= (FAULTS[Reason.OVERLOAD].bound_ms + frame_ms) * MS
 
@@ -153,8 +158,7 @@ def test_overloaded_it_refuses_outward_and_accepts_inward():
     bench = overloaded_bench().armed()
     bench.changed["GrappleStat"] = {"Load": 140.0}
     bench.tick([bench.hold()])
-    bench.run(30)
-    assert bench.mode is Mode.ACTIVE, "holding a load that is too heavy moves nothing"
+    assert bench.run(30) is Mode.ACTIVE, "holding a load that is too heavy moves nothing"
     start = list(bench.controller.reference_position)
 
     def to(j, by):
@@ -172,12 +176,11 @@ def test_overloaded_it_refuses_outward_and_accepts_inward():
 
 def test_a_profile_without_the_section_judges_nothing():
     profile = msgspec.structs.replace(PROFILE, stability=None)
-    bench = Bench(Settings(profile, profile_hash(profile), profile.rate_hz)).armed()
+    bench = Bench(settings_of(profile)).armed()
     bench.changed["GrappleStat"] = {"Load": 4000.0}
     bench.tick([bench.hold()])
     drive(bench, Joint.EXT, 0.02, 60)
     assert bench.mode is Mode.ACTIVE and bench.controller.crane.load_moment is None
-    assert Stability is type(PROFILE.stability)
 
 
 FRAME_NS = 5 * MS
@@ -271,9 +274,7 @@ def lifting_bench(v):
 
 def test_by_the_pressures_outward_motion_holds_in_time():
     bench = lifting_bench(0.02)
-    planned = (bench.moving(Joint.EXT, 0.02) if k % 10 == 9 else b"" for k in range(100))
-    k = count_until(lambda: bench.tick([d for d in [next(planned)] if d]), lambda: bench.mode is not Mode.ACTIVE)
-    assert bench.reason == Reason.OVERLOAD and bench.mode is Mode.STOP
+    k = holds_after(bench)
     assert k * T <= FAULTS[Reason.OVERLOAD].bound_ms * MS
     measured_nm, limit_nm, _ = bench.controller.evidence.numbers
     assert measured_nm > limit_nm == PROFILE.stability.share * PROFILE.stability.stabilising_nm
@@ -364,8 +365,6 @@ def test_load_cell_has_priority_over_pressures():
 
 
 # -- Load change: when a load comes or goes
-
-PERIOD_S = LOAD_PERIOD_NS * 1e-9
 
 
 class Scale:

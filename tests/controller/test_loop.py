@@ -1,6 +1,5 @@
 """The loop: deadlines, skipped periods, datagrams, records, warm-up; with a bus in memory and a scripted clock."""
 
-import contextlib
 import mmap
 import os
 
@@ -180,6 +179,8 @@ def test_a_flood_of_datagrams_is_taken_in_order_sixteen_in_a_tick(udp):
         loop.tick(10**9 + i * T, 0)
         taken.append(udp[2].read()[0].datagrams)
         assert len(taken[-1]) == wanted
+    with pytest.raises(BlockingIOError):
+        udp[0].recv(DATAGRAM_BYTES)
     assert [*taken[0], *taken[1]] == [*sent[:-1], b"x" * DATAGRAM_BYTES], "what is longer is cut and refused by its CRC"
 
 
@@ -290,19 +291,6 @@ def test_sample_to_command_counts_from_the_sync_of_the_oldest_sample(udp):
         loop.timing.command_sent()
         found.append(loop.timing.sample_to_command.total_ns - before)
     assert found == [LEAD] * 3 + [LEAD + T] * 3
-
-
-def test_flood_of_datagrams_does_not_delay_the_tick(udp):
-    loop = build(udp, Clock())
-    command = encode(OperatorCommand(1, SETTINGS.profile_hash, 10**9, OperatorAction.STOP))
-    for _ in range(40):
-        udp[1].sendto(command, udp[0].getsockname())
-    loop.tick(10**9, 0)
-    left = 0
-    with contextlib.suppress(BlockingIOError):
-        while udp[0].recv(2048):
-            left += 1
-    assert left == 40 - 16
 
 
 def test_an_operators_stop_waits_behind_no_setpoint(udp, tmp_path):

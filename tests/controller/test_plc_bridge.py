@@ -1,9 +1,10 @@
-"""The PLC bridge in virtual time: emulated nodes on crane0, passed commands, and losses."""
+"""The PLC bridge in virtual time: emulated nodes on crane0, passed commands and losses; and the joint references."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,8 @@ from can_dbc.plc.datagram import Header, encode_reply
 from can_dbc.plc.map import Command, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
 from can_dbc.protocols.canopen import parse_heartbeat
 from can_dbc.protocols.e2e import Checker, Sender, Status
+from controller.crane.outputs import CraneWriter
 from controller.crane.startup import Startup
-from controller.plc import __main__
 from controller.plc import __main__ as process
 from controller.plc.__main__ import summary
 from controller.plc.bridge import Bridge, role_of
@@ -37,8 +38,8 @@ HOME = (0.1, 0.7, -1.6, 0.3, 0.2, 0.0, 0.0)
 ARMED, MOVES = 0xA, 2
 
 
-def profile(role: str) -> Profile:
-    return msgspec.structs.replace(load_profile("palms_471"), plc=Plc(role))  # type: ignore[arg-type]
+def profile(role: str | None) -> Profile:
+    return msgspec.structs.replace(load_profile("palms_471"), plc=Plc(role) if role else None)  # type: ignore[arg-type]
 
 
 class Rig:
@@ -131,17 +132,21 @@ def test_bridge_is_silent_until_the_plc_has_initialised() -> None:
     assert not rig.sent
 
 
-def test_start_up_configures_the_emulated_encoders() -> None:
-    rig = Rig()
+def start_encoders(rig: Rig) -> None:
+    """Set them up as the controller does."""
     startup, ours = Startup(profile("valves")), list[Frame]()
     for _ in range(400):
-        out = rig.step(ours)
-        for key, data in out:
+        for key, data in rig.step(ours):
             startup.receive(key, data)
         asked: list[RawFrame] = []
         startup.step(rig.now_ns, asked)
         ours = [Frame(rig.now_ns, key, data) for key, data in asked]
     assert startup.complete, startup.problem()
+
+
+def test_start_up_configures_the_emulated_encoders() -> None:
+    rig = Rig()
+    start_encoders(rig)
     rig.step([Frame(rig.now_ns, 0x080, b"\x01")])
     slew, ext = rig.decoded("EncSlew"), rig.decoded("EncExt")
     assert slew is not None and slew["Position"] == 8192 + round(0.1 / 3.834951969714103e-4)
@@ -185,12 +190,8 @@ def test_armed_commands_of_role_valves_pass_as_shares() -> None:
     rig = Rig()
     rig.run(100, Slew=50.0, Lift=-25.05, Rot=100.0, Grapple=-100.0, GrappleMode=2)
     command = rig.command
-    assert (command.mode, command.armed, command.grapple, command.grapple_pct) == (
-        Mode.VALVES,
-        True,
-        Grapple.CLOSE,
-        100,
-    )
+    assert (command.mode, command.armed) == (Mode.VALVES, True)
+    assert (command.grapple, command.grapple_pct) == (Grapple.CLOSE, 100)
     assert command.reference == pytest.approx((0.5, -0.2505, 0.0, 0.0, 1.0, 0.0, 0.0))
     assert command.rate == (0.0,) * 7 and command.max_speed_pct == 100
     assert rig.bridge.gate.exit == 0
@@ -198,10 +199,7 @@ def test_armed_commands_of_role_valves_pass_as_shares() -> None:
     assert rig.command.max_speed_pct == 50
 
 
-@pytest.mark.parametrize(
-    ("missing", "exit_code"),
-    [({"arm": 0}, 8), ({"enable": 0}, 4), ({"mode": 3}, 6)],
-)
+@pytest.mark.parametrize(("missing", "exit_code"), [({"arm": 0}, 8), ({"enable": 0}, 4), ({"mode": 3}, 6)])
 def test_without_arm_key_enable_or_a_known_mode_it_is_neutral(missing: dict[str, int], exit_code: int) -> None:
     rig = Rig()
     rig.run(100, Slew=50.0)
@@ -237,14 +235,14 @@ def test_sync_lost_is_neutral() -> None:
 
 
 NAMES = ("Slew", "Lift", "Tilt", "Ext", "Rot")
+REFERENCES = ("JointRefA", "JointRefB", "JointRefC")
 
 
 def referring(rig: Rig, values: dict[str, float | None], ms: int, **control: Any) -> None:
     for _ in range(ms // 5):
         frames = rig.control(**control)
         frames += [
-            rig.frame(n, **{k: v for k, v in values.items() if k in DATABASE.message(n).index})
-            for n in ("JointRefA", "JointRefB", "JointRefC")
+            rig.frame(n, **{k: v for k, v in values.items() if k in DATABASE.message(n).index}) for n in REFERENCES
         ]
         rig.step(frames)
 
@@ -338,17 +336,6 @@ def frames_of(rig: Rig, name: str, ms: int, sync: bool = True) -> list[bytes]:
         frames = rig.control()
         found += [data for k, data in rig.step(frames if sync else frames[1:]) if k == key]
     return found
-
-
-def start_encoders(rig: Rig) -> None:
-    startup, ours = Startup(profile("valves")), list[Frame]()
-    for _ in range(400):
-        for key, data in rig.step(ours):
-            startup.receive(key, data)
-        asked: list[RawFrame] = []
-        startup.step(rig.now_ns, asked)
-        ours = [Frame(rig.now_ns, key, data) for key, data in asked]
-    assert startup.complete
 
 
 def test_the_emergency_stop_is_the_safety_modules_own_frame_and_is_sent_once() -> None:
@@ -558,10 +545,10 @@ def test_a_machine_is_connected_again_after_every_loss(monkeypatch: pytest.Monke
     async def at_once(_: float) -> None:
         pass
 
-    monkeypatch.setattr(__main__.asyncio, "sleep", at_once)
+    monkeypatch.setattr(process.asyncio, "sleep", at_once)
     bridge, machine = Bridge(profile("valves"), DATABASE), Flaky()
     with pytest.raises(asyncio.CancelledError):
-        asyncio.run(__main__.MachineLink(bridge, machine).run())
+        asyncio.run(process.MachineLink(bridge, machine).run())
     lost = ["connect", "disconnect"], ["connect", "act", "observe", "act", "observe", "act", "observe", "disconnect"]
     assert machine.calls == [*lost[0], *lost[1], "connect", "act", "observe", "act", "observe"]
     shake = bridge.handshake
@@ -578,3 +565,52 @@ def test_a_machine_that_is_not_installed_ends_the_bridge_before_it_opens_a_bus(
     assert process.main(["--profile", str(path), "--machine", "nobody"]) == 3
     with pytest.raises(SystemExit, match="2"):
         process.main(["--profile", str(path), "--machine", "nobody", "--key-file", str(path)])
+
+
+# -- the joint references, only for a PLC that closes the joint loops, and only within the frames' range
+
+HERE, SPEEDS = (0.1, 0.7, -1.6, 0.5, 3.0), (0.35, -0.15, 0.28, 0.25, -1.0)
+
+
+def decoded(frames: list[RawFrame]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for (key, data), name in zip(frames, REFERENCES, strict=True):
+        codec = DATABASE.message(name)
+        assert key == codec.key
+        found |= dict(zip((s.name for s in codec.signals), codec.receive(data), strict=True))
+    return found
+
+
+@pytest.mark.parametrize("role", [None, "valves"])
+def test_only_a_plc_with_role_references_gets_them(role: str | None) -> None:
+    frames: list[RawFrame] = []
+    CraneWriter(DATABASE, profile(role)).references(HERE, SPEEDS, True, frames)
+    assert not frames
+
+
+def test_references_carry_position_and_commanded_velocity() -> None:
+    frames: list[RawFrame] = []
+    CraneWriter(DATABASE, profile("references")).references(HERE, SPEEDS, True, frames)
+    found = decoded(frames)
+    for name, position, speed in zip(NAMES, HERE, SPEEDS, strict=True):
+        assert found[name] == pytest.approx(position, abs=1.01e-4)
+        assert found[f"{name}Rate"] == pytest.approx(speed, abs=5.01e-4)
+
+
+def test_references_at_rest_unknown_or_out_of_range_are_not_available() -> None:
+    writer, frames = CraneWriter(DATABASE, profile("references")), list[RawFrame]()
+    writer.references(HERE, SPEEDS, False, frames)
+    assert decoded(frames)["Slew"] is decoded(frames)["RotRate"] is None
+    frames.clear()
+    strange = (math.nan, 0.7, 1e9, 0.5, -math.inf)
+    writer.references(strange, (0.0, 2.0, 0.0, 0.1, 0.0), True, frames)
+    found = decoded(frames)
+    assert [found[n] for n in ("Slew", "Lift", "Tilt", "Rot")] == [None] * 4
+    assert found["Ext"] == pytest.approx(0.5, abs=1e-4) and found["ExtRate"] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_joint_range_beyond_the_frames_is_refused_at_start() -> None:
+    wide = profile("references")
+    slew = msgspec.structs.replace(wide.joints["slew"], upper=3.5)
+    with pytest.raises(ConfigError, check=coded("config.reference-range")):
+        CraneWriter(DATABASE, msgspec.structs.replace(wide, joints=wide.joints | {"slew": slew}))

@@ -76,9 +76,7 @@ def holding_bench():
     bench = Bench().armed()
     bench.changed["PressA"] = {"LiftA": 45.0, "LiftB": 5.0, "TiltA": 18.0, "TiltB": 30.0}
     bench.changed["PressB"] = {"ExtA": 6.0, "ExtB": 33.0, "SlewA": 20.0, "SlewB": 25.0}
-    for k in range(20):
-        bench.tick([bench.hold()] if k % 10 == 0 else ())
-    assert bench.mode is Mode.ACTIVE
+    assert bench.keep(20) is Mode.ACTIVE
     return bench
 
 
@@ -111,18 +109,15 @@ def test_a_pressure_that_is_not_known_is_no_burst():
     bench.run(3)
     bench.dropped.discard("PressA")
     bench.changed["PressA"] = {**bench.changed["PressA"], "LiftA": None}
-    for k in range(40):
-        bench.tick([bench.hold()] if k % 10 == 0 else ())
-    assert bench.mode is Mode.ACTIVE
+    assert bench.keep(40) is Mode.ACTIVE
 
 
 def test_pressures_that_fell_before_arming_do_not_count():
     bench = holding_bench()
-    bench.tick([bench.operator(OperatorAction.DISARM)])
+    bench.press(OperatorAction.DISARM)
     bench.run(60)
     assert not bench.controller.supervisor.armed
     bench.changed["PressA"] = {"LiftA": 0.0, "LiftB": 0.0}
     bench.tick()
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    bench.run(20)
-    assert bench.mode is Mode.ARMED
+    bench.press(OperatorAction.ARM)
+    assert bench.run(20) is Mode.ARMED

@@ -3,16 +3,13 @@
 import math
 from itertools import pairwise
 
-import msgspec
 import pytest
 
-from controller.config import Settings
 from controller.crane.reference_governor import GROWTH_FACTOR
 from controller.laws.joint import LEAST_SHARE, MOST_SHARE, UNKNOWN_GAIN, CommandBound
-from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import MS, PROFILE, SPECS, Bench, T
+from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, settings_of, with_pump
 from tests.controller.setpoint_attacks import ATTACKS, Attacker
 
 DT = T * 1e-9
@@ -27,11 +24,7 @@ CASES = [
 
 def limited_pump(share):
     """The pump gives too little: the trajectory's time runs behind the planner's."""
-    flow_m3_s = share * PROFILE.hydraulics.pump_flow_m3_s
-    profile = msgspec.structs.replace(
-        PROFILE, hydraulics=msgspec.structs.replace(PROFILE.hydraulics, pump_flow_m3_s=flow_m3_s)
-    )
-    return Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
+    return Bench(settings_of(with_pump(share * PROFILE.hydraulics.pump_flow_m3_s)))
 
 
 def attack(bench, kind, joints, every_ms, each_tick=1, seconds=SECONDS):

@@ -13,10 +13,9 @@ from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import DatagramFault
 from can_dbc.messages.vehicle import DriveSetpoint, Steering
 from controller.crane.reference_governor import extremes, hermite, peak_speed
-from machine.joints import Joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import MS, PROFILE, SETTINGS, SPECS, Bench
+from tests.controller.bench import MS, SETTINGS, Bench
 
 ZERO = [0.0] * 5
 HASH = SETTINGS.profile_hash
@@ -41,6 +40,12 @@ def far_knots(b, j, by, after_ms=400):
     return [(0, at(b), ZERO), (after_ms, at(b, j, by), ZERO)]
 
 
+def stamped(b):
+    return 99, HASH, b.now_ns, 200 * MS
+
+
+DRIVE = (63.0, 19.0, 0.0, 0.0, 0.5, (0.3,) * 4, False, False)
+REPORT = ((0.0,) * 5, (0.0,) * 5, (0.0,) * 5, 0.0, 0.0, 0.0, 0, 0, 0, 0)
 BAD = {
     "wrong profile": (Reason.WRONG_PROFILE, 0, lambda b: b.hold(profile_hash=HASH ^ 1)),
     "replayed": (Reason.OUT_OF_ORDER, 0, lambda b: b.hold(sequence=1)),
@@ -70,24 +75,8 @@ BAD = {
         0,
         lambda b: b.setpoint([(0, at(b), ZERO), (400, at(b, 0, 0.01), speed(0, 0.05))], final=True),
     ),
-    "drive": (
-        Reason.CANNOT_DRIVE,
-        0,
-        lambda b: encode(
-            DriveSetpoint(
-                99, HASH, b.now_ns, 200 * MS, Steering.WAYPOINT, 63.0, 19.0, 0.0, 0.0, 0.5, (0.3,) * 4, False, False
-            )
-        ),
-    ),
-    "a report": (
-        Reason.DATAGRAM_KIND,
-        0,
-        lambda b: encode(
-            StateReport(
-                1, HASH, b.now_ns, 2, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.0,) * 5, 0.0, 0.0, 0.0, 0, 0, 0, 0
-            )
-        ),
-    ),
+    "drive": (Reason.CANNOT_DRIVE, 0, lambda b: encode(DriveSetpoint(*stamped(b), Steering.WAYPOINT, *DRIVE))),
+    "a report": (Reason.DATAGRAM_KIND, 0, lambda b: encode(StateReport(1, HASH, b.now_ns, *[0] * 7, *REPORT))),
     "arm by a planner": (Reason.NO_AUTHORITY, 0, lambda b: b.operator(OperatorAction.ARM)),
     "truncated": (Reason.DATAGRAM_CRC, 0, lambda b: b.hold()[:-1]),
     "short": (Reason.DATAGRAM_LENGTH, 0, lambda b: b"\x54"),
@@ -123,14 +112,10 @@ def test_setpoint_is_refused_with_its_reason_and_nothing_moves(name):
 
 
 def test_every_refusal_reason_is_tried():
-    unreachable = {Reason.DATAGRAM_AUTHENTICATION, Reason.NOT_ARMED}  # own tests below and in test_modes
+    unreachable = {Reason.DATAGRAM_AUTHENTICATION, Reason.NOT_ARMED}  # own tests below
     unreachable |= {Reason.TEST_FUNCTION, Reason.TEST_SPOOL, Reason.TEST_BUSY}  # in test_spool_tests
     unreachable |= {r for r in Reason if Reason.DRIVE_SPEED <= r <= Reason.CARRIER_MOVES}  # in test_drive_setpoints
-    unreachable |= {
-        Reason.BELOW_GROUND,
-        Reason.KEEP_OUT,
-        Reason.RAISES_MOMENT,
-    }  # in test_workspace and test_load
+    unreachable |= {Reason.BELOW_GROUND, Reason.KEEP_OUT, Reason.RAISES_MOMENT}  # in test_workspace and test_load
     tried = {reason for reason, _, _ in BAD.values()} | unreachable
     assert tried == {r for r in Reason if r > 100}
     assert {100 + f for f in DatagramFault} <= set(Reason)
@@ -163,10 +148,9 @@ def test_strangers_hide_no_refusals_of_the_planner():
 def test_new_session_may_count_from_the_beginning_but_not_go_back_in_time():
     bench = Bench().active()
     old = bench.moving(0, 0.08)
-    bench.tick([bench.operator(2)])
+    bench.press(2)
     bench.run(40)
-    bench.tick([bench.operator(1)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(1) is Mode.ARMED
     bench.tick([old])
     assert bench.mode is Mode.ARMED, "a replay from the last session"
     bench.tick([bench.hold(sequence=0)])
@@ -199,7 +183,3 @@ def test_peak_and_extremes_bound_the_cubic(p):
     k = 100
     slope = (samples[k + 1][0] - samples[k - 1][0]) / (2 * h / 200)
     assert slope == pytest.approx(samples[k][1], abs=0.01 * (1 + peak))
-
-
-def test_limits_come_from_the_profile():
-    assert PROFILE.timeouts.lease_max_ms == 200 and SPECS[Joint.SLEW].speed_limit == 0.35

@@ -1,11 +1,13 @@
-"""Set-up of the encoders against emulated nodes."""
+"""Set-up of the encoders against emulated nodes, and supervision of all nodes of crane0."""
 
 from dataclasses import replace
 
 import msgspec
 import pytest
 
-from can_dbc.protocols.canopen import SDO_TO_SERVER, Sdo, SdoKind
+from can_dbc.frame import Frame
+from can_dbc.protocols.canopen import SDO_TO_SERVER, Emergency, Sdo, SdoKind, emergency_frame, heartbeat_frame
+from controller.crane.inputs import HEARTBEAT_TIMEOUT_NS, NodeMonitor
 from controller.crane.startup import EncoderSetup, Phase
 from controller.step import Controller
 from machine.status.modes import Mode
@@ -42,14 +44,11 @@ def test_at_most_one_frame_per_tick():
 def test_absent_encoder_is_reported_and_set_up_when_it_appears():
     bench = Bench()
     bench.encoders[4].silent = True
-    bench.run(500)
-    assert bench.mode is Mode.BOOT
+    assert bench.run(500) is Mode.BOOT
     assert bench.reason == Reason.NODE_ABSENT and bench.controller.supervisor.detail == 4
-    bench.tick([bench.operator(1)])
-    assert bench.mode is Mode.BOOT and bench.controller.gate.refusal is Reason.NODE_ABSENT
+    assert bench.press(1) is Mode.BOOT and bench.controller.gate.refusal is Reason.NODE_ABSENT
     bench.encoders[4].silent = False
-    bench.run(200)
-    assert bench.mode is Mode.STANDBY
+    assert bench.run(200) is Mode.STANDBY
 
 
 @pytest.mark.parametrize(("place", "value"), [((0x1000, 0), 0x00080196), ((0x6001, 0), 4096), ((0x6002, 0), 1)])
@@ -57,15 +56,12 @@ def test_wrong_identity_or_range_is_refused_until_reset(place, value):
     bench = Bench()
     good = bench.encoders[3].objects[place]
     bench.encoders[3].objects[place] = value
-    bench.run(300)
-    assert bench.mode is Mode.BOOT
+    assert bench.run(300) is Mode.BOOT
     assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 3
     bench.encoders[3].objects[place] = good
-    bench.run(100)
-    assert bench.mode is Mode.BOOT
-    bench.tick([bench.operator(4)])
-    bench.run(100)
-    assert bench.mode is Mode.STANDBY
+    assert bench.run(100) is Mode.BOOT
+    bench.press(4)
+    assert bench.run(100) is Mode.STANDBY
 
 
 def test_refused_set_up_is_a_configuration_fault():
@@ -80,8 +76,7 @@ def test_device_swapped_while_running_is_detected():
     bench.encoders[2].objects[0x1018, 1] = 8
     bench.extra.append((0x702, b"\x00"))
     bench.encoders[2].state = 0x7F
-    bench.run(100)
-    assert bench.mode is Mode.STANDBY
+    assert bench.run(100) is Mode.STANDBY
     assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 2
 
 
@@ -109,13 +104,11 @@ def test_encoder_that_left_operational_by_itself_is_set_up_again_by_a_reset():
     bench = Bench().boot()
     bench.encoders[3].state = 0x7F  # what a CiA 301 device does after a communication error
     bench.run(100)
-    bench.tick([bench.operator(1)])
-    assert bench.mode is Mode.STANDBY
-    bench.tick([bench.operator(4)])
+    assert bench.press(1) is Mode.STANDBY
+    bench.press(4)
     bench.run(200)
     assert bench.encoders[3].state == 0x05
-    bench.tick([bench.operator(1)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(1) is Mode.ARMED
 
 
 def test_node_that_boots_late_is_started():
@@ -145,3 +138,45 @@ def test_node_that_cannot_send_its_message_is_a_configuration_error():
     profile = msgspec.structs.replace(PROFILE, joints=PROFILE.joints | {"slew": slew})
     with pytest.raises(ConfigError, check=coded("config.encoder-node")):
         Controller(replace(SETTINGS, profile=profile), DATABASE)
+
+
+# -- the nodes of crane0: findings by frames and by silence
+
+
+def receive(nodes, now_ns, *frames):
+    nodes.begin_tick()
+    for key, data in frames:
+        assert nodes.receive(Frame(now_ns, key, data), now_ns)
+
+
+def test_silence_is_detected_without_any_frame():
+    nodes = NodeMonitor([2])
+    receive(nodes, 10 * MS, heartbeat_frame(2, 5), heartbeat_frame(0x20, 5))
+    receive(nodes, 15 * MS, heartbeat_frame(0x10, 5))
+    end_ns = 10 * MS + HEARTBEAT_TIMEOUT_NS
+    for now_ns in (15 * MS, 200 * MS, end_ns):
+        receive(nodes, now_ns)
+        assert nodes.worst_finding(now_ns) == (Reason.NONE, 0)
+    receive(nodes, end_ns + 1)
+    assert nodes.worst_finding(end_ns + 1) == (Reason.ENCODER_NODE_LOST, 2), "worse than the lost pressure module"
+    receive(nodes, end_ns + 6 * MS)
+    assert nodes.worst_finding(end_ns + 6 * MS) == (Reason.SAFETY_NODE_LOST, 0x10)
+
+
+def test_hardest_finding_wins_in_any_order():
+    nodes = NodeMonitor([2])
+    receive(nodes, 0, emergency_frame(Emergency(2, 0x4200, 1, b"")), emergency_frame(Emergency(0x22, 0x5000, 1, b"")))
+    assert nodes.worst_finding(0) == (Reason.EMERGENCY_MESSAGE, 0x22)
+    receive(nodes, 1, emergency_frame(Emergency(0x22, 0, 0, b"")))
+    assert nodes.worst_finding(1) == (Reason.EMERGENCY_WARNING, 2)
+
+
+def test_restart_between_heartbeats_counts_in_one_tick():
+    bench = Bench().boot()
+    while bench.count % 20 != 2:
+        bench.tick()
+    bench.extra += [heartbeat_frame(1, 0), heartbeat_frame(1, 5)]
+    bench.tick()
+    assert bench.reason == Reason.NODE_RESTARTED and bench.controller.supervisor.detail == 1
+    bench.tick()
+    assert bench.reason == Reason.NONE

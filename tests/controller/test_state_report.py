@@ -15,21 +15,18 @@ from machine.status.evidence import EVIDENCE
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import DetailKind, Reason
-from tests.controller.bench import MS, OTHER_CHECK, SETTINGS, Bench, T
+from tests.controller.bench import MS, OTHER_CHECK, SETTINGS, Bench, T, count_until
 from tests.controller.drive_bench import DriveBench
 
 REPORT_TICKS = 4
 
 
-def stopped(bench: Bench, disturb: Callable[[Bench], None], reason: Reason, limit: int = 200, **measured: int) -> Bench:
-    """The bench, one report after the reason was set; the planner continues."""
+def stopped(bench: Bench, disturb: Callable[[Bench], None], reason: Reason, **measured: int) -> Bench:
+    """The bench, one report after the reason was set."""
     disturb(bench)
-    for k in range(limit):
-        bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else (), **measured)
-        if bench.reason == reason:
-            bench.run(REPORT_TICKS)
-            return bench
-    raise AssertionError(f"{reason.name} not seen; {bench.mode.name} {bench.controller.supervisor.reason.name}")
+    bench.until(reason, 200, **measured)
+    bench.run(REPORT_TICKS)
+    return bench
 
 
 def numbers(bench: Bench) -> tuple[float, ...]:
@@ -110,12 +107,10 @@ def test_an_emergency_message_shows_its_code() -> None:
 def test_a_late_loop_shows_how_late_it_was() -> None:
     bench = Bench().active()
     bench.tick([bench.moving(0, 0.08)], late_ns=2 * T + MS)
-    bench.run(REPORT_TICKS)
-    assert bench.mode is Mode.ACTIVE
+    assert bench.run(REPORT_TICKS) is Mode.ACTIVE
     assert numbers(bench) == (pytest.approx(11.0), 10.0, 1.0)
     bench.tick([bench.moving(0, 0.08)], late_ns=61 * MS)
-    bench.run(REPORT_TICKS)
-    assert bench.mode is Mode.STOP
+    assert bench.run(REPORT_TICKS) is Mode.STOP
     assert numbers(bench) == (pytest.approx(61.0), 50.0, 2.0)
 
 
@@ -170,24 +165,22 @@ def test_a_lost_bus_shows_its_counters(measured: dict[str, int], reason: Reason,
 def test_the_evidence_stays_until_the_reset_and_tells_when_it_began() -> None:
     bench = Bench().active()
     bench.dropped.add("GuardStat")
-    began_ns = 0
-    for _ in range(60):
-        bench.tick([bench.moving(0, 0.08)] if bench.mode is Mode.ACTIVE else ())
-        if not began_ns and bench.reason == Reason.GUARD_LOST:
-            began_ns = bench.now_ns
+    bench.until(Reason.GUARD_LOST)
+    began_ns = bench.now_ns
+    bench.run(60)
     kept = numbers(bench)
     bench.dropped.clear()
     bench.run(400)
     report = bench.reports[-1]
     assert bench.mode is Mode.FAULT and (report.numbers, report.since_ns) == (kept, began_ns)
-    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.press(OperatorAction.RESET)
     bench.run(REPORT_TICKS)
     assert bench.reports[-1].numbers == () and bench.reports[-1].since_ns == 0
 
 
 def test_the_second_fault_of_a_stop_has_its_own_evidence() -> None:
     bench = Bench().active()
-    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.press(OperatorAction.STOP)
     bench.run(REPORT_TICKS)
     assert all(map(math.isnan, numbers(bench)))
     bench.dropped.add("EncSlew")
@@ -208,11 +201,8 @@ def test_every_other_reason_of_the_table_is_measured_on_a_driving_machine(detail
     bench = DriveBench().under_way(100)
     evidence, supervisor = bench.controller.evidence, bench.controller.supervisor
     for reason in EVIDENCE.keys() - SILENT:
-        if detail == ARTICULATION and FAULTS[reason].about is not DetailKind.JOINT:
-            continue
-        if detail == ARTICULATION and (
-            reason in CRANE_ONLY or reason.name.startswith(("JOINT_", "SPEED_", "SPOOL_", "TEST_"))
-        ):
+        of_crane = reason in CRANE_ONLY or reason.name.startswith(("JOINT_", "SPEED_", "SPOOL_", "TEST_"))
+        if detail == ARTICULATION and (of_crane or FAULTS[reason].about is not DetailKind.JOINT):
             continue
         supervisor.reason, supervisor.detail = reason, detail
         evidence.update(bench.inputs, bench.now_ns)
@@ -221,19 +211,15 @@ def test_every_other_reason_of_the_table_is_measured_on_a_driving_machine(detail
 
 
 @pytest.mark.parametrize(
-    ("message", "reason", "limit_ms"),
-    [("VehStat", Reason.CARRIER_LOST, 90.0), ("ArmHeightB", Reason.SWING_ARMS_LOST, 90.0)],
+    ("message", "reason"), [("VehStat", Reason.CARRIER_LOST), ("ArmHeightB", Reason.SWING_ARMS_LOST)]
 )
-def test_a_silent_message_of_the_carrier_shows_its_age(message: str, reason: Reason, limit_ms: float) -> None:
+def test_a_silent_message_of_the_carrier_shows_its_age(message: str, reason: Reason) -> None:
     bench = DriveBench().under_way(100)
     bench.dropped.add(message)
-    for _ in range(60):
-        bench.run(1)
-        if bench.reason == reason:
-            break
+    count_until(bench.tick, lambda: bench.reason == reason)
     bench.run(REPORT_TICKS)
     age_ms, limit, _ = bench.reports[-1].numbers
-    assert bench.reason == reason and age_ms > limit and limit <= limit_ms
+    assert bench.reason == reason and age_ms > limit and limit <= 90.0
 
 
 def test_a_carrier_that_runs_away_shows_its_speed_and_its_command() -> None:

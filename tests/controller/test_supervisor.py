@@ -8,7 +8,7 @@ from controller.transitions import TRANSITIONS, Event
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
-from tests.controller.bench import MS, OTHER_CHECK, SETTINGS, VALUES, Bench
+from tests.controller.bench import MS, OTHER_CHECK, SETTINGS, Bench
 
 B, S, A, X, P, F = Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE, Mode.STOP, Mode.FAULT
 #                 BOOT STANDBY ARMED ACTIVE STOP FAULT
@@ -37,47 +37,34 @@ def test_every_mode_and_event(mode, event):
     assert changed is (TABLE[event][mode] is not mode)
 
 
-def test_only_arm_leads_to_armed_but_the_end_of_a_motion():
-    ways = {event for (mode, event), after in TRANSITIONS.items() if after is Mode.ARMED}
-    assert ways == {Event.ARM, Event.DONE}
-    assert [key for key, after in TRANSITIONS.items() if after is Mode.ACTIVE] == [(Mode.ARMED, Event.SETPOINT)]
-    assert [key for key in TRANSITIONS if key[0] is Mode.FAULT] == [(Mode.FAULT, Event.RESET)]
-
-
 def test_boot_to_active_and_back():
     bench = Bench().armed()
     assert bench.neutral and bench.commands_b["ArmKey"] == 0xA
     bench.tick([bench.hold(final=True)])
     assert bench.mode is Mode.ACTIVE
-    bench.run(38)
-    assert bench.mode is Mode.ACTIVE
-    bench.run(2)
-    assert bench.mode is Mode.ARMED and bench.reason == Reason.NONE
+    assert bench.run(38) is Mode.ACTIVE
+    assert bench.run(2) is Mode.ARMED and bench.reason == Reason.NONE
 
 
 def test_stop_from_every_mode():
-    assert Bench().boot().tick() is not None
     for prepare in (Bench.boot, Bench.armed, Bench.active):
         bench = prepare(Bench())
-        bench.tick([bench.operator(OperatorAction.STOP)])
-        assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_STOP
+        assert bench.press(OperatorAction.STOP) is Mode.STOP and bench.reason == Reason.OPERATOR_STOP
         bench.run(31)
         assert bench.neutral and bench.commands_b["ArmKey"] == 0
-        bench.run(300)
-        assert bench.mode is Mode.STOP
+        assert bench.run(300) is Mode.STOP
 
 
 def test_stop_is_accepted_with_a_wrong_profile_and_an_old_stamp():
     bench = Bench().active()
-    bench.tick([bench.operator(OperatorAction.STOP, profile_hash=1, stamp_ns=5, sequence=0)])
-    assert bench.mode is Mode.STOP
+    assert bench.press(OperatorAction.STOP, profile_hash=1, stamp_ns=5, sequence=0) is Mode.STOP
 
 
 def test_stop_ramps_monotonically_to_neutral_within_150_ms():
     bench = Bench().active(speed=0.12)
     before = abs(bench.commands_a["Slew"])
     assert before > 12.0
-    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.press(OperatorAction.STOP)
     seen = [before, abs(bench.commands_a["Slew"])]
     for _ in range(30):
         bench.tick()
@@ -88,30 +75,26 @@ def test_stop_ramps_monotonically_to_neutral_within_150_ms():
 
 def test_setpoints_after_a_stop_do_not_start_it_again():
     bench = Bench().active()
-    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.press(OperatorAction.STOP)
     for _ in range(100):
         bench.tick([bench.hold()])
         assert bench.mode is Mode.STOP
     assert bench.controller.gate.refusal is Reason.NOT_ARMED
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def test_arm_is_refused_while_still_stopping_and_in_fault():
     bench = Bench().active()
-    bench.tick([bench.operator(OperatorAction.STOP)])
-    bench.tick([bench.operator(OperatorAction.ARM)])
+    bench.press(OperatorAction.STOP)
+    bench.press(OperatorAction.ARM)
     assert bench.controller.gate.refusal is Reason.STILL_STOPPING
-    bench.tick([bench.operator(OperatorAction.DISARM)])
-    bench.tick([bench.operator(OperatorAction.RESET)])
-    assert bench.mode is Mode.STOP and bench.controller.supervisor.ramping
+    bench.press(OperatorAction.DISARM)
+    assert bench.press(OperatorAction.RESET) is Mode.STOP and bench.controller.supervisor.ramping
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
-    bench.run(3)
-    assert bench.mode is Mode.FAULT and bench.reason == Reason.ESTOP_PRESSED
+    assert bench.run(3) is Mode.FAULT and bench.reason == Reason.ESTOP_PRESSED
     del bench.changed["EstopStat"]
     bench.run(10)
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.FAULT and bench.controller.gate.refusal is Reason.FAULT_LATCHED
+    assert bench.press(OperatorAction.ARM) is Mode.FAULT and bench.controller.gate.refusal is Reason.FAULT_LATCHED
 
 
 def test_reset_button_is_an_edge_and_arming_needs_the_operator_as_well():
@@ -119,34 +102,27 @@ def test_reset_button_is_an_edge_and_arming_needs_the_operator_as_well():
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0, "ResetReq": 1}
     bench.run(10)
     bench.changed["EstopStat"] = {"ResetReq": 1}
-    bench.run(20)
-    assert bench.mode is Mode.FAULT, "a button that was already down is no edge"
+    assert bench.run(20) is Mode.FAULT, "a button that was already down is no edge"
     bench.changed["EstopStat"] = {"ResetReq": 0}
     bench.run(4)
     bench.changed["EstopStat"] = {"ResetReq": 1}
-    bench.run(4)
-    assert bench.mode is Mode.STANDBY
-    bench.run(200)
-    assert bench.mode is Mode.STANDBY
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.run(4) is Mode.STANDBY
+    assert bench.run(200) is Mode.STANDBY
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def test_reset_with_the_emergency_stop_still_pressed_stays_in_fault():
     bench = Bench().armed()
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
     bench.run(3)
-    bench.tick([bench.operator(OperatorAction.RESET)])
-    assert bench.mode is Mode.FAULT
+    assert bench.press(OperatorAction.RESET) is Mode.FAULT
 
 
 def test_disarm():
     bench = Bench().armed()
-    bench.tick([bench.operator(OperatorAction.DISARM)])
-    assert bench.mode is Mode.STANDBY and bench.commands_b["ArmKey"] == 0
+    assert bench.press(OperatorAction.DISARM) is Mode.STANDBY and bench.commands_b["ArmKey"] == 0
     bench = Bench().active()
-    bench.tick([bench.operator(OperatorAction.DISARM)])
-    assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_DISARM
+    assert bench.press(OperatorAction.DISARM) is Mode.STOP and bench.reason == Reason.OPERATOR_DISARM
 
 
 ARMING = [
@@ -175,17 +151,14 @@ def test_arming_is_refused(what, fault, reason):
     bench = Bench().boot()
     for name, value in fault.items():
         getattr(bench, name).update(value)
-    bench.run(60)
-    assert bench.mode is Mode.STANDBY
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.STANDBY
+    assert bench.run(60) is Mode.STANDBY
+    assert bench.press(OperatorAction.ARM) is Mode.STANDBY
     assert bench.controller.gate.refusal is reason
     for name, value in fault.items():
         for key in value:
             getattr(bench, name).pop(key) if name == "changed" else getattr(bench, name).discard(key)
     bench.run(60)
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 @pytest.mark.parametrize("value", [1, 2])
@@ -194,22 +167,19 @@ def test_a_moved_hand_lever_ends_automatic_work_at_once_and_for_good(value):
     bench = Bench().active()
     assert not bench.neutral
     bench.changed["EstopStat"] = {"Lever": value}
-    bench.run(2)
-    assert bench.mode is Mode.STOP and bench.reason == Reason.LEVER_MOVED, "within the period of EstopStat"
+    assert bench.run(2) is Mode.STOP and bench.reason == Reason.LEVER_MOVED, "within the period of EstopStat"
     assert bench.neutral and bench.commands_b["ArmKey"] == 0 and not bench.controller.supervisor.ramping
     del bench.changed["EstopStat"]
     for _ in range(40):
         bench.tick([bench.hold()])
         assert bench.mode is Mode.STOP and bench.neutral
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def test_a_moved_hand_lever_disarms_a_machine_that_stands():
     bench = Bench().armed()
     bench.changed["EstopStat"] = {"Lever": 1}
-    bench.run(2)
-    assert bench.mode is Mode.STOP and bench.reason == Reason.LEVER_MOVED
+    assert bench.run(2) is Mode.STOP and bench.reason == Reason.LEVER_MOVED
 
 
 @pytest.mark.parametrize("value", [0, None])
@@ -217,8 +187,7 @@ def test_a_machine_that_does_not_tell_about_its_levers_works_as_before(value):
     bench = Bench()
     bench.changed["EstopStat"] = {"Lever": value}
     bench.active()
-    bench.run(10)
-    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
+    assert bench.run(10) is Mode.ACTIVE and bench.reason == Reason.NONE
 
 
 def test_the_mode_switch_is_reported_and_stops_nothing():
@@ -237,24 +206,23 @@ def test_the_mode_switch_is_reported_and_stops_nothing():
 def test_arming_with_the_emergency_stop_in_error_is_refused():
     bench = Bench().boot()
     bench.changed["EstopStat"] = {"ChannelA": 2}
-    bench.run(3)
-    assert bench.mode is Mode.FAULT and bench.reason == Reason.ESTOP_CHANNELS
+    assert bench.run(3) is Mode.FAULT and bench.reason == Reason.ESTOP_CHANNELS
 
 
 def test_arming_outside_the_range_is_refused():
     bench = Bench(home=(0.0, 1.40, -1.2, 0.6, 0.0))
-    bench.run(400)
-    assert bench.mode is Mode.STANDBY and bench.reason == Reason.POSITION_OUTSIDE
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.POSITION_OUTSIDE
+    assert bench.run(400) is Mode.STANDBY and bench.reason == Reason.POSITION_OUTSIDE
+    assert bench.press(OperatorAction.ARM) is Mode.STANDBY and bench.controller.gate.refusal is Reason.POSITION_OUTSIDE
 
 
 def test_operator_commands_are_refused_replayed_old_or_for_another_profile():
     bench = Bench().boot()
     arm = bench.operator(OperatorAction.ARM)
     bench.tick([arm])
-    bench.tick([bench.operator(OperatorAction.DISARM)])
-    assert bench.mode is Mode.STANDBY
+    bench.press(OperatorAction.STOP)
+    bench.tick([arm])
+    assert bench.mode is Mode.STOP and bench.controller.gate.refusal is Reason.OUT_OF_ORDER
+    assert bench.press(OperatorAction.DISARM) is Mode.STANDBY
     for data, reason in (
         (arm, Reason.OUT_OF_ORDER),
         (bench.operator(OperatorAction.ARM, profile_hash=3), Reason.WRONG_PROFILE),
@@ -271,10 +239,8 @@ def test_operator_commands_are_refused_replayed_old_or_for_another_profile():
 
 def test_an_arm_for_the_file_of_the_controllers_profile_arms_and_what_enables_nothing_is_heard_for_any():
     bench = Bench().boot()
-    bench.tick([bench.operator(OperatorAction.ARM, profile_check=SETTINGS.file_check)])
-    assert bench.mode is Mode.ARMED
-    bench.tick([bench.operator(OperatorAction.DISARM, profile_check=OTHER_CHECK)])
-    assert bench.mode is Mode.STANDBY
+    assert bench.press(OperatorAction.ARM, profile_check=SETTINGS.file_check) is Mode.ARMED
+    assert bench.press(OperatorAction.DISARM, profile_check=OTHER_CHECK) is Mode.STANDBY
     without_a_file = RequestGate(SETTINGS.profile, SETTINGS.profile_hash)
     arm = bench.operator(OperatorAction.ARM, profile_check=OTHER_CHECK)
     assert without_a_file.accept(arm, bench.now_ns, 0, operator=True) is OperatorAction.ARM
@@ -285,10 +251,8 @@ def test_neutral_in_every_mode_but_active_and_the_ramp():
     assert bench.neutral and bench.commands_b["ArmKey"] == 0 and bench.commands_b["PumpReq"] == 0
     bench = Bench().active()
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
-    bench.run(3)
-    assert bench.mode is Mode.FAULT and bench.neutral
+    assert bench.run(3) is Mode.FAULT and bench.neutral
     assert bench.commands_b["ArmKey"] == 0 and bench.commands_b["PumpReq"] == 0
-    assert set(VALUES) >= {"EstopStat"}
 
 
 def test_every_reason_is_described():
@@ -302,21 +266,11 @@ def test_every_reason_is_described():
     )
 
 
-def test_last_arm_command_replayed_does_not_arm_again():
-    bench = Bench().boot()
-    arm = bench.operator(OperatorAction.ARM)
-    bench.tick([arm])
-    bench.tick([bench.operator(OperatorAction.STOP)])
-    bench.tick([arm])
-    assert bench.mode is Mode.STOP and bench.controller.gate.refusal is Reason.OUT_OF_ORDER
-
-
 def test_a_guard_with_another_profile_is_not_armed_with():
     bench = Bench().boot()
     bench.changed["GuardStat"] = {"Enable": 0xA, "ProfileCheck": OTHER_CHECK}
     bench.run(10)
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.STANDBY
+    assert bench.press(OperatorAction.ARM) is Mode.STANDBY
     assert bench.controller.gate.refusal is Reason.PROFILE_DIFFERS
     for check in (SETTINGS.file_check, 0):
         bench = Bench().boot()

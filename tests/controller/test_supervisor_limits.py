@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import count
 from types import SimpleNamespace
 
-import msgspec
 import pytest
 
 from can_dbc.messages.crane import OperatorAction
-from controller.config import Settings
 from controller.supervisor import (
     DEGRADE_NS,
     LATE_NS,
@@ -22,18 +21,17 @@ from controller.supervisor import (
     STALLED_NS,
 )
 from controller.transitions import Event
-from machine.loading.profile_file import profile_hash
-from machine.profile import Plc, Profile
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import AORO, MACHINE, MS, PROFILE, SPECS, Bench, T
+from tests.controller.bench import AORO, MACHINE, MS, PROFILE, SETTINGS, SPECS, Bench, T, behind_plc
 
 NOW = 100 * 10**9
 
 
-def supervisor_in(mode: Mode, profile: Profile = PROFILE):
-    made = Bench(Settings(profile, profile_hash(profile), profile.rate_hz)).controller.supervisor
-    made.mode = mode
+def supervisor_in(mode: Mode, detail: int = 0, settings=SETTINGS):
+    """Its details are those of the time before."""
+    made = Bench(settings).controller.supervisor
+    made.mode, made.detail, made.worst_detail = mode, detail, detail
     return made
 
 
@@ -117,9 +115,23 @@ def test_a_finding_reacts_only_while_armed_unless_it_always_does(reason: Reason,
 
 
 def test_before_a_plc_which_adds_its_own_ramp_the_latched_one_is_short() -> None:
-    supervisor = supervisor_in(Mode.ACTIVE, msgspec.structs.replace(PROFILE, plc=Plc("valves")))
+    supervisor = supervisor_in(Mode.ACTIVE, settings=behind_plc("valves"))
     supervisor.apply(Event.RAMP, Reason.ENCODER_LOST, 2, NOW)
     assert supervisor.ramp_ns == PLC_RAMP_NS == 10 * MS
+
+
+def blind(supervisor):
+    """From now on nothing is found: no input is checked, only time passes."""
+    nothing, unknown = SimpleNamespace(values=None), SimpleNamespace(value=lambda: None)
+    nodes = SimpleNamespace(worst_finding=lambda _now_ns: (Reason.NONE, 0))
+    supervisor.crane_inputs = SimpleNamespace(
+        foreign=False, stale_mask=0, estop=nothing, guard=nothing, valve_a=nothing, nodes=nodes
+    )
+    for name in ("_person", "_valve_state", "_plc_faults", "_enable"):
+        setattr(supervisor, name, unknown)
+    supervisor._alarms = supervisor._axes = ()
+    supervisor._echo_counter = SimpleNamespace(value=count().__next__)
+    return supervisor
 
 
 @pytest.mark.parametrize(
@@ -127,7 +139,7 @@ def test_before_a_plc_which_adds_its_own_ramp_the_latched_one_is_short() -> None
 )
 @pytest.mark.parametrize("coast_ns", [0, 700 * MS])
 def test_a_ramp_begins_and_ends_to_the_nanosecond(event: Event, ramp_ns: int, coast_ns: int) -> None:
-    supervisor = supervisor_in(Mode.ACTIVE)
+    supervisor = blind(supervisor_in(Mode.ACTIVE))
     supervisor.coast_ns = coast_ns
     assert supervisor.apply(event, Reason.ENCODER_LOST, 2, NOW) is True
     latches = event is Event.RAMP
@@ -141,36 +153,10 @@ def test_a_ramp_begins_and_ends_to_the_nanosecond(event: Event, ramp_ns: int, co
     assert (supervisor.mode, supervisor.ramping) == (Mode.STOP, True)
     for at_ns in (end_ns - 1, end_ns):
         assert supervisor.ramping and supervisor.mode is Mode.STOP
-        _only_time(supervisor, at_ns)
+        supervisor.supervise(0, T, at_ns)
     assert not supervisor.ramping
     assert supervisor.mode is (Mode.FAULT if latches else Mode.STOP)
     assert (supervisor.reason, supervisor.detail) == (Reason.ENCODER_LOST, 2)
-
-
-def _only_time(supervisor, now_ns: int) -> None:
-    """One call in which nothing is found: no input is checked."""
-    inputs, supervisor.crane_inputs = (
-        supervisor.crane_inputs,
-        SimpleNamespace(
-            foreign=False,
-            stale_mask=0,
-            estop=SimpleNamespace(values=None),
-            guard=SimpleNamespace(values=None),
-            valve_a=SimpleNamespace(values=None),
-            nodes=SimpleNamespace(worst_finding=lambda at_ns: (Reason.NONE, 0)),
-        ),
-    )
-    unknown = SimpleNamespace(value=lambda: None)
-    names = ("_person", "_valve_state", "_plc_faults", "_enable")
-    before = {name: getattr(supervisor, name) for name in (*names, "_alarms", "_axes", "_echo_counter")}
-    for name in names:
-        setattr(supervisor, name, unknown)
-    supervisor._alarms = supervisor._axes = ()
-    supervisor._echo_counter = SimpleNamespace(value=lambda: now_ns)
-    supervisor.supervise(0, T, now_ns)
-    supervisor.crane_inputs = inputs
-    for name, value in before.items():
-        setattr(supervisor, name, value)
 
 
 @pytest.mark.parametrize(("period_ms", "ticks"), [(5, 5), (1, 21), (10, 5)])
@@ -233,15 +219,14 @@ def test_the_range_ends_with_its_margin(j: int) -> None:
 def test_a_second_arm_is_no_refusal() -> None:
     bench = Bench().armed()
     refused = bench.controller.gate.refused
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED and bench.controller.gate.refused == refused
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED and bench.controller.gate.refused == refused
 
 
 def test_arm_in_the_tick_in_which_the_emergency_stop_opens_is_refused() -> None:
     bench = Bench().boot()
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
     bench.run(bench.count % 2)  # the frame is due in the next tick
-    bench.tick([bench.operator(OperatorAction.ARM)])
+    bench.press(OperatorAction.ARM)
     assert bench.controller.gate.refusal is Reason.ESTOP_NOT_RELEASED and bench.mode is Mode.FAULT
 
 
@@ -252,9 +237,9 @@ def test_a_reset_claims_a_lost_address_again() -> None:
     bench.run(2)
     address = bench.controller.carrier_bus.inputs.address
     assert address.lost
-    bench.tick([bench.operator(OperatorAction.ARM)])
+    bench.press(OperatorAction.ARM)
     assert bench.controller.gate.refusal is Reason.ADDRESS_LOST
-    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.press(OperatorAction.RESET)
     assert not address.lost
 
 
@@ -292,3 +277,123 @@ def test_only_a_stop_of_a_moving_machine_has_a_ramp() -> None:
         supervisor = supervisor_in(mode)
         assert supervisor.apply(Event.HOLD, Reason.OPERATOR_STOP, 0, NOW) and supervisor.mode is Mode.STOP
         assert supervisor.ramping is ramp
+
+
+# -- what is left beside its decisions: details of reasons, findings of a tick, the ends of a ramp
+
+STALE = 7
+"""A detail of the time before."""
+
+
+def test_the_numbers_of_events_are_those_of_recordings_and_no_joint_is_none() -> None:
+    assert [event.value for event in Event] == list(range(10))
+    assert NO_JOINT == -1
+
+
+def test_a_link_that_nobody_watches_is_lost_at_no_time_a_register_can_hold() -> None:
+    link = supervisor_in(Mode.BOOT).operator_link
+    assert (link.stamp_ns, link.lost_from_ns) == (0, 1 << 61)
+
+
+@pytest.mark.parametrize(
+    ("mode", "request_name", "after"),
+    [(Mode.FAULT, "request_reset", Mode.BOOT), (Mode.ARMED, "request_disarm", Mode.STANDBY)],
+)
+def test_what_a_person_asked_for_has_no_detail(mode: Mode, request_name: str, after: Mode) -> None:
+    supervisor = supervisor_in(mode, STALE)
+    getattr(supervisor, request_name)(NOW)
+    assert (supervisor.mode, supervisor.detail) == (after, 0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ({"dropped": {"EncTilt"}}, Reason.INPUT_MISSING),
+        ({"changed": {"GuardStat": {"Enable": 0}}}, Reason.GUARD_NOT_READY),
+        ({"changed": {"ValveFbA": {"State": 4}}}, Reason.VALVE_NODE_NOT_READY),
+    ],
+)
+def test_what_prevents_arming_without_a_part_of_its_own_has_no_detail(fault, reason: Reason) -> None:
+    bench = Bench().boot()
+    for name, value in fault.items():
+        getattr(bench, name).update(value)
+    bench.run(60)
+    assert bench.controller.supervisor.arming_blocker(bench.now_ns) == (reason, 0)
+
+
+def test_an_emergency_stop_that_is_not_released_has_no_detail() -> None:
+    bench = Bench().boot()
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.run(4)
+    assert bench.controller.supervisor.arming_blocker(bench.now_ns) == (Reason.ESTOP_NOT_RELEASED, 0)
+
+
+def test_what_an_earlier_check_found_does_not_prevent_arming() -> None:
+    bench = Bench().boot()
+    supervisor = bench.controller.supervisor
+    supervisor.worst, supervisor.worst_detail = Reason.ENCODER_LOST, 3
+    assert supervisor.arming_blocker(bench.now_ns) == (Reason.NONE, 0)
+    assert (supervisor.worst, supervisor.worst_detail) == (Reason.NONE, 0)
+
+
+def test_a_good_tick_forgets_the_finding_of_the_one_before() -> None:
+    bench = Bench().active()
+    supervisor = bench.controller.supervisor
+    supervisor.worst, supervisor.worst_detail = Reason.NONE, 3
+    bench.tick([bench.hold()])
+    assert (supervisor.worst, supervisor.worst_detail) == (Reason.NONE, 0)
+
+
+@pytest.mark.parametrize("mode", [Mode.ARMED, Mode.ACTIVE])
+def test_a_foreign_controller_on_the_crane_bus_is_number_0(mode: Mode) -> None:
+    supervisor = supervisor_in(mode, STALE)
+    supervisor.crane_inputs.foreign = True
+    supervisor.supervise(0, T, NOW)
+    assert (supervisor.reason, supervisor.detail) == (Reason.FOREIGN_CONTROLLER, 0)
+
+
+def test_a_finding_without_a_part_has_the_detail_0() -> None:
+    bench = Bench().armed()
+    bench.changed["EstopStat"] = {"Person": 1}
+    bench.run(4)
+    assert (bench.reason, bench.controller.supervisor.detail) == (Reason.PERSON_IN_ZONE, 0)
+
+
+@pytest.mark.parametrize("lost", ["PlcStatus", "PlcOut"])
+def test_either_message_of_a_plc_is_its_loss(lost: str) -> None:
+    bench = Bench(behind_plc("references")).armed()
+    bench.dropped.add(lost)
+    assert bench.run(30) is Mode.FAULT and bench.reason is Reason.PLC_LOST
+
+
+def test_a_pilot_supply_that_is_off_is_a_fault_of_a_moving_machine_only() -> None:
+    bench = Bench().armed()
+    bench.changed["ValveFbA"] = {"State": 3}
+    assert bench.run(20) is Mode.ARMED
+    bench = Bench().active()
+    bench.changed["ValveFbA"] = {"State": 3}
+    bench.run(20)
+    assert bench.reason is Reason.VALVE_NODE_FAULT
+
+
+@pytest.mark.parametrize(
+    ("mode", "event", "reason"),
+    [
+        (Mode.ARMED, Event.HOLD, Reason.OPERATOR_STOP),
+        (Mode.ACTIVE, Event.CUT, Reason.ESTOP_PRESSED),
+        (Mode.ACTIVE, Event.DONE, Reason.NONE),
+    ],
+)
+def test_no_ramp_is_left_where_there_is_none(mode: Mode, event: Event, reason: Reason) -> None:
+    supervisor = supervisor_in(mode)
+    supervisor.ramp_ns = 5
+    assert supervisor.apply(event, reason, 0, NOW)
+    assert supervisor.ramp_ns == 0
+
+
+def test_a_hand_lever_ends_the_motion_at_once_and_the_end_of_a_ramp_leaves_none() -> None:
+    supervisor = supervisor_in(Mode.ACTIVE)
+    supervisor.apply(Event.HOLD, Reason.LEVER_MOVED, 0, NOW)
+    assert supervisor.ramp_end_ns == NOW
+    supervisor.supervise(0, T, NOW)
+    assert supervisor.ramp_ns == 0 and not supervisor.ramping

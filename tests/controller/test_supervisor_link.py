@@ -14,7 +14,7 @@ from machine.profile import Profile
 from machine.status.explanation import describe
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
-from machine.status.reasons import Reaction, Reason
+from machine.status.reasons import Reason
 from tests.controller.bench import MS, SETTINGS, Bench, T
 
 PROFILE = load_profile("palms_471")
@@ -29,7 +29,7 @@ def limited(limit_ms: int) -> Profile:
 
 
 def watched(bench: Bench) -> Bench:
-    bench.tick([bench.operator(WATCH)])
+    bench.press(WATCH)
     return bench
 
 
@@ -103,8 +103,7 @@ def test_a_lost_link_holds_a_working_machine_in_time() -> None:
 
 def test_a_lost_link_holds_an_armed_machine() -> None:
     bench = watched(Bench().armed())  # stamped one tick before it arrived
-    bench.run(LIMIT_TICKS - 2)
-    assert bench.mode is Mode.ARMED
+    assert bench.run(LIMIT_TICKS - 2) is Mode.ARMED
     bench.tick()
     assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_LINK_LOST
 
@@ -115,22 +114,15 @@ def test_heartbeats_keep_the_machine_working() -> None:
     assert bench.mode is Mode.ACTIVE and bench.reports[-1].operator_link == LinkWatch.WATCHED
 
 
-def test_without_a_watcher_nothing_changes() -> None:
-    bench = Bench().active()
-    assert work(bench, 3 * LIMIT_TICKS) == 3 * LIMIT_TICKS and bench.mode is Mode.ACTIVE
-    assert bench.reports[-1].operator_link == LinkWatch.OFF
-
-
-def test_ending_the_watch_on_purpose_is_no_fault() -> None:
-    bench = watched(Bench().active())
-    bench.tick([bench.operator(WATCH_END)])
+@pytest.mark.parametrize("watch", ["nobody", "ended", "switched off by the profile"])
+def test_without_a_watcher_nothing_changes(watch: str) -> None:
+    bench = Bench(replace(SETTINGS, profile=limited(0)) if watch.startswith("switched") else SETTINGS).active()
+    if watch != "nobody":
+        watched(bench)
+    if watch == "ended":
+        bench.press(WATCH_END)
     assert work(bench, 3 * LIMIT_TICKS) == 3 * LIMIT_TICKS and bench.mode is Mode.ACTIVE
     assert state(bench) == LinkWatch.OFF
-
-
-def test_a_profile_switches_the_watch_off() -> None:
-    bench = watched(Bench(replace(SETTINGS, profile=limited(0))).active())
-    assert work(bench, 3 * LIMIT_TICKS) == 3 * LIMIT_TICKS and state(bench) == LinkWatch.OFF
 
 
 def test_a_link_that_comes_back_does_not_resume_the_work() -> None:
@@ -139,8 +131,7 @@ def test_a_link_that_comes_back_does_not_resume_the_work() -> None:
     for k in range(100):
         bench.tick([bench.operator(WATCH), bench.hold()] if k % 10 == 0 else ())
     assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_LINK_LOST
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
     bench.tick([bench.hold()])
     assert bench.mode is Mode.ACTIVE
 
@@ -148,30 +139,26 @@ def test_a_link_that_comes_back_does_not_resume_the_work() -> None:
 @pytest.mark.parametrize("back", [WATCH, WATCH_END])
 def test_arming_is_refused_while_the_link_is_lost_and_says_what_to_do(back: OperatorAction) -> None:
     bench = watched(Bench().boot())
-    bench.run(LIMIT_TICKS + REPORT_TICKS)
-    assert bench.mode is Mode.STANDBY and bench.reason == Reason.OPERATOR_LINK_LOST
-    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.run(LIMIT_TICKS + REPORT_TICKS) is Mode.STANDBY and bench.reason == Reason.OPERATOR_LINK_LOST
+    bench.press(OperatorAction.ARM)
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.OPERATOR_LINK_LOST
     assert "unwatch" in describe(Reason.OPERATOR_LINK_LOST)
-    bench.tick([bench.operator(back)])
+    bench.press(back)
     assert bench.reason == Reason.NONE
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def test_a_stopped_machine_is_not_armed_while_the_link_is_lost() -> None:
     bench = watched(Bench().active())
     work(bench, 2 * LIMIT_TICKS)
     bench.run(100)
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.STOP and bench.controller.gate.refusal is Reason.OPERATOR_LINK_LOST
+    assert bench.press(OperatorAction.ARM) is Mode.STOP and bench.controller.gate.refusal is Reason.OPERATOR_LINK_LOST
 
 
 def test_a_lost_link_is_no_second_fault_of_a_stop() -> None:
     bench = watched(Bench().active())
-    bench.tick([bench.operator(OperatorAction.STOP)])
-    bench.run(2 * LIMIT_TICKS)
-    assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_STOP
+    bench.press(OperatorAction.STOP)
+    assert bench.run(2 * LIMIT_TICKS) is Mode.STOP and bench.reason == Reason.OPERATOR_STOP
 
 
 def test_a_harder_fault_wins_over_the_lost_link() -> None:
@@ -179,13 +166,7 @@ def test_a_harder_fault_wins_over_the_lost_link() -> None:
     work(bench, LIMIT_TICKS - 4)
     bench.dropped.add("EstopStat")
     work(bench, 20)
-    bench.run(20)
-    assert bench.mode is Mode.FAULT and bench.reason == Reason.ESTOP_LOST
-
-
-def test_the_reaction_is_a_hold() -> None:
-    fault = FAULTS[Reason.OPERATOR_LINK_LOST]
-    assert fault.reaction is Reaction.HOLD and not fault.always
+    assert bench.run(20) is Mode.FAULT and bench.reason == Reason.ESTOP_LOST
 
 
 # -- the gate
@@ -230,7 +211,7 @@ def test_the_slower_of_two_senders_is_not_refused() -> None:
 )
 def test_a_heartbeat_is_checked_as_every_command(fields: dict[str, int], refusal: Reason) -> None:
     bench = Bench().armed()
-    bench.tick([bench.operator(WATCH, **fields)])
+    bench.press(WATCH, **fields)
     assert bench.controller.gate.refusal is refusal and state(bench) == LinkWatch.OFF
 
 
@@ -247,7 +228,7 @@ def test_a_heartbeat_outruns_no_command() -> None:
     bench = Bench().boot()
     arm = bench.operator(OperatorAction.ARM)
     bench.run(2)
-    bench.tick([bench.operator(WATCH)])
+    bench.press(WATCH)
     bench.tick([arm])
     assert bench.mode is Mode.ARMED
     bench.tick([arm])

@@ -25,12 +25,11 @@ from controller.laws.valve_map import ValveMap
 from controller.step import Controller
 from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, Joint
-from machine.loading.profile_file import profile_hash
 from machine.profile import Imu, joint
 from machine.status.modes import Mode
 from runtime.errors import ConfigError
 from tests.codes import coded
-from tests.controller.bench import AORO, DATABASE, MS, SETTINGS, Bench, T, count_until
+from tests.controller.bench import AORO, DATABASE, SETTINGS, Bench, T, count_until, settings_of
 
 T_S = T * 1e-9
 KEY = DATABASE.message("GrappleImu").key
@@ -38,6 +37,7 @@ IMU = Imu(0x23, "GrappleImu", gain=0.4, pendulum_m=0.8, pin_speed_m_s=0.12, dead
 PROFILE = msgspec.structs.replace(AORO.profile, imu=IMU)
 LEADS = [150_000_000] * len(JOINTS)
 POSE = (0.3, 0.6, -1.4, 0.8, 0.0)
+SWING = (0.2, 0.2, 0.0, 0.0)
 GRAVITY_M_S2 = 9.81
 
 
@@ -176,7 +176,7 @@ def test_pin_returns_exactly_after_the_time_limit():
     law, moved = sway(), []
 
     def tick():
-        law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+        law.step(SWING, 0.0, True, POSE, T_S)
         moved.append(abs(law.displacement[Joint.SLEW]))
 
     ticks = count_until(tick, lambda: not law.active, round((MAX_DAMPING_S + 4.0) / T_S))
@@ -184,21 +184,21 @@ def test_pin_returns_exactly_after_the_time_limit():
     assert max(moved) > 0.01
     assert not any(law.velocity) and not any(law.displacement)
     for _ in range(200):
-        law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+        law.step(SWING, 0.0, True, POSE, T_S)
     assert not law.active and not any(law.velocity)
 
 
 def test_damping_does_not_begin_and_fades_while_the_reference_moves():
     law = sway()
     for _ in range(100):
-        law.step((0.2, 0.2, 0.0, 0.0), 0.0, False, POSE, T_S)
+        law.step(SWING, 0.0, False, POSE, T_S)
     assert not law.active
     for _ in range(100):
-        law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+        law.step(SWING, 0.0, True, POSE, T_S)
     assert law.active
     for unknown in (True, False):  # stale first, then a new motion
         before = list(law.velocity)
-        law.step(None if unknown else (0.2, 0.2, 0.0, 0.0), 0.0, unknown, POSE, T_S)
+        law.step(None if unknown else SWING, 0.0, unknown, POSE, T_S)
         steps = [abs(a - b) for a, b in zip(law.velocity, before, strict=True)]
         assert 0.0 < max(steps) < 1.1 * IMU.pin_speed_m_s * T_S / FADE_S
     count_until(lambda: law.step(None, 0.0, True, POSE, T_S), lambda: not law.active, 1000)
@@ -207,8 +207,8 @@ def test_damping_does_not_begin_and_fades_while_the_reference_moves():
 
 def test_unknown_joints_are_not_moved():
     law = sway()
-    law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
-    law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, (0.3, math.nan, -1.4, 0.8, 0.0), T_S)
+    law.step(SWING, 0.0, True, POSE, T_S)
+    law.step(SWING, 0.0, True, (0.3, math.nan, -1.4, 0.8, 0.0), T_S)
     assert not law.active and not any(law.velocity) and not any(law.displacement)
 
 
@@ -231,8 +231,7 @@ def test_end_positioning_waits_for_the_damping():
 
 
 def sensing(imu=IMU) -> Settings:
-    profile = msgspec.structs.replace(SETTINGS.profile, imu=imu)
-    return Settings(profile, profile_hash(profile), SETTINGS.rate_hz)
+    return settings_of(msgspec.structs.replace(SETTINGS.profile, imu=imu))
 
 
 def feel(bench: Bench, **values: float) -> None:
@@ -281,11 +280,9 @@ def test_standby_has_no_damping_and_arming_needs_no_sensor():
         feel(bench, LeanTangential=0.15)
         bench.tick()
     assert not bench.controller.crane.sway.active
-    for _ in range(40):
-        bench.tick()
+    bench.run(40)
     assert bench.controller.crane_inputs.imu.values is None
-    bench.tick([bench.operator(OperatorAction.ARM)])
-    assert bench.mode is Mode.ARMED
+    assert bench.press(OperatorAction.ARM) is Mode.ARMED
 
 
 def test_machine_without_a_sensor_does_not_receive_its_frames():
@@ -302,7 +299,3 @@ def test_machine_without_a_sensor_does_not_receive_its_frames():
 def test_wrong_sensor_node_is_a_configuration_error():
     with pytest.raises(ConfigError, check=coded("config.imu-node")):
         Controller(sensing(msgspec.structs.replace(IMU, node=0x24)), DATABASE)
-
-
-def test_sensor_time_out_is_that_of_the_dbc():
-    assert Controller(sensing(), DATABASE).crane_inputs.imu.timeout_ns == 50 * MS

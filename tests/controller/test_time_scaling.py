@@ -2,11 +2,9 @@
 
 from itertools import pairwise
 
-import msgspec
 import pytest
 
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot
-from controller.config import Settings
 from controller.crane.reference_governor import (
     FLOW_SHARE,
     HISTORY_KNOTS,
@@ -17,19 +15,12 @@ from controller.crane.reference_governor import (
     Trajectory,
 )
 from controller.laws.valve_map import ValveMap
-from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
-from tests.controller.bench import MS, PROFILE, SETTINGS, SPECS, Bench, T
+from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, settings_of, with_pump
 from tests.controller.smooth_motion import GOALS, drive
 
 VALVES = [ValveMap(s.valve) for s in SPECS]
 ZERO = (0.0,) * 5
-
-
-def with_pump(flow_m3_s):
-    return msgspec.structs.replace(
-        PROFILE, hydraulics=msgspec.structs.replace(PROFILE.hydraulics, pump_flow_m3_s=flow_m3_s)
-    )
 
 
 def setpoint(stamp_ns, positions, velocity=ZERO, every_ms=50):
@@ -173,14 +164,12 @@ def test_a_curve_that_ended_rests_until_it_is_continued():
 # -- in the controller
 
 
-def bench_with(flow_m3_s):
-    profile = with_pump(flow_m3_s)
-    return Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
+def bench_with(share):
+    return Bench(settings_of(with_pump(PROFILE.hydraulics.pump_flow_m3_s * share))).armed()
 
 
 def test_motion_beyond_the_pump_flow_stays_on_its_path():
-    bench = bench_with(SETTINGS.profile.hydraulics.pump_flow_m3_s * 0.85)
-    bench.armed()
+    bench = bench_with(0.85)
     behind, off = 0, 0.0
     for start in drive(bench, 9.0, 13.0):
         follower = bench.controller.crane.governor
@@ -194,8 +183,7 @@ def test_motion_beyond_the_pump_flow_stays_on_its_path():
 
 
 def test_setpoint_at_the_slowed_reference_is_accepted():
-    bench = bench_with(SETTINGS.profile.hydraulics.pump_flow_m3_s * 0.5)
-    bench.armed()
+    bench = bench_with(0.5)
     for _ in drive(bench, 9.0, 4.0):
         pass
     follower = bench.controller.crane.governor

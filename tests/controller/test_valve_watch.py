@@ -7,15 +7,12 @@ import msgspec
 import pytest
 
 from can_dbc.messages.crane import GrappleCommand
-from controller.config import Settings
 from controller.estimation.valve_monitors import SPOOL_S, SpoolMonitor
 from controller.valve_watch import allowed_delay_s
-from machine.loading.profile_file import profile_hash
-from machine.profile import Plc
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import MS, PROFILE, SPECS, Bench, T
+from tests.controller.bench import MS, SPECS, Bench, T, behind_plc, count_until
 
 SPEED = 0.25
 
@@ -69,11 +66,8 @@ def test_a_spool_that_opens_while_armed_and_neutral_cuts_before_the_joint_tells(
     bench = Bench().armed()
     bench.run(100)
     bench.spool_stuck[1] = 30.0
-    for k in range(60):  # noqa: B007
-        bench.tick()
-        if bench.mode is Mode.FAULT:
-            break
-    assert bench.reason == Reason.SPOOL_OPEN and k * T <= 60 * MS
+    k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT)
+    assert bench.reason == Reason.SPOOL_OPEN and (k - 1) * T <= 60 * MS
 
 
 def test_a_spool_that_opens_half_as_far_slows_the_machine_and_lets_it_work():
@@ -96,8 +90,7 @@ def test_a_joint_that_its_spool_does_not_move_is_the_encoders_fault_or_an_obstac
 
 
 def behind_a_plc(role: Literal["references", "valves"] = "valves") -> Bench:
-    profile = msgspec.structs.replace(PROFILE, plc=Plc(role))
-    bench = Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
+    bench = Bench(behind_plc(role))
     bench.spools_measured = False
     return bench
 
@@ -162,8 +155,7 @@ def test_the_dead_time_of_a_valve_that_no_calibration_measures_may_be_the_longes
 
 def test_a_new_session_may_begin_while_the_spools_still_close():
     bench = driven(Bench(), 0)
-    bench.tick([bench.operator(2)])
+    bench.press(2)
     bench.run(40)
-    bench.tick([bench.operator(1)])
-    bench.run(100)
-    assert bench.mode is Mode.ARMED
+    bench.press(1)
+    assert bench.run(100) is Mode.ARMED

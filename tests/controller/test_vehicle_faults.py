@@ -9,11 +9,10 @@ from controller.carrier.dead_reckoning import CROSSWISE_SAMPLES_COUNT, MAX_JUMP_
 from controller.carrier.monitors import ARM_STUCK_NS, DISAGREE_RAD, OVERSPEED_M_S, OVERSPEED_RATIO
 from controller.carrier.vehicle import RTK_FLOAT_SPEED_SHARE
 from machine.joints import ARTICULATION
-from machine.status.explanation import describe, part_of
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
-from machine.status.reasons import DetailKind, Reaction, Reason
-from tests.controller.drive_bench import CARRIER, MS, DriveBench, T
+from machine.status.reasons import Reaction, Reason
+from tests.controller.drive_bench import CARRIER, MS, DriveBench
 
 SWAY = math.degrees(CARRIER.tilt_limit_rad)
 
@@ -47,140 +46,73 @@ def go(bench: DriveBench, ticks: int, *place: float, **fields) -> None:
         bench.go(1, *(place or (50.0, 0.0)), **fields) if bench.count % 10 == 0 else bench.run(1)
 
 
-def lose_position(b):
-    b.dropped.add("PositionRapidUpdate")
+def lose(message):
+    return lambda bench: bench.dropped.add(message)
 
 
-def no_position(b):
-    b.lies["PositionRapidUpdate"] = {"Latitude": None, "Longitude": None}
+def lie(message, **values):
+    """What is sent in place of the truth; a function is given the bench."""
 
-
-def lose_heading(b):
-    b.dropped.add("VesselHeading")
-
-
-def no_heading(b):
-    b.lies["VesselHeading"] = {"Heading": None}
-
-
-def heading_of(reference):
     def inject(b):
-        b.lies["VesselHeading"] = {"Reference": reference}
+        b.lies[message] = {name: value(b) if callable(value) else value for name, value in values.items()}
 
     return inject
 
 
-def unknown_to_the_carrier(b):
-    b.lies["VehStat"] = {"Fault": None}
+def put(**values):
+    """Something else is true from now on."""
+
+    def inject(b):
+        for name, value in values.items():
+            setattr(b, name, value(b) if callable(value) else value)
+
+    return inject
 
 
-def unknown_to_the_arms(b):
-    b.lies["ArmHeightA"] = {"State": None}
+def heading(b):
+    return b.changed["VesselHeading"]["Heading"]
 
 
-def unknown_roll(b):
-    b.lies["ArmHeightB"] = {"Roll": None}
-
-
-def unknown_pitch(b):
-    b.lies["ArmHeightB"] = {"Pitch": None}
-
-
-def lose_fix(b):
-    b.lies["GnssPositionData"] = {"Method": 1}
-
-
-def jump_position(b):
-    b.east_m += 3.0
-
-
-def swap_antennas(b):
-    b.lies["VesselHeading"] = {"Heading": (b.changed["VesselHeading"]["Heading"] + math.pi) % math.tau}
-
-
-def freeze_heading(b):
-    b.lies["VesselHeading"] = dict(b.changed["VesselHeading"])
-
-
-def carrier_fault(b):
-    b.lies["VehStat"] = {"Fault": 1}
-
-
-def arms_fault(b):
-    b.lies["ArmHeightA"] = {"State": 3}
-
-
-def run_away(b):
-    b.lies["VehStat"] = {"Speed": OVERSPEED_RATIO * 0.6 + OVERSPEED_M_S + 0.02}
-
-
-def roll_back(b):
-    b.lies["VehStat"] = {"Speed": -OVERSPEED_M_S - 0.02}
-
-
-def block(b):
-    b.blocked, b.speed_m_s = True, 0.0
-
-
-def disagree(b):
-    b.lies["VehStat"] = {"Articulation": b.bend_rad + DISAGREE_RAD + 0.01}
-
-
-def roll(b):
-    b.lies["ArmHeightB"] = {"Roll": SWAY + 0.5}
-
-
-def pitch(b):
-    b.lies["ArmHeightB"] = {"Pitch": -SWAY - 0.5}
-
-
-def arm_outside(b):
-    b.lies["ArmHeightA"] = {"Arm3": 400.0}
-
-
-def bend_outside(b):
-    b.bend_rad = CARRIER.articulation_limit_rad + 0.08
-
-
-def stick_steering(b):
-    b.steering_gain = 0.0
-
-
-def reverse_steering(b):
-    b.steering_gain = -1.0
-
-
-def open_steering(b):
-    b.steering_drift = 0.2
-
-
+TOO_FAST = OVERSPEED_RATIO * 0.6 + OVERSPEED_M_S + 0.02
 CASES = {
-    "position lost": (Reason.POSITION_LOST, straight, lose_position),
-    "position not available": (Reason.POSITION_LOST, straight, no_position),
-    "heading lost": (Reason.HEADING_LOST, straight, lose_heading),
-    "heading not available": (Reason.HEADING_LOST, straight, no_heading),
-    "heading magnetic": (Reason.HEADING_LOST, straight, heading_of(1)),
-    "heading of unknown reference": (Reason.HEADING_LOST, straight, heading_of(None)),
-    "fix lost": (Reason.FIX_LOST, straight, lose_fix),
-    "position jump": (Reason.POSITION_JUMP, straight, jump_position),
-    "heading flipped": (Reason.HEADING_JUMP, straight, swap_antennas),
-    "heading frozen": (Reason.HEADING_FROZEN, turning, freeze_heading),
-    "carrier fault": (Reason.CARRIER_FAULT, straight, carrier_fault),
-    "arms fault": (Reason.ARMS_FAULT, straight, arms_fault),
-    "carrier fault not available": (Reason.CARRIER_FAULT, straight, unknown_to_the_carrier),
-    "arms state not available": (Reason.ARMS_FAULT, straight, unknown_to_the_arms),
-    "roll not available": (Reason.ARMS_FAULT, straight, unknown_roll),
-    "pitch not available": (Reason.ARMS_FAULT, straight, unknown_pitch),
-    "runaway": (Reason.CARRIER_RUNAWAY, straight, run_away),
-    "rolls back": (Reason.CARRIER_RUNAWAY, straight, roll_back),
-    "stuck": (Reason.CARRIER_STUCK, straight, block),
-    "steering disagrees": (Reason.STEERING_DISAGREES, straight, disagree),
-    "tilted aside": (Reason.TILTED, straight, roll),
-    "tilted down": (Reason.TILTED, straight, pitch),
-    "steering stuck": (Reason.STEERING_STUCK, aside, stick_steering),
-    "steering reversed": (Reason.STEERING_RUNAWAY, aside, reverse_steering),
-    "steering valve stuck open": (Reason.STEERING_RUNAWAY, straight, open_steering),
-    "arm outside": (Reason.ARM_OUTSIDE, straight, arm_outside),
+    "position lost": (Reason.POSITION_LOST, straight, lose("PositionRapidUpdate")),
+    "position not available": (
+        Reason.POSITION_LOST,
+        straight,
+        lie("PositionRapidUpdate", Latitude=None, Longitude=None),
+    ),
+    "heading lost": (Reason.HEADING_LOST, straight, lose("VesselHeading")),
+    "heading not available": (Reason.HEADING_LOST, straight, lie("VesselHeading", Heading=None)),
+    "heading magnetic": (Reason.HEADING_LOST, straight, lie("VesselHeading", Reference=1)),
+    "heading of unknown reference": (Reason.HEADING_LOST, straight, lie("VesselHeading", Reference=None)),
+    "fix lost": (Reason.FIX_LOST, straight, lie("GnssPositionData", Method=1)),
+    "position jump": (Reason.POSITION_JUMP, straight, put(east_m=lambda b: b.east_m + 3.0)),
+    "heading flipped": (
+        Reason.HEADING_JUMP,
+        straight,
+        lie("VesselHeading", Heading=lambda b: (heading(b) + math.pi) % math.tau),
+    ),
+    "heading frozen": (Reason.HEADING_FROZEN, turning, lie("VesselHeading", Heading=heading)),
+    "carrier fault": (Reason.CARRIER_FAULT, straight, lie("VehStat", Fault=1)),
+    "arms fault": (Reason.ARMS_FAULT, straight, lie("ArmHeightA", State=3)),
+    "carrier fault not available": (Reason.CARRIER_FAULT, straight, lie("VehStat", Fault=None)),
+    "arms state not available": (Reason.ARMS_FAULT, straight, lie("ArmHeightA", State=None)),
+    "roll not available": (Reason.ARMS_FAULT, straight, lie("ArmHeightB", Roll=None)),
+    "pitch not available": (Reason.ARMS_FAULT, straight, lie("ArmHeightB", Pitch=None)),
+    "runaway": (Reason.CARRIER_RUNAWAY, straight, lie("VehStat", Speed=TOO_FAST)),
+    "rolls back": (Reason.CARRIER_RUNAWAY, straight, lie("VehStat", Speed=-OVERSPEED_M_S - 0.02)),
+    "stuck": (Reason.CARRIER_STUCK, straight, put(blocked=True, speed_m_s=0.0)),
+    "steering disagrees": (
+        Reason.STEERING_DISAGREES,
+        straight,
+        lie("VehStat", Articulation=lambda b: b.bend_rad + DISAGREE_RAD + 0.01),
+    ),
+    "tilted aside": (Reason.TILTED, straight, lie("ArmHeightB", Roll=SWAY + 0.5)),
+    "tilted down": (Reason.TILTED, straight, lie("ArmHeightB", Pitch=-SWAY - 0.5)),
+    "steering stuck": (Reason.STEERING_STUCK, aside, put(steering_gain=0.0)),
+    "steering reversed": (Reason.STEERING_RUNAWAY, aside, put(steering_gain=-1.0)),
+    "steering valve stuck open": (Reason.STEERING_RUNAWAY, straight, put(steering_drift=0.2)),
+    "arm outside": (Reason.ARM_OUTSIDE, straight, lie("ArmHeightA", Arm3=400.0)),
 }
 
 
@@ -200,7 +132,6 @@ def test_fault_is_detected_in_time_and_the_machine_stops(name):
         assert bench.vehicle.driving is Driving.BRAKING
     bench.run(300)
     assert bench.braked and bench.mode in (Mode.STOP, Mode.FAULT), "and nothing starts by itself"
-    assert describe(reason, bench.controller.supervisor.detail)[0].isupper()
 
 
 GNSS = {name: case for name, case in CASES.items() if Reason.POSITION_LOST <= case[0] <= Reason.HEADING_REVERSED}
@@ -224,8 +155,7 @@ def test_machine_that_does_not_drive_is_not_stopped(name):
     bench = DriveBench().armed()
     bench.run(60)
     inject(bench)
-    bench.run(300)
-    assert bench.mode is Mode.ARMED
+    assert bench.run(300) is Mode.ARMED
 
 
 def test_carrier_that_rolls_under_the_crane_is_a_runaway():
@@ -305,12 +235,11 @@ def test_drifting_position_is_detected():
 
 def test_articulation_outside_its_range_latches():
     bench = straight()
-    bend_outside(bench)
+    bench.bend_rad = CARRIER.articulation_limit_rad + 0.08
     bench.lies["VehStat"] = {"Articulation": bench.bend_rad}
     go(bench, 12)
     assert bench.controller.supervisor.reason in (Reason.POSITION_OUTSIDE, Reason.ENCODER_JUMP)
     assert bench.controller.supervisor.detail == ARTICULATION and bench.braked
-    assert "articulation" in describe(Reason.POSITION_OUTSIDE, ARTICULATION)
 
 
 def test_arm_stuck():
@@ -321,7 +250,6 @@ def test_arm_stuck():
     bench.lies["ArmHeightA"] = {"Arm2": held[1]}
     ms = until(bench, Reason.ARM_STUCK, ARM_STUCK_NS // MS + 100, speed_m_s=0.0, heights_m=(0.45,) * 4)
     assert ms >= ARM_STUCK_NS // MS - 100 and bench.controller.supervisor.detail == 1
-    assert part_of(DetailKind.ARM, 1).lower() in describe(Reason.ARM_STUCK, 1).lower()
 
 
 @pytest.mark.long
@@ -338,7 +266,6 @@ def test_long_drive_raises_no_fault():
         else:
             bench.tick()
     assert bench.mode is Mode.ACTIVE and bench.vehicle.gate.refused == 0
-    assert 30.0 < 12000 * T * 1e-9 * 0.6 < 40.0
 
 
 def test_every_fault_of_the_carrier_is_tried():
@@ -351,8 +278,6 @@ def test_every_fault_of_the_carrier_is_tried():
 def test_a_moved_hand_lever_stops_a_driving_carrier_softly():
     bench = DriveBench().under_way(300)
     bench.changed["EstopStat"] = {"Lever": 1}
-    bench.run(2)
-    assert bench.mode is Mode.STOP and bench.reason == Reason.LEVER_MOVED
+    assert bench.run(2) is Mode.STOP and bench.reason == Reason.LEVER_MOVED
     assert bench.vehicle.driving is Driving.BRAKING
-    bench.run(400)
-    assert bench.mode is Mode.STOP and bench.vehicle.driving is Driving.STANDING
+    assert bench.run(400) is Mode.STOP and bench.vehicle.driving is Driving.STANDING

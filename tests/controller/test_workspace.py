@@ -6,17 +6,16 @@ import msgspec
 import pytest
 
 from can_dbc.messages.crane import Knot
-from controller.config import Settings
 from controller.crane.trajectory_check import MAX_KNOTS_CHECKED, WorkspaceCheck
 from controller.requests import RequestRefused
 from machine.geometry.bunk import stake_walls
 from machine.geometry.grapple import FIXED_GROUND_M
 from machine.geometry.kinematics import Unreachable, pin_position, solve
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import load_profile
 from machine.profile import KeepOut
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import PROFILE, Bench
+from tests.controller.bench import PROFILE, Bench, settings_of
 
 KIN = PROFILE.kinematics
 HANG_M = KIN.hanger_to_fork_m + KIN.fork_to_rotator_m
@@ -90,7 +89,7 @@ def test_the_controller_refuses_such_a_setpoint_and_keeps_what_it_does():
     box = pin_position(KIN, bench.q)
     keep_out = {"pole": KeepOut((box[0], box[1], box[2] - 0.5), (0.05, 0.05, 0.05))}
     profile = msgspec.structs.replace(PROFILE, keep_out=keep_out)
-    bench = Bench(Settings(profile, profile_hash(profile), profile.rate_hz)).armed()
+    bench = Bench(settings_of(profile)).armed()
     bench.tick([bench.hold()])
     start = list(bench.controller.reference_position)
     down = [start[0], start[1] - 0.02, *start[2:]]

@@ -56,12 +56,6 @@ def problems(folder: Path, changes: dict[str, object], of: dict[str, object] = R
     return caught.value.problems
 
 
-def the_problem(folder: Path, changes: dict[str, object], of: dict[str, object] = RAW) -> tuple[tuple[str, str], str]:
-    """Code and key path, and the sentence, of the only problem of a changed copy."""
-    (problem,) = problems(folder, changes, of)
-    return (problem.code, problem.path), problem.sentence
-
-
 SAG = {"head_rad_m": 0.005, "pin_rad_m": 0.003, "rest_rad": 0.02}
 IMU = {
     "node": 0x23,

@@ -29,6 +29,15 @@ def drafted(folder: Path, text: str) -> Profile:
     return load_profile(path)
 
 
+def urdf(folder: Path, old: str = "", new: str = "", name: str = "palms_471") -> Path:
+    """The crane of a shipped machine as a URDF, with something replaced in it."""
+    text = crane_urdf(load_profile(name), load_truth("nominal", 0, name))
+    assert old in text
+    path = folder / "crane.urdf"
+    path.write_text(text.replace(old, new))
+    return path
+
+
 def test_the_profile_has_what_follows_from_the_answers(tmp_path: Path) -> None:
     profile = drafted(tmp_path, profile_text(example(), MESSAGES))
     lift, slew = profile.joints["lift"], profile.joints["slew"]
@@ -71,9 +80,7 @@ def test_the_questionnaire_asks_for_everything_and_checks_what_is_typed() -> Non
 
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 def test_a_urdf_gives_the_geometry_back(tmp_path: Path, name: str) -> None:
-    profile, path = load_profile(name), tmp_path / "crane.urdf"
-    path.write_text(crane_urdf(profile, load_truth("nominal", 0, name)))
-    found = answers_from_urdf(path, {})
+    profile, found = load_profile(name), answers_from_urdf(urdf(tmp_path, name=name), {})
     for key, value in found["kinematics"].items():
         assert value == pytest.approx(getattr(profile.kinematics, key), abs=1e-9), key
     assert {n: (j["lower"], j["upper"]) for n, j in found["joints"].items()} == {
@@ -82,9 +89,7 @@ def test_a_urdf_gives_the_geometry_back(tmp_path: Path, name: str) -> None:
 
 
 def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path) -> None:
-    path = tmp_path / "crane.urdf"
-    text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
-    path.write_text(text.replace('joint name="lift"', 'joint name="q2"'))
+    path = urdf(tmp_path, 'joint name="lift"', 'joint name="q2"')
     with pytest.raises(InputRefused, match="--urdf-joints lift", check=coded("answers.urdf-joint")):
         answers_from_urdf(path, {})
     given = answers(("kinematics", None), ("joints.lift.lower", None))
@@ -103,12 +108,8 @@ def test_a_urdf_with_other_names_fills_what_the_answers_leave_out(tmp_path: Path
     ],
 )
 def test_a_urdf_of_something_else_is_refused(tmp_path: Path, old: str, new: str, code: str) -> None:
-    path = tmp_path / "crane.urdf"
-    text = crane_urdf(load_profile("palms_471"), load_truth("nominal", 0, "palms_471"))
-    assert old in text
-    path.write_text(text.replace(old, new))
     with pytest.raises(InputRefused, check=coded(code)):
-        answers_from_urdf(path, {})
+        answers_from_urdf(urdf(tmp_path, old, new), {})
 
 
 @pytest.mark.parametrize(

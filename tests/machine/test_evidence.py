@@ -1,4 +1,4 @@
-"""The numbers of a reason in words, the one text of a reason, and its identity in the journal."""
+"""The numbers of a reason in words, its one text, its identity in the journal; and the names of stale inputs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 
 import pytest
 
-from machine.joints import Joint
+from machine.joints import ARTICULATION, JOINTS, Joint
 from machine.status.evidence import EVIDENCE, quantities
-from machine.status.explanation import describe, explain, message_id, priority, sentence_of
+from machine.status.explanation import describe, explain, message_id, part_of, priority, sentence_of
 from machine.status.faults import FAULTS
 from machine.status.reasons import DetailKind, Reaction, Reason, pack
+from machine.status.stale_inputs import CARRIER_BIT, CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
 from tests.codes import numbers_in
 
 
@@ -67,6 +68,20 @@ def test_the_one_text_has_sentence_numbers_advice_and_code() -> None:
     assert (found.code, found.sentence) == ("ENCODER_LOST", f"{sentence}.")
 
 
+@pytest.mark.parametrize(
+    ("reason", "detail", "part"),
+    [
+        (Reason.ENCODER_LOST, Joint.TILT, "tilt"),
+        (Reason.POSITION_OUTSIDE, ARTICULATION, "articulation"),
+        (Reason.SAFETY_NODE_LOST, 0x10, part_of(DetailKind.NODE, 0x10)),
+        (Reason.FOREIGN_CONTROLLER, 1, part_of(DetailKind.BUS, 1)),
+        (Reason.ARM_STUCK, 1, part_of(DetailKind.ARM, 1)),
+    ],
+)
+def test_a_description_names_the_part(reason: Reason, detail: int, part: str) -> None:
+    assert part.lower() in describe(pack(reason, detail)).lower()
+
+
 def test_every_text_is_made_for_every_reason_and_detail() -> None:
     for reason in FAULTS:
         for detail in (0, 3, 5, 17, 255):
@@ -87,3 +102,9 @@ def test_the_journal_knows_a_reason_by_a_number_that_never_changes() -> None:
     assert len(numbers) == len(Reason)
     assert message_id(Reason.ENCODER_LOST) == "627996cecfa7575e9754666b55c67cfe"
     assert (priority(Reason.ENCODER_LOST), priority(Reason.LEASE_LOST), priority(Reason.OPERATOR_STOP)) == (3, 4, 5)
+
+
+def test_every_input_has_a_bit_of_its_own_and_a_name() -> None:
+    bits = [*CRANE_INPUT_BITS.values(), CARRIER_BIT, *(ENCODER_BIT + j for j in (*JOINTS, ARTICULATION))]
+    assert len(set(bits)) == len(bits) and all(0 <= bit < 16 for bit in bits)
+    assert set(STALE_INPUT_NAMES) == set(bits)

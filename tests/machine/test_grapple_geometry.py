@@ -44,14 +44,6 @@ def test_rotator_gives_the_yaw_modulo_pi_with_the_least_turn(slew, yaw, near):
             assert abs(rot - near) <= abs(other - near) + 1e-9
 
 
-def test_convention_at_rotator_zero_the_jaws_open_across_the_reach():
-    # Reach +y at slew 0; the carrier's x axis is the opening axis.
-    assert grapple_yaw(PALMS, (0.0, 0.4, -1.0, 0.8, 0.0)) == 0.0
-    # A log along y (psi = pi/2) is gripped with yaw psi + pi/2 = pi, the same axis.
-    assert rotator_for_yaw(PALMS, 0.0, pi / 2 + pi / 2) == pytest.approx(0.0, abs=1e-12)
-    assert rotator_for_yaw(PALMS, 0.5, 0.0) == pytest.approx(-0.5)
-
-
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 @given(st.floats(-1.7, 1.7))
 def test_at_rotator_zero_the_jaws_open_across_the_reach_of_both_machines(name, slew):
@@ -71,7 +63,7 @@ def test_a_rotator_with_a_small_range_is_reported():
     assert numbers_in(str(caught.value)) == [90.0, 0.0, -11.5, 11.5]
 
 
-def tip(tong_rad: float) -> tuple[float, float]:
+def palms_tip(tong_rad: float) -> tuple[float, float]:
     """(half gap, depth below the pin) of tong 2 by its joint: pivot (0.275, -0.202), tip (0.458, -0.458)."""
     x, z = 0.458, -0.458
     # Closing swings the tip inward and first down: rotation about +y for the tong on the +x side.
@@ -79,18 +71,24 @@ def tip(tong_rad: float) -> tuple[float, float]:
     return 0.275 + turned[0], 0.154 + 0.261 + 0.202 - turned[1]
 
 
-@pytest.mark.parametrize("angle", TONGS.angle_rad)
-def test_the_jaw_table_agrees_with_the_joint_table(angle):
-    gap, depth = tip(angle)
-    assert half_gap_m(TONGS, angle) == pytest.approx(gap, abs=1.5e-3)
-    assert tip_below_pin_m(TONGS, angle) == pytest.approx(depth, abs=1.5e-3)
+def cr250_tip(tong_rad: float) -> tuple[float, float]:
+    """(half gap, depth below the pin): pivot 0.25 m off the middle, tip (0.45, -0.45) m from it when open."""
+    c, s = cos(tong_rad), sin(tong_rad)
+    return 0.25 + 0.45 * (c - s), 0.15 + 0.27 + 0.30 + 0.45 * (c + s)
 
 
-@given(st.floats(0.0, 1.222))
-def test_interpolation_stays_within_2_cm_of_the_true_tips_until_they_meet(angle):
-    gap, depth = tip(angle)
-    assert half_gap_m(TONGS, angle) == pytest.approx(gap, abs=0.02)
-    assert tip_below_pin_m(TONGS, angle) == pytest.approx(depth, abs=0.02)
+@pytest.mark.parametrize(
+    ("name", "tip", "until_rad", "close_m"),
+    [("palms_471", palms_tip, 1.222, 1.5e-3), ("aoro_fc8", cr250_tip, 2.234, 6e-4)],
+)
+def test_the_jaw_table_is_that_of_one_rigid_jaw_and_between_its_rows_within_2_cm(name, tip, until_rad, close_m):
+    """Tongs 2 interpolate the true tips until they meet."""
+    tongs = load_profile(name).grapple.jaws
+    rows = [(angle, close_m) for angle in tongs.angle_rad]
+    for angle, within_m in [*rows, *((i * until_rad / 300, 0.02) for i in range(301))]:
+        gap, depth = tip(angle)
+        assert half_gap_m(tongs, angle) == pytest.approx(gap, abs=within_m)
+        assert tip_below_pin_m(tongs, angle) == pytest.approx(depth, abs=within_m)
 
 
 def test_tips_close_monotonically_and_sweep_0_18_m_lower():
@@ -105,22 +103,8 @@ def test_outside_the_table_the_end_values_apply():
     assert tip_below_pin_m(TONGS, -1.0) == 1.075 and tip_below_pin_m(TONGS, 9.0) == 0.696
 
 
-def cr250_tip(tong_rad: float) -> tuple[float, float]:
-    """(half gap, depth below the pin): pivot 0.25 m off the middle, tip (0.45, -0.45) m from it when open."""
-    c, s = cos(tong_rad), sin(tong_rad)
-    return 0.25 + 0.45 * (c - s), 0.15 + 0.27 + 0.30 + 0.45 * (c + s)
-
-
-def test_the_table_of_the_cr250_is_one_rigid_jaw_that_opens_1_40_m():
+def test_the_cr250_opens_1_40_m():
     tongs = load_profile("aoro_fc8").grapple.jaws
-    for angle in tongs.angle_rad:
-        gap, depth = cr250_tip(angle)
-        assert half_gap_m(tongs, angle) == pytest.approx(gap, abs=6e-4)
-        assert tip_below_pin_m(tongs, angle) == pytest.approx(depth, abs=6e-4)
-    for angle in (i * 2.234 / 300 for i in range(301)):
-        gap, depth = cr250_tip(angle)
-        assert half_gap_m(tongs, angle) == pytest.approx(gap, abs=0.02)
-        assert tip_below_pin_m(tongs, angle) == pytest.approx(depth, abs=0.02)
     assert 2.0 * half_gap_m(tongs, 0.0) == pytest.approx(1.40)
     assert half_gap_m(tongs, 1.189) == pytest.approx(0.0, abs=1e-3)
 

@@ -1,4 +1,4 @@
-"""Loading profiles: names, paths, content hash, keys, types, files that cannot be read."""
+"""Loading profiles: names, paths, content hash, files that cannot be read; their DBC, and the envelope beside them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ import zlib
 import msgspec
 import pytest
 
+from can_dbc.dbc import codec
+from controller.guard.__main__ import build, profile_path
+from controller.guard.layout import GuardConfigError
 from machine.joints import JOINTS, Joint
-from machine.loading.profile_file import ProfileError, load_profile, profile_hash, shipped_profiles
-from machine.profile import Imu, Profile, Sag, joint, joint_limits
+from machine.loading.checks import IMU_MESSAGE
+from machine.loading.profile_file import ProfileError, carry_envelope, load_profile, profile_hash, shipped_profiles
+from machine.loading.ranges import _RANGES
+from machine.profile import Carrier, Imu, Sag, joint
 from tests.codes import coded, numbers_in
-from tests.machine.changed_profiles import AORO, DELETE, FOLDER, IMU, RAW, SAG, SHIPPED, the_problem, write
+from tests.machine.changed_profiles import AORO, DELETE, FOLDER, IMU, SAG, SHIPPED, write
+from tests.machine.own_machine import NAME, made
 
 
 def test_shipped_profile_loads_by_name_and_by_path(tmp_path):
@@ -22,12 +28,6 @@ def test_shipped_profile_loads_by_name_and_by_path(tmp_path):
     assert by_name == load_profile(SHIPPED) == load_profile(str(SHIPPED))
     assert by_name == load_profile(write(tmp_path, {}))
     assert by_name.name == "palms_471" and by_name.machine_bus is None
-
-
-def test_access_by_enum():
-    profile = load_profile("palms_471")
-    assert [joint(profile, j) for j in JOINTS] == [profile.joints[n] for n in ("slew", "lift", "tilt", "ext", "rot")]
-    assert joint_limits(profile)[Joint.EXT] == (0.13, 1.80)
 
 
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
@@ -68,65 +68,6 @@ def test_hash_is_a_u32_of_the_content_only(tmp_path):
 def test_a_joint_without_encoder_and_a_second_bus_are_allowed(tmp_path):
     profile = load_profile(write(tmp_path, {"joints.rot.encoder": DELETE, "machine_bus": "mach0"}))
     assert profile.joints["rot"].encoder is None and profile.machine_bus == "mach0"
-
-
-# One row per mistake: what is changed, and code, key path and named words of the only problem.
-STRUCTURE = [
-    (
-        {"joints.lift.lower_deg": -22.0, "joints.lift.lower": DELETE},
-        "profile.wrong-unit",
-        "joints.lift.lower_deg",
-        ('"lower"',),
-    ),
-    ({"kinematics.d1_mm": 1364.34, "kinematics.d1_m": DELETE}, "profile.wrong-unit", "kinematics.d1_mm", ('"d1_m"',)),
-    (
-        {"joints.slew.speed_limit_deg_s": 20.0},
-        "profile.wrong-unit",
-        "joints.slew.speed_limit_deg_s",
-        ('"speed_limit"',),
-    ),
-    (
-        {"joints.slew.valve.dedband_plus_pct": 3.0},
-        "profile.unknown-key",
-        "joints.slew.valve.dedband_plus_pct",
-        ('"deadband_plus_pct"',),
-    ),
-    ({"timeouts.zzz": 1}, "profile.unknown-key", "timeouts.zzz", ()),
-    ({"rate": 200}, "profile.wrong-unit", "rate", ('"rate_hz"',)),
-    ({"joints.boom": RAW["joints"]["lift"]}, "profile.unknown-joint", "joints.boom", ()),
-    ({"joints.slw": RAW["joints"]["slew"]}, "profile.unknown-joint", "joints.slw", ('"slew"',)),
-    ({"joints.ext": DELETE}, "profile.missing-joint", "joints.ext", ()),
-    ({"joints.ext.law": DELETE}, "profile.missing-key", "joints.ext.law", ()),
-    ({"bunk": DELETE}, "profile.missing-key", "bunk", ()),
-    ({"bunk": 3}, "profile.not-a-table", "bunk", ("3",)),
-    ({"joints": 3}, "profile.not-a-table", "joints", ("3",)),
-    ({"joints.lift.lower": "-22 deg"}, "profile.wrong-type", "joints.lift.lower", ()),
-    ({"rate_hz": 200.5}, "profile.wrong-type", "rate_hz", ()),
-    ({"bunk.center_m": [1.0]}, "profile.wrong-type", "bunk.center_m", ("2", "1")),
-    ({"bunk.center_m": [1.0, "x"]}, "profile.wrong-type", "bunk.center_m[1]", ()),
-    ({"cameras": 3}, "profile.not-a-table", "cameras", ("3",)),
-    (
-        {"cameras.stick.fx": 530.0, "cameras.stick.fx_px": DELETE},
-        "profile.wrong-unit",
-        "cameras.stick.fx",
-        ('"fx_px"',),
-    ),
-    ({"cameras.d435.rate_hz": DELETE}, "profile.missing-key", "cameras.d435.rate_hz", ()),
-    ({"cameras.d435.rpy_rad": [0.0, 1.57]}, "profile.wrong-type", "cameras.d435.rpy_rad", ("3", "2")),
-    ({"carrier": 3}, "profile.not-a-table", "carrier", ("3",)),
-    ({"schema": 2}, "profile.not-allowed", "schema", ("2", "1")),
-    ({"joints.slew.valve.sign": 0}, "profile.not-allowed", "joints.slew.valve.sign", ("0", "-1", "1")),
-    ({"joints.slew.valve.sign": True}, "profile.not-allowed", "joints.slew.valve.sign", ("-1", "1")),
-    ({"joints.slew.encoder.kind": "round"}, "profile.not-allowed", "joints.slew.encoder.kind", ()),
-    ({"joints.slew.encoder.direction": [1]}, "profile.not-allowed", "joints.slew.encoder.direction", ("1", "-1")),
-]
-
-
-@pytest.mark.parametrize(("changes", "code", "path", "named"), STRUCTURE, ids=lambda v: "")
-def test_wrong_keys_and_types(tmp_path, changes, code, path, named):
-    found, sentence = the_problem(tmp_path, changes)
-    assert found == (code, path)
-    assert all(word in sentence for word in named)
 
 
 def test_sag_is_optional_and_part_of_the_hash(tmp_path):
@@ -197,13 +138,6 @@ def test_an_error_keeps_its_problems_between_processes(tmp_path):
     assert (copy.code, str(copy), copy.problems) == (caught.value.code, str(caught.value), caught.value.problems)
 
 
-def test_profiles_are_frozen():
-    profile = load_profile("palms_471")
-    assert isinstance(profile, Profile)
-    with pytest.raises(AttributeError):
-        profile.rate_hz = 100  # type: ignore[misc]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "code"),
     [
@@ -217,3 +151,54 @@ def test_brackets_and_digits_beyond_what_python_reads_are_refused_in_a_sentence(
     path.write_text(SHIPPED.read_text().replace(old, new))
     with pytest.raises(ProfileError, check=coded(code)):
         load_profile(path)
+
+
+# -- the database, and the envelope
+
+
+@pytest.mark.parametrize("name", shipped_profiles())
+def test_every_encoder_and_valve_of_a_profile_is_in_the_dbc(name: str) -> None:
+    crane = codec.load("crane")
+    commands = {s.name for m in ("ValveCmdA", "ValveCmdB") for s in crane.message(m).signals}
+    profile = load_profile(name)
+    encoders = [joint.encoder for joint in profile.joints.values()]
+    if profile.carrier is not None:
+        encoders.append(profile.carrier.articulation_encoder)
+    assert all(joint.valve.signal in commands for joint in profile.joints.values())
+    for encoder in filter(None, encoders):
+        message = crane.message(encoder.message)
+        assert message.key == 0x180 + encoder.node, "TPDO1 of the encoder's node"
+        assert "Position" in message.index
+
+
+def test_the_only_message_of_a_sensor_on_the_grapple_is_in_the_dbc() -> None:
+    message = codec.load("crane").message(IMU_MESSAGE)
+    assert message.key == 0x180 + 0x23, "TPDO1 of node 23h"
+
+
+@pytest.mark.parametrize(
+    ("limit", "signal"), [("articulation_rate_limit_rad_s", "ArticRate"), ("speed_limit_m_s", "Speed")]
+)
+def test_every_carrier_limit_that_a_profile_may_have_fits_its_command(limit: str, signal: str) -> None:
+    """A command out of the DBC's range is refused by the codec, and would end the tick."""
+    message = codec.load("machine").message("VehCmd")
+    values = [0.0] * len(message.signals)
+    for side in (-1.0, 1.0):
+        values[message.index[signal]] = side * _RANGES[Carrier][limit][1]
+        assert message.encode(*values)
+
+
+def test_a_changed_copy_elsewhere_takes_the_envelope_along(tmp_path):
+    profile, copy = made(tmp_path / "mine"), tmp_path / "changed" / "calibrated.toml"
+    copy.parent.mkdir()
+    copy.write_text(profile.read_text())
+    with pytest.raises(GuardConfigError, check=coded("guard.envelope-missing")):
+        build(copy)
+    carry_envelope(profile, copy.parent)
+    build(copy)
+    assert [p.name for p in sorted(copy.parent.iterdir())] == ["calibrated.toml", f"{NAME}.envelope.toml"]
+
+
+def test_a_shipped_envelope_is_not_copied(tmp_path):
+    carry_envelope(profile_path("palms_471"), tmp_path)
+    assert list(tmp_path.iterdir()) == []
