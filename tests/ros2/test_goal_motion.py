@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,10 @@ from ros2.interfaces.action import CancelCode, GoalInfo, Status
 from ros2.interfaces.builtin import UUID, time_of
 from ros2.interfaces.control import ErrorCode, Goal, Result
 from ros2.wire.action_server import ALL, KEPT, GoalTable
-from tests.autonomy.crane_stand_in import QUIET
 from tests.codes import coded
-from tests.ros2.goals import goal
+from tests.ros2.goals import START, goal, report
 
 PROFILE = load_profile("palms_471")
-START = (0.0, 0.75, -1.6, 0.3, 0.0)
 CHECK = MotionCheck(PROFILE)
 
 
@@ -116,11 +113,6 @@ def test_tolerances_by_joint() -> None:
     asked.path_tolerance[0].velocity = 0.1
     with pytest.raises(GoalRefused, check=coded("ros2.goal-tolerance")):
         tolerances_of(asked)
-
-
-def report(mode: Mode = Mode.ARMED, **changes: Any) -> StateReport:
-    """Of a crane that stands at the start."""
-    return replace(QUIET, **{"mode": mode, "position": START, "reference": START} | changes)
 
 
 def execution(*reports: StateReport) -> TrajectoryExecution:
