@@ -9,15 +9,19 @@ from __future__ import annotations
 import math
 import random
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
+import numpy as np
+
 from autonomy.localization.local_plane import LocalPlane
+from autonomy.localization.location import Location, Status
 from autonomy.localization.vehicle_filter import antenna_reach, front_attitude
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from controller.laws.drive import AngleLaw, DriveLaw, SteeringLimits, WaypointLaw, east_north_m
-from machine.geometry.carrier import turning_radius_m
+from machine.loading.profile_file import load_profile
 from machine.profile import Carrier
+from tests.console.vehicle_reports import VEHICLE
 
 TICK_NS: Final = 5_000_000
 TICK_S: Final = 0.005
@@ -249,35 +253,45 @@ class Vehicle:
             driving = Driving.DRIVING
         elif not self._drive.brake:
             driving = Driving.BRAKING
-        height = self._c.arm_transport_m
-        return VehicleReport(
-            self._tick,
-            0,
-            self.now_ns,
-            s.sequence if s else 0,
-            driving,
-            0,
-            0,
-            at,
-            lat,
-            lon,
-            262.5,
-            self._own.fix,
-            19,
-            math.nan,
-            at,
-            heading % math.tau,
-            rate,
-            self.now_ns,
-            self._wheel_speed(),
-            self._measured_bend(),
-            roll + self._rng.gauss(0.0, 0.001),
-            pitch + self._rng.gauss(0.0, 0.001),
-            (height,) * 4,
-            0,
+        return replace(
+            VEHICLE,
+            sequence=self._tick,
+            profile_hash=0,
+            stamp_ns=self.now_ns,
+            drive_sequence=s.sequence if s else 0,
+            driving=driving,
+            position_ns=at,
+            latitude_deg=lat,
+            longitude_deg=lon,
+            altitude_m=262.5,
+            fix=self._own.fix,
+            sigma_m=math.nan,
+            heading_ns=at,
+            heading_rad=heading % math.tau,
+            yaw_rate_rad_s=rate,
+            motion_ns=self.now_ns,
+            speed_m_s=self._wheel_speed(),
+            articulation_rad=self._measured_bend(),
+            roll_rad=roll + self._rng.gauss(0.0, 0.001),
+            pitch_rad=pitch + self._rng.gauss(0.0, 0.001),
+            heights_m=(self._c.arm_transport_m,) * 4,
         )
 
 
-def radius_m(carrier: Carrier) -> float:
-    """The machine's turning circle at full articulation [m]."""
-    return turning_radius_m(carrier, carrier.articulation_limit_rad)
+CARRIER = load_profile("aoro_fc8").carrier
+SQUARE = [(0.0, 0.0), (25.0, 0.0), (25.0, 20.0)]
+
+
+def at(x_m: float, y_m: float, yaw_rad: float, **values: float) -> Location:
+    """A machine that is tracked there, straight and level, at cruising speed."""
+    base = {
+        "course_rad": yaw_rad,
+        "speed_m_s": 0.6,
+        "articulation_rad": 0.0,
+        "roll_rad": 0.0,
+        "pitch_rad": 0.0,
+        "covariance": np.eye(3) * 1e-4,
+        "front_height_m": 0.35,
+    }
+    stamp = int(values.pop("stamp_ns", 10**9))
+    return Location(stamp, Status.TRACKING, "", x_m, y_m, 0.0, yaw_rad, **(base | values))

@@ -26,6 +26,7 @@ from machine.profile import Profile, Sag, Valve, joint
 from machine.sensing import counts_from_position, empty_moment_nm, lever_share
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
+from tests.autonomy.crane_stand_in import QUIET
 
 DATABASE = load("crane")
 STEP_S = 0.01
@@ -142,27 +143,18 @@ class Crane:
 
     def _report(self) -> StateReport:
         sensed = tuple(q if joint(self.profile, j).encoder else nan for j, q in zip(JOINTS, self.q, strict=True))
-        return StateReport(
-            0,
-            profile_hash(self.profile),
-            self.now_ns,
-            self.mode,
-            0,
-            self.reason,
-            0,
-            self.refusal,
-            self.refuses,
-            0,
-            sensed,
-            tuple(self.v),
-            sensed,
-            self.opening,
-            0.0,
-            0.0,
-            0,
-            0,
-            0,
-            0,
+        return replace(
+            QUIET,
+            profile_hash=profile_hash(self.profile),
+            stamp_ns=self.now_ns,
+            mode=self.mode,
+            reason=self.reason,
+            refusal=self.refusal,
+            refused=self.refuses,
+            position=sensed,
+            velocity=tuple(self.v),
+            reference=sensed,
+            opening_pct=self.opening,
         )
 
     @property

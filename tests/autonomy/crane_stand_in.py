@@ -6,6 +6,7 @@ It judges setpoints as a controller does (order, lease, range, speed, jump) and 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import atan2, cos, hypot, inf, nan, pi, remainder, sin
@@ -14,6 +15,9 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.missions.crane_job import CraneJob
+from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, ModeSwitch, StateReport
 from can_dbc.messages.datagrams import decode
@@ -23,12 +27,35 @@ from machine.joints import JOINTS
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile, joint
 from machine.status.modes import Mode
+from tests.autonomy.grasp_scenes import PROFILE
+from tests.console.state_reports import REPORT
 
+CYCLE = ["LOOK", "ABOVE", "DESCEND", "CLOSE", "LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
 GROUND_LOG = LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)
 HOME = (0.0, 0.75, -1.6, 0.30, 0.0)
 TICK_NS = 50_000_000
 GRIP_RAD = 1.15
 DROP_RAD = 0.95
+QUIET = dataclasses.replace(REPORT, grapple_state=0, reason=0, setpoint_sequence=0, refused=0, stale_mask=0)
+"""A report without troubles."""
+
+
+def activity(
+    job: CraneJob | None = None, direct: bool = True, profile: Profile = PROFILE, planner=None, **how
+) -> Activity:
+    """A crane job; with a grasp planner, by that one's choice."""
+    if planner is not None:
+        how["grasp_selector"] = PlannerSelection(planner)
+    return Activity(profile, profile_hash(profile), job, motion_planner=TimeOptimalPlanner(direct), **how)
+
+
+def refusing(trouble: Exception) -> Callable[..., None]:
+    """A function that raises, for one that finds no way or place."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise trouble
+
+    return refuse
 
 
 @dataclass
@@ -70,31 +97,24 @@ class StandIn:
     def report(self) -> StateReport:
         """What the controller says now."""
         opening = opening_pct_from_jaw_angle(self.profile.grapple.jaws, self.tong_rad)
-        state = 5 if self.gripped else 0
-        sequence = self.setpoint.sequence if self.setpoint else 0
-        return StateReport(
-            0,
-            self.profile_hash,
-            self.now_ns,
-            self.mode,
-            state,
-            0,
-            sequence,
-            0,
-            0,
-            0,
-            self.q,
-            (0.0,) * 5,
-            self.q,
-            opening if self.feedback else nan,
-            nan,
-            self.load_kg,
-            0,
-            0,
-            0,
-            0,
+        return dataclasses.replace(
+            QUIET,
+            profile_hash=self.profile_hash,
+            stamp_ns=self.now_ns,
+            mode=self.mode,
+            grapple_state=5 if self.gripped else 0,
+            setpoint_sequence=self.setpoint.sequence if self.setpoint else 0,
+            position=self.q,
+            reference=self.q,
+            opening_pct=opening if self.feedback else nan,
+            clamp_bar=nan,
+            load_kg=self.load_kg,
             mode_switch=self.mode_switch,
         )
+
+    def report_with(self, **changes: object) -> StateReport:
+        """The same, with these values."""
+        return dataclasses.replace(self.report(), **changes)
 
     @property
     def load_kg(self) -> float:
@@ -117,15 +137,35 @@ class StandIn:
             self.step(activity)
         return (self.now_ns - start_ns) * 1e-9
 
-    def until(self, activity: Activity, phase: Phase, limit_s: float = 200.0) -> list[Phase]:
-        """Runs the activity until it is in a phase, which it has to reach; the phases up to there."""
+    def until(self, activity: Activity, phase: Phase, more_s: float = 0.0) -> list[Phase]:
+        """Runs the activity until it is in a phase, which it has to reach, and some time on; the phases up to there."""
         phases, start_ns = [activity.phase], self.now_ns
-        while activity.phase is not phase and not activity.idle and self.now_ns - start_ns < limit_s * 1e9:
+        while activity.phase is not phase and not activity.idle and self.now_ns - start_ns < 200e9:
             self.step(activity)
             if activity.phase is not phases[-1]:
                 phases.append(activity.phase)
         assert activity.phase is phase, activity.failure
+        self.steps(activity, int(more_s * 1e9 / TICK_NS))
         return phases
+
+    def steps(self, activity: Activity, count: int) -> None:
+        """So many ticks."""
+        for _ in range(count):
+            self.step(activity)
+
+    def phases(self) -> list[str]:
+        """The phases of the run up to now."""
+        names = [moment.phase for moment in self.trace]
+        return [name for k, name in enumerate(names) if k == 0 or name != names[k - 1]]
+
+    def misreport(self, activity: Activity, **reported: object) -> CraneSetpoint:
+        """A tick in which the controller reports these values, wherever the crane goes; the newest setpoint."""
+        data = activity.step(self.now_ns, self.report_with(mode=Mode.ACTIVE, **reported), self.seen())
+        self.setpoint = self.setpoint if data is None else decode(data)
+        self.now_ns += TICK_NS
+        self.q = self._knot_at(self.now_ns).position
+        self._carry()
+        return self.setpoint
 
     def step(self, activity: Activity) -> bytes | None:
         """One tick: the activity's datagram is judged, obeyed and its effect recorded."""
@@ -148,7 +188,6 @@ class StandIn:
         return data
 
     def _knot_at(self, now_ns: int) -> Knot:
-        assert self.setpoint is not None
         after = now_ns - self.setpoint.stamp_ns
         return next((k for k in self.setpoint.knots if k.after_ns >= after), self.setpoint.knots[-1])
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from machine.profile import Profile
 from machine.status.modes import Mode
 from tests.autonomy.carrier_model import heading_from_yaw
 from tests.autonomy.crane_stand_in import TICK_NS, StandIn, over_bunk
+from tests.console.vehicle_reports import VEHICLE
 
 TICK_S = TICK_NS * 1e-9
 RANGE_M = 14.0
@@ -37,7 +39,6 @@ class Forwarder:
     def __init__(
         self, profile: Profile, plane: LocalPlane, logs: list[MappedLog], at: tuple[float, float, float]
     ) -> None:
-        assert profile.carrier is not None
         self.profile, self.plane, self.carrier = profile, plane, profile.carrier
         self.crane = StandIn(profile, [], q=(0.0, 0.9, -1.6, 0.5, 0.0))
         self.x_m, self.y_m, self.yaw_rad = at
@@ -78,34 +79,25 @@ class Forwarder:
         side = self.carrier.antenna_main_m[1]
         c, s = math.cos(yaw), math.sin(yaw)
         east, north = x + c * ahead - s * side, y + s * ahead + c * side
-        lat = self.plane.latitude_deg + north * self._degrees[0]
-        lon = self.plane.longitude_deg + east * self._degrees[1]
-        obeys = self.drive is not None
-        return VehicleReport(
-            0,
-            self.crane.profile_hash,
-            now_ns,
-            self.drive.sequence if self.drive else 0,
-            Driving.DRIVING if obeys else Driving.STANDING,
-            0,
-            0,
-            now_ns,
-            lat,
-            lon,
-            102.5,
-            4,
-            18,
-            0.01,
-            now_ns,
-            heading_from_yaw(yaw),
-            self._turn_rad_s,
-            now_ns,
-            self.speed_m_s,
-            self.articulation_rad,
-            0.0,
-            0.0,
-            tuple(self.heights_m),
-            0,
+        return replace(
+            VEHICLE,
+            profile_hash=self.crane.profile_hash,
+            stamp_ns=now_ns,
+            drive_sequence=self.drive.sequence if self.drive else 0,
+            driving=Driving.DRIVING if self.drive else Driving.STANDING,
+            position_ns=now_ns,
+            latitude_deg=self.plane.latitude_deg + north * self._degrees[0],
+            longitude_deg=self.plane.longitude_deg + east * self._degrees[1],
+            altitude_m=102.5,
+            heading_ns=now_ns,
+            heading_rad=heading_from_yaw(yaw),
+            yaw_rate_rad_s=self._turn_rad_s,
+            motion_ns=now_ns,
+            speed_m_s=self.speed_m_s,
+            articulation_rad=self.articulation_rad,
+            roll_rad=0.0,
+            pitch_rad=0.0,
+            heights_m=tuple(self.heights_m),
         )
 
     def seen(self) -> tuple[LogObservation, ...]:
@@ -150,6 +142,11 @@ class Forwarder:
             self.step(manager)
             assert self.crane.now_ns - begin < limit_s * 1e9, (manager.state.name, manager.paused, manager.failure)
         return (self.crane.now_ns - begin) * 1e-9
+
+    def steps(self, manager: ActivityManager, count: int) -> None:
+        """So many ticks."""
+        for _ in range(count):
+            self.step(manager)
 
     def _lie(self) -> None:
         """The logs of the field as they lie in the base frame now; those on board and in the grapple go with it."""

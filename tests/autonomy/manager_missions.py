@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,8 @@ from autonomy.manager.checkpoint import CheckpointFile, read_checkpoint
 from autonomy.manager.log_map import MappedLog
 from autonomy.manager.transition_table import FINAL_STATES, OURS, PAPER_B, State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
+from autonomy.process.jobs import ForwardingJob
+from can_dbc.messages.mission import MissionAction, MissionCommand
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.mapped_logs import lying
@@ -60,6 +63,12 @@ def ended(manager: ActivityManager) -> bool:
     return manager.state in FINAL_STATES
 
 
+def completed(machine: Forwarder, manager: ActivityManager, limit_s: float = 600.0) -> None:
+    """Run the mission to its end, which is no failure."""
+    machine.run(manager, ended, limit_s)
+    assert manager.state is State.DONE, (manager.failure, states(manager)[-6:])
+
+
 def at(state: State):
     return lambda manager: manager.state is state
 
@@ -69,7 +78,7 @@ def states(manager: ActivityManager) -> list[State]:
 
 
 def again(
-    machine: Forwarder, manager: ActivityManager, told: ForwardingMission, path: Path, table=OURS
+    machine: Forwarder, manager: ActivityManager, told: ForwardingMission, path: Path, table=OURS, auto: bool = False
 ) -> ActivityManager:
     """Another planner that only has the checkpoint file, some time later: the machine stands."""
     CheckpointFile(path).write(manager.progress(), machine.crane.now_ns, 10**18)
@@ -78,7 +87,10 @@ def again(
     for _ in range(60):
         machine.crane.now_ns += 50_000_000
         machine._move()
-    return ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
+    if auto:
+        manager.auto()
+    return manager
 
 
 LISTED_LOGS = ((15.0, 4.2), (36.0, -4.2))
@@ -94,3 +106,33 @@ def listed_mission(landing=None, lie=LISTED_LOGS, end_m: float = 50.0, **options
     landings = () if landing is None else (Landing(place(*landing)),)
     way = (place(10.0, 0.0), place(end_m, 0.0))
     return ForwardingMission("test", way, (), landings, known, Options(logs="listed", **options))
+
+
+def begin_job(
+    *logs, end_m: float = 26.0, waits: bool = False, **told
+) -> tuple[Forwarder, ForwardingJob, ActivityManager]:
+    """A forwarding job of the planning process."""
+    mission = ForwardingMission("test", (place(10.0, 0.0), place(end_m, 0.0)))
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE, **told)
+    return forwarder([lying(*log) for log in logs]), ForwardingJob(manager, mission, begin=not waits), manager
+
+
+def events_until(
+    machine: Forwarder, job: ForwardingJob, enough, limit: int = 20_000
+) -> list[tuple[str, dict[str, Any]]]:
+    """The events until ``enough(job)``, each time that they change."""
+    told: dict[str, Any] = {}
+    said = []
+    for _ in range(limit):
+        for event, what in job.events():
+            if told.get(event) != what:
+                told[event] = what
+                said.append((event, dict(what)))
+        if enough(job):
+            return said
+        machine.step(job)
+    raise AssertionError(said[-5:])
+
+
+def command(number: int, action: MissionAction) -> MissionCommand:
+    return MissionCommand(number, 0, 0, action)

@@ -17,7 +17,7 @@ EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 def refused(data: bytes, name: str = "m", **how: object) -> MissionError:
     """The error of a file that is refused."""
     with pytest.raises(MissionError) as caught:
-        verify(read(data, name), **how)  # type: ignore[arg-type]
+        verify(read(data, name), **how)
     return caught.value
 
 

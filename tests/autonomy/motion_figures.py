@@ -15,7 +15,7 @@ from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS
 from machine.profile import Profile, joint
 
-STEP_S = 0.005
+STEP_S, GRAVITY_M_S2 = 0.005, 9.81
 PERIODS_S = (1.5, 1.8, 2.1)
 LEAVE_M = 1.2
 POINTS = 41
@@ -37,17 +37,50 @@ class Figures:
     lost_m: float
 
 
+def sampled(motion: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and the velocities that the motion states, every 5 ms, with rest before and after."""
+    q, v = zip(*(motion.at(t) for t in np.arange(-0.02, motion.duration_s + 0.02, STEP_S)), strict=True)
+    return np.array(q), np.array(v)
+
+
+def pins(profile: Profile, q: np.ndarray) -> np.ndarray:
+    """Where the pin is (n, 3)."""
+    return np.array([pin_position(profile.kinematics, row) for row in q.tolist()])
+
+
+def assert_within_limits(profile: Profile, motion: Trajectory, pump: float = 0.96) -> None:
+    """Within the joints' ranges, speeds and accelerations and a share of the pump's oil; its velocities are its own."""
+    q, stated = sampled(motion)
+    assert np.max(np.abs(np.gradient(q, STEP_S, axis=0) - stated)) < 0.005
+    acceleration = np.abs(np.gradient(stated, STEP_S, axis=0))
+    for j in JOINTS:
+        spec = joint(profile, j)
+        assert q[:, j].min() >= spec.lower and q[:, j].max() <= spec.upper
+        assert np.max(np.abs(stated[:, j])) < spec.speed_limit and np.max(acceleration[:, j]) < spec.acceleration_limit
+    assert np.max(_flow(profile, q, stated)) < pump * profile.hydraulics.pump_flow_m3_s
+
+
+def swing(pin: np.ndarray, period_s: float, damping: float = 0.0) -> tuple[float, float]:
+    """A point mass on a rigid rod below a pin that is known every 5 ms: what it swings when the pin stands, and at
+    most, [rad]."""
+    omega, angle, rate, most = 2.0 * pi / period_s, np.zeros(2), np.zeros(2), 0.0
+    for push in np.diff(pin[:, :2], n=2, axis=0) / STEP_S**2:
+        pull = omega**2 * (push / GRAVITY_M_S2 * np.cos(angle) + np.sin(angle))
+        rate -= STEP_S * (pull + 2.0 * damping * omega * rate)
+        angle += STEP_S * rate
+        most = max(most, hypot(*angle))
+    return hypot(hypot(*angle), hypot(*rate) / omega), most
+
+
 def figures(profile: Profile, motion: Trajectory, around: CollisionScene, held: HeldLog | None) -> Figures:
     """All of them, looked at every 5 ms, clearances every 20 ms."""
-    time_s = np.arange(0.0, motion.duration_s + STEP_S / 2, STEP_S)
-    both = [motion.at(min(t, motion.duration_s - 1e-9)) for t in time_s]
-    q, v = (np.array(x) for x in zip(*both, strict=True))
+    q, v = sampled(motion)
     a = np.diff(v, axis=0) / STEP_S
     jerk = np.abs(np.diff(np.array(motion.velocity), n=2, axis=0)) / 0.02**2
     specs = [joint(profile, j) for j in JOINTS]
     most = np.array([s.acceleration_limit for s in specs])
     low, high = (np.array([getattr(s, side) for s in specs]) for side in ("lower", "upper"))
-    pin = np.array([pin_position(profile.kinematics, row) for row in q.tolist()])
+    pin = pins(profile, q)
     apart, away = _apart(profile, q[::4], pin[::4], around, held)
     middle = away > LEAVE_M
     return Figures(
@@ -56,7 +89,7 @@ def figures(profile: Profile, motion: Trajectory, around: CollisionScene, held: 
         float(np.max(np.abs(a) / most)),
         float(np.max(_flow(profile, q, v))) / profile.hydraulics.pump_flow_m3_s,
         float(1.0 / max(np.max(jerk / most), 1e-9)),
-        max(_swing(pin, period) for period in PERIODS_S),
+        max(swing(pin, period)[0] for period in PERIODS_S),
         float(np.min(apart[middle])) if middle.any() else np.inf,
         float(np.max(np.minimum(np.minimum(apart[0], apart[-1]), 0.05) - apart)),
     )
@@ -69,15 +102,6 @@ def _flow(profile: Profile, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         lever = np.interp(q[:, j], valve.lever_at, valve.lever) if valve.lever else 1.0
         total += np.where(v[:, j] > 0.0, v[:, j] * valve.flow_plus, -v[:, j] * valve.flow_minus) * lever
     return total
-
-
-def _swing(pin: np.ndarray, period_s: float) -> float:
-    """What is left when the pin stands."""
-    omega, lean, rate = 2.0 * pi / period_s, np.zeros(2), np.zeros(2)
-    for push in np.diff(pin[:, :2], n=2, axis=0) / STEP_S**2:
-        rate += STEP_S * (-push - omega**2 * lean)
-        lean += STEP_S * rate
-    return float(np.hypot(hypot(*lean), hypot(*rate) / omega)) * omega**2 / 9.81
 
 
 def _apart(

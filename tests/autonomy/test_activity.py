@@ -10,30 +10,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from autonomy.crane_job.activity import Activity, Phase
+from autonomy.crane_job.activity import Phase
 from autonomy.crane_job.phase_motions import corrected_grasp
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.grasp.selection import plan_single_log_grasp
-from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm
-from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.perception.log_list import LogObservation
-from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, StateReport
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.sag import true_pin
 from machine.joints import JOINTS, Joint
-from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Sag, joint
-from machine.status.modes import Mode
-from tests.autonomy.crane_stand_in import GROUND_LOG, TICK_NS, StandIn, clearances
-
-PROFILE = load_profile("palms_471")
-CYCLE = ["LOOK", "ABOVE", "DESCEND", "CLOSE", "LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
-
-
-def activity(mission: CraneJob | None = None, direct: bool = True) -> Activity:
-    return Activity(PROFILE, profile_hash(PROFILE), mission, motion_planner=TimeOptimalPlanner(direct))
+from tests.autonomy.crane_stand_in import CYCLE, GROUND_LOG, TICK_NS, StandIn, activity, clearances
+from tests.autonomy.grasp_scenes import PROFILE
 
 
 def random_log(seed: int) -> LogObservation:
@@ -45,34 +35,15 @@ def random_log(seed: int) -> LogObservation:
     return LogObservation(0, (x, y, z), (cos(yaw), sin(yaw), 0.0), rng.uniform(2.5, 2.8), diameter)
 
 
-def phases(crane: StandIn) -> list[str]:
-    out: list[str] = []
-    for moment in crane.trace:
-        if not out or out[-1] != moment.phase:
-            out.append(moment.phase)
-    return out
-
-
-def run_until(crane: StandIn, planner: Activity, phase: Phase, more_s: float = 0.0) -> None:
-    crane.until(planner, phase)
-    for _ in range(int(more_s * 1e9 / TICK_NS)):
-        crane.step(planner)
-
-
-def report(crane: StandIn, **changes: object) -> StateReport:
-    return replace(crane.report(), **changes)  # type: ignore[arg-type]
-
-
 def test_a_column_that_leans_under_the_log_is_known_where_the_log_is_laid_down() -> None:
     sag = Sag(0.0054, 0.0036, 0.028, 2.0e-6, 4500.0, 3000.0)
     profile = msgspec.structs.replace(PROFILE, sag=sag)
     crane = StandIn(profile, [GROUND_LOG], log_kg=260.0)
-    planner = Activity(profile, profile_hash(profile))
+    planner = activity(profile=profile)
     crane.run(planner)
     assert planner.done and planner.failure is None and planner.missed == 0
     assert lies_in_bunk(profile.bunk, crane.logs[0])
     last = {m.phase: m for m in crane.trace}
-    assert planner.grasp is not None and planner.place is not None
     assert last["DESCEND"].pin[2] == pytest.approx(planner.grasp.pose.z_m, abs=1e-3)
     lowered, place = last["LOWER"], planner.place
     assert lowered.pin[2] == pytest.approx(place.z_m, abs=1e-3)
@@ -84,7 +55,7 @@ def test_a_column_that_leans_under_the_log_is_known_where_the_log_is_laid_down()
 def test_an_implausible_load_is_not_planned_for(load_kg: float) -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=load_kg)
-    planner = Activity(profile, profile_hash(profile))
+    planner = activity(profile=profile)
     crane.run(planner)
     assert planner.done and planner.failure is None
 
@@ -105,7 +76,7 @@ def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
     crane, planner = StandIn(PROFILE, [random_log(seed)]), activity()
     seconds = crane.run(planner)
     assert planner.done and planner.failure is None and planner.missed == 0
-    assert phases(crane) == CYCLE and 15.0 < seconds < 30.0
+    assert crane.phases() == CYCLE and 15.0 < seconds < 30.0
     assert lies_in_bunk(PROFILE.bunk, crane.logs[0])
     least = clearances(PROFILE, crane.trace[::2])
     assert least["tip"] > 0.005 and least["log"] > 0.0
@@ -122,7 +93,7 @@ def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
 def test_separate_motions_lead_there_too(seed: int) -> None:
     crane, planner = StandIn(PROFILE, [random_log(seed)]), activity(direct=False)
     crane.run(planner)
-    assert planner.done and phases(crane) == CYCLE and lies_in_bunk(PROFILE.bunk, crane.logs[0])
+    assert planner.done and crane.phases() == CYCLE and lies_in_bunk(PROFILE.bunk, crane.logs[0])
     heights = {m.phase: m.pin[2] for m in crane.trace}
     assert heights["LIFT"] == pytest.approx(heights["CLOSE"] + VERIFY_LIFT_M, abs=0.08), "it stands there to be judged"
     least = clearances(PROFILE, crane.trace[::2])
@@ -138,17 +109,14 @@ def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_continues_from
         wanted.append(log.id)
         return not lies_in_bunk(PROFILE.bunk, log)
 
-    def job() -> Activity:
-        return Activity(PROFILE, profile_hash(PROFILE), fetches_next=onward)
-
-    first, second = job(), job()
+    first, second = (activity(fetches_next=onward) for _ in range(2))
     first_s = crane.run(first)
-    assert first.done and "RETREAT" not in phases(crane)
+    assert first.done and "RETREAT" not in crane.phases()
     assert first.place is not None and crane.pin()[2] == pytest.approx(first.place.z_m, abs=0.02)
     assert first.grasp is not None and first.grasp.log.id not in wanted, "what was laid down is not asked about"
     begin = len(crane.trace)
     crane.run(second)
-    assert second.done and phases(crane)[-2:] == ["RETREAT", "DONE"] and first_s < 30.0
+    assert second.done and crane.phases()[-2:] == ["RETREAT", "DONE"] and first_s < 30.0
     assert all(lies_in_bunk(PROFILE.bunk, log) for log in crane.logs)
     least = clearances(PROFILE, crane.trace[begin::2])
     assert least["tip"] > 0.005 and least["stakes"] > 0.08
@@ -156,10 +124,10 @@ def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_continues_from
 
 def test_a_log_that_hangs_askew_is_turned_during_the_motion() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.LIFT)
+    crane.until(planner, Phase.LIFT)
     crane._psi += 0.15  # it slipped while it was gripped
     crane.run(planner)
-    assert planner.done and phases(crane).count("CARRY") == 1
+    assert planner.done and crane.phases().count("CARRY") == 1
     yaw = atan2(crane.logs[0].axis[1], crane.logs[0].axis[0])
     assert abs(remainder(yaw - PROFILE.bunk.yaw_rad, pi)) < 0.02
     rate = np.abs(np.diff([m.q[Joint.SLEW] for m in crane.trace if m.phase in ("LIFT", "CARRY")]))
@@ -169,24 +137,16 @@ def test_a_log_that_hangs_askew_is_turned_during_the_motion() -> None:
 
 def test_nothing_is_released_in_the_air_while_a_joint_lags() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.CARRY)
+    crane.until(planner, Phase.CARRY)
     stuck = crane.q[Joint.SLEW]
     for _ in range(60):
-        position = (stuck, *crane.q[1:])
-        data = planner.step(crane.now_ns, report(crane, position=position, mode=Mode.ACTIVE), crane.seen())
-        if data is not None:
-            sent = decode(data)
-            assert isinstance(sent, CraneSetpoint) and sent.grapple is GrappleCommand.HOLD
-            crane.setpoint = sent
-        crane.now_ns += TICK_NS
-        crane.q = crane._knot_at(crane.now_ns).position
-        crane._carry()
+        assert crane.misreport(planner, position=(stuck, *crane.q[1:])).grapple is GrappleCommand.HOLD
 
 
 def test_without_grapple_feedback_time_alone_decides() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], feedback=False), activity()
     crane.run(planner)
-    assert planner.done and phases(crane) == CYCLE
+    assert planner.done and crane.phases() == CYCLE
 
 
 def test_datagrams_come_every_50_ms_however_often_it_is_called() -> None:
@@ -194,7 +154,7 @@ def test_datagrams_come_every_50_ms_however_often_it_is_called() -> None:
     sent = []
     for n in range(400):
         now_ns = crane.now_ns + n * 5_000_000
-        data = planner.step(now_ns, replace(crane.report(), stamp_ns=now_ns), crane.seen() if n % 50 == 0 else ())
+        data = planner.step(now_ns, crane.report_with(stamp_ns=now_ns), crane.seen() if n % 50 == 0 else ())
         if data is not None:
             sent.append((now_ns, decode(data)))
     times = [now_ns for now_ns, _ in sent]
@@ -205,10 +165,10 @@ def test_datagrams_come_every_50_ms_however_often_it_is_called() -> None:
 def test_a_log_that_lies_a_little_elsewhere_is_gripped_there() -> None:
     """As where the machine leans towards the crane that reaches out."""
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.ABOVE, more_s=1.0)
+    crane.until(planner, Phase.ABOVE, more_s=1.0)
     x, y, z = GROUND_LOG.center_m
     crane.logs[0] = replace(GROUND_LOG, center_m=(x + 0.03, y - 0.05, z + 0.04))
-    run_until(crane, planner, Phase.CLOSE)
+    crane.until(planner, Phase.CLOSE)
     above = crane.trace[-1].pin
     assert hypot(above[0] - x - 0.03, above[1] - y + 0.05) < 0.005
     crane.run(planner)
@@ -250,8 +210,8 @@ def test_a_log_on_the_ground_that_is_measured_higher_is_gripped_where_it_lies() 
 def test_a_log_at_its_place_is_released_at_once() -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=90.0)
-    planner = Activity(profile, profile_hash(profile), motion_planner=TimeOptimalPlanner())
-    run_until(crane, planner, Phase.CARRY, more_s=1.0)
+    planner = activity(profile=profile)
+    crane.until(planner, Phase.CARRY, more_s=1.0)
     crane.log_kg = 70.0  # it swings, and weighs less for the moment in which the scale is asked
     crane.run(planner)
     lowers_s = sum(moment.phase == "LOWER" for moment in crane.trace) * TICK_NS * 1e-9
@@ -260,17 +220,12 @@ def test_a_log_at_its_place_is_released_at_once() -> None:
 
 def test_the_pin_waits_for_slow_jaws() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.CLOSE)
+    crane.until(planner, Phase.CLOSE)
     heights = []
     for _ in range(40):  # tongs that do not close yet
-        data = planner.step(crane.now_ns, report(crane, opening_pct=100.0, mode=Mode.ACTIVE), crane.seen())
-        setpoint = decode(data) if data else crane.setpoint
-        assert isinstance(setpoint, CraneSetpoint)
+        setpoint = crane.misreport(planner, opening_pct=100.0)
         assert setpoint.grapple is GrappleCommand.CLOSE
         heights.append(setpoint.knots[0].position[Joint.LIFT])
-        crane.setpoint = setpoint
-        crane.now_ns += TICK_NS
-        crane.q = crane._knot_at(crane.now_ns).position
     assert heights[-1] == pytest.approx(heights[-5], abs=5e-4)
     crane.run(planner)
     assert planner.done

@@ -21,8 +21,8 @@ from autonomy.motion.trajectory import STEP_S
 from autonomy.perception.log_list import TRIANGLE, LogObservation
 from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.joints import Joint
-from tests.autonomy.crane_stand_in import GROUND_LOG, TICK_NS, StandIn
-from tests.autonomy.test_activity import PROFILE, activity, phases
+from tests.autonomy.crane_stand_in import GROUND_LOG, TICK_NS, StandIn, activity
+from tests.autonomy.grasp_scenes import PROFILE
 from tests.codes import numbers_in
 
 THIN = replace(GROUND_LOG, id=1, center_m=(-1.8, 4.4, -1.32), diameter_m=0.14, covariance=(1e-6,) * TRIANGLE)
@@ -60,9 +60,17 @@ class Twisting(StandIn):
         return abs(remainder(atan2(ay, ax) - PROFILE.bunk.yaw_rad, pi))
 
 
-def driven(log: LogObservation, hidden_ns: float = 300_000_000) -> tuple[Twisting, Activity, float]:
-    crane, planner = Twisting(PROFILE, [log]), activity()
-    crane.planner, crane.hidden_ns = planner, hidden_ns
+def watched(kind: type[StandIn], log: LogObservation, **told) -> tuple[StandIn, Activity]:
+    """A crane that knows its job, with these attributes."""
+    crane, planner = kind(PROFILE, [log]), activity()
+    for name, value in {"planner": planner, **told}.items():
+        setattr(crane, name, value)
+    return crane, planner
+
+
+def driven(log: LogObservation, kind: type[StandIn] = Twisting, **told) -> tuple[StandIn, Activity, float]:
+    """The same at the end of the job, and its time."""
+    crane, planner = watched(kind, log, **told)
     return crane, planner, crane.run(planner)
 
 
@@ -70,7 +78,7 @@ def test_a_twisted_log_is_recognized_above_the_bunk_and_turned() -> None:
     crane, planner, _ = driven(THIN)
     assert planner.done and planner.missed == 0, planner.failure
     assert crane.askew_rad() < 0.05
-    assert phases(crane)[-6:] == ["LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
+    assert crane.phases()[-6:] == ["LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
 
 
 def test_it_is_turned_so_slowly_that_it_does_not_spin() -> None:
@@ -82,9 +90,9 @@ def test_it_is_turned_so_slowly_that_it_does_not_spin() -> None:
 
 
 def test_a_log_that_nothing_shows_is_laid_down_as_it_was_gripped_after_a_short_wait() -> None:
-    crane, planner, lasted_s = driven(THIN, inf)
+    crane, planner, lasted_s = driven(THIN, hidden_ns=inf)
     assert planner.done and crane.askew_rad() == pytest.approx(TWIST_RAD, abs=0.05)
-    shown, _, _ = driven(THIN, 0)
+    shown, _, _ = driven(THIN, hidden_ns=0)
     assert shown.askew_rad() < 0.05
     waits = [m for m in crane.trace if m.phase == "LIFT"]
     assert crane.stood_ns is not None and len(waits) * TICK_NS > HIDDEN_LOAD_NS and lasted_s < 60.0
@@ -92,7 +100,7 @@ def test_a_log_that_nothing_shows_is_laid_down_as_it_was_gripped_after_a_short_w
 
 def test_a_thick_log_does_not_twist_in_the_jaws_and_nobody_waits_for_it() -> None:
     assert THICK.diameter_m > THICK_LOG_M > THIN.diameter_m
-    (_, _, thin_s), (crane, planner, thick_s) = driven(THIN, inf), driven(THICK, inf)
+    (_, _, thin_s), (crane, planner, thick_s) = driven(THIN, hidden_ns=inf), driven(THICK, hidden_ns=inf)
     assert planner.done and crane.stood_ns is not None
     assert thin_s - thick_s > 0.8 * HIDDEN_LOAD_NS * 1e-9
 
@@ -150,9 +158,7 @@ class Forgotten(Twisting):
 
 def test_where_the_load_was_seen_before_is_no_other_log_above_the_bunk() -> None:
     """Else it is an obstacle to itself, and the bunk is full."""
-    crane, planner = Forgotten(PROFILE, [THIN]), activity()
-    crane.planner, crane.hidden_ns = planner, 300_000_000
-    crane.run(planner)
+    crane, planner, _ = driven(THIN, Forgotten)
     assert crane.ghost is not None and planner.done and crane.askew_rad() < 0.05, planner.failure
 
 
@@ -189,19 +195,15 @@ class SpinsOn(Twisting):
         return super().seen()
 
 
-def spun(spins: int, spin_rad: float = TWIST_RAD) -> tuple[SpinsOn, Activity]:
-    crane, planner = SpinsOn(PROFILE, [replace(THIN, length_m=2.6)]), activity()
-    crane.planner, crane.spins, crane.part_m = planner, spins, 2.3
-    crane.spin_rad = spin_rad
-    crane.run(planner)
-    return crane, planner
+def spun(spins: int, spin_rad: float = TWIST_RAD) -> tuple[StandIn, Activity]:
+    return driven(replace(THIN, length_m=2.6), SpinsOn, spins=spins, spin_rad=spin_rad, part_m=2.3)[:2]
 
 
 @pytest.mark.parametrize("spins", [1, MAX_FURTHER_TURNS])
 def test_a_log_that_has_spun_on_above_its_place_is_turned_back(spins: int) -> None:
     crane, planner = spun(spins)
     assert planner.done and crane.askew_rad() < 0.05, planner.failure
-    assert phases(crane)[-2 * spins - 5 :] == ["CARRY", "LOWER"] * (spins + 1) + ["OPEN", "RETREAT", "DONE"]
+    assert crane.phases()[-2 * spins - 5 :] == ["CARRY", "LOWER"] * (spins + 1) + ["OPEN", "RETREAT", "DONE"]
 
 
 def test_a_log_that_spins_for_ever_is_laid_down_and_never_called_done_across_the_stakes() -> None:
@@ -231,11 +233,9 @@ class Remembering(Twisting):
 @pytest.mark.parametrize("blind_ns", [0, 1_000_000_000, inf])
 def test_what_is_remembered_from_before_the_turn_says_nothing_about_it(blind_ns: float) -> None:
     """Measured: the list still had the direction before the turn, and the log was turned twice too far."""
-    crane, planner = Remembering(PROFILE, [THIN]), activity()
-    crane.planner, crane.blind_ns = planner, blind_ns
-    crane.run(planner)
+    crane, planner, _ = driven(THIN, Remembering, blind_ns=blind_ns)
     assert planner.done and crane.askew_rad() < 0.05, planner.failure
-    assert phases(crane)[-6:] == ["LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
+    assert crane.phases()[-6:] == ["LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
 
 
 def test_only_a_log_askew_with_an_end_beyond_the_stakes_lies_across_them() -> None:
@@ -273,8 +273,7 @@ class Partial(StandIn):
 
 
 def test_a_log_of_which_an_end_was_in_view_is_gripped_at_its_middle() -> None:
-    crane, planner = Partial(PROFILE, [THICK]), activity()
-    crane.planner = planner
+    crane, planner = watched(Partial, THICK)
     crane.until(planner, Phase.LIFT)
     x, y = Arm(PROFILE).xy(Arm(PROFILE).pose(crane.trace[-1].q))
     assert hypot(x - THICK.center_m[0], y - THICK.center_m[1]) < 0.1
@@ -283,8 +282,7 @@ def test_a_log_of_which_an_end_was_in_view_is_gripped_at_its_middle() -> None:
 
 
 def test_a_recognized_log_that_falls_beside_the_bunk_is_reported() -> None:
-    crane, planner = Twisting(PROFILE, [THIN]), activity()
-    crane.planner = planner
+    crane, planner = watched(Twisting, THIN)
     crane.until(planner, Phase.RETREAT)
     crane.logs = [replace(crane.logs[0], center_m=(3.0, 3.0, -1.32))]
     crane.run(planner)

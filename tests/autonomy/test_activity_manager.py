@@ -28,6 +28,7 @@ from tests.autonomy.manager_missions import (
     PROFILE,
     at,
     begin,
+    completed,
     ended,
     outward_rad,
     place,
@@ -41,8 +42,7 @@ from tests.codes import numbers_in
 @whole
 def test_all_logs_in_reach_are_loaded_from_one_stop() -> None:
     forwarder, manager = begin()
-    forwarder.run(manager, ended)
-    assert manager.state is State.DONE, manager.failure
+    completed(forwarder, manager)
     assert forwarder.in_bunk == manager.tally.loaded == 2
     assert states(manager).count(State.APPROACH) == 1 and states(manager).count(State.COLLECT) == 2
     assert math.dist((forwarder.x_m, forwarder.y_m), (26.0, 0.0)) < 0.05
@@ -78,8 +78,7 @@ def test_a_machine_outside_its_fence_stops(keep_out: bool) -> None:
     forwarder, manager = begin((), fences=(Fence(corners, keep_out),))
     forwarder.run(manager, ended)
     assert manager.failure_code == "mission.outside-fence" and manager.world.outside_fence_m > MAX_OUTSIDE_M
-    for _ in range(60):
-        forwarder.step(manager)
+    forwarder.steps(manager, 60)
     assert forwarder.speed_m_s == 0.0 and 16.4 < forwarder.x_m < 17.6
 
 
@@ -92,8 +91,7 @@ def test_a_machine_stops_before_a_log_in_its_wheel_path(y_m: float, yaw: float, 
         assert manager.failure_code != "mission.log-before-wheel"
         return
     assert manager.state is State.FAILED and manager.failure_code == "mission.log-before-wheel"
-    for _ in range(60):
-        forwarder.step(manager)
+    forwarder.steps(manager, 60)
     assert forwarder.speed_m_s == 0.0 and forwarder.x_m + CARRIER.wheel_radius_m < 15.0
 
 
@@ -184,8 +182,7 @@ def test_a_stop_pauses_any_state_and_arming_resumes_it(state: State) -> None:
     forwarder.run(manager, at(state))
     forwarder.crane.mode = Mode.STOP
     forwarder.drive = forwarder.crane.setpoint = None
-    for _ in range(60):
-        forwarder.step(manager)
+    forwarder.steps(manager, 60)
     assert Mode.STOP.name in manager.paused and manager.state is state
     assert forwarder.speed_m_s == 0.0 and forwarder.drive is None and forwarder.crane.setpoint is None
     forwarder.crane.mode = Mode.ARMED
@@ -193,34 +190,15 @@ def test_a_stop_pauses_any_state_and_arming_resumes_it(state: State) -> None:
     assert manager.state is State.DONE and forwarder.in_bunk == 1
 
 
-@whole
-def test_idle_stops_the_machine_and_auto_resumes() -> None:
-    forwarder, manager = begin(LOGS[:1])
-    forwarder.run(manager, at(State.SEARCH))
-    for _ in range(100):
-        forwarder.step(manager)
-    manager.idle()
-    driven = forwarder.driven_m
-    for _ in range(100):
-        forwarder.step(manager)
-    assert manager.paused and forwarder.speed_m_s == 0.0
-    assert forwarder.driven_m - driven < 1.0
-    manager.auto()
-    forwarder.run(manager, ended)
-    assert manager.state is State.DONE and forwarder.in_bunk == 1
-
-
 def test_in_single_step_every_transition_waits_for_the_operator() -> None:
     forwarder, manager = begin(LOGS[:1])
     manager.single_step = True
-    for _ in range(40):
-        forwarder.step(manager)
+    forwarder.steps(manager, 40)
     assert manager.state is State.IDLE
     for wanted in (State.RAISE, State.SEARCH):
         manager.next_step()
         forwarder.run(manager, at(wanted), 30.0)
-        for _ in range(20):
-            forwarder.step(manager)
+        forwarder.steps(manager, 20)
         assert manager.state is wanted
 
 
@@ -229,8 +207,7 @@ def test_in_single_step_no_event_is_lost_while_waiting() -> None:
     forwarder, manager = begin(LOGS[:1])
     manager.single_step = True
     while not ended(manager):
-        for _ in range(1200):
-            forwarder.step(manager)
+        forwarder.steps(manager, 1200)
         manager.next_step()
         forwarder.step(manager)
         assert forwarder.crane.now_ns < 1500e9, (manager.state, manager.failure)
@@ -241,11 +218,9 @@ def test_in_single_step_no_event_is_lost_while_waiting() -> None:
 def test_abort_fails_the_mission_with_its_reason_and_stops_the_machine() -> None:
     forwarder, manager = begin(LOGS[:1])
     forwarder.run(manager, at(State.SEARCH))
-    for _ in range(60):
-        forwarder.step(manager)
+    forwarder.steps(manager, 60)
     manager.abort("the supervisor wants it")
-    for _ in range(60):
-        forwarder.step(manager)
+    forwarder.steps(manager, 60)
     assert manager.state is State.FAILED and manager.failure == "the supervisor wants it"
     assert forwarder.speed_m_s == 0.0
     assert manager.failure_code == "mission.aborted"
@@ -285,8 +260,7 @@ def test_a_log_that_slips_repeatedly_is_given_up_and_the_next_one_loaded() -> No
 @whole
 def test_at_the_end_of_the_route_the_load_is_brought_to_the_landing() -> None:
     forwarder, manager = begin(landing=(30.0, 12.0))
-    forwarder.run(manager, ended, 900.0)
-    assert manager.state is State.DONE, manager.failure
+    completed(forwarder, manager, 900.0)
     assert manager.tally.loaded == manager.tally.unloaded == 2 and forwarder.in_bunk == manager.tally.on_board == 0
     assert [s.name for s in states(manager)][-7:] == ["HAUL", "SETTLE", "UNLOAD", "STOW", "RAISE", "SEARCH", "DONE"]
     for log in forwarder.field.values():
@@ -302,8 +276,7 @@ def test_at_the_end_of_the_route_the_load_is_brought_to_the_landing() -> None:
 @pytest.mark.parametrize("bearing_deg", [30.0, 100.0])
 def test_logs_are_placed_along_the_bearing_of_their_landing(bearing_deg) -> None:
     forwarder, manager = begin(landing=(30.0, 12.0), bearing_deg=bearing_deg)
-    forwarder.run(manager, ended, 900.0)
-    assert manager.state is State.DONE, manager.failure
+    completed(forwarder, manager, 900.0)
     assert manager.tally.unloaded == 2
     for log in forwarder.field.values():
         assert math.dist(log.center_m[:2], (30.0, 12.0)) < 1.6
@@ -318,8 +291,7 @@ def test_logs_from_before_the_mission_are_unloaded_too() -> None:
     aboard = LogObservation(7, (x, y, PROFILE.bunk.floor_z_m + 0.15), (1.0, 0.0, 0.0), 2.0, 0.25)
     forwarder.crane.logs = [aboard]
     forwarder.field[7] = lying(7, 0.0, 0.0)
-    forwarder.run(manager, ended, 900.0)
-    assert manager.state is State.DONE, manager.failure
+    completed(forwarder, manager, 900.0)
     assert manager.tally.unloaded == 1 and manager.tally.on_board == manager.tally.loaded == forwarder.in_bunk == 0
     assert not manager.tally.loads, "logs from before the mission are not part of a load"
     assert math.dist(forwarder.field[7].center_m[:2], (30.0, 12.0)) < 1.6
@@ -332,8 +304,7 @@ def test_a_full_bunk_is_unloaded_and_the_route_resumed(monkeypatch) -> None:
     forwarder, manager = begin(logs, end_m=50.0, landing=(20.0, -20.0))
     forwarder.run(manager, lambda m: len(m.tally.loads) == 2 or ended(m), 1800.0)
     driven_m = manager.route.driven_m
-    forwarder.run(manager, ended, 1800.0)
-    assert manager.state is State.DONE, manager.failure
+    completed(forwarder, manager, 1800.0)
     assert manager.tally.unloaded == 2 and [s.name for s in states(manager)].count("HAUL") == 2
     assert sum(load.driven_m for load in manager.tally.loads) == pytest.approx(driven_m, abs=0.5)
     assert [len(load.logs) for load in manager.tally.loads] == [1, 1]
@@ -352,8 +323,7 @@ def test_a_bunk_without_room_ends_the_collecting(table, monkeypatch) -> None:
     if table is PAPER_B:
         lie = tuple((number, x, y, outward_rad(y)) for number, x, y, _ in lie)
     forwarder, manager = begin(lie, table, end_m=50.0)
-    forwarder.run(manager, ended, 900.0)
-    assert manager.state is State.DONE, (manager.failure, states(manager)[-6:])
+    completed(forwarder, manager, 900.0)
     assert forwarder.in_bunk == manager.tally.loaded == 1
     assert manager.tally.missed == 1 and list(manager.tally.given_up.values()) == ["the bunk is full"]
     assert forwarder.crane.held is None
@@ -362,7 +332,7 @@ def test_a_bunk_without_room_ends_the_collecting(table, monkeypatch) -> None:
 def test_a_landing_without_room_fails_the_mission() -> None:
     forwarder, manager = begin((), landing=(12.0, 0.0))
     manager.tally.on_board = 1
-    manager.route.drive_to_landing = refuse  # type: ignore[method-assign]
+    manager.route.drive_to_landing = refuse
     forwarder.run(manager, ended)
     assert manager.failure_code == "path.none"
 
@@ -376,8 +346,7 @@ def test_a_grasp_that_is_stopped_repeatedly_is_given_up() -> None:
     forwarder, manager = begin(LOGS[:1], PAPER_B)
     while not ended(manager):
         forwarder.run(manager, lambda m: ended(m) or (m.state is State.COLLECT and not m.paused))
-        for _ in range(30):
-            forwarder.step(manager)
+        forwarder.steps(manager, 30)
         if manager.state is State.COLLECT:
             forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
             forwarder.step(manager)
@@ -393,8 +362,7 @@ def test_a_log_in_the_jaws_is_laid_down_after_three_stops() -> None:
     forwarder, manager = begin(LOGS[:1], OURS)
     forwarder.run(manager, lambda m: ended(m) or forwarder.crane.held is not None)
     for _ in range(MAX_STOPS):
-        for _ in range(30):
-            forwarder.step(manager)
+        forwarder.steps(manager, 30)
         forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
         forwarder.step(manager)
         forwarder.crane.mode = Mode.ARMED
@@ -418,9 +386,8 @@ def test_the_same_inputs_give_the_same_bytes() -> None:
         forwarder, manager = begin(LOGS[:1])
         sent: list[bytes] = []
         step = manager.step
-        manager.step = lambda *a: sent.extend(step(*a)) or []  # type: ignore[method-assign, func-returns-value]
-        for _ in range(200):
-            forwarder.step(manager)
+        manager.step = lambda *a: sent.extend(step(*a)) or []
+        forwarder.steps(manager, 200)
         return sent
 
     assert datagrams() == datagrams()

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from math import nan
+from dataclasses import dataclass, replace
+from math import dist, nan
 
 import numpy as np
 import pytest
 
-from autonomy.crane_job.activity import Phase
+from autonomy.crane_job.activity import Activity, Phase
 from autonomy.crane_job.cycle import HIGHER_M, MAX_HIGHER
 from autonomy.crane_job.grasp_verification import is_between_jaws
+from autonomy.grasp.grapple_heights import retreat_height_m
+from autonomy.grasp.planner import NoGrasp
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
-from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
+from can_dbc.messages.crane import GrappleCommand, StateReport
 from can_dbc.messages.datagrams import decode
 from machine.geometry.grapple import lowest_tip_below_pin_m
+from machine.geometry.kinematics import Unreachable
 from machine.joints import JOINTS, Joint
 from machine.profile import joint
 from machine.status.modes import Mode
-from tests.autonomy.crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
-from tests.autonomy.test_activity import CYCLE, PROFILE, activity, phases, report, run_until
+from tests.autonomy.crane_stand_in import CYCLE, GROUND_LOG, HOME, TICK_NS, StandIn, activity, clearances, refusing
+from tests.autonomy.grasp_scenes import PROFILE
 
 
 def test_nothing_is_sent_before_the_controller_is_armed() -> None:
@@ -29,10 +32,10 @@ def test_nothing_is_sent_before_the_controller_is_armed() -> None:
     assert planner.step(crane.now_ns, None, ()) is None and planner.paused_code == "activity.no-report"
     for mode in (Mode.BOOT, Mode.STANDBY, Mode.STOP, Mode.FAULT):
         crane.now_ns += TICK_NS
-        assert planner.step(crane.now_ns, report(crane, mode=mode), crane.seen()) is None
+        assert planner.step(crane.now_ns, crane.report_with(mode=mode), crane.seen()) is None
         assert planner.paused_code == "activity.controller-mode" and mode.name in (planner.paused or "")
         assert planner.phase is Phase.WAIT
-    assert planner.step(crane.now_ns, report(crane, position=(nan, *HOME[1:])), crane.seen()) is None
+    assert planner.step(crane.now_ns, crane.report_with(position=(nan, *HOME[1:])), crane.seen()) is None
     assert planner.paused_code == "activity.position-unknown"
     assert crane.step(planner) is not None and planner.phase is Phase.LOOK and planner.paused is None
 
@@ -41,7 +44,7 @@ def test_nothing_is_sent_before_the_controller_is_armed() -> None:
 @pytest.mark.parametrize("mode", [Mode.STOP, Mode.FAULT])
 def test_a_stop_in_any_phase_pauses_and_arming_resumes_it(phase: Phase, mode: Mode) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, phase, more_s=0.2)
+    crane.until(planner, phase, more_s=0.2)
     interrupted = planner.phase
     crane.mode = mode
     for _ in range(400):  # longer than any limit of a phase
@@ -51,9 +54,7 @@ def test_a_stop_in_any_phase_pauses_and_arming_resumes_it(phase: Phase, mode: Mo
     crane.mode, crane.setpoint = Mode.ARMED, None
     data = crane.step(planner)
     assert data is not None and planner.phase is interrupted and planner.paused is None
-    first = decode(data)
-    assert isinstance(first, CraneSetpoint)
-    assert not any(first.knots[0].velocity), "it starts at rest, where the crane stands"
+    assert not any(decode(data).knots[0].velocity), "it starts at rest, where the crane stands"
     crane.run(planner)
     assert planner.done and planner.missed == 0
     assert clearances(PROFILE, crane.trace[::2])["tip"] > 0.005
@@ -61,7 +62,7 @@ def test_a_stop_in_any_phase_pauses_and_arming_resumes_it(phase: Phase, mode: Mo
 
 def test_a_crane_that_was_moved_aside_first_returns_above_the_log() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.DESCEND, more_s=1.0)
+    crane.until(planner, Phase.DESCEND, more_s=1.0)
     crane.mode = Mode.STOP
     crane.step(planner)
     crane.mode, crane.setpoint = Mode.ARMED, None
@@ -74,7 +75,7 @@ def test_a_crane_that_was_moved_aside_first_returns_above_the_log() -> None:
 
 def test_a_silent_controller_pauses() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.ABOVE, more_s=1.0)
+    crane.until(planner, Phase.ABOVE, more_s=1.0)
     answers = [planner.step(crane.now_ns + n * TICK_NS, None, crane.seen()) for n in range(20)]
     assert planner.paused_code == "activity.controller-silent"
     assert sum(a is not None for a in answers) <= 6 and answers[-1] is None
@@ -113,7 +114,7 @@ def test_a_missed_log_is_gripped_again() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=2), activity()
     crane.run(planner)
     assert planner.done and planner.missed == 2
-    assert phases(crane).count("LOOK") == 3 and phases(crane)[-7:] == CYCLE[3:]
+    assert crane.phases().count("LOOK") == 3 and crane.phases()[-7:] == CYCLE[3:]
 
 
 def test_a_log_that_is_missed_three_times_ends_the_job() -> None:
@@ -136,15 +137,15 @@ def test_a_late_list_is_evaluated_once(slips: int) -> None:
             return ()
         return told()
 
-    crane.seen = late  # type: ignore[method-assign]
+    crane.seen = late
     crane.run(planner)
     assert planner.missed == min(slips, 3) and planner.done == (slips < 3)
-    assert phases(crane).count("LOOK") == min(slips + 1, 3)
+    assert crane.phases().count("LOOK") == min(slips + 1, 3)
 
 
 def test_a_log_that_is_lost_during_the_motion_is_picked_again() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.CARRY, more_s=2.0)
+    crane.until(planner, Phase.CARRY, more_s=2.0)
     crane.held = None
     crane.logs = [replace(GROUND_LOG, center_m=(-1.0, 4.6, GROUND_LOG.center_m[2]))]
     crane.run(planner)
@@ -153,7 +154,7 @@ def test_a_log_that_is_lost_during_the_motion_is_picked_again() -> None:
 
 def test_a_log_that_falls_beside_the_bunk_is_reported() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.RETREAT)
+    crane.until(planner, Phase.RETREAT)
     crane.logs = [replace(crane.logs[0], center_m=(3.0, 3.0, -1.29))]
     crane.run(planner)
     assert planner.failure_code == "activity.log-misplaced" and "(3.00, 3.00, -1.29)" in (planner.failure or "")
@@ -192,32 +193,20 @@ def test_what_cannot_be_done_ends_the_job_with_one_sentence(job: CraneJob, log: 
         (Phase.RETREAT, True, "lift", "activity.retreat-timeout"),
     ],
 )
-def test_a_joint_that_does_not_move_ends_the_phase_by_its_name(
-    phase: Phase, direct: bool, freeze: str, code: str
-) -> None:
+def test_a_joint_that_does_not_move_ends_the_phase_by_its_name(phase, direct, freeze, code) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=direct)
-    run_until(crane, planner, phase)
+    crane.until(planner, phase)
     j = Joint[freeze.upper()]
     stuck = crane.q[j]
     sent = []
-    for _ in range(1200):
+    while not planner.idle and len(sent) < 1200:
         position = tuple(stuck if k == j else q for k, q in zip(JOINTS, crane.q, strict=True))
-        data = planner.step(crane.now_ns, report(crane, position=position, mode=Mode.ACTIVE), crane.seen())
-        if data is not None:
-            sent.append(decode(data))
-            crane.setpoint = sent[-1]  # type: ignore[assignment]
-        crane.now_ns += TICK_NS
-        crane.q = crane._knot_at(crane.now_ns).position
-        crane._carry()
-        if planner.idle:
-            break
+        sent.append(crane.misreport(planner, position=position))
     assert planner.phase is Phase.FAILED
-    assert planner.failure_code == code and freeze in (planner.failure or "")
-    last = sent[-1]
-    assert isinstance(last, CraneSetpoint) and last.final and not any(last.knots[0].velocity)
+    assert planner.failure_code == code and freeze in planner.failure
+    assert sent[-1].final and not any(sent[-1].knots[0].velocity)
     speed = joint(PROFILE, j).speed_limit
-    reference = [m.knots[0].position[j] for m in sent if isinstance(m, CraneSetpoint)]
-    assert max(abs(p - stuck) for p in reference) < 1.5 * speed, "the reference waits for the joint"
+    assert max(abs(m.knots[0].position[j] - stuck) for m in sent) < 1.5 * speed, "the reference waits for the joint"
 
 
 @pytest.mark.parametrize(
@@ -230,20 +219,15 @@ def test_a_joint_that_does_not_move_ends_the_phase_by_its_name(
 )
 def test_a_grapple_that_does_not_move_ends_its_phase(phase: Phase, opening: float, code: str) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, phase)
+    crane.until(planner, phase)
     for _ in range(1200):
-        stuck = report(crane, opening_pct=opening, grapple_state=0, mode=Mode.ACTIVE)
-        data = planner.step(crane.now_ns, stuck, crane.seen())
-        if data is not None:
-            crane.setpoint = decode(data)  # type: ignore[assignment]
-        crane.now_ns += TICK_NS
-        crane.q = crane._knot_at(crane.now_ns).position
+        crane.misreport(planner, opening_pct=opening, grapple_state=0)
     assert planner.failure_code == code
 
 
 def test_an_abort_stops_smoothly_and_ends_with_a_hold() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.CARRY, more_s=5.0)
+    crane.until(planner, Phase.CARRY, more_s=5.0)
     before = crane.trace[-1].q[Joint.SLEW]
     planner.abort("ended by SIGTERM")
     seconds = crane.run(planner)
@@ -260,11 +244,9 @@ def test_an_abort_stops_smoothly_and_ends_with_a_hold() -> None:
 
 
 @pytest.mark.parametrize(("times", "done"), [(1, True), (10_000, False)])
-def test_jaws_in_whose_way_something_lies_open_higher_and_not_for_ever(
-    times: int, done: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jaws_in_whose_way_something_lies_open_higher_and_not_for_ever(times, done, monkeypatch) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.OPEN)
+    crane.until(planner, Phase.OPEN)
     low_m, left = planner._cycle.place.z_m, [times]
 
     def in_the_way(_: object) -> bool:
@@ -283,7 +265,7 @@ def test_jaws_in_whose_way_something_lies_open_higher_and_not_for_ever(
 def test_a_load_that_rests_above_its_place_is_released_there(low: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """What lies in the bunk may lie higher than a camera that only looks ahead lets it know."""
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
-    run_until(crane, planner, Phase.CARRY)
+    crane.until(planner, Phase.CARRY)
     while planner.phase is Phase.CARRY and planner._cycle.is_close_above_place(planner._position()) is not low:
         crane.step(planner)
     assert planner.phase is Phase.CARRY
@@ -295,3 +277,108 @@ def test_a_load_that_rests_above_its_place_is_released_there(low: bool, monkeypa
             break
     stands_m = planner._cycle._arm.pose(planner._position()).z_m - planner._cycle.place.z_m
     assert (planner.phase is Phase.OPEN and 0.1 < stands_m < above_m) is low
+
+
+# -- over the bunk before the machine drives, and back where there is no path
+ARM = Arm(PROFILE)
+BUNK = PROFILE.bunk
+
+
+def stow(crane: StandIn) -> Activity:
+    planner = activity(stow_only=True)
+    while not planner.idle:
+        data = crane.step(planner)
+        assert data is None or decode(data).grapple is GrappleCommand.HOLD
+    assert planner.done and planner.idle, planner.failure
+    assert planner.grasp is None
+    return planner
+
+
+def over_the_bunk(q: tuple[float, ...]) -> bool:
+    pin = ARM.pose(q)
+    x, y = ARM.xy(pin)
+    near = abs(x - BUNK.center_m[0]) < BUNK.width_m and abs(y - BUNK.center_m[1]) < BUNK.width_m
+    return near and pin.z_m > retreat_height_m(PROFILE) - 0.02
+
+
+def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_jaws_as_they_are() -> None:
+    crane = StandIn(PROFILE, [GROUND_LOG])
+    planner = activity()
+    crane.until(planner, Phase.DESCEND)
+    planner.abort("that will do")
+    crane.run(planner)
+    assert not over_the_bunk(crane.q)
+    stow(crane)
+    assert over_the_bunk(crane.q)
+
+
+def test_where_it_already_rests_there_nothing_moves() -> None:
+    crane = StandIn(PROFILE, [])
+    over = ARM.pose_above(*BUNK.center_m, retreat_height_m(PROFILE) + 0.2, retreat_height_m(PROFILE) + 0.2)
+    crane.q = tuple(ARM.joints(np.array([over]))[0].tolist())
+    before = crane.q
+    stow(crane)
+    assert crane.q == pytest.approx(before, abs=1e-6)
+
+
+@pytest.mark.parametrize("trouble", [Unreachable("no way is clear"), NoGrasp("grasp.bunk-full", "the bunk is full")])
+def test_a_log_without_a_path_on_is_released_where_it_lay(trouble: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autonomy.crane_job.cycle.carry_motion", refusing(trouble))
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    crane.run(planner)
+    assert planner.failure == str(trouble) and planner.idle
+    assert crane.phases()[-3:] == ["LOWER", "OPEN", "FAILED"]
+    (log,) = crane.logs
+    assert crane.held is None
+    assert log.center_m == pytest.approx(GROUND_LOG.center_m, abs=0.1)
+
+
+def test_a_lifted_log_without_a_path_on_goes_down_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lifted alone first, it hangs over where it lay when there turns out to be no room."""
+    monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", refusing(NoGrasp("grasp.bunk-full", "no room")))
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=False)
+    crane.run(planner)
+    assert planner.failure_code == "grasp.bunk-full"
+    assert "LIFT" in crane.phases() and crane.phases()[-3:] == ["LOWER", "OPEN", "FAILED"]
+    (log,) = crane.logs
+    assert crane.held is None and log.center_m == pytest.approx(GROUND_LOG.center_m, abs=0.1)
+
+
+# -- a camera that remembers what it cannot show
+_SHUT = 4
+
+
+@dataclass
+class Remembering(StandIn):
+    """A crane whose camera looks while it rests, shows only what lies near the pin, not what hangs under it, and
+    remembers the rest."""
+
+    def __post_init__(self) -> None:
+        self.last = {log.id: log for log in self.logs}
+        self.was = self.q
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        """The logs, remembered where they cannot be seen."""
+        rests, self.was = self.q == self.was, self.q
+        if not rests:
+            return ()
+        told = []
+        for log in self.logs:
+            near = dist(self.pin()[:2], log.center_m[:2]) < 1.0 and log.id != self.held
+            if near:
+                self.last[log.id] = log
+            told.append(replace(self.last[log.id], seen=near))
+        return tuple(told)
+
+    def report(self) -> StateReport:
+        """The report of a controller with an opening sensor: closed empty, or holding."""
+        told = super().report()
+        return replace(told, grapple_state=_SHUT) if self.gripped and self.held is None else told
+
+
+@pytest.mark.parametrize("slips", [0, 1, 9])
+def test_not_the_remembered_log_but_the_jaws_tell_whether_it_was_lifted(slips: int) -> None:
+    crane, planner = Remembering(PROFILE, [GROUND_LOG], slippery=slips), activity()
+    crane.run(planner)
+    assert planner.missed == min(slips, 3) and planner.done is (slips < 3)
+    assert planner.failure_code == ("activity.log-missed" if slips > 3 else None)

@@ -18,7 +18,7 @@ from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.manager_missions import PLANE, PROFILE, again, at, ended, place, states, whole
+from tests.autonomy.manager_missions import PLANE, PROFILE, again, at, completed, ended, place, states, whole
 from tests.autonomy.mapped_logs import lying
 from tests.codes import numbers_in
 
@@ -53,7 +53,7 @@ def managed(told: ForwardingMission, **how) -> ActivityManager:
     return manager
 
 
-# ---------------------------------------------------------------------- the rules
+# -- the rules
 def test_without_selection_every_log_is_wanted() -> None:
     plain = sorting(SAW, PULP, sorts=False)
     assert plain.wants("") and plain.wants("veneer")
@@ -136,13 +136,12 @@ def test_wanted_logs_always_belong_to_the_landing_of_the_load(takes, only, grasp
         assert all(rules.landing_of(k) == rules.landing for k in taken) and (not only or set(taken) <= set(only))
 
 
-# ---------------------------------------------------------------------- whole missions
+# -- whole missions
 @whole
 def test_the_machine_does_not_stop_for_unwanted_logs() -> None:
     lie = (("pulpwood", 14.0, 4.2), ("saw logs", 22.0, 4.4))
     machine, manager = forwarder(lie), managed(mission(lie, assortments=SAW))
-    machine.run(manager, ended)
-    assert manager.state is State.DONE, manager.failure
+    completed(machine, manager)
     assert machine.in_bunk == manager.tally.loaded == 1 and states(manager).count(State.APPROACH) == 1
     assert machine.field[1].center_m[:2] == pytest.approx((14.0, 4.2), abs=0.01)
 
@@ -156,7 +155,6 @@ def test_an_unwanted_log_is_not_grasped_with_its_neighbour(only, grasp) -> None:
         managed(mission(lie, assortments=only), selector=PlannerSelection(SamplingPlanner())),
     )
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
-    assert manager.activity is not None and manager.activity.grasp is not None
     assert sorted(log.id for log in manager.activity.grasp.logs) == list(grasp)
 
 
@@ -166,7 +164,6 @@ def test_the_first_grasp_of_a_sorted_load_has_one_landing() -> None:
     told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
     machine, manager = forwarder(lie), managed(told, selector=PlannerSelection(SamplingPlanner()))
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
-    assert manager.activity is not None and manager.activity.grasp is not None
     assert len(manager.activity.grasp.logs) == 1
 
 
@@ -202,10 +199,8 @@ def test_a_planner_restarted_with_a_load_drives_the_second_round(tmp_path: Path)
     told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
     machine, manager = forwarder(lie), managed(told)
     machine.run(manager, at(State.HAUL))
-    manager = again(machine, manager, told, tmp_path / "progress.json")
-    manager.auto()
-    machine.run(manager, ended, 1500.0)
-    assert manager.state is State.DONE, manager.failure
+    manager = again(machine, manager, told, tmp_path / "progress.json", auto=True)
+    completed(machine, manager, 1500.0)
     assert manager.tally.unloaded == 2 and manager.world.sorting.rounds == 1
 
 
@@ -215,8 +210,7 @@ def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
     lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -9.5))
     landings = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
     machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
-    machine.run(manager, ended, 1500.0)
-    assert manager.state is State.DONE, manager.failure
+    completed(machine, manager, 1500.0)
     assert manager.world.sorting.rounds == 1 and manager.tally.loaded == manager.tally.unloaded == 1
     assert machine.field[2].center_m[:2] == pytest.approx((18.0, -9.5), abs=0.01)
 
@@ -227,7 +221,6 @@ def test_an_unsorted_load_goes_to_the_nearest_landing() -> None:
     landings = ((-30.0, 12.0, SAW), (34.0, 14.0, PULP))
     machine, manager = forwarder(lie), managed(mission(lie, landings))
     machine.run(manager, at(State.HAUL))
-    machine.run(manager, ended, 900.0)
-    assert manager.state is State.DONE, manager.failure
+    completed(machine, manager, 900.0)
     (load,) = manager.tally.loads
     assert load.landing == 1 and math.dist(machine.field[1].center_m[:2], (34.0, 14.0)) < 1.6

@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from functools import cache
+from math import pi
+from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
+from autonomy.calibration.loop_gain import GAIN_MARGIN_DB, PHASE_MARGIN_DEG, borne_gain_1_s, margins
 from autonomy.calibration.plan import Findings
+from autonomy.calibration.procedure_state import MIN_FIRST_TURN_RAD
 from autonomy.calibration.result import identify
-from autonomy.calibration.spool_program import reversed_sweep, staircase, sweep, wiggle
+from autonomy.calibration.spool_program import (
+    PULSES,
+    TURN_TOPS_PCT,
+    allowed_by,
+    reversed_sweep,
+    staircase,
+    sweep,
+    turn_search,
+    wiggle,
+)
 from autonomy.calibration.survey import SurveyReading, fit_survey, most_informative_poses
 from autonomy.calibration.trace import SpoolTestRecord
+from autonomy.calibration.turn_fit import YAW_SIGMA_RAD, SideFit, Turn, TurnFit, fit_turns, pulse_to
 from autonomy.calibration.valve_fit import deadband_difference, fit_delay, fit_valve, response_s
+from controller.crane.spool_test_run import MAX_OPEN_UNSENSED_NS
 from machine.geometry.sag import true_pin
 from machine.joints import Joint
+from machine.loading.checks import MAX_GAIN_DELAY
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag
 from machine.sensing import empty_moment_nm
@@ -73,7 +91,6 @@ def test_a_fast_valve_is_known_where_it_is_driven() -> None:
 def test_dead_time_and_lag_are_found_to_milliseconds(machine: StandIn) -> None:
     stairs = [t for t in measured(machine) if t.kind == "staircase"]
     fit = fit_delay(stairs)
-    assert fit is not None
     assert fit.delay_s == pytest.approx(machine.delay_s, abs=0.003)
     assert fit.lag_s == pytest.approx(2 * machine.spool_zeta / machine.spool_rad_s, abs=0.004)
     for t in stairs:
@@ -199,3 +216,151 @@ def test_a_joint_that_was_held_does_not_fit_a_valve() -> None:
     tests[1] = dataclasses.replace(tests[1], position=held)
     problems = identify(PALMS, found(tuple(tests))).implausible
     assert any(problem.code == "implausible.motion-residual" for problem in problems), problems
+
+
+# -- surveyed turns of a rotator that has no encoder
+AORO = load_profile("aoro_fc8")
+ROT = AORO.joints["rot"]
+READINGS = 8
+SLOW_PLUS = StandIn(deadbands=(0.122, 0.085), full_speeds=(1.65, 2.35), hysteresis=0.024)
+SLOW_MINUS = StandIn(deadbands=(0.083, 0.12), full_speeds=(2.4, 1.6), hysteresis=0.015)
+FAR_OFF = StandIn(deadbands=(0.14, 0.07), full_speeds=(3.2, 1.3))
+
+
+def turned(
+    machine: StandIn, seed: int = 3, readings: int = READINGS, searched: bool = False
+) -> tuple[list[Turn], list[float]]:
+    """The turns of a calibration, and where the rotator stood after each [rad]."""
+    rng = np.random.default_rng(seed)
+
+    def read() -> float:
+        return (0.3 + angle + rng.normal(0.0, YAW_SIGMA_RAD / readings**0.5)) % pi
+
+    angle, turns, stood = 0.0, [], []
+    before = read()
+    for side in (1, -1) if searched else ():
+        for top_pct in TURN_TOPS_PCT:  # rising ramps until one turns it, as the procedure does
+            record = machine.run(Joint.ROT, side, "search", turn_search(ROT, side, top_pct, allowed_by(ROT)), angle)
+            turned, angle = abs(float(record.position[-1]) - angle), float(record.position[-1])
+            after = read()
+            turns.append(Turn(record, before, after, readings))
+            before = after
+            if turned > MIN_FIRST_TURN_RAD:
+                break
+    for share, far in PULSES:
+        for side, goal in ((1, far), (-1, 0.0)):
+            program = pulse_to(ROT, fit_turns(turns, ROT), side, share, goal)
+            record = machine.run(Joint.ROT, side, "pulse", program, angle)
+            angle = float(record.position[-1])
+            after = read()
+            turns.append(Turn(record, before, after, readings))
+            stood.append(angle)
+            before = after
+    return turns, stood
+
+
+def errors_of(fit: TurnFit, machine: StandIn) -> tuple[list[float], list[float]]:
+    """Of dead-bands [share of the stroke] and full speeds [relative]."""
+    sides = (fit.plus, fit.minus)
+    return (
+        [abs(s.deadband - true) for s, true in zip(sides, machine.deadbands, strict=True)],
+        [abs(s.full_speed / true - 1.0) for s, true in zip(sides, machine.full_speeds, strict=True)],
+    )
+
+
+@pytest.mark.parametrize("machine", [SLOW_PLUS, SLOW_MINUS], ids=["slow to plus", "slow to minus"])
+def test_the_valve_is_found_though_its_metering_is_another(machine: StandIn) -> None:
+    turns, stood = turned(machine)
+    fit = fit_turns(turns, ROT)
+    deadbands, fulls = errors_of(fit, machine)
+    assert max(deadbands) < 0.02 and max(fulls) < 0.05
+    assert max(fit.plus.errors[0], fit.minus.errors[0]) < 0.004
+    assert max(map(abs, (*fit.plus.left_rad, *fit.minus.left_rad))) < 0.03
+    assert fit.angle_rad == pytest.approx(stood[-1], abs=0.03) and abs(stood[-1]) < 0.15, "it is back"
+    result = identify(AORO, Findings(turns=turns))
+    assert result.turns == fit and result.implausible == () and result.kept == ()
+
+
+def test_half_turns_are_not_mistaken_on_a_machine_far_from_its_profile() -> None:
+    turns, stood = turned(FAR_OFF)
+    fit = fit_turns(turns, ROT)
+    assert max(abs(a - b) for a, b in zip(stood, (0.0, *stood), strict=False)) > pi / 2, "a turn that looks shorter"
+    true = [b - a for a, b in zip((0.0, *stood), stood, strict=False)]
+    assert fit.plus.turns_rad == pytest.approx(true[::2], abs=0.03)
+    assert fit.minus.turns_rad == pytest.approx([-turn for turn in true[1::2]], abs=0.03)
+    assert min(stood) > -0.3 and max(stood) < pi, "never farther than half a turn"
+    assert abs(stood[-1]) < 0.15
+
+
+def test_single_readings_of_a_person_are_plausible() -> None:
+    turns, _ = turned(SLOW_PLUS, readings=1, searched=True)
+    result = identify(AORO, Findings(turns=turns))
+    assert result.turns is not None and result.implausible == ()
+    assert max(errors_of(result.turns, SLOW_PLUS)[1]) < 0.1
+
+
+@pytest.mark.parametrize(("deadband", "full"), [(0.03, 0.67), (0.18, 0.67), (0.3, 0.67), (0.3, 6.0)])
+def test_no_pulse_lasts_longer_than_the_controller_lets_one(deadband: float, full: float) -> None:
+    slow = SideFit(deadband, full, (0.01, 0.1))
+    for share, far in PULSES:
+        assert pulse_to(ROT, TurnFit(slow, slow), 1, share, far).duration_s < 1e-9 * MAX_OPEN_UNSENSED_NS
+
+
+def test_without_turns_a_side_keeps_the_profiles_values() -> None:
+    fit = fit_turns([], ROT)
+    assert (fit.plus.deadband, fit.minus.full_speed) == (0.01 * ROT.valve.deadband_plus_pct, ROT.valve.full_speed_minus)
+    assert fit.angle_rad == 0.0
+
+
+def test_implausible_turns_are_reported() -> None:
+    turns, _ = turned(SLOW_PLUS)
+    wrong = [*turns[:-2], replace(turns[-2], after_rad=turns[-2].after_rad + 0.9), turns[-1]]
+    problems = identify(AORO, Findings(turns=wrong)).implausible
+    assert "implausible.turn-residual" in {problem.code for problem in problems}, problems
+    crawling, _ = turned(replace(SLOW_PLUS, full_speeds=(0.3, 2.35)))
+    problems = identify(AORO, Findings(turns=crawling)).implausible
+    assert "implausible.out-of-range" in {problem.code for problem in problems}, problems
+
+
+# -- loop gains that a measured dead time bears
+PROFILES = {name: load_profile(name) for name in ("palms_471", "aoro_fc8")}
+
+
+def dead_time(delay_s: float, lag_s: float = 0.04, oil_s: float = 0.04):
+    """A joint's result as far as a gain depends on it."""
+    return SimpleNamespace(
+        delay=SimpleNamespace(delay_s=delay_s, lag_s=lag_s), valve=SimpleNamespace(lags_s=(oil_s, oil_s))
+    )
+
+
+def test_margins_of_a_pure_delay_are_the_closed_forms() -> None:
+    phase_deg, gain_db = margins(2.0, 0.2, 1e-4, 0.0)
+    assert phase_deg == pytest.approx(90.0 - 2.0 * 0.2 * 57.3, abs=0.6)
+    assert gain_db == pytest.approx(11.9, abs=0.2)  # 20 log10(pi / 2 / 0.4)
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_the_shipped_gains_stay_at_the_shipped_dead_times(name: str) -> None:
+    for spec in PROFILES[name].joints.values():
+        assert borne_gain_1_s(spec, dead_time(spec.valve.delay_s)) == spec.law.kp_1_s
+
+
+@pytest.mark.parametrize("delay_s", [0.149, 0.2, 0.25])
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_lowered_gain_has_its_margins_and_is_no_lower_than_it_must_be(name: str, delay_s: float) -> None:
+    lowered = 0
+    for spec in PROFILES[name].joints.values():
+        kp = borne_gain_1_s(spec, dead_time(delay_s))
+        assert kp * delay_s <= MAX_GAIN_DELAY and kp <= spec.law.kp_1_s
+        phase_deg, gain_db = margins(kp, delay_s, 0.04, 0.04)
+        assert phase_deg >= PHASE_MARGIN_DEG and gain_db >= GAIN_MARGIN_DB
+        if kp < spec.law.kp_1_s:
+            lowered += 1
+            more = margins(1.15 * kp, delay_s, 0.04, 0.04)
+            assert more[0] < PHASE_MARGIN_DEG or more[1] < GAIN_MARGIN_DB or 1.15 * kp * delay_s > 0.9 * MAX_GAIN_DELAY
+    assert lowered >= 1 or delay_s < 0.2
+
+
+def test_without_a_measured_dead_time_a_gain_stays() -> None:
+    spec = PROFILES["palms_471"].joints["ext"]
+    assert borne_gain_1_s(msgspec.structs.replace(spec), SimpleNamespace(delay=None)) == spec.law.kp_1_s

@@ -32,6 +32,7 @@ from tests.autonomy.commissioned_crane import HOME, SAG, Crane
 from tests.codes import coded, numbers_in
 
 PALMS = load_profile("palms_471")
+ROTATOR = {"name": "aoro_fc8", "only_turns": True}
 
 
 @pytest.mark.long
@@ -52,7 +53,7 @@ def test_a_good_machine_takes_under_four_minutes(name: str) -> None:
 
 
 def test_a_rotator_without_encoder_turns_there_and_back_and_its_valve_is_found() -> None:
-    crane = Crane("aoro_fc8", only_turns=True)
+    crane = Crane(**ROTATOR)
     run = crane.run()
     assert run.failure is None and run.done and run.elapsed_s < 35.0
     spec = crane.profile.joints["rot"]
@@ -68,21 +69,24 @@ def test_a_rotator_without_encoder_turns_there_and_back_and_its_valve_is_found()
 
 
 @pytest.mark.parametrize(
-    ("fault", "code"),
+    ("fault", "joint", "code", "moved"),
     [
-        ({"backward": {Joint.ROT}}, "calibration.wrong-direction"),
-        ({"stuck": {Joint.ROT}}, "calibration.no-motion"),
+        ({"backward": {Joint.SLEW}}, Joint.SLEW, "calibration.wrong-direction", 0.03),
+        ({"backward": {Joint.EXT}}, Joint.EXT, "calibration.wrong-direction", 0.03),
+        ({"stuck": {Joint.LIFT}}, Joint.LIFT, "calibration.no-motion", 0.03),
+        (ROTATOR | {"backward": {Joint.ROT}}, Joint.ROT, "calibration.wrong-direction", 0.6),
+        (ROTATOR | {"stuck": {Joint.ROT}}, Joint.ROT, "calibration.no-motion", 0.6),
     ],
 )
-def test_a_rotator_that_does_not_follow_its_command_ends_the_run(fault: dict, code: str) -> None:
-    crane = Crane("aoro_fc8", only_turns=True, **fault)
-    run = crane.run()
-    assert run.failure_code == code and "rot" in (run.failure or "")
-    assert ends_shut(crane) and abs(crane.q[Joint.ROT]) < 0.6
+def test_a_joint_that_does_not_follow_its_command_ends_the_run(fault, joint, code, moved) -> None:
+    crane = Crane(**fault)
+    before, run = crane.q[joint], crane.run()
+    assert run.failure_code == code and joint.name.lower() in run.failure
+    assert abs(crane.q[joint] - before) < moved and ends_shut(crane)
 
 
 def test_an_abort_while_the_rotator_turns_shuts_its_valve() -> None:
-    crane = Crane("aoro_fc8", only_turns=True)
+    crane = Crane(**ROTATOR)
     crane.run(done=lambda c: c._spools()[Joint.ROT] > 12.0)
     crane.calibration.abort("interrupted")
     run = crane.run()
@@ -128,23 +132,6 @@ def test_a_side_that_is_slow_or_narrow_is_swept_twice(change: dict[str, float], 
     assert {side: found.count(side) for side in (1, -1)} == sweeps
 
 
-@pytest.mark.parametrize("joint", [Joint.SLEW, Joint.EXT])
-def test_a_joint_that_moves_the_wrong_way_ends_the_run_at_once(joint: Joint) -> None:
-    crane = Crane(backward={joint})
-    before = crane.q[joint]
-    run = crane.run()
-    assert run.failure_code == "calibration.wrong-direction" and joint.name.lower() in (run.failure or "")
-    assert abs(crane.q[joint] - before) < 0.03
-    assert ends_shut(crane)
-
-
-def test_a_joint_that_does_not_move_ends_the_run() -> None:
-    crane = Crane(stuck={Joint.LIFT})
-    run = crane.run()
-    assert run.failure_code == "calibration.no-motion" and "lift" in (run.failure or "")
-    assert ends_shut(crane)
-
-
 @pytest.mark.parametrize("after_s", [1.0, 40.0])
 def test_an_abort_shuts_the_valve_within_a_tenth_of_a_second(after_s: float) -> None:
     crane = Crane()
@@ -177,12 +164,8 @@ def test_a_stop_ends_the_run_and_nothing_is_sent_after_it() -> None:
     sent = len(crane.heard)
     crane.mode = Mode.ARMED
     crane.run(5.0)
-    assert (
-        run.idle
-        and run.failure_code == "calibration.controller-mode"
-        and "STOP" in (run.failure or "")
-        and len(crane.heard) == sent
-    )
+    assert run.idle and run.failure_code == "calibration.controller-mode" and "STOP" in run.failure
+    assert len(crane.heard) == sent
 
 
 def interrupted(crane: Crane, reason: Reason, for_s: float = 20.0) -> None:
@@ -349,7 +332,6 @@ def test_a_changed_program_is_sent_at_once_and_its_end_however_late() -> None:
     other.run(done=lambda c: isinstance(c.calibration.task, SpoolTask) and any(c._spools()))
     heard = len(other.heard)
     spool = other.calibration._spool
-    assert spool is not None
     other.now_ns += int(spool.program.duration_s * 1e9)
     other.run(0.05)
     assert len(other.heard) > heard and other.heard[-1].knots[-1].percent == 0.0

@@ -28,9 +28,7 @@ from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, MissionError, Point
 from autonomy.process.command_line import CONFIGURATION, FINE
 from runtime.errors import InputRefused
-from tests.autonomy.manager_missions import (
-    listed_mission,
-)
+from tests.autonomy.manager_missions import listed_mission
 from tests.codes import coded, numbers_in
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "paper_b.geojson"
@@ -57,7 +55,6 @@ def test_times_survive_a_restart_of_the_computer(tmp_path: Path) -> None:
     )
     path = kept(tmp_path / "p", progress, 100 * PERIOD_NS, 10**18)
     found = read_checkpoint(path, listed_mission(), 3 * PERIOD_NS, 10**18 + 60 * PERIOD_NS)
-    assert found is not None
     then_ns = 10**18 - (10**18 + 60 * PERIOD_NS) + 3 * PERIOD_NS  # when it was kept, by the new clock
     assert found.tally.board[0].at_ns == then_ns - 20 * PERIOD_NS
     assert found.tally.loads[0].at_ns == then_ns - 10 * PERIOD_NS
@@ -128,21 +125,9 @@ NUMBER = st.integers(0, 10**6)
 PLACE = st.builds(Point, st.floats(-90.0, 90.0), st.floats(-180.0, 180.0))
 TAKEN = st.builds(LoadedLog, PLACE, st.integers(0, 2**62), METRES, TEXT)
 LOAD = st.builds(Load, st.lists(TAKEN, max_size=3).map(tuple), st.integers(0, 2**62), METRES, st.just(0))
-TALLY = st.builds(
-    Tally,
-    NUMBER,
-    NUMBER,
-    NUMBER,
-    NUMBER,
-    NUMBER,
-    METRES,
-    METRES,
-    st.booleans(),
-    st.dictionaries(NUMBER, TEXT, max_size=3),
-    st.lists(LOAD, max_size=3),
-    st.lists(TAKEN, max_size=3),
-    METRES,
-)
+GIVEN_UP = st.dictionaries(NUMBER, TEXT, max_size=3)
+ABOARD = st.lists(LOAD, max_size=3), st.lists(TAKEN, max_size=3), METRES
+TALLY = st.builds(Tally, *[NUMBER] * 5, METRES, METRES, st.booleans(), GIVEN_UP, *ABOARD)
 LOG = st.builds(KnownLog, PLACE, st.just(""), st.floats(0.0, 360.0), METRES, METRES, TEXT, TEXT)
 KNOWN = st.builds(
     LogKnowledge,
@@ -181,27 +166,13 @@ def test_a_written_checkpoint_is_read_back(
     assert later is not None and later.tally == copied_tally(tally, 1000)
 
 
-# ---------------------------------------------------------------------- the process
+# -- the process
+WORDS = ["--controller", "127.0.0.1:1", "--scene", "127.0.0.1:2", "--report-port", "0"]
+
+
 def start(progress: Path, *more: str) -> int:
-    return main(
-        [
-            "--profile",
-            "aoro_fc8",
-            "--controller",
-            "127.0.0.1:1",
-            "--scene",
-            "127.0.0.1:2",
-            "--report-port",
-            "0",
-            "--order-port",
-            "0",
-            "--mission",
-            str(EXAMPLE),
-            "--progress",
-            str(progress),
-            *more,
-        ]
-    )
+    words = [*WORDS, "--profile", "aoro_fc8", "--order-port", "0", "--mission", str(EXAMPLE)]
+    return main([*words, "--progress", str(progress), *more])
 
 
 def test_the_process_refuses_other_and_damaged_checkpoints(tmp_path: Path, capsys) -> None:
@@ -245,10 +216,7 @@ def test_the_process_refuses_an_unwritable_checkpoint(tmp_path: Path, capsys) ->
 
 @pytest.mark.parametrize("left_out", ["--mission", "--order-port"])
 def test_progress_needs_a_mission_and_an_order_port(left_out: str, capsys) -> None:
-    words = ["--controller", "127.0.0.1:1", "--scene", "127.0.0.1:2", "--report-port", "0", "--progress", "p"]
-    words += [
-        w for name, value in (("--mission", "m"), ("--order-port", "0")) if name != left_out for w in (name, value)
-    ]
-    with pytest.raises(SystemExit) as ended_:
-        main(words)
-    assert ended_.value.code == 2
+    given = {"--mission": "m", "--order-port": "0"}
+    del given[left_out]
+    with pytest.raises(SystemExit, match="2"):
+        main([*WORDS, "--progress", "p", *given.popitem()])

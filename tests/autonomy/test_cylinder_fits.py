@@ -42,11 +42,16 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
     return math.degrees(math.acos(min(1.0, abs(float(a @ b)))))
 
 
-def fits_of(*logs, exact: bool = True, **options):
-    scene, view = scene_of(*logs), view_from()
-    picture = seen(scene, view)
-    perception = Perception(PROFILE)
-    return perception.fits(frame_of(picture, view, exact=exact, **options), masks_of(picture)), view, perception
+def shot(*logs, exact: bool = True):
+    """A picture of logs, the view that it was taken from, and the frame of it."""
+    view = view_from()
+    picture = seen(scene_of(*logs), view)
+    return picture, view, frame_of(picture, view, exact=exact)
+
+
+def fits_of(*logs):
+    picture, view, frame = shot(*logs)
+    return Perception(PROFILE).fits(frame, masks_of(picture)), view
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 55.0, 90.0])
@@ -69,7 +74,7 @@ def test_outline_and_depth_agree_with_the_renderer(degrees: float) -> None:
 @pytest.mark.long
 def test_with_exact_depth_the_fit_is_accurate_to_two_centimetres(degrees: float) -> None:
     log = lying(1, 4.6, 0.2, degrees)
-    (fit,), view, _ = fits_of(log)
+    (fit,), view = fits_of(log)
     assert np.linalg.norm(view.to_world(fit.body.center_m[None])[0] - log.position_m) < 0.02
     assert angle_deg(view.rotation @ fit.body.axis, log.axis) < 0.6
     assert abs(2 * fit.body.radius_m - 0.25) < 0.005 and abs(fit.body.length_m - 2.0) < 0.04
@@ -80,7 +85,7 @@ def test_with_exact_depth_the_fit_is_accurate_to_two_centimetres(degrees: float)
 def test_the_middle_of_a_bowed_log_is_fitted(sweep_m: float) -> None:
     log = replace(lying(1, 4.6, 0.2, 0.0), sweep_m=sweep_m)  # a straight one was found 6 and 10 cm off
     truth = log.spine(40)[0].mean(axis=0)
-    (fit,), view, _ = fits_of(log)
+    (fit,), view = fits_of(log)
     miss = view.to_world(fit.body.center_m[None])[0] - truth
     assert np.linalg.norm(miss) < 0.035, miss
 
@@ -103,7 +108,7 @@ def test_the_covariance_covers_stereo_errors(degrees: float) -> None:
 
 def test_an_end_hidden_by_another_log_is_not_an_end() -> None:
     back, front = lying(1, 5.2, 0.0, 90.0), lying(2, 4.3, 0.8, 10.0, length=1.6, diameter=0.5)
-    fits, view, _ = fits_of(back, front)
+    fits, view = fits_of(back, front)
     fit = min(fits, key=lambda f: abs(f.body.radius_m - 0.125))
     left = 1 if (view.rotation @ fit.body.axis)[1] < 0 else 0  # the end towards -y is free
     assert fit.ends_seen[left] and not fit.ends_seen[1 - left]
@@ -116,15 +121,13 @@ def test_an_end_hidden_by_another_log_is_not_an_end() -> None:
 
 def test_contour_that_is_not_its_own_says_nothing_of_the_width() -> None:
     """The same log, once with its lower side marked as hidden: it may be wider there."""
-    view, sensor = view_from(), StereoSensor(CAMERA.fx_px * CAMERA.baseline_m)
-    picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
-    mask, depth_m = picture.mask == 1, frame_of(picture, view).depth_m
+    sensor = StereoSensor(CAMERA.fx_px * CAMERA.baseline_m)
+    picture, _, frame = shot(lying(1, 4.6, 0.0, 90.0), exact=False)
+    mask, depth_m = picture.mask == 1, frame.depth_m
     first = initial_cylinder(mask, depth_m, PIN, 3.0 * 0.2 / sensor.fb_px_m)
-    assert first is not None
     whole = log_contour(mask, depth_m, PIN, first, sensor, (0, 0, PIN.width_px, PIN.height_px))
     half = replace(whole, own=whole.own & (whole.v_px < np.median(whole.v_px)))
     sure, unsure = (fit_cylinder(mask, depth_m, PIN, first, edge, sensor) for edge in (whole, half))
-    assert sure is not None and unsure is not None
     assert sure.covariance[6, 6] < 0.006**2 and unsure.covariance[6, 6] > 0.02**2
     assert unsure.covariance[1, 1] > 3.0 * sure.covariance[1, 1], "depth beside it may be that of what hides it"
 
@@ -163,14 +166,13 @@ def test_fragments_on_both_sides_of_an_occluder_are_one_log() -> None:
 
 
 def test_two_logs_in_line_stay_two() -> None:
-    fits, _, _ = fits_of(lying(1, 5.0, -1.3, 90.0), lying(2, 5.0, 1.3, 90.0))
+    fits, _ = fits_of(lying(1, 5.0, -1.3, 90.0), lying(2, 5.0, 1.3, 90.0))
     assert sorted(round(f.body.length_m, 1) for f in fits) == [2.0, 2.0]
 
 
 def test_only_the_largest_part_of_a_mask_that_is_too_long_is_fitted() -> None:
     log = lying(1, 4.6, 0.0, 0.0)
-    picture, view = seen(scene_of(log), view_from()), view_from()
-    frame = frame_of(picture, view, exact=True)
+    picture, view, frame = shot(log)
     v, u = np.nonzero(picture.mask == 1)
     stray = np.zeros(picture.mask.shape, bool)
     stray[v.min() - 260 : v.min() - 180, int(u.mean()) - 15 : int(u.mean()) + 15] = True  # the far end of a boom, say
@@ -182,7 +184,7 @@ def test_only_the_largest_part_of_a_mask_that_is_too_long_is_fitted() -> None:
 
 def test_a_log_half_outside_the_picture_has_one_end() -> None:
     log = lying(1, 3.2, 4.0, 90.0, length=3.0)
-    (fit,), view, _ = fits_of(log)
+    (fit,), view = fits_of(log)
     seen_ends = view.to_world(fit.body.center_m + np.outer((-0.5, 0.5), fit.body.length_m * fit.body.axis))
     inner = int(np.argmin(np.abs(seen_ends[:, 1])))
     assert fit.ends_seen[inner] and not fit.ends_seen[1 - inner]
@@ -205,7 +207,7 @@ def test_an_end_at_the_edge_of_the_picture_is_unknown(degrees: float, short_px: 
 
 
 def test_an_implausible_fit_is_rejected_with_a_reason() -> None:
-    (fit,), _, _ = fits_of(lying(1, 4.6, 0.0, 90.0))
+    (fit,), _ = fits_of(lying(1, 4.6, 0.0, 90.0))
     assert implausibility(fit) is None
     short = replace(fit.body, start_m=-0.1, end_m=0.1, radius_m=0.11)
     assert implausibility(replace(fit, body=short)).code == "too-wide"
@@ -217,9 +219,8 @@ def test_an_implausible_fit_is_rejected_with_a_reason() -> None:
 
 
 def test_no_mask_no_depth_and_an_invalid_frame_give_no_log() -> None:
-    scene, view = scene_of(lying(1, 4.6, 0.2, 90.0)), view_from()
-    picture = seen(scene, view)
-    frame, perception = frame_of(picture, view, exact=True), Perception(PROFILE)
+    picture, _, frame = shot(lying(1, 4.6, 0.2, 90.0))
+    perception = Perception(PROFILE)
     assert perception.fits(frame, []) == []
     assert perception.fits(frame, [TrueMask(np.zeros_like(picture.mask, bool))]) == []
     blind = replace(frame, depth_m=np.where(picture.mask == 1, np.nan, frame.depth_m))
@@ -236,10 +237,7 @@ def test_no_mask_no_depth_and_an_invalid_frame_give_no_log() -> None:
 
 
 def test_noise_in_a_mask_gives_a_log_or_a_rejection() -> None:
-    rng, view = np.random.default_rng(3), view_from()
-    picture = seen(scene_of(), view)
-    frame = frame_of(picture, view, exact=True)
-    perception = Perception(PROFILE)
+    rng, (picture, _, frame), perception = np.random.default_rng(3), shot(), Perception(PROFILE)
     for _ in range(12):
         mask = np.zeros(picture.mask.shape, bool)
         top, left = rng.integers(0, 600), rng.integers(0, 1200)
@@ -252,25 +250,21 @@ def test_noise_in_a_mask_gives_a_log_or_a_rejection() -> None:
 
 
 def test_the_initial_cylinder_needs_depth_and_ignores_outliers() -> None:
-    view = view_from()
-    picture = seen(scene_of(lying(1, 4.6, 0.2, 90.0)), view)
+    picture, _, _ = shot(lying(1, 4.6, 0.2, 90.0))
     mask, depth_m = picture.mask == 1, picture.depth_m.copy()
     slack = 3.0 * 0.2 / (CAMERA.fx_px * CAMERA.baseline_m)
     clean = initial_cylinder(mask, depth_m, PIN, slack)
     rng = np.random.default_rng(1)
     depth_m[mask & (rng.random(mask.shape) < 0.3)] = 1.5
     dirty = initial_cylinder(mask, depth_m, PIN, slack)
-    assert clean is not None and dirty is not None
     assert np.linalg.norm(clean.center_m - dirty.center_m) < 0.05
     assert initial_cylinder(mask, np.full_like(depth_m, np.nan), PIN, slack) is None
 
 
 def test_paper_a_reads_axis_width_and_trimmed_ends_from_a_mask_and_its_points() -> None:
-    log, view = lying(1, 4.6, 0.2, 90.0), view_from()
-    picture = seen(scene_of(log), view)
-    frame = frame_of(picture, view, exact=True)
+    log = lying(1, 4.6, 0.2, 90.0)
+    picture, view, frame = shot(log)
     found = papers.log_from_mask(frame, picture.mask == 1)
-    assert found is not None
     assert found.length_m == pytest.approx(2.0, abs=0.05) and found.diameter_m == pytest.approx(0.25, abs=0.02)
     assert angle_deg(view.rotation @ found.axis, log.axis) < 1.0
     off = view.to_world(found.center_m[None])[0] - log.position_m
@@ -292,9 +286,7 @@ def test_a_steep_cylinder_is_not_a_log(lean_deg: float, confirmed: int) -> None:
 
 
 def test_a_log_with_depth_only_at_its_border_is_rejected() -> None:
-    view = view_from()
-    picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
-    frame = frame_of(picture, view, exact=True)
+    picture, _, frame = shot(lying(1, 4.6, 0.0, 90.0))
     inner = binary_erosion(picture.mask == 1, iterations=3)
     perception = Perception(PROFILE)
     assert perception.fits(replace(frame, depth_m=np.where(inner, np.nan, frame.depth_m)), masks_of(picture)) == []

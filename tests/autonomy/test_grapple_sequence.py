@@ -1,4 +1,4 @@
-"""The grapple: when opening jaws may open further, and what their report says."""
+"""The grapple: when jaws may open further, what their report says, and recovery when they hold the wrong thing."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.grapple import GrappleSequence, is_between_stakes
+from autonomy.crane_job.grasp_verification import MAX_RESTARTS, GraspRecovery
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.grasp.planner import Grasp
 from autonomy.motion.arm_kinematics import Arm, Pose
@@ -18,10 +20,32 @@ from can_dbc.messages.crane import GrappleCommand
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile
 from machine.profile import Bunk
+from tests.autonomy.grasp_scenes import MEASURED
 
 AORO = load_profile("aoro_fc8")
 ARM = Arm(AORO)
 PILE = Bunk((0.4, -2.9), 0.0, 3.0, 2.6, -1.4, 1.5)
+
+
+def grasp(*diameters_m: float, extracts: bool = False, measured: bool = True) -> Grasp:
+    covariance = MEASURED if measured else None
+    first, *others = (
+        LogObservation(i, (0.0, 4.0, -1.2), (1.0, 0.0, 0.0), 2.6, diameter_m, covariance)
+        for i, diameter_m in enumerate(diameters_m or (0.28,), 1)
+    )
+    return Grasp(first, Pose(0.0, 4.0, -0.4, 0.3, 0.1), -1.3, 0.0, tuple(others), extracts=extracts)
+
+
+def sequence_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> GrappleSequence:
+    """Tongs by what is reported of them."""
+    report = SimpleNamespace(opening_pct=opening_pct, grapple_state=state, load_kg=load_kg)
+    return GrappleSequence(load_profile("palms_471"), SimpleNamespace(report=report))
+
+
+def weighs(sequence: GrappleSequence, load_kg: float, command: GrappleCommand) -> None:
+    """A step in which the load cell shows this."""
+    sequence._inbox.report.load_kg = load_kg
+    sequence.apply(command, 0.05)
 
 
 @pytest.mark.parametrize("bunk", [AORO.bunk, PILE])
@@ -49,9 +73,7 @@ def test_beside_the_bunk_jaws_may_open_at_any_height() -> None:
     ],
 )
 def test_jaws_stall_wide_by_what_they_should_hold(opening_pct: float, diameters_m: list[float], wide: bool) -> None:
-    logs = [LogObservation(i, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, d) for i, d in enumerate(diameters_m)]
-    grasp = Grasp(logs[0], Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, tuple(logs[1:]))
-    assert sequence_at(opening_pct).is_stalled_wide(grasp) is wide
+    assert sequence_at(opening_pct).is_stalled_wide(grasp(*diameters_m)) is wide
 
 
 @pytest.mark.parametrize(
@@ -65,23 +87,17 @@ def test_jaws_stall_wide_by_what_they_should_hold(opening_pct: float, diameters_
         (nan, 0, 0.28, True, False),
     ],
 )
-def test_jaws_tell_that_they_have_missed(
-    opening_pct: float, state: int, diameter_m: float, drawn: bool, missed: bool
-) -> None:
-    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
-    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, extracts=drawn)
-    assert sequence_at(opening_pct, state).has_missed(grasp) is missed
+def test_jaws_tell_that_they_have_missed(opening_pct, state, diameter_m, drawn, missed) -> None:
+    assert sequence_at(opening_pct, state).has_missed(grasp(diameter_m, extracts=drawn)) is missed
 
 
 @pytest.mark.parametrize(("load_kg", "missed"), [(57.0, False), (4.0, True), (nan, True)])
 def test_what_the_load_cell_weighs_in_fully_closed_jaws_was_not_missed(load_kg: float, missed: bool) -> None:
     """A log of 19 cm was measured as 21 cm, which leaves a gap: these jaws are full."""
-    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.21)
-    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)
     tongs = sequence_at(0.0, 4, load_kg)
     for _ in range(20):
         tongs.apply(GrappleCommand.CLOSE, 0.05)
-    assert tongs.has_missed(grasp) is missed
+    assert tongs.has_missed(grasp(0.21)) is missed
 
 
 @pytest.mark.parametrize(("loads_kg", "nothing"), [((0.0, 16.0, 13.0, 14.0), False), ((6.0, 0.0, 0.0, 3.0), True)])
@@ -89,8 +105,7 @@ def test_the_mean_of_noisy_readings_tells_a_thin_log_from_nothing(loads_kg: tupl
     """Measured: a log of 12 cm reads 0 to 16 kg while it swings, empty jaws 0 to 6 kg."""
     tongs = sequence_at(0.0, 4, nan)
     for k in range(60):
-        tongs._inbox.report.load_kg = loads_kg[k // 3 % len(loads_kg)]
-        tongs.apply(GrappleCommand.HOLD, 0.05)
+        weighs(tongs, loads_kg[k // 3 % len(loads_kg)], GrappleCommand.HOLD)
         assert k < 40 or tongs.lifts_nothing is nothing, k
 
 
@@ -105,16 +120,12 @@ def test_the_mean_of_noisy_readings_tells_a_thin_log_from_nothing(loads_kg: tupl
         ([0.0, 5.0, 7.0] * 8 + [2.0] * 24, 0.25, False),  # estimated while the crane stood, and then kept
     ],
 )
-def test_a_thick_load_that_weighs_nothing_for_a_second_was_lost(
-    loads_kg: list[float], diameter_m: float, lost: bool
-) -> None:
+def test_a_thick_load_that_weighs_nothing_for_a_second_was_lost(loads_kg, diameter_m, lost) -> None:
     """Also where the jaws have not closed fully: they pressed on a log, slid off, and still close."""
-    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
     sequence = sequence_at(40.0, 3)
     for load_kg in loads_kg:
-        sequence._inbox.report.load_kg = load_kg
-        sequence.apply(GrappleCommand.CLOSE, 0.05)
-    assert sequence.has_lost(Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)) is lost
+        weighs(sequence, load_kg, GrappleCommand.CLOSE)
+    assert sequence.has_lost(grasp(diameter_m)) is lost
 
 
 @pytest.mark.parametrize(
@@ -135,29 +146,22 @@ def test_closed_jaws_that_weigh_nothing_hold_nothing(state: int, load_kg: float,
     ],
 )
 def test_opening_jaws_that_bear_a_load_push(loads_kg: tuple[float, ...], pushed: bool) -> None:
-    sequence = sequence_at(nan)
-    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
-    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)
+    sequence, held = sequence_at(nan), grasp(0.25)
     for load_kg, command in zip(loads_kg, ["HOLD", *["OPEN"] * 4], strict=False):
-        sequence._inbox.report.load_kg = load_kg
-        sequence.apply(GrappleCommand[command], 0.05)
+        weighs(sequence, load_kg, GrappleCommand[command])
     assert sequence.is_obstructed is pushed
     if pushed:
         sequence.release(0.05)
-        assert (
-            sequence.command is GrappleCommand.CLOSE
-            and sequence.is_obstructed
-            and not sequence.has_released(grasp, 10.0)
-        )
+        assert sequence.command is GrappleCommand.CLOSE and sequence.is_obstructed
+        assert not sequence.has_released(held, 10.0)
         sequence._inbox.report.load_kg = 90.0
         for _ in range(10):
             sequence.release(0.05)
-        assert sequence.command is GrappleCommand.NEUTRAL and not sequence.has_released(grasp, 10.0), (
-            "the crane still swings"
-        )
+        assert sequence.command is GrappleCommand.NEUTRAL
+        assert not sequence.has_released(held, 10.0), "the crane still swings"
         for _ in range(10):
             sequence.release(0.05)
-        assert sequence.has_released(grasp, 0.3)
+        assert sequence.has_released(held, 0.3)
     sequence.apply(GrappleCommand.CLOSE, 0.05)
     assert not sequence.is_obstructed
 
@@ -165,22 +169,17 @@ def test_opening_jaws_that_bear_a_load_push(loads_kg: tuple[float, ...], pushed:
 @pytest.mark.parametrize(
     ("opening_pct", "others", "higher"), [(30.0, 0, True), (95.0, 0, False), (30.0, 1, False), (nan, 0, False)]
 )
-def test_jaws_that_pushed_and_still_enclose_the_log_must_open_higher(
-    opening_pct: float, others: int, higher: bool
-) -> None:
+def test_jaws_that_pushed_and_still_enclose_the_log_must_open_higher(opening_pct, others, higher) -> None:
     """Risen, they would lift the log again, and drop it when they open above the stakes."""
-    sequence = sequence_at(opening_pct)
-    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
-    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, others=(replace(log, id=1),) * others)
+    sequence, held = sequence_at(opening_pct), grasp(*[0.25] * (1 + others))
     for load_kg in (80.0, 10.0, 400.0):
-        sequence._inbox.report.load_kg = load_kg
-        sequence.apply(GrappleCommand.OPEN, 0.05)
-    assert sequence.is_obstructed and not sequence.must_open_higher(grasp), "they still push"
+        weighs(sequence, load_kg, GrappleCommand.OPEN)
+    assert sequence.is_obstructed and not sequence.must_open_higher(held), "they still push"
     sequence._inbox.report.load_kg = 90.0
     for _ in range(20):
         sequence.release(0.05)
-    assert sequence.must_open_higher(grasp) is higher
-    assert sequence.has_released(grasp, 10.0) is not higher
+    assert sequence.must_open_higher(held) is higher
+    assert sequence.has_released(held, 10.0) is not higher
 
 
 @pytest.mark.parametrize(
@@ -196,7 +195,83 @@ def test_a_load_that_weighs_little_on_the_way_down_rests(laden_kg: float, read_k
     assert sequence.load_rests is rests
 
 
-def sequence_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> GrappleSequence:
-    """Tongs by what is reported of them."""
-    report = SimpleNamespace(opening_pct=opening_pct, grapple_state=state, load_kg=load_kg)
-    return GrappleSequence(load_profile("palms_471"), SimpleNamespace(report=report))
+# -- recovery
+class Told(SimpleNamespace):
+    """A grapple whose state the test sets."""
+
+    is_still, empty, wide, missed, holds_nothing = True, False, False, False, False
+
+    def is_stalled_wide(self, grasp: Grasp) -> bool:
+        return self.wide
+
+    def has_missed(self, grasp: Grasp) -> bool:
+        return self.missed
+
+
+def test_held_logs_are_lifted() -> None:
+    first = grasp()
+    assert GraspRecovery().after_closing(first, Told()) == (Phase.LIFT, first)
+
+
+@pytest.mark.parametrize("trouble", ["wide", "missed"])
+def test_moving_jaws_are_waited_for(trouble: str) -> None:
+    assert GraspRecovery().after_closing(grasp(), Told(is_still=False, **{trouble: True}))[0] is None
+
+
+def test_jaws_that_stall_wide_lift_what_they_clasp() -> None:
+    assert GraspRecovery().after_closing(grasp(), Told(wide=True)) == (Phase.LIFT, grasp())
+
+
+def test_a_miss_restarts_from_above_a_few_times() -> None:
+    regrip = GraspRecovery()
+    phases = [regrip.after_closing(grasp(), Told(missed=True, empty=True))[0] for _ in range(MAX_RESTARTS + 1)]
+    assert phases == [Phase.ABOVE] * MAX_RESTARTS + [Phase.LIFT]
+
+
+def test_a_pinched_log_in_a_row_is_dragged_once_before_a_restart() -> None:
+    regrip = GraspRecovery()
+    phase, now = regrip.after_closing(grasp(extracts=True), Told(missed=True))
+    assert phase is Phase.CLOSE and now.dragging
+    phase, now = regrip.after_closing(now, Told(missed=True))
+    assert phase is Phase.ABOVE and not now.dragging
+    phase, _ = regrip.after_closing(grasp(extracts=True), Told(missed=True, empty=True))
+    assert phase is Phase.ABOVE, "nothing to drag"
+
+
+def test_jaws_that_rise_empty_restart_as_often_as_jaws_that_closed_on_nothing() -> None:
+    regrip, empty = GraspRecovery(), Told(empty=True, holds_nothing=True)
+    assert regrip.after_rising(grasp(), Told()) is None
+    assert regrip.after_rising(grasp(), Told(holds_nothing=True, is_still=False)) is None, "they may close on it yet"
+    assert regrip.after_rising(grasp(measured=False), empty) is None
+    restarts = [regrip.after_rising(grasp(), empty) is not None for _ in range(MAX_RESTARTS + 1)]
+    assert restarts == [True] * MAX_RESTARTS + [False]
+
+
+def row(*across_m: float) -> Grasp:
+    first, *others = (replace(grasp().log, id=i, center_m=(0.0, 4.0 + y, -1.2)) for i, y in enumerate(across_m, 1))
+    return replace(grasp(), log=first, others=tuple(others))
+
+
+def test_after_a_failed_row_its_inner_logs_are_excluded() -> None:
+    regrip, wide, empty = GraspRecovery(), row(0.3, -0.3, 0.0), Told(empty=True, holds_nothing=True)
+    regrip.after_closing(wide, Told(wide=True))
+    assert regrip.after_rising(wide, empty) is not None and regrip.excluded_logs == (3,)
+    drawn = replace(row(0.3), extracts=True)
+    regrip.after_closing(drawn, Told(missed=True, empty=True))
+    assert regrip.excluded_logs == (3, 1)
+    regrip.after_closing(row(0.3), Told(wide=True))
+    assert regrip.after_rising(row(0.3), empty) is None, "twice, and no more"
+
+
+@pytest.mark.parametrize(("across_m", "wide"), [((0.0, 0.3), True), ((0.3, -0.3, 0.0), False)])
+def test_no_inner_logs_are_excluded_of_two_or_where_the_jaws_had_closed(across_m, wide) -> None:
+    regrip = GraspRecovery()
+    regrip.after_closing(row(*across_m), Told(wide=wide))
+    regrip.after_rising(row(*across_m), Told(holds_nothing=True))
+    assert regrip.restart_count == 1 and regrip.excluded_logs == ()
+
+
+def test_exactly_known_logs_are_lifted_as_they_are() -> None:
+    told = grasp(measured=False)
+    for tongs in (Told(wide=True), Told(missed=True, empty=True)):
+        assert GraspRecovery().after_closing(told, tongs) == (Phase.LIFT, told)

@@ -28,6 +28,7 @@ ARM = Arm(PROFILE)
 JAWS = PROFILE.grapple.jaws
 GROUND = PROFILE.workspace.ground_z_m
 BUNK = PROFILE.bunk
+GRASP = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
 
 
 def log_at(x: float, y: float, yaw: float = 0.7, number: int = 0, diameter: float = 0.2) -> LogObservation:
@@ -77,9 +78,7 @@ def test_every_log_of_the_pick_area_has_a_grasp_and_a_place(log: LogObservation)
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.97, 1.03), st.floats(0.1, 0.3), st.floats(0.05, 0.15))
-def test_the_tips_sweep_between_the_ground_and_the_middle_of_the_log(
-    pace: float, diameter: float, delay_s: float
-) -> None:
+def test_the_tips_sweep_between_the_ground_and_the_middle_of_the_log(pace, diameter, delay_s) -> None:
     height = closing_height_curve(PROFILE, GROUND, diameter)
     rate = JAWS.angle_rad[-1] / PROFILE.grapple.close_time_s
     tips = []
@@ -102,23 +101,18 @@ def test_the_closing_height_starts_at_rest_and_is_smooth() -> None:
 
 def test_a_log_on_others_is_gripped_at_its_own_height() -> None:
     high = replace(GROUND_LOG, center_m=(-1.8, 4.4, -0.9))
-    assert plan_single_log_grasp(ARM, high, 0.0).pose.z_m - plan_single_log_grasp(
-        ARM, GROUND_LOG, 0.0
-    ).pose.z_m == pytest.approx(0.39)
+    assert plan_single_log_grasp(ARM, high, 0.0).pose.z_m - GRASP.pose.z_m == pytest.approx(0.39)
 
 
 def test_a_log_whose_centre_is_just_out_of_reach_is_gripped_off_its_centre() -> None:
     distances = (float(r) for r in np.arange(6.2, 7.2, 0.05))
-    far = next(log for log in (log_at(0.0, r, pi / 2) for r in distances) if not centre_in_reach(log))
-    grasp = plan_single_log_grasp(ARM, far, 0.0)
+    grasps = (plan_single_log_grasp(ARM, log_at(0.0, r, pi / 2), 0.0) for r in distances)
+    grasp = next(grasp for grasp in grasps if grasp.along_m != 0.0)
+    far = grasp.log
     assert grasp.along_m < 0.0 and ARM.xy(grasp.pose)[1] < far.center_m[1] - 0.05
     place = plan_place(ARM, CraneJob(), grasp, [])
     for point in log_ends(laid(grasp.log, grasp.pose, place)):
         assert over_bunk(PROFILE, point, 0.001)
-
-
-def centre_in_reach(log: LogObservation) -> bool:
-    return plan_single_log_grasp(ARM, log, 0.0).along_m == 0.0
 
 
 def laid(log: LogObservation, grasp: Pose, place: Pose) -> LogObservation:
@@ -161,30 +155,28 @@ def test_the_top_log_comes_first_then_the_nearest_and_never_one_in_the_bunk() ->
 
 
 def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
-    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
     deepest = lowest_tip_below_pin_m(JAWS)
-    empty = plan_place(ARM, CraneJob(), grasp, [GROUND_LOG])
+    empty = plan_place(ARM, CraneJob(), GRASP, [GROUND_LOG])
     assert 0.04 < empty.z_m - deepest - BUNK.floor_z_m < 0.1
-    half = plan_place(ARM, CraneJob(), grasp, layer(-0.5))
+    half = plan_place(ARM, CraneJob(), GRASP, layer(-0.5))
     assert half.z_m - empty.z_m == pytest.approx(0.5)
     top_m, radius_m = BUNK.floor_z_m + BUNK.stake_height_m, GROUND_LOG.diameter_m / 2
-    last = plan_place(ARM, CraneJob(), grasp, layer(-BELOW_STAKE_TOP_M - radius_m - 0.01))
+    last = plan_place(ARM, CraneJob(), GRASP, layer(-BELOW_STAKE_TOP_M - radius_m - 0.01))
     assert last.z_m - deepest + radius_m < top_m + 0.03, "its middle comes to lie below the top of the stakes"
     with pytest.raises(BunkFull, check=coded("grasp.bunk-full")):
-        plan_place(ARM, CraneJob(), grasp, layer(-BELOW_STAKE_TOP_M - radius_m + 0.01))
+        plan_place(ARM, CraneJob(), GRASP, layer(-BELOW_STAKE_TOP_M - radius_m + 0.01))
 
 
 def test_a_job_may_name_the_place() -> None:
-    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
-    assert ARM.xy(plan_place(ARM, CraneJob(place_m=(3.2, 1.0)), grasp, [])) == pytest.approx((3.2, 1.0))
+    assert ARM.xy(plan_place(ARM, CraneJob(place_m=(3.2, 1.0)), GRASP, [])) == pytest.approx((3.2, 1.0))
     with pytest.raises(NoGrasp, check=coded("grasp.place-out-of-reach")):
-        plan_place(ARM, CraneJob(place_m=(9.0, 1.0)), grasp, [])
+        plan_place(ARM, CraneJob(place_m=(9.0, 1.0)), GRASP, [])
 
 
 def test_lying_in_the_bunk_and_hanging_from_the_grapple() -> None:
     assert lies_in_bunk(BUNK, in_bunk(0, -0.8)) and not lies_in_bunk(BUNK, in_bunk(0, 0.4))
     assert not lies_in_bunk(BUNK, GROUND_LOG)
-    up = plan_single_log_grasp(ARM, GROUND_LOG, 0.0).pose.at_height(travel_height_m(PROFILE))
+    up = GRASP.pose.at_height(travel_height_m(PROFILE))
     assert not hangs_below(ARM, GROUND_LOG, up)
     assert hangs_below(ARM, replace(GROUND_LOG, center_m=(-1.7, 4.5, up.z_m - 1.1)), up)
     assert not hangs_below(ARM, replace(GROUND_LOG, center_m=(1.0, 4.5, up.z_m - 1.1)), up)
@@ -192,11 +184,10 @@ def test_lying_in_the_bunk_and_hanging_from_the_grapple() -> None:
 
 @pytest.mark.parametrize("skew", [-0.5, 0.0, 0.4])
 def test_a_log_that_hangs_askew_is_turned_along_the_bunk(skew):
-    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
     held_yaw = 0.9
     hangs = held_yaw - pi / 2 + skew
     seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
-    place = plan_place(ARM, CraneJob(), grasp, [seen], held_yaw)
+    place = plan_place(ARM, CraneJob(), GRASP, [seen], held_yaw)
     laid = hangs + (place.slew_rad + place.rot_rad - held_yaw)
     assert remainder(laid - BUNK.yaw_rad, pi) == pytest.approx(0.0, abs=1e-6)
 
@@ -204,10 +195,9 @@ def test_a_log_that_hangs_askew_is_turned_along_the_bunk(skew):
 @pytest.mark.parametrize(("stands", "turn"), [(-0.2, 0.0), (2.3, pi), (1.2, pi), (0.8, 0.0)])
 def test_of_two_turns_it_makes_the_shorter_one_from_where_the_rotator_stands(stands: float, turn: float) -> None:
     """The grasp's angle may be nearer to the other one, half a turn away: a thin log would not follow so far."""
-    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
     held_yaw = 0.9
     hangs = held_yaw - pi / 2 + 0.6
     seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
-    first, second = (plan_place(ARM, CraneJob(), grasp, [seen], held_yaw, at) for at in (-0.6, stands))
+    first, second = (plan_place(ARM, CraneJob(), GRASP, [seen], held_yaw, at) for at in (-0.6, stands))
     assert first.rot_rad == pytest.approx(-0.6, abs=0.01)
     assert second.rot_rad - first.rot_rad == pytest.approx(turn, abs=1e-6)

@@ -20,6 +20,7 @@ from tests.codes import coded, numbers_in
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "harvest.hpr"
 TEXT = EXAMPLE.read_text(encoding="utf-8")
+LOGS = load_mission(EXAMPLE).mission.logs
 NS = {"s": "urn:skogforsk:stanford2010"}
 
 
@@ -28,25 +29,21 @@ def problem(text: str) -> Problem:
     return refused(text.encode(), "h", route_wanted=False).problems[0]
 
 
-# -- hpr --------------------------------------------------------------------------------------------------------
-
-
+# -- hpr
 def test_logs_of_a_harvesters_production() -> None:
-    logs = load_mission(EXAMPLE).mission.logs
-    assert [log.key for log in logs] == ["4001/1", "4001/2", "4002/1", "4002/2", "4003/1", "4004/1", "4004/2"]
-    assert [(log.species, log.assortment, log.product_key) for log in logs[1:3]] == [
+    assert [log.key for log in LOGS] == ["4001/1", "4001/2", "4002/1", "4002/2", "4003/1", "4004/1", "4004/2"]
+    assert [(log.species, log.assortment, log.product_key) for log in LOGS[1:3]] == [
         ("birch", "pulpwood", 31),
         ("pine", "saw logs", 11),
     ]
-    assert (logs[0].length_m, logs[0].diameter_m) == (pytest.approx(3.0), pytest.approx(0.210))
-    assert all(log.bearing_deg is None for log in logs)
+    assert (LOGS[0].length_m, LOGS[0].diameter_m) == (pytest.approx(3.0), pytest.approx(0.210))
+    assert all(log.bearing_deg is None for log in LOGS)
 
 
 def test_the_crane_tips_position_is_better_than_the_harvesters() -> None:
-    logs = load_mission(EXAMPLE).mission.logs
-    places = SITE.points_enu([log.position for log in logs])
-    assert places[0, :2] == pytest.approx((-10.0, -9.0), abs=0.02) and logs[0].sigma_m == TIP_SIGMA_M
-    assert places[-1, :2] == pytest.approx((0.0, -12.0), abs=0.02) and logs[-1].sigma_m == MACHINE_SIGMA_M
+    places = SITE.points_enu([log.position for log in LOGS])
+    assert places[0, :2] == pytest.approx((-10.0, -9.0), abs=0.02) and LOGS[0].sigma_m == TIP_SIGMA_M
+    assert places[-1, :2] == pytest.approx((0.0, -12.0), abs=0.02) and LOGS[-1].sigma_m == MACHINE_SIGMA_M
 
 
 @pytest.mark.parametrize(("south", "west"), [("South", "West"), ("south", "WEST"), ("S", "W")])
@@ -67,33 +64,34 @@ def test_diameters_of_harvesters_with_fewer_measurements() -> None:
     assert by_volume.diameter_m == pytest.approx(0.210, rel=1e-3)  # the sample's volumes are cylinders
 
 
-def test_stems_without_coordinates_are_counted() -> None:
-    start = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
-    end = TEXT.index("</StemCoordinates>", start) + len("</StemCoordinates>")
-    draft = read((TEXT[:start] + TEXT[end:]).encode(), "h")
-    assert len(draft.mission.logs) == 5 and draft.notes == []
-    assert [(p.code, numbers_in(p.sentence)) for p in draft.warnings] == [("hpr.no-coordinates", [2])]
+START = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
+END = TEXT.index("</StemCoordinates>", START) + len("</StemCoordinates>")
 
 
-def test_no_fix_is_no_position() -> None:
-    zeros = re.sub(r"(<L(?:at|ong)itude[^>]*>)[\d.]+", r"\g<1>0.0", TEXT)
-    draft = read(zeros.encode(), "h")
-    assert draft.mission.logs == () and [p.code for p in draft.warnings] == ["hpr.no-coordinates", "hpr.no-logs"]
-
-
-def test_a_file_without_logs_is_said_to_have_none() -> None:
-    draft = read(TEXT.replace("ProcessedStem>", "Stem>").encode(), "h")
-    assert draft.mission.logs == () and [p.code for p in draft.warnings] == ["hpr.no-logs"]
+@pytest.mark.parametrize(
+    ("text", "logs", "warned"),
+    [
+        (TEXT[:START] + TEXT[END:], 5, {"hpr.no-coordinates": [2]}),
+        (
+            re.sub(r"(<L(?:at|ong)itude[^>]*>)[\d.]+", r"\g<1>0.0", TEXT),
+            0,
+            {"hpr.no-coordinates": [7], "hpr.no-logs": []},
+        ),
+        (TEXT.replace("ProcessedStem>", "Stem>"), 0, {"hpr.no-logs": []}),
+    ],
+    ids=["a stem without coordinates", "no fix", "no logs"],
+)
+def test_logs_that_have_no_place_are_counted(text: str, logs: int, warned: dict[str, list[float]]) -> None:
+    draft = read(text.encode(), "h")
+    assert len(draft.mission.logs) == logs and draft.notes == []
+    assert {p.code: numbers_in(p.sentence) for p in draft.warnings} == warned
 
 
 def test_a_position_in_the_processing_of_a_stem() -> None:
-    start = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
-    end = TEXT.index("</StemCoordinates>", start) + len("</StemCoordinates>")
-    given = TEXT[start:end].replace("StemCoordinates", "Coordinates")
-    inner = "<SingleTreeProcessedStem>"
-    moved = TEXT[:start] + TEXT[end:].replace(inner, inner + given, 1)
+    given, inner = TEXT[START:END].replace("StemCoordinates", "Coordinates"), "<SingleTreeProcessedStem>"
+    moved = TEXT[:START] + TEXT[END:].replace(inner, inner + given, 1)
     draft = read(moved.encode(), "h")
-    assert draft.mission.logs == read(TEXT.encode(), "h").mission.logs and draft.warnings == []
+    assert draft.mission.logs == LOGS and draft.warnings == []
 
 
 def test_two_measurements_of_a_log_are_not_mixed() -> None:
@@ -103,14 +101,14 @@ def test_two_measurements_of_a_log_are_not_mixed() -> None:
     )
     draft = read(TEXT.replace("<LogMeasurement", other + "<LogMeasurement", 1).encode(), "h")
     again = read(TEXT.replace("</LogMeasurement>", "</LogMeasurement>" + other, 1).encode(), "h")
-    assert draft.mission.logs == again.mission.logs == read(TEXT.encode(), "h").mission.logs
+    assert draft.mission.logs == again.mission.logs == LOGS
     assert [numbers_in(note) for note in draft.notes] == [[1]]
 
 
 def test_an_hpr_in_an_envelope() -> None:
     body = TEXT[TEXT.index("<HarvestedProduction ") :]
     draft = read(f"<Envelope><Head/>{body}</Envelope>".encode(), "h")
-    assert draft.mission.logs == read(TEXT.encode(), "h").mission.logs
+    assert draft.mission.logs == LOGS
     assert problem(f"<Envelope>{body}{body}</Envelope>").code == "mission.envelope"
 
 
@@ -151,8 +149,7 @@ def test_logs_of_another_site_are_refused(tmp_path: Path) -> None:
         load_mission(EXAMPLE.with_name("route.gpx"), logs=tmp_path / "far.hpr")
 
 
-# -- fpr --------------------------------------------------------------------------------------------------------
-
+# -- fpr
 NOON = datetime(2026, 6, 1, 12, 0, tzinfo=timezone(timedelta(hours=2)))
 ROAD, YARD = Landing(at(22, 17), "Road side"), Landing(at(-22, 17), "Yard")
 BIRCH = ForwardedLog(at(-10, -9), NOON, 0.0982, "birch", "pulpwood", 31)
@@ -230,9 +227,7 @@ def test_every_log_has_its_place_time_product_and_volume() -> None:
     assert {p.findtext("s:LoadNumberOfItems", "", NS) for p in parts} == {"1"}
     assert [datetime.fromisoformat(t) for t in texts(root, ".//s:CoordinateDate")][2] == PINE.taken
     pine = parts[2].find("s:LoadingCoordinates", NS)
-    assert pine is not None
     latitude, longitude = pine.find("s:Latitude", NS), pine.find("s:Longitude", NS)
-    assert latitude is not None and longitude is not None
     assert (latitude.get("latitudeCategory"), float(latitude.text or "")) == ("South", 33.5)
     assert (longitude.get("longitudeCategory"), float(longitude.text or "")) == ("West", 70.25)
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.manager.transition_table import State
 from autonomy.perception.log_list import LogObservation
@@ -18,19 +17,16 @@ from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
 from can_dbc.messages.vehicle import DriveSetpoint
 from machine.geometry.grapple import grapple_yaw
-from machine.loading.profile_file import load_profile, profile_hash
-from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn
+from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn, activity
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.forwarding_jobs import begin, command, run
-from tests.autonomy.manager_missions import LOGS
-
-PALMS = load_profile("palms_471")
+from tests.autonomy.grasp_scenes import PROFILE
+from tests.autonomy.manager_missions import LOGS, begin_job, command, events_until
 
 
 @pytest.mark.long
 def test_a_mission_emits_its_states_grasps_and_load_and_ends_idle() -> None:
-    forwarder, job, _ = begin(LOGS[0])
-    said = run(forwarder, job, lambda j: j.idle)
+    forwarder, job, _ = begin_job(LOGS[0])
+    said = events_until(forwarder, job, lambda j: j.idle)
     assert job.done and job.failure is None
     states = [what["state"] for event, what in said if event == "state"]
     assert states[0] == "IDLE" and states[-1] == "DONE" and states.count("COLLECT") == 1
@@ -41,34 +37,25 @@ def test_a_mission_emits_its_states_grasps_and_load_and_ends_idle() -> None:
     assert outcome["driven_m"] == pytest.approx(26.0, abs=1.0)
 
 
-def test_an_aborted_mission_is_idle_after_standstill() -> None:
-    forwarder, job, manager = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
-    job.abort("ended by SIGTERM")
-    assert not job.idle and not job.done
-    run(forwarder, job, lambda j: j.idle)
-    assert job.failure == "ended by SIGTERM" and forwarder.speed_m_s < 0.05 and manager.state is State.FAILED
-
-
 def test_a_mission_ends_although_the_machine_does_not_stop() -> None:
-    forwarder, job, _ = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, _ = begin_job()
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     job.abort("enough")
     ended_ns = forwarder.crane.now_ns
-    forwarder._move = lambda: None  # type: ignore[method-assign]
-    run(forwarder, job, lambda j: j.idle)
+    forwarder._move = lambda: None
+    events_until(forwarder, job, lambda j: j.idle)
     assert STOPPING_TIMEOUT_NS <= forwarder.crane.now_ns - ended_ns < 2 * STOPPING_TIMEOUT_NS
 
 
 def test_setpoints_have_the_requested_lease() -> None:
-    forwarder, job, _ = begin(lease_ns=150_000_000)
-    run(forwarder, job, lambda j: forwarder.drive is not None)
+    forwarder, job, _ = begin_job(lease_ns=150_000_000)
+    events_until(forwarder, job, lambda j: forwarder.drive is not None)
     assert forwarder.drive is not None and forwarder.drive.lease_ns == 150_000_000
 
 
 def test_an_ended_job_sends_no_speed() -> None:
-    forwarder, job, _ = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, _ = begin_job()
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     job.abort("enough")
     crane = forwarder.crane
     sent = [decode(d) for d in job.step(crane.now_ns, crane.report(), forwarder.vehicle(), ())]
@@ -78,37 +65,32 @@ def test_an_ended_job_sends_no_speed() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("phase", ["ABOVE", "DESCEND", "CLOSE", "CARRY", "LOWER", "OPEN"])
 def test_pause_stops_the_crane_smoothly_and_auto_resumes_with_the_log(phase: str) -> None:
-    forwarder, job, manager = begin(LOGS[0])
-    run(forwarder, job, lambda j: manager.activity is not None and manager.activity.phase.name == phase)
-    for _ in range(10):
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder, job, manager = begin_job(LOGS[0])
+    events_until(forwarder, job, lambda j: manager.activity is not None and manager.activity.phase.name == phase)
+    forwarder.steps(job, 10)
     assert job.execute(command(1, MissionAction.PAUSE)) == "" and not job.report(0).auto
-    for _ in range(100):  # a grip that has begun is ended; then the crane stands
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.steps(job, 100)  # a grip that has begun is ended; then the crane stands
     before, stands = manager.activity, forwarder.crane.q
-    for _ in range(700):  # longer than any phase may take
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.steps(job, 700)  # longer than any phase may take
     assert forwarder.crane.q == stands and manager.state is State.COLLECT and manager.activity is before
     assert forwarder.crane.setpoint is not None, "it is held, not abandoned"
     assert job.execute(command(2, MissionAction.AUTO)) == ""
-    run(forwarder, job, lambda j: j.idle)
+    events_until(forwarder, job, lambda j: j.idle)
     assert job.done and manager.tally.loaded == 1 and forwarder.in_bunk == 1
 
 
 def standing(forwarder: Forwarder, job: ForwardingJob) -> bool:
     """Whether the machine has come to rest and stays there for ten seconds."""
-    for _ in range(60):
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.steps(job, 60)
     before = forwarder.driven_m
-    for _ in range(200):
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.steps(job, 200)
     return forwarder.speed_m_s == 0.0 and forwarder.driven_m == before
 
 
 @pytest.mark.parametrize(("position", "code"), [(ModeSwitch.IDLE, "switch.idle"), (ModeSwitch.FAULTY, "switch.faulty")])
 def test_the_operators_switch_holds_a_mission_whatever_is_commanded(position: ModeSwitch, code: str) -> None:
-    forwarder, job, _ = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, _ = begin_job()
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     forwarder.crane.mode_switch = position
     assert standing(forwarder, job)
     told = job.report(forwarder.crane.now_ns)
@@ -119,38 +101,37 @@ def test_the_operators_switch_holds_a_mission_whatever_is_commanded(position: Mo
 
 
 def test_turning_the_switch_from_idle_to_auto_resumes_and_auto_alone_does_not() -> None:
-    forwarder, job, manager = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, manager = begin_job()
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     forwarder.crane.mode_switch = ModeSwitch.AUTO
-    for _ in range(20):
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.steps(job, 20)
     assert forwarder.speed_m_s > 0.3, "Auto changes nothing by itself"
     job.execute(command(1, MissionAction.PAUSE))
     assert standing(forwarder, job)
     forwarder.crane.mode_switch = ModeSwitch.FAULTY
-    forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.step(job)
     forwarder.crane.mode_switch = ModeSwitch.AUTO
     assert standing(forwarder, job), "it was not at Idle"
     forwarder.crane.mode_switch = ModeSwitch.IDLE
     assert standing(forwarder, job)
     forwarder.crane.mode_switch = ModeSwitch.AUTO
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     assert job.report(0).auto and manager.state is State.SEARCH and manager.paused == ""
 
 
 def test_a_repaired_switch_lets_a_command_resume() -> None:
-    forwarder, job, _ = begin()
+    forwarder, job, _ = begin_job()
     forwarder.crane.mode_switch = ModeSwitch.FAULTY
     assert standing(forwarder, job) and forwarder.drive is None
     forwarder.crane.mode_switch = ModeSwitch.AUTO
     assert standing(forwarder, job) and forwarder.drive is None
     assert job.execute(command(1, MissionAction.AUTO)) == ""
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
 
 
 @pytest.mark.parametrize("position", [ModeSwitch.NOT_FITTED, ModeSwitch.AUTO])
 def test_a_mission_that_waits_starts_by_the_turn_of_the_switch_or_by_command(position: ModeSwitch) -> None:
-    forwarder, job, manager = begin(waits=True)
+    forwarder, job, manager = begin_job(waits=True)
     forwarder.crane.mode_switch = position
     assert standing(forwarder, job) and manager.state is State.IDLE
     assert not job.begun and not job.report(0).auto and job.report(0).paused == ""
@@ -160,7 +141,7 @@ def test_a_mission_that_waits_starts_by_the_turn_of_the_switch_or_by_command(pos
         forwarder.crane.mode_switch = ModeSwitch.AUTO
     else:
         assert job.execute(command(1, MissionAction.AUTO)) == ""
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     assert job.begun
 
 
@@ -168,7 +149,7 @@ class Lone:
     """A single-log job, as the stand-in of the crane steps one."""
 
     def __init__(self) -> None:
-        self.activity = Activity(PALMS, profile_hash(PALMS))
+        self.activity = activity()
         self.job = SingleLogJob(self.activity)
 
     @property
@@ -193,32 +174,29 @@ class Lone:
 
 @pytest.mark.parametrize("position", [ModeSwitch.IDLE, ModeSwitch.FAULTY])
 def test_the_operators_switch_holds_a_single_log_job_and_its_turn_resumes_it(position: ModeSwitch) -> None:
-    crane, lone = StandIn(PALMS, [GROUND_LOG]), Lone()
-    crane.until(lone, Phase.ABOVE)  # type: ignore[arg-type]
-    for _ in range(20):
-        crane.step(lone)  # type: ignore[arg-type]
+    crane, lone = StandIn(PROFILE, [GROUND_LOG]), Lone()
+    crane.until(lone, Phase.ABOVE)
+    crane.steps(lone, 20)
     crane.mode_switch = position
-    for _ in range(60):
-        crane.step(lone)  # type: ignore[arg-type]
+    crane.steps(lone, 60)
     stands = crane.q
     assert lone.paused()
     crane.mode_switch = ModeSwitch.AUTO if position is ModeSwitch.FAULTY else ModeSwitch.NOT_FITTED
-    for _ in range(600):
-        crane.step(lone)  # type: ignore[arg-type]
+    crane.steps(lone, 600)
     assert crane.q == stands and crane.setpoint is not None, "it is held, not abandoned"
     for crane.mode_switch in (ModeSwitch.IDLE, ModeSwitch.AUTO):
-        crane.step(lone)  # type: ignore[arg-type]
-    crane.until(lone, Phase.DESCEND)  # type: ignore[arg-type]
+        crane.step(lone)
+    crane.until(lone, Phase.DESCEND)
     assert lone.paused() is None
 
 
 def test_a_single_log_job_that_finds_the_switch_at_idle_sends_nothing_before_its_turn() -> None:
-    crane, lone = StandIn(PALMS, [GROUND_LOG], mode_switch=ModeSwitch.IDLE), Lone()
+    crane, lone = StandIn(PROFILE, [GROUND_LOG], mode_switch=ModeSwitch.IDLE), Lone()
     for _ in range(40):
-        assert crane.step(lone) is None and lone.phase is Phase.WAIT  # type: ignore[arg-type]
+        assert crane.step(lone) is None and lone.phase is Phase.WAIT
     assert lone.paused()
     crane.mode_switch = ModeSwitch.AUTO
-    crane.step(lone)  # type: ignore[arg-type]
+    crane.step(lone)
     assert crane.setpoint is not None and lone.paused() is None
 
 
@@ -239,14 +217,14 @@ def ahead(forwarder: Forwarder, job: ForwardingJob) -> None:
             for log in near()
         )
 
-    forwarder.seen = seen  # type: ignore[method-assign]
+    forwarder.seen = seen
 
 
 def test_logs_seen_ahead_are_mapped_where_they_lie() -> None:
-    forwarder, job, manager = begin(LOGS[0], uses_memory=True)
+    forwarder, job, manager = begin_job(LOGS[0], uses_memory=True)
     assert job.drives
     ahead(forwarder, job)
-    run(forwarder, job, lambda j: bool(manager.world.log_map.logs) and forwarder.speed_m_s > 0.3)
+    events_until(forwarder, job, lambda j: bool(manager.world.log_map.logs) and forwarder.speed_m_s > 0.3)
     (log,) = manager.world.log_map.logs
     (lies,) = forwarder.field.values()
     assert log.center_m[:2] == pytest.approx(lies.center_m[:2], abs=0.1)
@@ -254,9 +232,9 @@ def test_logs_seen_ahead_are_mapped_where_they_lie() -> None:
 
 @pytest.mark.long
 def test_no_picture_is_asked_for_and_none_counts_while_the_crane_works() -> None:
-    forwarder, job, manager = begin(LOGS[0], uses_memory=True)
+    forwarder, job, manager = begin_job(LOGS[0], uses_memory=True)
     ahead(forwarder, job)
-    run(forwarder, job, lambda j: manager.state is State.COLLECT)
+    events_until(forwarder, job, lambda j: manager.state is State.COLLECT)
     assert job.standpoint(forwarder.crane.now_ns) is None
     before = manager.world.log_map.logs
     late = (LogObservation(7, (30.0, 2.0, 0.1), (1.0, 0.0, 0.0), 2.0, 0.2),)
@@ -267,9 +245,9 @@ def test_no_picture_is_asked_for_and_none_counts_while_the_crane_works() -> None
 
 @pytest.mark.long
 def test_a_load_is_shown_to_the_camera_ahead_and_its_picture_maps_no_log() -> None:
-    forwarder, job, manager = begin(LOGS[0], uses_memory=True)
+    forwarder, job, manager = begin_job(LOGS[0], uses_memory=True)
     ahead(forwarder, job)
-    run(forwarder, job, lambda j: manager.shows_load)
+    events_until(forwarder, job, lambda j: manager.shows_load)
     crane, activity, base = forwarder.crane, manager.activity, forwarder.base()
     asked = job.standpoint(crane.now_ns)
     assert activity is not None and asked is not None and asked.load

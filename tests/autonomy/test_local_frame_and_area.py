@@ -31,12 +31,9 @@ def proj(frame: LocalFrame) -> pyproj.Transformer:
 
 
 @given(LATITUDES, LONGITUDES, HEIGHTS, NEAR, NEAR, st.floats(-200.0, 200.0))
-def test_local_metres_are_projs_to_a_micrometre(
-    latitude: float, longitude: float, height: float, east: float, north: float, up: float
-) -> None:
+def test_local_metres_are_projs_to_a_micrometre(latitude, longitude, height, east, north, up) -> None:
     frame = LocalFrame(latitude, longitude, height)
     place = frame.point(east, north, up)
-    assert place.altitude_m is not None
     theirs = proj(frame).transform(place.longitude_deg, place.latitude_deg, place.altitude_m)
     assert theirs == pytest.approx((east, north, up), abs=1e-6)
     assert frame.points_enu([place])[0] == pytest.approx(np.array([east, north, up]), abs=1e-6)
@@ -81,8 +78,7 @@ def test_bearings_and_yaws(bearing: float) -> None:
     assert math.sin(math.radians(back - bearing) / 2) == pytest.approx(0.0, abs=1e-9)
 
 
-# -- fences -----------------------------------------------------------------------------------------------------
-
+# -- fences
 SQUARE = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)])
 
 

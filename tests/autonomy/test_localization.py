@@ -30,9 +30,7 @@ from sim.geometry import LocalFrame
 from tests.autonomy.carrier_model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, heading_from_yaw, individual
 from tests.codes import coded
 
-PROFILE = load_profile("aoro_fc8")
-CARRIER = PROFILE.carrier
-assert CARRIER is not None
+CARRIER = load_profile("aoro_fc8").carrier
 ANGLE = st.floats(-20.0, 20.0)
 
 
@@ -54,23 +52,10 @@ class Drive:
             if report is None:
                 continue
             t = (report.stamp_ns - 10**9) * 1e-9
-            rate = 0.5 * self.bend_rad * math.cos(0.5 * t)
+            bend_rad, rate_rad_s = self.bend_rad * math.sin(0.5 * t), 0.5 * self.bend_rad * math.cos(0.5 * t)
+            steer = (Steering.ARTICULATION, 0.0, 0.0, bend_rad, rate_rad_s)
             self.vehicle.order(
-                DriveSetpoint(
-                    1,
-                    0,
-                    report.stamp_ns,
-                    10**9,
-                    Steering.ARTICULATION,
-                    0.0,
-                    0.0,
-                    self.bend_rad * math.sin(0.5 * t),
-                    rate,
-                    self.speed_m_s,
-                    (0.35,) * 4,
-                    False,
-                    False,
-                )
+                DriveSetpoint(1, 0, report.stamp_ns, 10**9, *steer, self.speed_m_s, (0.35,) * 4, False, False)
             )
             self.report = self.tamper(report)
             out.append(self.localizer.step(self.report))
@@ -89,9 +74,7 @@ class Drive:
     st.floats(-500.0, 500.0),
     st.floats(-20.0, 20.0),
 )
-def test_the_plane_agrees_with_another_formula_and_inverts(
-    lat: float, lon: float, east: float, north: float, up: float
-) -> None:
+def test_the_plane_agrees_with_another_formula_and_inverts(lat, lon, east, north, up) -> None:
     plane, site = LocalPlane(lat, lon, 260.0), LocalFrame(lat, lon, 260.0)
     assert plane.local(*site.geodetic(east, north, up)) == pytest.approx((east, north, up), abs=1e-5)
     assert plane.local(*plane.geodetic(east, north, up)) == pytest.approx((east, north, up), abs=1e-5)
@@ -256,16 +239,11 @@ def test_two_seconds_without_satellites_are_dead_reckoned_then_lost() -> None:
     assert np.hypot(*drive.off(back[-1])[:2]) < 0.1 and back[-1].jumps == 0
 
 
-def test_a_frozen_receiver_is_detected() -> None:
-    drive = Drive()
+@pytest.mark.parametrize(("frozen", "heading_off_rad"), [(True, 0.0), (False, math.pi)], ids=["frozen", "swapped"])
+def test_a_frozen_receiver_and_swapped_antennas_are_detected(frozen: bool, heading_off_rad: float) -> None:
+    drive = Drive(own=Individual(heading_off_rad=heading_off_rad))
     drive.on(5.0)
-    drive.vehicle.frozen = True
-    assert drive.on(4.0)[-1].status is Status.LOST
-
-
-def test_swapped_antennas_are_detected_while_driving() -> None:
-    drive = Drive(own=Individual(heading_off_rad=math.pi))
-    drive.on(1.0)
+    drive.vehicle.frozen = frozen
     assert drive.on(5.0)[-1].status is Status.LOST
 
 
@@ -304,7 +282,6 @@ def test_a_machine_that_turns_while_its_frame_sinks_on_a_hill_stays_located() ->
     drive = Drive(bend_rad=0.0)
     drive.speed_m_s = 0.0
     drive.on(4.0)
-    assert drive.report is not None
     begun_ns, turn_rad = drive.report.stamp_ns, 0.05
 
     def sunk(report: VehicleReport) -> VehicleReport:
@@ -360,9 +337,7 @@ def test_a_level_straight_machine_has_its_crane_behind_its_axle() -> None:
 
 @settings(max_examples=30)
 @given(st.floats(-3.0, 3.0), st.floats(-0.6, 0.6), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-def test_the_rear_frame_carries_the_front_axle_to_the_location(
-    yaw: float, bend: float, roll: float, pitch: float
-) -> None:
+def test_the_rear_frame_carries_the_front_axle_to_the_location(yaw, bend, roll, pitch) -> None:
     rear = Frames(CARRIER, located(yaw_rad=yaw, articulation_rad=bend, roll_rad=roll, pitch_rad=pitch)).rear()
     ahead = np.array((math.cos(bend), math.sin(bend), 0.0))
     drop = np.array((0.0, 0.0, -(CARRIER.arm_drop_low_m + CARRIER.arm_transport_m)))

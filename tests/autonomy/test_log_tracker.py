@@ -1,4 +1,6 @@
-"""Logs over time: identities, honest uncertainty, what motion tells and what standing still does not."""
+"""Logs over time: identities, honest uncertainty, what motion tells, and which log is one that was displaced."""
+
+from __future__ import annotations
 
 import math
 from dataclasses import replace
@@ -8,16 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.perception.camera.frame import Pose
+from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.fitting.cylinder import Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
 from autonomy.perception.fitting.measure import fragment_groups, joined_cylinder, same_log
 from autonomy.perception.log_list import END, START, LogEstimate
 from autonomy.perception.tracking.log_filter import CameraErrors
-from autonomy.perception.tracking.log_tracker import LOST_MISSES, LogTracker
-from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix
+from autonomy.perception.tracking.log_tracker import LOST_MISSES, LogTracker, is_displaced
+from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics, rpy_matrix
 
 QUIET = CameraErrors(scale=1e-5, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
+TRUTH = (5.0, 0.0, 0.12)
 SIGMA = np.array([0.01, 0.03, 0.01, 0.02, 0.03, 0.03, 0.005])
 
 
@@ -41,6 +44,14 @@ def fit_of(pose: Pose, center, yaw: float = 1.5, length: float = 2.0, scale: flo
     return CylinderFit(body, np.diag(SIGMA**2), (True, True), 1.0, 0.5, np.full(7, 1e-4))
 
 
+def tracked(pictures: int = 3) -> tuple[LogTracker, Pose]:
+    """A tracker that has seen one log in so many pictures, and where from."""
+    tracks, pose = LogTracker(QUIET), pose_at()
+    for k in range(pictures):
+        tracks.step([fit_of(pose, TRUTH)], pose, k)
+    return tracks, pose
+
+
 def length_sigma_m(estimate: LogEstimate) -> float:
     c = estimate.covariance
     return math.sqrt(c[START, START] + c[END, END] - 2.0 * c[START, END])
@@ -59,7 +70,7 @@ def test_a_log_is_confirmed_by_its_second_picture_and_keeps_its_number() -> None
 
 def test_a_fit_with_a_reversed_axis_is_of_the_same_log() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
-    fit = fit_of(pose, (5.0, 0.0, 0.12))
+    fit = fit_of(pose, TRUTH)
     turned = replace(fit, body=replace(fit.body, axis=-fit.body.axis), ends_seen=(False, True))
     fit = replace(fit, ends_seen=(True, False))
     for k, one in enumerate((fit, turned, fit, turned)):
@@ -104,7 +115,7 @@ def test_a_scale_error_remains_while_the_camera_stands_and_shrinks_when_it_drive
 def test_similar_pictures_do_not_reduce_their_common_errors() -> None:
     shared = np.array([0.01, 0.02, 0.01, 0.02, 0.05, 0.05, 0.004])
     tracks, pose = LogTracker(QUIET), pose_at()
-    fit = replace(fit_of(pose, (5.0, 0.0, 0.12)), systematic=shared, covariance=np.diag(SIGMA**2 + shared**2))
+    fit = replace(fit_of(pose, TRUTH), systematic=shared, covariance=np.diag(SIGMA**2 + shared**2))
     for k in range(200):
         found = tracks.step([fit], pose, k)
     assert length_sigma_m(found[0].estimate) > 0.06
@@ -123,45 +134,37 @@ def test_many_pictures_from_one_place_do_not_outweigh_few_from_others() -> None:
 
 
 def test_an_outlier_changes_nothing_but_a_wrong_start_is_corrected() -> None:
-    pose, truth = pose_at(), (5.0, 0.0, 0.12)
-    tracks = LogTracker(QUIET)
-    for k in range(6):
-        tracks.step([fit_of(pose, truth)], pose, k)
-    found = tracks.step([fit_of(pose, truth, length=3.5)], pose, 6)
+    tracks, pose = tracked(6)
+    found = tracks.step([fit_of(pose, TRUTH, length=3.5)], pose, 6)
     assert found[0].estimate.length_m == pytest.approx(2.0, abs=1e-3) and len(found) == 1
     tracks = LogTracker(QUIET)
     for k in range(2):
-        tracks.step([fit_of(pose, truth, length=3.5)], pose, k)
+        tracks.step([fit_of(pose, TRUTH, length=3.5)], pose, k)
     for k in range(2, 9):
-        found = tracks.step([fit_of(pose, truth)], pose, k)
+        found = tracks.step([fit_of(pose, TRUTH)], pose, k)
     assert [t.id for t in found] == [1] and found[0].estimate.length_m == pytest.approx(2.0, abs=0.01)
 
 
 def test_a_log_with_a_wrong_first_fit_is_confirmed_nevertheless() -> None:
-    pose, truth = pose_at(), (5.0, 0.0, 0.12)
-    tracks = LogTracker(QUIET)
-    tracks.step([fit_of(pose, truth, length=3.5)], pose, 0)
-    assert tracks.step([fit_of(pose, truth)], pose, 1) == (), "two pictures that do not agree tell of no log"
-    found = tracks.step([fit_of(pose, truth)], pose, 2)
+    tracks, pose = LogTracker(QUIET), pose_at()
+    tracks.step([fit_of(pose, TRUTH, length=3.5)], pose, 0)
+    assert tracks.step([fit_of(pose, TRUTH)], pose, 1) == (), "two pictures that do not agree tell of no log"
+    found = tracks.step([fit_of(pose, TRUTH)], pose, 2)
     assert [t.id for t in found] == [1] and found[0].estimate.length_m == pytest.approx(2.0, abs=0.01)
 
 
 def test_a_log_that_is_gone_is_deleted_and_a_new_one_gets_a_new_number() -> None:
-    tracks, pose = LogTracker(QUIET), pose_at()
-    for k in range(3):
-        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    tracks, pose = tracked()
     for k in range(LOST_MISSES - 1):
         assert len(tracks.step([], pose, 3 + k)) == 1
     assert tracks.step([], pose, 20) == ()
     for k in range(2):
-        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, 30 + k)
+        found = tracks.step([fit_of(pose, TRUTH)], pose, 30 + k)
     assert [t.id for t in found] == [2]
 
 
 def test_a_displaced_log_keeps_its_number() -> None:
-    tracks, pose = LogTracker(QUIET), pose_at()
-    for k in range(3):
-        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    tracks, pose = tracked()
     for k, up in enumerate((0.5, 0.9, 1.3)):
         found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12 + up))], pose, 3 + k, displaced=lambda log, fit: True)
         assert [t.id for t in found] == [1]
@@ -170,19 +173,15 @@ def test_a_displaced_log_keeps_its_number() -> None:
 
 def test_two_numbers_for_one_log_merge_into_the_older_one() -> None:
     """A wrong fit took a log's number, a new number began where it is, and then the picture is clear again."""
-    tracks, pose = LogTracker(QUIET), pose_at()
-    for k in range(3):
-        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
-    tracks.step([fit_of(pose, (5.0, 0.0, 0.12), length=2.1), fit_of(pose, (5.0, 0.0, 0.2))], pose, 3)
+    tracks, pose = tracked()
+    tracks.step([fit_of(pose, TRUTH, length=2.1), fit_of(pose, (5.0, 0.0, 0.2))], pose, 3)
     for k in range(2):
         found = tracks.step([fit_of(pose, (5.0, 0.0, 0.2))], pose, 4 + k)
     assert [t.id for t in found] == [1] and found[0].estimate.center_m[2] == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_fragment_of_a_log_does_not_delete_the_whole_log() -> None:
-    tracks, pose = LogTracker(QUIET), pose_at()
-    for k in range(3):
-        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    tracks, pose = tracked()
     pieces = [fit_of(pose, (5.0, y, 0.12), length=0.7) for y in (0.3, -0.3)]
     for k in range(3):
         found = tracks.step(pieces, pose, 3 + k)
@@ -202,7 +201,7 @@ def test_a_fragment_of_a_log_does_not_delete_the_whole_log() -> None:
 def test_a_fragment_beside_the_whole_log_is_not_reported(center, length: float, count: int) -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
-        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12)), fit_of(pose, center, length=length)], pose, k)
+        found = tracks.step([fit_of(pose, TRUTH), fit_of(pose, center, length=length)], pose, k)
     assert [t.id for t in found] == [1, 2][:count]
 
 
@@ -242,3 +241,68 @@ def test_fragments_that_miss_the_ends_facing_each_other_are_one_log() -> None:
 def test_other_fits_are_not_merged(other: CylinderFit) -> None:
     a = fragment(-1.0, -0.2, (True, False))
     assert not same_log(a, other) and fragment_groups({0: a, 1: other}) == [[0], [1]]
+
+
+# -- a log that is seen elsewhere, and no longer where it was
+HEIGHT_M = 4.0
+LENGTH_M, RADIUS_M = 2.0, 0.1
+PIN = Intrinsics(320, 240, 220.0, 220.0, 159.5, 119.5)
+DOWN = Pose(np.array([0.0, 0.0, HEIGHT_M]), np.diag([1.0, -1.0, -1.0]))
+"""A camera that looks straight down on a level ground."""
+
+Place = tuple[float, float]
+"""Across its axis, and up, of a log along x."""
+
+
+def picture(*logs: Place, tongs: slice | None = None, length_m: float = LENGTH_M, known: bool = True) -> RgbdFrame:
+    """Depth of logs over the ground, and of tongs close to the camera in some of the picture's columns."""
+    v, u = np.mgrid[: PIN.height_px, : PIN.width_px]
+    depth = np.full(u.shape, HEIGHT_M)
+    for across, up in logs:
+        z = HEIGHT_M - up
+        off = -(v - PIN.cy_px) / PIN.fy_px * z - across
+        inside = (np.abs(off) < RADIUS_M) & (np.abs((u - PIN.cx_px) / PIN.fx_px * z) < 0.5 * length_m)
+        surface = z - np.sqrt(np.maximum(RADIUS_M**2 - off**2, 0.0))
+        depth = np.where(inside, np.minimum(depth, surface), depth)
+    if tongs is not None:
+        depth[:, tongs] = 2.0
+    rgb = np.full((*depth.shape, 3), 90, np.uint8)
+    depth = depth if known else np.full_like(depth, np.nan)
+    return RgbdFrame("stick", 1, rgb, depth.astype(np.float32), PIN)
+
+
+def log_at(place: Place, x_m: float = 0.0) -> LogEstimate:
+    return LogEstimate(np.array([x_m, *place]), np.array([1.0, 0.0, 0.0]), LENGTH_M, 2.0 * RADIUS_M, np.eye(7) * 1e-4)
+
+
+def fit_at(place: Place, length_m: float = LENGTH_M, radius_m: float = RADIUS_M, x_m: float = 0.0) -> CylinderFit:
+    middle, half = DOWN.to_optical(np.array([x_m, *place])), length_m / 2
+    body = Cylinder(middle, np.array([1.0, 0.0, 0.0]), -half, half, radius_m)
+    return CylinderFit(body, np.eye(7) * 1e-4, (True, True), 1.0, 0.5, np.zeros(7))
+
+
+LAY = (0.0, RADIUS_M)
+
+
+NOW, ASIDE = (0.0, 0.6), (0.6, RADIUS_M)
+HIDDEN = slice(0, PIN.width_px)
+SEEN = {
+    "lifted": (picture(NOW), log_at(LAY), fit_at(NOW), True),
+    "carried": (picture((0.3, 0.5)), log_at(LAY), fit_at((0.3, 0.5)), True),
+    "rolled away": (picture(ASIDE), log_at(LAY), fit_at(ASIDE), True),
+    "a grapple over its middle": (picture(NOW, tongs=slice(140, 180)), log_at(LAY), fit_at(NOW), True),
+    "half of it in the picture": (picture(), log_at(LAY, x_m=2.4), fit_at((0.6, 0.6), x_m=1.6), True),
+    "a similar one beside it": (picture(LAY, (0.5, RADIUS_M)), log_at(LAY), fit_at((0.5, RADIUS_M)), False),
+    "hidden": (picture((0.5, 0.6), tongs=HIDDEN), log_at(LAY), fit_at((0.5, 0.6)), False),
+    "a shorter log": (picture(), log_at(LAY), fit_at(NOW, length_m=1.2), False),
+    "a thicker log": (picture(), log_at(LAY), fit_at(NOW, radius_m=0.2), False),
+    "far away": (picture(), log_at(LAY), fit_at((0.0, 1.8)), False),
+    "half visible in its place": (picture(LAY, length_m=0.4 * LENGTH_M), log_at(LAY), fit_at(ASIDE), False),
+    "outside the picture": (picture((3.0, 0.6)), log_at((4.0, RADIUS_M)), fit_at((3.0, 0.6)), False),
+    "without depth": (picture(NOW, known=False), log_at(LAY), fit_at(NOW), False),
+}
+
+
+@pytest.mark.parametrize(("frame", "log", "fit", "displaced"), SEEN.values(), ids=SEEN)
+def test_a_log_seen_elsewhere_and_not_in_its_place_is_displaced(frame, log, fit, displaced) -> None:
+    assert is_displaced(frame, DOWN, log, fit) is displaced

@@ -1,4 +1,4 @@
-"""Mission files that are too large, cut off, of another kind, or have invalid values."""
+"""Mission files that are too large, cut off, of another kind, or have invalid values or wrong coordinates."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 
 from autonomy.missions import gpx_kml, xml_tree
+from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import MissionError, Point
+from autonomy.missions.validation import SWAPPED_HINT
 from tests.autonomy.mission_checks import assert_route, codes, good, place, refused
 from tests.autonomy.mission_texts import (
+    FENCE,
     ROUTE,
     at,
     collection,
@@ -32,9 +35,116 @@ from tests.codes import coded, numbers_in
 NEWLINE = b"\n"
 
 
-# -- numbers, counts, sizes -------------------------------------------------------------------------------------
+SWAPPED_ROUTE = [Point(p.longitude_deg, p.latitude_deg) for p in ROUTE]
+NOTCH = [at(-30, -25), at(30, -25), at(30, 25), at(5, 25), at(0, -20), at(-5, 25), at(-30, 25)]
+CIRCLE = [Point(63.66 + 1e-4 * math.sin(0.00314 * i), 19.9 + 1e-4 * math.cos(0.00314 * i)) for i in range(2001)]
 
 
+def fenced(*corners: Point) -> bytes:
+    return collection(line(), polygon(list(corners)))
+
+
+def log(**properties: float) -> bytes:
+    return collection(line(), feature("Point", lon_lat([at(0, -9)])[0], role="log", **properties))
+
+
+def headed(**options: object) -> bytes:
+    return collection(line(), timberhand={"schema": 1, "options": options})
+
+
+REFUSED = {
+    # numbers
+    "too large for a float": (b'{"type": "Point", "coordinates": [1e999, 2]}', "json-number"),
+    "an integer of 31 digits": (b'{"type": "Point", "coordinates": [%d, 2]}' % 10**30, "projected-coordinates"),
+    "401 digits in a GPX": (gpx(f'<rte><rtept lat="{10**400}" lon="2"/></rte>'), "non-finite-coordinate"),
+    "a number as text": (b'{"type": "Point", "coordinates": ["%d", 2]}' % 10**400, "geojson-position"),
+    "infinity in a KML": (
+        kml("<Placemark><LineString><coordinates>1,2 inf,3</coordinates></LineString></Placemark>"),
+        "non-finite-coordinate",
+    ),
+    "a decimal comma": (gpx('<rte><rtept lat="63,65" lon="19.8"/></rte>'), "decimal-comma"),
+    "a word": (gpx('<rte><rtept lat="north" lon="19.8"/></rte>'), "number"),
+    "no longitude": (gpx('<rte><rtept lat="63.1"/></rte>'), "gpx.missing-coordinate"),
+    # counts
+    "waypoints": (
+        collection(feature("LineString", [[19.0 + 1e-6 * i, 63.0] for i in range(2001)])),
+        "too-many-waypoints",
+    ),
+    "positions": (b'{"type":"LineString","coordinates":[' + b"1," * 200_000 + b"1]}", "too-many-positions"),
+    "corners": (fenced(*CIRCLE), "too-many-corners"),
+    "depth of JSON": (b'{"a":' + b"[" * 100_000, "nesting"),
+    "depth of XML": (b"<kml>" + b"<Folder>" * 100_000, "nesting"),
+    # files of other kinds
+    "nothing": (b"", "empty-file"),
+    "blanks": (b"\xef\xbb\xbf \n", "empty-file"),
+    "cut off XML": (gpx(f"<rte>{gpx_points('rtept')}</rte>")[:-8], "not-xml"),
+    "a zip file's head": (b"PK\x03\x04rest", "archive-damaged"),
+    "a web page": (b"<html><body/></html>", "unknown-xml"),
+    "an old plan": (b"QGC WPL 110\n", "unknown-format"),
+    "no features": (collection(), "no-waypoints"),
+    "an empty line": (collection(feature("LineString", [])), "no-waypoints"),
+    "an empty route": (gpx("<rte/>"), "no-waypoints"),
+    "a plan without items": (b'{"fileType": "Plan"}', "plan.items"),
+    # GeoJSON
+    "a misspelt role": (collection(line(role="raod")), "unknown-role"),
+    "an area as log": (collection(polygon(role="log")), "role-shape"),
+    "several lines": (collection(feature("MultiLineString", [])), "geojson-geometry"),
+    "another shape": (collection(feature("Circle", [])), "geojson-geometry"),
+    "a text as position": (collection(feature("LineString", [[1, 2], "x"])), "geojson-position"),
+    "a truth as coordinate": (collection(feature("LineString", [[1, 2], [1, True]])), "geojson-position"),
+    "a number as line": (collection(feature("LineString", 7)), "geojson-list"),
+    "a collection of nothing": (b'{"type": "FeatureCollection"}', "geojson-list"),
+    "a number as feature": (b'{"type": "FeatureCollection", "features": [3]}', "geojson-feature"),
+    "a length in words": (log(length_m="x"), "property-type"),
+    "a list as key": (log(key=[1]), "property-type"),
+    "a number as header": (collection(line(), timberhand=3), "header"),
+    "another schema": (collection(line(), timberhand={"schema": 2}), "schema"),
+    "laps in words": (headed(laps="two"), "option"),
+    "a misspelt option": (headed(lap=2), "option"),
+    "no laps": (headed(laps=0), "option-range"),
+    "too fast": (headed(speed_m_s=30), "option-range"),
+    "two routes": (collection(line(), line()), "second-route"),
+    "a waypoint beside": (
+        collection(line(), feature("Point", [19.9, 63.66], role="waypoint")),
+        "waypoint-beside-route",
+    ),
+    # logs
+    "too long": (log(length_m=200.0), "log-size"),
+    "too thick": (log(length_m=3.0, diameter_m=250.0), "log-size"),
+    "thicker than long": (log(length_m=0.5, diameter_m=0.6), "log-shape"),
+    "beyond north": (log(bearing_deg=400.0), "bearing-range"),
+    "before north": (log(bearing_deg=-1.0), "bearing-range"),
+    "less than certain": (log(sigma_m=-1.0), "sigma-range"),
+    # coordinates
+    "beyond the pole": (
+        collection(line([Point(144.0, -37.0), Point(144.001, -37.0)])),
+        "swapped-axes swapped-axes",
+    ),
+    "a swapped route": (collection(line(SWAPPED_ROUTE), polygon()), "swapped-axes swapped-axes swapped-axes"),
+    "metres of a projection": (
+        collection(feature("LineString", [[743000.0, 7065000.0], [743040.0, 7065000.0]])),
+        "projected-coordinates projected-coordinates",
+    ),
+    "far apart": (collection(line([at(0, 0), at(0, 21_000)])), "too-far-apart"),
+    "latitude": (collection(feature("Point", [100.0, 95.0])), "latitude-range"),
+    "longitude": (collection(feature("Point", [200.0, 45.0])), "longitude-range"),
+    # fences
+    "a leg through a notch": (collection(line([at(-20, 10), at(20, 10)]), polygon(NOTCH)), "leg-leaves-fence"),
+    "a bow": (fenced(FENCE[0], FENCE[2], FENCE[1], FENCE[3]), "fence-crosses-itself"),
+    "a spike": (fenced(*FENCE[:2], at(60, -25), FENCE[1], *FENCE[2:]), "fence-crosses-itself"),
+    "on one line": (fenced(at(0, 0), at(30, 0), at(10, 0)), "fence-crosses-itself"),
+    "half a square metre": (fenced(at(0, 0), at(1, 0), at(1, 1)), "fence-area"),
+    "two corners": (fenced(at(0, 0), at(1, 0)), "fence-corners"),
+    "a corner twice": (fenced(FENCE[0], FENCE[1], FENCE[1], FENCE[2]), "duplicate-corner"),
+}
+
+
+@pytest.mark.parametrize(("data", "found"), REFUSED.values(), ids=REFUSED)
+def test_an_invalid_file_is_refused_by_its_codes(data: bytes, found: str) -> None:
+    assert codes(data) == found.split()
+
+
+# -- numbers, counts, sizes
 @pytest.mark.parametrize("word", ["NaN", "Infinity", "-Infinity"])
 def test_nan_and_infinity_in_json(word: str) -> None:
     text = collection(line()).decode().replace(str(lon_lat(ROUTE)[1][1]), word)
@@ -45,19 +155,6 @@ def test_nan_and_infinity_in_json(word: str) -> None:
 def test_nan_and_infinity_in_xml() -> None:
     nan = gpx(f'<rte>{gpx_points("rtept")}<rtept lat="NaN" lon="19.8"/></rte>')
     assert codes(nan) == ["non-finite-coordinate"] and place(nan) == "m:6"
-    assert codes(kml("<Placemark><LineString><coordinates>1,2 inf,3</coordinates></LineString></Placemark>")) == [
-        "non-finite-coordinate"
-    ]
-    assert codes(gpx('<rte><rtept lat="63,65" lon="19.8"/></rte>')) == ["decimal-comma"]
-    assert codes(gpx('<rte><rtept lat="north" lon="19.8"/></rte>')) == ["number"]
-    assert codes(gpx('<rte><rtept lat="63.1"/></rte>')) == ["gpx.missing-coordinate"]
-
-
-def test_huge_numbers() -> None:
-    assert codes(b'{"type": "Point", "coordinates": [1e999, 2]}') == ["json-number"]
-    assert codes(b'{"type": "Point", "coordinates": [%d, 2]}' % 10**30) == ["projected-coordinates"]
-    assert codes(gpx(f'<rte><rtept lat="{10**400}" lon="2"/></rte>')) == ["non-finite-coordinate"]
-    assert codes(b'{"type": "Point", "coordinates": ["%d", 2]}' % 10**400) == ["geojson-position"]  # a text
 
 
 @pytest.mark.parametrize(
@@ -96,16 +193,6 @@ def test_a_million_points_are_refused_in_bounded_memory(form: str, monkeypatch: 
     assert most < 50e6  # the whole of it would be hundreds
 
 
-def test_too_many_of_everything() -> None:
-    grid = [[19.0 + 1e-6 * i, 63.0] for i in range(2001)]
-    assert codes(collection(feature("LineString", grid))) == ["too-many-waypoints"]
-    numbers = b'{"type":"LineString","coordinates":[' + b"1," * 200_000 + b"1]}"
-    assert codes(numbers) == ["too-many-positions"]
-    angles = [math.tau * i / 2001 for i in range(2001)]
-    circle = [Point(63.66 + 1e-4 * math.sin(a), 19.9 + 1e-4 * math.cos(a)) for a in angles]
-    assert codes(collection(line(), polygon(circle))) == ["too-many-corners"]
-
-
 def test_huge_files(tmp_path: Path) -> None:
     assert codes(b'{"a": "' + b"x" * (17 << 20) + b'"}') == ["too-large"]
     with (tmp_path / "huge.gpx").open("wb") as file:
@@ -114,14 +201,7 @@ def test_huge_files(tmp_path: Path) -> None:
         load_mission(tmp_path / "huge.gpx")
 
 
-def test_deep_nesting() -> None:
-    assert codes(b'{"a":' + b"[" * 100_000) == ["nesting"]
-    assert codes(b"<kml>" + b"<Folder>" * 100_000) == ["nesting"]
-
-
-# -- text -------------------------------------------------------------------------------------------------------
-
-
+# -- text
 def test_byte_order_mark_and_crlf() -> None:
     for data in (collection(line()), gpx(f"<rte>{gpx_points('rtept')}</rte>")):
         assert_route(good(b"\xef\xbb\xbf" + data.replace(b"\n", b"\r\n")).mission)
@@ -209,64 +289,16 @@ def test_text_in_pieces_is_whole() -> None:
     )
 
 
-def test_files_cut_off_and_files_of_other_kinds(tmp_path: Path) -> None:
+def test_files_cut_off_and_files_that_are_none(tmp_path: Path) -> None:
     data = collection(line())
     assert codes(data[:-20]) == ["not-json"] and place(data[:-20]) == f"m:{1 + data[:-20].count(NEWLINE)}"
-    assert codes(gpx(f"<rte>{gpx_points('rtept')}</rte>")[:-8]) == ["not-xml"]
-    assert codes(b"PK\x03\x04rest") == ["archive-damaged"]
-    assert codes(b"<html><body/></html>") == ["unknown-xml"]
-    assert codes(b"QGC WPL 110\n") == ["unknown-format"]
     with pytest.raises(MissionError, check=coded("mission.unreadable")):
         load_mission(tmp_path / "none.gpx")
     with pytest.raises(MissionError, check=coded("mission.unreadable")):
         load_mission(tmp_path)
 
 
-# -- invalid parts of GeoJSON ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("data", "code"),
-    [
-        (collection(line(role="raod")), "unknown-role"),
-        (collection(polygon(role="log")), "role-shape"),
-        (collection(feature("MultiLineString", [])), "geojson-geometry"),
-        (collection(feature("Circle", [])), "geojson-geometry"),
-        (collection(feature("LineString", [[1, 2], "x"])), "geojson-position"),
-        (collection(feature("LineString", [[1, 2], [1, True]])), "geojson-position"),
-        (collection(feature("LineString", 7)), "geojson-list"),
-        (b'{"type": "FeatureCollection"}', "geojson-list"),
-        (b'{"type": "FeatureCollection", "features": [3]}', "geojson-feature"),
-        (collection(line(), feature("Point", [1, 2], role="log", length_m="x")), "property-type"),
-        (collection(line(), feature("Point", [1, 2], role="log", key=[1])), "property-type"),
-        (collection(line(), timberhand=3), "header"),
-        (collection(line(), timberhand={"schema": 2}), "schema"),
-        (collection(line(), timberhand={"schema": 1, "options": {"laps": "two"}}), "option"),
-        (collection(line(), timberhand={"schema": 1, "options": {"lap": 2}}), "option"),
-        (collection(line(), timberhand={"schema": 1, "options": {"laps": 0}}), "option-range"),
-        (collection(line(), timberhand={"schema": 1, "options": {"speed_m_s": 30}}), "option-range"),
-    ],
-)
-def test_invalid_parts_of_geojson(data: bytes, code: str) -> None:
-    assert codes(data) == [code]
-
-
-@pytest.mark.parametrize(
-    ("properties", "code"),
-    [
-        ({"length_m": 200.0}, "log-size"),
-        ({"length_m": 3.0, "diameter_m": 250.0}, "log-size"),
-        ({"length_m": 0.5, "diameter_m": 0.6}, "log-shape"),
-        ({"bearing_deg": 400.0}, "bearing-range"),
-        ({"bearing_deg": -1.0}, "bearing-range"),
-        ({"sigma_m": -1.0}, "sigma-range"),
-    ],
-)
-def test_invalid_logs(properties: dict[str, float], code: str) -> None:
-    log = feature("Point", lon_lat([at(0, -9)])[0], role="log", **properties)
-    assert codes(collection(line(), log)) == [code]
-
-
+# -- invalid parts of GeoJSON
 def test_sorting_needs_a_landing_for_every_assortment() -> None:
     log = feature("Point", lon_lat([at(0, -9)])[0], role="log", assortment="veneer")
     landing = feature("Point", lon_lat([at(0, 9)])[0], role="landing", assortments=["pulpwood"])
@@ -309,3 +341,94 @@ def test_many_problems_are_counted() -> None:
     away = [at(100 + 3 * i, 0) for i in range(40)]
     error = refused(collection(line(away), polygon()))
     assert len(error.problems) == 10 and 30 in numbers_in(str(error).splitlines()[-1])
+
+
+# -- swapped axes
+def test_one_swapped_waypoint() -> None:
+    (problem,) = refused(collection(line([ROUTE[0], SWAPPED_ROUTE[1], ROUTE[2]]))).problems
+    assert problem.code == "mission.swapped-axes" and 2 in numbers_in(problem.sentence)
+
+
+def test_swapped_near_the_diagonal_shows_at_the_fence() -> None:
+    """Where latitude and longitude are nearly equal, swapping moves a place by metres only."""
+    near = LocalFrame(45.001, 45.0)
+    corners = [near.point(*c) for c in ((-40, -40), (40, -40), (40, 40), (-40, 40))]
+    way = [near.point(-10, 0), near.point(10, 0)]
+    swapped = [Point(p.longitude_deg, p.latitude_deg) for p in way]
+    error = refused(collection(line(swapped), polygon(corners)))
+    assert error.code == "mission.waypoint-outside-fence" and SWAPPED_HINT in str(error)
+    assert good(collection(line(way), polygon(corners)))
+
+
+def test_a_mission_swapped_as_a_whole_shows_at_the_machines_site() -> None:
+    data = collection(line(SWAPPED_ROUTE), polygon([Point(p.longitude_deg, p.latitude_deg) for p in FENCE]))
+    assert codes(data, site=(63.657853, 19.895562)) == ["swapped-axes"]
+    good(data)  # the file alone is consistent
+
+
+# -- the fence
+def test_waypoint_outside_of_the_fence() -> None:
+    (problem,) = refused(collection(line([*ROUTE, at(36, 12)]), polygon())).problems
+    assert problem.code == "mission.waypoint-outside-fence"
+    assert {4, 6.0} <= set(numbers_in(problem.sentence))
+
+
+def test_leg_through_a_keep_out() -> None:
+    keep_out = polygon([at(-2, -14), at(2, -14), at(2, -10), at(-2, -10)], role="keep-out")
+    error = refused(collection(line(), polygon(), keep_out))
+    assert error.code == "mission.leg-leaves-fence" and 2.0 in numbers_in(str(error))
+
+
+def test_the_closing_leg_of_laps_counts() -> None:
+    keep_out = polygon([at(-2, -2), at(2, -2), at(2, 2), at(-2, 2)], role="keep-out")
+    laps = {"timberhand": {"schema": 1, "options": {"laps": 2}}}
+    error = refused(collection(line(), polygon(), keep_out, **laps))
+    assert error.code == "mission.leg-leaves-fence" and {3, 1} <= set(numbers_in(str(error)))
+    good(collection(line(), polygon(), keep_out))
+
+
+def test_landing_outside_of_the_fence() -> None:
+    landing = feature("Point", lon_lat([at(0, 31)])[0], role="landing")
+    error = refused(collection(line(), polygon(), landing))
+    assert error.code == "mission.landing-outside-fence" and 6.0 in numbers_in(str(error))
+
+
+# -- other systems
+def test_wrong_datum() -> None:
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3006"}}
+    (problem,) = refused(collection(line(), crs=crs)).problems
+    assert (problem.code, problem.place) == ("mission.datum", "m:3")
+    for name in ("urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326"):
+        good(collection(line(), crs={"type": "name", "properties": {"name": name}}))
+
+
+@pytest.mark.parametrize("longitude", [180.0, -180.0, 179.9999, -179.9999])
+def test_antimeridian(longitude: float) -> None:
+    """A site on the 180th meridian is a site like any other."""
+    site = LocalFrame(65.0, longitude)
+    ring = [site.point(*c) for c in ((-40, -40), (40, -40), (40, 40), (-40, 40))]
+    way = [site.point(-20, 0), site.point(20, 0), site.point(20, 30)]
+    draft = good(collection(line(way), polygon(ring)))
+    assert len({math.copysign(1, p.longitude_deg) for p in draft.mission.waypoints}) == 2  # it lies on both sides
+    assert codes(collection(line([*way, site.point(45, 0)]), polygon(ring)))[0] == "waypoint-outside-fence"
+
+
+@pytest.mark.parametrize("latitude", [90.0, -90.0, 89.9999])
+def test_poles(latitude: float) -> None:
+    site = LocalFrame(latitude, 0.0)
+    ring = [site.point(*c) for c in ((-40, -40), (40, -40), (40, 40), (-40, 40))]
+    way = [site.point(-20, -5), site.point(20, -5), site.point(20, 30)]
+    good(collection(line(way), polygon(ring)))
+    assert codes(collection(line([*way, site.point(45, 0)]), polygon(ring)))[0] == "waypoint-outside-fence"
+
+
+# -- waypoints
+def test_duplicated_waypoints() -> None:
+    (problem,) = refused(collection(line([ROUTE[0], ROUTE[1], ROUTE[1], ROUTE[2]]))).problems
+    assert problem.code == "mission.duplicate-waypoint" and 3 in numbers_in(problem.sentence)
+    good(collection(line([*ROUTE, ROUTE[0]])))  # a closed lap has none
+
+
+def test_a_point_beside_a_route_is_a_note() -> None:
+    draft = good(collection(line(), feature("Point", lon_lat(ROUTE)[0])))
+    assert [numbers_in(note) for note in draft.notes] == [[1]]

@@ -1,32 +1,40 @@
-"""The mission report: state, positions, and a size that fits a datagram."""
+"""The mission report: state, positions, and a size that fits a datagram; and the chosen grasp as it is shown."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import pi
 
 import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
+from autonomy.grasp.planner import Grasp
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, OURS, RULES, Event, State
 from autonomy.manager.world_model import MAX_ATTEMPTS
 from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
+from autonomy.motion.arm_kinematics import Arm
+from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import ABORTED, MISSION_ENDED, NO_PENDING_STEP, ONLY_ABORT, ForwardingJob, SingleLogJob
-from autonomy.process.mission_publisher import CRANE_PHASES
+from autonomy.process.mission_publisher import CRANE_PHASES, chosen_grasp
+from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.mission import (
     MAX_CORNERS,
     MAX_LOGS,
     MAX_ROUTE_POINTS,
     MissionAction,
+    decode_grasp,
     decode_mission,
+    encode_grasp,
     encode_mission,
 )
-from machine.loading.profile_file import profile_hash
+from machine.geometry.grapple import rotator_for_yaw
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.profile import Profile
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.forwarding_jobs import begin, command, run
-from tests.autonomy.manager_missions import LOGS, PLANE, PROFILE
+from tests.autonomy.manager_missions import LOGS, PLANE, PROFILE, begin_job, command, events_until
 from tests.autonomy.mapped_logs import lying
 
 
@@ -36,8 +44,8 @@ def near(place, x_m, y_m, within_m=0.15) -> bool:
 
 @pytest.mark.long
 def test_the_report_has_the_machine_position_and_the_mapped_logs() -> None:
-    forwarder, job, manager = begin(LOGS[0])
-    run(forwarder, job, lambda j: manager.state is State.APPROACH)
+    forwarder, job, manager = begin_job(LOGS[0])
+    events_until(forwarder, job, lambda j: manager.state is State.APPROACH)
     told = job.report(forwarder.crane.now_ns)
     assert (told.name, told.state, told.words) == ("test", "APPROACH", RULES[State.APPROACH].description)
     assert told.auto and not told.paused and not told.ended and told.crane == ""
@@ -56,9 +64,8 @@ def test_the_report_has_the_machine_position_and_the_mapped_logs() -> None:
 @pytest.mark.long
 def test_the_targets_are_the_logs_of_the_grasp() -> None:
     """It may begin with another log than the one that the machine stopped for."""
-    forwarder, job, manager = begin(LOGS[0], (9, LOGS[0][1], -LOGS[0][2], 0.0))
-    run(forwarder, job, lambda j: manager.activity is not None and manager.activity.grasp is not None)
-    assert manager.activity is not None and manager.activity.grasp is not None
+    forwarder, job, manager = begin_job(LOGS[0], (9, LOGS[0][1], -LOGS[0][2], 0.0))
+    events_until(forwarder, job, lambda j: manager.activity is not None and manager.activity.grasp is not None)
     (taken,) = manager.activity.grasp.logs
     told = job.report(forwarder.crane.now_ns)
     (aimed,) = (log for log in told.logs if log.number in told.targets)
@@ -68,8 +75,8 @@ def test_the_targets_are_the_logs_of_the_grasp() -> None:
 
 @pytest.mark.long
 def test_commands_are_executed_and_reported() -> None:
-    forwarder, job, manager = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, manager = begin_job()
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
 
     def give(number: int, action: MissionAction) -> str:
         refusal = job.execute(command(number, action))
@@ -78,18 +85,20 @@ def test_commands_are_executed_and_reported() -> None:
         return refusal
 
     assert give(1, MissionAction.PAUSE) == "" and not job.report(0).auto
-    run(forwarder, job, lambda j: forwarder.speed_m_s == 0.0)
+    driven_m = forwarder.driven_m
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s == 0.0)
+    assert forwarder.driven_m - driven_m < 1.0
     assert job.report(forwarder.crane.now_ns).paused
     assert give(2, MissionAction.NEXT_STEP) == NO_PENDING_STEP
     assert give(3, MissionAction.SINGLE_STEP) == "" and job.report(0).single_step
     assert give(4, MissionAction.AUTO) == "" and job.report(0).auto
-    run(forwarder, job, lambda j: manager.pending_event is not None)
+    events_until(forwarder, job, lambda j: manager.pending_event is not None)
     assert (
         job.report(forwarder.crane.now_ns).waits_for == EVENT_DESCRIPTIONS[Event.ROUTE_END]
         and manager.state is State.SEARCH
     )
     assert give(5, MissionAction.NEXT_STEP) == ""
-    run(forwarder, job, lambda j: manager.state is State.DONE)
+    events_until(forwarder, job, lambda j: manager.state is State.DONE)
     assert give(6, MissionAction.AUTO) == MISSION_ENDED and job.report(0).ended
 
 
@@ -106,21 +115,22 @@ def test_there_is_a_report_before_the_machine_is_located() -> None:
 
 
 def test_run_through_needs_no_more_steps() -> None:
-    forwarder, job, manager = begin()
+    forwarder, job, manager = begin_job()
     job.execute(command(1, MissionAction.SINGLE_STEP))
-    run(forwarder, job, lambda j: manager.pending_event is Event.AUTO)
+    events_until(forwarder, job, lambda j: manager.pending_event is Event.AUTO)
     job.execute(command(2, MissionAction.RUN_THROUGH))
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     assert not job.report(0).single_step
 
 
 def test_a_commanded_abort_is_reported_as_the_operators() -> None:
-    forwarder, job, _ = begin()
-    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
-    assert job.execute(command(1, MissionAction.ABORT)) == ""
-    run(forwarder, job, lambda j: j.idle)
+    forwarder, job, manager = begin_job()
+    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    assert job.execute(command(1, MissionAction.ABORT)) == "" and not job.idle and not job.done
+    events_until(forwarder, job, lambda j: j.idle)
     told = job.report(forwarder.crane.now_ns)
-    assert told.ended and told.failure == job.failure == ABORTED and forwarder.speed_m_s < 0.05
+    assert told.ended and told.failure == job.failure == ABORTED
+    assert manager.state is State.FAILED and forwarder.speed_m_s < 0.05
 
 
 def test_a_single_log_job_only_accepts_abort() -> None:
@@ -130,7 +140,7 @@ def test_a_single_log_job_only_accepts_abort() -> None:
         def abort(self, reason: str) -> None:
             self.failure = reason
 
-    job = SingleLogJob(crane := Crane())  # type: ignore[arg-type]
+    job = SingleLogJob(crane := Crane())
     assert job.execute(command(1, MissionAction.PAUSE)) == ONLY_ABORT and not crane.failure
     assert job.execute(command(2, MissionAction.ABORT)) == "" and crane.failure == ABORTED
     assert job.report(0) is None
@@ -149,8 +159,7 @@ def test_the_longest_mission_fits_in_a_datagram() -> None:
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE)
     forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05))
     job = ForwardingJob(manager, mission)
-    for _ in range(20):
-        forwarder.step(job)  # type: ignore[arg-type]
+    forwarder.steps(job, 20)
     for k in range(500):
         far = lying(k, 100.0 - 0.2 * k, 3.0)
         manager.world.log_map.add_known(replace(far, misses=MAX_ATTEMPTS))
@@ -165,3 +174,45 @@ def test_the_longest_mission_fits_in_a_datagram() -> None:
         "the nearest logs are reported"
     )
     assert [g.log for g in told.given_up][-1] == 499 and told.given_up[0].reason.endswith("…")
+
+
+# -- the chosen grasp
+LOADER = load_profile("palms_471")
+LOG = LogObservation(3, (-1.0, 4.0, -0.3), (0.6, 0.8, 0.0), 3.0, 0.2)
+
+
+@dataclass
+class Crane:
+    phase: Phase
+    grasp: Grasp | None
+    profile: Profile = LOADER
+
+
+def crane(phase: Phase = Phase.DESCEND) -> Crane:
+    pose = Arm(LOADER).pose_above(-1.0, 4.0, 0.5, 1.2)
+    turned = pose._replace(rot_rad=rotator_for_yaw(LOADER, pose.slew_rad, 2.2))
+    return Crane(phase, Grasp(LOG, turned, -0.4, 0.0, (replace(LOG, id=8),), reason="two logs"))
+
+
+def test_the_grasp_is_shown_where_the_pin_will_be() -> None:
+    shown = chosen_grasp(crane())
+    assert shown.pin_m == pytest.approx((-1.0, 4.0, 0.5), abs=1e-3)
+    assert (shown.yaw_rad - 2.2 + pi / 2) % pi - pi / 2 == pytest.approx(0.0, abs=1e-3)
+    assert (shown.logs, shown.reason) == ((3, 8), "two logs")
+
+
+@pytest.mark.parametrize("phase", [Phase.LOOK, Phase.LIFT, Phase.CARRY, Phase.DONE, Phase.FAILED])
+def test_it_is_shown_only_until_the_jaws_have_closed(phase: Phase) -> None:
+    assert chosen_grasp(crane(phase)) is None
+    assert chosen_grasp(None) is None
+
+
+def test_the_datagram_is_whole_or_refused() -> None:
+    shown = chosen_grasp(crane())
+    data = encode_grasp(shown, 1, 2, 3, b"key")
+    assert decode_grasp(data, b"key") == (2, 3, shown)
+    for damaged in (data[:-1], data[:40] + b"x" + data[41:], encode_grasp(shown, 1, 2, 3)):
+        with pytest.raises(DatagramRefused):
+            decode_grasp(damaged, b"key")
+    with pytest.raises(DatagramRefused):
+        decode_mission(data, b"key")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from tests.autonomy.manager_missions import (
     PROFILE,
     again,
     at,
+    completed,
     ended,
     forwarder,
     listed_mission,
@@ -47,6 +48,27 @@ def begun(told: ForwardingMission, lie=LISTED_LOGS, table=OURS) -> tuple[Forward
     manager.auto()
     logs = [lying(i, x, y, outward_rad(y) if table is PAPER_B else 0.0) for i, (x, y) in enumerate(lie, 1)]
     return forwarder(logs, table), manager
+
+
+def resuming(told: ForwardingMission, left: RouteRemainder, table=OURS) -> ActivityManager:
+    """Another planner that only knows what of the route is left."""
+    progress = Checkpoint(mission="", tally=Tally(), left=left)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
+    manager.auto()
+    return manager
+
+
+def followed(machine: Forwarder, manager: ActivityManager, what: Callable[[], float]) -> list[float]:
+    """What was to be seen at each moment of a mission that is done."""
+    seen: list[float] = []
+
+    def over(manager: ActivityManager) -> bool:
+        seen.append(what())
+        return ended(manager)
+
+    machine.run(manager, over, 1800.0)
+    assert manager.state is State.DONE, manager.failure
+    return seen
 
 
 def loaded(count: int, state: State):
@@ -79,14 +101,7 @@ def test_a_resumed_mission_has_the_same_tally(landing, left_at, tmp_path: Path) 
     manager = again(machine, manager, told, tmp_path / "progress.json")
     assert manager.resumed and manager.tally.loaded == before
     manager.auto()
-    behind = []
-
-    def over(_: ActivityManager) -> bool:
-        behind.append(machine.x_m)
-        return ended(manager)
-
-    machine.run(manager, over, 900.0)
-    assert manager.state is State.DONE, manager.failure
+    behind = followed(machine, manager, lambda: machine.x_m)
     assert manager.tally.loaded == 2 and not manager.tally.given_up
     assert states(manager).count(State.APPROACH) == 2 - before, "loaded logs are not searched for again"
     assert states(manager)[:3] == [State.STOW, State.RAISE, State.SEARCH], "the crane was anywhere"
@@ -104,10 +119,8 @@ def test_a_load_on_its_way_still_reaches_its_landing(left_at, tmp_path: Path) ->
     told = listed_mission((58.0, 14.0))
     machine, manager = begun(told)
     machine.run(manager, left_at, 900.0)
-    manager = again(machine, manager, told, tmp_path / "progress.json")
-    manager.auto()
-    machine.run(manager, ended, 900.0)
-    assert manager.state is State.DONE, manager.failure
+    manager = again(machine, manager, told, tmp_path / "progress.json", auto=True)
+    completed(machine, manager, 900.0)
     assert manager.tally.loaded == 2 and machine.in_bunk == manager.tally.on_board == 0
     assert [len(load.logs) for load in manager.tally.loads] == [2]
     assert all(math.dist(log.center_m[:2], (58.0, 14.0)) < 1.6 for log in machine.field.values())
@@ -118,8 +131,7 @@ def test_a_paper_b_mission_is_resumed(tmp_path: Path) -> None:
     told = listed_mission()
     machine, manager = begun(told, table=PAPER_B)
     machine.run(manager, loaded(1, State.SEARCH))
-    manager = again(machine, manager, told, tmp_path / "progress.json", PAPER_B)
-    manager.auto()
+    manager = again(machine, manager, told, tmp_path / "progress.json", PAPER_B, auto=True)
     machine.run(manager, ended, 900.0)
     assert manager.state is State.DONE and machine.in_bunk == manager.tally.loaded == 2
 
@@ -133,21 +145,12 @@ def test_after_a_landing_the_machine_returns_to_where_it_left_the_route(left_at,
     machine.run(manager, at(State.HAUL))
     left_m = (machine.x_m, machine.y_m)
     machine.run(manager, lambda m: m.state is not State.HAUL and left_at(m), 900.0)
-    manager = again(machine, manager, told, tmp_path / "progress.json")
-    manager.auto()
+    manager = again(machine, manager, told, tmp_path / "progress.json", auto=True)
     if left_at is unloads:
         driven_m = machine.driven_m
         machine.run(manager, at(State.UNLOAD))
         assert machine.driven_m - driven_m < 1.0, "it stands beside the landing already"
-    nearest_m = []
-
-    def over(_: ActivityManager) -> bool:
-        nearest_m.append(math.dist((machine.x_m, machine.y_m), left_m))
-        return ended(manager)
-
-    machine.run(manager, over, 1800.0)
-    assert min(nearest_m) < 1.0
-    assert manager.state is State.DONE, manager.failure
+    assert min(followed(machine, manager, lambda: math.dist((machine.x_m, machine.y_m), left_m))) < 1.0
     assert manager.tally.unloaded == 2 and len(manager.tally.loads) == 2
 
 
@@ -159,8 +162,7 @@ def test_a_log_that_was_given_up_stays_given_up(tmp_path: Path) -> None:
     machine.run(manager, lambda m: bool(m.tally.given_up), 900.0)
     machine.run(manager, at(State.SEARCH))
     missed = manager.tally.missed
-    manager = again(machine, manager, told, tmp_path / "progress.json")
-    manager.auto()
+    manager = again(machine, manager, told, tmp_path / "progress.json", auto=True)
     machine.run(manager, ended, 900.0)
     assert manager.state is State.DONE and list(manager.tally.given_up) == [1]
     assert State.COLLECT not in states(manager) and manager.tally.missed == missed
@@ -173,13 +175,13 @@ def test_a_resumed_mission_waits_for_auto(tmp_path: Path) -> None:
     manager = again(machine, manager, told, tmp_path / "progress.json")
     job = ForwardingJob(manager, told)
     for _ in range(100):
-        machine.step(job)  # type: ignore[arg-type]
+        machine.step(job)
     assert manager.state is State.IDLE and machine.drive is None and machine.crane.setpoint is None
     assert not job.report(0).auto
     assert job.report(0).words != RULES[State.IDLE].description
     assert job.execute(MissionCommand(1, 0, 0, MissionAction.AUTO)) == ""
-    machine.step(job)  # type: ignore[arg-type]
-    machine.step(job)  # type: ignore[arg-type]
+    machine.step(job)
+    machine.step(job)
     assert manager.state is not State.IDLE and job.report(0).auto
     assert ForwardingJob(begun(told)[1], told).report(0).auto, "one that begins does not wait"
 
@@ -199,9 +201,7 @@ def undisturbed_m() -> float:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("after_m", "to_come"), [(35.0, 6), (90.0, 3)])
-def test_the_remaining_waypoints_of_all_laps_are_counted(
-    after_m: float, to_come: int, undisturbed_m: float, tmp_path: Path
-) -> None:
+def test_the_remaining_waypoints_of_all_laps_are_counted(after_m, to_come, undisturbed_m, tmp_path) -> None:
     told = LAPS
     machine, manager = begun(told, ())
     assert manager.progress().left is None
@@ -214,31 +214,19 @@ def test_the_remaining_waypoints_of_all_laps_are_counted(
     manager = again(machine, manager, told, tmp_path / "progress.json")
     assert manager.progress().left == left, "until something was driven"
     manager.auto()
-    machine.run(manager, ended, 900.0)
-    assert manager.state is State.DONE
+    completed(machine, manager, 900.0)
     assert machine.driven_m == pytest.approx(undisturbed_m, abs=4.0), "nothing is driven twice or left out"
     assert manager.route.driven_m == pytest.approx(machine.driven_m, abs=1.0)
     assert manager.progress().finished
 
 
-def test_a_finished_route_is_not_driven_again() -> None:
-    told = listed_mission(lie=())
-    left = RouteRemainder(1, ended=True)
-    manager = ActivityManager(
-        PROFILE, profile_hash(PROFILE), told, progress=Checkpoint(mission="", tally=Tally(), left=left)
-    )
-    manager.auto()
-    machine = Forwarder(PROFILE, PLANE, [], (49.0, 0.0, 0.0))
-    machine.run(manager, ended)
-    assert manager.state is State.DONE and machine.driven_m < 0.1
-
-
-@pytest.mark.parametrize("table", [PAPER_B, OURS], ids=["paper_b", "ours"])
-def test_a_route_without_waypoints_left_is_at_its_end(table) -> None:
-    told = listed_mission(lie=())
-    progress = Checkpoint(mission="", tally=Tally(), left=RouteRemainder(0))
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
-    manager.auto()
+@pytest.mark.parametrize(
+    ("left", "table"),
+    [(RouteRemainder(1, ended=True), OURS), (RouteRemainder(0), OURS), (RouteRemainder(0), PAPER_B)],
+    ids=["finished", "ours", "paper_b"],
+)
+def test_a_route_that_is_finished_or_has_no_waypoints_left_is_not_driven_again(left, table) -> None:
+    manager = resuming(listed_mission(lie=()), left, table)
     machine = Forwarder(PROFILE, PLANE, [], (49.0, 0.0, 0.0))
     machine.run(manager, ended)
     assert manager.state is State.DONE and machine.driven_m < 0.1
@@ -250,19 +238,8 @@ def test_a_route_without_waypoints_left_is_at_its_end(table) -> None:
 def test_a_machine_interrupted_while_returning_keeps_its_extra_places() -> None:
     told = ForwardingMission("test", (place(10.0, 0.0), place(60.0, 0.0)))
     left = RouteRemainder(1, (place(-6.0, 0.0), place(0.0, 0.0)), (place(30.0, 6.0),))
-    manager = ActivityManager(
-        PROFILE, profile_hash(PROFILE), told, progress=Checkpoint(mission="", tally=Tally(), left=left)
-    )
-    manager.auto()
-    machine = Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0))
-    aside_m = []
-
-    def over(_: ActivityManager) -> bool:
-        aside_m.append(machine.y_m)
-        return ended(manager)
-
-    machine.run(manager, over)
-    assert manager.state is State.DONE and 4.0 < max(aside_m) < 8.0
+    machine, manager = Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0)), resuming(told, left)
+    assert 4.0 < max(followed(machine, manager, lambda: machine.y_m)) < 8.0
 
 
 HEADINGS = st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0), st.floats(-math.pi, math.pi))

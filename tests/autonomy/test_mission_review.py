@@ -38,7 +38,7 @@ class Way:
             fences,
             (),
             logs,
-            Options(**options),  # type: ignore[arg-type]
+            Options(**options),
         )
         return review(mission, AORO)
 

@@ -18,13 +18,12 @@ from autonomy.navigation.waypoint_drive import MIN_SWITCH_M, Waypoint, WaypointD
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from machine.geometry.carrier import turning_radius_m
-from tests.autonomy.carrier_model import FIRM, MUD, Ground, Individual, Vehicle, individual
-from tests.autonomy.driven_carrier import CARRIER, at
+from tests.autonomy.carrier_model import CARRIER, FIRM, MUD, Ground, Individual, Vehicle, at, individual
 from tests.codes import coded, numbers_in
+from tests.console.vehicle_reports import VEHICLE
+
 
 # -- drives on the model
-
-
 def drive(
     way: PathDrive | WaypointDrive,
     ground: Ground = FIRM,
@@ -106,33 +105,16 @@ def test_paper_b_drives_from_waypoint_to_waypoint() -> None:
 
 def report(**values: float) -> VehicleReport:
     """A machine at the origin of the site that stands and is fine."""
-    base = VehicleReport(
-        sequence=1,
-        profile_hash=0,
-        stamp_ns=10**9,
-        drive_sequence=0,
-        driving=Driving.DRIVING,
-        refusal=0,
-        refused=0,
-        position_ns=10**9,
-        latitude_deg=CARRIER.site_lat_deg,
-        longitude_deg=CARRIER.site_lon_deg,
-        altitude_m=260.0,
-        fix=4,
-        satellites=19,
-        sigma_m=0.01,
-        heading_ns=10**9,
-        heading_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        motion_ns=10**9,
-        speed_m_s=0.6,
-        articulation_rad=0.1,
-        roll_rad=0.0,
-        pitch_rad=0.0,
-        heights_m=(0.35,) * 4,
-        stale_mask=0,
-    )
-    return replace(base, **values)
+    site = {"latitude_deg": CARRIER.site_lat_deg, "longitude_deg": CARRIER.site_lon_deg, "altitude_m": 260.0}
+    level = {
+        "heading_rad": 0.0,
+        "speed_m_s": 0.6,
+        "articulation_rad": 0.1,
+        "roll_rad": 0.0,
+        "pitch_rad": 0.0,
+        "heights_m": (0.35,) * 4,
+    }
+    return replace(VEHICLE, **site | level | values)
 
 
 @pytest.mark.parametrize(
@@ -163,8 +145,6 @@ def test_a_last_waypoint_that_was_passed_is_reached() -> None:
 
 
 # -- navigator
-
-
 def begun(location: Location | None = None) -> tuple[Navigator, PathDrive, Location]:
     """A navigator that drives along x from the origin."""
     navigator = Navigator(CARRIER, 7, (0.3, 0.3, 0.35, 0.35))

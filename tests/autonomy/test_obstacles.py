@@ -35,9 +35,7 @@ points = arrays(float, 3, elements=st.floats(-3.0, 3.0).map(lambda x: round(x, 3
 
 @settings(deadline=None, max_examples=60)
 @given(points, points, points, points)
-def test_the_distance_of_two_segments_is_the_least_of_their_points(
-    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray
-) -> None:
+def test_the_distance_of_two_segments_is_the_least_of_their_points(a, b, c, d) -> None:
     found = float(segment_segment(a, b, c, d))
 
     def to_other(t: float) -> float:
@@ -52,9 +50,7 @@ def test_the_distance_of_two_segments_is_the_least_of_their_points(
 
 @settings(deadline=None, max_examples=60)
 @given(points, points, arrays(float, 3, elements=st.floats(0.01, 2.0)))
-def test_the_distance_of_a_segment_and_a_box_is_the_least_of_its_points(
-    a: np.ndarray, b: np.ndarray, half: np.ndarray
-) -> None:
+def test_the_distance_of_a_segment_and_a_box_is_the_least_of_its_points(a, b, half) -> None:
     found = float(segment_box(a, b, half))
     on_it = a + np.linspace(0.0, 1.0, 4001)[:, None] * (b - a)
     brute = float(np.min(np.linalg.norm(on_it - np.clip(on_it, -half, half), axis=1)))
@@ -100,7 +96,7 @@ def test_a_ground_may_have_a_shape() -> None:
 
 
 @pytest.mark.parametrize("profile", [PALMS, AORO])
-def test_the_walls_hold_every_stake_of_the_plant(profile) -> None:  # type: ignore[no-untyped-def]
+def test_the_walls_hold_every_stake_of_the_plant(profile) -> None:
     floor, *walls = bunk_boxes(profile.bunk)
     assert floor.center_m[2] + floor.half_m[2] == pytest.approx(profile.bunk.floor_z_m)
     for size, middle in plant_boxes(profile)[1:]:

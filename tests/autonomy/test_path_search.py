@@ -1,4 +1,4 @@
-"""Collision-free paths: fastest where the path is free, over or around obstacles where it is not."""
+"""Collision-free paths: fastest where the path is free, over or around what is not; and whose motions are made."""
 
 from __future__ import annotations
 
@@ -8,24 +8,38 @@ from math import cos, sin
 import numpy as np
 import pytest
 
-from autonomy.grasp.grapple_heights import travel_height_m
-from autonomy.motion import clearance
+from autonomy.crane_job.phase_motions import MACHINE_LEAN_M, approach_motion, carry_motion
+from autonomy.grasp.bunk_load import plan_place
+from autonomy.grasp.grapple_heights import hover_height_m, travel_height_m
+from autonomy.grasp.selection import plan_single_log_grasp
+from autonomy.missions.crane_job import CraneJob
+from autonomy.motion import clearance, motion_planner
 from autonomy.motion.arm_kinematics import Arm, Pose
-from autonomy.motion.clearance import clearance_reserve, clearances
-from autonomy.motion.obstacles import Capsule, CollisionScene, HeldLog, collision_scene, swept_capsules, tree_capsule
+from autonomy.motion.clearance import MARGIN_M, clearance_reserve, clearances
+from autonomy.motion.motion_planner import MovementPrimitivePlanner, TimeOptimalPlanner
+from autonomy.motion.movement_primitives import load
+from autonomy.motion.obstacles import (
+    Capsule,
+    CollisionScene,
+    HeldLog,
+    collision_scene,
+    held_log,
+    swept_capsules,
+    tree_capsule,
+)
 from autonomy.motion.path_search import PathBlocked, plan_path
 from autonomy.motion.trajectory import Trajectory, slow_line, travel_over
 from autonomy.perception.log_list import LogObservation
-from machine.geometry.kinematics import Unreachable
-from machine.joints import JOINTS
+from machine.geometry.kinematics import Unreachable, pin_position
 from machine.loading.profile_file import load_profile
-from machine.profile import Profile, joint
-from tests.autonomy.motion_figures import figures
+from machine.profile import Profile
+from tests.autonomy.crane_stand_in import refusing
+from tests.autonomy.motion_figures import assert_within_limits, figures, pins
 from tests.codes import coded
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
 ARMS = {"palms_471": Arm(PALMS), "aoro_fc8": Arm(AORO)}
-LOG = HeldLog(2.0, 0.25)
+HELD = HeldLog(2.0, 0.25)
 
 
 def places(profile: Profile, seed: int) -> tuple[Pose, Pose]:
@@ -48,50 +62,28 @@ def logs_about(profile: Profile, seed: int, count: int = 6) -> list[LogObservati
     return found
 
 
-def fine(arm: Arm, motion: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Joints and true pins, every 20 ms."""
-    q = np.array(motion.position)
-    poses = [arm.pose(row) for row in q]
-    return q, np.array([(*arm.xy(p), p.z_m) for p in poses])
+def poses_of(motion: Trajectory) -> np.ndarray:
+    return np.array([ARMS["aoro_fc8"].pose(q)[:3] for q in motion.position])
 
 
 def assert_kept(profile: Profile, motion: Trajectory, start: Pose, goal: Pose) -> None:
-    """Rest to rest, within joints, speeds, accelerations and the pump's oil."""
+    """Rest to rest, within all limits."""
     arm = ARMS[profile.name]
-    q = np.array(motion.position)
-    assert arm.pose(q[0]) == pytest.approx(start, abs=1e-6) and arm.pose(q[-1]) == pytest.approx(goal, abs=1e-6)
-    v = np.array(motion.velocity)
-    a = np.gradient(v, 0.02, axis=0)
-    for j in JOINTS:
-        spec = joint(profile, j)
-        assert q[:, j].min() >= spec.lower and q[:, j].max() <= spec.upper
-        assert np.max(np.abs(v[:, j])) < spec.speed_limit and np.max(np.abs(a[:, j])) < spec.acceleration_limit
-    assert np.max(arm.pump_load(q, v)) < 1.01
-
-
-@pytest.mark.parametrize("profile", [PALMS, AORO], ids=lambda p: p.name)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_log_goes_over_the_stakes_and_touches_nothing(profile: Profile, seed: int) -> None:
-    arm, (start, goal) = ARMS[profile.name], places(profile, seed)
-    around = collision_scene(profile, logs_about(profile, seed))
-    path = plan_path(arm, start, goal, around, LOG)
-    assert_kept(profile, path.motion, start, goal)
-    q, pin = fine(arm, path.motion)
-    # Looked at ten times finer than the planner did: nothing but what is near at the ends comes nearer than 5 cm.
-    apart = clearances(around, swept_capsules(profile, q, pin, LOG))
-    middle = np.minimum(*(np.linalg.norm(pin - pin[i], axis=1) for i in (0, -1))) > clearance.DEPARTURE_ZONE_M
-    assert middle.any() and apart[middle].min() > 0.05
-    assert apart.min() > min(0.05, apart[0].min(), apart[-1].min()) - clearance.CONTACT_ALLOWANCE_M - 0.01
-    assert path.reserve_m >= 0.0 and clearance_reserve(arm, path.motion, around, LOG)[0] > -0.02
+    assert arm.pose(motion.position[0]) == pytest.approx(start, abs=1e-6)
+    assert arm.pose(motion.position[-1]) == pytest.approx(goal, abs=1e-6)
+    assert_within_limits(profile, motion, pump=1.01)
 
 
 @pytest.mark.parametrize("profile", [PALMS, AORO], ids=lambda p: p.name)
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
-def test_random_paths_keep_limits_and_touch_nothing(profile: Profile, seed: int) -> None:
+def test_random_paths_over_the_stakes_keep_limits_and_touch_nothing(profile: Profile, seed: int) -> None:
     arm, ends = ARMS[profile.name], places(profile, seed)
     start, goal = ends if seed % 2 else reversed(ends)
-    around, held = collision_scene(profile, logs_about(profile, seed)), LOG if seed % 2 else None
-    found = figures(profile, plan_path(arm, start, goal, around, held).motion, around, held)
+    around, held = collision_scene(profile, logs_about(profile, seed)), HELD if seed % 2 else None
+    path = plan_path(arm, start, goal, around, held)
+    assert path.reserve_m >= 0.0 and clearance_reserve(arm, path.motion, around, held)[0] > -0.02
+    assert_kept(profile, path.motion, start, goal)
+    found = figures(profile, path.motion, around, held)
     assert max(found.stops, found.speed, found.acceleration, found.pump) < 1.0
     assert found.jerk_s > 0.05 and found.swing_rad < 0.09
     assert found.clearance_m > clearance.MARGIN_M and found.lost_m < 0.06
@@ -101,7 +93,7 @@ def test_random_paths_keep_limits_and_touch_nothing(profile: Profile, seed: int)
 def test_it_is_no_slower_than_always_at_the_greatest_height(profile: Profile) -> None:
     arm, top = ARMS[profile.name], travel_height_m(profile)
     start, goal = places(profile, 3)
-    ours = plan_path(arm, start, goal, collision_scene(profile), LOG).motion
+    ours = plan_path(arm, start, goal, collision_scene(profile), HELD).motion
     assert ours.duration_s < travel_over(arm, start, goal, top, 2.5).duration_s
 
 
@@ -115,21 +107,6 @@ def test_where_the_path_is_free_it_goes_straight(profile: Profile) -> None:
     assert_kept(profile, path.motion, start, goal)
 
 
-def test_a_hanging_log_swings_little_at_the_end() -> None:
-    arm = ARMS["aoro_fc8"]
-    start, goal = places(AORO, 6)
-    _, pin = fine(arm, plan_path(arm, start, goal, collision_scene(AORO), LOG).motion)
-    for period_s in (1.55, 1.8, 2.05):
-        omega, swing, speed, most = 2.0 * np.pi / period_s, np.zeros(2), np.zeros(2), 0.0
-        for push in np.gradient(np.gradient(pin[:, :2], 0.02, axis=0), 0.02, axis=0):
-            for _ in range(4):  # a pendulum integrated step by step
-                speed += 0.005 * (-push - omega**2 * swing)
-                swing += 0.005 * speed
-            most = max(most, float(np.hypot(*swing)))
-        left = np.hypot(np.hypot(*swing), np.hypot(*speed) / omega) * omega**2 / 9.81
-        assert left < 0.09 and left < 0.8 * most * omega**2 / 9.81
-
-
 def beside() -> tuple[Pose, Pose]:
     """Two places on one side of the machine, low over the ground."""
     arm = ARMS["aoro_fc8"]
@@ -139,14 +116,13 @@ def beside() -> tuple[Pose, Pose]:
 def test_a_tree_between_two_places_is_gone_around() -> None:
     arm, (start, goal) = ARMS["aoro_fc8"], beside()
     free = plan_path(arm, start, goal, collision_scene(AORO))
-    q, pin = fine(arm, free.motion)
-    half = pin[len(pin) // 2]
-    trunk = tree_capsule(float(half[0]) * 1.06, float(half[1]) * 1.06, 0.15, -1.15)
-    assert clearance_reserve(arm, free.motion, collision_scene(AORO, trees=[trunk]))[0] < -0.1
-    path = plan_path(arm, start, goal, collision_scene(AORO, trees=[trunk]))
-    q, pin = fine(arm, path.motion)
+    half = pin_position(AORO.kinematics, free.motion.position[len(free.motion.position) // 2])
+    around = collision_scene(AORO, trees=[tree_capsule(half[0] * 1.06, half[1] * 1.06, 0.15, -1.15)])
+    assert clearance_reserve(arm, free.motion, around)[0] < -0.1
+    path = plan_path(arm, start, goal, around)
+    q = np.array(path.motion.position)
     assert path.name == "drawn in"
-    assert clearances(collision_scene(AORO, trees=[trunk]), swept_capsules(AORO, q, pin, None))[:, :, -1].min() > 0.08
+    assert clearances(around, swept_capsules(AORO, q, pins(AORO, q), None))[:, :, -1].min() > 0.08
     assert_kept(AORO, path.motion, start, goal)
 
 
@@ -175,8 +151,7 @@ def test_higher_ground_lifts_the_path() -> None:
         along = np.arctan2(y, x) - 0.75
         return -1.15 + 1.2 * np.exp(-((along / 0.08) ** 2))
 
-    low = fine(arm, plan_path(arm, start, goal, CollisionScene(-1.15)).motion)[1]
-    high = fine(arm, plan_path(arm, start, goal, CollisionScene(hill)).motion)[1]
+    low, high = (poses_of(plan_path(arm, start, goal, CollisionScene(ground)).motion) for ground in (-1.15, hill))
     assert high[:, 2].max() > low[:, 2].max() + 0.3
 
 
@@ -205,3 +180,72 @@ def test_a_slow_lift_keeps_the_arms_limits_however_short_its_requested_time() ->
     hasty, slow = (slow_line(arm, start, goal, seconds) for seconds in (2.0, 20.0))
     assert_kept(AORO, hasty, start, goal)
     assert hasty.duration_s > 4.0 and slow.duration_s == pytest.approx(20.0, abs=0.05)
+
+
+# -- planners
+ARM, HIGH, GROUND = ARMS["aoro_fc8"], travel_height_m(AORO), AORO.workspace.ground_z_m
+LOG = LogObservation(0, (3.6, 3.2, GROUND + 0.12), (1.0, 0.0, 0.0), 2.0, 0.24)
+GRASP = plan_single_log_grasp(ARM, LOG, 0.0)
+PLACE = plan_place(ARM, CraneJob(), GRASP, [LOG])
+OVER = GRASP.pose.at_height(hover_height_m(AORO, GRASP))
+
+
+def test_the_time_optimal_planner_goes_down_to_the_log_and_into_the_bunk_in_one_motion() -> None:
+    """On tyres to just above it: the machine leans, and the rest of the descent is vertical."""
+    out = approach_motion(ARM, TimeOptimalPlanner(), PLACE, GRASP, [LOG])
+    back = carry_motion(ARM, TimeOptimalPlanner(), GRASP.pose, PLACE, GRASP, [LOG], hangs=False)
+    assert poses_of(out)[-1] == pytest.approx(GRASP.pose.at_height(GRASP.pose.z_m + MACHINE_LEAN_M)[:3], abs=1e-3)
+    assert poses_of(back)[-1] == pytest.approx(PLACE[:3], abs=1e-3)
+    assert max(out.duration_s, back.duration_s) < 10.5
+    held = held_log(ARM, GRASP.pose, LOG)
+    assert clearance_reserve(ARM, back, collision_scene(AORO), held)[0] >= -0.01
+
+
+def test_a_place_only_reachable_from_above_is_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    def only_high(arm: Arm, start: Pose, goal: Pose, *more: object) -> object:
+        if goal.z_m < HIGH:
+            raise PathBlocked("too near to the stakes", "motion.path-blocked")
+        return plan_path(arm, start, goal, *more)
+
+    monkeypatch.setattr(motion_planner, "plan_path", only_high)
+    monkeypatch.setattr(motion_planner, "clearance_reserve", lambda *_: (-1.0, ""))
+    motion = carry_motion(ARM, TimeOptimalPlanner(), GRASP.pose, PLACE, GRASP, [LOG], hangs=False)
+    assert poses_of(motion)[-1] == pytest.approx((PLACE.slew_rad, PLACE.r_m, HIGH), abs=2e-3)
+
+
+def test_the_end_of_the_descent_is_above_the_log() -> None:
+    pin = poses_of(approach_motion(ARM, TimeOptimalPlanner(), PLACE, GRASP, [LOG]))
+    aside = np.abs(pin[:, 1] - GRASP.pose.r_m)
+    assert np.max(aside[pin[:, 2] < GRASP.pose.z_m + 0.3]) < 0.25
+
+
+def test_among_other_logs_it_stops_above() -> None:
+    beside = LogObservation(1, (3.6, 3.55, GROUND + 0.12), (1.0, 0.0, 0.0), 2.0, 0.24)
+    gathered = GRASP.__class__(LOG, GRASP.pose, GRASP.support_z_m, 0.0, (), GROUND + 0.24)
+    out = approach_motion(ARM, TimeOptimalPlanner(), PLACE, gathered, [LOG, beside])
+    assert poses_of(out)[-1, 2] == pytest.approx(hover_height_m(AORO, gathered), abs=1e-3)
+
+
+def test_where_no_fast_path_is_clear_the_one_at_full_height_replaces_it_only_if_clear(monkeypatch) -> None:
+    blocked = PathBlocked("no path is clear: as requested", "motion.path-blocked")
+    monkeypatch.setattr(motion_planner, "plan_path", refusing(blocked))
+    free = CollisionScene(GROUND)
+    slow = TimeOptimalPlanner()(ARM, PLACE, OVER, free, None, HIGH, 0.0)
+    assert slow == travel_over(ARM, PLACE, OVER, HIGH, 0.0)
+    x, y = (0.5 * (a + b) for a, b in zip(ARM.xy(PLACE), ARM.xy(OVER), strict=True))
+    stands = collision_scene(AORO, trees=[tree_capsule(x, y, 0.2, GROUND)])
+    with pytest.raises(PathBlocked, check=coded("motion.path-blocked")):
+        TimeOptimalPlanner()(ARM, PLACE, OVER, stands, None, HIGH, 0.0)
+
+
+def test_paper_bs_planner_uses_the_primitive_unless_it_would_touch_something() -> None:
+    shown = MovementPrimitivePlanner(load(AORO))
+    free = collision_scene(AORO)
+    start = PLACE.at_height(PLACE.z_m + 0.9)
+    motion = shown(ARM, start, OVER, free, None, HIGH, 0.0)
+    assert not shown.direct and clearance_reserve(ARM, motion, free)[0] >= -MARGIN_M
+    assert motion != travel_over(ARM, start, OVER, HIGH, 0.0)
+    z = poses_of(motion)[len(motion.position) // 2][2]
+    middle = ARM.xy(ARM.pose(motion.position[len(motion.position) // 2]))
+    in_the_way = collision_scene(AORO, trees=[tree_capsule(*middle, 0.1, GROUND, z - GROUND - 0.3)])
+    assert shown(ARM, start, OVER, in_the_way, None, HIGH, 0.0) == travel_over(ARM, start, OVER, HIGH, 0.0)

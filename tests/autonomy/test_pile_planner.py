@@ -8,7 +8,6 @@ from math import hypot, inf, pi, remainder
 import numpy as np
 import pytest
 
-from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.grasp_verification import is_at_target
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.bunk_load import lies_in_bunk
@@ -21,9 +20,9 @@ from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import StateReport
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import load_profile
 from machine.profile import Bunk
-from tests.autonomy.crane_stand_in import StandIn
+from tests.autonomy.crane_stand_in import StandIn, activity
 from tests.autonomy.grasp_scenes import PROFILE as PALMS
 from tests.codes import coded
 
@@ -50,9 +49,13 @@ def planner() -> PilePlanner:
     return PilePlanner(SamplingPlanner())
 
 
+def asked(logs: list[LogObservation], **how) -> GraspRequest:
+    return GraspRequest(ARM, logs, 0.0, **how)
+
+
 def test_a_pile_is_penetrated_and_several_logs_are_between_the_jaws() -> None:
     logs = heap()
-    p = planner()(GraspRequest(ARM, logs, 0.0))
+    p = planner()(asked(logs))
     assert p.penetrates and len(p.logs) >= 2 and "\n" not in p.reason
     assert abs(remainder(p.yaw_rad - pi / 2, pi)) < 0.15, "across the logs"
     wood = sum(pi * (logs[i].diameter_m / 2) ** 2 for i in p.logs)
@@ -63,7 +66,7 @@ def test_a_pile_is_penetrated_and_several_logs_are_between_the_jaws() -> None:
 
 def test_no_tip_comes_down_on_the_middle_of_a_log() -> None:
     logs = heap()
-    p = planner()(GraspRequest(ARM, logs, 0.0))
+    p = planner()(asked(logs))
     for side in (-1.0, 1.0):
         tip = p.y_m + side * (JAWS.half_gap_m + JAWS.plate_m / 2)
         met = [log for log in logs if log.center_m[2] > p.support_z_m]
@@ -71,45 +74,43 @@ def test_no_tip_comes_down_on_the_middle_of_a_log() -> None:
 
 
 def test_logs_that_lie_on_no_others_are_left_to_the_other_planner() -> None:
-    p = planner()(GraspRequest(ARM, row(0, 3, 0), 0.0))
-    assert not p.penetrates and p == SamplingPlanner()(GraspRequest(ARM, row(0, 3, 0), 0.0))
+    p = planner()(asked(row(0, 3, 0)))
+    assert not p.penetrates and p == SamplingPlanner()(asked(row(0, 3, 0)))
 
 
 def test_a_row_without_a_safe_grasp_is_penetrated() -> None:
     def never(request: GraspRequest) -> GraspCandidate:
         raise NoGrasp("grasp.none-safe", "no grasp of the 6 logs is safe")
 
-    p = PilePlanner(never)(GraspRequest(ARM, row(0, 6, 0), 0.0))
+    p = PilePlanner(never)(asked(row(0, 6, 0)))
     assert p.penetrates and p.logs and p.support_z_m >= BUNK.floor_z_m
 
 
 def test_nothing_in_view_is_no_grasp() -> None:
     with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
-        planner()(GraspRequest(ARM, [], 0.0))
+        planner()(asked([]))
 
 
 def test_a_place_where_nothing_came_up_is_not_tried_again_until_something_did() -> None:
     press, logs = planner(), heap()
-    first = press(GraspRequest(ARM, logs, 0.0))
-    second = press(GraspRequest(ARM, logs, 0.0))
-    third = press(GraspRequest(ARM, logs, 0.0))
+    first, second, third = (press(asked(logs)) for _ in range(3))
     places = [(p.x_m, p.y_m) for p in (first, second, third)]
     for i, a in enumerate(places):
         assert all(hypot(a[0] - b[0], a[1] - b[1]) >= FAILED_RADIUS_M - 1e-9 for b in places[:i])
-    press(GraspRequest(ARM, [log for i, log in enumerate(logs) if i not in third.logs], 0.0))
-    assert press(GraspRequest(ARM, logs, 0.0)) == first, "something came up: every place is as good as before"
+    press(asked([log for i, log in enumerate(logs) if i not in third.logs]))
+    assert press(asked(logs)) == first, "something came up: every place is as good as before"
 
 
 def test_a_log_that_only_rolled_has_not_come_up() -> None:
     press, logs = planner(), heap()
-    first = press(GraspRequest(ARM, logs, 0.0))
+    first = press(asked(logs))
     moved = [replace(log, center_m=(log.center_m[0] + 0.02, *log.center_m[1:])) for log in logs]
-    second = press(GraspRequest(ARM, moved, 0.0))
+    second = press(asked(moved))
     assert hypot(first.x_m - second.x_m, first.y_m - second.y_m) > FAILED_RADIUS_M / 2
 
 
 def test_the_same_pile_gives_the_same_grasp() -> None:
-    assert planner()(GraspRequest(ARM, heap(), 0.0)) == planner()(GraspRequest(ARM, heap(), 0.0))
+    assert planner()(asked(heap())) == planner()(asked(heap()))
 
 
 class Resisting(StandIn):
@@ -128,22 +129,21 @@ class Resisting(StandIn):
 def test_penetrating_jaws_that_rest_on_wood_close_there(pressed: bool, short_m: float) -> None:
     logs = [LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)]
 
-    def chooser(arm, mission, seen, slew, rot):  # type: ignore[no-untyped-def]
+    def chooser(arm, mission, seen, slew, rot):
         return replace(PlannerSelection(SamplingPlanner())(arm, mission, seen, slew, rot), penetrates=pressed)
 
     crane = Resisting(PALMS, logs)
-    activity = Activity(PALMS, profile_hash(PALMS), grasp_selector=chooser)
-    crane.until(activity, Phase.DESCEND)
-    assert activity.grasp is not None
+    job = activity(grasp_selector=chooser)
+    crane.until(job, Phase.DESCEND)
     begun_ns = crane.now_ns
-    crane.floor_z_m = activity.grasp.pose.z_m + short_m
+    crane.floor_z_m = job.grasp.pose.z_m + short_m
     for _ in range(400):
-        crane.step(activity)
-        if activity.phase is not Phase.DESCEND:
+        crane.step(job)
+        if job.phase is not Phase.DESCEND:
             break
     begun_s = (crane.now_ns - begun_ns) * 1e-9
     assert not pressed or begun_s < 3.0, "before the controller takes the joint for stuck"
-    assert activity.phase is (Phase.CLOSE if pressed else Phase.FAILED), activity.failure
+    assert job.phase is (Phase.CLOSE if pressed else Phase.FAILED), job.failure
 
 
 def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_hangs() -> None:
@@ -158,8 +158,8 @@ def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_h
 
 def test_no_place_with_a_log_that_must_stay_between_the_jaws_is_penetrated() -> None:
     logs = heap()
-    taken = planner()(GraspRequest(ARM, logs, 0.0)).logs
-    other = planner()(GraspRequest(ARM, logs, 0.0, stay=taken[:1]))
+    taken = planner()(asked(logs)).logs
+    other = planner()(asked(logs, stay=taken[:1]))
     assert other.penetrates and taken[0] not in other.logs and other.logs
     with pytest.raises(NoGrasp):
-        planner()(GraspRequest(ARM, logs, 0.0, stay=range(len(logs))))
+        planner()(asked(logs, stay=range(len(logs))))

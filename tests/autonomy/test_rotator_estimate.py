@@ -1,32 +1,81 @@
-"""A rotator that is only counted: what hangs in the grapple sets its count right, job after job."""
+"""A rotator that is only counted: what hangs in the grapple sets its count right, also before the camera ahead."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from math import atan2, cos, degrees, pi, remainder, sin
+from math import atan2, cos, degrees, isfinite, nan, pi, remainder, sin
 
+import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.rotator_estimate import (
+    AHEAD_RAD,
     SCALE_BOUNDS,
+    UNSURE_AHEAD_RAD,
+    UNSURE_RAD,
     RotatorEstimate,
     has_no_encoder,
+    load_in_view,
     load_view,
     planning_profile,
 )
+from autonomy.grasp.bunk_load import lies_in_bunk
+from autonomy.motion.arm_kinematics import Arm, Pose
+from autonomy.perception.camera.frame import optical_pose
 from autonomy.perception.log_list import LogObservation
-from machine.geometry.grapple import grapple_yaw
+from can_dbc.messages.crane import StateReport
+from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m
 from machine.joints import Joint
-from machine.loading.profile_file import load_profile, profile_hash
-from tests.autonomy.crane_stand_in import StandIn
-from tests.autonomy.test_activity_blind import HOME, Blind, birch
+from machine.loading.profile_file import load_profile
+from tests.autonomy.crane_stand_in import StandIn, activity
 
 FORWARDER, LOADER = load_profile("aoro_fc8"), load_profile("palms_471")
+ARM, CAMERA = Arm(FORWARDER), FORWARDER.cameras["front"]
+HOME = (0.0, 1.25, -2.39, 0.10, 0.0)
+
+
+class Blind(StandIn):
+    """The stand-in whose controller reports no rotator and no opening."""
+
+    def report(self) -> StateReport:
+        said = super().report()
+        return replace(said, position=(*said.position[: Joint.ROT], nan), opening_pct=nan)
+
+
+def birch(seed: int) -> LogObservation:
+    rng = random.Random(f"scene {seed}")
+    (cx, cy), half = FORWARDER.workspace.pick_center_m, FORWARDER.workspace.pick_half_size_m
+    x, y, yaw = cx + rng.uniform(-half, half), cy + rng.uniform(-half, half), rng.uniform(-pi, pi)
+    return LogObservation(0, (x, y, FORWARDER.workspace.ground_z_m + 0.125), (cos(yaw), sin(yaw), 0.0), 2.0, 0.25)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_log_beside_the_forwarder_goes_into_its_bunk(seed: int) -> None:
+    crane = Blind(FORWARDER, [birch(seed)], q=HOME)
+    planner = activity(profile=FORWARDER)
+    crane.run(planner)
+    assert planner.failure is None and planner.done and planner.missed == 0
+    assert lies_in_bunk(FORWARDER.bunk, crane.logs[0])
+
+
+def test_a_lost_encoder_still_pauses_it() -> None:
+    crane = Blind(FORWARDER, [birch(0)], q=HOME)
+    planner = activity(profile=FORWARDER)
+    lost = replace(crane.report(), position=(nan, *crane.report().position[1:]))
+    assert planner.step(crane.now_ns, lost, crane.seen()) is None
+    assert planner.paused_code == "activity.position-unknown"
+    assert crane.step(planner) is not None and planner.paused is None
+    assert not isfinite(crane.report().position[Joint.ROT])
+
+
+# -- the count
 ANGLE = st.floats(-pi, pi)
 ROTATORS = st.builds(RotatorEstimate, ANGLE, ANGLE, st.tuples(st.floats(*SCALE_BOUNDS), st.floats(*SCALE_BOUNDS)))
 
@@ -65,7 +114,7 @@ def askew_deg(count: int, learns: bool) -> list[float]:
     crane, rests, rotator, found = Drifting(FORWARDER, [], q=HOME), HOME, None, []
     for seed in range(count):
         crane.logs = [birch(seed)]
-        planner = Activity(FORWARDER, profile_hash(FORWARDER), last_setpoint=rests, rotator=rotator)
+        planner = activity(profile=FORWARDER, last_setpoint=rests, rotator=rotator)
         crane.run(planner)
         assert planner.done, planner.failure
         rests, rotator = (planner.last_setpoint, planner.rotator) if learns else (crane.q, None)
@@ -110,7 +159,7 @@ def laid_askew_deg(count: int, has_camera: bool) -> tuple[list[float], list[int]
     view = load_view(FORWARDER, 0.0) if has_camera else None
     for seed in range(count):
         crane.logs, crane.views = [birch(seed)], 0
-        planner = Activity(FORWARDER, profile_hash(FORWARDER), last_setpoint=rests, rotator=rotator, view=view)
+        planner = activity(profile=FORWARDER, last_setpoint=rests, rotator=rotator, view=view)
         crane.run(planner)
         assert planner.done, planner.failure
         rests, rotator = planner.last_setpoint, planner.rotator
@@ -132,7 +181,7 @@ def test_a_rotator_that_proves_slow_while_its_load_is_viewed_gets_slower_plans()
     """Its count must be faster for the same turn: at the speed that was planned before, the controller refuses it."""
     crane, spec = Remembered(FORWARDER, [birch(0)], q=HOME), FORWARDER.joints["rot"]
     crane.made = (0.65, 0.65)
-    planner = Activity(FORWARDER, profile_hash(FORWARDER), view=load_view(FORWARDER, 0.0))
+    planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0))
     while not crane.views:
         crane.step(planner)
     pace = min(planner.rotator.paces)
@@ -145,7 +194,7 @@ def test_a_rotator_that_proves_slow_while_its_load_is_viewed_gets_slower_plans()
 @pytest.mark.long
 def test_a_load_that_no_picture_shows_is_laid_down_all_the_same_and_said() -> None:
     crane = Blind(FORWARDER, [birch(0)], q=HOME)
-    planner = Activity(FORWARDER, profile_hash(FORWARDER), view=load_view(FORWARDER, 0.0))
+    planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0))
     crane.run(planner)
     assert planner.done and planner.load_unseen, planner.failure
 
@@ -206,6 +255,59 @@ def test_a_rotator_without_encoder_is_planned_within_half_its_range_and_its_comm
 
 def test_a_rotator_with_encoder_is_left_as_it_is() -> None:
     crane = StandIn(LOADER, [replace(birch(0), center_m=(-1.8, 4.4, -1.29), length_m=2.6, diameter_m=0.2)])
-    planner = Activity(LOADER, profile_hash(LOADER))
+    planner = activity(profile=LOADER)
     crane.run(planner)
     assert planner.done and planner.rotator == RotatorEstimate()
+
+
+# -- a load before the camera ahead
+def hanging(pose: Pose, length_m: float = 2.0, diameter_m: float = 0.25) -> LogObservation:
+    """A log across the jaws of a grapple at a pose."""
+    yaw = grapple_yaw(FORWARDER, tuple(ARM.joints(np.array([pose]))[0].tolist())) - pi / 2
+    (x, y), drop_m = ARM.xy(pose), lowest_tip_below_pin_m(FORWARDER.grapple.jaws) - diameter_m / 2
+    return LogObservation(4, (x, y, pose.z_m - drop_m), (cos(yaw), sin(yaw), 0.0), length_m, diameter_m)
+
+
+@pytest.mark.parametrize("slew_rad", [-2.6, -0.5, 0.8, 2.6])
+@pytest.mark.parametrize("articulation_rad", [-0.4, 0.0, 0.4])
+def test_the_whole_load_is_in_the_picture_and_across_the_view(slew_rad: float, articulation_rad: float) -> None:
+    view = load_view(FORWARDER, articulation_rad)
+    x, y = 5.0 * cos(slew_rad), 5.0 * sin(slew_rad)
+    pose = view.pose(ARM, ARM.pose_above(x, y, 1.0, 3.0), 0.25)
+    load = hanging(pose)
+    mount = optical_pose(FORWARDER, CAMERA, (0.0,) * 5, articulation_rad)
+    for side in (-0.5, 0.5):
+        px, py, depth_m = mount.to_optical(np.array(load.center_m) + side * load.length_m * np.array(load.axis))
+        u, v = CAMERA.cx_px + CAMERA.fx_px * px / depth_m, CAMERA.cy_px + CAMERA.fy_px * py / depth_m
+        assert depth_m > 1.5 and 0 < u < CAMERA.width_px and 0 < v < CAMERA.height_px
+    assert abs(np.array(load.axis) @ mount.rotation[:, 2]) < 0.05
+    ground_m = FORWARDER.workspace.ground_z_m
+    assert load.center_m[2] - ground_m > 1.0, "clear of the ground"
+
+
+def test_a_load_is_shown_while_the_rotator_is_unsure_and_sooner_where_the_camera_is_near() -> None:
+    view = load_view(FORWARDER, 0.0)
+
+    def rotator(sigma_rad: float) -> RotatorEstimate:
+        return RotatorEstimate(covariance=(sigma_rad**2, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+    assert view.is_needed(rotator(UNSURE_RAD + 0.01), 0.0) and not view.is_needed(rotator(UNSURE_RAD - 0.01), 0.0)
+    for side in (-1.0, 1.0):
+        assert view.is_needed(rotator(UNSURE_AHEAD_RAD + 0.01), side * (AHEAD_RAD + 0.1))
+    assert not view.is_needed(rotator(UNSURE_AHEAD_RAD - 0.01), AHEAD_RAD + 0.1)
+
+
+def test_a_machine_with_an_encoder_or_without_a_camera_ahead_shows_nothing() -> None:
+    assert load_view(LOADER, 0.0) is None
+    assert load_view(msgspec.structs.replace(FORWARDER, cameras={}), 0.0) is None
+
+
+def test_the_load_is_the_longest_log_between_the_jaws() -> None:
+    pose = ARM.pose_above(-5.0, 2.0, 1.7, 3.0)
+    load = hanging(pose)
+    x, y, z = load.center_m
+    part = replace(load, id=1, length_m=0.8)
+    below = replace(load, id=2, center_m=(x, y, FORWARDER.workspace.ground_z_m + 0.1))
+    beside = replace(load, id=3, center_m=(x + 2.0, y + 2.0, z))
+    assert load_in_view(ARM, [part, below, load, beside], pose) is load
+    assert load_in_view(ARM, [below, beside], pose) is None

@@ -35,8 +35,8 @@ from tests.codes import coded
 JAWS = jaws_of(PROFILE)
 
 
-def planned(logs: list[LogObservation]) -> GraspCandidate:
-    return SamplingPlanner()(GraspRequest(ARM, logs, 0.0))
+def planned(logs: list[LogObservation], arm: Arm = ARM, **how) -> GraspCandidate:
+    return SamplingPlanner()(GraspRequest(arm, logs, 0.0, **how))
 
 
 def is_safe(
@@ -57,18 +57,35 @@ def test_the_jaws_are_those_of_the_profile() -> None:
     assert list(JAWS.half_width_m) == sorted(JAWS.half_width_m, reverse=True)
 
 
-def test_logs_on_the_ground_are_not_pinched_above_a_thinner_one_between_them() -> None:
-    row = [log(0, -0.22, diameter=0.29), log(1, 0.0, diameter=0.13), log(2, 0.22, diameter=0.29)]
-    assert is_safe([row[0], row[2]], 0.0)
-    assert not is_safe(row, 0.0, level=GROUND + 0.14, rule=LAYER_RULE)
+ACROSS = log(1, 0.0, 0.2, yaw=pi / 2, along_m=0.8)
+BESIDE = [log(0, -0.18, diameter=0.26), log(1, 0.16, diameter=0.24)]
+LAYER = {"level": GROUND + 0.19, "rule": LAYER_RULE}
+ROW, UPON = [log(0, -0.3, diameter=0.26), log(1, 0.3, diameter=0.26)], log(2, 0.0, 0.1, diameter=0.3)
+CLOSE = [log(0, -0.26, diameter=0.26), log(1, 0.26, diameter=0.26)]
+THICK = [log(0, -0.22, diameter=0.29), log(2, 0.22, diameter=0.29)]
+RULE = {
+    "one log": ([log(0)], {}, True),
+    "askew": ([log(0)], {"yaw": pi / 2 + 0.6}, False),
+    "a tong comes down on it": ([log(0)], {"across_m": 0.72}, False),
+    "nothing between the tongs": ([log(0)], {"across_m": 1.2}, False),
+    "only its end": ([log(0, along_m=1.25)], {}, False),
+    "too much": ([log(i, 0.31 * (i - 1.5), diameter=0.3) for i in range(4)], {}, False),
+    "a small pile": (small_pile(), {}, True),
+    "two thick ones": (THICK, {}, True),
+    "pinched above a thinner one": ([*THICK, log(1, 0.0, diameter=0.13)], LAYER | {"level": GROUND + 0.14}, False),
+    "tips that ride up meet a high one": ([*BESIDE, log(2, 0.0, 0.22, diameter=0.1)], LAYER, True),
+    "they miss one deep between": ([*BESIDE, log(2, 0.0, 0.15, diameter=0.1)], LAYER, False),
+    "a row": (ROW, {}, True),
+    "a row that one upon it keeps apart": ([*ROW, UPON], {}, False),
+    "a close row with one upon it": ([*CLOSE, UPON], {}, True),
+    "one beside and one upon": ([ROW[0], UPON], {}, True),
+    "and an outer one that floats": ([ROW[0], UPON, log(1, 0.33, 0.12, diameter=0.12)], {}, False),
+}
 
 
-def test_tips_that_ride_up_over_its_neighbours_do_not_come_down_on_a_log_deep_between_them() -> None:
-    beside = [log(0, -0.18, diameter=0.26), log(1, 0.16, diameter=0.24)]
-    deep, high = log(2, 0.0, 0.15, diameter=0.1), log(2, 0.0, 0.22, diameter=0.1)
-    level = GROUND + 0.19
-    assert is_safe([*beside, high], 0.0, level=level, rule=LAYER_RULE)
-    assert not is_safe([*beside, deep], 0.0, level=level, rule=LAYER_RULE)
+@pytest.mark.parametrize(("logs", "how", "safe"), RULE.values(), ids=RULE)
+def test_the_rule(logs: list[LogObservation], how: dict, safe: bool) -> None:
+    assert is_safe(logs, **{"across_m": 0.0} | how) is safe
 
 
 def test_a_thick_log_beside_a_thin_one_does_not_lie_on_it() -> None:
@@ -97,55 +114,21 @@ def test_the_log_on_top_is_taken_and_those_below_are_left() -> None:
     assert planned(cross()).logs == (2,)
 
 
-@pytest.mark.parametrize(
-    ("logs", "across_m", "yaw", "safe"),
-    [
-        ([log(0)], 0.0, pi / 2, True),
-        ([log(0)], 0.0, pi / 2 + 0.6, False),  # (d) askew
-        ([log(0)], 0.72, pi / 2, False),  # (b) a tong comes down on it
-        ([log(0)], 1.2, pi / 2, False),  # nothing between the tongs
-        ([log(0, along_m=1.25)], 0.0, pi / 2, False),  # only its end
-        ([log(i, 0.31 * (i - 1.5), diameter=0.3) for i in range(4)], 0.0, pi / 2, False),  # (a) too much
-        (small_pile(), 0.0, pi / 2, True),
-    ],
-)
-def test_the_rule(logs: list[LogObservation], across_m: float, yaw: float, safe: bool) -> None:
-    assert is_safe(logs, across_m, yaw) is safe
-
-
-@pytest.mark.parametrize(("half_m", "upon", "safe"), [(0.3, True, False), (0.3, False, True), (0.26, True, True)])
-def test_a_row_with_logs_upon_it_is_not_pressed_together(half_m: float, upon: bool, safe: bool) -> None:
-    """The log that lies upon two others keeps them apart, or upon a third one that it hides."""
-    row = [log(0, -half_m, diameter=0.26), log(1, half_m, diameter=0.26)]
-    assert is_safe([*row, log(2, 0.0, 0.1, diameter=0.3)] if upon else row, 0.0) is safe
-
-
-def test_an_outer_log_that_floats_counts_to_the_row() -> None:
-    """Its underside is hidden: a camera measured the visible strip of a thicker log."""
-    beside, upon = log(0, -0.3, diameter=0.26), log(2, 0.0, 0.1, diameter=0.3)
-    assert is_safe([beside, upon], 0.0)
-    assert not is_safe([beside, upon, log(1, 0.33, 0.12, diameter=0.12)], 0.0)
-
-
 def test_of_logs_that_are_too_heavy_together_one_is_taken() -> None:
     both = [log(0, -0.32, diameter=0.28), log(1, 0.32, diameter=0.28)]
     assert planned(both).logs == (0, 1)
     weak = PROFILE.stability
-    assert weak is not None
     arm = Arm(msgspec.structs.replace(PROFILE, stability=msgspec.structs.replace(weak, stabilising_nm=21e3)))
-    assert len(SamplingPlanner()(GraspRequest(arm, both, 0.0)).logs) == 1
+    assert len(planned(both, arm).logs) == 1
     arm = Arm(msgspec.structs.replace(PROFILE, stability=msgspec.structs.replace(weak, stabilising_nm=12e3)))
     with pytest.raises(NoGrasp, check=coded("grasp.too-heavy")):
-        SamplingPlanner()(GraspRequest(arm, both, 0.0))
+        planned(both, arm)
 
 
 def test_no_log_is_pulled_from_under_another() -> None:
     """(c): the lower log alone between the jaws, the upper one far off its middle across it."""
-    under, over = log(0), log(1, 0.0, 0.2, yaw=pi / 2, along_m=0.8)
-    assert is_safe([under], 0.0)
-    assert not is_safe([under, over], 0.0)
-    upon = rests_upon(as_cylinders([under, over]))
-    assert upon.tolist() == [[False, True], [False, False]]
+    assert not is_safe([log(0), ACROSS], 0.0)
+    assert rests_upon(as_cylinders([log(0), ACROSS])).tolist() == [[False, True], [False, False]]
 
 
 def test_from_above_a_layer_only_that_layer_is_taken() -> None:
@@ -160,7 +143,7 @@ def test_from_above_a_layer_only_that_layer_is_taken() -> None:
 def _both(at: object) -> tuple[object]:
     from dataclasses import fields
 
-    return (type(at)(*(getattr(at, f.name)[:, None, :] for f in fields(at))),)  # type: ignore[arg-type]
+    return (type(at)(*(getattr(at, f.name)[:, None, :] for f in fields(at))),)
 
 
 def test_uncertain_perception_makes_a_grasp_less_probable() -> None:
@@ -180,10 +163,10 @@ def test_a_machine_on_wheels_takes_the_ground_from_the_logs(sunk_m: float) -> No
         LogObservation(i, (x, y + side, ground + 0.1), (1.0, 0.0, 0.0), 2.6, 0.2) for i, side in ((0, 0), (1, 0.21))
     ]
     upon = LogObservation(2, (x, y + 0.105, ground + 0.27), (1.0, 0.0, 0.0), 2.6, 0.2)
-    p = SamplingPlanner()(GraspRequest(arm, [*logs, upon], 0.0))
+    p = planned([*logs, upon], arm)
     assert set(p.logs) == {0, 1, 2} and p.support_z_m == pytest.approx(ground, abs=1e-3)
     higher = replace(logs[0], id=3, center_m=(x, y + 3.0, ground + 0.4))
-    alone = SamplingPlanner()(GraspRequest(arm, [higher], 0.0))
+    alone = planned([higher], arm)
     assert alone.support_z_m == pytest.approx(ground + 0.3, abs=1e-3), "it lies on a bank"
 
 
@@ -241,20 +224,20 @@ def test_a_job_that_names_its_log_is_served_directly() -> None:
 
 def test_a_log_that_must_stay_is_never_taken_and_still_an_obstacle() -> None:
     apart = [log(0, -0.3), log(1, 0.3)]
-    assert SamplingPlanner()(GraspRequest(ARM, apart, 0.0)).logs == (0, 1)
-    p = SamplingPlanner()(GraspRequest(ARM, apart, 0.0, stay={0}))
+    assert planned(apart).logs == (0, 1)
+    p = planned(apart, stay={0})
     assert p.logs == (1,) and p.y_m > Y + 0.3, "the tongs come down beside it"
     with pytest.raises(NoGrasp, check=coded("grasp.none-safe")):
-        SamplingPlanner()(GraspRequest(ARM, pair(), 0.0, stay=(0,)))
+        planned(pair(), stay=(0,))
     with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-reach")):
-        SamplingPlanner()(GraspRequest(ARM, pair(), 0.0, stay=(0, 1)))
+        planned(pair(), stay=(0, 1))
 
 
 def test_nothing_is_taken_from_under_a_log_that_must_stay() -> None:
     logs = small_pile()
-    assert 2 not in SamplingPlanner()(GraspRequest(ARM, [*logs[:2], log(2, 1.0)], 0.0, stay=(2,))).logs
+    assert 2 not in planned([*logs[:2], log(2, 1.0)], stay=(2,)).logs
     with pytest.raises(NoGrasp):
-        SamplingPlanner()(GraspRequest(ARM, logs, 0.0, stay=(2,)))
+        planned(logs, stay=(2,))
 
 
 def test_a_job_names_the_logs_that_stay_by_their_numbers() -> None:
@@ -310,7 +293,7 @@ def test_a_floating_log_is_neither_gripped_nor_an_obstacle() -> None:
     logs = measured(pair())
     alone, haunted = planned(logs), planned([ghost, *logs])
     assert haunted.logs == tuple(i + 1 for i in alone.logs) and (haunted.x_m, haunted.y_m) == (alone.x_m, alone.y_m)
-    assert SamplingPlanner()(GraspRequest(ARM, [log(0, -0.4), ghost, log(1, 0.4)], 0.0, stay=(0,))).logs == (2,)
+    assert planned([log(0, -0.4), ghost, log(1, 0.4)], stay=(0,)).logs == (2,)
     with pytest.raises(NoGrasp, check=coded("grasp.no-supported-log")):
         planned([ghost])
 
@@ -330,9 +313,9 @@ def test_a_log_is_extracted_from_a_row_that_is_too_wide() -> None:
     )
     assert abs(outer - Y) > abs(end - Y) + 1.0, "and on free ground"
     assert p.logs == (0,)
-    beside = SamplingPlanner()(GraspRequest(ARM, measured([*WALL, log(9, -1.6)]), 0.0, stay=(7,)))
+    beside = planned(measured([*WALL, log(9, -1.6)]), stay=(7,))
     assert beside.logs == (6,), "where another lies there is no room"
-    laden = SamplingPlanner()(GraspRequest(ARM, measured([*WALL, on_top(WALL[0], WALL[1])]), 0.0, stay=(7,)))
+    laden = planned(measured([*WALL, on_top(WALL[0], WALL[1])]), stay=(7,))
     assert laden.logs == (6,), "none that another lies on, where the others are free"
 
 
@@ -343,7 +326,7 @@ def on_top(a: LogObservation, b: LogObservation) -> LogObservation:
 
 
 def test_without_a_safe_grasp_camera_measured_logs_are_gripped_at_the_top() -> None:
-    p = SamplingPlanner()(GraspRequest(ARM, measured(WALL), 0.0, stay=(0, 6)))
+    p = planned(measured(WALL), stay=(0, 6))
     assert p.probability == 0.3 and len(p.logs) == 1 and "\n" not in p.reason
     one = WALL[p.logs[0]]
     assert np.hypot(p.x_m - one.center_m[0], p.y_m - one.center_m[1]) < 0.01
@@ -353,5 +336,5 @@ def test_on_wheels_nothing_penetrates_below_the_lowest_log() -> None:
     arm = Arm(load_profile("aoro_fc8"))
     x, y = arm.profile.workspace.pick_center_m
     logs = measured([LogObservation(i, (x, y + 0.25 * i, -1.0), (1.0, 0.0, 0.0), 2.6, 0.2) for i in range(-4, 5)])
-    p = SamplingPlanner()(GraspRequest(arm, logs, 0.0))
+    p = planned(logs, arm)
     assert p.support_z_m >= -1.1 - 1e-6

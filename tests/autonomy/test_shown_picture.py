@@ -56,10 +56,16 @@ def log_between(a: tuple[float, float, float], b: tuple[float, float, float]) ->
     length = math.dist(a, b)
     axis = tuple((q - p) / length for p, q in zip(a, b, strict=True))
     center = tuple(0.5 * (p + q) for p, q in zip(a, b, strict=True))
-    return LogObservation(4, center, axis, length, 0.2)  # type: ignore[arg-type]
+    return LogObservation(4, center, axis, length, 0.2)
 
 
 LOG = log_between(ahead(400.0, 300.0, 4.0), ahead(800.0, 420.0, 5.0))
+
+
+def kept(picture: MeasuredPicture) -> NewestPicture:
+    pictures = NewestPicture("stick")
+    pictures.keep(picture, 77)
+    return pictures
 
 
 def asked(pictures: NewestPicture, since_ns: int = 0) -> tuple:
@@ -69,9 +75,7 @@ def asked(pictures: NewestPicture, since_ns: int = 0) -> tuple:
 
 
 def test_a_measured_log_is_drawn_where_the_camera_saw_it() -> None:
-    pictures = NewestPicture("stick")
-    pictures.keep(measured(LOG), 77)
-    facts, jpeg = asked(pictures)
+    facts, jpeg = asked(kept(measured(LOG)))
     picture = np.asarray(Image.open(io.BytesIO(jpeg)), int)
     assert picture.shape == (360, 640, 3) == (facts.height_px, facts.width_px, 3)
     (log,) = facts.logs
@@ -85,9 +89,7 @@ def test_a_measured_log_is_drawn_where_the_camera_saw_it() -> None:
 
 
 def test_pinhole_and_pose_of_a_reply_project_as_the_camera_does() -> None:
-    pictures = NewestPicture("stick")
-    pictures.keep(measured(LOG), 77)
-    facts, _ = asked(pictures)
+    facts, _ = asked(kept(measured(LOG)))
     point = np.array(ahead(640.0, 200.0, 3.0)) - facts.position_m
     x, y, z = point @ np.array(facts.rotation).reshape(3, 3)
     at = facts.fx_px * x / z + facts.cx_px, facts.fy_px * y / z + facts.cy_px
@@ -106,9 +108,7 @@ def test_a_picture_is_sent_once_and_a_log_behind_the_camera_has_no_place() -> No
 
 
 def test_a_noisy_picture_fits_into_a_datagram() -> None:
-    pictures = NewestPicture("stick")
-    pictures.keep(measured(LOG, noise=255), 77)
-    assert 0 < len(asked(pictures)[1]) <= MAX_JPEG_BYTES
+    assert 0 < len(asked(kept(measured(LOG, noise=255)))[1]) <= MAX_JPEG_BYTES
 
 
 def test_why_there_is_no_newer_picture_is_told() -> None:
@@ -148,9 +148,7 @@ def test_a_small_frame_is_drawn_whole_and_stays_as_it_was() -> None:
     mask = np.zeros(shape, bool)
     mask[50:90, 100:200] = True
     frame = RgbdFrame("stick", 5, rgb, np.full(shape, 4.0, np.float32), small)
-    pictures = NewestPicture("stick")
-    pictures.keep(MeasuredPicture(frame, POSE, [Mask(mask)], [LOG]), 77)
-    facts, jpeg = asked(pictures)
+    facts, jpeg = asked(kept(MeasuredPicture(frame, POSE, [Mask(mask)], [LOG])))
     assert (facts.width_px, facts.height_px) == (320, 180) and jpeg
     assert (rgb == 90).all()
 
@@ -158,8 +156,6 @@ def test_a_small_frame_is_drawn_whole_and_stays_as_it_was() -> None:
 def test_black_bars_are_left_out_and_what_is_seen_stays_in_its_place() -> None:
     framed = measured(LOG)
     framed.frame.rgb[:120] = framed.frame.rgb[600:] = 0
-    pictures = NewestPicture("stick")
-    pictures.keep(framed, 77)
-    facts, jpeg = asked(pictures)
+    facts, jpeg = asked(kept(framed))
     assert (facts.width_px, facts.height_px) == (640, 240) == Image.open(io.BytesIO(jpeg)).size
     assert facts.logs[0].ends_px == (pytest.approx((200.0, 90.0), abs=0.1), pytest.approx((400.0, 150.0), abs=0.1))

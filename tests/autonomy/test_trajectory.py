@@ -1,6 +1,8 @@
-"""Planned motions: smooth, inside the limits, without much swing, and where they should be."""
+"""Planned motions: smooth, inside the limits, without much swing, nearly as fast as can be, where they should be."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.motion.arm_kinematics import Arm, Pose
-from autonomy.motion.time_law import SWING_RAD
+from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
+from autonomy.motion.time_optimal import time_optimal_law
 from autonomy.motion.trajectory import (
+    STEP_S,
     Trajectory,
     follow_path,
     hold,
@@ -18,17 +22,18 @@ from autonomy.motion.trajectory import (
     straight_line,
     travel_over,
     with_quick_rotation,
+    within_limits,
 )
-from machine.geometry.kinematics import Unreachable, pin_position
-from machine.joints import JOINTS
+from machine.geometry.kinematics import Unreachable
+from machine.joints import JOINTS, N_JOINTS
 from machine.loading.profile_file import load_profile
-from machine.profile import joint
+from machine.profile import Profile
+from tests.autonomy.motion_figures import assert_within_limits, pins, sampled, swing
 from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
 ARM = Arm(PROFILE)
 TOP = 1.65
-FINE_S = 0.005
 
 
 def poses(slew: float = 1.6) -> st.SearchStrategy[Pose]:
@@ -39,41 +44,6 @@ def poses(slew: float = 1.6) -> st.SearchStrategy[Pose]:
         st.floats(-0.2, 1.6),
         st.floats(-3.0, 3.0),
     )
-
-
-def sampled(motion: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and the velocities that the motion states, every 5 ms, with rest before and after."""
-    times = np.arange(-0.1, motion.duration_s + 0.1, FINE_S)
-    both = [motion.at(t) for t in times]
-    return np.array([b[0] for b in both]), np.array([b[1] for b in both])
-
-
-def pins(q: np.ndarray) -> np.ndarray:
-    return np.array([pin_position(PROFILE.kinematics, row) for row in q])
-
-
-def assert_within_limits(motion: Trajectory) -> None:
-    q, stated = sampled(motion)
-    velocity = np.gradient(q, FINE_S, axis=0)
-    acceleration = np.gradient(stated, FINE_S, axis=0)
-    assert np.max(np.abs(velocity - stated)) < 0.005
-    for j in JOINTS:
-        spec = joint(PROFILE, j)
-        assert q[:, j].min() >= spec.lower and q[:, j].max() <= spec.upper
-        assert np.max(np.abs(velocity[:, j])) < spec.speed_limit
-        assert np.max(np.abs(acceleration[:, j])) < spec.acceleration_limit
-    assert flow_m3_s(q, stated).max() < 0.96 * PROFILE.hydraulics.pump_flow_m3_s
-
-
-def flow_m3_s(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """What the valves of all joints take, by the profile."""
-    total = np.zeros(len(q))
-    for j in JOINTS:
-        valve = joint(PROFILE, j).valve
-        for i, (at, v) in enumerate(zip(q[:, j], velocity[:, j], strict=True)):
-            arm = np.interp(at, valve.lever_at, valve.lever) if valve.lever else 1.0
-            total[i] += abs(v) * arm * (valve.flow_plus if v >= 0.0 else valve.flow_minus)
-    return total
 
 
 def test_progress_goes_from_0_to_1_with_rest_up_to_the_jerk_at_both_ends() -> None:
@@ -90,11 +60,11 @@ def test_progress_goes_from_0_to_1_with_rest_up_to_the_jerk_at_both_ends() -> No
 @given(poses(), poses())
 def test_a_travel_keeps_the_limits_and_ends_at_the_goal(start: Pose, goal: Pose) -> None:
     motion = travel_over(ARM, start, goal, TOP)
-    assert_within_limits(motion)
+    assert_within_limits(PROFILE, motion)
     q, _ = sampled(motion)
     assert ARM.pose(q[0]) == pytest.approx(start, abs=1e-6)
     assert ARM.pose(q[-1]) == pytest.approx(goal, abs=1e-6)
-    pin = pins(q)
+    pin = pins(PROFILE, q)
     assert pin[:, 2].max() < TOP + 0.001
     # It moves sideways only when it is almost up, and goes down only when it is almost there.
     aside = np.minimum(np.hypot(*(pin[:, :2] - pin[0, :2]).T), np.hypot(*(pin[:, :2] - pin[-1, :2]).T))
@@ -106,39 +76,25 @@ def test_a_travel_keeps_the_limits_and_ends_at_the_goal(start: Pose, goal: Pose)
 @given(poses(), st.floats(-0.2, 1.6))
 def test_a_vertical_line_is_vertical(start: Pose, z: float) -> None:
     motion = straight_line(ARM, start, start.at_height(z))
-    assert_within_limits(motion)
-    pin = pins(sampled(motion)[0])
+    assert_within_limits(PROFILE, motion)
+    pin = pins(PROFILE, sampled(motion)[0])
     assert np.max(np.hypot(*(pin[:, :2] - pin[0, :2]).T)) < 0.001
     assert pin[-1, 2] == pytest.approx(z, abs=1e-6)
 
 
 @pytest.mark.parametrize("period_s", [1.55, 1.6, 1.75, 1.9, 2.0])
 def test_a_hanging_log_swings_little_after_a_slew(period_s: float) -> None:
+    left, largest = swing(pins(PROFILE, sampled(to_bunk())[0]), period_s)
+    assert left < 1.1 * SWING_RAD < largest
+
+
+def to_bunk() -> Trajectory:
     start = ARM.pose_above(-1.8, 4.4, -0.1, TOP).at_height(TOP)
-    goal = ARM.pose_above(3.47, 0.96, 0.3, TOP).at_height(TOP)
-    pin = pins(sampled(travel_over(ARM, start, goal, TOP))[0])[:, :2]
-    omega = 2 * np.pi / period_s
-    swing, speed = np.zeros(2), np.zeros(2)  # a pendulum integrated step by step, undamped
-    acceleration = np.gradient(np.gradient(pin, FINE_S, axis=0), FINE_S, axis=0)
-    largest = 0.0
-    for a in acceleration:
-        speed += FINE_S * (-a - omega**2 * swing)
-        swing += FINE_S * speed
-        largest = max(largest, float(np.hypot(*swing)))
-    left = np.hypot(np.hypot(*swing), np.hypot(*speed) / omega) * omega**2 / 9.81
-    assert left < 1.1 * SWING_RAD < largest * omega**2 / 9.81
+    return travel_over(ARM, start, ARM.pose_above(3.47, 0.96, 0.3, TOP).at_height(TOP), TOP)
 
 
 def test_a_slew_to_the_bunk_takes_about_ten_seconds() -> None:
-    start = ARM.pose_above(-1.8, 4.4, -0.1, TOP).at_height(TOP)
-    goal = ARM.pose_above(3.47, 0.96, 0.3, TOP).at_height(TOP)
-    assert 6.0 < travel_over(ARM, start, goal, TOP).duration_s < 11.0
-
-
-def test_hold_stands_still() -> None:
-    q = (0.1, 0.5, -1.2, 0.4, 0.3)
-    motion = hold(q)
-    assert all(motion.at(t) == (q, (0.0,) * 5) for t in (-1.0, 0.0, 0.01, 1.0))
+    assert 6.0 < to_bunk().duration_s < 11.0
 
 
 def test_a_wrong_start_fades_out() -> None:
@@ -172,3 +128,177 @@ def test_a_quick_turn_is_the_same_turn_in_less_time_and_within_the_limits() -> N
     assert np.max(np.abs(push)) <= 1.01 * arm.acceleration[4]
     assert np.array(quick.velocity)[:, 4] == pytest.approx(np.gradient(after[:, 4], 0.02), abs=0.02)
     assert with_quick_rotation(arm, hold(start)).position == hold(start).position
+
+
+# -- laws that leave little swing
+GOALS, PERIODS_S = [(4.27, 1.86), (6.0, -1.86)], (1.5, 1.57, 1.72, 1.88, 2.03, 2.1)
+
+
+@dataclass(frozen=True)
+class Crane:
+    profile: Profile
+    arm: Arm
+
+
+CRANES = {name: Crane(p, Arm(p)) for name in ("aoro_fc8", "palms_471") for p in (load_profile(name),)}
+FORWARDER = CRANES["aoro_fc8"]
+
+
+def left_rad(crane: Crane, motion: Trajectory, period_s: float, damping: float = 0.0) -> float:
+    return swing(pins(crane.profile, sampled(motion)[0]), period_s, damping)[0]
+
+
+def trial(goal: tuple[float, float]) -> tuple[Pose, Pose]:
+    """Paper B's accuracy test: from over the bunk to a point beside it."""
+    arm = FORWARDER.arm
+    return arm.compact_pose_above(3.0, 0.0, 3.5, 3.5), arm.compact_pose_above(*goal, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("goal", GOALS)
+def test_the_trial_motions_leave_little_swing_for_every_period_of_the_range(goal: tuple[float, float]) -> None:
+    start, end = trial(goal)
+    shaped, plain = (straight_line(FORWARDER.arm, start, end, shaped) for shaped in (True, False))
+    assert shaped.duration_s == plain.duration_s and shaped.goal == pytest.approx(plain.goal)
+    left, left_plain = ([left_rad(FORWARDER, m, p) for p in PERIODS_S] for m in (shaped, plain))
+    assert max(left) < 1.15 * SWING_RAD < np.radians(3.0)
+    assert max(left) < 0.4 * max(left_plain) and np.mean(left) < 0.4 * np.mean(left_plain)
+    for motion in (shaped, plain):
+        assert_within_limits(FORWARDER.profile, motion)
+
+
+@pytest.mark.parametrize("damping", [0.05, 0.1, 0.15])
+@pytest.mark.parametrize("goal", GOALS)
+def test_links_with_friction_swing_as_little(goal: tuple[float, float], damping: float) -> None:
+    motion = straight_line(FORWARDER.arm, *trial(goal))
+    left = [left_rad(FORWARDER, motion, p, damping) for p in PERIODS_S]
+    assert max(left) < 1.1 * SWING_RAD
+
+
+@pytest.mark.parametrize("goal", GOALS)
+def test_a_motion_takes_as_long_as_its_law_says(goal: tuple[float, float]) -> None:
+    start, end = (np.array(pose) for pose in trial(goal))
+    law = swing_free_law(PathGeometry(FORWARDER.arm, start + np.linspace(0.0, 1.0, 81)[:, None] * (end - start)))
+    assert straight_line(FORWARDER.arm, *trial(goal)).duration_s < law.duration_s + STEP_S
+
+
+@pytest.mark.parametrize("goal", GOALS)
+def test_the_law_without_swing_takes_little_longer_than_the_fastest(goal: tuple[float, float]) -> None:
+    start, end = (np.array(pose) for pose in trial(goal))
+    way = PathGeometry(FORWARDER.arm, start + np.linspace(0.0, 1.0, 81)[:, None] * (end - start))
+    fastest, shaped = swing_free_law(way, shaped=False), swing_free_law(way)
+    assert fastest.duration_s < shaped.duration_s < 1.13 * fastest.duration_s
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", CRANES)
+@settings(deadline=None, max_examples=20)
+@given(slew=st.floats(-1.2, 1.2), near=st.floats(3.4, 4.2), far=st.floats(4.2, 6.0), z=st.floats(0.8, 1.6))
+def test_any_straight_motion_keeps_limits_and_swing(name: str, slew: float, near: float, far: float, z: float) -> None:
+    crane = CRANES[name]
+    turn = crane.profile.kinematics.theta1_offset_rad
+    start = crane.arm.pose_above(near * np.cos(turn), near * np.sin(turn), 1.2, 1.2)
+    goal = crane.arm.pose_above(far * np.cos(turn + slew), far * np.sin(turn + slew), z, z)
+    motion = straight_line(crane.arm, start, goal)
+    assert_within_limits(crane.profile, motion)
+    assert crane.arm.pose(motion.goal) == pytest.approx(goal, abs=1e-6)
+    assert max(left_rad(crane, motion, p) for p in (1.53, 1.75, 2.05)) < 1.2 * SWING_RAD
+
+
+def test_a_short_motion_that_needs_a_second_stretch_keeps_its_limits() -> None:
+    crane = FORWARDER
+    turn = crane.profile.kinematics.theta1_offset_rad
+    reach = np.cos(turn), np.sin(turn)
+    start = crane.arm.pose_above(*(4.171785896742758 * c for c in reach), 1.2, 1.2)
+    goal = crane.arm.pose_above(*(4.203125 * c for c in reach), 1.158203125, 1.158203125)
+    assert_within_limits(crane.profile, straight_line(crane.arm, start, goal))
+
+
+def test_a_motion_that_no_duration_slows_is_refused() -> None:
+    def sampled(duration_s: float) -> np.ndarray:
+        q = np.zeros((int(duration_s / STEP_S) + 2, len(JOINTS)))
+        q[len(q) // 2, 0] = 0.5
+        return q
+
+    with pytest.raises(Unreachable, check=coded("motion.over-limits")):
+        within_limits(FORWARDER.arm, sampled, 1.0)
+
+
+def test_equal_paths_have_equal_laws_and_a_point_has_none() -> None:
+    start, end = trial(GOALS[0])
+    first, again = (straight_line(Arm(FORWARDER.profile), start, end) for _ in range(2))
+    assert first.position == again.position and first.velocity == again.velocity
+    still = straight_line(FORWARDER.arm, start, start)
+    assert still.duration_s == STEP_S and still.velocity == [(0.0,) * len(JOINTS)] * 2
+
+
+# -- the quick law
+ENDS = {
+    "palms_471": ((-1.8, 4.4), (3.47, 0.96), 1.6),
+    "aoro_fc8": ((2.4, 0.0), (3.4, 4.1), 2.9),
+}
+
+
+def way_over(name: str) -> PathGeometry:
+    arm, (a, b, z) = CRANES[name].arm, ENDS[name]
+    first, last = (np.array(arm.pose_above(*xy, z - 0.5, z).at_height(z)) for xy in (a, b))
+    return PathGeometry(arm, first + np.linspace(0.0, 1.0, 81)[:, None] * (last - first))
+
+
+@pytest.mark.parametrize("name", CRANES)
+def test_it_keeps_speeds_accelerations_and_pump(name: str) -> None:
+    arm, way = CRANES[name].arm, way_over(name)
+    law = time_optimal_law(arm, way)
+    time_s = np.arange(0.0, law.duration_s + 1e-9, 0.01)
+    q = way.curve(law.progress(time_s))[:, :N_JOINTS]
+    v = np.gradient(q, 0.01, axis=0)
+    a = np.gradient(v, 0.01, axis=0)
+    assert np.max(np.abs(v) / arm.speed) < 1.01 and np.max(arm.pump_load(q, v)) < 1.01
+    assert np.max(np.abs(a) / arm.acceleration) < 1.04  # cubics between the samples overshoot a little
+    assert law.done[0] == 0.0 and law.done[-1] == pytest.approx(1.0)
+    assert np.all(np.diff(law.done) >= -1e-9)
+    assert np.max(np.abs(v[[0, -1]] / arm.speed)) < 0.01
+
+
+@pytest.mark.parametrize("name", CRANES)
+def test_it_leaves_little_swing_and_says_how_much(name: str) -> None:
+    arm, way = CRANES[name].arm, way_over(name)
+    law = time_optimal_law(arm, way)
+    pin = way.curve(law.progress(np.arange(0.0, law.duration_s, 0.005)))[:, N_JOINTS:]
+    assert max(swing(pin, period_s)[0] for period_s in (1.5, 1.8, 2.1)) < 1.15 * SWING_RAD
+    assert law.swing_rad <= SWING_RAD
+    assert time_optimal_law(arm, way, shaped=False).swing_rad > 2.0 * SWING_RAD
+
+
+@pytest.mark.parametrize("name", CRANES)
+def test_without_regard_to_swing_it_is_as_fast_as_the_slow_law(name: str) -> None:
+    way = way_over(name)
+    quick, slow = time_optimal_law(CRANES[name].arm, way, shaped=False), swing_free_law(way, shaped=False)
+    assert quick.duration_s < 1.06 * slow.duration_s
+
+
+@pytest.mark.parametrize("name", CRANES)
+def test_a_level_path_takes_at_most_a_second_longer_than_the_slow_law(name: str) -> None:
+    way = way_over(name)
+    assert time_optimal_law(CRANES[name].arm, way).duration_s < swing_free_law(way).duration_s + 1.3
+
+
+def test_a_vertical_path_needs_no_window() -> None:
+    arm = CRANES["palms_471"].arm
+    low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
+    way = PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, 0.0, 1.2, 0.0, 0.0]))
+    law = time_optimal_law(arm, way)
+    assert law.swing_rad == 0.0
+    assert law.duration_s < 1.08 * swing_free_law(way).duration_s
+
+
+def test_a_path_too_short_to_swing_anything_is_as_fast_as_a_vertical_one() -> None:
+    arm = CRANES["palms_471"].arm
+    low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
+    up, aside = (
+        PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, r_m, 1.2, 0.0, 0.0]))
+        for r_m in (0.0, 0.015)
+    )
+    assert swing_free_law(aside).duration_s < swing_free_law(up).duration_s + 0.05
+    pin = aside.curve(np.linspace(0.0, 1.0, 2))[:, N_JOINTS:]
+    omega = 2.0 * np.pi / 1.5
+    assert not aside.sideways and float(np.hypot(*(pin[1] - pin[0]))) * omega**2 / 9.81 < SWING_RAD

@@ -1,12 +1,14 @@
-"""Every transition of both tables, and the invariants of the tables."""
+"""Every transition of both tables, the invariants of the tables, and the page that shows them."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 
 import pytest
 
+from autonomy.manager.state_chart import diagram, page
 from autonomy.manager.transition_table import (
     EVENT_DESCRIPTIONS,
     FINAL_STATES,
@@ -36,16 +38,22 @@ def test_only_transitions_of_the_table_are_possible(name: str, state: State, eve
             next_state(table, state, event)
 
 
-@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
-def test_every_state_is_reached_and_left(table) -> None:
-    used = {state for state, _ in table} | set(table.values())
-    reached, front = {State.IDLE}, [State.IDLE]
+def reached_from(table, *begins: State, without: State | None = None) -> set[State]:
+    """The states that a mission comes to after these, by ways that do not lead through one."""
+    reached, front = set(begins), list(begins)
     while front:
         state = front.pop()
         for (begin, _), end in table.items():
-            if begin is state and end not in reached:
+            if begin is state and end not in reached and end is not without:
                 reached.add(end)
                 front.append(end)
+    return reached
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
+def test_every_state_is_reached_and_left(table) -> None:
+    used = {state for state, _ in table} | set(table.values())
+    reached = reached_from(table, State.IDLE)
     assert reached == used
     assert State.DONE in reached
     for state in used - FINAL_STATES:
@@ -67,11 +75,7 @@ def test_every_state_and_event_has_a_description_and_an_end() -> None:
 
 def test_the_machine_only_drives_after_the_crane_is_stowed() -> None:
     for table in TABLES.values():
-        seen, todo = set(), [end for (begin, _), end in table.items() if begin in (State.COLLECT, State.UNLOAD)]
-        while todo:
-            if (state := todo.pop()) not in seen | {State.STOW}:
-                seen.add(state)
-                todo += [end for (begin, _), end in table.items() if begin is state]
+        seen = reached_from(table, State.COLLECT, State.UNLOAD, without=State.STOW)
         assert not any(RULES[state].drives for state in seen), seen
 
 
@@ -86,11 +90,19 @@ def test_the_crane_only_works_at_standstill_with_the_frame_lowered() -> None:
 def test_paper_b_observes_at_standstill_and_passes_the_log_before_loading() -> None:
     """Fig. 8: every path from the search to the crane includes these states."""
     for needed in (State.HALT, State.LOOK, State.APPROACH, State.CHECK, State.LOWER):
-        reached, front = {State.SEARCH}, [State.SEARCH]
-        while front:
-            state = front.pop()
-            for (begin, _), end in PAPER_B.items():
-                if begin is state and end not in reached and end is not needed:
-                    reached.add(end)
-                    front.append(end)
-        assert State.COLLECT not in reached, needed
+        assert State.COLLECT not in reached_from(PAPER_B, State.SEARCH, without=needed), needed
+
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_the_page_of_the_activity_manager_is_as_the_code_has_it() -> None:
+    assert (DOCS / "activity.md").read_text() == page(), "run `timberhand mission states --docs docs`"
+
+
+@pytest.mark.parametrize("table", [PAPER_B, OURS], ids=["paper_b", "ours"])
+def test_every_change_is_in_the_diagram(table) -> None:
+    text = diagram(table)
+    for (begin, event), end in table.items():
+        line = next(x for x in text.splitlines() if x.strip().startswith(f"{begin.name} --> {end.name} "))
+        assert event.name.lower().replace("_", " ") in line

@@ -1,22 +1,29 @@
-"""Paper A's virtual world: trimmed cylinders, cuboid, the camera above it; and the planner that looks through it."""
+"""Paper A's virtual world, the planner that looks through it, the picture of its plan, and planners by name."""
 
 from __future__ import annotations
 
 from math import cos, hypot, pi, remainder, sin
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
-from autonomy.grasp.cnn_planner import CnnPlanner, mean_maps
+from autonomy.grasp import planners
+from autonomy.grasp.cnn_planner import GAP_PX, GRASP_RGB, QUALITY_RGB, ZOOM, CnnPlanner, mean_maps, write_plan
 from autonomy.grasp.cylinders import as_cylinders
-from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet
+from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet, PixelGrasp
 from autonomy.grasp.planner import GraspRequest, NoGrasp
+from autonomy.grasp.planners import OUR_PLANNER, PlannerChoice
 from autonomy.grasp.quality import jaws_of
+from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
+from autonomy.process.command_line import arguments
 from machine.loading.profile_file import load_profile
 from runtime.errors import InputRefused
 from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, Chosen, X, Y, cross, log, pair, small_pile
@@ -171,3 +178,96 @@ def test_the_network_plans_as_if_logs_that_must_stay_were_not_there() -> None:
     assert p.logs == (1,) and (p.x_m, p.y_m) == (without.x_m, without.y_m)
     with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
         planner(GraspRequest(ARM, logs, 0.0, stay=range(3)))
+
+
+# -- the picture of a plan
+SIDE_PX = 300
+
+
+def test_the_near_is_bright_the_best_is_yellow_and_the_grasp_is_drawn_in_both(tmp_path: Path) -> None:
+    depth_m, quality = np.full((SIDE_PX, SIDE_PX), 3.0), np.zeros((100, 100))
+    depth_m[:150] = 2.0
+    quality[:, :50] = 1.0
+    write_plan(tmp_path / "plan.png", depth_m, quality, PixelGrasp(200.0, 220.0, 0.0, 1.0), 60.0)
+    picture = np.asarray(Image.open(tmp_path / "plan.png"))
+    right = ZOOM * SIDE_PX + GAP_PX
+    assert picture.shape == (ZOOM * SIDE_PX, 2 * ZOOM * SIDE_PX + GAP_PX, 3)
+    assert tuple(picture[10, 10]) == (255, 255, 255) and tuple(picture[-10, 10]) == (0, 0, 0)
+    assert tuple(picture[10, right + 10]) == QUALITY_RGB[-1] and tuple(picture[10, -10]) == QUALITY_RGB[0]
+    for left in (0, right):
+        for side_px in (-30, 30):
+            jaw = picture[ZOOM * 220 + 3, left + ZOOM * (200 + side_px)]
+            assert tuple(jaw) == GRASP_RGB
+
+
+def test_every_plan_has_its_picture_and_a_folder_that_is_gone_changes_no_plan(tmp_path: Path) -> None:
+    folder = tmp_path / "plans"
+    folder.mkdir()
+    planner, request = CnnPlanner(Chosen(150.0, 150.0, 0.3), pictures=folder), GraspRequest(ARM, tuple(pair()), 0.0)
+    plain = CnnPlanner(Chosen(150.0, 150.0, 0.3))(request)
+    plans = [planner(request), planner(request)]
+    assert [path.name for path in sorted(folder.iterdir())] == ["plan-001.png", "plan-002.png"]
+    assert str(folder / "plan-002.png") in plans[1].reason
+    for path in folder.iterdir():
+        path.unlink()
+    folder.rmdir()
+    last = planner(request)
+    for plan in (*plans, last):
+        assert (plan.x_m, plan.y_m, plan.yaw_rad, plan.support_z_m) == (
+            plain.x_m,
+            plain.y_m,
+            plain.yaw_rad,
+            plain.support_z_m,
+        )
+    assert "plan-003.png" in last.reason and last.reason != plans[0].reason
+
+
+# -- planners by name
+WORDS = ["--controller", "127.0.0.1:1", "--report-port", "2", "--scene", "127.0.0.1:3"]
+
+
+@pytest.mark.parametrize(
+    ("choice", "kind"),
+    [
+        (OUR_PLANNER, SamplingPlanner),
+        (PlannerChoice("cnn"), CnnPlanner),
+        (PlannerChoice("cnn-physical", 4), CnnPlanner),
+        (PlannerChoice("cnn", 1, "."), CnnPlanner),
+    ],
+)
+def test_a_name_makes_its_planner_and_reaches_the_planning_process(choice, kind):
+    assert isinstance(choice.make(), kind)
+    assert arguments([*WORDS, *choice.arguments()]).planner == choice
+
+
+@pytest.mark.parametrize(
+    ("choice", "code"),
+    [
+        (PlannerChoice("nobody"), "planner.unknown"),
+        (PlannerChoice("search", 2), "planner.no-virtual-camera"),
+        (PlannerChoice("search", 1, "."), "planner.no-pictures"),
+        (PlannerChoice("cnn", 1, "no/such/folder"), "planner.no-folder"),
+        (PlannerChoice("cnn", 0), "planner.virtual-cameras"),
+        (PlannerChoice("cnn", planners.MAX_VIRTUAL_CAMERAS + 1), "planner.virtual-cameras"),
+    ],
+)
+def test_what_no_planner_can_do_is_refused_before_anything_is_loaded(choice, code, capsys):
+    with pytest.raises(InputRefused, check=coded(code)):
+        choice.check()
+    with pytest.raises(InputRefused, check=coded(code)):
+        choice.make()
+    words = ("--virtual-cameras", str(choice.virtual_cameras), "--plan-pictures", choice.pictures)
+    with pytest.raises(SystemExit, match="2"):
+        arguments([*WORDS, "--planner", choice.name, *words])
+
+
+def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch):
+    def entry_points(group, name=""):
+        assert group == "timberhand.grasp_planners"
+        return [SimpleNamespace(name="pca", load=lambda: SamplingPlanner)] if name in ("", "pca") else []
+
+    monkeypatch.setattr("autonomy.grasp.planners.entry_points", entry_points)
+    monkeypatch.setattr("runtime.plugins.entry_points", entry_points)
+    assert isinstance(PlannerChoice("pca").make(), SamplingPlanner)
+    with pytest.raises(InputRefused, check=coded("planner.no-virtual-camera")):
+        PlannerChoice("pca", 2).check()

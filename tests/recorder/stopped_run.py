@@ -40,6 +40,11 @@ class RecordedBench(Bench):
         self.tick([self.hold()])
         self.drive(0, 0.08, 20)
 
+    def close(self) -> None:
+        """End the recordings."""
+        for recorder in self.recorders:
+            recorder.close()
+
     def lose(self, message: str, ticks: int) -> None:
         """The message is not received any more; the planner goes on."""
         self.dropped.add(message)
@@ -51,15 +56,21 @@ def recorder_in(directory: Path, live: bool = False, **options) -> Recorder:
     return Recorder(directory, PROFILE, describe(PROFILE, ("crane0",), seed=3, live=live), sync=False, **options)
 
 
+def run_to_a_stop(directory: Path, before: int = 600, after: int = 1200, **options) -> RecordedBench:
+    """A run below ``directory`` that goes on: ``before`` ticks of motion, EncLift lost, and ``after`` ticks."""
+    bench = RecordedBench([recorder_in(directory, **options)])
+    bench.active(ticks=before)
+    if after:
+        bench.lose("EncLift", after)
+    return bench
+
+
 def run_with_a_stop(
     directory: Path, after: int = 1200, then: Callable[[RecordedBench], None] | None = None, **options
 ) -> RecordedBench:
-    """A run below ``directory``: 3 s of motion, EncLift lost, and ``after`` ticks."""
-    recorder = recorder_in(directory, **options)
-    bench = RecordedBench([recorder])
-    bench.active(ticks=600)
-    bench.lose("EncLift", after)
+    """The same, ended: 3 s of motion."""
+    bench = run_to_a_stop(directory, after=after, **options)
     if then is not None:
         then(bench)
-    recorder.close()
+    bench.close()
     return bench

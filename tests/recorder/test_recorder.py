@@ -1,30 +1,43 @@
-"""The recorder: its files can be read back, by the trace reader and by other tools."""
+"""The recorder: its files are read back, by other tools too, and survive the death of their writer (fault 37)."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import queue
+import random
+import shutil
 import struct
+import threading
 
 import can
 import pytest
 from mcap.reader import make_reader
 
+from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from can_dbc.messages.datagrams import encode
+from can_dbc.messages.record_ring import RingReader
 from can_dbc.messages.vehicle import VehicleReport
+from can_dbc.timing.page import TimingWriter
 from can_dbc.trace.candump import read_trace
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module
 from recorder import segment
+from recorder.__main__ import InputCollector, udp_socket, write_all
 from recorder.recorder import CHUNK_NS, Recorder
-from recorder.recover import Channel, Stored, is_complete, run_files, scan
+from recorder.recover import Channel, Stored, is_complete, recover, run_files, scan
 from runtime.errors import InputRefused
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 from tests.recorder.recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
 
-TICKS = 200
+TICKS = 400
+
+
+@pytest.fixture
+def recorder(tmp_path):
+    return Recorder(tmp_path, PROFILE, manifest())
 
 
 @pytest.fixture(scope="module")
@@ -96,8 +109,7 @@ def test_channels_have_their_encoding(run):
     assert {f"/crane0/{name}" for name in CRANE.messages} <= set(channels)
 
 
-def test_every_state_of_the_timing_page_is_a_message(timing, tmp_path):
-    recorder = Recorder(tmp_path, PROFILE, manifest())
+def test_every_state_of_the_timing_page_is_a_message(recorder, timing, tmp_path):
     for k in range(3):
         recorder.on_timing(timing(100 + k, written_ns=START_NS + k * 10**9))
     recorder.close()
@@ -109,15 +121,13 @@ def test_every_state_of_the_timing_page_is_a_message(timing, tmp_path):
     assert first["inputs"]["Input6"]["longest_ns"] == 16_000_000
 
 
-def test_the_sender_follows_the_raw_frame(tmp_path):
-    recorder = Recorder(tmp_path, PROFILE, manifest())
+def test_the_sender_follows_the_raw_frame(recorder, tmp_path):
     recorder.on_frame("crane0", Frame(START_NS, 0x80, b"\x01"), "plant")
     recorder.close()
     assert by_topic(tmp_path / "run.mcap")["/crane0/raw"][0][2][16:] == b"plant"
 
 
-def test_a_frame_of_wrong_length_is_recorded_raw(tmp_path):
-    recorder = Recorder(tmp_path, PROFILE, manifest())
+def test_a_frame_of_wrong_length_is_recorded_raw(recorder, tmp_path):
     recorder.on_frame("crane0", Frame(START_NS, CRANE.message("EncSlew").key, b"\x01"))
     recorder.close()
     assert set(by_topic(tmp_path / "run.mcap")) == {"/manifest", "/crane0/raw"}
@@ -150,8 +160,7 @@ def test_live_records_carry_utc_and_monotonic_time(tmp_path):
     assert manifests.read(tmp_path).start_utc.endswith("Z")
 
 
-def test_chunks_close_within_250_ms_of_recorded_time(tmp_path):
-    recorder = Recorder(tmp_path, PROFILE, manifest())
+def test_chunks_close_within_250_ms_of_recorded_time(recorder, tmp_path):
     feed(recorder, range(500))
     path = tmp_path / "run.mcap"
     stamps = [r.publish_ns for r in scan(path) if isinstance(r, Stored)]
@@ -161,8 +170,7 @@ def test_chunks_close_within_250_ms_of_recorded_time(tmp_path):
     assert is_complete(path)
 
 
-def test_chunks_stay_short_when_one_source_lags(tmp_path):
-    recorder = Recorder(tmp_path, PROFILE, manifest())
+def test_chunks_stay_short_when_one_source_lags(recorder, tmp_path):
     for k in range(0, 400, 38):
         for lagging in range(k, k + 38):
             recorder.on_tick(tick(lagging))
@@ -175,8 +183,7 @@ def test_chunks_stay_short_when_one_source_lags(tmp_path):
     assert max(spans) < CHUNK_NS
 
 
-def test_damaged_datagrams_are_counted(tmp_path):
-    recorder = Recorder(tmp_path, PROFILE, manifest())
+def test_damaged_datagrams_are_counted(recorder, tmp_path):
     recorder.on_tick(tick(0)[:-1])
     recorder.on_report(b"nonsense")
     recorder.on_report(report(0))
@@ -261,3 +268,145 @@ def test_scan_returns_only_the_requested_topics(run):
     records = list(scan(run / "run.mcap", {"/controller/tick"}))
     assert {r.topic for r in records if isinstance(r, Channel)} == {"/controller/tick"}
     assert len([r for r in records if isinstance(r, Stored)]) == TICKS
+
+
+# -- a writer that dies
+def chunk_ends(path):
+    """Where each chunk ends in the file; the first holds channels and manifest only."""
+    with path.open("rb") as file:
+        return [c.chunk_start_offset + c.chunk_length for c in make_reader(file).get_summary().chunk_indexes]
+
+
+def ticks_of(path):
+    """The tick records, read with the library's indexed reader."""
+    with path.open("rb") as file:
+        return [m.data for _, _, m in make_reader(file).iter_messages(topics=["/controller/tick"])]
+
+
+@pytest.mark.long
+def test_truncated_anywhere_is_readable_again_and_loses_one_chunk_at_most(run, tmp_path):
+    data = (run / "run.mcap").read_bytes()
+    size, dice = len(data), random.Random(1)
+    ends = chunk_ends(run / "run.mcap")
+    seen = []
+    for n in sorted({*range(0, 60, 7), *(dice.randrange(size) for _ in range(60)), *range(size - 40, size, 5)}):
+        path = tmp_path / "run.mcap"
+        path.write_bytes(data[:n])
+        (mended,) = recover(tmp_path)
+        assert mended.path == path and is_complete(path)
+        kept = ticks_of(path)
+        assert kept == [tick(k) for k in range(len(kept))]
+        whole_chunks = [end for end in ends if end <= n]
+        assert len(kept) == min(TICKS, CHUNK_NS // T_NS * max(0, len(whole_chunks) - 1))
+        seen.append(len(kept))
+    assert seen == sorted(seen) and seen[0] == 0 and seen[-1] == TICKS
+    assert len(set(seen)) > 8
+
+
+def test_a_flipped_byte_ends_the_valid_part(run, tmp_path):
+    data = bytearray((run / "run.mcap").read_bytes())
+    data[chunk_ends(run / "run.mcap")[3] - 20] ^= 0x55  # within a chunk: the index behind it has no checksum
+    (tmp_path / "run.mcap").write_bytes(data)
+    kept = [r.data for r in scan(tmp_path / "run.mcap", {"/controller/tick"}) if isinstance(r, Stored)]
+    assert 0 < len(kept) < TICKS and kept == [tick(k) for k in range(len(kept))]
+
+
+@pytest.mark.parametrize("damage", ["message without its header", "longer than its chunk", "unknown channel", "huge"])
+def test_damaged_records_with_good_checksums_end_the_valid_part(tmp_path, damage):
+    """A chunk may hold anything under a checksum that fits."""
+    message = struct.pack("<HIQQ", 7, 0, 1, 1) + b"data"
+    inner = {
+        "message without its header": struct.pack("<BQ", 5, 3) + b"abc",
+        "longer than its chunk": struct.pack("<BQ", 5, 1000) + message,
+        "unknown channel": struct.pack("<BQ", 5, len(message)) + message,
+        "huge": b"",
+    }[damage]
+    size = 1 << 50 if damage == "huge" else len(inner)
+    chunk = struct.pack("<QQQII", 0, 0, size, 0, 0) + struct.pack("<Q", len(inner)) + inner
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk)
+    assert list(scan(path)) == []
+    assert [r.messages for r in recover(tmp_path)] == [0] and is_complete(path)
+
+
+def test_a_complete_recording_is_not_changed(run, tmp_path):
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    before = {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()}
+    assert recover(tmp_path) == []
+    assert {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()} == before
+
+
+def test_a_running_recorder_is_not_disturbed(recorder, tmp_path):
+    feed(recorder, range(100))
+    assert recover(tmp_path) == []
+    recorder.close()
+    assert ticks_of(tmp_path / "run.mcap") == [tick(k) for k in range(100)]
+
+
+def test_an_unfinished_line_of_the_candump_file_is_removed(run, tmp_path):
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "crane0.log"
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:10]) + lines[10][:15])
+    recover(tmp_path)
+    assert log.read_bytes() == b"".join(lines[:10])
+
+
+def test_a_file_of_another_kind_is_refused_with_its_name(tmp_path):
+    (tmp_path / "run.mcap").write_text("this is no recording")
+    with pytest.raises(InputRefused, check=coded("recording.not-mcap")):
+        list(scan(tmp_path / "run.mcap"))
+
+
+def test_write_of_the_manifest_is_old_or_new(tmp_path):
+    manifests.write(tmp_path, manifest())
+    assert manifests.read(tmp_path).complete is False
+    assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]
+
+
+def test_frames_that_the_kernel_dropped_are_reported_once(tmp_path, capfd):
+    with open_bus("virtual:collector-loses") as bus:
+        inputs = InputCollector({"crane0": bus}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
+        receive = inputs._receivers[0]
+        receive()
+        assert not capfd.readouterr().err
+        bus.stats.dropped += 7
+        receive()
+        receive()
+        said = capfd.readouterr().err
+        assert said.count("crane0") == 1 and 7 in numbers_in(said)
+        inputs.items.put(None)
+        write_all(Recorder(tmp_path, PROFILE, manifest()), inputs)
+    assert manifests.read(tmp_path).dropped == 7, "a recording with gaps says so"
+
+
+def test_the_collector_receives_each_state_of_the_timing_page_once(timing, tmp_path, monkeypatch):
+    monkeypatch.setattr("recorder.__main__.TIMING_PERIOD_S", 0.0)
+    page = tmp_path / "controller.timing"
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0), page)
+    *_, receive = inputs._receivers
+    receive()
+    assert inputs.items.empty(), "no controller yet"
+    writer = TimingWriter(page)
+    for k in (1, 1, 2):
+        written = timing(100, written_ns=k)
+        writer.publish(written.facts, written.durations)
+        receive()
+    writer.close()
+    receive()
+    received = [inputs.items.get_nowait() for _ in range(inputs.items.qsize())]
+    assert [(kind, told.facts.written_ns) for kind, _, told in received] == [("timing", 1), ("timing", 2)]
+
+
+def test_records_that_do_not_fit_into_the_queue_are_counted(tmp_path, capfd):
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
+    inputs.items = queue.Queue(2)
+    for k in range(5):
+        inputs._put(("tick", "", tick(k)), 1)
+    recorder = Recorder(tmp_path, PROFILE, manifest())
+    writer = threading.Thread(target=write_all, args=(recorder, inputs))
+    writer.start()
+    inputs.items.put(None)
+    writer.join(10)
+    assert recorder.dropped == 3 and manifests.read(tmp_path).dropped == 3
+    assert 3 in numbers_in(capfd.readouterr().err)

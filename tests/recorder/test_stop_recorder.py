@@ -1,4 +1,4 @@
-"""Every stop has a file of its own: 10 s before it and 5 s after it, whole whatever happens to the writer."""
+"""Every stop has a file of its own, whole whatever happens to the writer, and an entry in systemd's journal."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import errno
 import itertools
 import os
 import random
+import socket
+import struct
 import time
 from pathlib import Path
 
@@ -15,17 +17,17 @@ import pytest
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.tick_record import decode
 from hil.replay.recording import manifest_of, messages
-from machine.status.explanation import StopDetector
+from machine.status.explanation import StopDetector, message_id
 from machine.status.modes import Mode
 from machine.status.reasons import Reason, pack
+from recorder import __main__, stop_recorder
 from recorder import manifest as manifests
-from recorder import stop_recorder
-from recorder import stop_recorder as stop_recorder_module
+from recorder.__main__ import write_to_journal
 from recorder.recorder import TICK
 from recorder.recover import is_complete
 from recorder.stop_recorder import TOPIC, Stop, StopFiles, files_in, parts_in, repair, stop_from
 from tests.codes import numbers_in
-from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
+from tests.recorder.stopped_run import RecordedBench, run_to_a_stop, run_with_a_stop
 
 
 def stop_of(path: Path) -> Stop:
@@ -59,11 +61,7 @@ def test_a_stop_has_a_file_with_its_reason_and_numbers(whole: Path) -> None:
 
 
 def test_the_file_has_ten_seconds_before_the_stop_and_five_after_it(tmp_path: Path) -> None:
-    recorder = recorder_in(tmp_path)
-    bench = RecordedBench([recorder])
-    bench.active(ticks=2400)
-    bench.lose("EncLift", 1200)
-    recorder.close()
+    run_to_a_stop(tmp_path, before=2400).close()
     (path,) = files_in(tmp_path / "stops")
     times = times_s(path)
     assert times[0] == pytest.approx(-10.0, abs=0.03) and times[-1] == pytest.approx(5.0, abs=0.03)
@@ -100,9 +98,7 @@ def test_the_end_of_the_run_completes_a_file_early(tmp_path: Path) -> None:
 
 
 def test_a_run_without_a_stop_has_no_directory(tmp_path: Path) -> None:
-    recorder = recorder_in(tmp_path)
-    RecordedBench([recorder]).active(ticks=100)
-    recorder.close()
+    run_to_a_stop(tmp_path, before=100, after=0).close()
     assert not (tmp_path / "stops").exists()
 
 
@@ -136,9 +132,7 @@ def test_a_reason_of_another_release_keeps_its_number() -> None:
     assert (stop.reason, stop.code, numbers_in(stop.text)) == (250, "REASON_250", [250])
 
 
-# ---- the ring of files --------------------------------------------------------------------------------------------
-
-
+# -- the ring of files
 def many_stops(directory: Path, stops: int) -> None:
     """Short stops, each in a recording of its own with one common directory of stops."""
     for k in range(stops):
@@ -146,22 +140,17 @@ def many_stops(directory: Path, stops: int) -> None:
 
 
 @pytest.mark.long
-def test_the_oldest_files_make_room_and_the_numbers_tell_how_many(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_oldest_files_make_room_and_the_numbers_tell_how_many(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(stop_recorder, "MAX_FILES", 3)
     many_stops(tmp_path, 5)
     assert [stop_of(path).number for path in files_in(tmp_path / "stops")] == [3, 4, 5]
     assert StopFiles(tmp_path / "stops", False).next_number == 6
 
 
-def test_the_bytes_of_all_files_are_bounded_and_the_newest_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bytes_of_all_files_are_bounded_and_the_newest_stays(tmp_path, monkeypatch) -> None:
     many_stops(tmp_path, 2)
     size = max(path.stat().st_size for path in files_in(tmp_path / "stops"))
     monkeypatch.setattr(stop_recorder, "MAX_BYTES", int(2.5 * size))
-    many_stops(tmp_path / "more", 0)
     run_with_a_stop(tmp_path / "third", after=20, stops=tmp_path / "stops")
     assert [stop_of(path).number for path in files_in(tmp_path / "stops")] == [2, 3]
     monkeypatch.setattr(stop_recorder, "MAX_BYTES", 1)
@@ -169,9 +158,7 @@ def test_the_bytes_of_all_files_are_bounded_and_the_newest_stays(
     assert [stop_of(path).number for path in files_in(tmp_path / "stops")] == [4]
 
 
-# ---- a writer that dies -------------------------------------------------------------------------------------------
-
-
+# -- a writer that dies
 @pytest.mark.long
 def test_truncated_anywhere_it_is_readable_again_and_earlier_stops_are_not_touched(whole: Path, tmp_path: Path) -> None:
     (complete,) = files_in(whole / "stops")
@@ -209,63 +196,116 @@ def test_a_flipped_byte_is_found_by_the_checksum(whole: Path, tmp_path: Path) ->
 
 
 def test_a_file_that_is_still_written_is_left_alone_and_can_be_read(tmp_path: Path) -> None:
-    recorder = recorder_in(tmp_path)
-    bench = RecordedBench([recorder])
-    bench.active(ticks=200)
-    bench.lose("EncLift", 100)
+    bench = run_to_a_stop(tmp_path, before=200, after=100)
     (part,) = parts_in(tmp_path / "stops")
     assert repair(tmp_path / "stops") == [] and parts_in(tmp_path / "stops") == [part]
     assert stop_of(part).code == "ENCODER_LOST" and times_s(part)[-1] > 0.3
-    recorder.close()
+    bench.close()
     assert not parts_in(tmp_path / "stops") and len(files_in(tmp_path / "stops")) == 1
 
 
 def test_a_full_disk_costs_the_file_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder = recorder_in(tmp_path)
-    bench = RecordedBench([recorder])
-    bench.active(ticks=200)
+    bench = run_to_a_stop(tmp_path, before=200, after=0)
 
     def full(self: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
-        patched.setattr(stop_recorder_module.StopFile, "commit", full)
+        patched.setattr(stop_recorder.StopFile, "commit", full)
         bench.lose("EncLift", 100)
     bench.arm_again()
     bench.lose("GuardStat", 100)
-    recorder.close()
+    bench.close()
     assert [stop_of(path).code for path in files_in(tmp_path / "stops")] == ["GUARD_LOST"]
-    assert recorder.lost == 1 and manifests.read(tmp_path).dropped == 1
+    assert bench.recorders[0].lost == 1 and manifests.read(tmp_path).dropped == 1
 
 
 def test_a_directory_that_cannot_be_made_costs_the_stops_only(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    recorder = recorder_in(tmp_path / "run", stops=tmp_path / "file" / "stops")
-    bench = RecordedBench([recorder])
-    bench.active(ticks=20)
-    bench.lose("EncLift", 20)
-    recorder.close()
-    assert recorder.lost == 1 and is_complete(tmp_path / "run" / "run.mcap")
+    bench = run_to_a_stop(tmp_path / "run", before=20, after=20, stops=tmp_path / "file" / "stops")
+    bench.close()
+    assert bench.recorders[0].lost == 1 and is_complete(tmp_path / "run" / "run.mcap")
 
 
 def test_live_a_stop_has_the_time_of_day_and_is_announced_at_once(tmp_path: Path) -> None:
     told: list[tuple[str, Path]] = []
-    recorder = recorder_in(tmp_path, live=True, on_stop=lambda stop, path: told.append((stop.code, path)))
-    bench = RecordedBench([recorder])
-    bench.active(ticks=20)
-    bench.lose("EncLift", 20)
+
+    def tell(stop: Stop, path: Path) -> None:
+        told.append((stop.code, path))
+
+    bench = run_to_a_stop(tmp_path, before=20, after=20, live=True, on_stop=tell)
     assert [code for code, _ in told] == ["ENCODER_LOST"] and not told[0][1].exists()
-    recorder.close()
+    bench.close()
     (path,) = files_in(tmp_path / "stops")
     assert path == told[0][1] and stop_of(path).utc_ns is not None
     assert time.strftime("%Y", time.gmtime()) in path.name and path.name.endswith("Z-ENCODER_LOST.mcap")
 
 
 def test_memory_is_bounded_in_a_flood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_recorder_module, "MAX_MEMORY_BYTES", 200_000)
-    recorder = recorder_in(tmp_path)
-    bench = RecordedBench([recorder])
-    bench.active(ticks=800)
-    remembered = sum(len(record) for _, record in recorder._stops._recent)
+    monkeypatch.setattr(stop_recorder, "MAX_MEMORY_BYTES", 200_000)
+    bench = run_to_a_stop(tmp_path, before=800, after=0)
+    remembered = sum(len(record) for _, record in bench.recorders[0]._stops._recent)
     assert 150_000 < remembered <= 200_000
-    recorder.close()
+    bench.close()
+
+
+# -- systemd's journal
+STOP = Stop(
+    number=4,
+    at_ns=5,
+    utc_ns=6,
+    mode_before="ACTIVE",
+    mode="STOP",
+    reason=pack(Reason.ENCODER_LOST, 1),
+    code="ENCODER_LOST",
+    numbers=(20.0, 15.0, 0.0),
+    text="The encoder of joint lift ... [ENCODER_LOST]",
+)
+
+
+def fields_in(data: bytes) -> dict[str, str]:
+    """The fields of a datagram, read as systemd's journald reads them."""
+    found, at = {}, 0
+    while at < len(data):
+        end = data.index(b"\n", at)
+        name, equals, value = data[at:end].partition(b"=")
+        at = end + 1
+        if not equals:
+            (length,) = struct.unpack_from("<Q", data, at)
+            value = data[at + 8 : at + 8 + length]
+            assert data[at + 8 + length : at + 9 + length] == b"\n"
+            at += 9 + length
+        found[name.decode()] = value.decode()
+    return found
+
+
+def test_a_value_with_a_line_feed_is_written_with_its_length() -> None:
+    fields = {"MESSAGE": "two\nlines = 2", "PRIORITY": "3", "CODE": "a=b"}
+    assert fields_in(__main__.encode(fields)) == fields
+
+
+def test_a_stop_has_its_identity_its_numbers_and_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "socket"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(path))
+        receiver.settimeout(5)
+        assert __main__.send(__main__.stop_fields(STOP, Path("/stops/4.mcap")), path)
+        got = fields_in(receiver.recv(65536))
+    assert got["MESSAGE_ID"] == message_id(Reason.ENCODER_LOST)
+    assert got["MESSAGE"] == f"STOP: {STOP.text}" and got["PRIORITY"] == "3"
+    assert got["TIMBERHAND_CODE"] == "ENCODER_LOST" and got["TIMBERHAND_PART"] == "joint lift"
+    assert numbers_in(got["TIMBERHAND_MEASURED"])[:2] == [20.0, 15.0]
+    assert (got["TIMBERHAND_MODE_BEFORE"], got["TIMBERHAND_FILE"]) == ("ACTIVE", "/stops/4.mcap")
+
+
+def test_without_a_journal_the_text_goes_to_stderr(tmp_path: Path, monkeypatch, capfd) -> None:
+    assert not __main__.send({"MESSAGE": "x"}, tmp_path / "none")
+    monkeypatch.setattr(__main__.send, "__defaults__", (tmp_path / "none",))
+    write_to_journal(STOP, Path("/stops/4.mcap"))
+    assert capfd.readouterr().err == f"recorder: STOP: {STOP.text} /stops/4.mcap\n"
+
+
+def test_a_reason_of_another_release_has_no_identity() -> None:
+    unknown = msgspec.structs.replace(STOP, reason=250, code="REASON_250", text="Unknown reason 250.")
+    fields = __main__.stop_fields(unknown, Path("x"))
+    assert "MESSAGE_ID" not in fields and fields["PRIORITY"] == "3" and "250" in fields["MESSAGE"]

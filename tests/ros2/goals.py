@@ -1,14 +1,20 @@
-"""Goals of FollowJointTrajectory for tests."""
+"""Goals of FollowJointTrajectory for tests, and reports of the machine that executes them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
+from can_dbc.messages.crane import StateReport
 from machine.joints import JOINTS
+from machine.status.modes import Mode
 from ros2.interfaces.builtin import Header, duration_of, time_of
 from ros2.interfaces.control import Goal, JointTolerance
 from ros2.interfaces.trajectory import JointTrajectory, JointTrajectoryPoint, MultiDOFJointTrajectory
+from tests.autonomy.crane_stand_in import QUIET
 
+START = (0.0, 0.75, -1.6, 0.3, 0.0)
 NAMES = tuple(j.name.lower() for j in JOINTS)
 
 
@@ -35,3 +41,8 @@ def goal(
     trajectory = JointTrajectory(Header(time_of(stamp_ns), ""), list(joints), made)
     late = duration_of(round(time_tolerance_s * 1e9))
     return Goal(trajectory, none, tolerances[0], [], tolerances[1], [], late)
+
+
+def report(mode: Mode = Mode.ARMED, **changes: Any) -> StateReport:
+    """Of a crane that stands at the start."""
+    return replace(QUIET, **{"mode": mode, "position": START, "reference": START} | changes)

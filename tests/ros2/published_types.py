@@ -81,20 +81,9 @@ def _renamed(part: Any) -> Any:
     return type(part)(map(_renamed, part)) if type(part) in (list, tuple) else part
 
 
-PRIMITIVES = {
-    "bool": bool,
-    "byte": idl.uint8,
-    "char": idl.uint8,
-    "uint8": idl.uint8,
-    "int8": idl.int8,
-    "uint16": idl.uint16,
-    "int32": idl.int32,
-    "uint32": idl.uint32,
-    "int64": idl.int64,
-    "uint64": idl.uint64,
-    "float64": idl.float64,
-    "string": str,
-}
+NUMBERS = ("uint8", "int8", "uint16", "int32", "uint32", "int64", "uint64", "float64")
+PRIMITIVES = {name: getattr(idl, name) for name in NUMBERS} | {"bool": bool, "string": str}
+PRIMITIVES |= {"byte": idl.uint8, "char": idl.uint8}
 
 
 class IdlTypes:

@@ -64,6 +64,13 @@ class Machine:
         while self.system.now_ns < end_ns and self.bridge.outcome is None:
             self.system.advance()
 
+    def outcome(self, asked: Goal, seconds: float = 20.0) -> Outcome:
+        """Of a goal that ends in so much time."""
+        self.begin(asked)
+        self.run(seconds)
+        assert self.bridge.outcome is not None
+        return self.bridge.outcome
+
     def begin(self, asked: Goal) -> None:
         self.bridge.outcome = None
         self.bridge.execution.begin(asked, self.system.now_ns, 0)
@@ -89,10 +96,8 @@ def machine() -> Iterator[Machine]:
 def test_a_goal_moves_the_crane_there_and_it_holds(machine: Machine) -> None:
     start = machine.report.position
     there = (start[0] - 0.4, start[1] + 0.1)
-    machine.begin(goal((5.0, there), joints=("slew", "lift")))
-    machine.run(20.0)
-    outcome = machine.bridge.outcome
-    assert outcome is not None and (outcome.status, outcome.error_code) == (Status.SUCCEEDED, ErrorCode.SUCCESSFUL)
+    outcome = machine.outcome(goal((5.0, there), joints=("slew", "lift")))
+    assert (outcome.status, outcome.error_code) == (Status.SUCCEEDED, ErrorCode.SUCCESSFUL)
     sent = machine.bridge.sent
     assert machine.rest(1.0) < 0.02 and machine.bridge.sent == sent
     assert machine.report.mode == Mode.ARMED and machine.report.refused == 0
@@ -103,9 +108,8 @@ def test_a_goal_moves_the_crane_there_and_it_holds(machine: Machine) -> None:
 def test_a_second_goal_begins_where_the_first_ended(machine: Machine) -> None:
     start = machine.report.position
     for offset in (-0.2, 0.0):
-        machine.begin(goal((4.0, (start[0] + offset,)), joints=("slew",), final={"slew": 0.03}))
-        machine.run(20.0)
-        assert machine.bridge.outcome is not None and machine.bridge.outcome.status is Status.SUCCEEDED
+        asked = goal((4.0, (start[0] + offset,)), joints=("slew",), final={"slew": 0.03})
+        assert machine.outcome(asked).status is Status.SUCCEEDED
     assert machine.report.position[0] == pytest.approx(start[0], abs=0.03) and machine.report.refused == 0
 
 
@@ -137,16 +141,12 @@ def test_a_stop_of_the_controller_ends_the_goal_with_its_reason(machine: Machine
 
 def test_leaving_the_path_ends_the_goal(machine: Machine) -> None:
     start = machine.report.position[0]
-    machine.begin(goal((5.0, (start - 0.5,)), joints=("slew",), path={"slew": 1e-4}))
-    machine.run(10.0)
-    outcome = machine.bridge.outcome
-    assert outcome is not None and outcome.error_code == ErrorCode.PATH_TOLERANCE_VIOLATED
+    outcome = machine.outcome(goal((5.0, (start - 0.5,)), joints=("slew",), path={"slew": 1e-4}), 10.0)
+    assert outcome.error_code == ErrorCode.PATH_TOLERANCE_VIOLATED
     assert "slew" in outcome.sentence
 
 
 def test_a_goal_tolerance_that_is_not_reached_in_time_ends_the_goal(machine: Machine) -> None:
     start = machine.report.position[0]
-    machine.begin(goal((5.0, (start - 0.5,)), joints=("slew",), final={"slew": 1e-7}, time_tolerance_s=1.0))
-    machine.run(20.0)
-    outcome = machine.bridge.outcome
-    assert outcome is not None and outcome.error_code == ErrorCode.GOAL_TOLERANCE_VIOLATED
+    asked = goal((5.0, (start - 0.5,)), joints=("slew",), final={"slew": 1e-7}, time_tolerance_s=1.0)
+    assert machine.outcome(asked).error_code == ErrorCode.GOAL_TOLERANCE_VIOLATED

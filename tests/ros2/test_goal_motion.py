@@ -1,4 +1,4 @@
-"""Goals: the motion they ask for, and why some are not executed."""
+"""Goals: the motion they ask for, why some are not executed, and the table that the action server keeps of them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from ros2.execution.execution import MotionCheck, TrajectoryExecution
 from ros2.execution.goal_motion import GoalRefused, beyond, goal_motion, tolerances_of
-from ros2.interfaces.control import ErrorCode, Goal
+from ros2.interfaces.action import CancelCode, GoalInfo, Status
+from ros2.interfaces.builtin import UUID, time_of
+from ros2.interfaces.control import ErrorCode, Goal, Result
+from ros2.wire.action_server import ALL, KEPT, GoalTable
 from tests.codes import coded
-from tests.ros2.goals import NAMES, goal
+from tests.ros2.goals import START, goal, report
 
 PROFILE = load_profile("palms_471")
-START = (0.0, 0.75, -1.6, 0.3, 0.0)
 CHECK = MotionCheck(PROFILE)
 
 
@@ -113,32 +115,6 @@ def test_tolerances_by_joint() -> None:
         tolerances_of(asked)
 
 
-def report(mode: Mode = Mode.ARMED, **changes: Any) -> StateReport:
-    values: dict[str, Any] = {
-        "sequence": 1,
-        "profile_hash": profile_hash(PROFILE),
-        "stamp_ns": 0,
-        "mode": mode,
-        "grapple_state": 0,
-        "reason": 0,
-        "setpoint_sequence": 0,
-        "refusal": 0,
-        "refused": 0,
-        "stale_mask": 0,
-        "position": START,
-        "velocity": (0.0,) * 5,
-        "reference": START,
-        "opening_pct": 100.0,
-        "clamp_bar": 0.0,
-        "load_kg": 0.0,
-        "tick_ns": 0,
-        "late_ns": 0,
-        "missed_ticks": 0,
-        "frames_received": 0,
-    }
-    return StateReport(**values | changes)
-
-
 def execution(*reports: StateReport) -> TrajectoryExecution:
     made = TrajectoryExecution(PROFILE, SetpointStream(profile_hash(PROFILE), 200_000_000))
     for each in reports:
@@ -218,5 +194,56 @@ def test_a_silent_controller_ends_the_goal() -> None:
     assert outcome is not None and outcome.error_code == Reason.NOT_ARMED
 
 
-def test_names_are_those_of_the_profile() -> None:
-    assert set(NAMES) == set(PROFILE.joints)
+# -- the goals of the action server
+A, B, C = (bytes([i]) * 16 for i in (1, 2, 3))
+DONE = Result(0, "done")
+
+
+def table() -> GoalTable:
+    """A has ended, B and C are executed; accepted at 1, 2 and 3 s."""
+    made = GoalTable()
+    for i, goal_id in enumerate((A, B, C)):
+        assert made.accept(goal_id, 0, (i + 1) * 10**9)
+    made.finish(A, Status.SUCCEEDED, DONE)
+    return made
+
+
+def asked(goal_id: bytes, until_s: int) -> GoalInfo:
+    return GoalInfo(UUID(goal_id), time_of(until_s * 10**9))
+
+
+@pytest.mark.parametrize(
+    ("request_", "code", "named"),
+    [
+        (asked(B, 0), CancelCode.NONE, [B]),
+        (asked(A, 0), CancelCode.GOAL_TERMINATED, []),
+        (asked(bytes([9]) * 16, 0), CancelCode.UNKNOWN_GOAL_ID, []),
+        (asked(ALL, 0), CancelCode.NONE, [B, C]),
+        (asked(ALL, 2), CancelCode.NONE, [B]),
+        (asked(C, 2), CancelCode.NONE, [B, C]),
+        (asked(ALL, 1), CancelCode.REJECTED, []),
+    ],
+)
+def test_what_a_cancel_request_names(request_: GoalInfo, code: CancelCode, named: list[bytes]) -> None:
+    made = table()
+    assert made.cancel(request_) == (code, named)
+    for goal_id in named:
+        goal = made.get(goal_id)
+        assert goal is not None and goal.status is Status.CANCELING
+
+
+def test_an_identifier_is_accepted_once() -> None:
+    made = table()
+    assert not made.accept(A, 0, 9) and not made.accept(ALL, 0, 9)
+
+
+def test_the_last_results_are_kept() -> None:
+    made = GoalTable()
+    for i in range(1, KEPT + 5):
+        goal_id = i.to_bytes(16, "little")
+        assert made.accept(goal_id, 0, i)
+        made.finish(goal_id, Status.ABORTED, DONE)
+    first = made.get((1).to_bytes(16, "little"))
+    last = made.get((KEPT + 4).to_bytes(16, "little"))
+    assert first is None and last is not None and last.result is DONE
+    assert len(made.statuses()) <= KEPT + 1

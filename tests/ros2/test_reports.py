@@ -34,7 +34,7 @@ from ros2.report import (
     static_transforms,
 )
 from tests.codes import numbers_in
-from tests.ros2.test_goal_motion import report
+from tests.ros2.goals import report
 
 Q = (-0.4, 0.6, -1.3, 0.5, 0.7)
 STAMP_NS = 1_795_690_741_202_842_462

@@ -1,7 +1,8 @@
-"""Settled piles, the pictures drawn of them, and the shards that store these."""
+"""Settled piles, the pictures drawn and traced of them, their labels, and the shards that store these."""
 
 import math
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,21 +14,40 @@ from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import interface_of
 from autonomy.perception.segmentation.segment_merging import load_scorers
-from machine.geometry.optics import pinhole
+from machine.geometry.optics import Intrinsics, pinhole
 from runtime.errors import InputRefused
 from sim.camera.geometry import look_at
 from sim.camera.scene import LogPose
 from tests.codes import coded
+from tests.training.drawn_logs import picture
 from training.common.loop import seeded
 from training.common.weight_file import restore, save
 from training.detection import detector_weights, scorer_weights
 from training.detection.networks import UNet
 from training.pictures import drawing, piles, shards
 from training.pictures.drawing import MAX_LOGS, draw, labelled
-from training.pictures.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
+from training.pictures.labels import (
+    ANGLE,
+    CENTRE_U,
+    CENTRE_V,
+    END_U,
+    END_V,
+    ID,
+    IGNORED,
+    START_U,
+    START_V,
+    cropped,
+    enlarged,
+    mirrored,
+)
 from training.pictures.piles import HELD_OUT, chunk, profile_of, settle
 from training.pictures.props import Steel
+from training.pictures.samples import read, sample, write
 from training.pictures.shards import pictures, shard
+from training.pictures.traced import shapes
+from training.pictures.traced.scenes import Assets, Format, describe, log_poses
+from training.pictures.traced.staging import pieces
+from training.pictures.traced.tracer import FLOATS, packed
 
 
 @pytest.fixture(scope="module")
@@ -133,12 +153,12 @@ def test_shards_are_drawn_once_and_read_back(few, monkeypatch):
     own = pictures(few, 96)
     again = [own(1), own(3)]  # of shards 0 and 1
     assert drawn == [0, 1, 2, 3]
-    for index, sample in ((1, again[0]), (3, again[1])):
-        assert sample.rgb.shape == (96, 96, 3) and sample.logs.shape[0] <= MAX_LOGS
-        assert np.isfinite(sample.depth_m).any() and np.isnan(sample.depth_m).any()
-        assert np.array_equal(pictures(few, 96)(index).ids, sample.ids)
-        height = height_over_plane(sample.depth_m, sample.intrinsics)
-        assert np.allclose(sample.height_m, height, atol=0.03, equal_nan=True)  # a millimetre of depth turns the plane
+    for index, shown in ((1, again[0]), (3, again[1])):
+        assert shown.rgb.shape == (96, 96, 3) and shown.logs.shape[0] <= MAX_LOGS
+        assert np.isfinite(shown.depth_m).any() and np.isnan(shown.depth_m).any()
+        assert np.array_equal(pictures(few, 96)(index).ids, shown.ids)
+        height = height_over_plane(shown.depth_m, shown.intrinsics)
+        assert np.allclose(shown.height_m, height, atol=0.03, equal_nan=True)  # a millimetre of depth turns the plane
     assert len(drawn) == 4
     assert not list(few.glob("*.part*"))
 
@@ -214,3 +234,92 @@ def test_scorers_are_written_with_their_cards(few, monkeypatch):
     assert "timberhand train scorers --pictures 4 --seed 1" in card.read_text()
     told = load_scorers(few / "scorers").merge.probability(np.zeros((3, 19), np.float32))
     assert told.shape == (3,) and (told > 0.0).all() and (told < 1.0).all()
+
+
+# -- labels under mirroring, windows and scaling
+LOGS = (((60.0, 60.0), 0.4, 80, 10), ((110.0, 110.0), 1.2, 60, 12))
+
+
+def test_mirroring_twice_is_the_identity():
+    sample = picture(*LOGS)
+    twice = mirrored(mirrored(sample))
+    assert np.array_equal(twice.ids, sample.ids)
+    assert np.allclose(twice.logs, sample.logs, atol=1e-4)
+    assert twice.intrinsics == sample.intrinsics
+
+
+def test_a_mirrored_label_agrees_with_its_pixels():
+    sample = mirrored(picture(*LOGS))
+    v, u = np.nonzero(sample.ids == 1)
+    assert sample.logs[0, CENTRE_U] == pytest.approx(u.mean(), abs=1.0)
+    slope = np.linalg.eigh(np.cov(np.stack([u, v]).astype(float)))[1][:, -1]
+    assert abs(math.remainder(math.atan2(slope[1], slope[0]) - sample.logs[0, ANGLE], math.pi)) < 0.02
+
+
+def test_a_window_determines_the_visible_part_again():
+    sample = picture(((60.0, 70.0), 0.0, 100, 10))
+    left = cropped(sample, 0, 20, 64)
+    assert left.ids.shape == (64, 64)
+    assert left.logs[0, CENTRE_U] == pytest.approx((10 + 63) / 2, abs=1.0)  # of columns 10..63
+    assert left.logs[0, [START_U, START_V]] == pytest.approx((10.0, 50.0))
+    assert cropped(sample, 40, 30, 80).logs[0, [END_U, END_V]] == pytest.approx((70.0, 40.0))
+    assert cropped(sample, 0, 90, 64).logs.shape[0] == 0
+    u = 30
+    assert (u - left.intrinsics.cx_px) / left.intrinsics.fx_px == (
+        u - sample.intrinsics.cx_px
+    ) / sample.intrinsics.fx_px
+
+
+def test_heights_move_with_the_pixels():
+    sample = replace(picture(*LOGS), height_m=np.arange(160 * 160, dtype=np.float32).reshape(160, 160))
+    assert cropped(mirrored(sample), 10, 20, 64).height_m[0, 0] == sample.height_m[20, 159 - 10]
+    assert cropped(picture(*LOGS), 10, 20, 64).height_m is None
+
+
+def test_enlarged_labels_agree_with_their_pixels():
+    large = enlarged(picture(*LOGS))
+    assert large.rgb.shape == (320, 320, 3) and large.ids.shape == large.depth_m.shape == (320, 320)
+    for log in large.logs:
+        _, u = np.nonzero(large.ids == log[ID])
+        assert log[CENTRE_U] == pytest.approx((u.min() + u.max()) / 2, abs=1.5)
+    assert large.logs[0, ANGLE] == picture(*LOGS).logs[0, ANGLE]
+
+
+# -- path-traced pictures
+@pytest.fixture(scope="module")
+def scene():
+    return describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+
+
+def test_a_scene_is_the_same_for_a_seed(scene):
+    again = describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+    assert again == scene and len(log_poses(scene)) == len(scene["logs"])
+
+
+def test_only_logs_are_numbered(scene):
+    numbers = [piece.number for piece in pieces(scene) if piece.number]
+    assert numbers == [log["number"] for log in scene["logs"]]
+
+
+def test_a_stem_has_bark_and_two_sawn_ends():
+    z = np.linspace(-1.0, 1.0, 6)
+    spine = np.stack([0 * z, 0 * z, z], axis=1)
+    stem = shapes.stem(spine, np.full(6, 0.1), np.random.default_rng(0), 0.0, 0.0)
+    around = np.hypot(*stem.vertices[:, :2].T)
+    assert around.max() == pytest.approx(0.1) and stem.faces.max() < len(stem.vertices)
+    assert np.count_nonzero(stem.slot == 1) == 2 * shapes.SIDES
+
+
+def test_looks_fit_the_kernel(scene):
+    corners, detail, bodies, looks = packed(scene)
+    assert looks.shape[1] == FLOATS and len(corners) == len(detail) and np.isfinite(looks).all()
+    assert detail["look"].max() < len(looks) and detail["body"].max() < len(bodies)
+
+
+def test_samples_come_back_as_written(tmp_path):
+    depth = np.full((8, 8), 2.5, np.float32)
+    depth[0] = np.nan
+    one = sample(np.zeros((8, 8, 3), np.uint8), depth, np.ones((8, 8)), np.zeros((0, 11)), Intrinsics(8, 8, 9, 9, 4, 4))
+    write(tmp_path / "a.npz", [one, one])
+    back = read(tmp_path / "a.npz")
+    assert (back["depth_mm"][1] == one.depth_mm).all() and one.depth_mm[0, 0] == 0 and one.depth_mm[1, 1] == 2500

@@ -1,4 +1,4 @@
-"""Instances from the maps of a perfect network, and the scales at which pictures are segmented."""
+"""Instances from maps and kernels, the scales at which pictures are segmented, and heights over the ground."""
 
 import math
 
@@ -8,15 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.perception.camera.frame import RgbdFrame, content_window
+from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.instances import decode_instances
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter, fuse_scales
-from autonomy.perception.segmentation.network import OFFSET_PX, STRIDE, interface_of
+from autonomy.perception.segmentation.mask_network import FEATURES, KERNEL, mask_input
+from autonomy.perception.segmentation.mask_segmenter import MaskSegmenter, decoded, kernel_logs
+from autonomy.perception.segmentation.network import COS2, MAPS, MASK, OFFSET_PX, STRIDE, interface_of
 from autonomy.perception.segmentation.resize import bilinear, doubled, interpolated_map, shrunk
 from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
 from tests.codes import coded
-from tests.training.drawn_logs import perfect_maps, picture
+from tests.training.drawn_logs import ground_depth, perfect_maps, picture
 from training.common.loop import seeded
 from training.common.weight_file import save
 from training.detection.networks import UNet
@@ -239,3 +242,97 @@ def test_a_map_is_interpolated_as_by_the_matrices(shape: tuple[int, int]) -> Non
     values = np.random.default_rng(3).normal(size=shape).astype(np.float32)
     by_matrices = bilinear(shape[0], 2) @ values @ bilinear(shape[1], 2).T
     assert interpolated_map(values) == pytest.approx(by_matrices, abs=1e-6)
+
+
+# -- the mask network
+def answer() -> tuple[np.ndarray, np.ndarray]:
+    """Maps and kernels of two parallel logs that a kernel each bounds by squares of the place."""
+    maps = np.full((len(MAPS) + FEATURES, 64, 64), -8.0, np.float32)
+    maps[len(MAPS) :] = 0.0
+    maps[COS2] = 1.0
+    kernels = np.zeros((1 + KERNEL, 16, 16), np.float32)
+    kernels[0] = -8.0
+    for row in (4, 10):
+        middle = 4 * row + 1
+        maps[MASK, middle - 4 : middle + 5, 6:58] = 8.0
+        kernels[0, row, 8] = 4.0
+        kernels[1 + FEATURES + 4, row, 8], kernels[-1, row, 8] = -100.0, 4.0
+    return maps, kernels
+
+
+def test_each_kernel_is_a_log():
+    found = kernel_logs(*answer())
+    assert len(found.logs) == 2
+    assert all(np.ptp(found.y[log.members]) <= 9 and np.ptp(found.x[log.members]) >= 50 for log in found.logs)
+
+
+def test_two_kernels_of_one_log_are_one():
+    """Each of them is surer of its own half, so that without suppression they would share the log."""
+    maps, kernels = answer()
+    for column, slope in ((4, -0.9), (12, 0.9)):
+        kernels[:, 4, column] = kernels[:, 4, 8]
+        kernels[1 + FEATURES, 4, column] = slope
+    kernels[0, 4, 8] = -8.0
+    found = kernel_logs(maps, kernels)
+    assert len(found.logs) == 2
+    assert all(np.ptp(found.x[log.members]) >= 50 for log in found.logs)
+
+
+def test_what_has_no_depth_is_no_log_where_a_picture_has_depth():
+    depth = np.full((128, 128), 3.0, np.float32)
+    depth[:60] = np.nan
+    assert len(decoded(*answer(), 2, depth)) == 1
+    assert len(decoded(*answer(), 2, np.full((128, 128), np.nan, np.float32))) == 2
+
+
+def test_a_missing_sense_is_zero():
+    unknown = np.full((64, 64), np.nan, np.float32)
+    image = mask_input(np.zeros((64, 64, 3), np.uint8), unknown, Intrinsics(64, 64, 60, 60, 32, 32), unknown)
+    assert not image[3:].any() and np.isfinite(image).all()
+
+
+@pytest.mark.parametrize("mode", ["rgbd", "colour", "depth"])
+def test_bare_ground_shows_no_log(mode):
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(60, 90, (192, 256, 3)).astype(np.uint8)
+    found = MaskSegmenter(mode).segment_picture(
+        rgb, np.full((192, 256), 3.0, np.float32), Intrinsics(256, 192, 200, 200, 128, 96)
+    )
+    assert not [one for one in found if one.score > 0.5]
+
+
+# -- heights over the ground
+PIN = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(height=st.floats(1.5, 4.0), pitch=st.floats(0.6, 1.5), share=st.floats(0.0, 0.3))
+def test_heights_are_over_the_ground_with_objects_on_it(height, pitch, share):
+    ground = ground_depth(PIN, height, pitch)
+    depth = ground.copy()
+    columns = round(share * PIN.width_px)
+    # A block of 0.4 m: its top is a plane 0.4 m nearer.
+    depth[:, :columns] *= (height - 0.4) / height
+    found = height_over_plane(depth, PIN)
+    assert np.abs(found[:, columns:]).max() < 0.03
+    assert columns == 0 or np.abs(found[:, :columns] - 0.4).max() < 0.04
+
+
+def test_unknown_stays_unknown_and_noise_is_tolerated():
+    rng = np.random.default_rng(4)
+    depth = ground_depth(PIN).copy()
+    depth += 0.01 * rng.standard_normal(depth.shape).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = np.nan
+    found = height_over_plane(depth, PIN)
+    assert np.array_equal(np.isnan(found), np.isnan(depth))
+    assert abs(float(np.nanmedian(found))) < 0.01
+
+
+def test_without_depth_heights_are_unknown():
+    assert np.isnan(height_over_plane(np.full((120, 160), np.nan, np.float32), PIN)).all()
+
+
+def test_too_few_points_give_the_plane_across_the_view():
+    depth = np.full((120, 160), np.nan, np.float32)
+    depth[60, 80] = 2.0
+    assert math.isclose(float(height_over_plane(depth, PIN)[60, 80]), -1.0, abs_tol=1e-3)

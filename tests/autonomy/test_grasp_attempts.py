@@ -1,4 +1,4 @@
-"""Tongs that tell that they have missed open, and are sent anew after another look, before the crane goes up empty."""
+"""Grasps that are chosen again: from above, where logs are seen better, and after jaws have told that they missed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from math import hypot, nan, pi
 
 import pytest
 
-from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.activity import DETECTION_TIMEOUT_NS, Activity
 from autonomy.crane_job.cycle import EXTRACTION_DEPTH_M
 from autonomy.crane_job.grasp_verification import MAX_RESTARTS
 from autonomy.crane_job.phase_motions import EXTRACTION_DISTANCE_M
@@ -15,14 +15,171 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.grasp.selection import PlannerSelection
-from autonomy.perception.log_list import LogObservation
+from autonomy.perception.log_list import TRIANGLE, LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import tip_below_pin_m
-from machine.loading.profile_file import profile_hash
-from tests.autonomy.crane_stand_in import StandIn
+from machine.geometry.kinematics import Unreachable
+from tests.autonomy.crane_stand_in import TICK_NS, StandIn, activity, refusing
 from tests.autonomy.grasp_scenes import GROUND, PROFILE, log, measured, pair
 
+OFF_M = 0.09
+NOTHING_SAFE = NoGrasp("grasp.none-safe", "nothing is safe")
+
+
+class Camera(StandIn):
+    """A crane whose camera sees logs beside where they lie, but from above; ``covered``: there it sees nothing."""
+
+    covered = False
+    off_m = OFF_M
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        """Measured logs."""
+        x, y, _ = self.pin()
+        above = hypot(x - self.logs[0].center_m[0], y - self.logs[0].center_m[1]) < 1.0
+        if above and self.covered:
+            return ()
+        return tuple(seen_aside(log, 0.0 if above else self.off_m) for log in self.logs)
+
+
+def seen_aside(log: LogObservation, off_m: float) -> LogObservation:
+    x, y, z = log.center_m
+    variances = [1e-4 if i in (0, 7) else 0.0 for i in range(TRIANGLE)]
+    return replace(log, center_m=(x, y + off_m, z), covariance=tuple(variances))
+
+
+def made(planner=None) -> tuple[Camera, Activity]:
+    return Camera(PROFILE, pair()), activity(planner=planner or SamplingPlanner())
+
+
+def grasps_until(crane: StandIn, planner: Activity, phase: Phase) -> int:
+    """How many grasps the crane went to, one after the other."""
+    found: list[tuple[float, float]] = []
+    while planner.phase is not phase and not planner.idle:
+        crane.step(planner)
+        if planner.grasp is not None:
+            at = (planner.grasp.pose.slew_rad, planner.grasp.pose.rot_rad)
+            if not found or found[-1] != at:
+                found.append(at)
+    assert planner.phase is phase, planner.failure
+    return len(found)
+
+
+def test_from_above_the_grasp_is_selected_again_and_approached() -> None:
+    crane, planner = made()
+    assert grasps_until(crane, planner, Phase.CLOSE) > 1
+    middle = sum(log.center_m[1] for log in crane.logs) / 2
+    assert crane.pin()[1] == pytest.approx(middle, abs=0.05), "and not off it by what was seen from aside"
+    phases = [m.phase for m in crane.trace]
+    assert phases.count("LOOK") and phases.index("DESCEND") > phases.index("ABOVE")
+
+
+def test_unmeasured_logs_are_detected_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Camera, "seen", StandIn.seen)
+    crane, planner = made()
+    assert grasps_until(crane, planner, Phase.CLOSE) == 1
+
+
+def test_without_a_detection_from_above_the_crane_continues_after_a_moment() -> None:
+    crane, planner = made()
+    crane.covered = True
+    crane.until(planner, Phase.ABOVE)
+    while not planner.arrived:
+        crane.step(planner)
+    since_ns = crane.now_ns
+    assert grasps_until(crane, planner, Phase.DESCEND) == 1
+    assert crane.now_ns - since_ns <= DETECTION_TIMEOUT_NS + 4 * TICK_NS
+
+
+class Edge(Camera):
+    """From aside the camera sees one end of a log, from above the same end and a whole log."""
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        part, whole = Camera.seen(self)
+        x, y, z = part.center_m
+        part = replace(part, center_m=(x + 0.7, y, z), length_m=1.2)
+        return (part, whole) if abs(self.pin()[1] - y) < 0.5 else (part,)
+
+
+def test_a_log_that_stays_a_part_is_not_gripped_before_the_others_are_looked_at() -> None:
+    _, planner = made()
+    edge = Edge(PROFILE, pair())
+    edge.until(planner, Phase.ABOVE)
+    assert planner.grasp.log.id == 0
+    edge.until(planner, Phase.DESCEND)
+    assert 1 in [log.id for log in planner.grasp.logs]
+
+
+@pytest.mark.parametrize(("direct", "selections"), [(False, 2), (True, 1)])
+def test_above_a_single_log_it_is_selected_again_where_the_crane_rests_anyway(direct: bool, selections: int) -> None:
+    asked = []
+
+    def counting(request: GraspRequest) -> GraspCandidate:
+        asked.append(len(request.logs))
+        return SamplingPlanner()(request)
+
+    crane = Camera(PROFILE, pair()[:1])
+    crane.off_m = 0.0
+    planner = activity(planner=counting, direct=direct)
+    crane.until(planner, Phase.CLOSE)
+    assert len(asked) == selections
+
+
+def test_a_better_grasp_without_a_path_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    crane, planner = made()
+    crane.until(planner, Phase.ABOVE)
+
+    monkeypatch.setattr("autonomy.crane_job.cycle.approach_motion", refusing(Unreachable("no way is clear")))
+    crane.until(planner, Phase.CLOSE)
+    assert planner.failure is None
+
+
+def test_a_reselection_that_finds_no_grasp_changes_none() -> None:
+    sampling = SamplingPlanner()
+    asked = []
+
+    def once(request: GraspRequest) -> GraspCandidate:
+        asked.append(1)
+        if len(asked) > 1:
+            raise NOTHING_SAFE
+        return sampling(request)
+
+    crane, planner = made(once)
+    crane.until(planner, Phase.ABOVE)
+    first = planner.grasp
+    crane.until(planner, Phase.CLOSE)
+    assert len(asked) > 1 and planner.grasp is not None and planner.grasp.reason == first.reason
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_without_a_grasp_further_detections_are_used_before_the_job_fails(better: bool) -> None:
+    sampling = SamplingPlanner()
+    asked: list[int] = []
+
+    def at_last(request: GraspRequest) -> GraspCandidate:
+        asked.append(crane.now_ns)
+        if better and len(asked) > 3:
+            return sampling(request)
+        raise NOTHING_SAFE
+
+    crane, planner = made(at_last)
+    while planner.phase <= Phase.LOOK and not planner.failure:
+        crane.step(planner)
+    if better:
+        assert planner.phase is Phase.ABOVE and len(asked) == 4
+    else:
+        assert planner.failure_code == "grasp.none-safe"
+        assert asked[-1] - asked[0] == pytest.approx(DETECTION_TIMEOUT_NS, abs=3 * TICK_NS)
+
+
+def test_with_exactly_known_logs_the_job_fails_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Camera, "seen", StandIn.seen)
+    crane, planner = made(refusing(NOTHING_SAFE))
+    while not planner.failure:
+        crane.step(planner)
+    assert len([m for m in crane.trace if m.phase == "LOOK"]) <= 6
+
+
+# -- jaws that tell that they have missed
 SHUT, HOLDING = 4, 5
 PINCH_RAD = 0.92  # of 2.25
 
@@ -51,9 +208,7 @@ def thick_pair() -> list[LogObservation]:
 
 
 def phases_until_lifted(crane: Slipping) -> list[Phase]:
-    phases = crane.until(
-        Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner())), Phase.LIFT
-    )
+    phases = crane.until(activity(planner=SamplingPlanner()), Phase.LIFT)
     return phases[phases.index(Phase.CLOSE) :]
 
 
@@ -96,7 +251,7 @@ class Weighed(Slipping):
 def test_closed_jaws_that_weigh_nothing_as_they_rise_restart(empty_kg: float, anew: bool) -> None:
     crane = Weighed(PROFILE, [replace(log, diameter_m=0.15) for log in pair()], log_kg=40.0)
     crane.empty_kg = empty_kg
-    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
+    planner = activity(planner=SamplingPlanner())
     crane.until(planner, Phase.LIFT)
     low = crane.pin()[2]
     while planner.phase is Phase.LIFT and crane.pin()[2] < low + VERIFY_LIFT_M:
@@ -121,7 +276,7 @@ def test_a_thin_log_hidden_in_closed_jaws_is_carried_on_where_it_weighs(weighs_k
     aside = replace(thin, id=thin.id + 7, center_m=(x, y - 2.0, z))
     crane = Hiding(PROFILE, [thin, aside], log_kg=weighs_kg)
     crane.empty_kg = weighs_kg
-    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
+    planner = activity(planner=SamplingPlanner())
     crane.until(planner, Phase.LIFT)
     while planner.phase in (Phase.LIFT, Phase.CARRY):
         crane.step(planner)
@@ -154,13 +309,12 @@ def extracting(request: GraspRequest) -> GraspCandidate:
 
 def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
-    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(extracting))
+    planner = activity(planner=extracting)
     crane.until(planner, Phase.LIFT)
     pins = [m.pin for m in crane.trace if m.phase == "CLOSE"]
     assert pins[-1][1] - pins[0][1] == pytest.approx(EXTRACTION_DISTANCE_M, abs=0.03), "away from the others"
     assert abs(pins[-1][2] - pins[0][2] - EXTRACTION_DEPTH_M) < 0.15 and abs(pins[-1][0] - pins[0][0]) < 0.05
-    for _ in range(60):
-        crane.step(planner)
+    crane.steps(planner, 60)
     assert crane.pin()[1] == pytest.approx(pins[-1][1], abs=0.03), "it goes up from there"
 
 
@@ -169,8 +323,7 @@ def test_extracting_jaws_go_in_beside_the_log_before_they_close() -> None:
     over = {}
     for draws in (True, False):
         crane = Pinching(PROFILE, pair_of)
-        planner = lambda request, d=draws: replace(extracting(request), extracts=d)  # noqa: E731
-        crane.until(Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(planner)), Phase.CLOSE)
+        crane.until(activity(planner=lambda request, d=draws: replace(extracting(request), extracts=d)), Phase.CLOSE)
         tip = crane.pin()[2] - tip_below_pin_m(PROFILE.grapple.jaws, crane.tong_rad)
         over[draws] = tip - GROUND
     assert 0.02 < over[True] < 0.1, "under the middle of the log, and over the ground"
@@ -180,7 +333,7 @@ def test_extracting_jaws_go_in_beside_the_log_before_they_close() -> None:
 def test_a_log_still_pinched_after_the_drag_is_detected_again() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
-    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(extracting))
+    planner = activity(planner=extracting)
     phases = crane.until(planner, Phase.LIFT)
     assert phases.count(Phase.ABOVE) == 1 + MAX_RESTARTS
 
@@ -191,12 +344,12 @@ def test_without_a_better_grasp_after_a_drag_the_old_one_closes_before_it_drags_
     def once(request: GraspRequest) -> GraspCandidate:
         asked.append(1)
         if len(asked) > 3:
-            raise NoGrasp("grasp.none-safe", "nothing is safe")
+            raise NOTHING_SAFE
         return extracting(request)
 
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
-    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(once))
+    planner = activity(planner=once)
     crane.until(planner, Phase.LIFT)
     assert len(asked) > 3
     phases = [m.phase for m in crane.trace]

@@ -1,14 +1,16 @@
-"""Datagrams from a motion: a window of it with a lease, final at its end, numbered so that no restart is a replay."""
+"""Datagrams from a motion: a window with a lease, final at its end; and the clock of the motion that they follow."""
 
 from __future__ import annotations
 
 import pytest
 
+from autonomy.crane_job.trajectory_tracker import BRAKE_S, TrajectoryTracker
 from autonomy.motion.setpoint_stream import HORIZON_KNOT_COUNT, PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import hold
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramFault, DatagramRefused
+from machine.loading.profile_file import load_profile
 
 
 class Ramp:
@@ -83,3 +85,32 @@ def test_with_a_key_the_datagrams_are_authenticated() -> None:
     with pytest.raises(DatagramRefused) as refused:
         decode(data, b"other")
     assert refused.value.fault is DatagramFault.AUTHENTICATION
+
+
+# -- the clock of a tracked motion
+LOADER = load_profile("palms_471")
+HOME = (0.0, 1.0, -1.8, 0.5, 0.0)
+
+
+@pytest.mark.parametrize("steps", [1, 5, 7])
+def test_while_it_brakes_every_datagram_begins_where_the_last_one_has_led(steps: int) -> None:
+    """Steps of the planner for each datagram of 50 ms: the controller goes on at the rate that was announced."""
+    tracker, step_s = TrajectoryTracker(LOADER, HOME), 0.05 / steps
+    tracker.begin(hold(HOME))
+    at_s = tracker.clock_s
+    for period in range(60):
+        assert tracker.clock_s == pytest.approx(at_s, abs=1e-12)
+        at_s += 0.05 * tracker.announce()
+        for _ in range(steps):
+            tracker.advance(step_s, 1.0 if period < 20 else 0.0, HOME)
+    assert tracker.is_stopped and at_s == pytest.approx(20 * 0.05 + BRAKE_S / 2, abs=0.05)
+
+
+def test_a_clock_stands_until_its_motion_is_announced() -> None:
+    tracker = TrajectoryTracker(LOADER, HOME)
+    tracker.begin(hold(HOME))
+    tracker.advance(0.04, 1.0, HOME)
+    assert tracker.clock_s == 0.0 and not tracker.is_stopped
+    assert tracker.announce() == 1.0
+    tracker.advance(0.04, 1.0, HOME)
+    assert tracker.clock_s == pytest.approx(0.04)
