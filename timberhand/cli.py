@@ -33,7 +33,6 @@ from timberhand.commands import (
     mission,
     operator,
     plan,
-    plan_learn,
     record,
     recording,
     release,
@@ -96,8 +95,6 @@ app.add_typer(machine.app, name="machine")
 app.add_typer(dbc.app, name="dbc")
 app.add_typer(recording.app, name="recording")
 app.add_typer(plan.app, name="plan")
-plan.app.command("learn")(plan_learn.learn)
-plan.app.command("demonstrate")(plan_learn.demonstrate)
 app.add_typer(mission.app, name="mission")
 app.add_typer(operator.app, name="operator")
 app.add_typer(bench.app, name="bench")
@@ -150,7 +147,6 @@ def _run() -> None:
         raise CommandFailed(
             "package.missing",
             f"{error.name} is missing, which this command needs: pip install 'timberhand[{extra}]'{bundle}",
-            ExitCode.CONFIGURATION,
         ) from None
 
 

@@ -18,7 +18,7 @@ from typing import Final
 
 from controller.guard.envelope import read_envelope
 from controller.guard.layout import GuardConfigError
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 from host.release import sums
 from host.release.signature import signature_path, verify
 from host.release.trees import flush_folder
@@ -41,28 +41,21 @@ def check(folder: Path, public: Path) -> list[str]:
         raise CommandFailed(
             "machine-files.no-sums",
             f"{folder} holds no {SUMS}; make it with `sha256sum *.toml > {SUMS}` and sign it: timberhand release sign",
-            ExitCode.CONFIGURATION,
         )
     verify(folder / SUMS, public)
     listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))
     toml_names = {path.name for path in folder.glob("*.toml")}
     if wrong := sums.differing(folder, listed) or sorted(toml_names - listed.keys()):
         raise CommandFailed(
-            "machine-files.changed",
-            f"{folder / wrong[0]} is not what was signed; sign it again, or restore it",
-            ExitCode.CONFIGURATION,
+            "machine-files.changed", f"{folder / wrong[0]} is not what was signed; sign it again, or restore it"
         )
     if PROFILE not in listed:
-        raise CommandFailed(
-            "machine-files.no-profile",
-            f"{folder} holds no {PROFILE}; name the machine's profile so",
-            ExitCode.CONFIGURATION,
-        )
+        raise CommandFailed("machine-files.no-profile", f"{folder} holds no {PROFILE}; name the machine's profile so")
     try:
         load_profile(str(folder / PROFILE))
         read_envelope(folder / PROFILE)
     except (ProfileError, GuardConfigError) as error:
-        raise CommandFailed(error.code, str(error).splitlines()[0], ExitCode.CONFIGURATION) from error
+        raise CommandFailed(error.code, str(error).splitlines()[0]) from error
     return sorted(listed)
 
 
@@ -84,9 +77,7 @@ def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
         _use(place, slot.name)
     except OSError as error:
         raise CommandFailed(
-            "machine-files.not-written",
-            f"{slot} cannot be written: {error.strerror}; nothing has changed",
-            ExitCode.CONFIGURATION,
+            "machine-files.not-written", f"{slot} cannot be written: {error.strerror}; nothing has changed"
         ) from None
     return place / LINK / PROFILE
 
@@ -100,9 +91,7 @@ def revert(public: Path, place: Path = PLACE) -> Path:
     slot = place / SLOTS[_in_use(place) == SLOTS[0]]
     if not slot.is_dir():
         raise CommandFailed(
-            "machine-files.no-former",
-            "there are no former machine files to go back to; apply the ones that you want",
-            ExitCode.CONFIGURATION,
+            "machine-files.no-former", "there are no former machine files to go back to; apply the ones that you want"
         )
     check(slot, public)
     _use(place, slot.name)

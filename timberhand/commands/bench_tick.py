@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from host.exit_codes import ExitCode
 from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
@@ -57,12 +60,9 @@ def tick(
 
       timberhand bench tick --count --ticks 600
     """
-    import json
-    import sys
     import tempfile
 
     from hil.tick import compare, release
-    from host.exit_codes import ExitCode
 
     def progress(text: str) -> None:
         print(f"bench: {text}", file=sys.stderr, flush=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from experiments.common.registry import EXPERIMENTS
+from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
     ForeignDetectorOption,
     ForeignPlannerOption,
@@ -64,13 +65,9 @@ def campaign(
     from experiments.common import campaign as campaigns
     from experiments.common.registry import Options
     from experiments.common.workers import Workers
-    from host.exit_codes import CommandFailed, ExitCode
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
 
-    try:
-        load_profile(profile)
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    load_profile(profile)
     check_foreign(name.value, planner, detector)
     options = Options(
         seed=seed,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from experiments.common.registry import EXPERIMENTS
+from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
     ForeignDetectorOption,
     ForeignPlannerOption,
@@ -106,7 +107,6 @@ def experiment(
     from experiments.common.result import ROOT, commit, sealed_seed
     from experiments.common.standing import CHANGES, UNKNOWN
     from experiments.common.workers import Workers
-    from host.exit_codes import CommandFailed, ExitCode
 
     if bus is Bus.VCAN and "TIMBERHAND_LAB" not in os.environ:
         from host.vcan_lab.__main__ import vcan
@@ -119,7 +119,6 @@ def experiment(
             "experiment.uncommitted",
             "the sources are not those of a commit; a page must name one, and a sealed seed is drawn from one: commit "
             "the changes first, or leave out --sealed and write to a folder outside the checkout with --docs",
-            ExitCode.CONFIGURATION,
         )
     if name.value == ALL:
         if any((sealed, as_json, planner, detector, trials, minutes, repetitions, data)) or bus is not Bus.WIRE:
@@ -168,7 +167,6 @@ def _all(quick: bool, workers: int | None, common: list[str], docs: Path | None,
     from rich.console import Console
 
     from experiments.common import all_experiments as every
-    from host.exit_codes import CommandFailed, ExitCode
 
     screen, count = Console(stderr=True), workers or len(os.sched_getaffinity(0))
     common = ["--workers", str(count), *common]
@@ -189,7 +187,6 @@ def _all(quick: bool, workers: int | None, common: list[str], docs: Path | None,
         raise CommandFailed(
             "experiment.failed",
             f"{', '.join(failed)} did not end with a result; run them one by one: timberhand experiment NAME",
-            ExitCode.CONFIGURATION,
         )
     missed = [outcome.name for outcome in outcomes if outcome.code == ExitCode.FIGURE_MISSED]
     if missed and not quick:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import LinkError
 from timberhand.commands.options import ProfileOption
 
 
@@ -34,17 +36,13 @@ def record(
       timberhand record --out runs/field-1 --bus crane0=socketcan:can0
     """
     from can_dbc.bus.factory import default_address
-    from host.exit_codes import CommandFailed, ExitCode
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
     from recorder.__main__ import main
-    from runtime.errors import LinkError
 
     try:
         machine = load_profile(profile)
         names = [name for name in (machine.crane_bus, machine.machine_bus) if name]
         buses = bus or [f"{name}={default_address(name)}" for name in names]
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     except LinkError as error:
         raise CommandFailed.from_error(error, ExitCode.BUS) from error
     arguments = ["--out", str(out), "--report-port", str(report_port), *(("--ticks", str(ticks)) if ticks else ())]

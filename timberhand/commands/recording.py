@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed
 from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
@@ -43,23 +45,15 @@ def decode(
     bad CRC is shown and counted. A file in which no frame can be read ends
     with exit code 3.
     """
-    import json
-
     from can_dbc.dbc.codec import SHIPPED
     from can_dbc.trace.candump import read_trace
     from can_dbc.trace.decoder import Decoder
-    from host.exit_codes import CommandFailed, ExitCode
-    from runtime.errors import ConfigError
 
     try:
         decoder = Decoder(dbc or list(SHIPPED))
         records = read_trace(recording)
-    except ConfigError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     except OSError as error:
-        raise CommandFailed(
-            "recording.unreadable", f"{recording}: cannot be read: {error.strerror}", ExitCode.CONFIGURATION
-        ) from error
+        raise CommandFailed("recording.unreadable", f"{recording}: cannot be read: {error.strerror}") from error
     if as_json:
         separator = '{"frames": ['
         for entry in decoder.run(records):
