@@ -7,18 +7,18 @@ from machine.geometry.optics import Intrinsics
 from training.pictures.piles import settle
 from training.pictures.samples import read, sample, write
 from training.pictures.traced import shapes
-from training.pictures.traced.scenes import Assets, Format, describe, log_poses
+from training.pictures.traced.scenes import Format, describe, log_poses
 from training.pictures.traced.staging import pieces
 from training.pictures.traced.tracer import FLOATS, packed
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+    return describe(settle("palms_471", 5), 3, Format(size_px=48, samples=1, views=1, stereo_share=0.0))
 
 
 def test_a_scene_is_the_same_for_a_seed(scene):
-    again = describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+    again = describe(settle("palms_471", 5), 3, Format(size_px=48, samples=1, views=1, stereo_share=0.0))
     assert again == scene and len(log_poses(scene)) == len(scene["logs"])
 
 
