@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any, Final
 
 from starlette.applications import Starlette
@@ -40,7 +40,6 @@ def create_replay_app(
     note: str = "",
     at_ns: int | None = None,
     allow_hosts: Collection[str] = (),
-    clock: Callable[[], int] = time.monotonic_ns,
 ) -> Starlette:
     """Build the ASGI application; ``name`` and ``note`` are shown, ``at_ns`` is where a page begins."""
     overview, databases = Overview(recording, profile), load_databases(profile)
@@ -65,7 +64,7 @@ def create_replay_app(
         hearing = asyncio.create_task(_hear(socket, orders))
         with contextlib.suppress(WebSocketDisconnect, asyncio.QueueFull):
             while not hearing.done():
-                state = await asyncio.to_thread(_next, view, _waiting(orders), clock())
+                state = await asyncio.to_thread(_next, view, _waiting(orders), time.monotonic_ns())
                 await socket.send_text(json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
         hearing.cancel()
