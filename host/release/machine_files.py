@@ -21,7 +21,7 @@ from controller.guard.layout import GuardConfigError
 from host.exit_codes import CommandFailed
 from host.release import sums
 from host.release.signature import signature_path, verify
-from host.release.trees import flush_folder
+from host.release.trees import point
 from machine.loading.profile_file import ProfileError, load_profile
 
 PLACE: Final = Path("/etc/timberhand")
@@ -74,7 +74,7 @@ def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
             (slot / name).write_bytes((folder / name).read_bytes())
         os.sync()
         check(slot, public)  # what lies there, not what it was copied from
-        _use(place, slot.name)
+        point(place / LINK, slot.name)
     except OSError as error:
         raise CommandFailed(
             "machine-files.not-written", f"{slot} cannot be written: {error.strerror}; nothing has changed"
@@ -94,7 +94,7 @@ def revert(public: Path, place: Path = PLACE) -> Path:
             "machine-files.no-former", "there are no former machine files to go back to; apply the ones that you want"
         )
     check(slot, public)
-    _use(place, slot.name)
+    point(place / LINK, slot.name)
     return place / LINK / PROFILE
 
 
@@ -103,11 +103,3 @@ def _in_use(place: Path) -> str | None:
         return os.readlink(place / LINK)
     except OSError:
         return None
-
-
-def _use(place: Path, slot: str) -> None:
-    fresh = place / f"{LINK}.new"
-    fresh.unlink(missing_ok=True)
-    fresh.symlink_to(slot)
-    os.replace(fresh, place / LINK)
-    flush_folder(place)
