@@ -198,19 +198,17 @@ _SECOND_NS: Final = 1_000_000_000
 
 
 class AuditLog:
-    """``wall_clock`` is UTC, ``clock`` monotonic [ns].
+    """``clock`` is monotonic [ns]; the lines have UTC.
 
     Raises:
         OSError: the file cannot be opened.
     """
 
-    def __init__(
-        self, path: Path, clock: Callable[[], int], wall_clock: Callable[[], datetime] = lambda: datetime.now(UTC)
-    ) -> None:
+    def __init__(self, path: Path, clock: Callable[[], int]) -> None:
         self.path = path
         self.failed = ""
         """Why the last lines could not be written."""
-        self._clock, self._wall_clock = clock, wall_clock
+        self._clock = clock
         self._second, self._refused, self._left_out = 0, 0, 0
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self._waiting: queue.Queue[bytes] = queue.Queue(MAX_WAITING)
@@ -227,7 +225,7 @@ class AuditLog:
             if self._refused > MAX_REFUSED:
                 self._left_out += 1
                 return
-        line = {"at": self._wall_clock().isoformat(timespec="milliseconds"), **fields}
+        line = {"at": datetime.now(UTC).isoformat(timespec="milliseconds"), **fields}
         if self._left_out:
             line["refusals_left_out"], self._left_out = self._left_out, 0
         try:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
-from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from console.access import Access
 from console.access_guards import TOKEN_HEADER, cookie_of, page_of, person_of, set_session
+from console.guards import body_of, json_route, page_route
 
-STATIC: Final = Path(__file__).with_name("static")
 MAX_BODY_BYTES: Final = 2048
 HANDOVER_STEPS, HANDOVER_STEP_S = 10, 0.05
 """So long a page that is loaded again waits for the end of its former connection; a duplicated tab waits in vain."""
@@ -43,12 +42,6 @@ class Take(msgspec.Struct, forbid_unknown_fields=True):
 def access_routes(access: Access, secure: bool) -> list[Route]:
     """Make the routes of sign-in, sessions and lease; ``secure``: the page and its cookie use TLS."""
     hash_lock = asyncio.Lock()
-
-    async def form(_: Request) -> Response:
-        return FileResponse(STATIC / "sign-in.html", media_type="text/html")
-
-    async def how(_: Request) -> Response:
-        return JSONResponse({"by": "password" if access.accounts is not None else "token"})
 
     async def enter(request: Request) -> Response:
         entry = await _body(request, Entry)
@@ -115,8 +108,8 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
         return Response(status_code=204)
 
     return [
-        Route("/sign-in", form),
-        Route("/api/sign-in", how),
+        page_route("/sign-in", "sign-in.html"),
+        json_route("/api/sign-in", lambda: {"by": "password" if access.accounts is not None else "token"}),
         Route("/api/sign-in", sign_in, methods=["POST"]),
         Route("/api/sign-out", sign_out, methods=["POST"]),
         Route("/api/session", session, methods=["POST"]),
@@ -127,12 +120,7 @@ def access_routes(access: Access, secure: bool) -> list[Route]:
 
 async def _body(request: Request, kind: type[T]) -> T | None:
     """Decode the JSON of a small body; None when it is none of this kind."""
-    data = b""
     try:
-        async for part in request.stream():
-            data += part
-            if len(data) > MAX_BODY_BYTES:
-                return None
-        return msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, ClientDisconnect):
+        return msgspec.json.decode(await body_of(request, MAX_BODY_BYTES) or b"", type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError):
         return None

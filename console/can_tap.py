@@ -25,15 +25,10 @@ RETRY_NS: Final = 1_000_000_000
 IDENTITY: Final = "console"
 
 
-def databases_of(profile: Profile) -> dict[str, tuple[str, ...]]:
-    """Name the machine's buses, with the databases of their messages."""
-    databases: dict[str, tuple[str, ...]] = {profile.crane_bus: ("crane",)}
-    return databases | ({profile.machine_bus: ("machine", "gnss")} if profile.machine_bus else {})
-
-
 def load_databases(profile: Profile) -> dict[str, tuple[Database, ...]]:
     """Load the databases by the bus; reading takes so long that it is done before anything is served."""
-    return {bus: tuple(map(load, names)) for bus, names in databases_of(profile).items()}
+    names = {profile.crane_bus: ("crane",), profile.machine_bus: ("machine", "gnss")}
+    return {bus: tuple(map(load, databases)) for bus, databases in names.items() if bus}
 
 
 class CanTap:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
@@ -26,11 +26,11 @@ from console.access import Access
 from console.access_guards import page_of, person_of
 from console.accounts import Role
 from console.commissioning import Commissioning
+from console.guards import body_of, json_route, page_route
 from machine.joints import JOINTS, Joint
 from machine.profile import joint
 from runtime.errors import TimberhandError
 
-STATIC: Final = Path(__file__).with_name("static")
 SUFFIX: Final = ".protocol.json"
 NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
 
@@ -57,23 +57,22 @@ class CommissionApi:
     def routes(self) -> list[Route]:
         """Make the routes, to be mounted by the server."""
         handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
-            ("/commission", self._page, "GET"),
-            ("/api/commission/settings", self._settings, "GET"),
-            ("/api/commission/state", self._state, "GET"),
             ("/api/commission/step", self._step, "POST"),
             ("/api/commission/calibrate", self._calibrate, "POST"),
             ("/api/commission/end", self._end, "POST"),
             ("/api/commission/plots/{name}", self._plot, "GET"),
-            ("/api/commission/protocols", self._protocols, "GET"),
             ("/api/commission/protocols/{name}", self._open, "GET"),
             ("/api/commission/protocols/{name}", self._save, "POST"),
         ]
-        return [Route(path, handler, methods=[method]) for path, handler, method in handlers]
+        return [
+            page_route("/commission", "commission.html"),
+            json_route("/api/commission/settings", self._settings),
+            json_route("/api/commission/state", self._work.state),
+            json_route("/api/commission/protocols", self._protocols),
+            *(Route(path, handler, methods=[method]) for path, handler, method in handlers),
+        ]
 
-    async def _page(self, _: Request) -> Response:
-        return FileResponse(STATIC / "commission.html", media_type="text/html")
-
-    async def _settings(self, _: Request) -> Response:
+    def _settings(self) -> dict[str, Any]:
         profile = self._work.profile
         joints: list[dict[str, Any]] = []
         for j in JOINTS:
@@ -90,15 +89,10 @@ class CommissionApi:
             )
         checks = [{"id": c.id, "title": c.title, "how": c.how, "value": c.value} for c in CHECKS]
         machine_facts = {"machine": profile.title, "profile": profile.name, "folder": str(self._work.folder)}
-        return JSONResponse(
-            machine_facts | {"joints": joints, "checks": checks, "hash": f"{self._work.profile_hash:08x}"}
-        )
-
-    async def _state(self, _: Request) -> Response:
-        return JSONResponse(self._work.state())
+        return machine_facts | {"joints": joints, "checks": checks, "hash": f"{self._work.profile_hash:08x}"}
 
     async def _step(self, request: Request) -> Response:
-        body = await _body(request, 1024)
+        body = await body_of(request, 1024)
         try:
             step_request = msgspec.json.decode(body or b"", type=Step)
             selected_joint = Joint[step_request.joint.upper()]
@@ -107,7 +101,7 @@ class CommissionApi:
         return self._run(request, lambda work, goes_on: work.step_joint(selected_joint, step_request.amount, goes_on))
 
     async def _calibrate(self, request: Request) -> Response:
-        body = await _body(request, 1024)
+        body = await body_of(request, 1024)
         try:
             selection = msgspec.json.decode(body or b"", type=Chosen)
             joints = [Joint[name.upper()] for name in selection.joints] or list(JOINTS)
@@ -140,9 +134,8 @@ class CommissionApi:
             return PlainTextResponse("There is no such plot.", 404)
         return FileResponse(self._work.folder / result["name"] / name, headers={"Cache-Control": "no-cache"})
 
-    async def _protocols(self, _: Request) -> Response:
-        names = (path.name.removesuffix(SUFFIX) for path in self._work.folder.glob(f"*{SUFFIX}"))
-        return JSONResponse(sorted(names))
+    def _protocols(self) -> list[str]:
+        return sorted(path.name.removesuffix(SUFFIX) for path in self._work.folder.glob(f"*{SUFFIX}"))
 
     async def _open(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -154,7 +147,7 @@ class CommissionApi:
     async def _save(self, request: Request) -> Response:
         if why := self._access.refusal(page_of(request), Role.TECHNICIAN, leased=False):
             return PlainTextResponse(why, 403)
-        name, data = request.path_params["name"], await _body(request, MAX_JSON_BYTES)
+        name, data = request.path_params["name"], await body_of(request, MAX_JSON_BYTES)
         if not NAME.fullmatch(name):
             return PlainTextResponse("Give a name of letters, digits, - and _, up to 40.", 422)
         if data is None:
@@ -190,15 +183,3 @@ def _write_once(path: Path, told: dict[str, Any]) -> None:
         os.link(draft, path)
     finally:
         draft.unlink(missing_ok=True)
-
-
-async def _body(request: Request, most: int) -> bytes | None:
-    data = b""
-    try:
-        async for part in request.stream():
-            data += part
-            if len(data) > most:
-                return None
-    except ClientDisconnect:
-        return None
-    return data

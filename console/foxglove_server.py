@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 import foxglove
@@ -42,16 +42,16 @@ class _Newcomers(ServerListener):
 
 
 class FoxgloveServer:
-    """Serves on ``host`` and ``port`` (0: any free one) until ``close``; ``clock`` gives the monotonic time [ns].
+    """Serves on ``host`` and ``port`` (0: any free one) until ``close``.
 
     Raises:
         OSError: the port cannot be used.
     """
 
-    def __init__(self, profile: Profile, host: str, port: int, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, profile: Profile, host: str, port: int) -> None:
         self._context = context = Context()  # kept: the library lets go of a context that nobody holds
         self._topics = MachineTopics(profile)
-        self._offset_ns = time.time_ns() - clock()
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._channels: Mapping[str, Channel] = {
             topic: Channel(topic, schema=schema, message_encoding=ENCODING, context=context)
             for topic, schema in self._topics.topics

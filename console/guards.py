@@ -3,6 +3,8 @@
 A foreign ``Host`` is DNS rebinding; a foreign ``Origin`` on the websocket or on a command is a page of another site in
 this browser.  Both are refused with a sentence.  Every response carries a policy that only lets the page load resources
 from this server (docs/reference/safety.md section 3).
+
+`page_route`, `json_route` and `body_of` are what the handlers of several pages have in common.
 """
 
 from __future__ import annotations
@@ -10,13 +12,18 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Collection, Sequence
-from typing import Final
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Any, Final
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+STATIC: Final = Path(__file__).with_name("static")
 LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost", "::1")
 _HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:[0-9]{1,5})?")
 """``uri-host [":" port]`` of RFC 9110, section 7.2, as browsers send it: no user, no path."""
@@ -87,3 +94,40 @@ class RequestGuards:
             await send(message)
 
         return send_with_headers
+
+
+def guarded(file: str, allow_hosts: Collection[str]) -> Middleware:
+    """Return the guards of the page ``file``, which is served under this machine's names and ``allow_hosts``."""
+    policy = content_security_policy((STATIC / file).read_text())
+    return Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=policy)
+
+
+def page_route(path: str, file: str) -> Route:
+    """Serve the page ``file`` of this package."""
+
+    async def page(_: Request) -> Response:
+        return FileResponse(STATIC / file, media_type="text/html")
+
+    return Route(path, page)
+
+
+def json_route(path: str, content: Callable[[], Any]) -> Route:
+    """Serve what ``content`` returns at each request, as JSON."""
+
+    async def answer(_: Request) -> Response:
+        return JSONResponse(content())
+
+    return Route(path, answer)
+
+
+async def body_of(request: Request, most: int) -> bytes | None:
+    """Read the body of a request; None for more than ``most`` bytes, and for a page that is gone."""
+    data = b""
+    try:
+        async for part in request.stream():
+            data += part
+            if len(data) > most:
+                return None
+    except ClientDisconnect:
+        return None
+    return data

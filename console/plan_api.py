@@ -11,12 +11,11 @@ import asyncio
 import hashlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from autonomy.missions import geojson
@@ -30,6 +29,7 @@ from autonomy.missions.validation import Finding, problems_of
 from console.access import Access
 from console.access_guards import page_of, person_of
 from console.accounts import Role
+from console.guards import page_route
 from machine.profile import Carrier, Profile
 from runtime.errors import InputRefused
 
@@ -111,7 +111,6 @@ def _told(findings: list[Finding]) -> list[dict[str, Any]]:
 
 
 MAX_BODY_BYTES: Final = MAX_JSON_BYTES
-STATIC: Final = Path(__file__).with_name("static")
 MAX_QUERY_CHARS: Final = 100
 ANSWER_S: Final = 3.0
 """So long the planner may take to answer an upload; it reports at once."""
@@ -141,7 +140,6 @@ class PlanApi:
     def routes(self) -> list[Route]:
         """Make the routes, to be mounted by the server."""
         handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
-            ("/plan", self._page, "GET"),
             ("/api/plan/settings", self._settings, "GET"),
             ("/api/plan/missions", self._missions, "GET"),
             ("/api/plan/missions/{name}", self._open, "GET"),
@@ -151,10 +149,8 @@ class PlanApi:
             ("/api/plan/export/{kind}", self._export, "POST"),
             ("/api/plan/upload/{name}", self._upload, "POST"),
         ]
-        return [Route(path, _answering(handler), methods=[method]) for path, handler, method in handlers]
-
-    async def _page(self, _: Request) -> Response:
-        return FileResponse(STATIC / "plan.html", media_type="text/html")
+        requests = [Route(path, _answering(handler), methods=[method]) for path, handler, method in handlers]
+        return [page_route("/plan", "plan.html"), *requests]
 
     async def _settings(self, request: Request) -> Response:
         carrier = self.profile.carrier

@@ -7,20 +7,18 @@ import contextlib
 import time
 from collections.abc import AsyncIterator, Collection
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.perception.log_list import decode_logs
-from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy, is_loopback
+from console.guards import STATIC, guarded, is_loopback, page_route
 from runtime.errors import InputRefused
 
 RESPONSE_TIMEOUT_S: Final = 1.0
@@ -67,12 +65,10 @@ class PlantLink(asyncio.DatagramProtocol):
 # shows the ground truth of a simulation; no control process reads it.
 
 VIEW_PERIOD_S: Final = 0.05
-STATIC: Final = Path(__file__).with_name("static")
 
 
 def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starlette:
     """Build the ASGI application of the plant's page."""
-    page = (STATIC / "plant.html").read_text()
     links: list[PlantLink] = []
     silent = "The plant does not respond; check that it is running and that the request port is right."
 
@@ -82,9 +78,6 @@ def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starl
         links.append(link)
         yield
         link.close()
-
-    async def index(_: Request) -> Response:
-        return FileResponse(STATIC / "plant.html", media_type="text/html")
 
     async def api_plant(_: Request) -> Response:
         response = await links[0].request({"op": "scene"})
@@ -110,16 +103,14 @@ def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starl
 
     return Starlette(
         routes=[
-            Route("/", index),
-            Route("/plant", index),
+            page_route("/", "plant.html"),
+            page_route("/plant", "plant.html"),
             Route("/api/plant", api_plant),
             Route("/api/plant/lever", lever, methods=["POST"]),
             WebSocketRoute("/ws/plant", ws),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
-        middleware=[
-            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))
-        ],
+        middleware=[guarded("plant.html", allow_hosts)],
         lifespan=lifespan,
     )
 

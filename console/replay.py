@@ -19,7 +19,7 @@ from can_dbc.messages.crane import StateReport
 from can_dbc.messages.vehicle import VehicleReport
 from console.can_table import CanTable
 from console.panel import Panel
-from console.state import CraneState, timing_of_recording
+from console.state import CraneState, timing_facts
 from console.timeline import Timeline
 from machine.geometry.map_projection import MapProjection, Metres
 from machine.profile import Profile
@@ -159,7 +159,8 @@ class ReplayView:
         """Return the timing card, read again when the time is in another second."""
         second = self.at_ns // 1_000_000_000
         if self._timed[0] != second:
-            self._timed = second, timing_of_recording(self._recording.timing(self.at_ns))
+            page = self._recording.timing(self.at_ns)
+            self._timed = second, None if page is None else timing_facts(page)
         return self._timed[1]
 
     def _errors(self) -> list[tuple[float, list[float | None]]]:

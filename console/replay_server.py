@@ -10,21 +10,20 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any, Final
 
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from console.can_tap import load_databases
-from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy
+from console.guards import STATIC, guarded, json_route, page_route
 from console.replay import Overview, Recording, ReplayView
-from console.server import PERIOD_S, STATIC
+from console.server import PERIOD_S
 from console.state import describe_machine
 from machine.profile import Profile
 
@@ -41,7 +40,6 @@ def create_replay_app(
     note: str = "",
     at_ns: int | None = None,
     allow_hosts: Collection[str] = (),
-    clock: Callable[[], int] = time.monotonic_ns,
 ) -> Starlette:
     """Build the ASGI application; ``name`` and ``note`` are shown, ``at_ns`` is where a page begins."""
     overview, databases = Overview(recording, profile), load_databases(profile)
@@ -55,19 +53,6 @@ def create_replay_app(
             "moves": bool(overview.trail),
         },
     }
-    page = (STATIC / "index.html").read_text()
-
-    async def index(_: Request) -> Response:
-        return FileResponse(STATIC / "index.html", media_type="text/html")
-
-    async def api_machine(_: Request) -> Response:
-        return JSONResponse(machine)
-
-    async def api_trail(_: Request) -> Response:
-        return JSONResponse(overview.trail)
-
-    async def api_timeline(_: Request) -> Response:
-        return JSONResponse(overview.entries)
 
     async def refuse(_: Request) -> Response:
         return PlainTextResponse(REFUSAL, 409)
@@ -79,24 +64,22 @@ def create_replay_app(
         hearing = asyncio.create_task(_hear(socket, orders))
         with contextlib.suppress(WebSocketDisconnect, asyncio.QueueFull):
             while not hearing.done():
-                state = await asyncio.to_thread(_next, view, _waiting(orders), clock())
+                state = await asyncio.to_thread(_next, view, _waiting(orders), time.monotonic_ns())
                 await socket.send_text(json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
         hearing.cancel()
 
     return Starlette(
         routes=[
-            Route("/", index),
-            Route("/api/machine", api_machine),
-            Route("/api/trail", api_trail),
-            Route("/api/timeline", api_timeline),
+            page_route("/", "index.html"),
+            json_route("/api/machine", lambda: machine),
+            json_route("/api/trail", lambda: overview.trail),
+            json_route("/api/timeline", lambda: overview.entries),
             Route("/api/{command:path}", refuse, methods=["POST"]),
             WebSocketRoute("/ws", ws),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
-        middleware=[
-            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))
-        ],
+        middleware=[guarded("index.html", allow_hosts)],
     )
 
 

@@ -20,13 +20,14 @@ import asyncio
 import contextlib
 import json
 from collections.abc import AsyncIterator, Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -44,7 +45,7 @@ from console.camera import Camera
 from console.console import Address, Console
 from console.fault_watch import FaultWatch
 from console.foxglove_server import feed_pictures
-from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy
+from console.guards import STATIC, guarded, json_route, page_route
 from console.panel import Panel, panel_data, panels_of
 from console.plan_api import PlanApi
 from console.plant_link import TrueLogs
@@ -108,26 +109,23 @@ def _error(told: dict[str, Any]) -> str:
 PERIOD_S: Final = 0.05
 LOG_REQUEST_PERIOD_S: Final = 0.1  # a log in the grapple moves with it
 TIMING_PERIOD_S: Final = 1.0
-STATIC: Final = Path(__file__).with_name("static")
 
 BUTTONS: Final = tuple(action.name for action in OperatorAction if action not in WATCH_ACTIONS)
 
 
-class _Reports(asyncio.DatagramProtocol):
-    def __init__(self, console: Console) -> None:
-        self._console = console
+class _Receiver(asyncio.DatagramProtocol):
+    """Hands every datagram to ``take``."""
+
+    def __init__(self, take: Callable[[bytes], object]) -> None:
+        self._take = take
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        self._console.crane_state.on_report(data, self._console.clock())
+        self._take(data)
 
 
-class _Logs(asyncio.DatagramProtocol):
-    def __init__(self, console: Console) -> None:
-        self._console = console
-
-    def datagram_received(self, data: bytes, addr: Address) -> None:
-        with contextlib.suppress(InputRefused):
-            self._console.crane_state.logs = decode_logs(data)
+def _take_logs(crane_state: CraneState, data: bytes) -> None:
+    with contextlib.suppress(InputRefused):
+        crane_state.logs = decode_logs(data)
 
 
 async def _request_logs(transport: asyncio.DatagramTransport) -> None:
@@ -200,7 +198,6 @@ def _commission_routes(console: Console) -> list[Route]:
 
 def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette:
     """Build the ASGI application; ``allow_hosts`` are host names to serve in addition to this machine's."""
-    page = (STATIC / "index.html").read_text()
     machine = describe_machine(console.profile)
     plan = PlanApi(
         console.profile,
@@ -225,21 +222,18 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             if true_logs is not None:
                 await stack.enter_async_context(true_logs.connected())
             if console.reports:
-                reports, _receiver = await loop.create_datagram_endpoint(
-                    lambda: _Reports(console), sock=console.reports
-                )
+                receiver = _Receiver(lambda data: console.crane_state.on_report(data, console.clock()))
+                reports, _protocol = await loop.create_datagram_endpoint(lambda: receiver, sock=console.reports)
                 stack.callback(reports.close)
             if console.scene:
-                scene, _logs = await loop.create_datagram_endpoint(lambda: _Logs(console), remote_addr=console.scene)
+                logs = _Receiver(partial(_take_logs, console.crane_state))
+                scene, _protocol = await loop.create_datagram_endpoint(lambda: logs, remote_addr=console.scene)
                 requesting = asyncio.create_task(_request_logs(scene))
                 stack.callback(scene.close)
                 stack.callback(requesting.cancel)
             if console.timing_page:
                 stack.callback(asyncio.create_task(_read_timing(console.crane_state, console.timing_page)).cancel)
             yield
-
-    async def index(_: Request) -> Response:
-        return FileResponse(STATIC / "index.html", media_type="text/html")
 
     async def api_machine(_: Request) -> Response:
         commissions = console.commission is not None
@@ -256,12 +250,6 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
     async def api_state(request: Request) -> Response:
         state = console.state_for(page_of(request), person_of(request))
         return JSONResponse(state | {"mission": console.crane_state.mission_state.mission()})
-
-    async def api_trail(_: Request) -> Response:
-        return JSONResponse(list(console.crane_state.mission_state.trail))
-
-    async def api_timeline(_: Request) -> Response:
-        return JSONResponse(list(console.crane_state.timeline.entries))
 
     async def healthz(_: Request) -> Response:
         alive = console.crane_state.alive(console.clock())
@@ -326,11 +314,11 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
 
     app = Starlette(
         routes=[
-            Route("/", index),
+            page_route("/", "index.html"),
             Route("/api/machine", api_machine),
             Route("/api/state", api_state),
-            Route("/api/trail", api_trail),
-            Route("/api/timeline", api_timeline),
+            json_route("/api/trail", lambda: list(console.crane_state.mission_state.trail)),
+            json_route("/api/timeline", lambda: list(console.crane_state.timeline.entries)),
             Route("/api/operator/{action}", operator, methods=["POST"]),
             Route("/api/watch-end/{page}", watch_end, methods=["POST"]),
             Route("/api/mission/{order}", mission, methods=["POST"]),
@@ -347,7 +335,7 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         ],
         middleware=[
             *([Middleware(AuditTrail, log=console.audit)] if console.audit else ()),
-            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page)),
+            guarded("index.html", allow_hosts),
             Middleware(AccessGuards, access=console.access),
         ],
         lifespan=lifespan,

@@ -286,7 +286,7 @@ class CraneState:
 
     def on_timing(self, timing: Timing) -> None:
         """Accept a state of the controller's timing page."""
-        self._timing, self._timing_ns = _timing_facts(timing), timing.facts.written_ns
+        self._timing, self._timing_ns = timing_facts(timing.named()), timing.facts.written_ns
         self._newest_timing = timing
 
     @property
@@ -363,32 +363,17 @@ class CraneState:
         }
 
 
-def _timing_facts(timing: Timing) -> dict[str, Any]:
-    """Summarize the controller's timing since its start: durations at the 99th percentile, oldest input used."""
-    facts, durations = timing.facts, timing.durations
-    inputs = {name: age.longest_ns for name, age in facts.inputs.items() if age.count}
-    oldest = max(inputs, key=inputs.__getitem__, default="")
-    return {
-        "ticks": facts.ticks,
-        "missed": facts.missed,
-        "wake_us": durations["wake"].quantile_ns(0.99) / 1e3,
-        "cpu_us": durations["cpu"].quantile_ns(0.99) / 1e3,
-        "sample_to_command_ms": durations["sample_to_command"].quantile_ns(0.99) / 1e6,
-        "oldest_input": oldest,
-        "oldest_input_ms": inputs[oldest] / 1e6 if oldest else None,
-    }
+def timing_facts(page: dict[str, Any]) -> dict[str, Any]:
+    """Summarize the controller's timing since its start: durations at the 99th percentile, oldest input used.
 
-
-def timing_of_recording(found: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return the same from the timing page as a recording has it: without histograms."""
-    if found is None:
-        return None
-    durations, inputs = found["durations"], found["inputs"]
-    used = {name: age["longest_ns"] for name, age in inputs.items() if age["count"]}
+    ``page``: the timing page as a recording has it (`Timing.named`).
+    """
+    durations = page["durations"]
+    used = {name: age["longest_ns"] for name, age in page["inputs"].items() if age["count"]}
     oldest = max(used, key=used.__getitem__, default="")
     return {
-        "ticks": found["ticks"],
-        "missed": found["missed"],
+        "ticks": page["ticks"],
+        "missed": page["missed"],
         "wake_us": durations["wake"]["p99_us"],
         "cpu_us": durations["cpu"]["p99_us"],
         "sample_to_command_ms": durations["sample_to_command"]["p99_us"] / 1e3,

@@ -26,14 +26,14 @@ class ExitCode(IntEnum):
 
 
 class CommandFailed(TimberhandError):
-    """Ends a command: an error code, one sentence for stderr, and the exit code."""
+    """Ends a command: an error code, one sentence for stderr, and the exit code, by default that of any coded error."""
 
-    def __init__(self, code: str, sentence: str, exit_code: ExitCode) -> None:
+    def __init__(self, code: str, sentence: str, exit_code: ExitCode = ExitCode.CONFIGURATION) -> None:
         super().__init__(code, sentence)
         self.exit_code = exit_code
 
     @classmethod
-    def from_error(cls, error: Exception, exit_code: ExitCode) -> Self:
+    def from_error(cls, error: Exception, exit_code: ExitCode = ExitCode.CONFIGURATION) -> Self:
         """Make a failure with the same sentence, and the same error code where ``error`` carries one."""
         return cls(error.code if isinstance(error, TimberhandError) else "", str(error), exit_code)
 

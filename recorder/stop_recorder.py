@@ -230,16 +230,12 @@ class StopFile:
         self._segment.channel(TOPIC, "json", "Stop", _OBJECT)
         self._segment.channel(TICK, "timberhand.tick")
         self._add("/manifest", stop.at_ns, _JSON.encode(manifest))
-        self.add_stop(stop)
+        self._add(TOPIC, stop.at_ns, _JSON.encode(stop))
 
     @property
     def pending(self) -> int:
         """Messages since the last commit."""
         return self._segment.pending
-
-    def add_stop(self, stop: Stop) -> None:
-        """Add the record of this stop, or of a second reason while the machine is stopped."""
-        self._add(TOPIC, stop.at_ns, _JSON.encode(stop))
 
     def add_tick(self, now_ns: int, record: bytes) -> None:
         """Add the controller's record of a tick."""
@@ -250,7 +246,7 @@ class StopFile:
         self._segment.commit()
 
     def finish(self) -> None:
-        """Complete the file and gives it its name."""
+        """Complete the file and give it its name."""
         self._segment.finish()
         _put_in_place(self._part, self.path, self._durable)
 
@@ -267,8 +263,6 @@ class StopFiles:
 
     def __init__(self, directory: Path, durable: bool) -> None:
         self.directory, self._durable = directory, durable
-        self.removed = 0
-        """Files that made room for newer ones."""
         with contextlib.suppress(OSError):  # a directory that cannot be written shows at the next stop
             repair(directory)
         self.next_number = 1 + max(map(_number, [*files_in(directory), *parts_in(directory)]), default=0)
@@ -286,7 +280,6 @@ class StopFiles:
         while len(files) > 1 and (len(files) > MAX_FILES or sum(sizes) > MAX_BYTES):
             files.pop(0).unlink()
             sizes.pop(0)
-            self.removed += 1
 
 
 def repair(directory: Path) -> list[Path]:

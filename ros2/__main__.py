@@ -25,10 +25,11 @@ from autonomy.process.command_line import emit
 from autonomy.process.controller_link import ControllerLink
 from can_dbc.messages.envelope import read_key
 from can_dbc.messages.udp_address import address_argument
+from host.exit_codes import ExitCode
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from ros2.bridge import Bridge, run
 from ros2.execution.execution import TrajectoryExecution
-from ros2.process import BUSY, add_node_options, catch_signals, complain, exit_code, open_node
+from ros2.process import add_node_options, catch_signals, complain, exit_code, open_node
 from runtime.errors import ConfigError, LinkError
 
 NAME: Final = "timberhand"
@@ -67,7 +68,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         link = ControllerLink(options.controller, options.report_port, number, key)
     except (OSError, OverflowError) as error:
-        return complain(f"UDP port {options.report_port} cannot be opened ({error}); choose another one", BUSY)
+        return complain(f"UDP port {options.report_port} cannot be opened ({error}); choose another one", ExitCode.BUS)
     signals = catch_signals()
     try:
         node = open_node(NAME, options)
@@ -77,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
         emit("ready", domain=options.domain, goals=execution is not None)
         run(bridge, link, signals)
     except LinkError as error:
-        return complain(str(error), BUSY)
+        return complain(str(error), ExitCode.BUS)
     finally:
         link.close()
     if link.foreign:

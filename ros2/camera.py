@@ -19,9 +19,10 @@ from typing import Final
 
 from autonomy.perception.sources.stream import StreamCamera
 from autonomy.process.command_line import emit
+from host.exit_codes import ExitCode
 from machine.loading.profile_file import ProfileError, load_profile
 from ros2.interfaces.sensor import CameraInfo, Image
-from ros2.process import BUSY, add_node_options, catch_signals, complain, exit_code, open_node
+from ros2.process import add_node_options, catch_signals, complain, exit_code, open_node
 from ros2.report import camera_info, colour_image, depth_image
 from ros2.wire.node import Node, send
 from ros2.wire.qos import sensor_data
@@ -112,7 +113,7 @@ def main(argv: list[str] | None = None) -> int:
         emit("ready", camera=options.camera, domain=options.domain)
         _run(camera, 1.0 / options.rate_hz, signals)
     except LinkError as error:
-        return complain(str(error), BUSY)
+        return complain(str(error), ExitCode.BUS)
     finally:
         source.close()
     return exit_code(signals)

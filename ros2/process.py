@@ -6,16 +6,9 @@ import argparse
 import os
 import signal
 import sys
-from typing import Final
 
+from host.exit_codes import ExitCode
 from ros2.wire.node import LOOPBACK, MAX_DOMAIN, Node
-
-OK: Final = 0
-CONFIGURATION: Final = 3
-"""Profile, camera or key cannot be used, or the controller has another profile."""
-BUSY: Final = 4
-"""A port is in use, or the domain cannot be opened."""
-INTERRUPTED: Final = 130
 
 
 def domain(text: str) -> int:
@@ -60,7 +53,7 @@ def catch_signals() -> list[int]:
     return signals
 
 
-def complain(sentence: str, code: int = CONFIGURATION) -> int:
+def complain(sentence: str, code: ExitCode = ExitCode.CONFIGURATION) -> int:
     """Write why the process ends; returns its exit code."""
     sys.stderr.write(f"ros2: {sentence}\n")
     return code
@@ -68,4 +61,4 @@ def complain(sentence: str, code: int = CONFIGURATION) -> int:
 
 def exit_code(signals: list[int]) -> int:
     """Return the exit code after these signals."""
-    return INTERRUPTED if signal.SIGINT in signals else OK
+    return ExitCode.INTERRUPTED if signal.SIGINT in signals else ExitCode.OK

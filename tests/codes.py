@@ -5,12 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
+from host.exit_codes import CommandFailed, ExitCode
 from runtime.errors import TimberhandError
 
 
 def coded(code: str) -> Callable[[TimberhandError], bool]:
     """For ``pytest.raises(..., check=coded("profile.unknown-key"))``."""
     return lambda error: error.code == code
+
+
+def exit_code_of(error: TimberhandError) -> ExitCode:
+    """The exit code with which ``timberhand`` ends for an error that reaches its command line."""
+    return error.exit_code if isinstance(error, CommandFailed) else ExitCode.CONFIGURATION
 
 
 def numbers_in(text: str) -> list[float]:

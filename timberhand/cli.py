@@ -18,9 +18,8 @@ from host.exit_codes import CommandFailed, ExitCode
 from runtime.errors import TimberhandError
 from timberhand.commands import (
     bench,
+    bench_tick,
     calibrate,
-    campaign,
-    compile_tick,
     config,
     console,
     dbc,
@@ -33,8 +32,6 @@ from timberhand.commands import (
     mission,
     operator,
     plan,
-    plan_learn,
-    record,
     recording,
     release,
     replay,
@@ -82,22 +79,20 @@ app.command("demo")(demo.demo)
 app.command("calibrate")(calibrate.calibrate)
 app.command("survey-camera")(survey_camera.survey_camera)
 app.command("experiment")(experiment.experiment)
-app.command("campaign")(campaign.campaign)
+app.command("campaign")(experiment.campaign)
 app.command("report")(report.report)
 app.command("inject")(inject.inject)
 app.command("replay")(replay.replay)
 app.command("why")(why.why)
-app.command("record")(record.record)
+app.command("record")(recording.record)
 app.command("console")(console.console)
 app.command("doctor")(doctor.doctor)
-app.command("compile")(compile_tick.compile_tick)
+app.command("compile")(bench_tick.compile_tick)
 app.add_typer(config.app, name="config")
 app.add_typer(machine.app, name="machine")
 app.add_typer(dbc.app, name="dbc")
 app.add_typer(recording.app, name="recording")
 app.add_typer(plan.app, name="plan")
-plan.app.command("learn")(plan_learn.learn)
-plan.app.command("demonstrate")(plan_learn.demonstrate)
 app.add_typer(mission.app, name="mission")
 app.add_typer(operator.app, name="operator")
 app.add_typer(bench.app, name="bench")
@@ -150,7 +145,6 @@ def _run() -> None:
         raise CommandFailed(
             "package.missing",
             f"{error.name} is missing, which this command needs: pip install 'timberhand[{extra}]'{bundle}",
-            ExitCode.CONFIGURATION,
         ) from None
 
 

@@ -31,7 +31,6 @@ from can_dbc.messages.mission import (
 )
 from host.exit_codes import CommandFailed, ExitCode
 from machine.profile import Profile
-from runtime.errors import ConfigError
 
 ANSWER_S: Final = 3.0
 """The planner answers at once, but plans a path while it does."""
@@ -61,33 +60,27 @@ def key_of(file: Path | None) -> bytes | None:
     """Read the key in ``file``; by default that of the installed services, None where there is none.
 
     Raises:
-        CommandFailed: it cannot be read.
+        ConfigError: it cannot be read.
     """
     if file is None and not SERVICE_KEY.exists():
         return None
-    try:
-        return read_key(file or SERVICE_KEY)
-    except ConfigError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    return read_key(file or SERVICE_KEY)
 
 
 def checked(file: Path, machine: Profile) -> ForwardingMission:
     """Return the mission of a file after the checks of ``timberhand plan check``.
 
     Raises:
-        CommandFailed: it cannot be driven.
+        MissionError: it cannot be driven.
     """
     carrier = machine.carrier
-    try:
-        if carrier is None:
-            raise MissionError(
-                "mission.stationary-machine",
-                f"{machine.name} does not drive; name the profile of the machine with --profile",
-            )
-        mission = load_mission(file, route_wanted=True, site=(carrier.site_lat_deg, carrier.site_lon_deg)).mission
-        review(mission, machine)
-    except MissionError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    if carrier is None:
+        raise MissionError(
+            "mission.stationary-machine",
+            f"{machine.name} does not drive; name the profile of the machine with --profile",
+        )
+    mission = load_mission(file, route_wanted=True, site=(carrier.site_lat_deg, carrier.site_lon_deg)).mission
+    review(mission, machine)
     return mission
 
 
@@ -109,9 +102,7 @@ class PlannerOrders:
         try:
             MissionFolder(folder).write(name, data, replace=True)
         except MissionError as error:
-            raise CommandFailed(
-                error.code, f"{folder}: {error}; the services' folder is written by root", ExitCode.CONFIGURATION
-            ) from None
+            raise CommandFailed(error.code, f"{folder}: {error}; the services' folder is written by root") from None
         digest = hashlib.sha256(data).digest()
         self._ask(
             lambda number, now_ns: encode_mission_upload(

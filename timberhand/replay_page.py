@@ -37,7 +37,7 @@ def show_recording(
         machine = load_profile(profile or profile_beside(files) or manifest.profile)
     except ProfileError as error:
         hint = f"; name the profile of that run, {manifest.profile}, with --profile FILE"
-        raise CommandFailed("replay.page-profile", f"{error}{hint}", ExitCode.CONFIGURATION) from error
+        raise CommandFailed("replay.page-profile", f"{error}{hint}") from error
     same = f"{profile_hash(machine):08x}" == manifest.profile_hash
     note = "" if same else f"Drawn with the profile {machine.name} of today, which differs from the recorded one."
     name = f"{run} · {manifest.start_utc or 'lockstep'}"

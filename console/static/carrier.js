@@ -2,10 +2,10 @@
 // ground at the height of the wheels.  Group `rear` is the rear frame: x ahead, y left, origin on the articulation axis.
 
 import * as THREE from "three";
+import { paint } from "./viewport.js";
 
 const PAINT = 0x3f7d5a, DARK = 0x39443f, TYRE = 0x2c322e, HUB = 0xd8a52e, GLASS = 0x8fb7c9;
 const HALF_FRAME_M = 0.45;
-const paint = (color) => new THREE.MeshLambertMaterial({ color });
 
 function box(parent, [x, y, z], size, color) {
   const mesh = new THREE.Mesh(new THREE.BoxGeometry(...size), paint(color));

@@ -2,13 +2,11 @@
 // World frame: metres, z up.  A pose is [x, y, z, qx, qy, qz, qw].
 
 import * as THREE from "three";
-import { createViewport } from "./viewport.js";
+import { createViewport, flatGround, paint, v3 } from "./viewport.js";
 
 const LOST_AFTER_MS = 1500;
 const LEVER_MS = 150;
 const $ = (id) => document.getElementById(id);
-const paint = (color) => new THREE.MeshLambertMaterial({ color });
-const v3 = (p) => new THREE.Vector3(p[0], p[1], p[2]);
 
 function place(object, pose) {
   object.position.set(pose[0], pose[1], pose[2]);
@@ -114,31 +112,21 @@ function logShape({ length_m: length, diameter_m: diameter, taper_m_m: taper, sw
 
 /** Flat ground as a disc with a grid, rough ground as its height grid. */
 function ground(g) {
-  const group = new THREE.Group();
-  if (g.heights) {
-    const shape = new THREE.BufferGeometry(), at = [], index = [];
-    for (let j = 0; j < g.rows; j++) {
-      for (let i = 0; i < g.columns; i++) at.push(g.x0_m + i * g.cell_m, g.y0_m + j * g.cell_m, g.heights[j * g.columns + i]);
-    }
-    for (let j = 0; j < g.rows - 1; j++) {
-      for (let i = 0; i < g.columns - 1; i++) {
-        const a = j * g.columns + i, b = a + g.columns;
-        index.push(a, a + 1, b, a + 1, b + 1, b);
-      }
-    }
-    shape.setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
-    shape.setIndex(index);
-    shape.computeVertexNormals();
-    group.add(new THREE.Mesh(shape, paint(0x3d4f3a)));
-    return group;
+  if (!g.heights) return flatGround(40, 60, g.z_m);
+  const shape = new THREE.BufferGeometry(), at = [], index = [];
+  for (let j = 0; j < g.rows; j++) {
+    for (let i = 0; i < g.columns; i++) at.push(g.x0_m + i * g.cell_m, g.y0_m + j * g.cell_m, g.heights[j * g.columns + i]);
   }
-  const disc = new THREE.Mesh(new THREE.CircleGeometry(40, 64), paint(0x22302a));
-  disc.position.z = g.z_m - 0.01;
-  const grid = new THREE.GridHelper(60, 60, 0x51655b, 0x33443c);
-  grid.rotation.x = Math.PI / 2;
-  grid.position.z = g.z_m;
-  group.add(disc, grid);
-  return group;
+  for (let j = 0; j < g.rows - 1; j++) {
+    for (let i = 0; i < g.columns - 1; i++) {
+      const a = j * g.columns + i, b = a + g.columns;
+      index.push(a, a + 1, b, a + 1, b + 1, b);
+    }
+  }
+  shape.setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
+  shape.setIndex(index);
+  shape.computeVertexNormals();
+  return new THREE.Mesh(shape, paint(0x3d4f3a));
 }
 
 // ---- numbers -----------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { createCarrier } from "./carrier.js";
-import { createViewport } from "./viewport.js";
+import { createViewport, flatGround, paint, v3 } from "./viewport.js";
 
 const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff, GRIP = 0xff9ec4, TRUE = 0x40e0ff;
 const UP = new THREE.Vector3(0, 1, 0);
@@ -15,9 +15,6 @@ const VIEWS = {
   top: [[0.6, 2.3, 12], [0.6, 2.31, 0]],
   side: [[10.5, 2.6, 1.4], [0, 2.6, 0.7]],
 };
-
-const v3 = (p) => new THREE.Vector3(p[0], p[1], p[2]);
-const paint = (color) => new THREE.MeshLambertMaterial({ color });
 
 /** A bar between two movable end points, round or square. */
 class Bar {
@@ -89,13 +86,7 @@ class Crane {
 
 /** The ground, with the picking area of a stationary machine; returns the group to move. */
 function addGround(scene, machine) {
-  const z = machine.ground_z_m, ground = new THREE.Group();
-  const disc = new THREE.Mesh(new THREE.CircleGeometry(14, 64), paint(0x22302a));
-  disc.position.z = z - 0.01;
-  const grid = new THREE.GridHelper(20, 20, 0x51655b, 0x33443c);
-  grid.rotation.x = Math.PI / 2;
-  grid.position.z = z;
-  ground.add(disc, grid);
+  const z = machine.ground_z_m, ground = flatGround(14, 20, z);
   scene.add(ground);
   if (machine.carrier) return ground;
   const [x, y] = machine.pick_center_m, h = machine.pick_half_size_m;

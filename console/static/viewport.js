@@ -3,6 +3,20 @@
 import * as THREE from "three";
 import { OrbitControls } from "./vendor/OrbitControls.js";
 
+export const paint = (color) => new THREE.MeshLambertMaterial({ color });
+export const v3 = (p) => new THREE.Vector3(p[0], p[1], p[2]);
+
+/** Flat ground at height `z`: a disc of `radius`, and a grid of `cells` squares of 1 m along each side. */
+export function flatGround(radius, cells, z) {
+  const group = new THREE.Group();
+  const disc = new THREE.Mesh(new THREE.CircleGeometry(radius, 64), paint(0x22302a));
+  disc.position.z = z - 0.01;
+  const grid = new THREE.GridHelper(cells, cells, 0x51655b, 0x33443c);
+  grid.rotation.x = Math.PI / 2;
+  grid.position.z = z;
+  return group.add(disc, grid);
+}
+
 /** Fills `container`; returns `{world, camera, controls, draw, look(position, target)}`.  Throws without WebGL. */
 export function createViewport(container, { nearest, farthest, sight }) {
   const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });

@@ -26,7 +26,7 @@ from typing import Any, Final
 
 from host.compiled.modules import MODULES
 from host.compiled.tree import make_tree, needed_sources
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 from runtime import compiled
 
 KEPT_BUILDS: Final = 3
@@ -61,12 +61,12 @@ def check_tools() -> None:
     """Raise CommandFailed when a tool is missing."""
     compiler = (str(sysconfig.get_config_var("CC") or "cc")).split()[0]
     if shutil.which(os.environ.get("CC", "").split(" ")[0] or compiler) is None:
-        raise _failed("compile.no-compiler", f"no C compiler ({compiler}): sudo apt-get install gcc")
+        raise CommandFailed("compile.no-compiler", f"no C compiler ({compiler}): sudo apt-get install gcc")
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
-        raise _failed("compile.no-headers", "the headers of Python are missing: sudo apt-get install python3-dev")
+        raise CommandFailed("compile.no-headers", "the headers of Python are missing: sudo apt-get install python3-dev")
     for module in ("mypyc", "setuptools"):
         if importlib.util.find_spec(module) is None:
-            raise _failed("compile.no-mypyc", f"{module} is missing: pip install 'timberhand[compile]'")
+            raise CommandFailed("compile.no-mypyc", f"{module} is missing: pip install 'timberhand[compile]'")
 
 
 def _build(root: Path, folder: Path, progress: Progress) -> str:
@@ -115,7 +115,7 @@ def _run_compiler(tree: Path, made: Path, progress: Progress) -> None:
                     progress(("compiling C, about a minute", "linking")[done])
                 done += 1
     if process.returncode:
-        raise _failed("compile.failed", "the tick does not compile; the last lines are:\n" + "\n".join(last))
+        raise CommandFailed("compile.failed", "the tick does not compile; the last lines are:\n" + "\n".join(last))
 
 
 def _environment(tree: Path) -> dict[str, str]:
@@ -153,7 +153,3 @@ def _answer(key: str, folder: Path, begin_s: float, new: bool) -> dict[str, Any]
         "seconds": round(time.monotonic() - begin_s, 1),
         "new": new,
     }
-
-
-def _failed(code: str, sentence: str) -> CommandFailed:
-    return CommandFailed(code, sentence, ExitCode.CONFIGURATION)

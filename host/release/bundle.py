@@ -34,7 +34,7 @@ from typing import Final
 
 from packaging.utils import parse_wheel_filename
 
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 from host.release import sums
 from host.release.signature import sign, signature_path, verify
 from host.release.trees import MARKER
@@ -117,9 +117,7 @@ def program_sums(wheel: Path) -> dict[str, str]:
         names = [name for name in archive.namelist() if not name.endswith(("/", "/RECORD"))]
         if moved := [name for name in names if ".data/" in name]:
             raise CommandFailed(
-                "bundle.data-files",
-                f"{wheel} installs {moved[0]} outside site-packages; build it without",
-                ExitCode.CONFIGURATION,
+                "bundle.data-files", f"{wheel} installs {moved[0]} outside site-packages; build it without"
             )
         return {name: hashlib.sha256(archive.read(name)).hexdigest() for name in names}
 
@@ -132,11 +130,7 @@ def unpack(bundle: Path, folder: Path) -> None:
         OSError: the folder cannot be written.
     """
     if not os.access(bundle, os.R_OK):
-        raise CommandFailed(
-            "bundle.unreadable",
-            f"{bundle} cannot be read; name the file that `make bundle` made",
-            ExitCode.CONFIGURATION,
-        )
+        raise CommandFailed("bundle.unreadable", f"{bundle} cannot be read; name the file that `make bundle` made")
     if bundle.is_dir():
         shutil.copytree(bundle, folder)
         return
@@ -156,9 +150,7 @@ def unpack(bundle: Path, folder: Path) -> None:
                     shutil.copyfileobj(source, file)
     except tarfile.TarError:
         raise CommandFailed(
-            "bundle.no-bundle",
-            f"{bundle} is no bundle; name the tar file that `make bundle` made",
-            ExitCode.CONFIGURATION,
+            "bundle.no-bundle", f"{bundle} is no bundle; name the tar file that `make bundle` made"
         ) from None
 
 
@@ -170,29 +162,22 @@ def check(folder: Path, public: Path) -> Release:
     """
     if not (folder / SUMS).is_file():
         raise CommandFailed(
-            "bundle.no-sums",
-            f"{folder} holds no {SUMS}, so it is no bundle; name the file that `make bundle` made",
-            ExitCode.CONFIGURATION,
+            "bundle.no-sums", f"{folder} holds no {SUMS}, so it is no bundle; name the file that `make bundle` made"
         )
     verify(folder / SUMS, public)
     listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))
     unlisted = _files(folder) - listed.keys() - {SUMS, signature_path(Path(SUMS)).name}
     wrong = sums.differing(folder, listed) or sorted(unlisted)
     if wrong:
-        raise CommandFailed(
-            "bundle.changed",
-            f"{wrong[0]} in the bundle is not what was signed; get the bundle again",
-            ExitCode.CONFIGURATION,
-        )
+        raise CommandFailed("bundle.changed", f"{wrong[0]} in the bundle is not what was signed; get the bundle again")
     release = Release(**json.loads((folder / MARKER).read_text()))
     if release.machine != platform.machine():
         raise CommandFailed(
             "bundle.other-machine",
             f"the bundle is for {release.machine}, and this computer is {platform.machine()}; get that one",
-            ExitCode.CONFIGURATION,
         )
     if not _NAME.fullmatch(release.name):
-        raise CommandFailed("bundle.name", f"{release.name!r} is no name of a release", ExitCode.CONFIGURATION)
+        raise CommandFailed("bundle.name", f"{release.name!r} is no name of a release")
     return release
 
 
@@ -206,9 +191,7 @@ def _release_of(wheel: Path) -> Release:
             return Release(f"{version}-{sums.sha256_of(wheel)[:12]}", str(version), wheel.name, machine)
     except (ValueError, OSError):
         pass
-    raise CommandFailed(
-        "bundle.no-wheel", f"{wheel} is no wheel of timberhand; make one: make wheel", ExitCode.CONFIGURATION
-    )
+    raise CommandFailed("bundle.no-wheel", f"{wheel} is no wheel of timberhand; make one: make wheel")
 
 
 def _add_packages(folder: Path, release: Release, find_links: Path | None, lock: Lock) -> None:
@@ -231,16 +214,12 @@ def _add_packages(folder: Path, release: Release, find_links: Path | None, lock:
         )
     except subprocess.TimeoutExpired:
         raise CommandFailed(
-            "bundle.slow-download",
-            f"the packages did not come within {_DOWNLOAD_S:.0f} s; use --find-links DIR",
-            ExitCode.CONFIGURATION,
+            "bundle.slow-download", f"the packages did not come within {_DOWNLOAD_S:.0f} s; use --find-links DIR"
         ) from None
     if done.returncode:
         reason = next((line for line in reversed(done.stderr.splitlines()) if line.startswith("ERROR")), "no message")
         raise CommandFailed(
-            "bundle.no-packages",
-            f"a package cannot be had: {reason}; name a folder that has it with --find-links",
-            ExitCode.CONFIGURATION,
+            "bundle.no-packages", f"a package cannot be had: {reason}; name a folder that has it with --find-links"
         )
 
 
@@ -251,9 +230,7 @@ def _locked(wheel: Path, lock: Lock) -> str:
             return archive.read(name).decode()
     except KeyError:
         raise CommandFailed(
-            "bundle.no-lock",
-            f"{wheel.name} holds no {name}, so no package can be checked; build it anew: make wheel",
-            ExitCode.CONFIGURATION,
+            "bundle.no-lock", f"{wheel.name} holds no {name}, so no package can be checked; build it anew: make wheel"
         ) from None
 
 
@@ -266,9 +243,7 @@ def _add_sbom(folder: Path) -> None:
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise CommandFailed(
-            "bundle.no-sbom",
-            f"the list of parts cannot be made: {reason}; pip install 'timberhand[audit]'",
-            ExitCode.CONFIGURATION,
+            "bundle.no-sbom", f"the list of parts cannot be made: {reason}; pip install 'timberhand[audit]'"
         )
 
 

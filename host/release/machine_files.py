@@ -18,10 +18,10 @@ from typing import Final
 
 from controller.guard.envelope import read_envelope
 from controller.guard.layout import GuardConfigError
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 from host.release import sums
 from host.release.signature import signature_path, verify
-from host.release.trees import flush_folder
+from host.release.trees import point
 from machine.loading.profile_file import ProfileError, load_profile
 
 PLACE: Final = Path("/etc/timberhand")
@@ -41,28 +41,21 @@ def check(folder: Path, public: Path) -> list[str]:
         raise CommandFailed(
             "machine-files.no-sums",
             f"{folder} holds no {SUMS}; make it with `sha256sum *.toml > {SUMS}` and sign it: timberhand release sign",
-            ExitCode.CONFIGURATION,
         )
     verify(folder / SUMS, public)
     listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))
     toml_names = {path.name for path in folder.glob("*.toml")}
     if wrong := sums.differing(folder, listed) or sorted(toml_names - listed.keys()):
         raise CommandFailed(
-            "machine-files.changed",
-            f"{folder / wrong[0]} is not what was signed; sign it again, or restore it",
-            ExitCode.CONFIGURATION,
+            "machine-files.changed", f"{folder / wrong[0]} is not what was signed; sign it again, or restore it"
         )
     if PROFILE not in listed:
-        raise CommandFailed(
-            "machine-files.no-profile",
-            f"{folder} holds no {PROFILE}; name the machine's profile so",
-            ExitCode.CONFIGURATION,
-        )
+        raise CommandFailed("machine-files.no-profile", f"{folder} holds no {PROFILE}; name the machine's profile so")
     try:
         load_profile(str(folder / PROFILE))
         read_envelope(folder / PROFILE)
     except (ProfileError, GuardConfigError) as error:
-        raise CommandFailed(error.code, str(error).splitlines()[0], ExitCode.CONFIGURATION) from error
+        raise CommandFailed(error.code, str(error).splitlines()[0]) from error
     return sorted(listed)
 
 
@@ -81,12 +74,10 @@ def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
             (slot / name).write_bytes((folder / name).read_bytes())
         os.sync()
         check(slot, public)  # what lies there, not what it was copied from
-        _use(place, slot.name)
+        point(place / LINK, slot.name)
     except OSError as error:
         raise CommandFailed(
-            "machine-files.not-written",
-            f"{slot} cannot be written: {error.strerror}; nothing has changed",
-            ExitCode.CONFIGURATION,
+            "machine-files.not-written", f"{slot} cannot be written: {error.strerror}; nothing has changed"
         ) from None
     return place / LINK / PROFILE
 
@@ -100,12 +91,10 @@ def revert(public: Path, place: Path = PLACE) -> Path:
     slot = place / SLOTS[_in_use(place) == SLOTS[0]]
     if not slot.is_dir():
         raise CommandFailed(
-            "machine-files.no-former",
-            "there are no former machine files to go back to; apply the ones that you want",
-            ExitCode.CONFIGURATION,
+            "machine-files.no-former", "there are no former machine files to go back to; apply the ones that you want"
         )
     check(slot, public)
-    _use(place, slot.name)
+    point(place / LINK, slot.name)
     return place / LINK / PROFILE
 
 
@@ -114,11 +103,3 @@ def _in_use(place: Path) -> str | None:
         return os.readlink(place / LINK)
     except OSError:
         return None
-
-
-def _use(place: Path, slot: str) -> None:
-    fresh = place / f"{LINK}.new"
-    fresh.unlink(missing_ok=True)
-    fresh.symlink_to(slot)
-    os.replace(fresh, place / LINK)
-    flush_folder(place)

@@ -115,6 +115,4 @@ def _order(*words: str) -> None:
     done = systemctl(*words)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise CommandFailed(
-            "update.systemd", f"systemctl {words[0]} failed: {reason}; see journalctl -b", ExitCode.CONFIGURATION
-        )
+        raise CommandFailed("update.systemd", f"systemctl {words[0]} failed: {reason}; see journalctl -b")

@@ -14,7 +14,7 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 
 PRIVATE_NAME: Final = "signing-key.pem"
 PUBLIC_NAME: Final = "signer.pem"
@@ -45,14 +45,10 @@ def make_keys(folder: Path) -> tuple[Path, Path]:
         )
     except FileExistsError:
         raise CommandFailed(
-            "signature.key-exists",
-            f"{private} exists; a new key would be another signer: name another folder",
-            ExitCode.CONFIGURATION,
+            "signature.key-exists", f"{private} exists; a new key would be another signer: name another folder"
         ) from None
     except OSError as error:
-        raise CommandFailed(
-            "signature.key-not-written", f"{folder} cannot take a key: {error.strerror}", ExitCode.CONFIGURATION
-        ) from None
+        raise CommandFailed("signature.key-not-written", f"{folder} cannot take a key: {error.strerror}") from None
     return private, public
 
 
@@ -70,15 +66,12 @@ def sign(file: Path, private: Path) -> Path:
         raise CommandFailed(
             "signature.private-key",
             f"{private} is no readable private Ed25519 key without a password; make one: timberhand release keygen",
-            ExitCode.CONFIGURATION,
         )
     path = signature_path(file)
     try:
         path.write_bytes(key.sign(file.read_bytes()))
     except OSError as error:
-        raise CommandFailed(
-            "signature.not-written", f"{path} cannot be written: {error.strerror}", ExitCode.CONFIGURATION
-        ) from None
+        raise CommandFailed("signature.not-written", f"{path} cannot be written: {error.strerror}") from None
     return path
 
 
@@ -96,7 +89,6 @@ def verify(file: Path, public: Path) -> None:
         raise CommandFailed(
             "signature.public-key",
             f"{public} is no readable public Ed25519 key; install the key of those who sign your releases there",
-            ExitCode.CONFIGURATION,
         )
     try:
         key.verify(signature_path(file).read_bytes(), file.read_bytes())
@@ -104,5 +96,4 @@ def verify(file: Path, public: Path) -> None:
         raise CommandFailed(
             "signature.bad",
             f"the signature of {file} is not by {public}; nothing is used of it: get it again from its maker",
-            ExitCode.CONFIGURATION,
         ) from None

@@ -64,11 +64,7 @@ class Trees:
 
     def point(self, link: str, name: str) -> None:
         """Let a link name a release, at once and for good."""
-        fresh = self.place / f"{link}.new"
-        fresh.unlink(missing_ok=True)
-        fresh.symlink_to(f"{RELEASES}/{name}")
-        os.replace(fresh, self.place / link)
-        flush_folder(self.place)
+        point(self.place / link, f"{RELEASES}/{name}")
 
     def accept(self) -> None:
         """End the trial: where to return to becomes the previous release."""
@@ -129,6 +125,15 @@ def write_durably(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
     os.replace(fresh, path)
     flush_folder(path.parent)
+
+
+def point(link: Path, target: str) -> None:
+    """Let a link name ``target``, at once and for good; raises OSError."""
+    fresh = link.with_name(f"{link.name}.new")
+    fresh.unlink(missing_ok=True)
+    fresh.symlink_to(target)
+    os.replace(fresh, link)
+    flush_folder(link.parent)
 
 
 def flush_folder(folder: Path) -> None:

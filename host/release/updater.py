@@ -170,9 +170,7 @@ class Updater:
         previous = self._trees.state().previous
         if previous is None or previous not in self._trees.whole():
             raise CommandFailed(
-                "update.no-previous",
-                "there is no release to go back to; update to the one that you want",
-                ExitCode.CONFIGURATION,
+                "update.no-previous", "there is no release to go back to; update to the one that you want"
             )
         self._name = previous
         return self._change(ROLLBACK)
@@ -193,9 +191,7 @@ class Updater:
         with self._locked():
             if self._trees.state().trial is not None:
                 raise CommandFailed(
-                    "update.unfinished",
-                    "an update was interrupted; finish it first: timberhand service resume",
-                    ExitCode.CONFIGURATION,
+                    "update.unfinished", "an update was interrupted; finish it first: timberhand service resume"
                 )
             self._carry_out(steps)
             return self._name
@@ -293,18 +289,14 @@ class Updater:
     def _locked(self) -> Iterator[None]:
         if self._trees.state().current is None:
             raise CommandFailed(
-                "update.not-installed",
-                f"there is no installation in {self._trees.place}; see docs/how-to/service.md",
-                ExitCode.CONFIGURATION,
+                "update.not-installed", f"there is no installation in {self._trees.place}; see docs/how-to/service.md"
             )
         descriptor = os.open(self._trees.place, os.O_RDONLY | os.O_DIRECTORY)
         try:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise CommandFailed(
-                    "update.running", "another update is running; wait for its end", ExitCode.CONFIGURATION
-                ) from None
+                raise CommandFailed("update.running", "another update is running; wait for its end") from None
             yield
         finally:
             os.close(descriptor)
@@ -316,15 +308,9 @@ def _run(name: str, command: Sequence[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd="/", env=environment)
     if done.returncode:
         lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
-        raise CommandFailed(
-            "update.refused", f"the release {name} cannot be used here: {lines[-1]}", ExitCode.CONFIGURATION
-        )
+        raise CommandFailed("update.refused", f"the release {name} cannot be used here: {lines[-1]}")
 
 
 def _of_disk(error: OSError) -> CommandFailed:
     cause = "the disk is full; free some space" if error.errno == errno.ENOSPC else f"{error.strerror}; see dmesg"
-    return CommandFailed(
-        "update.disk",
-        f"{error.filename or 'a file'} cannot be written: {cause}; nothing has changed",
-        ExitCode.CONFIGURATION,
-    )
+    return CommandFailed("update.disk", f"{error.filename or 'a file'} cannot be written: {cause}; nothing has changed")

@@ -10,8 +10,8 @@ wheel; the checkout is hidden from it.  The guest writes to its own memory only,
 - ``host``: builds the wheel, boots the guest, reads its messages.  ``init.sh``: from the kernel to systemd.
 - ``updates``: an update that is refused, one that stays, one that is cut off and comes back.
 - ``guest``: the steps inside, as a service of that systemd.  ``pilot``: arms and moves the machine, observes the bus.
-  ``trial``: ends the controller or the guard and measures the reaction.  ``lost_bus``: removes and restores the bus.
-  ``perception``: the camera's service and its failures.  ``loading``: a log from the ground into the bunk.
+  ``trial``: ends the controller or the guard, or takes the bus away, and measures the reaction.
+  ``perception``: the camera's service and its failures.  ``authority``: who may command, and a log into the bunk.
 
 Time is simulated: it passes only while every process of the guest sleeps.  So no verdict depends on how busy this
 computer is, and what computing costs is not seen.

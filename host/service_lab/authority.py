@@ -1,4 +1,9 @@
-"""Who may command under systemd: the page as an operator with its token and lease, nobody as the planner."""
+"""Who may command under systemd: the page as an operator with its token and lease, nobody as the planner.
+
+`load_a_log` is what it commands in earnest: one log from the ground into the bunk by the installed services alone, in
+simulated time.  A person opens the printed address, takes the lease, and presses RESET and ARM; nobody types anything
+at the planner's side.  The camera is the plant's: its service asks for pictures, and the planner asks it for logs.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from host.service_lab import trial
-from host.service_lab.updates import Expect
+from host.service_lab.updates import Expect, Step
 from host.systemd import journal, show
 
 AUTHORITY_S: Final = 10.0
@@ -21,6 +26,10 @@ TOKEN_HEADER: Final = "X-Timberhand-Page"
 _ENTERED: Final = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
 """Keeps the cookie of the session, as a browser."""
 OPERATORS: Final = Path("/run/timberhand-operator/controller")
+PLANNER: Final = "timberhand-autonomy.service"
+LOAD_S: Final = 300.0
+"""A log takes half a minute; the planner looks for it as soon as the camera's service answers."""
+SETTLE_S: Final = 20.0
 
 
 def probe(expect: Expect, page: str) -> None:
@@ -47,6 +56,33 @@ def probe(expect: Expect, page: str) -> None:
     command = ("setpriv", "--reuid", "timberhand-planner", "--regid", "timberhand-planner", "--init-groups")
     done = subprocess.run([*command, sys.executable, "-c", send], capture_output=True, text=True)
     expect("PermissionError" in done.stderr, f"the planner's user sent a command: {done.stderr[-300:]}")
+
+
+def load_a_log(page: str, plant_port: int, expect: Expect, step: Step) -> dict[str, float]:
+    """Arm the machine on the page and wait for the planner's end; returns the seconds that it took.
+
+    The planner is `active` until its mission has ended; that the log lies in the bunk is the plant's word.
+    """
+    origin = page.rstrip("/")
+    token = open_page(origin)
+    for path, body in (("lease/take", {"over": 0}), ("operator/reset", None), ("operator/arm", None)):
+        code, text = post(origin, path, token, body)
+        expect(code in (200, 204), f"{path} was answered {code}: {text}")
+        time.sleep(1.0)
+    begin_s = time.monotonic()
+    while show(PLANNER, "ActiveState")["ActiveState"] == "active" and time.monotonic() < begin_s + LOAD_S:
+        time.sleep(1.0)
+    loaded_s = time.monotonic() - begin_s
+    for line in journal(PLANNER):
+        if '"event"' in line:
+            step(f"planner: {line}")
+    expect(show(PLANNER, "Result")["Result"] == "success", f"the planner: {journal(PLANNER)[-8:]}")
+    while not (verdict := trial.ask_plant(plant_port, "verdict"))["success"]:
+        if time.monotonic() > begin_s + LOAD_S + SETTLE_S:
+            break
+        time.sleep(1.0)
+    expect(verdict["success"], f"the log is not in the bunk: {verdict}")
+    return {"loaded_s": loaded_s}
 
 
 def open_page(origin: str) -> str:

@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any, Final, TextIO
 
 from can_dbc.messages.envelope import SERVICE_KEY, read_key
-from host.service_lab import authority, loading, perception, trial, updates
+from host.service_lab import authority, perception, trial, updates
 from host.service_lab.pilot import Pilot
 from host.systemd import journal, main_pid, process_facts, show, systemctl
+from host.vcan_lab.guest import prioritize_soft_interrupts
 from host.vcan_lab.spec import LabError
 from recorder.recorder import TIMING
 from recorder.recover import Stored, scan
@@ -40,7 +41,7 @@ WORK_S: Final = 30.0
 STILL_MRAD: Final = 10.0
 """Greatest motion of a crane with closed valves; a slewing crane exceeds it within a tenth of a second."""
 IFF_UP: Final = 1
-PILOT_PRIORITY, PLANT_PRIORITY, SYSTEMD_PRIORITY, SOFT_INTERRUPT_PRIORITY = 70, 50, 40, 95
+PILOT_PRIORITY, PLANT_PRIORITY, SYSTEMD_PRIORITY = 70, 50, 40
 
 
 class Check:
@@ -120,9 +121,7 @@ def change_settings(check: Check) -> dict[str, str]:
 def prioritize() -> None:
     """Set real-time priorities as in the vcan lab: frames and systemd must not wait for ordinary processes."""
     os.sched_setscheduler(1, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(SYSTEMD_PRIORITY))
-    for comm in Path("/proc").glob("[0-9]*/comm"):
-        if comm.read_text().startswith("ksoftirqd"):
-            os.sched_setscheduler(int(comm.parent.name), os.SCHED_FIFO, os.sched_param(SOFT_INTERRUPT_PRIORITY))
+    prioritize_soft_interrupts(Path("/proc"))
 
 
 def bus_without_interface(check: Check) -> None:
@@ -320,7 +319,7 @@ def run_loading(check: Check, order: dict[str, str]) -> None:
     plant = start_plant(check, "--camera", str(CAMERA_PORT))
     page = f"http://127.0.0.1:{conf['CONSOLE_PORT']}/"
     wait_for_work(check, page)
-    for name, value in loading.load_a_log(page, PLANT_PORT, check.expect, check.step).items():
+    for name, value in authority.load_a_log(page, PLANT_PORT, check.expect, check.step).items():
         check.result["figures"][f"loading_{name}"] = value
     plant.terminate()
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
+from host.service_lab.updates import Expect, Step
 from host.systemd import journal, main_pid, show
 
 UNIT: Final = "timberhand-perception.service"
@@ -23,8 +24,6 @@ PROFILE: Final = "palms_471"
 SEEN_S: Final = 60.0
 """A detection takes a second; the planner asks four times a second, and the start of both takes most of a minute."""
 BACK_S: Final = 60.0
-Expect = Callable[[object, str], None]
-Step = Callable[[str], None]
 
 
 def try_perception(port: int, expect: Expect, step: Step) -> dict[str, float]:

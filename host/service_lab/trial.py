@@ -244,10 +244,10 @@ def lose(loss: Loss, pilot: Pilot, plant_port: int) -> dict[str, Any]:
     release(losing)
     losing.wait()
     pilot.until(lambda: False, STOPPED_S)
-    stopped_rad = _slew(plant_port)
+    stopped_rad = ask_plant(plant_port, "state")["joints"][Joint.SLEW]
     pilot.until(lambda: False, AWAY_S)
     status = {unit: show(unit, "StatusText")["StatusText"] for unit in (CONTROLLER, GUARD)}
-    moved_rad = abs(_slew(plant_port) - stopped_rad)
+    moved_rad = abs(ask_plant(plant_port, "state")["joints"][Joint.SLEW] - stopped_rad)
     pilot.clear()
     begin_s = time.monotonic()
     subprocess.run(loss.restore, check=True)
@@ -272,9 +272,10 @@ def _processes() -> list[dict[str, str]]:
     return [show(unit, "MainPID", "NRestarts", "ActiveState") for unit in (CONTROLLER, GUARD)]
 
 
-def _slew(port: int) -> float:
-    """Return the true slew angle [rad]."""
+def ask_plant(port: int, question: str) -> dict[str, Any]:
+    """Ask the emulated machine (``python -m sim``); return its answer, with joints in rad and m."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(5.0)
-        client.sendto(json.dumps({"op": "state"}).encode(), ("127.0.0.1", port))
-        return float(json.loads(client.recv(65536))["joints"][Joint.SLEW])
+        client.sendto(json.dumps({"op": question}).encode(), ("127.0.0.1", port))
+        answer: dict[str, Any] = json.loads(client.recv(65536))
+        return answer

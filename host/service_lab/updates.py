@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from host.exit_codes import ExitCode
 from host.release.gate import lacking
@@ -28,13 +28,7 @@ SETTLE_S: Final = 120.0
 """Page and planner start, too, and take a minute for their imports; frames come late until then."""
 Expect = Callable[[object, str], None]
 Step = Callable[[str], None]
-
-
-class Machine(Protocol):
-    """What ``subprocess.Popen`` offers of the emulated machine."""
-
-    def send_signal(self, signal: int) -> None:
-        """Stop or continue it."""
+Machine = subprocess.Popen[str]
 
 
 def try_updates(order: dict[str, str], machine: Machine, expect: Expect, step: Step) -> dict[str, Any]:

@@ -19,7 +19,8 @@ from autonomy.networks import load
 from experiments.common.registry import Options
 from experiments.grasp_network import experiment, folds, latency
 from host.exit_codes import CommandFailed, ExitCode
-from tests.codes import coded
+from runtime.errors import TimberhandError
+from tests.codes import coded, exit_code_of
 from timberhand.commands import train
 from training.grasp.cornell import load as load_samples
 
@@ -123,7 +124,7 @@ def test_scenes_are_reproducible() -> None:
 
 def test_train_needs_data() -> None:
     done = CliRunner().invoke(train.app, ["grasp", "--data", "/nowhere"])
-    assert isinstance(done.exception, CommandFailed) and done.exception.exit_code == ExitCode.CONFIGURATION
+    assert isinstance(done.exception, TimberhandError) and exit_code_of(done.exception) == ExitCode.CONFIGURATION
     assert done.exception.code == "dataset.no-samples" and "/nowhere" in str(done.exception)
 
 

@@ -18,8 +18,9 @@ from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder
+from runtime.errors import TimberhandError
 from sim.world import home_pose
-from tests.codes import coded
+from tests.codes import coded, exit_code_of
 from timberhand.cli import app
 from training.motion.demonstration_recordings import motions_in
 
@@ -77,16 +78,16 @@ def test_learn_reads_the_shipped_demonstrations(tmp_path: Path) -> None:
 def test_a_file_without_motions_is_refused(tmp_path: Path, name: str, text: str | None, code: str | None) -> None:
     if text is not None:
         (tmp_path / name).write_text(text)
-    with pytest.raises(CommandFailed) as stopped:
+    with pytest.raises(TimberhandError) as stopped:
         motions_in(tmp_path / name)
-    assert stopped.value.exit_code == ExitCode.CONFIGURATION and code in (None, stopped.value.code)
+    assert exit_code_of(stopped.value) == ExitCode.CONFIGURATION and code in (None, stopped.value.code)
     with pytest.raises(CommandFailed, check=coded("demonstration.other-machine")):
         motions_in(SHOWN, "palms_471")
 
 
 def test_records_that_cannot_be_read_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "cut.log").write_text("(0.1) can0 7FF#00\n(0.2) can0 7FF#0")
-    with pytest.raises(CommandFailed, check=coded("demonstration.encoder-missing")):
+    with pytest.raises(TimberhandError, check=coded("demonstration.encoder-missing")):
         motions_in(tmp_path / "cut.log")
     assert "line 2" in capsys.readouterr().err
 
@@ -99,7 +100,7 @@ def test_encoder_frames_of_two_interfaces_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CommandFailed, check=coded("demonstration.several-buses")):
         motions_in(log)
     log.write_text("".join(lines[::2]) + "(9.0) can1 18FECA00#04FF6E000401FFFF\n")
-    with pytest.raises(CommandFailed, check=coded("demonstration.encoder-missing")):
+    with pytest.raises(TimberhandError, check=coded("demonstration.encoder-missing")):
         motions_in(log)
 
 

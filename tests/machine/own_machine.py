@@ -8,7 +8,7 @@ from typing import Any
 from controller.guard.seal import main as seal
 from machine.draft.answers import read_answers as read
 from machine.draft.questions import EXAMPLE
-from timberhand.machine_files.make import make
+from timberhand.machine_files import make
 
 NAME = "truck_loader"
 

@@ -10,7 +10,7 @@ from ros2.interfaces import action, builtin, control, diagnostic, graph, sensor
 from ros2.interfaces.builtin import UUID, Header, duration_of, nanoseconds, time_of
 from ros2.interfaces.trajectory import MultiDOFJointTrajectoryPoint
 from ros2.wire.action_server import with_header
-from ros2.wire.type_hashes import type_hash
+from ros2.wire.qos import type_hash
 from tests.ros2.goals import goal
 from tests.ros2.published_types import ACTION, published
 

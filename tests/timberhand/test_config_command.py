@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import ExitCode
+from runtime.errors import TimberhandError
 from timberhand.cli import app
 from timberhand.configuration.check import problems_of
 from timberhand.configuration.settings_file import SHIPPED, migrated, parse
@@ -83,7 +84,7 @@ def test_the_command_names_the_file_and_its_line_and_fails(tmp_path: Path) -> No
     found = json.loads(RUNNER.invoke(app, ["config", "check", str(conf), "--json"]).stdout)
     assert [problem["line"] for problem in found["problems"]] == [parse(conf.read_text(), [])["SETPOINT_PORT"].line]
     missing = RUNNER.invoke(app, ["config", "check", str(tmp_path / "none")])
-    assert isinstance(missing.exception, CommandFailed) and missing.exception.code == "settings.unreadable"
+    assert isinstance(missing.exception, TimberhandError) and missing.exception.code == "settings.unreadable"
 
 
 def test_show_tells_every_file_that_decides_what_the_machine_does(tmp_path: Path) -> None:

@@ -10,7 +10,9 @@ from typer.testing import CliRunner
 
 from can_dbc.dbc import codec
 from can_dbc.protocols.e2e import protect
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import ExitCode
+from runtime.errors import TimberhandError
+from tests.codes import exit_code_of
 from timberhand.commands import bench_codec, dbc, recording
 
 OVERLAP = (
@@ -22,8 +24,8 @@ SOUND = OVERLAP.replace("7|8", "8|8")
 
 def run(app: object, *arguments: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, [str(a) for a in arguments])  # type: ignore[arg-type]
-    if isinstance(result.exception, CommandFailed):
-        return result.exception.exit_code, str(result.exception)
+    if isinstance(result.exception, TimberhandError):
+        return exit_code_of(result.exception), str(result.exception)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output

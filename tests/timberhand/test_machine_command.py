@@ -18,8 +18,7 @@ from tests.codes import coded
 from tests.machine.own_machine import NAME, answers, made
 from timberhand.cli import app
 from timberhand.commands.machine import _ask as asked
-from timberhand.machine_files.check import check
-from timberhand.machine_files.make import make
+from timberhand.machine_files import check, make
 
 RUNNER = CliRunner()
 

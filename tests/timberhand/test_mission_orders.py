@@ -14,8 +14,9 @@ from autonomy.process.planner_process import PlannerProcess
 from can_dbc.messages.crane import ModeSwitch
 from host.exit_codes import CommandFailed, ExitCode
 from machine.status.modes import Mode
+from runtime.errors import TimberhandError
 from tests.autonomy.mission_checks import EXAMPLES
-from tests.codes import coded
+from tests.codes import coded, exit_code_of
 from tests.live.autonomy.waiting_planner import PROFILE, planner_process, report_machine
 from timberhand import mission_orders
 from timberhand.cli import app
@@ -68,7 +69,7 @@ class Machine:
 
     def run(self, *words: str, key: Path | None = None) -> int:
         done = RUNNER.invoke(app, ["mission", *words, "--key-file", str(key or self.key)])
-        return done.exception.exit_code if isinstance(done.exception, CommandFailed) else done.exit_code
+        return exit_code_of(done.exception) if isinstance(done.exception, TimberhandError) else done.exit_code
 
     def start(self, file: Path = FILE) -> int:
         return self.run("start", str(file), "--missions", str(self.folder))
@@ -142,8 +143,8 @@ def test_a_mission_that_cannot_be_driven_is_refused_before_it_is_sent(machine: M
     bad = tmp_path / "bad.geojson"
     bad.write_text(json.dumps(document))
     checked = RUNNER.invoke(app, ["plan", "check", str(bad)]).exception
-    assert isinstance(checked, CommandFailed)
-    assert machine.start(bad) == checked.exit_code == ExitCode.CONFIGURATION
+    assert isinstance(checked, TimberhandError)
+    assert machine.start(bad) == exit_code_of(checked) == ExitCode.CONFIGURATION
     assert list(machine.folder.iterdir()) == []
     assert machine.start(tmp_path / "none.geojson") == ExitCode.CONFIGURATION
 

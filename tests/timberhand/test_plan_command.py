@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import ExitCode
+from runtime.errors import TimberhandError
 from runtime.plot_style import MOSS, OIL, RUST, TIMBER
 from tests.autonomy.mission_texts import at, gpx, gpx_points
-from tests.codes import numbers_in
+from tests.codes import exit_code_of, numbers_in
 from timberhand.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -25,10 +26,10 @@ def run(*arguments: str | Path) -> Any:
     return CliRunner().invoke(app, ["plan", *map(str, arguments)], env={"COLUMNS": "200"})
 
 
-def failure(*arguments: str | Path) -> CommandFailed:
+def failure(*arguments: str | Path) -> TimberhandError:
     """Why a command ended."""
     error = run(*arguments).exception
-    assert isinstance(error, CommandFailed)
+    assert isinstance(error, TimberhandError)
     return error
 
 
@@ -50,7 +51,7 @@ def test_a_bad_mission_ends_with_its_line_and_exit_code_3(tmp_path: Path) -> Non
     bad = tmp_path / "bad.gpx"
     bad.write_text('<gpx><rte>\n<rtept lat="19.9" lon="63.66"/>\n<rtept lat="19.901" lon="63.66"/></rte></gpx>')
     error = failure("check", bad)
-    assert error.exit_code == ExitCode.CONFIGURATION
+    assert exit_code_of(error) == ExitCode.CONFIGURATION
     assert error.code == "mission.swapped-axes" and str(bad) in str(error)
     result = run("check", bad, "--json")
     assert result.exit_code == ExitCode.CONFIGURATION and json.loads(result.output)["codes"] == [error.code]
@@ -74,7 +75,7 @@ def test_strict_refuses_what_a_file_loses(tmp_path: Path) -> None:
 
 def test_a_machine_that_does_not_drive_or_is_unknown() -> None:
     assert failure("check", PAPER_B, "--profile", "palms_471").code == "plan.stationary-machine"
-    assert failure("check", PAPER_B, "--profile", "none").exit_code == ExitCode.CONFIGURATION
+    assert exit_code_of(failure("check", PAPER_B, "--profile", "none")) == ExitCode.CONFIGURATION
 
 
 def test_convert_with_a_harvest(tmp_path: Path) -> None:
@@ -82,7 +83,7 @@ def test_convert_with_a_harvest(tmp_path: Path) -> None:
     said = run("convert", EXAMPLES / "site.kml", out, "--logs", EXAMPLES / "harvest.hpr").output
     assert {3, 2, 1, 7} <= set(numbers_in(said))
     assert json.loads(run("check", out, "--json").output)["logs"] == 7
-    assert failure("convert", PAPER_B, tmp_path / "m.dxf").exit_code == ExitCode.USAGE
+    assert exit_code_of(failure("convert", PAPER_B, tmp_path / "m.dxf")) == ExitCode.USAGE
     assert failure("convert", PAPER_B, tmp_path / "no" / "m.geojson").code == "mission.not-written"
 
 
@@ -101,7 +102,7 @@ def test_show_draws_everything(tmp_path: Path) -> None:
     with Image.open(tmp_path / "a.png") as picture:
         inks = {color for _, color in picture.convert("RGB").getcolors(1 << 20)}
     assert {OIL, MOSS, RUST, TIMBER} <= {f"#{r:02x}{g:02x}{b:02x}" for r, g, b in inks}  # route, fence, keep-out, logs
-    assert failure("show", PAPER_B, "--png", tmp_path / "a.jpg").exit_code == ExitCode.USAGE
+    assert exit_code_of(failure("show", PAPER_B, "--png", tmp_path / "a.jpg")) == ExitCode.USAGE
 
 
 def test_show_of_logs_alone(tmp_path: Path) -> None:

@@ -13,9 +13,11 @@ from msgspec.structs import replace
 from typer.testing import CliRunner
 
 from autonomy.perception.camera.frame import optical_pose
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import ExitCode
 from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile, profile_hash
+from runtime.errors import TimberhandError
+from tests.codes import exit_code_of
 from timberhand.cli import app
 
 PALMS = load_profile("palms_471")
@@ -106,6 +108,6 @@ def test_what_cannot_be_is_said_in_one_sentence_and_nothing_is_written(
         targets = tmp_path / "nowhere.csv"
     more = [] if case.startswith("nobody") else ["--joints", "1 2 3" if case == "three joints" else joints]
     found = run(tmp_path, targets, *more)
-    assert isinstance(found.exception, CommandFailed)
-    assert found.exception.exit_code is code and words in str(found.exception)
+    assert isinstance(found.exception, TimberhandError)
+    assert exit_code_of(found.exception) is code and words in str(found.exception)
     assert not (tmp_path / "mine.toml").exists()

@@ -45,7 +45,7 @@ from training.pictures.props import Steel
 from training.pictures.samples import read, sample, write
 from training.pictures.shards import pictures, shard
 from training.pictures.traced import shapes
-from training.pictures.traced.scenes import Assets, Format, describe, log_poses
+from training.pictures.traced.scenes import Format, describe, log_poses
 from training.pictures.traced.staging import pieces
 from training.pictures.traced.tracer import FLOATS, packed
 
@@ -288,11 +288,11 @@ def test_enlarged_labels_agree_with_their_pixels():
 # -- path-traced pictures
 @pytest.fixture(scope="module")
 def scene():
-    return describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+    return describe(settle("palms_471", 5), 3, Format(size_px=48, samples=1, views=1, stereo_share=0.0))
 
 
 def test_a_scene_is_the_same_for_a_seed(scene):
-    again = describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+    again = describe(settle("palms_471", 5), 3, Format(size_px=48, samples=1, views=1, stereo_share=0.0))
     assert again == scene and len(log_poses(scene)) == len(scene["logs"])
 
 

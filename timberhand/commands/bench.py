@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
-from timberhand.commands import bench_codec, bench_loop_design, bench_tick
+from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands import bench_codec, bench_tick
 from timberhand.commands.options import JsonOption, ProfileOption, TruthOption, truth_of
 
 # -- ``timberhand bench bus``: the cost of receiving a frame, compared with python-can in one run.
@@ -31,11 +34,8 @@ def bus(
 
       timberhand hil vcan -- timberhand bench bus --rounds 5
     """
-    import json
-
     from experiments.common.result import environment
     from experiments.timing.receive_cost import LIMIT_US, measure
-    from host.exit_codes import ExitCode
 
     result = {"environment": environment()} | measure(frames, rounds)
     metrics, lab = result["metrics"], result["lab"]
@@ -88,14 +88,11 @@ def plant(
     Exit code 6 when a factor is missed on a quiet host; on a noisy host the
     figure is reported as inconclusive.
     """
-    import json
-
     from rich.console import Console
     from rich.table import Table
 
     from experiments.common.result import environment, evaluate
     from experiments.plant.bench import LOG_COUNTS, METRICS, measure
-    from host.exit_codes import ExitCode
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
     metrics, noisy, _ = measure(profile, truth_of(profile, truth), quick, screen)
@@ -142,14 +139,11 @@ def motion(
 
       timberhand bench motion --profile aoro_fc8 --seeds 20 --json
     """
-    import json
-
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
     from experiments.benches.motion import GOAL_MS, run
-    from host.exit_codes import CommandFailed, ExitCode
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
 
     error = Console(stderr=True)
     metrics_by_machine = {}
@@ -163,8 +157,8 @@ def motion(
                     bar.update(task, completed=done, total=total)
 
                 bench = run(machine, seeds, progress)
-        except (ProfileError, ValueError) as trouble:
-            raise CommandFailed.from_error(trouble, ExitCode.CONFIGURATION) from None
+        except ValueError as trouble:
+            raise CommandFailed.from_error(trouble) from None
         metrics_by_machine[name] = bench.metrics()
         if not as_json:
             m = bench.metrics()
@@ -179,6 +173,96 @@ def motion(
                 typer.echo(f"  {sentence}")
     if as_json:
         typer.echo(json.dumps(metrics_by_machine, indent=2))
+
+
+# -- ``timberhand bench loop-design``: stability margins of every loop over the whole spread of machines.
+
+
+def loop_design(
+    profile: Annotated[
+        list[str] | None, typer.Option(help="Machine profile; may be repeated (default: both shipped ones).")
+    ] = None,
+    truth: Annotated[
+        str, typer.Option(help="Ground truth of the plant and its spread: nominal or a TOML file.")
+    ] = "nominal",
+    out: Annotated[Path | None, typer.Option(help="Folder for plots (default: none).")] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="Folder of the page loop-design.md, written again with plots.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compute phase margin, gain margin and bandwidth of every control loop, for the worst machine.
+
+    Linear models of every joint and of the carrier with their control laws, over
+    near, working and far reach, empty and loaded, and the whole spread of dead
+    times and gains; of the heading loop slow and fast, near a waypoint and far
+    from it. Exit code 6 when a phase margin is below 40 deg or a gain margin
+    below 6 dB.
+
+    [bold]Examples[/bold]
+
+      timberhand bench loop-design
+
+      timberhand bench loop-design --profile my.toml --out runs/loops
+
+      timberhand bench loop-design --docs docs
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from experiments.loop_design import carrier
+    from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, case_set, study
+    from machine.loading.profile_file import load_profile
+
+    screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
+    documents: dict[str, Any] = {}
+    machines = []
+    holds = True
+    for source in profile or ["palms_471", "aoro_fc8"]:
+        try:
+            machine = load_profile(source)
+            with screen.status(f"{machine.name}: margins over all machines"):
+                work = case_set(source, truth)
+                studies = study(machine, work) + carrier.studies(machine, work)
+        except ValueError as error:
+            raise CommandFailed.from_error(error) from None
+        table = Table(box=None, header_style="bold", pad_edge=False, title=machine.title, title_justify="left")
+        for column in ("joint", "law", "kp 1/s", "phase deg", "gain dB", "bandwidth Hz", "worst machine"):
+            table.add_column(column, justify="left" if column in ("joint", "law", "worst machine") else "right")
+        for joint in studies:
+            mark = "[green]✔[/green]" if joint.holds else "[red]✘[/red]"
+            law = joint.spec.law
+            table.add_row(
+                f"{mark} {joint.name}",
+                law.kind,
+                f"{law.kp_1_s:g}",
+                f"{joint.phase_deg:.0f}",
+                f"{joint.gain_db:.1f}",
+                f"{joint.bandwidth_hz:.2f}",
+                str(joint.worst),
+            )
+            holds = holds and joint.holds
+        screen.print(table)
+        machines.append((machine, studies, work))
+        documents[machine.name] = {joint.name: joint.document() for joint in studies}
+        if out is not None:
+            from experiments.loop_design.page import draw
+
+            for file in draw(machine.name, studies, out):
+                screen.print(f"[dim]{file}[/dim]")
+    if docs is not None:
+        from experiments.loop_design.page import write
+
+        with screen.status("every law"):
+            holds = write(machines, docs) and holds
+        screen.print(f"[dim]{docs / 'loop-design.md'}[/dim]")
+    needed = {"phase_deg": MIN_PHASE_DEG, "gain_db": MIN_GAIN_DB}
+    if as_json:
+        typer.echo(json.dumps({"needed": needed, "reached": holds, "machines": documents}, indent=2))
+    else:
+        screen.print(f"needed everywhere: {MIN_PHASE_DEG:.0f} deg and {MIN_GAIN_DB:.0f} dB")
+    if not holds:
+        raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
 # -- ``timberhand bench pages``: what a tick does without and with open pages of the console.
@@ -211,15 +295,11 @@ def pages(
 
       timberhand bench pages --rounds 9 --pages 20 --json
     """
-    import json
-    import sys
     import tempfile
-    from pathlib import Path
 
     from experiments.common import host_activity
     from experiments.common.result import environment
     from experiments.timing import open_pages
-    from host.exit_codes import ExitCode
 
     def progress(text: str) -> None:
         print(f"bench: {text}", file=sys.stderr, flush=True)
@@ -261,7 +341,7 @@ def _show_pages(found: dict[str, Any], number: int) -> None:
 app = typer.Typer(no_args_is_help=True, help="Benchmarks: measure the documented figures again.")
 app.command("bus")(bus)
 app.command("codec")(bench_codec.codec)
-app.command("loop-design")(bench_loop_design.loop_design)
+app.command("loop-design")(loop_design)
 app.command("pages")(pages)
 app.command("plant")(plant)
 app.command("motion")(motion)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Callable
 from typing import Annotated, Any, Final
 
 import typer
 
+from host.exit_codes import ExitCode
+from runtime.errors import InputRefused
 from timberhand.commands.options import JsonOption
 
 MIN_ENCODE_RATIO: Final = 5.0
@@ -23,9 +27,6 @@ def codec(
     Both check ranges when they encode. Exit code 6 unless encoding is 5 times and
     decoding 2 times as fast as cantools.
     """
-    import json
-
-    from host.exit_codes import ExitCode
 
     result = measure(repetitions)
     if as_json:
@@ -39,14 +40,12 @@ def codec(
 def measure(repetitions: int) -> dict[str, Any]:
     """Return medians of interleaved repetitions [ns per frame] per message, and the ratios of their sums."""
     import gc
-    import os
     import platform
     import random
     from importlib.metadata import version
 
     from can_dbc.dbc.check import random_values
     from can_dbc.dbc.codec import FrameRefused, load, parse
-    from runtime.errors import InputRefused
 
     database = load("crane")
     reference = {m.name: m for m in parse(database.path).messages}

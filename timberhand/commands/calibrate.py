@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import InputRefused, LinkError
 from timberhand.commands.options import truth_of
 
 if TYPE_CHECKING:
@@ -68,13 +69,9 @@ def calibrate(
     from autonomy.calibration.profile_file import lowered_gains, profile_changes, write_profile
     from autonomy.calibration.report import result_document, write_report
     from autonomy.calibration.result import identify
-    from machine.loading.profile_file import ProfileError, carry_envelope, load_profile
-    from runtime.errors import InputRefused
+    from machine.loading.profile_file import carry_envelope, load_profile
 
-    try:
-        known = load_profile(profile)
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    known = load_profile(profile)
     if out.exists():
         raise CommandFailed(
             "calibrate.output-exists", f"{out} exists and is not overwritten; choose another --out", ExitCode.USAGE
@@ -194,7 +191,7 @@ def _lockstep(
                 aborted=lambda: bool(interrupts),
             )
     except ValueError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+        raise CommandFailed.from_error(error) from None
     finally:
         signal.signal(signal.SIGINT, before)
         if recorder is not None:
@@ -230,7 +227,6 @@ def _live(
     from can_dbc.messages.udp_address import udp_address
     from machine.loading.profile_file import profile_hash
     from machine.status.modes import Mode
-    from runtime.errors import InputRefused, LinkError
 
     controller, report_port, address, key_file, lease_ms = link_options
     if not 0 < lease_ms <= profile.timeouts.lease_max_ms:
@@ -255,9 +251,7 @@ def _live(
         report = live.first_report(link, 10.0, (Mode.STANDBY, Mode.ARMED, Mode.STOP))
         if link.foreign:
             raise CommandFailed(
-                "calibrate.other-profile",
-                "the controller runs another profile: start both with the same one",
-                ExitCode.CONFIGURATION,
+                "calibrate.other-profile", "the controller runs another profile: start both with the same one"
             )
         if report is None:
             raise CommandFailed(
@@ -288,8 +282,6 @@ def _live(
                 live.run(run, link, bus_frames, reader, watch)
         finally:
             signal.signal(signal.SIGINT, before)
-    except InputRefused as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except LinkError as error:
         raise CommandFailed.from_error(error, ExitCode.BUS) from None
     finally:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -34,10 +36,10 @@ def check(file: File = None, as_json: JsonOption = False) -> None:
     """
     from host.release.updater import SIGNER
     from timberhand.configuration.check import problems_of, signature_problems
-    from timberhand.configuration.settings_file import SHIPPED, read
+    from timberhand.configuration.settings_file import INSTALLED, SHIPPED, read
 
-    path = _file(file)
-    problems = [*problems_of(_text(path), read(SHIPPED)), *signature_problems(path, SIGNER)]
+    path = file or INSTALLED
+    problems = [*problems_of(read(path), read(SHIPPED)), *signature_problems(path, SIGNER)]
     if as_json:
         problem_rows = [asdict(problem) for problem in problems]
         print(json.dumps({"file": str(path), "problems": problem_rows}, indent=2))
@@ -62,17 +64,12 @@ def show(file: File = None, as_json: JsonOption = False) -> None:
 
       timberhand config show --json > accepted.json
     """
-    from machine.loading.profile_file import ProfileError
-    from timberhand.configuration.inventory import effective, parts, profile_word
+    from timberhand.configuration.settings_file import INSTALLED, effective, parts, profile_word
 
-    path = _file(file)
-    _text(path)
+    path = file or INSTALLED
     settings = effective(path)
     profile = settings["PROFILE"][0].value if "PROFILE" in settings else ""
-    try:
-        machine, files = profile_word(profile), list(parts(path, profile))
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    machine, files = profile_word(profile), list(parts(path, profile))
     if as_json:
         values = {name: {"value": s.value, "changed": changed} for name, (s, changed) in settings.items()}
         contents = [{"kind": part.kind, "path": str(part.path), "sha256": part.sha256} for part in files]
@@ -101,15 +98,12 @@ def diff(
     """
     import tomllib
 
-    from runtime.errors import ConfigError
-    from timberhand.configuration.inventory import differences
+    from timberhand.configuration.settings_file import differences
 
     try:
         changes = differences(first, second)
-    except ConfigError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except tomllib.TOMLDecodeError as error:
-        raise CommandFailed("config.broken-toml", f"broken TOML: {error}", ExitCode.CONFIGURATION) from None
+        raise CommandFailed("config.broken-toml", f"broken TOML: {error}") from None
     if as_json:
         print(json.dumps([{"key": key, "first": a, "second": b} for key, a, b in changes], indent=2, default=str))
     else:
@@ -134,13 +128,10 @@ def migrate(
 
       timberhand config migrate old.conf --dry-run
     """
-    import os
-    import sys
+    from timberhand.configuration.settings_file import INSTALLED, SHIPPED, migrated, read
 
-    from timberhand.configuration.settings_file import SHIPPED, migrated, read
-
-    path = _file(file)
-    text = _text(path)
+    path = file or INSTALLED
+    text = read(path)
     new, notes = migrated(text, read(SHIPPED))
     for note in notes:
         print(note, file=sys.stderr)
@@ -156,9 +147,7 @@ def migrate(
             path.with_name(f"{path.name}.old").write_text(text)
             os.replace(fresh, path)
         except OSError as error:
-            raise CommandFailed(
-                "config.not-written", f"{path} cannot be written: {error.strerror}", ExitCode.CONFIGURATION
-            ) from None
+            raise CommandFailed("config.not-written", f"{path} cannot be written: {error.strerror}") from None
         print(f"{path} is migrated; the old one is {path.name}.old", file=sys.stderr)
 
 
@@ -215,19 +204,3 @@ def _tell_profile(profile: Path) -> None:
         print(f"set PROFILE={profile} in {INSTALLED}, then: systemctl restart timberhand.target")
     else:
         print(f"{profile} is in use from the next start: systemctl restart timberhand.target")
-
-
-def _file(file: Path | None) -> Path:
-    from timberhand.configuration.settings_file import INSTALLED
-
-    return file or INSTALLED
-
-
-def _text(path: Path) -> str:
-    from runtime.errors import ConfigError
-    from timberhand.configuration.settings_file import read
-
-    try:
-        return read(path)
-    except ConfigError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None

@@ -7,6 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import ProfileOption
 
 DEFAULT_PROFILE: Final = "palms_471"
@@ -82,7 +83,6 @@ def console(
     """
     from console.__main__ import serve
     from console.exposure import Exposure, StartError
-    from host.exit_codes import CommandFailed, ExitCode
 
     if replay is not None:
         from timberhand.replay_page import show_recording

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from host.exit_codes import ExitCode
 from timberhand.commands.options import JsonOption
 
 app = typer.Typer(no_args_is_help=True, help="Check DBC and KCD files.")
@@ -35,11 +39,7 @@ def check(
     Exit code 3 when a file cannot be loaded, 6 when a compiled codec differs from
     cantools.
     """
-    import json
-    from dataclasses import asdict
-
     from can_dbc.dbc.check import check as check_file
-    from host.exit_codes import ExitCode
 
     reports = [check_file(file, frames, seed) for file in files]
     if as_json:
@@ -53,7 +53,6 @@ def check(
 
 
 def _show(reports: list) -> None:  # type: ignore[type-arg]
-    from pathlib import Path
 
     from rich.console import Console
     from rich.markup import escape

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,7 +26,7 @@ from timberhand.commands.options import (
     refuse_without_effect,
     truth_of,
 )
-from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
+from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, end, enter_lab, new_directory
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -141,7 +139,7 @@ def demo(
     from rich.console import Console
 
     from autonomy.crane_job.rotator_estimate import VEHICLE_LINKS
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
 
     if lockstep:
         refuse_without_effect(context, (*LIVE_ONLY, "plc_link"), "with --lockstep")
@@ -166,11 +164,8 @@ def demo(
             )
         camera, planner, plc = "stick", "cnn", True
     chosen = planner_of(planner, virtual_cameras, plan_pictures)
-    try:
-        machine = load_profile(profile)
-        cameras = machine.cameras
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    machine = load_profile(profile)
+    cameras = machine.cameras
     cheats = ""
     if detector is Detector.PERFECT:
         cheats = "--detector perfect cheats: the planner is told where the logs truly lie"
@@ -257,11 +252,7 @@ def demo(
             foxglove,
             chosen,
         )
-    summary.show(screen)
-    summary.save(directory / "summary.json")
-    if as_json:
-        print(json.dumps(asdict(summary)))
-    raise typer.Exit(summary.exit_code)
+    end(summary, screen, directory, as_json)
 
 
 def refusal(live: bool | None, lockstep: bool, bus: Backend, udp: bool) -> CommandFailed | None:

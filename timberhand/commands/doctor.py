@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import JsonOption
 
 
@@ -58,7 +60,6 @@ def doctor(
 
     from host.doctor import facts, installation, timing
     from host.doctor.finding import Severity, conclusion, show
-    from host.exit_codes import ExitCode
 
     if report:
         _report(out, seconds, bus, profile)
@@ -99,15 +100,12 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
     from experiments.timing.fitness import Measured, Verdict, data_of, loopback_bus, measure_computer, text_of
     from experiments.timing.testbed import cores
     from host.doctor import facts, timing
-    from host.exit_codes import CommandFailed, ExitCode
 
     try:
         out.touch()
     except OSError as error:
         raise CommandFailed(
-            "doctor.no-report",
-            f"the report {out} cannot be written: {error.strerror}; use --out",
-            ExitCode.CONFIGURATION,
+            "doctor.no-report", f"the report {out} cannot be written: {error.strerror}; use --out"
         ) from None
     cpu = cores()[0]
     host_facts = facts.read(Path("/"), _links(), cpu)
@@ -141,7 +139,6 @@ def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
 def _private() -> frozenset[str]:
     """Return the names that a report must not hold."""
     import contextlib
-    import os
     import platform
     import pwd
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import InputRefused
 from timberhand.commands.options import ProfileOption, TruthOption, truth_of
 
 
@@ -52,7 +53,6 @@ def inject(
     from rich.console import Console
 
     from hil.faults.table import FOREVER_S, make
-    from runtime.errors import InputRefused
 
     if list_all or not name:
         _show(Console())
@@ -83,15 +83,13 @@ def _in_lockstep(profile: str, seed: int, truth: str, order: object) -> None:
 
     from hil.demo.lockstep import run_lockstep
     from hil.faults.table import Order
-    from timberhand.commands.runs import new_directory
+    from timberhand.commands.runs import end, new_directory
 
     assert isinstance(order, Order)
     screen = Console()
     directory = new_directory(f"lockstep-{order.fault}-seed{seed}")
     summary = run_lockstep(profile, seed, truth, directory, 300.0, screen, orders=(order,))
-    summary.show(screen)
-    summary.save(directory / "summary.json")
-    raise typer.Exit(summary.exit_code)
+    end(summary, screen, directory)
 
 
 def _show(console: object) -> None:
@@ -110,7 +108,6 @@ def _show(console: object) -> None:
 
 
 def _seconds(text: str) -> float:
-    from runtime.errors import InputRefused
 
     number, factor = (text[:-2], 1e-3) if text.endswith("ms") else (text.removesuffix("s"), 1.0)
     try:
@@ -122,7 +119,6 @@ def _seconds(text: str) -> float:
 def _newest_run() -> Path:
     """Find the directory below runs/ with the newest live run."""
     from hil.harness.live import ADDRESSES
-    from runtime.errors import InputRefused
 
     address_files = sorted(Path("runs").glob(f"*/{ADDRESSES}"), key=lambda path: path.stat().st_mtime)
     if not address_files:

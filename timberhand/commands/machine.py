@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +14,7 @@ from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
-    from timberhand.machine_files.check import Finding
+    from timberhand.machine_files import Finding
 
 app = typer.Typer(no_args_is_help=True, help="Make and check the files of a machine of your own.")
 
@@ -64,24 +66,20 @@ def new(
     from machine.draft.answers import read_answers
     from machine.draft.from_urdf import answers_from_urdf
     from machine.draft.questions import merged
-    from runtime.errors import InputRefused
-    from timberhand.machine_files.check import check as check_files
-    from timberhand.machine_files.make import make
+    from timberhand.machine_files import check as check_files
+    from timberhand.machine_files import make
 
-    try:
-        described = {} if urdf is None else answers_from_urdf(urdf, _names(urdf_joints))
-        if answers is not None:
-            given = read_answers(answers)
-        elif sys.stdin.isatty():
-            given = _ask(described)
-        else:
-            raise CommandFailed(
-                "machine.no-answers",
-                "there is no terminal to ask on; give --answers FILE, from `timberhand machine questions`",
-                ExitCode.USAGE,
-            )
-    except InputRefused as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    described = {} if urdf is None else answers_from_urdf(urdf, _names(urdf_joints))
+    if answers is not None:
+        given = read_answers(answers)
+    elif sys.stdin.isatty():
+        given = _ask(described)
+    else:
+        raise CommandFailed(
+            "machine.no-answers",
+            "there is no terminal to ask on; give --answers FILE, from `timberhand machine questions`",
+            ExitCode.USAGE,
+        )
     path = make(merged(given, described), str(answers or folder), folder)
     findings = [finding for finding in check_files(str(path)) if finding.code != "guard.envelope-damaged"]
     _show(str(path), findings)
@@ -108,10 +106,7 @@ def check(
 
       timberhand machine check palms_471 --json
     """
-    import json
-    from dataclasses import asdict
-
-    from timberhand.machine_files.check import check as check_files
+    from timberhand.machine_files import check as check_files
 
     findings = check_files(profile)
     if as_json:

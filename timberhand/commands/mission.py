@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.options import (
     LIVE_ONLY,
     FoxglovePortOption,
@@ -28,7 +26,7 @@ from timberhand.commands.options import (
     refuse_without_effect,
     truth_of,
 )
-from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
+from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, end, enter_lab, new_directory
 
 if TYPE_CHECKING:
     from machine.profile import Profile
@@ -118,13 +116,10 @@ def run(
 
       timberhand mission run docs/examples/paper_b_angled.geojson --manager paper-b
     """
-    from dataclasses import asdict
-
     from rich.console import Console
 
     from autonomy.missions.mission_file import load_mission
-    from autonomy.missions.model import MissionError
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
 
     if lockstep:
         refuse_without_effect(context, LIVE_ONLY, "with --lockstep")
@@ -135,13 +130,10 @@ def run(
     chosen = planner_of(planner, virtual_cameras, plan_pictures)
     if not lockstep:
         enter_lab(bus, clock, detects=detector is not DetectorKind.PERFECT)
-    try:
-        machine = load_profile(profile)
-        carrier = machine.carrier
-        site = None if carrier is None else (carrier.site_lat_deg, carrier.site_lon_deg)
-        draft = load_mission(file, route_wanted=True, site=site)
-    except (MissionError, ProfileError) as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    machine = load_profile(profile)
+    carrier = machine.carrier
+    site = None if carrier is None else (carrier.site_lat_deg, carrier.site_lon_deg)
+    draft = load_mission(file, route_wanted=True, site=site)
     truth = truth_of(profile, truth)
     directory = out or new_directory(f"mission-{file.stem}-{manager.value}-seed{seed}")
     screen = Console(stderr=as_json)
@@ -180,11 +172,7 @@ def run(
         summary = run_live_mission(
             file, mission, options, TABLES[manager], logs, screen, terrain.value, DETECTORS[detector], chosen
         )
-    summary.show(screen)
-    summary.save(directory / "summary.json")
-    if as_json:
-        print(json.dumps(asdict(summary)))
-    raise typer.Exit(summary.exit_code)
+    end(summary, screen, directory, as_json)
 
 
 OrderPortOption = Annotated[int, typer.Option(help="The planner's --order-port on this computer.")]
@@ -243,13 +231,10 @@ def abort(
 
 
 def _orders(profile: str, order_port: int, key_file: Path | None) -> tuple[Profile, PlannerOrders]:
-    from machine.loading.profile_file import ProfileError, load_profile, profile_hash
+    from machine.loading.profile_file import load_profile, profile_hash
     from timberhand.mission_orders import PlannerOrders, key_of
 
-    try:
-        machine = load_profile(profile)
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    machine = load_profile(profile)
     return machine, PlannerOrders(order_port, profile_hash(machine), key_of(key_file))
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import ConfigError
 from timberhand.commands.options import ProfileOption
 
 if TYPE_CHECKING:
@@ -47,7 +51,6 @@ def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None) -
       timberhand operator watch --profile aoro_fc8 --operator /run/timberhand-operator/controller
     """
     from can_dbc.messages.crane import OperatorAction
-    from host.exit_codes import CommandFailed, ExitCode
     from timberhand import terminal_watch
 
     machine, send = _sender(profile, operator)
@@ -56,7 +59,6 @@ def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None) -
         raise CommandFailed(
             "operator.not-watched",
             f"{machine.name} watches no link (timeouts.operator_link_ms = 0); set 500 to 1000 in its profile",
-            ExitCode.CONFIGURATION,
         )
     print(f"Watching {machine.name}; Ctrl-C ends the watch. Without this terminal it holds after {limit_ms} ms.")
     try:
@@ -90,11 +92,7 @@ def password(
 
       timberhand operator password anna --role operator --file page.passwords
     """
-    import sys
-
     from console.accounts import Role, account_line, with_account
-    from host.exit_codes import CommandFailed, ExitCode
-    from runtime.errors import ConfigError
 
     if sys.stdin.isatty():
         secret = typer.prompt("password", hide_input=True, confirmation_prompt=True, err=True)
@@ -109,16 +107,13 @@ def password(
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise CommandFailed(
-            "operator.accounts-file",
-            f"{file} cannot be changed ({reason}); choose another --file",
-            ExitCode.CONFIGURATION,
+            "operator.accounts-file", f"{file} cannot be changed ({reason}); choose another --file"
         ) from None
     print(f"{file}: {name} is {role.value}.")
 
 
 def _replace(file: Path, text: str) -> None:
     """Write a file of secrets as a whole, readable by its owner only."""
-    import os
 
     beside = file.with_name(f".{file.name}.new")
     beside.unlink(missing_ok=True)
@@ -131,13 +126,11 @@ def _replace(file: Path, text: str) -> None:
 
 def _sender(profile: str, operator: Path | None) -> tuple[Profile, Callable[[OperatorAction, int | None], None]]:
     """Return the machine, and a function that sends an action with its stamp (None: now) to its controller."""
-    import os
     import time
 
     from can_dbc.messages import operator_link
     from can_dbc.messages.crane import OperatorCommand
     from can_dbc.messages.datagrams import encode
-    from host.exit_codes import CommandFailed, ExitCode
     from machine.loading.profile_file import load_profile, profile_hash
 
     machine = load_profile(profile)

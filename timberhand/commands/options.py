@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import InputRefused
 
 if TYPE_CHECKING:
     from autonomy.grasp.planners import PlannerChoice
@@ -99,7 +100,6 @@ def planner_of(name: str, virtual_cameras: int, pictures: Path | None) -> Planne
         CommandFailed: there is no such planner, it has no virtual camera or draws no pictures, or the folder is none.
     """
     from autonomy.grasp.planners import NETWORKS, PlannerChoice
-    from runtime.errors import InputRefused
 
     try:
         if pictures is not None and name in NETWORKS:
@@ -115,15 +115,12 @@ def truth_of(profile: str, truth: str) -> str:
     """Return the choice of ``--truth`` for the machine of ``--profile``: with the file beside a profile of one's own.
 
     Raises:
-        CommandFailed: the profile cannot be used.
+        ProfileError: the profile cannot be used.
     """
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
     from sim.individual import beside
 
-    try:
-        return beside(profile, load_profile(profile).name, truth)
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    return beside(profile, load_profile(profile).name, truth)
 
 
 LIVE_ONLY: Final = ("bus", "clock", "console", "console_port", "foxglove", "max_stops")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
+
 app = typer.Typer(no_args_is_help=True, help="Make, sign and check the bundles that bring a release to a machine.")
 KeyOption = Annotated[
     Path, typer.Option("--key", metavar="FILE", help="Private key that signs; it never comes to a machine.")
@@ -57,7 +59,6 @@ def bundle(
 
       timberhand release bundle dist/timberhand-0.1.0-cp311-cp311-linux_x86_64.whl --key ~/keys/signing-key.pem
     """
-    from host.exit_codes import CommandFailed, ExitCode
     from host.release import bundle as bundles
 
     if only_program and with_plant:

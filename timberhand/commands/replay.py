@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from host.exit_codes import ExitCode
 from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
@@ -32,11 +34,8 @@ def replay(
 
       timberhand replay runs/demo-1/run.mcap --contents
     """
-    import json
-
     from hil.replay.recording import contents as list_contents
     from hil.replay.recording import files_of, manifest_of
-    from host.exit_codes import ExitCode
 
     files = files_of(recording)
     if contents:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed, ExitCode
+
 if TYPE_CHECKING:
     from experiments.common.result import Result
 
@@ -34,15 +36,12 @@ def report(
     """
     from experiments.common import overview, result_page
     from experiments.loop_design import page as loop_design
-    from host.exit_codes import CommandFailed, ExitCode
 
     try:
         results = overview.results_in(docs)
         if not results:
             raise CommandFailed(
-                "report.no-results",
-                f"{docs / 'results'} holds no results of experiments; name the folder with --docs",
-                ExitCode.CONFIGURATION,
+                "report.no-results", f"{docs / 'results'} holds no results of experiments; name the folder with --docs"
             )
         if check:
             _check(results)
@@ -53,16 +52,13 @@ def report(
         print("\n".join(map(str, written)))
         print(f"{len(results)} experiments")
     except (OSError, ValueError) as error:
-        raise CommandFailed(
-            "report.results-unusable", f"the results in {docs} cannot be used: {error}", ExitCode.CONFIGURATION
-        ) from None
+        raise CommandFailed("report.results-unusable", f"the results in {docs} cannot be used: {error}") from None
 
 
 def _check(results: dict[str, Result]) -> None:
     """Print every result that is not current, and why."""
     from experiments.common.registry import EXPERIMENTS
     from experiments.common.standing import Standing, judge
-    from host.exit_codes import CommandFailed, ExitCode
 
     old = []
     for name, result in results.items():

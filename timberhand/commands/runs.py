@@ -1,15 +1,23 @@
-"""What the commands that run a machine share: the choice of bus, the vcan lab, the directory of a run."""
+"""What the commands that run a machine share: the choice of bus, the vcan lab, the directory and the end of a run."""
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+from dataclasses import asdict
 from enum import StrEnum
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from hil.demo.summary import Summary
+    from hil.missions.summary import MissionSummary
 
 
 class Backend(StrEnum):
@@ -89,6 +97,15 @@ def _simulates(detects: bool) -> bool:
 def _without_page(arguments: list[str]) -> list[str]:
     """Add the option for no page: a browser cannot reach one inside user-mode Linux."""
     return arguments if "--no-console" in arguments else [*arguments, "--no-console"]
+
+
+def end(summary: Summary | MissionSummary, screen: Console, directory: Path, as_json: bool = False) -> NoReturn:
+    """Show the summary of a run, keep it in the run's directory, and exit with its code."""
+    summary.show(screen)
+    summary.save(directory / "summary.json")
+    if as_json:
+        print(json.dumps(asdict(summary)))
+    raise typer.Exit(summary.exit_code)
 
 
 def new_directory(name: str) -> Path:

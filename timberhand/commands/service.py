@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from host.exit_codes import CommandFailed, ExitCode
 
 if TYPE_CHECKING:
     from host.release.updater import Updater
@@ -113,7 +118,6 @@ def resume() -> None:
     Exit code 6 when the new release did not come up and the former one is in
     use again.
     """
-    from host.exit_codes import CommandFailed
 
     try:
         print(f"{_updater().resume()} is in use")
@@ -142,18 +146,15 @@ def status(
     --watch also those of the last second. Also works without systemd, for a
     controller started by hand.
     """
-    import json
-
     from rich.console import Console
     from rich.live import Live
 
-    from host.exit_codes import CommandFailed, ExitCode
     from timberhand.service_status import read_status, screen
 
     console = Console(highlight=False)
     current_status, previous_timing = read_status(timing), None
     if not (watch or as_json or current_status.units or current_status.timing):
-        raise CommandFailed("service.nothing-found", " ".join(current_status.notes), ExitCode.CONFIGURATION)
+        raise CommandFailed("service.nothing-found", " ".join(current_status.notes))
     try:
         while as_json:
             print(json.dumps(current_status.named()), flush=True)
@@ -175,19 +176,16 @@ def status(
 
 
 def _updater() -> Updater:
-    import os
-    import sys
 
-    from host.exit_codes import CommandFailed, ExitCode
     from host.release.services import SystemdServices
     from host.release.trees import Trees
     from host.release.updater import PLACE, SIGNER, ReleaseProgram, Updater
     from timberhand.service_status import SYSTEMD
 
     if os.geteuid() != 0:
-        raise CommandFailed("update.not-root", "this needs root; start it with sudo", ExitCode.CONFIGURATION)
+        raise CommandFailed("update.not-root", "this needs root; start it with sudo")
     if not SYSTEMD.is_dir():
-        raise CommandFailed("update.no-systemd", "systemd does not run here", ExitCode.CONFIGURATION)
+        raise CommandFailed("update.no-systemd", "systemd does not run here")
     units = PLACE / "current" / "deploy" / "units"
     return Updater(
         Trees(PLACE),

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 from timberhand.commands.options import ProfileOption, Terrain, TerrainOption, TruthOption, truth_of
 
 app = typer.Typer(no_args_is_help=True, help="View the simulated plant live, or write a picture of it.")
@@ -53,12 +53,9 @@ def view(
     from rich.console import Console
 
     from hil.plant.viewer import run_view
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
 
-    try:
-        machine = load_profile(profile)
-    except ProfileError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    machine = load_profile(profile)
     options = ["--seed", str(seed), "--logs", str(logs), "--scene", scene.value, "--terrain", terrain.value]
     with tempfile.TemporaryDirectory(prefix="timberhand-view-") as directory:
         run_view(machine, profile, [*options, "--truth", truth_of(profile, truth)], port, Path(directory), Console())
@@ -90,7 +87,7 @@ def picture(
       timberhand sim picture front.png --profile aoro_fc8 --camera front --depth
     """
     from hil.plant.picture import PictureRequest, take_picture
-    from machine.loading.profile_file import ProfileError, load_profile
+    from machine.loading.profile_file import load_profile
 
     request = PictureRequest(
         logs=logs,
@@ -107,12 +104,10 @@ def picture(
     try:
         machine = load_profile(profile)
         take_picture(machine, request, out)
-    except (ProfileError, ValueError) as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    except ValueError as error:
+        raise CommandFailed.from_error(error) from None
     except OSError as error:
         raise CommandFailed(
-            "sim.picture-not-written",
-            f"{out} cannot be written ({error.strerror}); give another file",
-            ExitCode.CONFIGURATION,
+            "sim.picture-not-written", f"{out} cannot be written ({error.strerror}); give another file"
         ) from None
     print(out)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import InputRefused
 
 if TYPE_CHECKING:
     from machine.profile import Camera
@@ -51,14 +52,10 @@ def survey_camera(
     from autonomy.perception.camera.frame import link_pose
     from autonomy.perception.camera.survey import surveyed
     from controller.guard.__main__ import profile_path
-    from machine.loading.profile_file import ProfileError, load_profile
-    from runtime.errors import InputRefused
+    from machine.loading.profile_file import load_profile
 
-    try:
-        machine = load_profile(profile)
-        observations = load_targets(targets)
-    except (ProfileError, InputRefused) as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    machine = load_profile(profile)
+    observations = load_targets(targets)
     if camera not in machine.cameras:
         names = ", ".join(machine.cameras) or "none"
         raise CommandFailed(

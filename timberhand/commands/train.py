@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
@@ -94,16 +95,12 @@ def _grasp_physical(weights: Path, seed: int, epochs: int | None) -> None:
 def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None:
     from rich.console import Console
 
-    from runtime.errors import InputRefused
     from training.grasp import network_training as training
     from training.grasp.cornell import load
     from training.grasp.cornell_weights import produce
 
     screen = Console(stderr=True)
-    try:
-        samples = load(data)
-    except InputRefused as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    samples = load(data)
     try:
         weights, card = produce(samples, seed, epochs or training.EPOCHS, out, screen)
     except KeyboardInterrupt:
@@ -260,7 +257,6 @@ def traced_pictures(
     """
     from rich.console import Console
 
-    from runtime.errors import InputRefused
     from training.pictures.traced.sets import SetPlan, produce_sets
 
     screen = Console(stderr=True)
@@ -271,8 +267,6 @@ def traced_pictures(
         raise CommandFailed(
             "train.interrupted", "interrupted; the same command continues", ExitCode.INTERRUPTED
         ) from None
-    except InputRefused as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     screen.print(f"\n{folder}", highlight=False)
 
 
@@ -307,7 +301,6 @@ def masks(
       timberhand train masks pictures --device cpu --steps 2 --batch 2 --side 64     a short trial
     """
     prepare_torch()
-    import math
 
     from training.detection.masks.mask_weights import produce
     from training.detection.masks.run import Run
@@ -335,9 +328,7 @@ def _photographs() -> list[tuple[np.ndarray, np.ndarray]]:
 
     photographs = [(shot.rgb, shot.wood) for shot in photos(folder()) if shot.name in TRAINED_SCENES]
     if not photographs:
-        raise CommandFailed(
-            "train.no-photographs", f"{folder()} holds no photographs; leave out --photographs", ExitCode.CONFIGURATION
-        )
+        raise CommandFailed("train.no-photographs", f"{folder()} holds no photographs; leave out --photographs")
     return photographs
 
 
@@ -357,7 +348,7 @@ def _train_on_pictures(weights: Path, folder: Path | None, make: Callable[[Path,
             ExitCode.INTERRUPTED,
         ) from None
     except ValueError as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+        raise CommandFailed.from_error(error) from None
     screen.print(f"{weights}, {card}", highlight=False)
 
 
@@ -370,7 +361,5 @@ def prepare_torch() -> None:
     try:
         import torch
     except ImportError:
-        raise CommandFailed(
-            "train.no-torch", "training needs torch: pip install 'timberhand[train]'", ExitCode.CONFIGURATION
-        ) from None
+        raise CommandFailed("train.no-torch", "training needs torch: pip install 'timberhand[train]'") from None
     torch.set_num_threads(1)

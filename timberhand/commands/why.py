@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from host.exit_codes import CommandFailed
 from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
@@ -49,11 +51,8 @@ def why(
 
       timberhand why --page
     """
-    import json
-
     import msgspec
 
-    from host.exit_codes import CommandFailed, ExitCode
     from timberhand.why.stops import SERVICE_STOPS, newest_failure
 
     if page:
@@ -63,9 +62,7 @@ def why(
     try:
         count, newest_utc_ns = _explain(run, every, plot, stops)
     except (OSError, ValueError) as error:
-        raise CommandFailed(
-            "why.unusable", f"{run or 'the newest stop'} cannot be shown: {error}", ExitCode.CONFIGURATION
-        ) from error
+        raise CommandFailed("why.unusable", f"{run or 'the newest stop'} cannot be shown: {error}") from error
     failed = newest_failure(newest_utc_ns) if run is None else None
     if not count and run is None and failed is None:
         raise _no_stop(f"below runs/, and none in {SERVICE_STOPS} that you may read")
@@ -106,9 +103,8 @@ def _open_page(run: Path | None, port: int) -> None:
 
 
 def _no_stop(where: str) -> CommandFailed:
-    from host.exit_codes import CommandFailed, ExitCode
 
-    return CommandFailed("why.no-stop", f"there is no stop {where}; name a run", ExitCode.CONFIGURATION)
+    return CommandFailed("why.no-stop", f"there is no stop {where}; name a run")
 
 
 def _explain(

@@ -23,7 +23,7 @@ from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import TickRecord
 from hil.replay.recording import files_of, manifest_of, messages
 from hil.replay.replay import recorded_ticks
-from host.exit_codes import CommandFailed, ExitCode
+from host.exit_codes import CommandFailed
 from machine.status.explanation import StopDetector
 from recorder.manifest import Manifest
 from recorder.recorder import STOPS_NAME, TICK
@@ -101,9 +101,7 @@ def _decoded(data: bytes, file: Path) -> TickRecord:
         return tick_record.decode(data)
     except InputRefused as error:
         raise CommandFailed(
-            "recording.other-version",
-            f"{file.parent}: {error}; read it with the release that recorded it",
-            ExitCode.CONFIGURATION,
+            "recording.other-version", f"{file.parent}: {error}; read it with the release that recorded it"
         ) from error
 
 
@@ -114,7 +112,6 @@ def _report_of(tick: TickRecord) -> StateReport | None:
         raise CommandFailed(
             "recording.reports-unreadable",
             f"the recorded reports cannot be read ({error}); read it with the release that recorded it",
-            ExitCode.CONFIGURATION,
         ) from error
 
 
@@ -146,7 +143,6 @@ def _recording(run: Path) -> list[Path]:
             "why.no-record",
             f"{run} holds neither stops nor a recording; give a run's directory, a stop file, or nothing for the "
             "newest stop",
-            ExitCode.CONFIGURATION,
         ) from error
 
 

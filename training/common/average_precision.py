@@ -65,7 +65,7 @@ def curve(pictures: Sequence[Matches], threshold: float) -> Curve:
     scores, correct, truths = [], [], 0
     for picture in pictures:
         truths += int(np.count_nonzero(~picture.ignored))
-        for score, is_true in _verdicts(picture, threshold):
+        for score, is_true in _matched(picture, threshold)[0]:
             scores.append(score)
             correct.append(is_true)
     order = np.argsort(-np.array(scores), kind="stable")
@@ -75,19 +75,14 @@ def curve(pictures: Sequence[Matches], threshold: float) -> Curve:
     return Curve(precision, recall, np.array(scores)[order], _average(precision, recall) if truths else float("nan"))
 
 
-def average_precision(pictures: Sequence[Matches], thresholds: Sequence[float] = THRESHOLDS) -> float:
-    """Compute the mean over the thresholds: mAP@0.5:0.95 by default."""
-    return float(np.mean([curve(pictures, t).average for t in thresholds]))
+def average_precision(pictures: Sequence[Matches]) -> float:
+    """Compute the mean over `THRESHOLDS`: mAP@0.5:0.95."""
+    return float(np.mean([curve(pictures, t).average for t in THRESHOLDS]))
 
 
 def matched_truths(picture: Matches, threshold: float) -> np.ndarray:
     """Tell which ground truths (M,) were detected, at any score."""
     return _matched(picture, threshold)[1]
-
-
-def _verdicts(picture: Matches, threshold: float) -> list[tuple[float, bool]]:
-    """Return the score of every detection that counts, and whether it is true."""
-    return _matched(picture, threshold)[0]
 
 
 def _matched(picture: Matches, threshold: float) -> tuple[list[tuple[float, bool]], np.ndarray]:

@@ -15,11 +15,10 @@ from can_dbc.frame import Frame
 from can_dbc.trace.candump import read_trace
 from can_dbc.trace.records import Trace, TraceFrame
 from hil.replay.recording import files_of, manifest_of, no_frames, tell_end
-from host.exit_codes import CommandFailed, ExitCode
-from machine.loading.profile_file import ProfileError, load_profile
+from host.exit_codes import CommandFailed
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile, encoders
 from recorder.recover import Stored, scan
-from runtime.errors import InputRefused
 
 _RAW: Final = struct.Struct("<IB3x8s")
 DEFAULT_PROFILE: Final = "aoro_fc8"
@@ -31,28 +30,20 @@ def motions_in(log: Path, profile: str | None = None) -> tuple[Profile, tuple[Jo
     demonstrations.
 
     Raises:
-        CommandFailed: the recording cannot be read, is of another machine, or holds no motion.
+        TimberhandError: the recording cannot be read, is of another machine, or holds no motion.
     """
-    try:
-        if log.is_file() and log.suffix.lower() == ".csv":
-            name, motions = read_demonstrations(log)
-            machine = load_profile(profile or name)
-            if machine.name != name:
-                raise CommandFailed(
-                    "demonstration.other-machine",
-                    f"{log} is of machine {name}, not of {machine.name}",
-                    ExitCode.CONFIGURATION,
-                )
-        else:
-            machine, frames = _frames(log, profile)
-            motions = segment_motions(machine, joint_track(machine, load_database("crane"), frames))
-    except (InputRefused, ProfileError) as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    if log.is_file() and log.suffix.lower() == ".csv":
+        name, motions = read_demonstrations(log)
+        machine = load_profile(profile or name)
+        if machine.name != name:
+            raise CommandFailed("demonstration.other-machine", f"{log} is of machine {name}, not of {machine.name}")
+    else:
+        machine, frames = _frames(log, profile)
+        motions = segment_motions(machine, joint_track(machine, load_database("crane"), frames))
     if not motions:
         raise CommandFailed(
             "demonstration.no-motion",
             f"{log}: the crane does not move in this recording; record some motions from rest to rest",
-            ExitCode.CONFIGURATION,
         )
     return machine, motions
 
@@ -63,9 +54,7 @@ def _frames(log: Path, profile: str | None) -> tuple[Profile, Iterator[Frame]]:
         try:
             return machine, _of_one_interface(log, read_trace(log), machine)
         except OSError as error:
-            raise CommandFailed(
-                "demonstration.unreadable", f"{log} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
-            ) from None
+            raise CommandFailed("demonstration.unreadable", f"{log} cannot be read ({error.strerror})") from None
     files = files_of(log)
     machine = load_profile(profile or manifest_of(files).profile)
     return machine, _raw(files, f"/{machine.crane_bus}/raw")
@@ -91,7 +80,6 @@ def _of_one_interface(log: Path, trace: Trace, machine: Profile) -> Iterator[Fra
                 "demonstration.several-buses",
                 f"{log} holds encoder frames of several interfaces ({', '.join(sorted(interfaces))}); keep the lines "
                 "of one of them",
-                ExitCode.CONFIGURATION,
             )
         yield record
     if not frames:
@@ -102,11 +90,8 @@ def _of_one_interface(log: Path, trace: Trace, machine: Profile) -> Iterator[Fra
 
 def _raw(files: Sequence[Path], topic: str) -> Iterator[Frame]:
     """Yield the frames of a bus with their monotonic stamps."""
-    try:
-        for path in files:
-            for record in scan(path, {topic}, partial(tell_end, path)):
-                if isinstance(record, Stored) and len(record.data) >= _RAW.size:
-                    key, length, data = _RAW.unpack_from(record.data)
-                    yield Frame(record.publish_ns, key, data[:length])
-    except InputRefused as error:
-        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
+    for path in files:
+        for record in scan(path, {topic}, partial(tell_end, path)):
+            if isinstance(record, Stored) and len(record.data) >= _RAW.size:
+                key, length, data = _RAW.unpack_from(record.data)
+                yield Frame(record.publish_ns, key, data[:length])

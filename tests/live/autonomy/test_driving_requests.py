@@ -15,7 +15,8 @@ from autonomy.perception.shown_picture import NewestPicture
 from autonomy.perception.standpoint import MAX_AGE_NS, standpoint
 from can_dbc.messages.picture import decode_picture, encode_picture_request
 from runtime.errors import InputRefused
-from tests.autonomy.test_driving_requests import LOG, Q, driving, turned
+from tests.autonomy.mapped_logs import base as base_at
+from tests.autonomy.test_detector_requests import AHEAD, Q, driving
 from tests.codes import coded
 from tests.operator_end import udp_end
 
@@ -32,7 +33,7 @@ class Detector:
         time.sleep(self.delay_s)
         self.stood.append(standing())
         self.problem = "" if self.stood[-1] else "too late"
-        return (LOG,) if self.stood[-1] else None
+        return (AHEAD,) if self.stood[-1] else None
 
 
 class Served:
@@ -70,14 +71,16 @@ def test_only_the_newest_of_waiting_requests_gets_a_picture(served: Served) -> N
     served.requests.answer_waiting()
     (stood,) = served.detector.stood
     assert stood is not None and stood[0].position_m[0] == pytest.approx(2.1)
-    assert decode_logs(served.planner.recv(4096), in_plane=True) == (LOG,)
+    assert decode_logs(served.planner.recv(4096), in_plane=True) == (AHEAD,)
 
 
 def test_a_page_gets_the_last_list_in_the_frame_of_the_crane(served: Served) -> None:
     served.planner.send(encode_request(()))
     served.requests.answer_waiting()
     assert decode_logs(served.planner.recv(4096)) == () and not served.detector.stood
-    served.planner.send(encode_request(Q, standpoint(time.monotonic_ns(), turned(2, 0, 0), turned(2, 0, 0), (0, 0), 0)))
+    served.planner.send(
+        encode_request(Q, standpoint(time.monotonic_ns(), base_at(2, 0, 0), base_at(2, 0, 0), (0, 0), 0))
+    )
     served.requests.answer_waiting()
     served.planner.recv(4096)
     served.planner.send(encode_request(()))

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from training.pictures.piles import settle
-from training.pictures.traced.scenes import Assets, Format, describe
+from training.pictures.traced.scenes import Format, describe
 from training.pictures.traced.tracer import Tracer, library
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return describe(settle("palms_471", 5), 3, Assets(), Format(size_px=48, samples=1, views=1, stereo_share=0.0))
+    return describe(settle("palms_471", 5), 3, Format(size_px=48, samples=1, views=1, stereo_share=0.0))
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="the tracer needs g++")

@@ -130,21 +130,19 @@ def disturbed_colour(w: Windows, chance: Chance) -> torch.Tensor:
     return x.clamp(0.0, 1.0)
 
 
-def inputs(w: Windows, chance: Chance, disturb: bool = True) -> torch.Tensor:
+def inputs(w: Windows, chance: Chance) -> torch.Tensor:
     """Compute the network's input (B, 6, C, C); as ``mask_network.mask_input`` with all disturbances."""
     b = w.ids.shape[0]
-    z = disturbed_depth(w, chance) if disturb else w.depth_m
-    rgb = disturbed_colour(w, chance) if disturb else w.rgb
+    z = disturbed_depth(w, chance)
+    rgb = disturbed_colour(w, chance)
     known = torch.isfinite(z)
     # The plane as found in the picture: a little off.
-    off = (0.02 * chance.normal(b) * float(disturb))[:, None, None]
-    lean = (1.0 + 0.01 * chance.normal(b) * float(disturb))[:, None, None]
+    off = (0.02 * chance.normal(b))[:, None, None]
+    lean = (1.0 + 0.01 * chance.normal(b))[:, None, None]
     height = (1.0 - lean * z * w.slope) / w.size[:, None, None] + off
     per_m = torch.log2(w.focal_px[:, None, None] / PIXELS_PER_M_UNIT / z.clamp(min=0.1))
-    if disturb:
-        lost = chance.some(b, NO_DEPTH_SHARE)[:, None, None] > 0
-        known = known & ~lost
-    known = known & torch.isfinite(height)
+    lost = chance.some(b, NO_DEPTH_SHARE)[:, None, None] > 0
+    known = known & ~lost & torch.isfinite(height)
     out = torch.zeros(b, CHANNELS, *w.ids.shape[1:], device=rgb.device)
     out[:, 3] = torch.where(known, height.clamp(*HEIGHT_RANGE_M) / HEIGHT_UNIT_M, 0.0)
     out[:, 4] = torch.where(known, per_m, 0.0)
@@ -155,8 +153,6 @@ def inputs(w: Windows, chance: Chance, disturb: bool = True) -> torch.Tensor:
     mean = (grey * share).sum((2, 3), keepdim=True) / total
     spread = (((grey - mean) ** 2 * share).sum((2, 3), keepdim=True) / total).sqrt()
     colour = (grey - mean) / (spread + MIN_COLOUR_SPREAD)
-    if disturb:
-        blind = (chance.some(b, NO_COLOUR_SHARE) * known.any(2).any(1).float())[:, None, None, None]
-        colour = torch.where(blind > 0, torch.zeros_like(colour), colour)
-    out[:, :3] = colour
+    blind = (chance.some(b, NO_COLOUR_SHARE) * known.any(2).any(1).float())[:, None, None, None]
+    out[:, :3] = torch.where(blind > 0, torch.zeros_like(colour), colour)
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -135,9 +135,7 @@ PHOTO_VIEW_RAD: Final = 1.4
 IGNORED: Final = 255
 
 
-def mixed(
-    folder: Path, photographs: Sequence[tuple[np.ndarray, np.ndarray]] = (), shares: Mapping[str, float] = SHARES
-) -> tuple[Bank, dict[str, int]]:
+def mixed(folder: Path, photographs: Sequence[tuple[np.ndarray, np.ndarray]] = ()) -> tuple[Bank, dict[str, int]]:
     """Join the pictures of ``folder`` with photographs (rgb, wood), and count how many there are of each set.
 
     Raises:
@@ -164,7 +162,7 @@ def mixed(
         raise InputRefused("dataset.sizes-differ", f"{folder}: the sets have pictures of different sizes")
     for name, picture_set in banks.items():
         weight = torch.where(wood_share(picture_set) < BARE_WOOD_SHARE, BARE_WEIGHT, 1.0)
-        picture_set.share.copy_(shares[name] * weight / weight.sum())
+        picture_set.share.copy_(SHARES[name] * weight / weight.sum())
     return joined(list(banks.values())), {name: len(picture_set) for name, picture_set in banks.items()}
 
 

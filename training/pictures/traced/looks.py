@@ -9,22 +9,13 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Final
 
 Look = dict[str, Any]
 Tones = list[list[float]]
 
-BARKS: Final = {
-    "scaly": 2.0,
-    "plated": 2.0,
-    "furrowed": 2.5,
-    "birch": 2.2,
-    "smooth": 1.3,
-    "peeled": 1.0,
-    "photo": 1.5,
-    "wild": 2.5,
-}
+BARKS: Final = ("scaly", "plated", "furrowed", "birch", "smooth", "peeled", "furrowed", "wild")
+BARK_SHARES: Final = (2.0, 2.0, 2.5, 2.2, 1.3, 1.0, 1.5, 2.5)
 """Kinds of bark and how often they are drawn."""
 TONES: Final[dict[str, Sequence[Tones]]] = {
     "scaly": (
@@ -56,7 +47,6 @@ TONES: Final[dict[str, Sequence[Tones]]] = {
         [[0.12, 0.09, 0.07], [0.3, 0.28, 0.25], [0.48, 0.46, 0.43]],
         [[0.1, 0.05, 0.03], [0.42, 0.24, 0.12], [0.6, 0.4, 0.22]],
     ),
-    "photo": ([[0.04, 0.03, 0.02], [0.15, 0.1, 0.08], [0.3, 0.25, 0.2]],),
     "wild": (
         [[0.04, 0.03, 0.02], [0.15, 0.1, 0.08], [0.3, 0.25, 0.2]],
         [[0.02, 0.02, 0.018], [0.1, 0.09, 0.075], [0.5, 0.46, 0.4]],
@@ -92,7 +82,6 @@ SOILS: Final[dict[str, Sequence[Tones]]] = {
         [[0.03, 0.02, 0.012], [0.13, 0.075, 0.035], [0.27, 0.17, 0.09]],
         [[0.02, 0.022, 0.01], [0.08, 0.075, 0.03], [0.2, 0.17, 0.1]],
     ),
-    "photo": ([[0.04, 0.03, 0.02], [0.11, 0.09, 0.06], [0.22, 0.19, 0.14]],),
     "wild": (
         [[0.03, 0.025, 0.02], [0.12, 0.1, 0.07], [0.3, 0.26, 0.2]],
         [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]],
@@ -133,11 +122,9 @@ def wild(rng: random.Random) -> list[float]:
     ]
 
 
-def bark(rng: random.Random, kind: str, snow: float, photos: Sequence[Path]) -> Look:
+def bark(rng: random.Random, kind: str, snow: float) -> Look:
     """Draw the look of a log."""
-    if kind == "photo" and not photos:
-        kind = "furrowed"
-    look: Look = {
+    return {
         "kind": kind,
         "tones": varied(rng.choice(TONES[kind]), rng),
         "seed": rng.uniform(0.0, 80.0),
@@ -156,52 +143,26 @@ def bark(rng: random.Random, kind: str, snow: float, photos: Sequence[Path]) -> 
         "bast": rng.uniform(0.0, 1.0),
         "wild": wild(rng),
     }
-    if kind == "photo":
-        look |= {
-            "image": str(rng.choice(photos)),
-            "repeat": rng.choice((1, 1, 2)),
-            "hue": 0.5 + rng.gauss(0.0, 0.02),
-            "saturation": rng.uniform(0.4, 1.2),
-            "value": math.exp(rng.gauss(0.0, 0.35)),
-        }
-    return look
 
 
-def soil(rng: random.Random, photos: Sequence[Path]) -> Look:
+def soil(rng: random.Random) -> Look:
     """Draw one kind of ground."""
-    kinds = {
-        "earth": 3.0,
-        "grassy": 1.8,
-        "leaves": 1.5,
-        "stones": 1.0,
-        "needles": 1.5,
-        "wild": 1.5,
-        "photo": 2.5 if photos else 0.0,
-    }
+    kinds = {"earth": 3.0, "grassy": 1.8, "leaves": 1.5, "stones": 1.0, "needles": 1.5, "wild": 1.5}
     kind = rng.choices(list(kinds), list(kinds.values()))[0]
-    look: Look = {
+    return {
         "kind": kind,
         "tones": varied(rng.choice(SOILS[kind]), rng),
         "scale": math.exp(rng.gauss(0.0, 0.4)),
         "warp": rng.choice((0.0, 0.0, 0.5, 1.5)),
         "wild": wild(rng),
     }
-    if kind == "photo":
-        look |= {
-            "image": str(rng.choice(photos)),
-            "scale": rng.uniform(0.3, 0.8),
-            "hue": 0.5 + rng.gauss(0.0, 0.025),
-            "saturation": rng.uniform(0.5, 1.2),
-            "value": math.exp(rng.gauss(0.0, 0.3)),
-        }
-    return look
 
 
-def ground(rng: random.Random, snow: float, photos: Sequence[Path]) -> Look:
+def ground(rng: random.Random, snow: float) -> Look:
     """Draw the look of the ground."""
     return {
-        "first": soil(rng, photos),
-        "second": soil(rng, photos),
+        "first": soil(rng),
+        "second": soil(rng),
         "seed": rng.uniform(0.0, 60.0),
         "patch_scale": rng.uniform(0.4, 2.5),
         "relief": rng.uniform(0.3, 1.0),
@@ -289,7 +250,6 @@ def crowds(
     clear: list[list[float]],
     near: list[list[float]],
     snow: float,
-    photos: Sequence[Path],
 ) -> list[Look]:
     """Draw what grows and lies around: ``clear`` (x, y, radius) is kept free of big things, ``near`` of stems."""
     crowd_looks: list[Look] = []
@@ -377,7 +337,7 @@ def crowds(
         )
     for kind, share in (("stumps", 0.3), ("trees", 0.4)):
         if rng.random() < share:
-            look = bark(rng, rng.choices(list(BARKS), list(BARKS.values()))[0], snow, photos)
+            look = bark(rng, rng.choices(BARKS, BARK_SHARES)[0], snow)
             high, reach = (rng.uniform(0.1, 0.4), 5.0) if kind == "stumps" else (9.0, 12.0)
             add(
                 kind,

@@ -6,7 +6,6 @@ import math
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -25,14 +24,6 @@ BASELINES_M: Final = (0.05, 0.063, 0.12)  # of the stereo cameras in use
 
 
 @dataclass(frozen=True, slots=True)
-class Assets:
-    """Photographed surfaces that a set may use."""
-
-    barks: tuple[Path, ...] = ()
-    grounds: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Format:
     """Size of the pictures [px], samples of each pixel, views of a scene, share of views with a second eye."""
 
@@ -42,7 +33,7 @@ class Format:
     stereo_share: float = 0.15
 
 
-def describe(pile: Pile, seed: int, assets: Assets, form: Format) -> dict[str, Any]:
+def describe(pile: Pile, seed: int, form: Format) -> dict[str, Any]:
     """Describe the scene of a pile, drawn from ``seed``."""
     rng = random.Random(f"traced {VERSION} {pile.machine} {pile.number} {seed}")
     growth = math.exp(rng.uniform(math.log(0.7), math.log(MAX_GROWTH)))
@@ -50,9 +41,8 @@ def describe(pile: Pile, seed: int, assets: Assets, form: Format) -> dict[str, A
     snow = rng.uniform(0.15, 1.0) if rng.random() < 0.2 else 0.0
     middle = np.mean([log.position_m for log in logs], axis=0)
     dropped = _loose(middle, rng) if rng.random() < 0.25 else []
-    kinds = rng.choices(list(looks.BARKS), list(looks.BARKS.values()), k=rng.choice((1, 1, 2, 3)))
-    barks = [looks.bark(rng, kind, snow, assets.barks) for kind in kinds]
-    barks += [looks.bark(rng, kind, snow, assets.barks) for kind in kinds]
+    kinds = rng.choices(looks.BARKS, looks.BARK_SHARES, k=rng.choice((1, 1, 2, 3)))
+    barks = [looks.bark(rng, kind, snow) for kind in (*kinds, *kinds)]
     everything = [*logs, *dropped]
     number = [replace(log, instance=k) for k, log in enumerate(everything, 1)]
     clear = [[float(p[0]), float(p[1]), 0.25 + log.diameter_m] for log in number for p in log.spine(12)[0]]
@@ -65,8 +55,8 @@ def describe(pile: Pile, seed: int, assets: Assets, form: Format) -> dict[str, A
         "seed": rng.getrandbits(30),
         "logs": [_log(log, rng, len(barks)) for log in number],
         "barks": barks,
-        "ground": looks.ground(rng, snow, assets.grounds) | _heights(pile, growth, middle, snow, rng),
-        "crowds": looks.crowds(rng, middle.tolist(), wide, clear, snow, assets.barks),
+        "ground": looks.ground(rng, snow) | _heights(pile, growth, middle, snow, rng),
+        "crowds": looks.crowds(rng, middle.tolist(), wide, clear, snow),
         "boxes": _steel(pile, growth, middle, rng),
         "views": views,
     }

@@ -24,7 +24,7 @@ from training.pictures.piles import MACHINES, Pile, chunk
 from training.pictures.samples import Sample, sample, write
 from training.pictures.traced.blender.matching import matched_depth
 from training.pictures.traced.developing import developed
-from training.pictures.traced.scenes import Assets, Format, describe, log_poses, view_of
+from training.pictures.traced.scenes import Format, describe, log_poses, view_of
 from training.pictures.traced.tracer import Tracer, compiler, library
 
 # -- Sets of samples: scenes drawn by the own tracer, and piles drawn by the analytic renderer, in parallel,
@@ -74,7 +74,7 @@ def traced_file(folder: Path, number: int, piles: Sequence[Pile], form: Format, 
     file = folder / f"traced{number:05d}.npz"
     if not file.is_file():
         rng = random.Random(f"traced set {number}")
-        scene = describe(rng.choice(list(piles)), number, Assets(), form)
+        scene = describe(rng.choice(list(piles)), number, form)
         write(file, traced_scene(json.loads(json.dumps(scene)), code), compressed=False)
     return file
 
@@ -232,7 +232,7 @@ def blender_files(
     work = folder / "blender"
     (work / "scenes").mkdir(parents=True, exist_ok=True)
     for k in missing_numbers:
-        scene = describe(random.Random(f"traced set {k}").choice(piles), k, Assets(), form)
+        scene = describe(random.Random(f"traced set {k}").choice(piles), k, form)
         (work / "scenes" / f"{k:05d}.json").write_text(json.dumps(scene))
     root = Path(__file__).parents[3]
     threads = max(1, (os.cpu_count() or 1) // workers)

@@ -62,8 +62,7 @@ def packed_look(look: Mapping[str, Any]) -> np.ndarray:
 
 
 def _number(kind: str) -> float:
-    known = {"photo": "wild", "grassy": "earth"}.get(kind, kind)
-    return float(KINDS.index(known))
+    return float(KINDS.index("earth" if kind == "grassy" else kind))
 
 
 def _tones(tones: Any, count: int) -> list[float]:
@@ -218,11 +217,10 @@ def packed(scene: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray
         turn = np.asarray(piece.turn)
         detail = np.zeros(len(corners), FINE)
         detail["normals"] = normals @ turn.T
-        detail["look"] = np.array(numbers)[np.minimum(slots, len(numbers) - 1)]
+        slots = np.minimum(slots, len(numbers) - 1)
+        detail["look"] = np.array(numbers)[slots]
         detail["body"] = len(bodies)
-        detail["end"] = [look["what"] == "end" for look in piece.looks] and np.array(
-            [look["what"] == "end" for look in piece.looks]
-        )[np.minimum(slots, len(numbers) - 1)]
+        detail["end"] = np.array([look["what"] == "end" for look in piece.looks])[slots]
         tris.append((piece.scale * corners @ turn.T + piece.position_m).astype(np.float32))
         fine.append(detail)
         bodies.append((turn.T.ravel(), piece.position_m, piece.number))
@@ -254,9 +252,7 @@ def packed_light(look: Mapping[str, Any]) -> np.ndarray:
     """Pack the light of a view for the kernel."""
     light_record = np.zeros((), LIGHT)
     own = look["own"]
-    for name in ("zenith", "horizon", "below", "sun_tone", "trees"):
-        light_record[name] = own[name]
-    for name in ("sun_edge", "glow", "backdrop", "backdrop_height", "backdrop_seed"):
+    for name in own:
         light_record[name] = own[name]
     elevation_rad, azimuth_rad = look["elevation_rad"], look["azimuth_rad"]
     light_record["sun_way"] = (

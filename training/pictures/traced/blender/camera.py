@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -155,3 +156,11 @@ def _rendered(folder: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
         passes[name] = values.reshape(height, width, 4)[::-1]
         bpy.data.images.remove(image)
     return passes
+
+
+def keep(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write the arrays of a picture, whole or not at all."""
+    draft = file.with_suffix(f".{os.getpid()}.part")
+    with draft.open("wb") as out:
+        np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
+    draft.replace(file)

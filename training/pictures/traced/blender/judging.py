@@ -7,7 +7,6 @@ controls, the matcher and the file format are common.  Scenes are arranged by ha
 from __future__ import annotations
 
 import math
-import os
 import random
 import sys
 import tempfile
@@ -38,11 +37,7 @@ def main(folder: Path, threads: int, number: int, count: int, pictures: int, tex
             file = target / f"judged{k:04d}.npz"
             if file.is_file():
                 continue
-            arrays = picture(k, threads, Path(scratch), textures)
-            draft = file.with_suffix(f".{os.getpid()}.part")
-            with draft.open("wb") as out:
-                np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
-            draft.replace(file)
+            camera.keep(file, picture(k, threads, Path(scratch), textures))
             print(f"judged {k}", flush=True)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -122,25 +121,3 @@ class Graph:
         made = self.node("SeparateXYZ")
         self.link(self.node("NewGeometry").outputs["Normal"], made.inputs[0])
         return made.outputs["Z"]
-
-    def image(self, path: str, at: Any, colour: bool = True) -> Any:
-        """Return an image's colour at coordinates."""
-        made = self.node("TexImage", interpolation="Linear")
-        made.image = bpy.data.images.load(path, check_existing=True)
-        if not colour:
-            made.image.colorspace_settings.name = "Non-Color"
-        self.link(at, made.inputs["Vector"])
-        return made.outputs["Color"]
-
-    def tinted(self, colour: Any, hue: float, saturation: float, value: float) -> Any:
-        """Return a colour with its hue turned (0.5: not), saturation and value multiplied."""
-        made = self.node("HueSaturation")
-        for name, number in (("Hue", hue), ("Saturation", saturation), ("Value", value)):
-            made.inputs[name].default_value = number
-        self.link(colour, made.inputs["Color"])
-        return made.outputs["Color"]
-
-
-def rotation_z(angle_rad: float) -> tuple[float, float, float]:
-    """Return the Euler angles of a turn about the vertical."""
-    return (0.0, 0.0, angle_rad % (2.0 * math.pi))
