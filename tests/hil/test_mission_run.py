@@ -30,6 +30,8 @@ from hil.missions.site import site_of
 from hil.missions.summary import MissionSummary
 from host.exit_codes import ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
+from runtime.errors import TimberhandError
+from tests.codes import exit_code_of
 from tests.hil.short_missions import PLANE, mission_file, point
 from tests.hil.stand_ins import Idle
 from timberhand.cli import app
@@ -39,7 +41,8 @@ def test_a_file_that_is_no_mission_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mission.geojson"
     path.write_text("{}")
     result = CliRunner().invoke(app, ["mission", "run", str(path), "--lockstep", "--out", str(tmp_path / "run")])
-    assert getattr(result.exception, "exit_code", None) == ExitCode.CONFIGURATION and str(path) in str(result.exception)
+    assert isinstance(result.exception, TimberhandError) and str(path) in str(result.exception)
+    assert exit_code_of(result.exception) == ExitCode.CONFIGURATION
 
 
 def test_a_machine_without_a_carrier_drives_no_mission(tmp_path: Path) -> None:
