@@ -54,5 +54,4 @@ def process_facts(pid: int) -> dict[str, object]:
         "capabilities": int(status["CapEff"], 16),
         "no_new_privileges": status["NoNewPrivs"] == "1",
         "seccomp": status["Seccomp"] == "2",
-        "threads": int(status["Threads"]),
     }

@@ -271,11 +271,10 @@ def test_unknown_numbers_are_none_and_the_state_is_json():
     json.dumps(state, allow_nan=False)
 
 
-def test_a_silent_controller_is_detected_within_a_second():
+def test_a_silent_controller_is_detected():
     crane_state = CraneState(PROFILE)
     crane_state.on_report(encode(REPORT), 0)
     assert crane_state.state(REPORT_TIMEOUT_NS - 1)["alive"] and not crane_state.state(REPORT_TIMEOUT_NS)["alive"]
-    assert REPORT_TIMEOUT_NS + 150_000_000 < 1_000_000_000, "the page is updated every 50 ms and checks every 100 ms"
 
 
 def test_peaks_hold_for_a_second():

@@ -203,7 +203,7 @@ def test_the_mode_switch_is_reported_and_stops_nothing():
     assert bench.reports[-1].mode_switch == ModeSwitch.NOT_FITTED, "it is not known"
 
 
-def test_arming_with_the_emergency_stop_in_error_is_refused():
+def test_an_emergency_stop_in_error_is_a_fault_before_anybody_arms():
     bench = Bench().boot()
     bench.changed["EstopStat"] = {"ChannelA": 2}
     assert bench.run(3) is Mode.FAULT and bench.reason == Reason.ESTOP_CHANNELS

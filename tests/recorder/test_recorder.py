@@ -358,7 +358,7 @@ def test_a_file_of_another_kind_is_refused_with_its_name(tmp_path):
         list(scan(tmp_path / "run.mcap"))
 
 
-def test_write_of_the_manifest_is_old_or_new(tmp_path):
+def test_a_manifest_is_written_without_a_second_file(tmp_path):
     manifests.write(tmp_path, manifest())
     assert manifests.read(tmp_path).complete is False
     assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]

@@ -115,7 +115,7 @@ def test_libmodbus_exchanges_in_one_request(plc: ServedPlc) -> None:
         assert library.modbus_write_registers(context, 100, 32, words) == -1
         assert ctypes.get_errno() == 112345678 + 3, "illegal data value"
         assert library.modbus_read_input_registers(context, 0, STATUS_COUNT, status) == STATUS_COUNT
-        assert (status[6], status[9]) == (1, 20) or status[9] == 20
+        assert status[9] == 20
     finally:
         library.modbus_close(context)
         library.modbus_free(context)
