@@ -30,7 +30,7 @@ def default_path() -> Path:
 
 def guard_path(path: Path) -> Path:
     """Return the guard's socket beside the controller's: of another user, so in a folder of its own."""
-    return path.parent.with_name(f"{path.parent.name}-guard") / path.name
+    return Path(f"{path.parent}-guard") / path.name
 
 
 def credential_path(path: Path) -> Path:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 
 import pytest
+from typer.testing import CliRunner
 
+from host.exit_codes import CommandFailed
 from runtime.errors import InputRefused
 from tests.codes import coded
+from timberhand.cli import app
 from timberhand.terminal_watch import FIRST_ANSWER_NS, MAX_QUESTIONS, TerminalWatch, watch
 
 MS = 1_000_000
@@ -60,3 +63,9 @@ def test_a_pipe_is_no_terminal() -> None:
         watch(lambda stamp_ns: None, LIMIT_NS, reading, writing)
     os.close(reading)
     os.close(writing)
+
+
+def test_a_socket_that_cannot_be_is_refused_as_one_that_nobody_serves() -> None:
+    """Beside the root there is no folder for the guard's."""
+    done = CliRunner().invoke(app, ["operator", "unwatch", "--operator", "/nowhere"])
+    assert isinstance(done.exception, CommandFailed) and done.exception.code == "operator.no-controller"
