@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from controller.laws.joint import DelayCompensation
+from controller.laws.response import DelayCompensation
 from machine.profile import Carrier
 
 STOP_M_S2: Final = 1.0

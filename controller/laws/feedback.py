@@ -3,7 +3,7 @@
 All are of the velocity type (docs/reference/machines.md section 4) and share one budget: ``kp_1_s`` is the greatest
 small-signal gain inside the ``layer``, which `timberhand bench loop-design` bounds; how a law uses it is written here
 and nowhere else.  A joint that is commanded by velocity has relative degree one: its sliding surface is the error, and
-its velocity enters by the estimate of the perturbation (``sliding_mode_pe``, `controller.laws.joint.ValveGain`).
+its velocity enters by the estimate of the perturbation (``sliding_mode_pe``, `controller.laws.response.ValveGain`).
 Sliding mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales
 2015, whose equations were not available.  Any other ``kind`` is an entry point of the group ``timberhand.joint_laws``,
 a factory that takes the `Law` and returns a `Feedback` (docs/how-to/extend.md).

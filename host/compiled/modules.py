@@ -52,6 +52,7 @@ MODULES: Final = (
     "controller.laws.feedback",
     "controller.laws.grapple",
     "controller.laws.joint",
+    "controller.laws.response",
     "controller.laws.suspension",
     "controller.laws.sway",
     "controller.laws.valve_map",

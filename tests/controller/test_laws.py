@@ -20,16 +20,13 @@ from controller.laws.feedback import (
 )
 from controller.laws.joint import (
     ACCELERATION_FACTOR,
-    GAIN_SPEED_SHARE,
     INCH_SHARE,
-    LEAST_GAIN,
     MAX_OPENING_SHARE,
-    MOST_SHARE,
-    DelayCompensation,
     EndPositioning,
     JointLaw,
     VibrationFilter,
 )
+from controller.laws.response import GAIN_SPEED_SHARE, LEAST_GAIN, MOST_SHARE, DelayCompensation
 from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, Joint
 from machine.profile import SPEED_HEADROOM_SHARE

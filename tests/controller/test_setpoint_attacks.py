@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from controller.crane.reference_governor import GROWTH_FACTOR
-from controller.laws.joint import LEAST_SHARE, MOST_SHARE, UNKNOWN_GAIN, CommandBound
+from controller.laws.response import LEAST_SHARE, MOST_SHARE, UNKNOWN_GAIN, CommandBound
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, settings_of, with_pump
