@@ -30,7 +30,8 @@ COLUMNS: Final = ("", "the paper", "its method here", "ours, its rules", "ours, 
 """Columns of a comparison: the question, and four answers."""
 LIKE_FOR_LIKE: Final = (
     "The paper's own figure on a real machine, its method rebuilt here, our method under the paper's rules, and ours "
-    "with everything that it has. A dash: not measured. Rates have 95 % intervals and their number of trials."
+    "with everything that it has. A dash: not measured; *missed*: outside its limit. Rates have 95 % intervals and "
+    "their number of trials."
 )
 
 
@@ -63,7 +64,7 @@ def read(path: Path) -> Result:
 def page(results: Mapping[str, Result], pages: Collection[str], standings: Mapping[str, Standing]) -> str:
     """Write the page as Markdown; an experiment without one of the ``pages`` is linked to its numbers."""
     links = {n: f"[{n}]({f'{n}.md' if n in pages else f'results/{n}.json'})" for n in results}
-    lines = [f"# {TITLE}", "", _conclusion(results, standings), "", INTRODUCTION, ""]
+    lines = [f"# {TITLE}", "", summary(results, standings), "", INTRODUCTION, ""]
     lines += ["| experiment | question | limits met | commit | |", "|---|---|---|---|---|"]
     for name, result in results.items():
         met = len(result.limits) - len(result.missed) - len(result.inconclusive)
@@ -96,7 +97,7 @@ def compared(results: Mapping[str, Result]) -> Iterator[tuple[Comparison, tuple[
         value = result.paper[entry.paper_metric]
         paper = f"{paper_metric.text(value)} (paper {entry.paper}{_interval(value, entry.trials)})"
         ours = (metrics.get((entry.experiment, name)) for name in (entry.method, entry.rules, entry.everything))
-        yield entry, (entry.question, paper, *("–" if metric is None else _here(result, metric) for metric in ours))
+        yield entry, (entry.question, paper, *("–" if metric is None else _judged(result, metric) for metric in ours))
 
 
 def _interval(value: float, trials: int) -> str:
@@ -108,6 +109,11 @@ def _interval(value: float, trials: int) -> str:
 
 def _here(result: Result, metric: Metric) -> str:
     return metric.text(result.metrics[metric.name]) + result.interval_text(metric)
+
+
+def _judged(result: Result, metric: Metric) -> str:
+    """Write a figure, and after it that it misses its limit."""
+    return _here(result, metric) + (", *missed*" if metric.name in result.missed else "")
 
 
 def _command(name: str) -> str:
@@ -138,7 +144,8 @@ def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]
     return [*lines, ""]
 
 
-def _conclusion(results: Mapping[str, Result], standings: Mapping[str, Standing]) -> str:
+def summary(results: Mapping[str, Result], standings: Mapping[str, Standing]) -> str:
+    """Tell how many limits all experiments set, meet and miss, and how many results are of today's sources."""
     total = sum(len(r.limits) for r in results.values())
     missed = sum(len(r.missed) for r in results.values())
     unsure = sum(len(r.inconclusive) for r in results.values())

@@ -79,16 +79,25 @@ LATER: Final = (
         49 / 73,
         73,
         "https://github.com/george-sideris/crane-hierarchical-rl",
-        ("grasp-configs", "success"),
+        ("grasp-configs", "first_closing"),
     ),
     Published(
         "Software of the FPInnovations crane 2026",
-        "the same; learned scoring",
+        "the same; learned scoring, single mound",
         "cycles that lifted logs",
         16 / 23,
         23,
         "https://github.com/george-sideris/crane-hierarchical-rl",
-        ("grasp-configs", "success"),
+        ("grasp-configs", "first_closing"),
+    ),
+    Published(
+        "Software of the FPInnovations crane 2026",
+        "the same; learned scoring, double mound",
+        "cycles that lifted logs",
+        17 / 30,
+        30,
+        "https://github.com/george-sideris/crane-hierarchical-rl",
+        ("grasp-configs", "first_closing"),
     ),
 )
 
@@ -258,7 +267,7 @@ UNSEEN: Final = (
     "**Fatigue, wear and misuse**: no run lasts longer than a shift, and nobody walks into the working area.",
     "**This computer on a vibrating machine**: timing is measured on hosts in a room.",
     "**The gap itself**: how far the plant is from a machine is unknown until a calibrated machine repeats a figure. "
-    "Paper A's own step from simulation (59 of 60) to its crane (58 of 60) is the only such pair among the systems "
-    "above.",
+    "Two systems above made that step: paper A from 59 of 60 to 58 of 60, FPInnovations' heuristic from 87 % to 67 %, "
+    "judged differently ([others' work](others.md)).",
 )
 """What no figure of a plant can show."""

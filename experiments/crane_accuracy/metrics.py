@@ -46,7 +46,7 @@ ACCURACY: Final = (
         0.010,
     ),
     _mm("encoder_error_xy_mean_m", "Error by encoders, horizontal, mean", "The same points.", 0.007),
-    _mm("encoder_error_z_mean_m", "Error by encoders, height, mean", "The same points."),
+    _mm("encoder_error_z_mean_m", "Error by encoders, height, mean", "The same points.", 0.007),
     _mm("encoder_error_p95_m", "Error by encoders, 3-D, 95th percentile", "The same points.", 0.020),
     _mm("encoder_error_max_m", "Error by encoders, 3-D, worst", "The same points."),
     _mm("encoder_error_empty_mean_m", "Error by encoders, 3-D, grapple empty, mean", "Half of the points."),

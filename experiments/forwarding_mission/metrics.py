@@ -89,9 +89,23 @@ OURS: Final = (
     Metric("mission_mean_s", "Duration of a mission, mean", "min", "From arming to the end of the route."),
     Metric("stops_mean", "Loading stops per mission, mean", "", "Paper B stops twice for every log."),
 )
-LEAST: Final = {"faithful.loaded": 0.8, "faithful.missions": 10.0}
+LEAST: Final = {
+    "faithful.loaded": 0.8,
+    "faithful.detected": PAPER["faithful.detected"],
+    "faithful.missions": 10.0,
+    "first.loaded": 0.98,
+    "first.detected": 0.99,
+}
+MOST: Final = {"faithful.grasp_offset_mean_m": PAPER["faithful.grasp_offset_mean_m"], "first.grasp_offset_mean_m": 0.08}
 BOTH: Final = tuple(
-    Metric(f"{prefix}.{name}", f"{who}: {title}", unit, f"As above, {which}.", least=LEAST.get(f"{prefix}.{name}"))
+    Metric(
+        f"{prefix}.{name}",
+        f"{who}: {title}",
+        unit,
+        f"As above, {which}.",
+        least=LEAST.get(f"{prefix}.{name}"),
+        most=MOST.get(f"{prefix}.{name}"),
+    )
     for prefix, who, which in (
         ("faithful", "Paper B's method", "for all missions by it"),
         ("first", "Ours", "for one mission on the original field"),

@@ -43,7 +43,8 @@ CORNELL = (
         "Correct grasps, views split at random (as in the paper)",
         "%",
         f"10 folds over ten views of every sample. {_CORRECT}. Views of one picture are in both parts and not "
-        "independent, so the interval is too narrow.",
+        "independent, so the interval is too narrow. The limit is paper A's figure.",
+        least=PAPER["cornell_paper_split"],
     ),
     Metric(
         "cornell_grouped",

@@ -86,7 +86,7 @@ FREE: Final = (
     Metric("hanger_period_s", "Period of the empty grapple's swing about the hanger's hinge", "s", RELEASED),
     Metric("fork_period_s", "Period about the fork's hinge", "s", RELEASED),
     Metric("cylinder_hz", "Natural frequency of the oil spring", "Hz", "Lift cylinder without friction and damping."),
-    Metric("turn_deg_m", "Turn per metre at full articulation", "deg/m", "Heading over path length."),
+    Metric("turn_deg_m", "Turn per metre at full articulation", "deg/m", "Heading over path length.", 8.1, 9.9),
     Metric("turn_radius_m", "Turning radius at full articulation", "m", "Path length over heading."),
     Metric(
         "brake_swing_rad",

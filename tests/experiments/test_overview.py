@@ -47,12 +47,21 @@ def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and
     assert not numbers_in(rows["optimal"][4]), "not measured so"
 
 
-def test_every_comparison_names_metrics_that_its_experiment_has() -> None:
+def test_every_comparison_names_metrics_that_its_experiment_has_and_limits_ours() -> None:
     for entry in COMPARISONS:
         module = import_module(EXPERIMENTS[entry.experiment].module)
         result = read(DOCS / "results" / f"{entry.experiment}.json")
-        names = {metric.name for metric in module.page_of(result, {}).metrics}
-        assert {entry.paper_metric, entry.method, entry.rules, entry.everything} - {""} <= names, entry.question
+        metrics = {metric.name: metric for metric in module.page_of(result, {}).metrics}
+        ours = {entry.method, entry.rules, entry.everything} - {""}
+        assert ours | {entry.paper_metric} <= set(metrics), entry.question
+        assert all(metrics[name].limit_text() for name in ours), entry.question
+
+
+def test_a_figure_in_a_comparison_says_that_it_misses_its_limit() -> None:
+    result = read(DOCS / "results" / "navigation.json")
+    ((_, (*_, kept, _, _)),) = compared({"navigation": replace(result, missed=())})
+    ((_, (*_, missed, _, _)),) = compared({"navigation": replace(result, missed=("heading_deg_per_m",))})
+    assert missed == f"{kept}, *missed*" and numbers_in(kept)
 
 
 def test_a_conclusion_leaves_out_a_sentence_without_a_value() -> None:

@@ -320,12 +320,12 @@ def readme(repository: Path) -> str:
 
 def _table(docs: Path) -> str:
     rows, results = [], overview.results_in(docs)
-    standings = {name: judge(results[name].commit, EXPERIMENTS[name]).standing for name in SHOWN if name in results}
+    standings = {name: judge(result.commit, EXPERIMENTS[name]).standing for name, result in results.items()}
     for entry, (question, *answers) in overview.compared(results):
-        if entry.experiment in standings:
+        if entry.experiment in SHOWN:
             linked = f"[{question}](docs/{entry.experiment}.md)"
             rows.append((linked, *answers, standings[entry.experiment]))
-    return table((*overview.COLUMNS, "sources"), rows)
+    return f"{overview.summary(results, standings)}\n\n{table((*overview.COLUMNS, 'sources'), rows)}"
 
 
 REPOSITORY = Path(__file__).resolve().parents[2]
