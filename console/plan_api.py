@@ -275,4 +275,4 @@ async def _body(request: Request) -> bytes:
 
 def _only_planners(request: Request) -> None:
     if person_of(request).role < Role.OPERATOR:
-        raise Refused(403, "Missions are planned by operators: sign in as one, or use the console's own machine.")
+        raise Refused(403, "Missions are planned by operators: sign in as one.")
