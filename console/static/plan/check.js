@@ -19,7 +19,7 @@ export function createCheck({ choose, found, exchange }) {
   async function send(mission, number) {
     try {
       const answer = await post("api/plan/check", { body: JSON.stringify(mission) });
-      if (!answer.ok) throw new Error(await sentenceOf(answer));
+      if (!answer.ok) throw await refusalOf(answer);
       const told = await answer.json();
       if (number === asked) show(told);
     } catch (error) {
@@ -81,9 +81,12 @@ function mark(kind) {
   return element;
 }
 
-export async function sentenceOf(answer) {
+/** Why a request was refused: an error with the sentence and, of a mission, its code. */
+export async function refusalOf(answer) {
   const body = await answer.text();
-  try { return JSON.parse(body).sentence; } catch { return body || answer.statusText; }
+  let told = {};
+  try { told = JSON.parse(body); } catch { /* a sentence alone */ }
+  return Object.assign(new Error(told.sentence ?? (body || answer.statusText)), { code: told.code });
 }
 
 const counted = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;

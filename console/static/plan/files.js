@@ -2,20 +2,19 @@
 
 import { post as send } from "../access.js";
 import { emptyMission } from "./model.js";
-import { sentenceOf } from "./check.js";
+import { refusalOf } from "./check.js";
 
 const $ = (id) => document.getElementById(id);
 const NAMES = { geojson: "GeoJSON", plan: ".plan", gpx: "GPX", kml: "KML" };
 
 /** `opened()` follows a mission that came from a file; returns `{begin(settings), name()}`. */
 export function createFiles(model, opened) {
-  let saved = [];
   const note = (text) => { $("file-note").textContent = text; };
   const name = () => `${$("file-name").value.trim() || "mission"}.geojson`;
 
   async function post(path, body) {
     const answer = await send(path, { body });
-    if (!answer.ok) throw new Error(await sentenceOf(answer));
+    if (!answer.ok) throw await refusalOf(answer);
     return answer.json();
   }
 
@@ -24,18 +23,18 @@ export function createFiles(model, opened) {
   }
 
   async function list() {
-    saved = await (await fetch("api/plan/missions")).json();
+    const saved = await (await fetch("api/plan/missions")).json();
     const chosen = $("saved").value;
     $("saved").replaceChildren(...saved.map((file) => new Option(file, file, false, file === chosen)));
     $("open-saved").disabled = !saved.length;
   }
 
   async function save() {
-    const replace = saved.includes(name()) && $("save").dataset.again === name() ? "?replace=1" : "";
+    const replace = $("save").dataset.again === name() ? "?replace=1" : "";
     try {
       await post(`api/plan/missions/${encodeURIComponent(name())}${replace}`, JSON.stringify(model.mission));
     } catch (error) {
-      if (!saved.includes(name())) throw error;
+      if (error.code !== "missions.exists") throw error;
       $("save").dataset.again = name();
       $("save").textContent = "Replace";
       note(`${name()} exists already. Press Replace to replace it, or change the name.`);
@@ -65,7 +64,7 @@ export function createFiles(model, opened) {
   guarded("save", save);
   guarded("open-saved", async () => {
     const file = $("saved").value, answer = await fetch(`api/plan/missions/${encodeURIComponent(file)}`);
-    if (!answer.ok) throw new Error(await sentenceOf(answer));
+    if (!answer.ok) throw await refusalOf(answer);
     take(await answer.json(), file);
     $("file-name").value = file.replace(/\.geojson$/, "");
     $("file-name").dispatchEvent(new Event("input"));

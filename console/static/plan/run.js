@@ -1,7 +1,7 @@
 // Upload to the planner, start, pause, resume and abort; the planner's state in words.
 
 import { post } from "../access.js";
-import { sentenceOf } from "./check.js";
+import { refusalOf } from "./check.js";
 import { sendMission } from "./header.js";
 
 const $ = (id) => document.getElementById(id);
@@ -16,7 +16,7 @@ export function createRun(model, files) {
     note("Uploading …");
     try {
       const answer = await post(`api/plan/upload/${encodeURIComponent(files.name())}`, { body: JSON.stringify(model.mission) });
-      if (!answer.ok) throw new Error(await sentenceOf(answer));
+      if (!answer.ok) throw await refusalOf(answer);
       note("The planner has the mission. Arm the machine on its page, then press Start.");
       files.list();
     } catch (error) { note(error.message); }

@@ -266,6 +266,23 @@ def test_files_are_read_and_written_by_the_page(stage: Stage, browser: Browser, 
     assert len(load_mission(tmp_path / "down" / "mission.kml").mission.waypoints) == 4
 
 
+def test_a_name_in_use_is_replaced_on_purpose_and_any_other_refusal_is_told(stage: Stage, browser: Browser) -> None:
+    stage.folder.mkdir()
+    file = stage.folder / "mission.geojson"
+    file.write_text("saved from another browser, after this page was opened")
+    browser.click("save")
+    browser.shows("file-note", "mission.geojson exists already. Press Replace")
+    browser.click("save")
+    browser.shows("file-note", "Saved as mission.geojson.")
+    browser.until("document.getElementById('saved').value === 'mission.geojson'")
+    file.unlink()
+    stage.folder.rmdir()
+    stage.folder.write_text("no folder")
+    browser.click("save")
+    browser.shows("file-note", "missions is no folder")
+    assert browser.text("save") == "Save"
+
+
 def test_a_picture_lies_under_the_grid_where_it_is_placed(browser: Browser, tmp_path: Path) -> None:
     Image.new("RGB", (40, 40), (200, 40, 90)).save(tmp_path / "site.png")
     browser.choose_file("picture", tmp_path / "site.png")
