@@ -1,7 +1,7 @@
 // Files: missions of the console's folder, files of any format in, files of every format that can be written out.
 
 import { post as send } from "../access.js";
-import { emptyMission } from "./model.js";
+import { allPlaces, emptyMission } from "./model.js";
 import { refusalOf } from "./check.js";
 
 const $ = (id) => document.getElementById(id);
@@ -51,13 +51,13 @@ export function createFiles(model, opened) {
     delete $("save").dataset.again;
   }
 
-  /** A mission from a file; one that holds only logs adds them. */
-  function take(told, from) {
-    const { mission, format, notes } = told, onlyLogs = mission.logs.length > 0 && !mission.waypoints.length
-      && !mission.fences.length && !mission.landings.length;
+  /** A mission from a file; of an imported one that holds only logs, these are added to the plan. */
+  function take({ mission, format, notes }, from, imports = false) {
+    const onlyLogs = mission.logs.length > 0 && allPlaces(mission).length === mission.logs.length;
+    const adds = imports && onlyLogs && allPlaces(model.mission).length > 0;
     const logs = [...model.mission.logs, ...mission.logs];
-    model.commit(onlyLogs && model.mission.waypoints.length ? { ...model.mission, logs } : mission);
-    note([`${from}: ${format}${onlyLogs ? `, ${mission.logs.length} logs added` : ""}.`, ...notes.map((n) => `Note: ${n}.`)].join(" "));
+    model.commit(adds ? { ...model.mission, logs } : mission);
+    note([`${from}: ${format}${adds ? `, ${mission.logs.length} logs added` : ""}.`, ...notes.map((n) => `Note: ${n}.`)].join(" "));
     opened();
   }
 
@@ -87,7 +87,7 @@ export function createFiles(model, opened) {
     const file = $("import").files[0];
     if (!file) return;
     try {
-      take(await post(`api/plan/import?name=${encodeURIComponent(file.name)}`, file), file.name);
+      take(await post(`api/plan/import?name=${encodeURIComponent(file.name)}`, file), file.name, true);
     } catch (error) { note(error.message); }
     $("import").value = "";
   });

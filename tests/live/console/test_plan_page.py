@@ -283,6 +283,16 @@ def test_a_name_in_use_is_replaced_on_purpose_and_any_other_refusal_is_told(stag
     assert browser.text("save") == "Save"
 
 
+def test_imported_logs_are_added_to_whatever_is_planned(browser: Browser) -> None:
+    browser.choose_file("import", EXAMPLES / "harvest.hpr")
+    browser.shows("file-note", "harvest.hpr: ")
+    logs = browser.value("plan.model.mission.logs.length")
+    draw(browser, "landing", (-15, -8))
+    browser.choose_file("import", EXAMPLES / "harvest.hpr")
+    browser.until(f"plan.model.mission.logs.length === {2 * logs}")
+    assert browser.value("plan.model.mission.landings.length") == 1
+
+
 def test_a_picture_lies_under_the_grid_where_it_is_placed(browser: Browser, tmp_path: Path) -> None:
     Image.new("RGB", (40, 40), (200, 40, 90)).save(tmp_path / "site.png")
     browser.choose_file("picture", tmp_path / "site.png")
