@@ -2,7 +2,7 @@
 
 const WORDS = { STOP: "STOPPED" };
 /** Made once: one for each entry was nearly half of the page's script over a shift (measured). */
-const CLOCK = new Intl.DateTimeFormat([], { hour: "numeric", minute: "numeric", second: "numeric", hour12: false });
+const CLOCK = new Intl.DateTimeFormat([], { hour: "numeric", minute: "numeric", second: "numeric", hourCycle: "h23" });
 const MARKS = { stop: "■", load: "▲", grip: "▲", mission: "●", mode: "○" };
 
 const add = (parent, name, className = "", words = "") => {
