@@ -8,7 +8,6 @@ import { added, allPlaces, placeOf, withItem } from "./model.js";
 const MOST_HANDLES = 300; // of a route or all fences: more are edited in the table
 const EDIT = {
   allowSelfIntersection: true, snappable: false, hideMiddleMarkers: false, removeLayerBelowMinVertexCount: false,
-  preventMarkerRemoval: true,
 };
 
 /** `model`: see model.js; `frame()` is the present frame; returns `{draw, marks, use, fit, show, close, grid}`. */
@@ -18,7 +17,6 @@ export function createMap(container, model, frame) {
     zoomControl: false, doubleClickZoom: false, boxZoom: false,
   });
   L.control.zoom({ position: "bottomright" }).addTo(map);
-  L.control.scale({ imperial: false, position: "bottomleft" });
   map.setView([0, 0], 2);
   const grid = addGrid(map);
   const wood = L.layerGroup().addTo(map), parts = L.layerGroup().addTo(map), marked = L.layerGroup().addTo(map), choice = L.layerGroup().addTo(map);

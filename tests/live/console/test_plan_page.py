@@ -172,6 +172,18 @@ def test_a_mission_is_planned_by_mouse_and_driven(stage: Stage, browser: Browser
     browser.until("document.getElementById('pause').disabled")
 
 
+def test_a_right_click_removes_a_point(browser: Browser) -> None:
+    mission = msgspec.to_builtins(load_mission(EXAMPLES / "paper_b.geojson").mission)
+    browser.value(f"plan.model.commit({json.dumps(mission)}); document.getElementById('fit').click()")
+    for east_m, north_m in ((20, 15), (-30, 25)):
+        x, y = window(browser, east_m, north_m)
+        browser._ask("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        for kind in ("mousePressed", "mouseReleased"):
+            browser._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="right", clickCount=1)
+        browser.until("plan.model.mission.waypoints.length === 3")
+    browser.until("plan.model.mission.fences[0].corners.length === 3")
+
+
 def test_exchanged_axes_are_named_and_put_right(browser: Browser) -> None:
     mission = msgspec.to_builtins(load_mission(EXAMPLES / "paper_b.geojson").mission)
     mission["fences"] = mission["logs"] = []
