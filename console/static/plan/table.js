@@ -27,7 +27,7 @@ const EMPTY = { waypoint: "No waypoints", fence: "No fences", landing: "No landi
 
 /** `model` and `frame`: see map.js; `complain(sentence)` says why a typed value is not taken. */
 export function createTable(model, frame, complain) {
-  let tab = "waypoint", fence = 0, shape = "";
+  let tab = "waypoint", fence = 0, first = 0, shape = "";
   const rows = $("parts").tBodies[0];
   const details = createFields($("details"), "detail", complain, (field, value) => {
     const part = detailed();
@@ -96,7 +96,9 @@ export function createTable(model, frame, complain) {
     drawFences(mission);
     $("add-corner").hidden = tab !== "fence" || !mission.fences.length;
     $("add").textContent = `Add a ${tab}`;
-    const all = points(), first = firstRow(all), shown = all.slice(first, first + MOST_ROWS);
+    const all = points();
+    first = firstRow(all);
+    const shown = all.slice(first, first + MOST_ROWS);
     const now = `${tab} ${fence} ${first} ${shown.length}`;
     if (now !== shape) rows.replaceChildren(...shown.map(([part]) => row(part)));
     shape = now;
@@ -109,6 +111,7 @@ export function createTable(model, frame, complain) {
 
   function firstRow(all) {
     const chosen = all.findIndex(([part]) => String(part) === String(model.chosen));
+    if (chosen >= first && chosen < first + MOST_ROWS) return first; // the row that has the keyboard stays
     return chosen < MOST_ROWS ? 0 : chosen - MOST_ROWS / 2;
   }
 

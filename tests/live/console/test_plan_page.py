@@ -218,6 +218,16 @@ def test_a_typed_place_is_taken_undone_and_deleted(stage: Stage, browser: Browse
     assert not stage.stopped()
 
 
+def test_a_row_far_down_a_long_list_keeps_the_keyboard(browser: Browser) -> None:
+    mission = msgspec.to_builtins(load_mission(EXAMPLES / "paper_b.geojson").mission)
+    mission["logs"] = list(mission["logs"][:1]) * 500
+    browser.value(f"plan.model.commit({json.dumps(mission)}); plan.model.choose(['log', 250])")
+    row = "log 300: east, metres"
+    browser.value(f"document.querySelector('[aria-label=\"{row}\"]').focus()")
+    assert browser.value("document.activeElement.ariaLabel") == row
+    assert browser.value("plan.model.chosen") == ["log", 299]
+
+
 def test_a_plan_is_made_with_the_keyboard_alone(browser: Browser) -> None:
     def enter(selector: str) -> None:
         browser.value(f"document.querySelector({selector!r}).focus()")
