@@ -15,6 +15,9 @@ export async function beginAccess() {
   return told;
 }
 
+/** Whether this page has a token now: a console that was started anew takes it away. */
+export const hasToken = () => Boolean(told.token);
+
 /** A POST with the token; `options` as for fetch. */
 export function post(path, options = {}) {
   return fetch(path, { method: "POST", ...options, headers: { ...header(told.token), ...options.headers } });

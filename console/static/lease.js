@@ -1,17 +1,16 @@
 // The control lease in the header: who has control, take it, take it over on purpose, give it back; and who is signed in.
 // A page without a session only looks, and says how to get one.
 
-import { post } from "./access.js";
+import { hasToken, post } from "./access.js";
 
 /** Fills `container`; `alarm(text, ms)` tells what goes wrong; `me` is this page's session; returns `{show(state)}`. */
 export function createLease(container, alarm, me) {
-  const words = make("span", "lease-words"), button = make("button", ""), dialog = makeDialog();
+  const words = make("span", "lease-words"), button = make("button", ""), enter = signIn(), dialog = makeDialog();
   button.type = "button";
   button.id = "lease-button";
-  container.append(words, button);
+  container.append(words, button, enter);
   container.hidden = false;
   if (me.signs_in) container.append(signOut());
-  if (!me.token) { container.append(signIn()); button.remove(); }
   let lease = null, had = false;
 
   button.addEventListener("click", () => {
@@ -33,9 +32,10 @@ export function createLease(container, alarm, me) {
     if (had && !lease.mine && lease.page) alarm(`${lease.holder} has taken control over.`, 10000);
     had = lease.mine;
     document.body.dataset.control = lease.mine ? "mine" : lease.page ? "other" : "nobody";
-    put(words, !me.token ? "Looking only" : lease.mine ? "You have control" : lease.page ? `${lease.holder} has control` : "Nobody has control");
+    put(words, !hasToken() ? "Looking only" : lease.mine ? "You have control" : lease.page ? `${lease.holder} has control` : "Nobody has control");
     put(button, lease.mine ? "Give back" : lease.page ? "Take over …" : "Take control");
     button.hidden = !lease.may_take;
+    enter.hidden = hasToken();
     if (dialog.element.open && (lease.mine || !lease.page)) dialog.element.close();
     if (state.audit) alarm(state.audit, 2000);
   }
@@ -69,6 +69,7 @@ export function createLease(container, alarm, me) {
   function signIn() {
     const enter = make("a", "button", "Sign in …");
     enter.id = "sign-in";
+    enter.hidden = true;
     enter.href = "sign-in";
     enter.title = "To command, open the address that the console printed at its start";
     return enter;

@@ -50,8 +50,8 @@ class Stage:
         self._operator.settimeout(0.05)
         reports = udp_end()
         self._to = reports.getsockname()
-        console = Console(PROFILE, HASH, self.folder / "operator", reports=reports, accounts=self.accounts)
-        self.url = self._open.enter_context(served(create_app(console)))
+        self.console = Console(PROFILE, HASH, self.folder / "operator", reports=reports, accounts=self.accounts)
+        self.url = self._open.enter_context(served(create_app(self.console)))
         self._thread = threading.Thread(target=self._work)
         self._thread.start()
 
@@ -168,7 +168,7 @@ def test_who_opens_the_bare_address_looks_and_stops_and_enters_by_the_token(stag
         )
         for button in ("arm", "reset", "disarm"):
             browser.until(f"document.getElementById('{button}').disabled")
-        assert browser.value("document.getElementById('lease-button') === null")
+        assert not browser.value("document.getElementById('lease-button').checkVisibility()")
         browser.click("stop")
         browser.wait(lambda: stage.pressed == [OperatorAction.STOP], "STOP of who only looks")
         browser.click("sign-in")
@@ -184,6 +184,17 @@ def test_who_opens_the_bare_address_looks_and_stops_and_enters_by_the_token(stag
         take_control(browser)
         browser.click("reset")
         browser.wait(lambda: stage.pressed[2:] == [OperatorAction.RESET], "a command of who has entered")
+
+
+def test_a_page_whose_session_has_ended_says_how_to_get_another(stage: Stage, tmp_path: Path) -> None:
+    with Browser(tmp_path, (1280, 800)) as browser:
+        browser.open(stage.url)
+        browser.until("document.body?.dataset.control === 'nobody'")
+        assert not browser.value("document.getElementById('sign-in').checkVisibility()")
+        (session,) = stage.console.access._sessions
+        stage.console.access.sign_out(session)
+        browser.until("document.getElementById('sign-in').checkVisibility()")
+        browser.shows("lease", "Looking only")
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (800, 1280), (390, 844)])
