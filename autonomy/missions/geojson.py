@@ -140,8 +140,8 @@ class _Reader:
             raise self.source.error("mission.geojson-geometry", path, sentence)
 
     def add(self, kind: Any, rings: tuple[tuple[Position, ...], ...], properties: dict[str, Any], at: Place) -> None:
-        if rings and all(rings):
-            self.shapes.append(Shape(kind, rings, properties, at))
+        if rings and rings[0]:
+            self.shapes.append(Shape(kind, tuple(filter(None, rings)), properties, at))
         else:
             self.notes.append(f"an empty {kind} ignored")
 

@@ -259,17 +259,14 @@ class _Kml:
                 line = self.gaps.joined(self.track(track) for track in child.all("Track"))
                 self.add("line", [line], properties, child.line)
             elif child.name == "Polygon":
-                rings = [
-                    self.positions(ring)
-                    for side in ("outerBoundaryIs", "innerBoundaryIs")
-                    for boundary in child.all(side)
-                    for ring in boundary.all("LinearRing")
-                ]
+                outer = child.first("outerBoundaryIs", "LinearRing")
+                holes = [ring for hole in child.all("innerBoundaryIs") for ring in hole.all("LinearRing")]
+                rings = [() if ring is None else self.positions(ring) for ring in (outer, *holes)]
                 self.add("polygon", rings, properties, child.line)
 
     def add(self, kind: Any, rings: list[tuple[Position, ...]], properties: dict[str, Any], place: Place) -> None:
-        if rings and all(rings):
-            self.shapes.append(Shape(kind, tuple(rings), properties, place))
+        if rings and rings[0]:
+            self.shapes.append(Shape(kind, tuple(filter(None, rings)), properties, place))
         else:
             self.notes.append(f"an empty {kind} ignored")
 

@@ -58,7 +58,10 @@ TRACK = "".join(f"<trkseg>{gpx_points('trkpt', part)}</trkseg>" for part in (ROU
 PLACES = "".join(
     f"<Placemark><Point><coordinates>{kml_coordinates([p])}</coordinates></Point></Placemark>" for p in ROUTE
 )
-KML = kml(f"<Placemark><LineString><coordinates>{kml_coordinates()}</coordinates></LineString></Placemark>")
+WAY = f"<Placemark><LineString><coordinates>{kml_coordinates()}</coordinates></LineString></Placemark>"
+KML = kml(WAY)
+RING = f"<LinearRing><coordinates>{kml_coordinates([*FENCE, FENCE[0]])}</coordinates></LinearRing>"
+EMPTY_HOLE = "<innerBoundaryIs><LinearRing><coordinates/></LinearRing></innerBoundaryIs>"
 GPX = gpx(f"<rte>{gpx_points('rtept')}</rte>")
 SAME = {
     "line": collection(line()),
@@ -119,6 +122,19 @@ def test_a_hole_keeps_out_and_rings_run_counter_clockwise() -> None:
     mission = good(collection(line(), feature("Polygon", rings))).mission
     assert [fence.keep_out for fence in mission.fences] == [False, True]
     assert [p.longitude_deg for p in mission.fences[0].corners] == [p.longitude_deg for p in FENCE]
+
+
+def test_a_fence_stays_where_a_hole_of_it_is_empty() -> None:
+    drawn = collection(line(), feature("Polygon", [lon_lat([*FENCE, FENCE[0]]), []]))
+    outer = f"<outerBoundaryIs>{RING}</outerBoundaryIs>"
+    for data in (drawn, kml(f"{WAY}<Placemark><Polygon>{outer}{EMPTY_HOLE}</Polygon></Placemark>")):
+        assert [(len(fence.corners), fence.keep_out) for fence in good(data).mission.fences] == [(4, False)]
+
+
+def test_a_hole_in_nothing_is_no_fence() -> None:
+    hole = f"<innerBoundaryIs>{RING}</innerBoundaryIs>"
+    draft = good(kml(f"{WAY}<Placemark><Polygon>{hole}</Polygon></Placemark>"))
+    assert draft.mission.fences == () and len(draft.notes) == 1
 
 
 def test_a_log_may_be_drawn_by_its_ends() -> None:
