@@ -143,6 +143,9 @@ def _angle(element: Element, positive: str, negative: str, source: Source) -> fl
     if category.lower() not in (positive, positive[0], negative, negative[0]):
         sentence = f'{name} is "{category[:40]}"; it is {positive.title()} or {negative.title()}'
         raise source.error("hpr.category", element.line, sentence)
+    if value < 0.0 and name in element.attributes:
+        sentence = f'{element.name} is {element.text.strip()} and {name} "{category}"; only one may tell the half'
+        raise source.error("hpr.category", element.line, sentence)
     return value if category.lower().startswith(positive[0]) else -value
 
 

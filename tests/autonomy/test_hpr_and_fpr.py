@@ -56,6 +56,13 @@ def test_south_and_west(south: str, west: str) -> None:
     )
 
 
+def test_a_sign_beside_the_half_of_the_globe() -> None:
+    signed = TEXT.replace('"North">', '"South">-')
+    assert problem(signed).code == "hpr.category"
+    at_first = read(signed.replace(' latitudeCategory="South"', "").encode(), "h").mission.logs[0].position
+    assert at_first.latitude_deg == pytest.approx(-63.65777, abs=1e-3)
+
+
 def test_diameters_of_harvesters_with_fewer_measurements() -> None:
     ends = TEXT.replace('"Mid ob">210', '"Butt ob">230')
     assert read(ends.encode(), "h").mission.logs[0].diameter_m == pytest.approx(0.5 * (0.230 + 0.190))
