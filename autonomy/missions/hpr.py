@@ -58,6 +58,7 @@ _WANTED: Final = frozenset(
     }
 )
 _LIMITS: Final = {"Log": (MAX_LOGS, "logs"), "Stem": (MAX_LOGS, "stems"), ANY: (400_000, "elements")}
+_UNITS: Final = {"lengthUnit": "cm", "diameterUnit": "mm", "volumeUnit": "m3"}
 _MIDDLE: Final = ("Mid ob", "Mid ub")
 _ENDS: Final = ("Butt ob", "Top ob")
 
@@ -66,7 +67,7 @@ def read_hpr(data: bytes, name: str) -> Draft:
     """Read the logs of a harvester's production, as a mission without a route.
 
     Raises:
-        MissionError: not an hpr, a coordinate system other than WGS84, or an invalid value.
+        MissionError: not an hpr, a coordinate system other than WGS84, other units, or an invalid value.
     """
     root = tree(data, name, _WANTED, _LIMITS, "HarvestedProduction")
     source = Source(name)
@@ -76,6 +77,11 @@ def read_hpr(data: bytes, name: str) -> Draft:
     if root.attributes.get("messageType", "hpr") != "hpr":
         sentence = f"message type {root.attributes['messageType'][:20]!r}; logs come from an hpr"
         raise source.error("hpr.message-type", root.line, sentence)
+    for name, unit in _UNITS.items():
+        given = root.attributes.get(name, unit)
+        if given.strip().lower() != unit:
+            sentence = f'{name} is "{given[:20]}"; StanForD 2010 has {unit}, so export the file anew'
+            raise source.error("hpr.unit", root.line, sentence)
     logs: list[KnownLog] = []
     places: dict[Key, Place] = {}
     lost = several = 0

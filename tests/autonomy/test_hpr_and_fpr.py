@@ -125,6 +125,8 @@ def test_an_hpr_in_an_envelope() -> None:
         ("urn:skogforsk:stanford2010", "urn:else", "hpr.namespace"),
         ('messageType="hpr"', 'messageType="pri"', "hpr.message-type"),
         ('"WGS84"', '"RT90"', "mission.datum"),
+        ('lengthUnit="cm"', 'lengthUnit="mm"', "hpr.unit"),
+        ('diameterUnit="mm"', 'diameterUnit="inch"', "hpr.unit"),
         ('"North"', '"Upwards"', "hpr.category"),
         ('"East"', '""', "hpr.category"),
         ("<LogLength>300", "<LogLength>3x0", "mission.number"),
