@@ -24,6 +24,7 @@ from autonomy.missions.model import (
     Options,
     Point,
     Problem,
+    is_product_key,
 )
 from autonomy.missions.source import Place, Source
 
@@ -203,7 +204,7 @@ class _Reader:
             elif not _far_from_sane(ring):
                 at, known["bearing_deg"], known["length_m"] = _from_ends(*ring)
         key = self.number(shape, "product_key")
-        if key is not None and not (key.is_integer() and 0.0 < key < 2**31):
+        if key is not None and not is_product_key(key):
             sentence = f"product_key is {key:g}; StanForD product keys are integers from 1"
             self.problems.append((shape.place, "mission.product-key", sentence))
             key = None

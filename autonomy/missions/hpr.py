@@ -15,7 +15,7 @@ from typing import Final
 
 from autonomy.missions.features import Draft, Key
 from autonomy.missions.gpx_kml import decimal
-from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point
+from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point, is_product_key
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree
 from runtime.errors import InputRefused
@@ -84,7 +84,7 @@ def read_hpr(data: bytes, name: str) -> Draft:
             raise source.error("hpr.unit", root.line, sentence)
     logs: list[KnownLog] = []
     places: dict[Key, Place] = {}
-    lost = several = 0
+    lost = several = unnamed = 0
     title = ""
     for machine in root.all("Machine"):
         title = title or machine.value("ObjectDefinition", "ObjectName")
@@ -103,6 +103,7 @@ def read_hpr(data: bytes, name: str) -> Draft:
                     several += len(list(log.all("LogMeasurement"))) > 1
                     places[("log", len(logs))] = log.line
                     logs.append(_log(log, stem, *at, species, products, source))
+                    unnamed += bool(log.value("ProductKey")) and logs[-1].product_key is None
     draft = Draft(ForwardingMission(title, logs=tuple(logs)), source, HPR, places)
     if lost:
         sentence = f"{lost} logs of stems without coordinates are left out; the machine is not told of them"
@@ -112,6 +113,10 @@ def read_hpr(data: bytes, name: str) -> Draft:
     if several:
         draft.notes.append(
             f"{several} logs were measured more than once; one measurement is read, the harvester's if it is marked"
+        )
+    if unnamed:
+        draft.notes.append(
+            f"{unnamed} logs have a product key that is no integer from 1; the report will not name their product"
         )
     return draft
 
@@ -167,7 +172,7 @@ def _log(
     key = log.first("ProductKey")
     measurement = _measurement(log)
     length = None if measurement is None else measurement.first("LogLength")
-    product = None if key is None or not key.text.strip() else int(_number(key, source))
+    product = None if key is None or not key.text.strip() else _number(key, source)
     return KnownLog(
         at,
         f"{stem.value('StemKey') or stem.value('StemNumber')}/{log.value('LogKey')}",
@@ -176,7 +181,7 @@ def _log(
         _diameter_m(log, measurement, length, source),
         species.get(stem.value("SpeciesGroupKey"), "") or species.get(_species_key(stem), ""),
         "" if key is None else products.get(key.text.strip(), ""),
-        product,
+        int(product) if product is not None and is_product_key(product) else None,
         sigma_m,
     )
 

@@ -147,6 +147,11 @@ class ForwardingMission(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     schema: Literal[1] = SCHEMA
 
 
+def is_product_key(key: float) -> bool:
+    """Tell whether a number is a product key of StanForD 2010: an integer from 1."""
+    return key.is_integer() and 0.0 < key < 2**31
+
+
 def all_points(mission: ForwardingMission) -> tuple[Point, ...]:
     """List every position of a mission: waypoints, corners of fences, landings, logs."""
     corners = tuple(corner for fence in mission.fences for corner in fence.corners)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from autonomy.missions import geojson
 from autonomy.missions.fpr import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
 from autonomy.missions.hpr import MACHINE_SIGMA_M, TIP_SIGMA_M
 from autonomy.missions.mission_file import load_mission, read
@@ -110,6 +111,15 @@ def test_two_measurements_of_a_log_are_not_mixed() -> None:
     again = read(TEXT.replace("</LogMeasurement>", "</LogMeasurement>" + other, 1).encode(), "h")
     assert draft.mission.logs == again.mission.logs == LOGS
     assert [numbers_in(note) for note in draft.notes] == [[1]]
+
+
+@pytest.mark.parametrize("key", ["0", "-1", "31.5", "99999999999"])
+def test_a_product_key_that_no_mission_holds_is_left_out(key: str) -> None:
+    draft = read(TEXT.replace("<ProductKey>31<", f"<ProductKey>{key}<").encode(), "h")
+    assert [log.product_key for log in draft.mission.logs[:3]] == [None, None, 11]
+    assert [log.assortment for log in draft.mission.logs] == [log.assortment for log in LOGS]
+    assert [numbers_in(note)[0] for note in draft.notes] == [sum(log.product_key == 31 for log in LOGS)]
+    assert read(geojson.write(draft.mission), "m").mission == draft.mission
 
 
 def test_an_hpr_in_an_envelope() -> None:
