@@ -13,6 +13,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -54,7 +55,10 @@ class Source:
     def at(self, place: Place) -> str:
         """Return ``name:line`` of a place, or ``name`` if the line is unknown."""
         if isinstance(place, tuple):
-            line = line_of(self.text, place) if len(self.text) <= MAX_LINED_CHARS else None
+            line = None
+            if len(self.text) <= MAX_LINED_CHARS:
+                with suppress(RecursionError):  # nested nearly as deep as json_document reads
+                    line = line_of(self.text, place)
         else:
             line = place
         return self.name if line is None else f"{self.name}:{line}"

@@ -202,6 +202,14 @@ def test_huge_files(tmp_path: Path) -> None:
 
 
 # -- text
+def test_the_place_in_a_file_that_is_nested_as_deep_as_it_may_be() -> None:
+    for depth in range(800, 1000):  # at some depth the reader of the file passes and that of its lines does not
+        data = b'{"a":%s%s, "type": "FeatureCollection", "features": [3]}' % (b"[" * depth, b"]" * depth)
+        error = refused(data)
+        assert error.code in ("mission.geojson-feature", "mission.nesting")
+        assert error.problems[0].place in ("m", "m:1")
+
+
 def test_byte_order_mark_and_crlf() -> None:
     for data in (collection(line()), gpx(f"<rte>{gpx_points('rtept')}</rte>")):
         assert_route(good(b"\xef\xbb\xbf" + data.replace(b"\n", b"\r\n")).mission)
