@@ -66,8 +66,11 @@ def _header(document: dict[str, Any], source: Source) -> tuple[str, Options]:
             f"schema is {own.get('schema')!r}; this release reads schema {SCHEMA}, so convert the file with the "
             "release that wrote it",
         )
+    name = own.get("name", "")
+    if not isinstance(name, str):
+        raise source.error("mission.header", (MEMBER, "name"), "the name of the mission is not a text")
     try:
-        return msgspec.convert(own.get("name", ""), str), msgspec.convert(own.get("options", {}), Options)
+        return name, msgspec.convert(own.get("options", {}), Options)
     except msgspec.ValidationError as error:
         sentence, _, where = str(error).partition(" - at ")
         key = where.strip("`").removeprefix("$.") or "options"

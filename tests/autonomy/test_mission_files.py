@@ -345,6 +345,11 @@ def test_the_line_of_every_kind_of_problem() -> None:
     assert codes(kml(body)) == ["duplicate-waypoint"] and place(kml(body)) == "m:8"
 
 
+def test_the_name_of_a_mission_is_a_text() -> None:
+    data = collection(line(), timberhand={"schema": 1, "options": {}, "name": 5})
+    assert (codes(data), place(data)) == (["header"], "m:6")
+
+
 def test_many_problems_are_counted() -> None:
     away = [at(100 + 3 * i, 0) for i in range(40)]
     error = refused(collection(line(away), polygon()))
