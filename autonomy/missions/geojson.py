@@ -7,6 +7,7 @@ A mission is a FeatureCollection whose member ``timberhand`` holds ``schema``, `
 from __future__ import annotations
 
 import json
+from collections import Counter
 from typing import Any, Final
 
 import msgspec
@@ -32,7 +33,7 @@ def read(document: dict[str, Any], source: Source) -> Draft:
     reader = _Reader(source)
     reader.anything(document, ())
     draft = assemble(reader.shapes, source, "GeoJSON", name, options)
-    draft.notes += reader.notes
+    draft.notes += [f"{count} × {item} ignored" for item, count in reader.left_out.items()]
     return draft
 
 
@@ -86,7 +87,7 @@ class _Reader:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.shapes: list[Shape] = []
-        self.notes: list[str] = []
+        self.left_out: Counter[str] = Counter()
         self.count = 0
 
     def anything(self, value: Any, path: Path) -> None:
@@ -109,7 +110,7 @@ class _Reader:
         if not isinstance(properties, dict | None):
             raise self.source.error("mission.geojson-properties", (*path, "properties"), "properties is not an object")
         if feature.get("geometry") is None:
-            self.notes.append("a feature without a geometry ignored")
+            self.left_out["a feature without a geometry"] += 1
             return
         self.geometry(feature["geometry"], properties or {}, (*path, "geometry"), path)
 
@@ -146,7 +147,7 @@ class _Reader:
         if rings and rings[0]:
             self.shapes.append(Shape(kind, tuple(filter(None, rings)), properties, at))
         else:
-            self.notes.append(f"an empty {kind} ignored")
+            self.left_out[f"an empty {kind}"] += 1
 
     def listed(self, value: Any, path: Path, what: str) -> list[Any]:
         if not isinstance(value, list):

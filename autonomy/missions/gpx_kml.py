@@ -202,7 +202,7 @@ def read_kml(data: bytes, name: str) -> Draft:
     if link is not None and not reader.shapes:
         raise reader.source.error("kml.network-link", link.line, f"holds no place, only {_LINK}")
     draft = assemble(reader.shapes, reader.source, "KML", title)
-    draft.notes += [*reader.notes, *(f"{count} × {item} ignored" for item, count in reader.left_out.items())]
+    draft.notes += [f"{count} × {item} ignored" for item, count in reader.left_out.items()]
     reader.gaps.tell(draft)
     if link is not None:
         draft.warn("kml.network-link", link.line, _LINK)
@@ -230,7 +230,6 @@ class _Kml:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.shapes: list[Shape] = []
-        self.notes: list[str] = []
         self.left_out: Counter[str] = Counter()
         self.gaps = Gaps()
         self.count = 0
@@ -268,7 +267,7 @@ class _Kml:
         if rings and rings[0]:
             self.shapes.append(Shape(kind, tuple(filter(None, rings)), properties, place))
         else:
-            self.notes.append(f"an empty {kind} ignored")
+            self.left_out[f"an empty {kind}"] += 1
 
     def track(self, owner: Element) -> tuple[Position, ...]:
         """Read the places of a gx:Track; its times are not used."""

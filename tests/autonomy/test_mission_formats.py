@@ -52,7 +52,7 @@ from tests.autonomy.mission_texts import (
     lon_lat,
     plan,
 )
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 
 TRACK = "".join(f"<trkseg>{gpx_points('trkpt', part)}</trkseg>" for part in (ROUTE[:2], ROUTE[2:]))
 PLACES = "".join(
@@ -129,6 +129,14 @@ def test_a_fence_stays_where_a_hole_of_it_is_empty() -> None:
     outer = f"<outerBoundaryIs>{RING}</outerBoundaryIs>"
     for data in (drawn, kml(f"{WAY}<Placemark><Polygon>{outer}{EMPTY_HOLE}</Polygon></Placemark>")):
         assert [(len(fence.corners), fence.keep_out) for fence in good(data).mission.fences] == [(4, False)]
+
+
+def test_empty_features_are_counted_in_one_note() -> None:
+    nothing = {"type": "Feature", "properties": {}, "geometry": None}
+    drawn = collection(line(), *[nothing] * 40, *[feature("Polygon", [])] * 30)
+    assert [numbers_in(note) for note in good(drawn).notes] == [[40], [30]]
+    point = "<Placemark><Point><coordinates/></Point></Placemark>"
+    assert [numbers_in(note) for note in good(kml(WAY + 20 * point)).notes] == [[20]]
 
 
 def test_a_hole_in_nothing_is_no_fence() -> None:
