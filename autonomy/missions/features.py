@@ -177,7 +177,7 @@ class _Reader:
     def fences(self, shape: Shape, keep_out: bool, first: int) -> list[Fence]:
         fences = []
         for number, ring in enumerate(shape.rings, first):
-            open_ring = ring[:-1] if len(ring) > 1 and _same(ring[0], ring[-1]) else ring
+            open_ring = ring[:-1] if len(ring) > 1 and same_place(ring[0], ring[-1]) else ring
             ordered = _counter_clockwise(open_ring)
             corners = tuple(self.point(("corner", number, i), position) for i, position in enumerate(ordered))
             self.draft.places[("fence", number)] = shape.place
@@ -259,7 +259,8 @@ def _abbreviated(value: object) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
-def _same(a: Position, b: Position) -> bool:
+def same_place(a: Position, b: Position) -> bool:
+    """Tell whether two positions have the same latitude and longitude."""
     return (a.latitude_deg, a.longitude_deg) == (b.latitude_deg, b.longitude_deg)
 
 
@@ -291,4 +292,4 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-__all__ = ["ROLES", "Draft", "Key", "MissionError", "Position", "Shape", "assemble", "merged"]
+__all__ = ["ROLES", "Draft", "Key", "MissionError", "Position", "Shape", "assemble", "merged", "same_place"]

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.missions.features import ROLES, Draft, Position, Shape, assemble
+from autonomy.missions.features import ROLES, Draft, Position, Shape, assemble, same_place
 from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.model import MAX_LOGS, MAX_WAYPOINTS, Point
 from autonomy.missions.source import Place, Source
@@ -145,14 +145,15 @@ class Gaps:
         self.found: list[tuple[float, Place]] = []
 
     def joined(self, segments: Iterable[tuple[Position, ...]]) -> tuple[Position, ...]:
-        """Join all segments to one line."""
+        """Join all segments to one line; the place where one ends and the next begins is one waypoint."""
         line: list[Position] = []
         for segment in segments:
             if line and segment:
                 gap_m = _distance_m(line[-1], segment[0])
                 if gap_m > MAX_GAP_M:
                     self.found.append((gap_m, segment[0].place))
-            line += segment
+            met = bool(line and segment) and same_place(line[-1], segment[0])
+            line += segment[1:] if met else segment
         return tuple(line)
 
     def tell(self, draft: Draft) -> None:

@@ -55,6 +55,11 @@ from tests.autonomy.mission_texts import (
 from tests.codes import coded, numbers_in
 
 TRACK = "".join(f"<trkseg>{gpx_points('trkpt', part)}</trkseg>" for part in (ROUTE[:2], ROUTE[2:]))
+MEETING = "".join(f"<trkseg>{gpx_points('trkpt', part)}</trkseg>" for part in (ROUTE[:2], ROUTE[1:]))
+TRACKS = "".join(
+    f"<Track>{''.join(f'<coord>{p.longitude_deg!r} {p.latitude_deg!r} 0</coord>' for p in part)}</Track>"
+    for part in (ROUTE[:2], ROUTE[1:])
+)
 PLACES = "".join(
     f"<Placemark><Point><coordinates>{kml_coordinates([p])}</coordinates></Point></Placemark>" for p in ROUTE
 )
@@ -71,6 +76,8 @@ SAME = {
     "plan": plan([item(p) for p in ROUTE]),
     "gpx route": GPX,
     "gpx track": gpx(f"<trk>{TRACK}</trk>"),
+    "gpx segments that meet": gpx(f"<trk>{MEETING}</trk>"),
+    "kml segments that meet": kml(f"<Placemark><MultiTrack>{TRACKS}</MultiTrack></Placemark>"),
     "gpx waypoints": gpx(gpx_points("wpt")),
     "kml line": KML,
     "kml points": kml(f"<Folder>{PLACES}</Folder>"),
