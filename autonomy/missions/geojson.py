@@ -43,7 +43,9 @@ def _check_crs(document: dict[str, Any], source: Source) -> None:
     if crs is None:
         return
     crs_name = crs.get("properties", crs) if isinstance(crs, dict) else crs
-    named = str(crs_name.get("name", crs_name)) if isinstance(crs_name, dict) else str(crs_name)
+    if isinstance(crs_name, dict):
+        crs_name = crs_name.get("name", f"EPSG:{crs_name['code']}" if "code" in crs_name else crs_name)
+    named = str(crs_name)
     if not any(word in named.lower() for word in _WGS84):
         raise source.error(
             "mission.datum",

@@ -413,6 +413,8 @@ def test_wrong_datum() -> None:
     assert (problem.code, problem.place) == ("mission.datum", "m:3")
     for name in ("urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326"):
         good(collection(line(), crs={"type": "name", "properties": {"name": name}}))
+    good(collection(line(), crs={"type": "EPSG", "properties": {"code": 4326}}))
+    assert codes(collection(line(), crs={"type": "EPSG", "properties": {"code": 3006}})) == ["datum"]
 
 
 @pytest.mark.parametrize("longitude", [180.0, -180.0, 179.9999, -179.9999])
