@@ -307,7 +307,7 @@ class _Kml:
             line += text.count("\n", at, word.start())
             at = word.start()
             parts = word[0].split(",")
-            if not 2 <= len(parts) <= 3 or not parts[0]:
+            if not 2 <= len(parts) <= 3 or not all(parts[:2]):
                 sentence = f'"{word[0][:40]}" is not a position; write longitude,latitude[,height] without spaces'
                 raise self.source.error("kml.position", line, sentence)
             line_positions.append(self.position(parts, line))

@@ -62,6 +62,10 @@ REFUSED = {
         kml("<Placemark><LineString><coordinates>1,2 inf,3</coordinates></LineString></Placemark>"),
         "non-finite-coordinate",
     ),
+    "a blank after a comma in a KML": (
+        kml("<Placemark><LineString><coordinates>1, 2, 0 3, 4, 0</coordinates></LineString></Placemark>"),
+        "kml.position",
+    ),
     "a decimal comma": (gpx('<rte><rtept lat="63,65" lon="19.8"/></rte>'), "decimal-comma"),
     "a word": (gpx('<rte><rtept lat="north" lon="19.8"/></rte>'), "number"),
     "no longitude": (gpx('<rte><rtept lat="63.1"/></rte>'), "gpx.missing-coordinate"),
