@@ -65,7 +65,7 @@ def _read_unpacked(data: bytes, name: str) -> Draft:
         raise MissionError("mission.empty-file", "is empty", name)
     if start.startswith(_XML_BEGINS):
         return _read_xml(data, name)
-    if start.startswith(b"{"):
+    if start.startswith((b"{", b"[")):
         return _read_json(data, name)
     raise MissionError(
         "mission.unknown-format",
@@ -76,8 +76,9 @@ def _read_unpacked(data: bytes, name: str) -> Draft:
 
 def _read_json(data: bytes, name: str) -> Draft:
     document, source = json_document(data, name)
-    if not isinstance(document, dict):  # pragma: no cover - an object begins with a brace
-        raise source.error("mission.no-object", None, "is not a JSON object")
+    if not isinstance(document, dict):
+        sentence = "is a JSON list; a mission is one object, such as a GeoJSON FeatureCollection"
+        raise source.error("mission.no-object", None, sentence)
     members: dict[str, Any] = document
     return qgc_plan.read(members, source) if members.get("fileType") == "Plan" else geojson.read(members, source)
 

@@ -85,6 +85,7 @@ REFUSED = {
     "a zip file's head": (b"PK\x03\x04rest", "archive-damaged"),
     "a web page": (b"<html><body/></html>", "unknown-xml"),
     "an old plan": (b"QGC WPL 110\n", "unknown-format"),
+    "a list": (b"[[19.9, 63.6], [19.9, 63.7]]", "no-object"),
     "no features": (collection(), "no-waypoints"),
     "an empty line": (collection(feature("LineString", [])), "no-waypoints"),
     "an empty route": (gpx("<rte/>"), "no-waypoints"),
