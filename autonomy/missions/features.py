@@ -143,7 +143,7 @@ def merged(route: Draft, harvest: Draft) -> Draft:
 def _role(shape: Shape, problems: list[tuple[Place, str, str]]) -> str:
     """Return the role of a shape; "" for a point without one."""
     role = shape.properties.get("role")
-    if role is None:
+    if role is None or role == "":
         return {"point": "", "line": "route", "polygon": "fence"}[shape.kind]
     if role not in ROLES:
         sentence = f"role {_abbreviated(role)} is unknown; use one of {', '.join(ROLES)}"

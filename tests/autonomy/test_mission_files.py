@@ -449,6 +449,7 @@ def test_duplicated_waypoints() -> None:
     good(collection(line([*ROUTE, ROUTE[0]])))  # a closed lap has none
 
 
-def test_a_point_beside_a_route_is_a_note() -> None:
-    draft = good(collection(line(), feature("Point", lon_lat(ROUTE)[0])))
+@pytest.mark.parametrize("role", [{}, {"role": None}, {"role": ""}], ids=["none", "null", "empty"])
+def test_a_point_beside_a_route_is_a_note(role: dict[str, str | None]) -> None:
+    draft = good(collection(line(**role), feature("Point", lon_lat(ROUTE)[0], **role)))
     assert [numbers_in(note) for note in draft.notes] == [[1]]
