@@ -24,6 +24,7 @@ from autonomy.missions.model import (
     Options,
     Point,
     Problem,
+    all_points,
     is_product_key,
 )
 from autonomy.missions.source import Place, Source
@@ -130,7 +131,7 @@ def merged(route: Draft, harvest: Draft) -> Draft:
     """Return the route's mission with the logs of another file added."""
     both = (*route.mission.logs, *harvest.mission.logs)
     fields = {name: getattr(route.mission, name) for name in ("name", "waypoints", "fences", "landings", "options")}
-    return Draft(
+    draft = Draft(
         ForwardingMission(**fields, logs=both),
         route.source,
         route.format,
@@ -138,6 +139,12 @@ def merged(route: Draft, harvest: Draft) -> Draft:
         [*route.notes, *harvest.notes],
         [*route.warnings, *harvest.warnings],
     )
+    if not harvest.mission.logs:
+        sentence = 'no log is added from this file; in GeoJSON and KML a log is a point with the role "log"'
+        draft.warnings.append(Problem("mission.no-logs-added", sentence, harvest.source.name))
+    elif all_points(harvest.mission)[len(harvest.mission.logs) :]:
+        draft.notes.append(f"{harvest.source.name}: only its logs are added, no route, fence or landing")
+    return draft
 
 
 def _role(shape: Shape, problems: list[tuple[Place, str, str]]) -> str:

@@ -179,6 +179,21 @@ def test_a_saved_mission_is_read_back(tmp_path: Path) -> None:
         save_mission(tmp_path / "none" / "m.geojson", mission)
 
 
+def test_what_is_added_from_a_file_of_logs(tmp_path: Path) -> None:
+    way, added = tmp_path / "way.geojson", tmp_path / "logs.geojson"
+    way.write_bytes(collection(line()))
+    spot, landing = lon_lat([at(4, 3), at(8, 3)])
+    for features, logs, warned, notes in (
+        ([feature("Point", spot)], 0, ["mission.no-logs-added"], 0),
+        ([feature("Point", spot, role="log")], 1, [], 0),
+        ([feature("Point", spot, role="log"), feature("Point", landing, role="landing")], 1, [], 1),
+    ):
+        added.write_bytes(collection(*features))
+        draft = load_mission(way, logs=added)
+        assert len(draft.mission.logs) == logs and draft.mission.landings == ()
+        assert ([problem.code for problem in draft.warnings], len(draft.notes)) == (warned, notes)
+
+
 def test_altitude_present_and_absent() -> None:
     heights = [[*p, 12.5] for p in lon_lat(ROUTE)]
     mission = good(collection(feature("LineString", heights))).mission
