@@ -17,6 +17,7 @@ from autonomy.missions.features import Draft, Key
 from autonomy.missions.gpx_kml import decimal
 from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point, is_product_key
 from autonomy.missions.source import Place, Source
+from autonomy.missions.validation import LENGTHS_M
 from autonomy.missions.xml_tree import ANY, Element, tree
 from runtime.errors import InputRefused
 
@@ -77,14 +78,14 @@ def read_hpr(data: bytes, name: str) -> Draft:
     if root.attributes.get("messageType", "hpr") != "hpr":
         sentence = f"message type {root.attributes['messageType'][:20]!r}; logs come from an hpr"
         raise source.error("hpr.message-type", root.line, sentence)
-    for name, unit in _UNITS.items():
-        given = root.attributes.get(name, unit)
+    for attribute, unit in _UNITS.items():
+        given = root.attributes.get(attribute, unit)
         if given.strip().lower() != unit:
-            sentence = f'{name} is "{given[:20]}"; StanForD 2010 has {unit}, so export the file anew'
+            sentence = f'{attribute} is "{given[:20]}"; StanForD 2010 has {unit}, so export the file anew'
             raise source.error("hpr.unit", root.line, sentence)
     logs: list[KnownLog] = []
     places: dict[Key, Place] = {}
-    lost = several = unnamed = 0
+    lost = several = unnamed = cut_offs = 0
     title = ""
     for machine in root.all("Machine"):
         title = title or machine.value("ObjectDefinition", "ObjectName")
@@ -99,11 +100,15 @@ def read_hpr(data: bytes, name: str) -> Draft:
                 if at is None:
                     lost += len(log_elements)
                     continue
-                for log in log_elements:
-                    several += len(list(log.all("LogMeasurement"))) > 1
-                    places[("log", len(logs))] = log.line
-                    logs.append(_log(log, stem, *at, species, products, source))
-                    unnamed += bool(log.value("ProductKey")) and logs[-1].product_key is None
+                for element in log_elements:
+                    log = _log(element, stem, *at, species, products, source)
+                    if log.length_m is not None and log.length_m < LENGTHS_M[0]:
+                        cut_offs += 1
+                        continue
+                    several += len(list(element.all("LogMeasurement"))) > 1
+                    unnamed += bool(element.value("ProductKey")) and log.product_key is None
+                    places[("log", len(logs))] = element.line
+                    logs.append(log)
     draft = Draft(ForwardingMission(title, logs=tuple(logs)), source, HPR, places)
     if lost:
         sentence = f"{lost} logs of stems without coordinates are left out; the machine is not told of them"
@@ -114,6 +119,8 @@ def read_hpr(data: bytes, name: str) -> Draft:
         draft.notes.append(
             f"{several} logs were measured more than once; one measurement is read, the harvester's if it is marked"
         )
+    if cut_offs:
+        draft.notes.append(f"{cut_offs} cut-offs shorter than {LENGTHS_M[0]:g} m are left out")
     if unnamed:
         draft.notes.append(
             f"{unnamed} logs have a product key that is no integer from 1; the report will not name their product"

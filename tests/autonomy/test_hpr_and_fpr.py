@@ -113,6 +113,13 @@ def test_two_measurements_of_a_log_are_not_mixed() -> None:
     assert [numbers_in(note) for note in draft.notes] == [[1]]
 
 
+@pytest.mark.parametrize("length_cm", ["0", "12"])
+def test_a_cut_off_is_left_out(length_cm: str) -> None:
+    draft = read(TEXT.replace("<LogLength>300<", f"<LogLength>{length_cm}<", 1).encode(), "h")
+    assert len(draft.mission.logs) == len(LOGS) - 1 and numbers_in(draft.notes[0])[0] == 1
+    assert [place for place in draft.places if place[0] == "log"] == [("log", i) for i in range(len(LOGS) - 1)]
+
+
 @pytest.mark.parametrize("key", ["0", "-1", "31.5", "99999999999"])
 def test_a_product_key_that_no_mission_holds_is_left_out(key: str) -> None:
     draft = read(TEXT.replace("<ProductKey>31<", f"<ProductKey>{key}<").encode(), "h")
