@@ -138,6 +138,10 @@ def _run() -> None:
     """
     try:
         app()
+    except SystemExit as end:
+        if isinstance(end.__context__, typer.Abort):  # Ctrl-C or the end of the input at a question: Typer says 1
+            sys.exit(ExitCode.INTERRUPTED)
+        raise
     except ModuleNotFoundError as error:
         if (extra := _extra_with(error.name or "")) is None:
             raise

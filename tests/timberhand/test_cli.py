@@ -6,6 +6,7 @@ import pickle
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 import deploy.__main__ as installer
 from experiments.common.result import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.cli import app
+from timberhand.cli import _run, app
 from timberhand.commands.runs import new_directory
 from timberhand.reference import __main__
 from timberhand.reference.__main__ import REPOSITORY
@@ -71,6 +72,21 @@ def test_the_last_run_is_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for number in (1, 2):
         assert new_directory("a") == Path(f"runs/a-{number}")
         assert Path("runs/LAST").resolve().name == f"a-{number}"
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, EOFError])
+def test_a_question_that_is_interrupted_ends_as_interrupted(
+    end: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(*_: object) -> str:
+        raise end
+
+    monkeypatch.setattr("sys.argv", ["timberhand", "operator", "password", "anna", "--role", "viewer", "--file", "x"])
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr("typer._click.termui.hidden_prompt_func", ended)
+    with pytest.raises(SystemExit) as done:
+        _run()
+    assert done.value.code == ExitCode.INTERRUPTED
 
 
 @pytest.mark.parametrize(
