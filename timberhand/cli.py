@@ -7,6 +7,7 @@ Every command group lives in a module of ``timberhand.commands`` that imports no
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -136,6 +137,8 @@ def _run() -> None:
     Raises:
         CommandFailed: an optional package is missing.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file's name may be no text, and a terminal may lack a sign
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         app()
     except SystemExit as end:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
@@ -72,6 +73,18 @@ def test_the_last_run_is_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for number in (1, 2):
         assert new_directory("a") == Path(f"runs/a-{number}")
         assert Path("runs/LAST").resolve().name == f"a-{number}"
+
+
+def test_a_sign_that_the_output_lacks_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text("gain = 1\n")
+    two.write_text("gain = 2\n")
+    output = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(output, "ascii", write_through=True))
+    monkeypatch.setattr("sys.argv", ["timberhand", "config", "diff", str(one), str(two)])
+    with pytest.raises(SystemExit):
+        _run()
+    assert output.getvalue() == b"gain: 1 \\u2192 2\n"
 
 
 @pytest.mark.parametrize("end", [KeyboardInterrupt, EOFError])
