@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import deploy.__main__ as installer
 from experiments.common.result import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
+from tests.codes import coded
 from timberhand.cli import _run, app
 from timberhand.commands.runs import new_directory
 from timberhand.reference import __main__
@@ -73,6 +74,15 @@ def test_the_last_run_is_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for number in (1, 2):
         assert new_directory("a") == Path(f"runs/a-{number}")
         assert Path("runs/LAST").resolve().name == f"a-{number}"
+
+
+@pytest.mark.parametrize("place", ["runs", "runs/LAST/run"])
+def test_a_run_that_cannot_be_kept_is_said(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(place).parent.mkdir(parents=True, exist_ok=True)
+    Path(place).touch()
+    with pytest.raises(CommandFailed, check=coded("runs.not-made")):
+        new_directory("a")
 
 
 def test_a_sign_that_the_output_lacks_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

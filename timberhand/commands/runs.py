@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 
+from host.exit_codes import CommandFailed
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -109,17 +111,26 @@ def end(summary: Summary | MissionSummary, screen: Console, directory: Path, as_
 
 
 def new_directory(name: str) -> Path:
-    """Make ``runs/<name>-<n>`` with the first free n, and point ``runs/LAST`` at it; safe for concurrent runs."""
+    """Make ``runs/<name>-<n>`` with the first free n, and point ``runs/LAST`` at it; safe for concurrent runs.
+
+    Raises:
+        CommandFailed: it cannot be made.
+    """
     runs = Path("runs")
-    runs.mkdir(exist_ok=True)
-    for number in count(1):
-        directory = runs / f"{name}-{number}"
-        try:
-            directory.mkdir()
-        except FileExistsError:
-            continue
-        break
-    link = runs / f".LAST-{directory.name}"
-    link.symlink_to(directory.name)
-    link.replace(runs / "LAST")
+    try:
+        runs.mkdir(exist_ok=True)
+        for number in count(1):
+            directory = runs / f"{name}-{number}"
+            try:
+                directory.mkdir()
+            except FileExistsError:
+                continue
+            break
+        link = runs / f".LAST-{directory.name}"
+        link.symlink_to(directory.name)
+        link.replace(runs / "LAST")
+    except OSError as error:
+        raise CommandFailed(
+            "runs.not-made", f"no run can be kept below {runs.absolute()}: {error.strerror}; start it in another folder"
+        ) from None
     return directory
