@@ -85,6 +85,11 @@ def test_a_run_that_cannot_be_kept_is_said(place: str, tmp_path: Path, monkeypat
         new_directory("a")
 
 
+def test_a_page_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    refused = CliRunner().invoke(app, ["mission", "states", "--docs", str(tmp_path / "none")]).exception
+    assert isinstance(refused, CommandFailed) and refused.code == "mission.page-not-written"
+
+
 def test_a_sign_that_the_output_lacks_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = tmp_path / "one.toml", tmp_path / "two.toml"
     one.write_text("gain = 1\n")

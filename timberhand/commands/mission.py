@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from host.exit_codes import CommandFailed
 from timberhand.commands.options import (
     LIVE_ONLY,
     FoxglovePortOption,
@@ -261,5 +262,11 @@ def states(
     if docs is None:
         print(page())
         return
-    (docs / "activity.md").write_text(page())
-    print(f"written: {docs / 'activity.md'}")
+    path = docs / "activity.md"
+    try:
+        path.write_text(page())
+    except OSError as error:
+        raise CommandFailed(
+            "mission.page-not-written", f"{path} cannot be written ({error.strerror}); name a folder with --docs"
+        ) from None
+    print(f"written: {path}")
