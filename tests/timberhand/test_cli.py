@@ -90,6 +90,23 @@ def test_a_page_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     assert isinstance(refused, CommandFailed) and refused.code == "mission.page-not-written"
 
 
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["--out", "mine"], "calibrate.output-name"),
+        (["--out", "file/mine.toml"], "calibrate.no-folder"),
+        (["--out", "mine.toml", "--report", "file"], "calibrate.no-folder"),
+    ],
+)
+def test_a_calibration_that_could_not_be_kept_does_not_begin(
+    words: list[str], code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    refused = CliRunner().invoke(app, ["calibrate", "--profile", "palms_471", "--lockstep", *words]).exception
+    assert isinstance(refused, CommandFailed) and refused.code == code
+
+
 def test_a_sign_that_the_output_lacks_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = tmp_path / "one.toml", tmp_path / "two.toml"
     one.write_text("gain = 1\n")

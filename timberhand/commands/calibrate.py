@@ -76,7 +76,18 @@ def calibrate(
         raise CommandFailed(
             "calibrate.output-exists", f"{out} exists and is not overwritten; choose another --out", ExitCode.USAGE
         )
+    if out.suffix != ".toml":
+        raise CommandFailed(
+            "calibrate.output-name", f"{out} has no name of a profile; call it {out.name}.toml", ExitCode.USAGE
+        )
     folder, chosen = report or out.with_suffix(""), _chosen(joint)
+    try:
+        for needed in (out.parent, folder):
+            needed.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CommandFailed(
+            "calibrate.no-folder", f"{needed} cannot be made: {error.strerror}; choose another --out or --report"
+        ) from None
     screen = Console(stderr=True)
     if lockstep:
         truth = truth_of(profile, truth)
