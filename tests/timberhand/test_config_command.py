@@ -109,6 +109,15 @@ def test_diff_compares_values_and_not_layout(tmp_path: Path) -> None:
     assert RUNNER.invoke(app, ["config", "diff", str(one), str(one)]).exit_code == 0
 
 
+def test_diff_names_the_file_that_is_broken(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text("gain = 2\n")
+    two.write_text("gain =\n")
+    refused = RUNNER.invoke(app, ["config", "diff", str(one), str(two)]).exception
+    assert isinstance(refused, TimberhandError) and refused.code == "settings.broken-toml"
+    assert str(two) in str(refused) and str(one) not in str(refused)
+
+
 def test_migrate_keeps_values_takes_this_release_s_words_and_leaves_the_old_file(tmp_path: Path) -> None:
     old = "PROFILE=aoro_fc8\nKEY_OPTIONS=--key-file /etc/timberhand/key\nMACHINE_BUS=socketcan:mach0\n"
     new, notes = migrated(old, TEXT)

@@ -96,14 +96,9 @@ def diff(
 
       timberhand config diff machine/palms_471.toml calibrated.toml
     """
-    import tomllib
-
     from timberhand.configuration.settings_file import differences
 
-    try:
-        changes = differences(first, second)
-    except tomllib.TOMLDecodeError as error:
-        raise CommandFailed("config.broken-toml", f"broken TOML: {error}") from None
+    changes = differences(first, second)
     if as_json:
         print(json.dumps([{"key": key, "first": a, "second": b} for key, a, b in changes], indent=2, default=str))
     else:

@@ -161,7 +161,10 @@ def _flat(path: Path) -> dict[str, Any]:
     if path.suffix != ".toml":
         return {name: setting.value for name, setting in parse(text, []).items()}
     values: dict[str, Any] = {}
-    _flatten(tomllib.loads(text), "", values)
+    try:
+        _flatten(tomllib.loads(text), "", values)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError("settings.broken-toml", f"{path} is no TOML file: {error}") from None
     return values
 
 
