@@ -162,7 +162,7 @@ def check(folder: Path, public: Path) -> Release:
     """
     if not (folder / SUMS).is_file():
         raise CommandFailed(
-            "bundle.no-sums", f"{folder} holds no {SUMS}, so it is no bundle; name the file that `make bundle` made"
+            "bundle.no-sums", f"the bundle holds no {SUMS}, so it is none; name the file that `make bundle` made"
         )
     verify(folder / SUMS, public)
     listed = sums.decode((folder / SUMS).read_text(), str(folder / SUMS))

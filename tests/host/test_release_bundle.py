@@ -174,3 +174,9 @@ def test_what_is_no_wheel_and_what_is_no_bundle_is_one_sentence(tmp_path: Path) 
         bundles.unpack(tmp_path / "text", tmp_path / "nothing")
     with pytest.raises(CommandFailed, check=coded("bundle.unreadable")):
         bundles.unpack(tmp_path / "none.tar", tmp_path / "none")
+
+
+def test_a_folder_that_is_no_bundle_is_not_read_through(tmp_path: Path) -> None:
+    (tmp_path / "dangling").symlink_to("nowhere")
+    refused = RUNNER.invoke(app, ["release", "verify", str(tmp_path)]).exception
+    assert isinstance(refused, CommandFailed) and refused.code == "bundle.no-sums"

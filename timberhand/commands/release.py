@@ -102,7 +102,8 @@ def verify(
     from host.release.updater import SIGNER
 
     with tempfile.TemporaryDirectory(prefix="timberhand-") as folder:
-        bundle_folder = Path(folder, "bundle")
-        bundles.unpack(bundle, bundle_folder)
+        bundle_folder = bundle if bundle.is_dir() else Path(folder, "bundle")
+        if bundle_folder is not bundle:
+            bundles.unpack(bundle, bundle_folder)
         release = bundles.check(bundle_folder, public_key or SIGNER)
     print(f"{release.name}, for {release.machine}: signature and every file are good")
