@@ -73,3 +73,13 @@ def test_an_option_without_effect_is_refused(words: tuple[str, ...], option: str
     done = CliRunner().invoke(app, [*words, option, *VALUES[option]])
     assert isinstance(done.exception, CommandFailed), done.output
     assert (done.exception.code, done.exception.exit_code) == ("option.no-effect", ExitCode.USAGE)
+
+
+def test_a_port_that_no_computer_has_is_refused_at_once() -> None:
+    ports = [
+        (*words, option.opts[0], getattr(option, "max", None))
+        for words, command in ALL.items()
+        for option in command.params
+        if option.opts[0].endswith(("-port", "--foxglove"))
+    ]
+    assert ports and not [port for port in ports if port[-1] != 65535]

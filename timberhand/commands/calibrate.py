@@ -38,7 +38,7 @@ def calibrate(
         list[str] | None, typer.Option(help="Test this joint only, after its valve was replaced; may be repeated.")
     ] = None,
     controller: Annotated[str, typer.Option(help="HOST:PORT of the controller's setpoint port.")] = "127.0.0.1:47001",
-    report_port: Annotated[int, typer.Option(help="Local UDP port for the state reports.")] = 47002,
+    report_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port for the state reports.")] = 47002,
     bus: Annotated[str, typer.Option(help="Bus of the crane, as in socketcan:can0; read only.")] = "wire:crane0",
     key_file: Annotated[Path | None, typer.Option(help="File with the key that authenticates datagrams.")] = None,
     lease_ms: Annotated[int, typer.Option(help="Lease of a setpoint in ms.")] = 200,

@@ -14,8 +14,11 @@ DEFAULT_PROFILE: Final = "palms_471"
 
 
 def console(
-    port: Annotated[int, typer.Option(help="Port of the page.")] = 8471,
-    report_port: Annotated[int, typer.Option(help="UDP port that receives the controller's state reports.")] = 8472,
+    context: typer.Context,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page.")] = 8471,
+    report_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="UDP port that receives the controller's state reports.")
+    ] = 8472,
     profile: ProfileOption = DEFAULT_PROFILE,
     operator: Annotated[
         Path | None,
@@ -43,7 +46,13 @@ def console(
         typer.Option(metavar="NAME=ADDRESS", help="Bus whose frames the page may show; may be repeated."),
     ] = None,
     foxglove: Annotated[
-        int | None, typer.Option(metavar="PORT", help="Port that serves the run to Foxglove and Lichtblick, read-only.")
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            metavar="PORT",
+            help="Port that serves the run to Foxglove and Lichtblick, read-only.",
+        ),
     ] = None,
     controller: Annotated[
         str | None,

@@ -176,7 +176,7 @@ def run(
     end(summary, screen, directory, as_json)
 
 
-OrderPortOption = Annotated[int, typer.Option(help="The planner's --order-port on this computer.")]
+OrderPortOption = Annotated[int, typer.Option(min=1, max=65535, help="The planner's --order-port on this computer.")]
 KeyOption = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Key of the planner (default: that of the installed services).")
 ]

@@ -44,11 +44,17 @@ TruthOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
 PageOption = Annotated[bool, typer.Option("--console/--no-console", help="Serve the operator's page (live).")]
-PagePortOption = Annotated[int, typer.Option("--console-port", help="Port of the operator's page on localhost.")]
+PagePortOption = Annotated[
+    int, typer.Option("--console-port", min=0, max=65535, help="Port of the operator's page on localhost.")
+]
 FoxglovePortOption = Annotated[
     int,
     typer.Option(
-        "--foxglove", metavar="PORT", help="Also serve the run to Foxglove and Lichtblick, read-only (live; 0: not)."
+        "--foxglove",
+        min=0,
+        max=65535,
+        metavar="PORT",
+        help="Also serve the run to Foxglove and Lichtblick, read-only (live; 0: not).",
     ),
 ]
 MaxStopsOption = Annotated[

@@ -25,7 +25,9 @@ def record(
         list[str] | None,
         typer.Option(help="NAME=ADDRESS of a bus; may be repeated (default: the buses of the profile)."),
     ] = None,
-    report_port: Annotated[int, typer.Option(help="UDP port of the controller's state reports.")] = 8474,
+    report_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="UDP port of the controller's state reports.")
+    ] = 8474,
     profile: ProfileOption = "palms_471",
     ticks: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Ring of the controller's tick records in shared memory.")

@@ -40,7 +40,7 @@ def view(
     scene: SceneOption = Scene.RANDOM,
     terrain: TerrainOption = Terrain.FLAT,
     truth: TruthOption = "nominal",
-    port: Annotated[int, typer.Option(help="Port of the page on localhost.")] = 8471,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on localhost.")] = 8471,
 ) -> None:
     """Serve a live three-dimensional view of the plant with its pressures and hand levers, for the browser.
 

@@ -30,7 +30,7 @@ def why(
     page: Annotated[
         bool, typer.Option("--page", help="Show the newest stop in the operator's page, from 10 s before it.")
     ] = False,
-    port: Annotated[int, typer.Option(help="Port of the page.")] = 8471,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page.")] = 8471,
     as_json: JsonOption = False,
 ) -> None:
     """Explain the last stop: code, sentence, numbers, what to do, and what happened before it.
