@@ -25,9 +25,33 @@ VALUES = {
     "--max-stops": ("3",),
     "--plc-link": ("modbus",),
     "--plc-role": ("valves",),
+    "--all": (),
+    "--data": ("samples",),
+    "--minutes": ("5",),
+    "--repetitions": ("5",),
+    "--count": (),
+    "--cpu": ("0",),
+    "--i-know": (),
+    "--json": (),
+    "--key-file": ("key",),
+    "--lease-ms": ("100",),
+    "--operator": ("socket",),
+    "--out": ("out.md",),
+    "--part": ("lift",),
+    "--passwords": ("accounts",),
+    "--plot": ("why.png",),
+    "--port": ("8000",),
+    "--profile": ("aoro_fc8",),
+    "--rounds": ("9",),
+    "--run": ("runs/LAST",),
+    "--seconds": ("5",),
+    "--seed": ("3",),
+    "--ticks": ("9",),
+    "--truth": ("nominal",),
+    "--urdf-joints": ("slew=q1",),
 }
 """A value for each option that some mode has no use for."""
-LIVE = tuple(option for option in VALUES if not option.startswith(("--plc", "--camera")))
+LIVE = ("--bus", "--clock", "--console", "--no-console", "--console-port", "--foxglove", "--max-stops")
 FILE = "docs/examples/paper_b.geojson"
 USELESS = {
     ("demo", "--lockstep"): (*LIVE, "--plc-link"),
@@ -39,6 +63,22 @@ USELESS = {
     ("mission", "run", FILE, "--lockstep"): LIVE,
     ("mission", "run", FILE): ("--clock",),
     ("mission", "run", FILE, "--no-console"): ("--console-port",),
+    ("console", "--replay", "runs/LAST"): ("--operator", "--bus", "--passwords"),
+    ("why", "--page"): ("--all", "--plot", "--json"),
+    ("why",): ("--port",),
+    ("doctor",): ("--cpu", "--out", "--seconds", "--bus", "--profile"),
+    ("doctor", "--report"): ("--cpu", "--json"),
+    ("calibrate", "--profile", "palms_471"): ("--truth", "--seed"),
+    ("calibrate", "--profile", "palms_471", "--lockstep"): ("--bus", "--key-file", "--lease-ms"),
+    ("inject", "estop"): ("--profile", "--truth"),
+    ("inject", "encoder-stuck", "--joint", "lift"): ("--part",),
+    ("inject", "estop", "--lockstep"): ("--run", "--i-know"),
+    ("replay", "runs/LAST", "--contents"): ("--profile",),
+    ("machine", "new", "mine"): ("--urdf-joints",),
+    ("bench", "tick"): ("--seed",),
+    ("experiment", "plant"): ("--minutes", "--repetitions", "--bus", "--data"),
+    ("bench", "tick", "--count"): ("--rounds", "--seed"),
+    ("bench", "tick", "--random", "9"): ("--count", "--rounds", "--ticks"),
 }
 """What has no effect, by the words before it."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.exit_codes import ExitCode
-from timberhand.commands.options import JsonOption
+from timberhand.commands.options import JsonOption, refuse_without_effect
 
 if TYPE_CHECKING:
     from hil.tick.compare import Progress
@@ -42,6 +42,7 @@ def compile_tick(
 
 
 def tick(
+    context: typer.Context,
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[RECORDING]...", help="Runs, or their run.mcap (default: those kept with the tests)."),
@@ -94,6 +95,12 @@ def tick(
 
     if against and (random or counted):
         raise typer.BadParameter("--against compares costs; leave --random and --count out")
+    if random:
+        refuse_without_effect(context, ("counted", "rounds", "ticks"), "with --random")
+    else:
+        refuse_without_effect(context, ("seed",), "without --random")
+    if counted:
+        refuse_without_effect(context, ("rounds",), "with --count")
     key = compare.need_build()
     with tempfile.TemporaryDirectory() as folder:
         recording_paths = recordings or compare.kept_recordings(Path(folder))

@@ -13,7 +13,7 @@ import typer
 
 from host.exit_codes import CommandFailed, ExitCode
 from runtime.errors import InputRefused, LinkError
-from timberhand.commands.options import truth_of
+from timberhand.commands.options import refuse_without_effect, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 
 def calibrate(
+    context: typer.Context,
     profile: Annotated[str, typer.Option(help="Present machine profile: a shipped name or a TOML file.")],
     out: Annotated[Path, typer.Option(help="New TOML file: the calibrated profile.")] = Path("calibrated.toml"),
     report: Annotated[Path | None, typer.Option(help="Folder of the report (default: beside --out).")] = None,
@@ -71,6 +72,11 @@ def calibrate(
     from autonomy.calibration.result import identify
     from machine.loading.profile_file import carry_envelope, load_profile
 
+    if lockstep:
+        live_only = ("controller", "report_port", "bus", "key_file", "lease_ms")
+        refuse_without_effect(context, live_only, "with --lockstep")
+    else:
+        refuse_without_effect(context, ("truth", "seed"), "without --lockstep")
     known = load_profile(profile)
     if out.exists():
         raise CommandFailed(

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.commands.options import ProfileOption
+from timberhand.commands.options import ProfileOption, refuse_without_effect
 
 DEFAULT_PROFILE: Final = "palms_471"
 
@@ -96,6 +96,8 @@ def console(
     if replay is not None:
         from timberhand.replay_page import show_recording
 
+        read = {"replay", "profile", "port", "bind", "allow_host"}
+        refuse_without_effect(context, context.params.keys() - read, "with --replay")
         show_recording(
             replay, None if profile == DEFAULT_PROFILE else profile, port, bind=bind, allow_hosts=allow_host or ()
         )

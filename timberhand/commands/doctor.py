@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.commands.options import JsonOption
+from timberhand.commands.options import JsonOption, refuse_without_effect
 
 
 class LoopbackBus(StrEnum):
@@ -23,6 +23,7 @@ class LoopbackBus(StrEnum):
 
 
 def doctor(
+    context: typer.Context,
     rt: Annotated[
         bool, typer.Option("--rt", help="Also check the computer's real-time settings and suggest changes.")
     ] = False,
@@ -62,8 +63,12 @@ def doctor(
     from host.doctor.finding import Severity, conclusion, show
 
     if report:
+        refuse_without_effect(context, ("cpu", "as_json"), "with --report")
         _report(out, seconds, bus, profile)
         return
+    refuse_without_effect(context, ("out", "seconds", "bus", "profile"), "without --report")
+    if not rt:
+        refuse_without_effect(context, ("cpu",), "without --rt")
     groups = {"installation": installation.examine()}
     if rt:
         groups["timing"] = timing.evaluate(facts.read(Path("/"), _links(), cpu))

@@ -22,6 +22,7 @@ from timberhand.commands.options import (
     ProfileOption,
     TruthOption,
     check_foreign,
+    refuse_without_effect,
     truth_of,
 )
 
@@ -48,7 +49,17 @@ class Bus(StrEnum):
     VCAN = "vcan"
 
 
+READERS: Final = {
+    "minutes": ("soak", "faults"),
+    "repetitions": ("crane-accuracy",),
+    "bus": ("soak",),
+    "data": ("grasp-network", "detector"),
+}
+"""The experiments that read a parameter which the others have no use for."""
+
+
 def experiment(
+    context: typer.Context,
     name: Annotated[
         Name,
         typer.Argument(
@@ -120,6 +131,9 @@ def experiment(
     from experiments.common.standing import CHANGES, UNKNOWN
     from experiments.common.workers import Workers
 
+    if name.value != ALL:
+        useless = [parameter for parameter, readers in READERS.items() if name.value not in readers]
+        refuse_without_effect(context, useless, f"on {name.value}")
     if bus is Bus.VCAN and "TIMBERHAND_LAB" not in os.environ:
         from host.vcan_lab.__main__ import vcan
 

@@ -10,10 +10,11 @@ import typer
 
 from host.exit_codes import CommandFailed, ExitCode
 from runtime.errors import InputRefused
-from timberhand.commands.options import ProfileOption, TruthOption, truth_of
+from timberhand.commands.options import ProfileOption, TruthOption, refuse_without_effect, truth_of
 
 
 def inject(
+    context: typer.Context,
     name: Annotated[str, typer.Argument(help="A fault (encoder-stuck) or a component (encoder-lift).")] = "",
     word: Annotated[
         str, typer.Argument(help="off, stuck, garbage, wrong, slow, delayed or intermittent; for a component.")
@@ -57,6 +58,12 @@ def inject(
     if list_all or not name:
         _show(Console())
         return
+    if joint:
+        refuse_without_effect(context, ("part",), "with --joint")
+    if lockstep:
+        refuse_without_effect(context, ("run", "i_know"), "with --lockstep")
+    else:
+        refuse_without_effect(context, ("profile", "truth"), "without --lockstep")
     try:
         order = make(
             name,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from timberhand.commands.options import JsonOption
+from timberhand.commands.options import JsonOption, refuse_without_effect
 
 if TYPE_CHECKING:
     from timberhand.machine_files import Finding
@@ -37,6 +37,7 @@ def questions() -> None:
 
 @app.command()
 def new(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder for the files; it is made.")],
     answers: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Answers as TOML; without, and on a terminal, you are asked.")
@@ -69,6 +70,8 @@ def new(
     from timberhand.machine_files import check as check_files
     from timberhand.machine_files import make
 
+    if urdf is None:
+        refuse_without_effect(context, ("urdf_joints",), "without --urdf")
     described = {} if urdf is None else answers_from_urdf(urdf, _names(urdf_joints))
     if answers is not None:
         given = read_answers(answers)

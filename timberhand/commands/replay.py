@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.exit_codes import ExitCode
-from timberhand.commands.options import JsonOption
+from timberhand.commands.options import JsonOption, refuse_without_effect
 
 if TYPE_CHECKING:
     from hil.replay.replay import Result
 
 
 def replay(
+    context: typer.Context,
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Directory of a run, or its run.mcap.")],
     profile: Annotated[
         str | None, typer.Option(help="Profile of that run (default: the shipped profile named in it).")
@@ -37,6 +38,8 @@ def replay(
     from hil.replay.recording import contents as list_contents
     from hil.replay.recording import files_of, manifest_of
 
+    if contents:
+        refuse_without_effect(context, ("profile",), "with --contents")
     files = files_of(recording)
     if contents:
         manifest, counts = manifest_of(files), list_contents(files)

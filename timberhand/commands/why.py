@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.exit_codes import CommandFailed
-from timberhand.commands.options import JsonOption
+from timberhand.commands.options import JsonOption, refuse_without_effect
 
 if TYPE_CHECKING:
     from host.exit_codes import CommandFailed
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def why(
+    context: typer.Context,
     run: Annotated[
         Path | None,
         typer.Argument(
@@ -56,8 +57,10 @@ def why(
     from timberhand.why.stops import SERVICE_STOPS, newest_failure
 
     if page:
+        refuse_without_effect(context, ("every", "plot", "as_json"), "with --page")
         _open_page(run, port)
         return
+    refuse_without_effect(context, ("port",), "without --page")
     stops: list[dict[str, object]] | None = [] if as_json else None
     try:
         count, newest_utc_ns = _explain(run, every, plot, stops)
