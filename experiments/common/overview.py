@@ -56,9 +56,12 @@ def read(path: Path) -> Result:
     Raises:
         ValueError: the file is not a result.
     """
-    document = msgspec.json.decode(path.read_bytes())
-    document["metrics"] = {k: float("nan" if v is None else v) for k, v in document["metrics"].items()}
-    return msgspec.convert(document, Result)
+    try:
+        document = msgspec.json.decode(path.read_bytes())
+        document["metrics"] = {k: float("nan" if v is None else v) for k, v in document["metrics"].items()}
+        return msgspec.convert(document, Result)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no result ({type(error).__name__}: {error})") from None
 
 
 def page(results: Mapping[str, Result], pages: Collection[str], standings: Mapping[str, Standing]) -> str:

@@ -200,6 +200,15 @@ def test_a_saved_result_is_flat_without_nan_and_tells_never_from_not_measured(tm
     assert metrics["speed"] == math.inf and math.isnan(metrics["broken"]) and metrics["share"] == 0.5
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"metrics": [1]}', '{"metrics": {"speed": [1]}}'])
+def test_a_file_that_is_no_result_is_refused_by_its_name(text, tmp_path):
+    path = tmp_path / "plant.json"
+    path.write_text(text)
+    with pytest.raises(ValueError) as refused:
+        read(path)
+    assert str(path) in str(refused.value)
+
+
 def test_every_source_of_a_fingerprint_exists_and_a_missing_one_does_not_fail():
     assert all((ROOT / folder).is_dir() for folder in (*SOURCES, *ALL_SOURCES, *LOCKSTEP_SOURCES))
     assert source_hash("moved/elsewhere") == source_hash() != source_hash("controller")
