@@ -63,6 +63,16 @@ def test_learn_reads_the_shipped_demonstrations(tmp_path: Path) -> None:
     assert np.array(learned["out"]["weights"]) == pytest.approx(np.array(shipped["out"]["weights"]), rel=1e-3, abs=1e-3)
 
 
+def test_learn_says_when_the_plot_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise ValueError("Format 'xyz' is not supported")
+
+    monkeypatch.setattr("training.motion.primitives_plot.plot_primitives", refused)
+    words = ["plan", "learn", str(SHOWN), "--out", str(tmp_path / "learned.json"), "--plot", "learned.xyz"]
+    failed = CliRunner().invoke(app, words).exception
+    assert isinstance(failed, CommandFailed) and failed.code == "plan.plot-not-written"
+
+
 @pytest.mark.parametrize(
     ("name", "text", "code"),
     [

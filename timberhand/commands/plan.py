@@ -190,7 +190,10 @@ def learn(
     if plot is not None:
         from training.motion.primitives_plot import plot_primitives
 
-        plot_primitives(plot, machine, motions, primitives)
+        try:
+            plot_primitives(plot, machine, motions, primitives)
+        except (OSError, ValueError) as error:
+            raise CommandFailed("plan.plot-not-written", f"{plot}: cannot be written: {error}") from None
     facts = {
         "profile": machine.name,
         "motions": len(motions),
