@@ -30,7 +30,6 @@ from tests.codes import coded, numbers_in
 from tests.controller.bench import Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 from timberhand.cli import app
-from timberhand.commands.why import why
 from timberhand.replay_page import show_recording
 from timberhand.why.screen import show
 from timberhand.why.stops import find_stops
@@ -256,8 +255,8 @@ def test_a_stop_opens_ten_seconds_before(monkeypatch: pytest.MonkeyPatch, kept: 
 
 
 def test_a_run_without_a_stop_has_no_page_of_one(kept: Path) -> None:
-    with pytest.raises(CommandFailed, check=coded("why.no-stop")):
-        why(kept, page=True)
+    refused = CliRunner().invoke(app, ["why", str(kept), "--page"]).exception
+    assert isinstance(refused, CommandFailed) and refused.code == "why.no-stop"
 
 
 def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
