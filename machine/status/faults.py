@@ -43,7 +43,7 @@ _FAULTS: Final = {
         DEGRADE, 500, JOINT, "The encoder of {} is much noisier than it was, or than its profile says; half speed"
     ),
     Reason.ENCODER_DRIFT: Fault(
-        HOLD, 3000, JOINT, "{} creeps by its encoder while its valve is shut, and its law pulls it back again and again"
+        HOLD, 6000, JOINT, "{} creeps by its encoder while its valve is shut, and its law pulls it back again and again"
     ),
     Reason.ENCODER_ALARM: Fault(RAMP, 20, JOINT, "The encoder of {} reports an alarm"),
     Reason.POSITION_OUTSIDE: Fault(RAMP, 20, JOINT, "{} is outside its range"),
