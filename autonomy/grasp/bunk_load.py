@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import atan2, cos, hypot, pi, remainder, sin
+from math import atan2, cos, hypot, inf, pi, remainder, sin
 from typing import Final
 
 import numpy as np
@@ -95,14 +95,16 @@ class BunkLoad:
         i = int(self._hollow[np.argmin(np.abs(self._across - across_m))])
         return float(self._across[i]), float(self._bed[i])
 
-    def lowest_place(self, reach_m: float) -> RestingPlace:
+    def lowest_place(self, reach_m: float, highest_m: float = inf) -> RestingPlace:
         """Find the place at most ``reach_m`` from the middle where the log rests lowest.
 
-        Among equal places it prefers the one where the log rolls least, then the middle of an empty bunk or else the
-        place nearest to the stakes: a log there cannot roll, and the middle fills by itself.
+        A place where it may come to rest above ``highest_m`` is chosen only where there is no other.  Among equal
+        places it prefers the one where the log rolls least, then the middle of an empty bunk or else the place nearest
+        to the stakes: a log there cannot roll, and the middle fills by itself.
         """
         grid_indices = np.flatnonzero(np.abs(self._across) <= reach_m + 0.5 * GRID_M).tolist()
         resting_places = [(i, self._place(i)) for i in grid_indices] or [(0, self.place_at(0.0))]
+        resting_places = [item for item in resting_places if item[1].rest_z_m <= highest_m] or resting_places
         sign = 1.0 if self._empty else -1.0
 
         def cost(item: tuple[int, RestingPlace]) -> tuple[int, int, float]:
@@ -234,13 +236,15 @@ def plan_place(
     top, thickest = bunk.floor_z_m + bunk.stake_height_m, max(log.diameter_m for log in grasp.logs)
     taken = {log.id for log in grasp.logs}
     load = BunkLoad(bunk, [o for o in logs if o.id not in taken], thickest, grasp.log.length_m, arm.slope)
-    rest = load.lowest_place(bunk.width_m / 2 - max(thickest / 2 + STAKE_CLEARANCE_M, GRAPPLE_STAKE_CLEARANCE_M))
+    highest_m = top - BELOW_STAKE_TOP_M
+    reach_m = bunk.width_m / 2 - max(thickest / 2 + STAKE_CLEARANCE_M, GRAPPLE_STAKE_CLEARANCE_M)
+    rest = load.lowest_place(reach_m, highest_m)
     c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
     center_x, center_y = bunk.center_m[0] - rest.across_m * s, bunk.center_m[1] + rest.across_m * c
     if job.place_m is not None:
         center_x, center_y = job.place_m
         rest = load.place_at(point_in_bunk(bunk, *job.place_m)[1])
-    if rest.rest_z_m > top - BELOW_STAKE_TOP_M:
+    if rest.rest_z_m > highest_m:
         raise BunkFull(
             "grasp.bunk-full", f"the bunk is full: log {grasp.log.id} would lie above the stakes; empty the bunk"
         )
@@ -270,6 +274,11 @@ def plan_place(
 def lies_in_bunk(bunk: Bunk, log: LogObservation) -> bool:
     """Tell whether the log's centre is between the stakes."""
     return is_over_bunk(bunk, *log.center_m[:2]) and log.center_m[2] < bunk.floor_z_m + bunk.stake_height_m
+
+
+def reaches_above_stakes(bunk: Bunk, log: LogObservation) -> bool:
+    """Tell whether a log in the bunk reaches above its stakes, over which a bump may throw it."""
+    return log.center_m[2] + log.diameter_m / 2 > bunk.floor_z_m + bunk.stake_height_m
 
 
 def lies_across_stakes(bunk: Bunk, log: LogObservation) -> bool:

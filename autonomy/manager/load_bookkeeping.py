@@ -188,7 +188,7 @@ class LoadBookkeeping:
         self.sorting.book_loaded(log.assortment for log in loaded_logs)
 
     def _remark_grip(self, logs: Sequence[LogObservation], grip: Grip, now_ns: int) -> None:
-        """Say where the weight in the grapple differs from what was meant, or cannot tell."""
+        """Say where the weight in the grapple differs from what was meant, or cannot tell, and what lies high."""
         names = " and ".join(str(log.id) for log in logs)
         for log in grip.also:
             self.tally.remark(
@@ -199,6 +199,12 @@ class LoadBookkeeping:
                 now_ns,
                 f"log {number} did not come up with log {names}: only {grip.read_kg:.0f} kg hung in the grapple; it is "
                 "looked for again where it lay",
+            )
+        for number in grip.high:
+            self.tally.remark(
+                now_ns,
+                f"log {number} was laid down as high as the stakes, where no camera looks: it may lie above them; look "
+                "at the load before the machine drives on",
             )
         weight_kg = sum(expected_kg(log) for log in logs)
         if not grip.left and weight_kg < UNSURE_KG:

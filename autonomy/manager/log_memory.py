@@ -17,7 +17,7 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.bunk_load import lies_in_bunk, settled_in_bunk
+from autonomy.grasp.bunk_load import is_over_bunk, lies_in_bunk, reaches_above_stakes, settled_in_bunk
 from autonomy.manager.load_detector import LoadDetector, WoodScale
 from autonomy.manager.log_map import LogMap
 from autonomy.motion.arm_kinematics import Arm, slope_of
@@ -39,12 +39,13 @@ BESIDE_M: Final = 0.45
 @dataclass(frozen=True, slots=True)
 class Grip:
     """What a released grip held, by its weight ``read_kg`` [kg] (NaN: not weighed): logs that nobody meant to grip, and
-    the numbers of those that were meant and did not come up.
+    the numbers of those that were meant and did not come up; ``high``: of those that lie as high as the stakes.
     """
 
     also: tuple[LogObservation, ...]
     left: tuple[int, ...]
     read_kg: float
+    high: tuple[int, ...] = ()
 
 
 class LogMemory:
@@ -151,6 +152,10 @@ class LogMemory:
             for log in self._hanging(report):
                 laid.append(settled_in_bunk(self._profile.bunk, log, under + laid, self._arm.slope))
             self._released, self._held, self._load_detector = laid, {}, None
+            if self.grip is not None:
+                bunk = self._profile.bunk
+                high = [log.id for log in laid if is_over_bunk(bunk, *log.center_m[:2]) and reaches_above_stakes(bunk, log)]
+                self.grip = replace(self.grip, high=tuple(high))
 
     def _judge(self, detector: LoadDetector) -> None:
         """Judge the load by its weight: logs that the weight does not explain still lie where they lay."""

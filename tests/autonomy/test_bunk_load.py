@@ -80,6 +80,14 @@ def test_a_place_is_chosen_where_what_falls_does_not_roll_to_either_side() -> No
     assert rest.rest_z_m == pytest.approx(LAID_M, abs=1e-3)
 
 
+def test_a_place_that_may_be_too_high_is_chosen_only_where_no_other_is_low_enough() -> None:
+    row = heap(*(lying(y, LAID_M) for y in (-0.54, -0.06, 0.53)))
+    best = row.lowest_place(REACH_M)
+    assert best.rest_z_m > LAID_M + 0.05, "in a gap that is a little too narrow: beside it there is more room"
+    assert row.lowest_place(REACH_M, LAID_M + 0.05).rest_z_m == pytest.approx(LAID_M, abs=1e-3)
+    assert row.lowest_place(REACH_M, FLOOR_M) == best
+
+
 def test_logs_that_lie_askew_count_at_their_ends() -> None:
     straight, askew = heap(lying(0.4, LAID_M)), heap(lying(0.4, LAID_M, skew_rad=0.3))
     assert straight.place_at(-0.05).support_z_m == FLOOR_M

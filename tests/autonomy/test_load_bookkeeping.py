@@ -321,6 +321,23 @@ def test_what_the_scale_says_of_a_grip_is_booked_and_said() -> None:
     assert books.load.tally.loaded == 4 and numbers_in(books.said()[2])[0] == 7
 
 
+@pytest.mark.parametrize(("bed_m", "is_high"), [(0.3, False), (0.9, True)])
+def test_a_log_that_lies_as_high_as_the_stakes_is_said(bed_m: float, is_high: bool) -> None:
+    """No camera looks into the bunk: five of 17 missions ended with a log above the stakes, and believed it held."""
+    bunk, hands, books = PROFILE.bunk, Hands(field_of((-4.0, 3.0))), Books()
+    (x, y), c, s = bunk.center_m, math.cos(bunk.yaw_rad), math.sin(bunk.yaw_rad)
+    for k in range(-4, 5):
+        center_m = (x - 0.2 * k * s, y + 0.2 * k * c, bunk.floor_z_m + bed_m * bunk.stake_height_m)
+        bed = replace(hands.grasp.log, id=50 + k, center_m=center_m, axis=(c, s, 0.0))
+        hands.memory._in_bunk.append(bed)
+    hands.place(90.0)
+    grip = hands.memory.grip
+    assert grip is not None and grip.high == ((hands.grasp.log.id,) if is_high else ())
+    books.world.grip = grip
+    books.book(0.25)
+    assert [numbers_in(text)[0] for text in books.said()] == list(grip.high)
+
+
 def test_lost_logs_are_not_reported_to_the_company() -> None:
     books = Books()
     books.look(0)
