@@ -134,7 +134,7 @@ class LoadBookkeeping:
         """Whether no more logs are wanted: there are enough, the bunk has no room, or, if there is a landing, the bunk
         holds its planned volume.
         """
-        full = self.tally.brimful or (self._lands and self.tally.full(self._bunk))
+        full = self.tally.bunk_full or (self._lands and self.tally.full(self._bunk))
         return full or self.has_enough
 
     @property
@@ -290,7 +290,7 @@ class LoadBookkeeping:
         tally.missed += 1
         number = self._world.map_number(job.grasp.log.id) if job.grasp is not None else target
         if job.bunk_full:
-            tally.brimful = True
+            tally.bunk_full = True
             if number is not None and not self._lands:
                 tally.given_up[number] = job.failure
         elif number is not None and self._world.record_miss(number, for_good):

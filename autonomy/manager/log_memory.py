@@ -154,8 +154,8 @@ class LogMemory:
             self._released, self._held, self._load_detector = laid, {}, None
             if self.grip is not None:
                 bunk = self._profile.bunk
-                high = [log.id for log in laid if is_over_bunk(bunk, *log.center_m[:2]) and reaches_above_stakes(bunk, log)]
-                self.grip = replace(self.grip, high=tuple(high))
+                over = [log for log in laid if is_over_bunk(bunk, *log.center_m[:2])]
+                self.grip = replace(self.grip, high=tuple(log.id for log in over if reaches_above_stakes(bunk, log)))
 
     def _judge(self, detector: LoadDetector) -> None:
         """Judge the load by its weight: logs that the weight does not explain still lie where they lay."""

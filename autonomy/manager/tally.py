@@ -61,7 +61,7 @@ class Tally:
     on_board: int = 0
     board_m3: float = 0.0
     board_kg: float = 0.0
-    brimful: bool = False
+    bunk_full: bool = False
     """The bunk had no room for a grasp."""
     given_up: dict[int, str] = field(default_factory=dict)
     loads: list[Load] = field(default_factory=list)
@@ -87,7 +87,7 @@ class Tally:
         self.loaded, self.on_board = max(0, self.loaded - logs), max(0, self.on_board - logs)
         for _ in range(min(logs, len(self.board))):
             self.board_m3 -= self.board.pop().volume_m3
-        self.brimful = False
+        self.bunk_full = False
 
     def book_found(self, logs: int) -> None:
         """Book that more logs are on board than were booked: where they had lain and their size are those of the last
@@ -114,4 +114,4 @@ class Tally:
         if self.board:  # else only logs from before the mission were unloaded
             self.loads.append(Load(tuple(self.board), now_ns, driven_m - self.counted_m, landing))
         self.board, self.counted_m = [], driven_m
-        self.on_board, self.board_m3, self.board_kg, self.brimful = 0, 0.0, 0.0, False
+        self.on_board, self.board_m3, self.board_kg, self.bunk_full = 0, 0.0, 0.0, False

@@ -85,7 +85,7 @@ def test_a_machine_outside_its_fence_stops(keep_out: bool) -> None:
 @pytest.mark.parametrize(("y_m", "yaw", "hit"), [(1.1, 0.0, True), (-1.4, 1.4, True), (0.0, 0.0, False)])
 def test_a_machine_stops_before_a_log_in_its_wheel_path(y_m: float, yaw: float, hit: bool) -> None:
     forwarder, manager = begin(((1, 15.0, y_m, yaw),), end_m=20.0)
-    manager.tally.brimful = True  # no room for it on board
+    manager.tally.bunk_full = True  # no room for it on board
     forwarder.run(manager, ended)
     if not hit:  # it passes below the machine, between the wheels
         assert manager.failure_code != "mission.log-before-wheel"
