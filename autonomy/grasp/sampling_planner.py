@@ -10,7 +10,7 @@ always proposes a grasp. Inputs: log list, with covariances where perception giv
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from math import atan2, isfinite, pi
 from typing import Final
@@ -20,6 +20,7 @@ import numpy as np
 from autonomy.grasp.candidates import ALONG_SHARES, CandidateArrays, candidate_grid, finalists, reachable_stations
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, log_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import grasp_pose, known_ground_m
+from autonomy.grasp.hidden_logs import hidden_observations, with_hidden_logs
 from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.quality import (
     LAYER_RULE,
@@ -160,13 +161,22 @@ class SamplingPlanner:
         return replace(candidate, logs=tuple(lying[i] for i in candidate.logs))
 
     def _best(self, arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray, rot_rad: float) -> GraspCandidate:
-        """Find the best grasp of logs that lie on something; those in ``stays`` (n,) must not be taken."""
+        """Find the best grasp of logs that lie on something; those in ``stays`` (n,) must not be taken.
+
+        What must lie under logs that a camera measured takes part, but a grasp of it alone is none.
+        """
         log_count_text = _log_count(np.flatnonzero(~stays).tolist())
         ground = known_ground_m(arm.profile)
         jaws, world = jaws_of(arm.profile), as_cylinders(logs)
         sigma = np.stack([log_covariance(log) for log in logs])
+        visible_count, is_measured = len(logs), any(log.covariance is not None for log in logs)
         if isfinite(ground):
             world, sigma = settled_poses(world, sigma, ground)
+            if is_measured:
+                world, sigma = with_hidden_logs(world, sigma, ground)
+                logs = [*logs, *hidden_observations(world, visible_count)]
+        hidden = np.arange(world.count) >= visible_count
+        stays = np.append(stays, np.zeros(world.count - visible_count, bool))
         upon = rests_upon(world)
         top, stations = reachable_stations(arm, logs, stays)
         at = candidate_grid(world, top, stations)
@@ -188,6 +198,7 @@ class SamplingPlanner:
             scores = _without_excluded(
                 score_grasps(jaws, world, upon, _with_height_axis(sections), levels, rule), stays
             )
+            scores = replace(scores, safe=scores.safe & np.any(scores.captured & ~hidden, axis=-1))
             if scores.safe.any():
                 best, scores = finalists(at, levels, sections, scores)
                 share = self._probability(jaws, samples, upon, best, scores.captured, rule, stays)
@@ -195,12 +206,12 @@ class SamplingPlanner:
                 plans.append((best, scores, trust * balance_factor * share))
         lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
         likely, topmost = max((float(np.max(plan[2])) for plan in plans), default=0.0), int(top[0])
-        if measured.any() and likely < TRY_ABOVE_PROBABILITY:
-            extraction = extract_end_log(arm, jaws, world, upon, logs, stays, lowest, rot_rad)
+        if is_measured and likely < TRY_ABOVE_PROBABILITY:
+            extraction = extract_end_log(arm, jaws, world, upon, logs, stays | hidden, lowest, rot_rad)
             if extraction is not None:
                 return extraction
         if not plans:
-            if measured.any():
+            if is_measured:
                 return self._topmost(arm, jaws, logs, world, topmost, stations[0], lowest, rot_rad)
             raise NoGrasp(
                 "grasp.none-safe",
@@ -217,12 +228,13 @@ class SamplingPlanner:
                     trouble.append(error)
                     continue
                 proposal = self._proposal(best, int(i), captured[i], float(probability[i]), logs)
-                deep_m = _penetration_m(jaws, world, proposal) if measured.any() else 0.0
-                return _penetrating(proposal, deep_m, lowest)
+                deep_m = _penetration_m(jaws, world, proposal) if is_measured else 0.0
+                visible = tuple(k for k in proposal.logs if not hidden[k])
+                return replace(_penetrating(proposal, deep_m, lowest), logs=visible)
         heavy = next((error for error in trouble if isinstance(error, NoGrasp)), None)
         if heavy is None:
             raise NoGrasp("grasp.none-in-reach", f"no grasp of the {log_count_text} is in reach: {trouble[-1]}")
-        if not measured.any():
+        if not is_measured:
             raise heavy
         return self._topmost(arm, jaws, logs, world, topmost, stations[0], lowest, rot_rad)
 
@@ -287,17 +299,18 @@ class SamplingPlanner:
         x, y, yaw, level = (float(v[i]) for v in (best.x, best.y, best.yaw, best.level))
         pose = grasp_pose(arm, x, y, yaw, level, min(log.diameter_m for log in taken), rot)
         heavier = HEAVIER if len(taken) == 1 else HEAP_HEAVIER
-        refuse_too_heavy(arm, pose, heavier * wood_kg(taken), "log " + " with ".join(str(log.id) for log in taken))
+        refuse_too_heavy(arm, pose, heavier * wood_kg(taken), "log " + " with ".join(_visible_numbers(taken)))
 
     def _proposal(
         self, best: CandidateArrays, i: int, captured: np.ndarray, probability: float, logs: Sequence[LogObservation]
     ) -> GraspCandidate:
         taken = tuple(int(k) for k in np.flatnonzero(captured))
-        names = ", ".join(str(logs[k].id) for k in taken)
-        remaining_count = len(logs) - len(taken)
+        names, in_view = _visible_numbers(logs[k] for k in taken), _visible_numbers(logs)
+        remaining_count, hidden_count = len(in_view) - len(names), len(taken) - len(names)
         reason = (
-            f"{_log_count(taken)} ({names}) of {len(logs)} at once, "
-            f"{100 * probability:.0f} % of {DRAW_COUNT} draws hold it"
+            f"{_log_count(names)} ({', '.join(names)}) of {len(in_view)} at once"
+            + (f" with {hidden_count} that must lie under them" if hidden_count else "")
+            + f", {100 * probability:.0f} % of {DRAW_COUNT} draws hold it"
             + (f"; {remaining_count} left lying" if remaining_count else "")
             + ("; nothing better is there" if probability < RELAX_BELOW_PROBABILITY else "")
         )
@@ -358,6 +371,10 @@ def _without_excluded(found: GraspScores, stays: np.ndarray) -> GraspScores:
     if not stays.any():
         return found
     return replace(found, safe=found.safe & ~np.any(found.captured & stays, axis=-1))
+
+
+def _visible_numbers(logs: Iterable[LogObservation]) -> list[str]:
+    return [str(log.id) for log in logs if log.id >= 0]
 
 
 def _log_count(logs: Sequence[object]) -> str:
