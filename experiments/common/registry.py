@@ -66,6 +66,10 @@ class Entry:
 _PLANT: Final = ("machine", "sim", "can_dbc")
 _MACHINE: Final = (*_PLANT, "autonomy", "controller", "hil")
 """The whole machine in lockstep."""
+_EYES: Final = ("autonomy/perception", "autonomy/networks.py", "autonomy/weights")
+_CRANE: Final = (*_PLANT, "controller", "hil", "autonomy/motion", "autonomy/perception")
+_CALIBRATED: Final = (*_CRANE, "autonomy/calibration")
+_CRANE_JOB: Final = (*_CRANE, "autonomy/crane_job", "autonomy/grasp", "autonomy/missions/crane_job.py")
 _LIVE: Final = ("machine", "can_dbc", "controller", "runtime", "recorder", "hil")
 
 
@@ -79,7 +83,7 @@ EXPERIMENTS: Final = {
     "calibration": Entry(
         "Does calibration recover the hidden truth? Dead-bands, gains, dead times, zeros, sag; many individuals.",
         "experiments.calibration.experiment",
-        (*_PLANT, "autonomy/calibration", "autonomy/motion", "controller", "hil", "experiments/calibration"),
+        (*_CALIBRATED, "experiments/calibration"),
         scale=20.0,
     ),
     "generalization": Entry(
@@ -91,13 +95,13 @@ EXPERIMENTS: Final = {
     "joint-tracking": Entry(
         "Which joint law tracks best, rests nearest and closes its valves? Four laws, both machines, disturbances.",
         "experiments.joint_tracking.experiment",
-        (*_PLANT, "controller", "hil", "experiments/joint_tracking"),
+        (*_PLANT, "controller", "experiments/joint_tracking"),
         scale=30.0,
     ),
     "crane-accuracy": Entry(
         "How near does the tip come to its goal, by encoders and truly? Paper B's four goals, calibrated machines.",
         "experiments.crane_accuracy.experiment",
-        (*_MACHINE, "experiments/crane_accuracy"),
+        (*_CALIBRATED, "experiments/crane_accuracy"),
         scale=60.0,
     ),
     "timing": Entry(
@@ -125,38 +129,46 @@ EXPERIMENTS: Final = {
     "plc": Entry(
         "Does a PLC between crane0 and the valves work as well? Both roles compared with CAN: logs, accuracy, latency.",
         "experiments.plc.experiment",
-        (*_MACHINE, "experiments/plc"),
+        (*_CRANE_JOB, "experiments/plc"),
         scale=20.0,
     ),
     "grasp-network": Entry(
         "Is it paper A's network, what has it learnt, how fast is it? Parameters, Cornell folds, latency.",
         "experiments.grasp_network.experiment",
-        ("autonomy/grasp", "autonomy/networks.py", "autonomy/weights", "training", "experiments/grasp_network"),
+        ("machine", "autonomy/grasp", *_EYES, "training", "experiments/grasp_network"),
         scale=40.0,
     ),
     "detector": Entry(
         "Are logs found in worlds unlike those of the training? mAP of boxes and masks; photographs.",
         "experiments.detector.experiment",
-        ("autonomy/perception", "autonomy/networks.py", "autonomy/weights", "sim", "training", "experiments/detector"),
+        (*_PLANT, *_EYES, "training", "experiments/detector"),
         scale=15.0,
     ),
     "log-localization": Entry(
         "How precisely is a log located? Paper B's approach to logs at 0, 45 and 90 degrees: its pipeline and ours.",
         "experiments.log_localization.experiment",
-        (*_PLANT, "autonomy/perception", "autonomy/networks.py", "autonomy/weights", "experiments/log_localization"),
+        (*_CALIBRATED, *_EYES, "experiments/log_localization"),
         scale=30.0,
     ),
     "grasp-configs": Entry(
         "How many grasps succeed, how good are they? Paper A's twelve configurations, camera to lift, three planners.",
         "experiments.grasp_configs.experiment",
-        (*_MACHINE, "experiments/grasp_configs"),
+        (*_CRANE_JOB, *_CALIBRATED, *_EYES, "experiments/grasp_configs"),
         clocked=("see_ms", "plan_ms"),
         scale=155.0,
     ),
     "navigation": Entry(
         "Does the machine follow its path? Paper B's four waypoints, six starts, mud, slope; both methods.",
         "experiments.navigation.experiment",
-        (*_MACHINE, "experiments/navigation"),
+        (
+            *_PLANT,
+            "controller",
+            "hil",
+            "autonomy/localization",
+            "autonomy/navigation",
+            "autonomy/perception",
+            "experiments/navigation",
+        ),
         scale=10.0,
     ),
     "parts": Entry(
