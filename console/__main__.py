@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from console.replay import Recording
 
 LOCAL: Final = Exposure()
+MAX_PORT: Final = 65535
 COMMISSION: Final = Path("commissioning")
 """Default folder of what commissioning writes."""
 
@@ -224,17 +225,25 @@ def _address(text: str | None, option: str) -> tuple[str, int] | None:
         return None
     host, _, port = text.rpartition(":")
     try:
-        return str(ipaddress.ip_address(host or "127.0.0.1")), int(port)
-    except ValueError:
+        return str(ipaddress.ip_address(host or "127.0.0.1")), _port(port)
+    except (ValueError, argparse.ArgumentTypeError):
         sentence = f"{option} {text} is not HOST:PORT, as in 127.0.0.1:5005"
         raise StartError("console.address", sentence, 2) from None
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > MAX_PORT:
+        raise argparse.ArgumentTypeError(f'"{text}" is no port; a port is a number from 0 to {MAX_PORT}')
+    return int(text)
 
 
 def command_line() -> argparse.ArgumentParser:
     """Build the parser of the process's command line."""
     parser = argparse.ArgumentParser(prog="python -m console", description="The operator's web page.")
-    parser.add_argument("--port", type=int, default=8471, help="port of the page (default 8471)")
-    parser.add_argument("--report-port", type=int, help="UDP port that receives the reports of controller and planner")
+    parser.add_argument("--port", type=_port, default=8471, help="port of the page (default 8471)")
+    parser.add_argument(
+        "--report-port", type=_port, help="UDP port that receives the reports of controller and planner"
+    )
     parser.add_argument("--plant", metavar="HOST:PORT", help="request port of a simulated plant to show instead")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
     parser.add_argument(
@@ -270,7 +279,7 @@ def command_line() -> argparse.ArgumentParser:
         help="request port of an emulated run's plant, to show its true logs",
     )
     parser.add_argument(
-        "--foxglove", type=int, metavar="PORT", help="port that serves the run to Foxglove and Lichtblick, read-only"
+        "--foxglove", type=_port, metavar="PORT", help="port that serves the run to Foxglove and Lichtblick, read-only"
     )
     parser.add_argument(
         "--recording",

@@ -241,9 +241,14 @@ class AuditLog:
             os.close(self._file)
 
     def _write(self) -> None:
+        torn = b""
+        """Ends a line of which the disk took only a part before it was full."""
         while line := self._waiting.get():
+            rest = torn + line
             try:
-                os.write(self._file, line)
-                self.failed = ""
+                while rest:
+                    written = os.write(self._file, rest)
+                    rest, torn = rest[written:], b"\n"
+                self.failed, torn = "", b""
             except OSError as error:
                 self.failed = f"The audit log {self.path} cannot be written ({error.strerror})."

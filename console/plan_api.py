@@ -148,6 +148,10 @@ class PlanApi:
             ("/api/plan/import", self._import, "POST"),
             ("/api/plan/export/{kind}", self._export, "POST"),
             ("/api/plan/upload/{name}", self._upload, "POST"),
+            # A name with a slash is refused like any other bad one, in a sentence.
+            ("/api/plan/missions/{name:path}", self._open, "GET"),
+            ("/api/plan/missions/{name:path}", self._save, "POST"),
+            ("/api/plan/upload/{name:path}", self._upload, "POST"),
         ]
         requests = [Route(path, _answering(handler), methods=[method]) for path, handler, method in handlers]
         return [page_route("/plan", "plan.html"), *requests]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import socket
 import string
 from collections.abc import Iterator
@@ -533,6 +535,28 @@ def test_the_audit_log_is_only_appended_to_and_floods_are_counted(tmp_path: Path
     left_out = [line.get("refusals_left_out") for line in lines if line["what"] == "last"]
     assert len(lines) == 2 * (MAX_REFUSED + 1) and left_out == [7, 7]
     assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_line_of_which_the_disk_took_a_part_is_ended_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk may be full in the middle of a line, and have room again later."""
+    room, write = [10, 0, 1000, 1000], os.write
+
+    def filling(file: int, data: bytes) -> int:
+        free = room.pop(0) if room else len(data)
+        if not free:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(file, data[:free])
+
+    monkeypatch.setattr("console.access_guards.os.write", filling)
+    log = AuditLog(tmp_path / "audit.jsonl", Clock())
+    for what in ("torn", "whole", "last"):
+        log.record(refused=False, what=what)
+    log.close()
+    torn, *whole = log.path.read_text().splitlines()
+    assert len(torn) == 10 and [json.loads(line)["what"] for line in whole] == ["whole", "last"]
+    assert log.failed == ""
 
 
 def test_a_full_disk_is_told_on_the_page(stage: Stage) -> None:

@@ -19,6 +19,7 @@ from can_dbc.messages.operator_link import credential_path
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, Timing, TimingWriter
 from console import server
+from console.__main__ import main
 from console.console import Console
 from console.server import STATIC
 from console.state import (
@@ -393,3 +394,14 @@ def test_a_page_that_the_server_has_given_up_counts_as_gone() -> None:
     with pytest.raises(WebSocketDisconnect) as gone:
         asyncio.run(server._send(Closed(), "{}"))  # type: ignore[arg-type]
     assert gone.value.code == 1006
+
+
+@pytest.mark.parametrize("option", ["--port", "--report-port", "--foxglove"])
+@pytest.mark.parametrize("text", ["65536", "-1", "page"])
+def test_a_port_that_no_computer_has_is_refused_with_the_option(
+    capsys: pytest.CaptureFixture[str], option: str, text: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--report-port", "0", f"{option}={text}"])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and option in told and f'"{text}" is no port' in told

@@ -169,6 +169,14 @@ def test_no_name_leads_out_of_the_folder(client: TestClient, name: str, tmp_path
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
 
 
+def test_a_name_with_a_slash_is_refused_in_a_sentence(client: TestClient) -> None:
+    for answer in (
+        client.get("/api/plan/missions/north%2fa.geojson"),
+        client.post("/api/plan/missions/north%2fa.geojson", json=document()),
+    ):
+        assert answer.json()["code"] == "missions.name" and "north/a.geojson" in answer.json()["sentence"]
+
+
 def test_links_in_the_folder_are_not_followed(client: TestClient, tmp_path: Path) -> None:
     (tmp_path / "missions").mkdir()
     outside = tmp_path / "outside.geojson"
