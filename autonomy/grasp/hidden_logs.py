@@ -27,10 +27,17 @@ _END_SIGMA_M: Final = 0.3
 """Standard deviations [m, rad] of the pose and the radius of a hidden log, and of its ends."""
 
 
-def with_hidden_logs(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
-    """Append the hidden logs, and their covariances (7, 7), to the settled logs (n) in view on level ground."""
+def with_hidden_logs(
+    measured: Cylinders, world: Cylinders, covariances: np.ndarray, ground_z_m: float
+) -> tuple[Cylinders, np.ndarray]:
+    """Append the hidden logs, and their covariances (7, 7), to the settled logs (n) in view on level ground.
+
+    ``measured``: the same logs before they were settled.  Of two that were measured too thick one is pushed up, and
+    lies on the ground all the same.
+    """
     radius_m, count = float(np.median(world.radius)), 0
-    above_ground_m = world.center[:, 2] - world.radius - ground_z_m
+    undersides_m = np.minimum(measured.center[:, 2] - measured.radius, world.center[:, 2] - world.radius)
+    above_ground_m = undersides_m - ground_z_m
     for i in np.argsort(world.center[:, 2], kind="stable").tolist():
         if above_ground_m[i] < MAX_HEIGHT_ON_GROUND_M:
             continue

@@ -171,14 +171,15 @@ class SamplingPlanner:
         sigma = np.stack([log_covariance(log) for log in logs])
         visible_count, is_measured = len(logs), any(log.covariance is not None for log in logs)
         if isfinite(ground):
+            measured_world = world
             world, sigma = settled_poses(world, sigma, ground)
             if is_measured:
-                world, sigma = with_hidden_logs(world, sigma, ground)
+                world, sigma = with_hidden_logs(measured_world, world, sigma, ground)
                 logs = [*logs, *hidden_observations(world, visible_count)]
         hidden = np.arange(world.count) >= visible_count
         stays = np.append(stays, np.zeros(world.count - visible_count, bool))
         upon = rests_upon(world)
-        top, stations = reachable_stations(arm, logs, stays)
+        top, stations = reachable_stations(arm, logs, stays | hidden)
         at = candidate_grid(world, top, stations)
         sections = blade_sections(jaws, world, *at)
         floor = np.full(len(at[0]), ground) if isfinite(ground) else _ground_between_jaws(jaws, sections, upon)
