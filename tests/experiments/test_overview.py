@@ -68,6 +68,7 @@ def test_a_conclusion_leaves_out_a_sentence_without_a_value() -> None:
     result = read(DOCS / "results" / "navigation.json")
     module = import_module(EXPERIMENTS["navigation"].module)
     shown = conclusion(result, module.page_of(result, {}))
-    assert "1.851 cm" in shown and 7 in numbers_in(shown)
+    lateral = f"{100.0 * result.metrics['lateral_p95_m']:.4g} cm"
+    assert lateral in shown and 7 in numbers_in(shown)
     without = replace(result, metrics={k: v for k, v in result.metrics.items() if k != "lateral_p95_m"})
-    assert "1.851 cm" not in conclusion(without, module.page_of(without, {}))
+    assert lateral not in conclusion(without, module.page_of(without, {}))
