@@ -241,8 +241,7 @@ class AuditLog:
             os.close(self._file)
 
     def _write(self) -> None:
-        torn = b""
-        """Ends a line of which the disk took only a part before it was full."""
+        torn = b""  # ends a line of which the disk took only a part before it was full
         while line := self._waiting.get():
             rest = torn + line
             try:

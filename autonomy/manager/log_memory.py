@@ -39,7 +39,9 @@ BESIDE_M: Final = 0.45
 @dataclass(frozen=True, slots=True)
 class Grip:
     """What a released grip held, by its weight ``read_kg`` [kg] (NaN: not weighed): logs that nobody meant to grip, and
-    the numbers of those that were meant and did not come up; ``high``: of those that lie as high as the stakes.
+    the numbers of those that were meant and did not come up.
+
+    ``high``: the numbers of the released logs that by the model of the load lie as high as the stakes.
     """
 
     also: tuple[LogObservation, ...]

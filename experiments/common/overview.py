@@ -164,8 +164,8 @@ def _currency(standings: Mapping[str, Standing]) -> str:
     if not old and not unsure:
         return "All results are of the present sources."
     return (
-        f"{len(standings) - old - unsure} of the results are current; of {old} the sources have changed since, and "
-        f"{unsure} name a commit that cannot be verified."
+        f"Current results: {len(standings) - old - unsure} of {len(standings)}; stale, because their sources have "
+        f"changed since: {old}; unverifiable, because their commit is not in the history or had changes: {unsure}."
     )
 
 
