@@ -348,6 +348,8 @@ class Activity(ActivityState):
         if following is not None:
             self._enter(following, self._tracker.setpoint)
         elif self._elapsed_s > _TIMEOUT_FACTOR * self.motion.duration_s + rule.settle_s + rule.slack_s:
+            if self.phase is Phase.LOOK and self._look_aside():
+                return
             off = self._tracker.worst_joint(self._position())
             self._fail(rule.timeout._replace(sentence=f"{rule.timeout.sentence} within {self._elapsed_s:.0f} s{off}"))
 
@@ -391,6 +393,15 @@ class Activity(ActivityState):
             case Phase.STOW:
                 return Phase.DONE
         return Phase(self.phase + 1)
+
+    def _look_aside(self) -> bool:
+        """Begin to turn to where the camera may see what boom and grapple hid; False after both sides."""
+        motion = self._cycle.look_aside(self._tracker.setpoint)
+        if motion is None:
+            return False
+        self._tracker.begin(motion)
+        self._elapsed_s, self._arrived_ns = 0.0, None
+        return True
 
     def _after_look(self, now_ns: int) -> Phase | None:
         """Go on to a grasp; with camera measurements, further detections may still find one for a while."""

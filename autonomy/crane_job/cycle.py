@@ -6,6 +6,7 @@ m).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Sequence
 from math import cos, dist, pi, sin
@@ -38,12 +39,13 @@ from autonomy.crane_job.phase_motions import (
 from autonomy.crane_job.phases import Phase
 from autonomy.crane_job.rotator_estimate import LoadView, has_no_encoder
 from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
-from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m
+from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m, travel_height_m
 from autonomy.grasp.planner import Grasp, GraspSelector, NoGrasp
 from autonomy.grasp.weight import bearable_kg
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import LEVEL, Arm, Pose
 from autonomy.motion.motion_planner import MotionPlanner
+from autonomy.motion.obstacles import collision_scene
 from autonomy.motion.setpoint_stream import Axes
 from autonomy.motion.trajectory import Trajectory, hold, straight_line, with_quick_rotation, with_rotation
 from autonomy.perception.log_list import LogObservation
@@ -59,6 +61,8 @@ SHORTEST_LOG_M: Final = 1.6
 MAX_ATTEMPTS: Final = 3
 MAX_RESELECTIONS: Final = 2
 """A grasp is selected again from above it this often."""
+LOOK_ASIDE_RAD: Final = 0.25
+"""Turn of the crane that shows what boom and grapple hid: a metre and a half aside at its usual reach."""
 WEIGHABLE_RISE_M: Final = 0.2
 """A rise of the jaws after which at least half of the load weighs on the load cell."""
 EXTRACTION_DEPTH_M: Final = 0.1
@@ -118,6 +122,8 @@ class Cycle:
         """The arm with the load of the present phase."""
         self._phase_start_z_m = 0.0
         self._reselection_count, self._recovery = 0, GraspRecovery()
+        self._side_slews: list[float] | None = None
+        """Slew angles [rad] from which the crane has yet to look; None while something is in view."""
         self.view: LoadView | None = None
         """Where the next lift shows its load to a camera; None: it goes straight to its place."""
         self._turn_count = 0
@@ -162,6 +168,25 @@ class Cycle:
         self.grasp = self._unturned_grasp(
             self._select_grasp(self._arm, job, self._inbox.logs, q[Joint.SLEW], q[Joint.ROT]), q
         )
+        self._side_slews = None
+
+    def look_aside(self, q: Axes) -> Trajectory | None:
+        """Plan a turn to one side, later to the other, where the camera on the crane sees what boom and grapple hid.
+
+        None when the crane has looked from both sides, as far as it can turn.
+        """
+        start, slew = self._arm.pose(q), self._profile.joints["slew"]
+        if self._side_slews is None:
+            middle_rad = 0.5 * (slew.lower + slew.upper)
+            sides = [start.slew_rad - LOOK_ASIDE_RAD, start.slew_rad + LOOK_ASIDE_RAD]
+            self._side_slews = sorted(sides, key=lambda side_rad: abs(side_rad - middle_rad))
+        high_m = travel_height_m(self._profile)
+        scene = collision_scene(self._profile, self._inbox.logs)
+        while self._side_slews:
+            goal = start.at_height(max(start.z_m, high_m))._replace(slew_rad=self._side_slews.pop(0))
+            with contextlib.suppress(Unreachable):
+                return self._motion_planner(self._arm, start, goal, scene, None, high_m, 0.0)
+        return None
 
     def _unturned_grasp(self, grasp: Grasp, q: Axes) -> Grasp:
         """Return the grasp with the rotator as it stands, where the planner does not turn it.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.activity import Activity, Phase
-from autonomy.crane_job.cycle import HIGHER_M, MAX_HIGHER
+from autonomy.crane_job.cycle import HIGHER_M, LOOK_ASIDE_RAD, MAX_HIGHER
 from autonomy.crane_job.grasp_verification import is_between_jaws
 from autonomy.grasp.grapple_heights import retreat_height_m
 from autonomy.grasp.planner import NoGrasp
@@ -160,10 +160,30 @@ def test_a_log_that_falls_beside_the_bunk_is_reported() -> None:
     assert planner.failure_code == "activity.log-misplaced" and "(3.00, 3.00, -1.29)" in (planner.failure or "")
 
 
-def test_no_log_list_ends_the_job() -> None:
+def test_no_log_list_ends_the_job_after_a_look_from_both_sides() -> None:
     crane, planner = StandIn(PROFILE, []), activity()
     crane.run(planner)
     assert planner.failure_code == "activity.look-timeout"
+    slews = [moment.q[Joint.SLEW] for moment in crane.trace]
+    assert min(slews) == pytest.approx(HOME[Joint.SLEW] - LOOK_ASIDE_RAD, abs=0.01)
+    assert max(slews) == pytest.approx(HOME[Joint.SLEW] + LOOK_ASIDE_RAD, abs=0.01)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_log_behind_the_boom_is_found_from_the_side(side: float) -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    crane.seen = lambda: tuple(crane.logs) if side * (crane.q[Joint.SLEW] - HOME[Joint.SLEW]) > 0.2 else ()
+    crane.until(planner, Phase.ABOVE)
+    assert planner.grasp is not None and planner.grasp.log.id == GROUND_LOG.id
+
+
+def test_a_crane_at_its_end_stop_looks_from_the_other_side() -> None:
+    slew = PROFILE.joints["slew"]
+    crane, planner = StandIn(PROFILE, [], q=(slew.upper - 0.05, *HOME[1:])), activity()
+    crane.run(planner)
+    slews = [moment.q[Joint.SLEW] for moment in crane.trace]
+    assert planner.failure_code == "activity.look-timeout"
+    assert min(slews) == pytest.approx(slew.upper - 0.05 - LOOK_ASIDE_RAD, abs=0.01) and max(slews) <= slew.upper
 
 
 @pytest.mark.parametrize(
