@@ -400,7 +400,7 @@ class Activity(ActivityState):
         if motion is None:
             return False
         self._tracker.begin(motion)
-        self._elapsed_s, self._arrived_ns = 0.0, None
+        self._elapsed_s, self._arrived_ns, self._ready_ns = 0.0, None, None
         return True
 
     def _after_look(self, now_ns: int) -> Phase | None:
@@ -412,10 +412,13 @@ class Activity(ActivityState):
             self._cycle.select_grasp(self.motion.goal)
         except NoGrasp as error:
             self._ready_ns = first_ns or now_ns
-            if now_ns > self._ready_ns + DETECTION_TIMEOUT_NS or not self._inbox.has_camera_measurements:
+            measured = self._inbox.has_camera_measurements
+            if measured and now_ns <= self._ready_ns + DETECTION_TIMEOUT_NS:
+                return None
+            if not measured or not self._look_aside():
                 self._fail(_problem(error))
             return None
-        return Phase.ABOVE
+        return None if self._cycle.is_unsure and self._look_aside() else Phase.ABOVE
 
     def _after_above(self, now_ns: int) -> Phase | None:
         """Go down, or first above a better grasp: from above, a camera measures logs better than from the side."""

@@ -14,11 +14,13 @@ from typing import Final
 
 import msgspec
 
-from autonomy.crane_job.grapple import THICK_LOG_M, GrappleSequence, is_between_stakes
+from autonomy.crane_job.grapple import THICK_LOG_M, GrappleSequence, is_between_stakes, is_measured_open
 from autonomy.crane_job.grasp_verification import (
     COLUMN_RADIUS_M,
     GraspRecovery,
     corrected_place,
+    end_sigma_m,
+    ghosts,
     is_at_target,
     is_camera_measured,
     lifted_part,
@@ -63,6 +65,11 @@ MAX_RESELECTIONS: Final = 2
 """A grasp is selected again from above it this often."""
 LOOK_ASIDE_RAD: Final = 0.25
 """Turn of the crane that shows what boom and grapple hid: a metre and a half aside at its usual reach."""
+SURE_PROBABILITY: Final = 0.8
+"""A grasp that holds less often in the planner's draws is worth a look from the side: half seen, logs are measured
+badly."""
+SURE_END_M: Final = 0.3
+"""An end that is known less well (1 sigma) is hidden."""
 WEIGHABLE_RISE_M: Final = 0.2
 """A rise of the jaws after which at least half of the load weighs on the load cell."""
 EXTRACTION_DEPTH_M: Final = 0.1
@@ -123,7 +130,7 @@ class Cycle:
         self._phase_start_z_m = 0.0
         self._reselection_count, self._recovery = 0, GraspRecovery()
         self._side_slews: list[float] | None = None
-        """Slew angles [rad] from which the crane has yet to look; None while something is in view."""
+        """Slew angles [rad] from which the crane has yet to look; None before it looks aside."""
         self.view: LoadView | None = None
         """Where the next lift shows its load to a camera; None: it goes straight to its place."""
         self._turn_count = 0
@@ -131,6 +138,8 @@ class Cycle:
         self._higher_count = 0
         """How often the jaws had to open higher above the place."""
         self._previous_grasp: Grasp | None = None
+        self._ghost_ids: set[int] = set()
+        """Numbers of what was seen between open jaws."""
         self._stirred = False
         """Whether the jaws have closed in vain since the last selection."""
         self.drops_load = False
@@ -166,9 +175,23 @@ class Cycle:
         self._stirred = False
         job = msgspec.structs.replace(self._job, leave=self._job.leave + self._recovery.excluded_logs)
         self.grasp = self._unturned_grasp(
-            self._select_grasp(self._arm, job, self._inbox.logs, q[Joint.SLEW], q[Joint.ROT]), q
+            self._select_grasp(self._arm, job, self._lying_logs(q), q[Joint.SLEW], q[Joint.ROT]), q
         )
-        self._side_slews = None
+
+    @property
+    def is_unsure(self) -> bool:
+        """Whether the grasp may well fail, or a hidden end of its logs keeps the crane from knowing it."""
+        grasp = self.grasp
+        if grasp is None or not is_camera_measured(grasp):
+            return False
+        fails = grasp.probability is not None and grasp.probability < SURE_PROBABILITY
+        return fails or (not self._motion_planner.direct and max(map(end_sigma_m, grasp.logs)) > SURE_END_M)
+
+    def _lying_logs(self, q: Axes) -> list[LogObservation]:
+        """List the logs without what open jaws have shown to be none."""
+        if is_measured_open(self._inbox.report):
+            self._ghost_ids |= ghosts(self._arm, self._inbox.logs, self._arm.pose(q))
+        return [log for log in self._inbox.logs if log.id not in self._ghost_ids]
 
     def look_aside(self, q: Axes) -> Trajectory | None:
         """Plan a turn to one side, later to the other, where the camera on the crane sees what boom and grapple hid.
@@ -181,7 +204,7 @@ class Cycle:
             sides = [start.slew_rad - LOOK_ASIDE_RAD, start.slew_rad + LOOK_ASIDE_RAD]
             self._side_slews = sorted(sides, key=lambda side_rad: abs(side_rad - middle_rad))
         high_m = travel_height_m(self._profile)
-        scene = collision_scene(self._profile, self._inbox.logs)
+        scene = collision_scene(self._profile, self._lying_logs(q))
         while self._side_slews:
             goal = start.at_height(max(start.z_m, high_m))._replace(slew_rad=self._side_slews.pop(0))
             with contextlib.suppress(Unreachable):
@@ -318,7 +341,8 @@ class Cycle:
             return hold(q)
         match phase:
             case Phase.ABOVE:
-                return approach_motion(arm, self._motion_planner, start, grasp, logs)
+                self._side_slews = None
+                return approach_motion(arm, self._motion_planner, start, grasp, self._lying_logs(q))
             case Phase.DESCEND:
                 self.grasp = grasp = self._unturned_grasp(corrected_grasp(arm, grasp, logs), q)
                 deeper_m = EXTRACTION_DEPTH_M if grasp.extracts else 0.0

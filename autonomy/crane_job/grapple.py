@@ -85,10 +85,15 @@ def is_closed_empty(report: StateReport) -> bool:
     return report.grapple_state == _STATE_CLOSED_EMPTY
 
 
+def is_measured_open(report: StateReport) -> bool:
+    """Tell whether the jaws are measured to be open; False without a sensor."""
+    return report.opening_pct >= _OPEN_FROM_PCT
+
+
 def is_open(profile: Profile, report: StateReport, opening_s: float) -> bool:
     """Tell whether the jaws are open; without a sensor, by the time since the command."""
     if isfinite(report.opening_pct):
-        return report.opening_pct >= _OPEN_FROM_PCT
+        return is_measured_open(report)
     return opening_s > profile.grapple.open_time_s
 
 
@@ -217,8 +222,10 @@ class GrappleSequence:
 
     @property
     def holds_nothing(self) -> bool:
-        """Whether the jaws have closed fully and the load cell reads nothing; False without a load cell."""
-        return is_closed_empty(self._inbox.report) and self._inbox.report.load_kg < _EMPTY_ON_GROUND_KG
+        """Whether the jaws have closed fully and the load cell reads nothing, now and on average; False without a load
+        cell.  The weight of a thin log that swings is nothing at times.
+        """
+        return self.lifts_nothing and self._inbox.report.load_kg < _EMPTY_ON_GROUND_KG
 
     def _gap_m(self) -> float:
         """Compute the gap between the tips, m; 0 without a sensor."""

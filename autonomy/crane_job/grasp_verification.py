@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import dist, hypot
@@ -13,7 +14,7 @@ from autonomy.grasp.bunk_load import is_over_bunk, lies_across_stakes, lies_in_b
 from autonomy.grasp.planner import Grasp, NoGrasp, hangs_below, restricted_to
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm, Pose
-from autonomy.perception.log_list import LogObservation
+from autonomy.perception.log_list import END, START, LogObservation, unpack_covariance
 from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m
 from machine.profile import Bunk
 
@@ -23,6 +24,8 @@ MAX_EXTRA_SAG_M: Final = 0.20
 """Where one end of a log hangs lower than assumed by more than this, the path is planned again."""
 LOAD_MARGIN_M: Final = 0.15
 """A log in the jaws is measured this near to them, although the jaws hide its middle."""
+GHOST_HEIGHT_M: Final = 1.0
+"""Open jaws that are lower may stand around a log that lies."""
 MIN_CORRECTION_RAD: Final = 0.03
 MAX_CORRECTION_RAD: Final = 0.4
 """The rotator corrects the log's direction during the motion between these angles; more asks for a new path."""
@@ -63,6 +66,18 @@ def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose, margin_m: float = 
     aside_m = hypot(c[0] + along_m * a[0] - x, c[1] + along_m * a[1] - y)
     near = aside_m < 0.5 * log.diameter_m + margin_m
     return near and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.jaws)
+
+
+def ghosts(arm: Arm, logs: Iterable[LogObservation], pin: Pose) -> set[int]:
+    """Return the numbers of the logs that a camera sees high over the ground between open jaws under a pin: nothing can
+    hang there, and the grapple itself may look like a log.
+    """
+    high_m = arm.profile.workspace.ground_z_m + GHOST_HEIGHT_M
+    return {
+        log.id
+        for log in logs
+        if log.covariance is not None and log.center_m[2] > high_m and is_between_jaws(arm, log, pin, LOAD_MARGIN_M)
+    }
 
 
 def is_part_of_load(arm: Arm, load: LogObservation, found: LogObservation, pin: Pose) -> bool:
@@ -206,3 +221,11 @@ def _inner_logs(grasp: Grasp) -> tuple[int, ...]:
 def is_camera_measured(grasp: Grasp) -> bool:
     """Tell whether a camera measured one of its logs."""
     return any(log.covariance is not None for log in grasp.logs)
+
+
+def end_sigma_m(log: LogObservation) -> float:
+    """Return the standard deviation of the less certain end of a log that a camera measured, m; 0 of a given log."""
+    if log.covariance is None:
+        return 0.0
+    variances = unpack_covariance(log.covariance).diagonal()
+    return math.sqrt(max(variances[START], variances[END]))

@@ -41,7 +41,6 @@ HIGHEST_LOG_M: Final = 1.0
 SURE_SCORE: Final = 0.5
 """Masks with a lower score are left out of paper A's perception, as is usual for its network."""
 RATE_NS: Final = 66_666_667
-DETECTION_NS: Final = PICTURE_COUNT * RATE_NS
 MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
 """A log with a larger error in position, direction or diameter misleads a planner."""
 

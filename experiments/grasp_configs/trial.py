@@ -32,7 +32,7 @@ from experiments.common.pool import Job
 from experiments.common.recording import recorder_of
 from experiments.common.worlds import profile_named, wood_of
 from experiments.grasp_configs.grasp_categories import Grip, category, lifted
-from experiments.grasp_configs.pose_sources import DETECTION_NS, Detection, PoseSource, misled, pose_source
+from experiments.grasp_configs.pose_sources import Detection, PoseSource, misled, pose_source
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.loading.profile_file import load_profile, profile_hash
@@ -78,14 +78,11 @@ class Attempt:
     """Joint positions last measured."""
     _up_ns: int = 0
     """Time at which the lift was completed [ns]; 0: not yet."""
-    _looked_ns: int = 0
     _rested_ns: int = 0
     """Time since which the crane rests above the logs [ns]."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """Run one planner cycle (contract of ``hil.harness.lockstep.Planner``): detects logs at the start until a grasp
-        is chosen, and once at each rest above it.
-        """
+        """Run one planner cycle (contract of ``hil.harness.lockstep.Planner``); detect logs where the crane rests."""
         activity = self.activity
         self._q = self._q if report is None else report.position
         data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
@@ -94,23 +91,18 @@ class Attempt:
         return data
 
     def _looked(self, now_ns: int) -> tuple[LogObservation, ...]:
-        phase = self.activity.phase
-        if phase <= Phase.LOOK:
-            wants = phase is Phase.LOOK or not self.seen.logs
-            if wants and now_ns >= self._looked_ns + DETECTION_NS:
-                self._look(now_ns)
-            return self.seen.logs
-        rests = phase is Phase.ABOVE and self.activity.arrived
+        """Return the logs of a new detection where the crane rests, as a camera on a moving stick is not used."""
+        rests = self.activity.phase in (Phase.LOOK, Phase.ABOVE) and self.activity.arrived
         self._rested_ns = (self._rested_ns or now_ns) if rests else 0
         if not rests or now_ns < self._rested_ns + SETTLE_AFTER_ARRIVAL_NS:
             return ()
-        self._rested_ns = now_ns + SETTLE_AFTER_ARRIVAL_NS
+        self._rested_ns = now_ns
         self._look(now_ns)
         return self.seen.logs
 
     def _look(self, now_ns: int) -> None:
         self.seen = self.source.detect(now_ns, self._q)
-        self.looks, self._looked_ns = self.looks + 1, now_ns
+        self.looks += 1
 
     def over(self, now_ns: int) -> bool:
         """Tell whether the grapple has been held still for two seconds after the lift."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from math import hypot, nan, pi
 
 import pytest
 
 from autonomy.crane_job.activity import DETECTION_TIMEOUT_NS, Activity
-from autonomy.crane_job.cycle import EXTRACTION_DEPTH_M
+from autonomy.crane_job.cycle import EXTRACTION_DEPTH_M, LOOK_ASIDE_RAD, SURE_PROBABILITY
 from autonomy.crane_job.grasp_verification import MAX_RESTARTS
 from autonomy.crane_job.phase_motions import EXTRACTION_DISTANCE_M
 from autonomy.crane_job.phases import Phase
@@ -19,6 +20,7 @@ from autonomy.perception.log_list import TRIANGLE, LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import tip_below_pin_m
 from machine.geometry.kinematics import Unreachable
+from machine.joints import Joint
 from tests.autonomy.crane_stand_in import TICK_NS, StandIn, activity, refusing
 from tests.autonomy.grasp_scenes import GROUND, PROFILE, log, measured, pair
 
@@ -168,7 +170,49 @@ def test_without_a_grasp_further_detections_are_used_before_the_job_fails(better
         assert planner.phase is Phase.ABOVE and len(asked) == 4
     else:
         assert planner.failure_code == "grasp.none-safe"
-        assert asked[-1] - asked[0] == pytest.approx(DETECTION_TIMEOUT_NS, abs=3 * TICK_NS)
+        pauses = [later - before for before, later in pairwise(asked) if later - before > 1e9]
+        assert len(pauses) == 2, "it turned to either side"
+        from_here = [now_ns for now_ns in asked if now_ns < asked[0] + pauses[0]]
+        assert from_here[-1] - from_here[0] == pytest.approx(DETECTION_TIMEOUT_NS, abs=3 * TICK_NS)
+
+
+def unsure(request: GraspRequest) -> GraspCandidate:
+    return replace(SamplingPlanner()(request), probability=SURE_PROBABILITY - 0.1)
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_an_unsure_grasp_is_chosen_after_a_look_from_both_sides(sure: bool) -> None:
+    crane, planner = made(SamplingPlanner() if sure else unsure)
+    crane.until(planner, Phase.ABOVE)
+    slews = [moment.q[Joint.SLEW] for moment in crane.trace]
+    turned_rad = max(slews) - min(slews)
+    assert turned_rad == pytest.approx(0.0 if sure else 2.0 * LOOK_ASIDE_RAD, abs=0.02)
+
+
+@pytest.mark.parametrize(("direct", "turns"), [(False, True), (True, False)])
+def test_a_hidden_end_is_looked_at_from_the_side_where_the_crane_takes_its_time(direct: bool, turns: bool) -> None:
+    crane, planner = Camera(PROFILE, pair()), activity(planner=SamplingPlanner(), direct=direct)
+    hidden_end = tuple(0.35 if i == 22 else 1e-4 if i in (0, 7, 13, 18) else 0.0 for i in range(TRIANGLE))
+    crane.seen = lambda: tuple(replace(log, covariance=hidden_end) for log in crane.logs)
+    crane.until(planner, Phase.ABOVE)
+    slews = [moment.q[Joint.SLEW] for moment in crane.trace]
+    assert (max(slews) - min(slews) > LOOK_ASIDE_RAD) is turns
+
+
+def test_what_looks_like_a_log_between_open_jaws_is_none() -> None:
+    """It would be in the crane's way, and the topmost log."""
+    crane, planner = made()
+
+    def seen_with_ghost() -> tuple[LogObservation, ...]:
+        if planner.phase > Phase.LOOK:
+            return Camera.seen(crane)
+        x, y, z = crane.pin()
+        ghost = LogObservation(9, (x + 0.1, y, z - 0.3), (1.0, 0.0, 0.0), 0.7, 0.1, (1e-4,) * TRIANGLE)
+        return (*Camera.seen(crane), ghost)
+
+    crane.seen = seen_with_ghost
+    crane.until(planner, Phase.ABOVE)
+    assert planner.grasp is not None and 9 not in [log.id for log in planner.grasp.logs]
 
 
 def test_with_exactly_known_logs_the_job_fails_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,14 @@ def length_sigma_m(estimate: LogEstimate) -> float:
     return math.sqrt(c[START, START] + c[END, END] - 2.0 * c[START, END])
 
 
+def test_what_is_thinner_than_any_log_is_not_reported() -> None:
+    tracks, pose = LogTracker(QUIET), pose_at()
+    thin = np.zeros(7)
+    thin[6] = (0.02 - 0.125) / SIGMA[6]
+    for k in range(4):
+        assert not tracks.step([fit_of(pose, TRUTH, noise=thin)], pose, k)
+
+
 def test_a_log_is_confirmed_by_its_second_picture_and_keeps_its_number() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     places = [(5.0, -1.0, 0.12), (6.0, 1.0, 0.12)]

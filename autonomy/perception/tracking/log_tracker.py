@@ -25,6 +25,8 @@ DUPLICATE_DISTANCE_SHARE, MIN_PARALLEL_COSINE, MAX_LENGTH_DIFFERENCE_M = 0.7, 0.
 of their axes is below this share of the sum of their radii."""
 FRAGMENT_DISTANCE_SHARE: Final = 0.5
 """A shorter log is a fragment of a longer one when their axes are nearer than this share of the sum of their radii."""
+THINNEST_LOG_M: Final = 0.05
+"""No thinner log is loaded; pictures that contradict each other in one log make one."""
 NO_PAIR_COST: Final = 1e9  # in the assignment matrix
 
 
@@ -102,7 +104,8 @@ class LogTracker:
             log.update(fits[j], pose, stamp_ns)
             self._logs.append(log)
             self._next_id += 1
-        return _without_fragments([log.track() for log in self._logs if log.hits >= CONFIRMED_HITS])
+        tracks = [log.track() for log in self._logs if log.hits >= CONFIRMED_HITS]
+        return _without_fragments([log for log in tracks if log.estimate.diameter_m >= THINNEST_LOG_M])
 
     def _associated(self, fits: Sequence[CylinderFit], pose: Pose) -> tuple[dict[int, int], set[int]]:
         """Find the nearest fit of each log, and the logs that agree with theirs."""
