@@ -2,8 +2,8 @@
 
 ``true``: a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
 same with true masks.  ``faithful``: paper A's steps on our masks (`autonomy.perception.papers.log_from_mask`).  The
-camera is surveyed.  It sees the logs from the start position of the crane, and again from above when the activity waits
-for that.
+camera is surveyed.  It sees the logs from the start position of the crane, and again from the side and from above
+when the activity waits for that.
 """
 
 from __future__ import annotations
