@@ -135,12 +135,13 @@ SECTIONS: Final = (
         "random place 3.5 to 6.5 m from the crane's column, at any angle of the slew that is clear of the bunk. The "
         "crane starts turned to the place, at most 30 degrees aside. One grasp is lifted and held for two seconds; "
         "the physics decides the outcome. The mount of the camera and the scale of its depth are surveyed before the "
-        "run. The camera sees the logs from the start position of the crane. Where it sees none, only a part of one, or "
-        "the planner is unsure, the crane turns 14 degrees to either side and looks again before it plans. It looks "
-        "once more from above the grasp, at most twice, and the planner plans anew. The feedback of the grapple is used as well. If the jaws stall at the "
-        "sides of a heap, they go on closing while they lift it. If they have closed on nothing, pinch a log that "
-        "they should be under, or are closed without weight after rising by 0.2 m, they open, look again and start "
-        "anew, at most twice. All of this counts as one attempt; the share that needed no second closing is "
+        "run. The camera sees the logs from the start position of the crane. Where it sees none, only a part of one, "
+        "or the planner is unsure, the crane turns 14 degrees to either side and looks again before it plans. It "
+        "looks once more from above the grasp, at most twice, and the planner plans anew. The feedback of the grapple "
+        "is used as well. If the jaws stall at the sides of a heap, they go on closing while they lift it. If they "
+        "have closed on nothing, pinch a log that they should be under, or are closed without weight after rising by "
+        "0.2 m, they open, look again and start anew, at most twice. All of this counts as one attempt; the share "
+        "that needed no second closing is "
         "reported as well.",
         EVALUATED,
         (
