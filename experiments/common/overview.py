@@ -99,8 +99,13 @@ def compared(results: Mapping[str, Result]) -> Iterator[tuple[Comparison, tuple[
             continue
         value = result.paper[entry.paper_metric]
         paper = f"{paper_metric.text(value)} (paper {entry.paper}{_interval(value, entry.trials)})"
-        ours = (metrics.get((entry.experiment, name)) for name in (entry.method, entry.rules, entry.everything))
-        yield entry, (entry.question, paper, *("–" if metric is None else _judged(result, metric) for metric in ours))
+        method, *ours = (
+            "–" if metric is None else _judged(result, metric)
+            for metric in (metrics.get((entry.experiment, n)) for n in (entry.method, entry.rules, entry.everything))
+        )
+        # A quick run keeps the figures of the paper's method, and names their commit.
+        earlier = result.environment.get("ablation", "") if method != "–" else ""
+        yield entry, (entry.question, paper, f"{method}, at `{earlier}`" if earlier else method, *ours)
 
 
 def _interval(value: float, trials: int) -> str:

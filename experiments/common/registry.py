@@ -44,6 +44,11 @@ class Options:
     planner: str = ""
     detector: str = ""
 
+    def selection(self) -> str:
+        """Return what of these the command line must say to select the same trials."""
+        said = {"--seed": self.seed if self.seed != 1 else None, "--trials": self.trials}
+        return "".join(f" {name} {v}" for name, v in said.items() if v is not None) + " --quick" * self.quick
+
 
 @dataclass(frozen=True, slots=True)
 class Entry:

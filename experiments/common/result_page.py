@@ -10,7 +10,7 @@ import math
 import re
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
@@ -64,6 +64,8 @@ class Page:
 
 def publish(result: Result, page: Page, options: Options, console: Console) -> None:
     """Save the result beside its plots in ``options.out``, print it, and write the docs if requested."""
+    if selection := options.selection():
+        result = replace(result, environment={**result.environment, "selection": selection})
     result.save(options.out / "result.json")
     show(result, page.sections, console)
     if options.docs is not None:
@@ -89,7 +91,9 @@ def markdown(result: Result, page: Page) -> str:
     out = [f"# {page.title}", "", conclusion(result, page), ""]
     out += [*_plot(result, *first), ""] if first else []
     numbers = f"[results/{result.experiment}.json](results/{result.experiment}.json) holds all numbers."
-    command = f"`{page.command or f'timberhand experiment {result.experiment} --docs docs'}` repeats the measurement."
+    selection = result.environment.get("selection", "")
+    default_command = f"timberhand experiment {result.experiment}{selection} --docs docs"
+    command = f"`{page.command or default_command}` repeats the measurement."
     out += ["## Method", "", page.introduction, "", f"{page.setting or _setting(result)} {command} {numbers}", ""]
     for section in page.sections:
         out += [f"## {section.title}", ""]

@@ -10,8 +10,8 @@ import pytest
 
 from experiments.common.overview import compared, page, read
 from experiments.common.published import COMPARISONS
-from experiments.common.registry import EXPERIMENTS
-from experiments.common.result_page import conclusion
+from experiments.common.registry import EXPERIMENTS, Options
+from experiments.common.result_page import Page, conclusion, markdown
 from experiments.common.standing import Standing
 from tests.codes import numbers_in
 
@@ -45,6 +45,24 @@ def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and
         shown = numbers_in(cell)
         assert shown[0] == pytest.approx(100.0 * metrics[name], abs=0.01) and shown[-1] == metrics[f"{name}_n"]
     assert not numbers_in(rows["optimal"][4]), "not measured so"
+
+
+def test_a_figure_that_a_quick_run_kept_names_its_commit() -> None:
+    result = read(DOCS / "results" / "grasp-configs.json")
+    for kept in ({}, {"ablation": "0123456789ab"}):
+        environment = {k: v for k, v in result.environment.items() if k != "ablation"} | kept
+        rows = {e.paper_metric: c for e, c in compared({"grasp-configs": replace(result, environment=environment)})}
+        _, _, method, rules, _ = rows["optimal"]
+        assert method.endswith(", at `0123456789ab`") is bool(kept) and "0123456789ab" not in rules
+
+
+def test_the_command_on_a_page_selects_the_trials_that_were_measured() -> None:
+    assert Options(1, "nominal", "palms_471", Path()).selection() == ""
+    said = Options(7, "nominal", "palms_471", Path(), trials=30, quick=True).selection()
+    assert said == " --seed 7 --trials 30 --quick"
+    result = read(DOCS / "results" / "grasp-configs.json")
+    shown = markdown(replace(result, environment=result.environment | {"selection": said}), Page("", (), "", ()))
+    assert "`timberhand experiment grasp-configs --seed 7 --trials 30 --quick --docs docs`" in shown
 
 
 def test_every_comparison_names_metrics_that_its_experiment_has_and_limits_ours() -> None:
