@@ -354,7 +354,10 @@ class Activity(ActivityState):
             self._fail(rule.timeout._replace(sentence=f"{rule.timeout.sentence} within {self._elapsed_s:.0f} s{off}"))
 
     def _drop_load(self) -> None:
-        """Open here, for what the jaws lift is too heavy, and grip anew: it has risen by a hand's breadth at most."""
+        """Lower what the jaws lift, for it is too heavy, and grip anew.
+
+        Not opened where they are: rid of half a tonne the crane springs up, and the controller stops it.
+        """
         q, load_kg = self._position(), self._inbox.report.load_kg
         if not self._cycle.drop_load(q):
             sentence = (
@@ -362,7 +365,7 @@ class Activity(ActivityState):
                 f"{self._cycle.arm.pose(q).r_m:.1f} m away; bring it nearer, or lay the logs apart"
             )
             self._put_back_reason = Problem("activity.too-heavy", sentence)
-        self._enter(Phase.OPEN, self._tracker.setpoint)
+        self._enter(Phase.LOWER, self._tracker.setpoint)
 
     def _next(self, now_ns: int) -> Phase | None:
         """Choose the phase after this one, whose motion is done; None while a condition is not met."""

@@ -304,9 +304,11 @@ class Cycle:
         return 1.0 - (1.0 - HEAVY_LIFT_RATE) * heavy
 
     def drop_load(self, q: Axes) -> bool:
-        """Let the jaws open here, and restart the grasp from above; False after too many times."""
+        """Lay the load down where it was gripped, and restart the grasp from above; False after too many times."""
         assert self.grasp is not None
-        self.place = self._arm.pose(q)
+        self.plan_return()
+        assert self.place is not None
+        self.place = self.place.at_height(min(self.place.z_m, self._arm.pose(q).z_m))
         restarted = self._recovery.after_overload(self.grasp)
         self.drops_load = restarted is not None
         if restarted is not None:

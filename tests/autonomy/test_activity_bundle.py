@@ -166,11 +166,11 @@ def test_a_pile_that_yields_slowly_is_waited_for() -> None:
     assert heap.tong_rad > STALL_RAD + 0.1
 
 
-def test_what_is_too_heavy_is_released_before_the_machine_stops_and_gripped_anew() -> None:
+def test_what_is_too_heavy_is_laid_down_before_the_machine_stops_and_gripped_anew() -> None:
     heap = Heap(PROFILE, small_pile())
     heap.heavy_kg = 600.0
     planner, _ = lifting(heap)
-    begun_m, loads = heap.pin_m(), []
+    begun_m, loads, opened_m = heap.pin_m(), [], []
     phases = [planner.phase]
     while planner.phase is not Phase.FAILED and len(phases) < 40:
         heap.step(planner)
@@ -178,11 +178,14 @@ def test_what_is_too_heavy_is_released_before_the_machine_stops_and_gripped_anew
         if planner.phase is not phases[-1]:
             phases.append(planner.phase)
             begun_m = heap.pin_m() if planner.phase is Phase.LIFT else begun_m
+            opened_m += [heap.pin_m() - begun_m] if planner.phase is Phase.OPEN else []
         assert planner.phase is not Phase.LIFT or heap.pin_m() < begun_m + 0.3
     assert max(loads) < 1.0
     assert phases.count(Phase.LIFT) == 1 + MAX_RESTARTS and planner.failure_code == "activity.too-heavy"
     assert 350.0 < numbers_in(planner.failure)[0] <= 600.0
     assert Phase.LIFT not in {b for a, b in pairwise(phases) if a is Phase.OPEN}
+    assert {b for a, b in pairwise(phases) if a is Phase.LIFT} == {Phase.LOWER}
+    assert max(opened_m) < 0.21, "opened in the air, the jaws let the crane spring up"
 
 
 def test_a_heavy_load_is_lifted_more_slowly() -> None:
