@@ -365,13 +365,13 @@ class Cycle:
                         return carry_motion(arm, self._motion_planner, start, shown, grasp, logs, hangs=False)
                     except Unreachable:
                         self.view = None
-                self.place = plan_place(arm, self._job, grasp, logs)
+                self.place = self._plan_place(arm, grasp, logs)
                 return carry_motion(arm, self._motion_planner, start, self.place, grasp, logs, hangs=False)
             case Phase.CARRY:
                 self.lifted_kg = arm.load_kg
                 logs = self._logs_with_load([q])
                 hangs_at_rad = grapple_yaw(self._profile, q)
-                place = plan_place(arm, self._job, grasp, logs, hangs_at_rad, q[Joint.ROT])
+                place = self._plan_place(arm, grasp, logs, hangs_at_rad, q[Joint.ROT])
                 self.place = drop_pose = self._unturned(place, q)
                 if (
                     self._turns_rotator
@@ -387,6 +387,17 @@ class Cycle:
         if phase is Phase.LOWER:
             return hold(q) if self._is_at_place(start, self.place) else straight_line(arm, start, self.place)
         return straight_line(arm, start, start.at_height(max(start.z_m, retreat_height_m(self._profile))))
+
+    def _plan_place(
+        self,
+        arm: Arm,
+        grasp: Grasp,
+        logs: Sequence[LogObservation],
+        held_yaw_rad: float | None = None,
+        stands_rad: float | None = None,
+    ) -> Pose:
+        knows_load = self._motion_planner.knows_load
+        return plan_place(arm, self._job, grasp, logs, held_yaw_rad, stands_rad, knows_load=knows_load)
 
     def _hanging_kg(self, phase: Phase) -> float:
         """Return the load that bends the crane in a phase, kg: that of a lifted log, otherwise 0."""

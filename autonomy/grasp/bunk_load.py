@@ -221,12 +221,14 @@ def plan_place(
     logs: Sequence[LogObservation],
     held_yaw_rad: float | None = None,
     stands_rad: float | None = None,
+    knows_load: bool = True,
 ) -> Pose:
     """Plan the pose of the pin in which the grapple may open over the bunk.
 
     ``held_yaw_rad`` is the grapple's yaw while the log was seen to hang in it.  A thin log may lie askew in closed
     jaws: the rotator turns so that the log, not the grapple, lies along the bunk.  Of the turns that differ by half a
-    turn it makes the one that ends nearest to ``stands_rad``, its angle by then; None: that of the grasp.
+    turn it makes the one that ends nearest to ``stands_rad``, its angle by then; None: that of the grasp.  Without
+    ``knows_load`` the log may lie above the stakes.
 
     Raises:
         BunkFull: the log would lie above the stakes.
@@ -244,7 +246,7 @@ def plan_place(
     if job.place_m is not None:
         center_x, center_y = job.place_m
         rest = load.place_at(point_in_bunk(bunk, *job.place_m)[1])
-    if rest.rest_z_m > highest_m:
+    if knows_load and rest.rest_z_m > highest_m:
         raise BunkFull(
             "grasp.bunk-full", f"the bunk is full: log {grasp.log.id} would lie above the stakes; empty the bunk"
         )

@@ -22,12 +22,17 @@ class MotionPlanner(Protocol):
 
     ``direct``: one motion leads down to a log, or with it up, over and down into the bunk; otherwise an activity
     requests each of these alone.  ``free_telescope``: the planner is fastest with the telescope far out at a log
-    (`Arm`).  ``turns_rotator``: whether the planner of the crane job may turn the grapple.
+    (`Arm`).  ``turns_rotator``: whether the planner of the crane job may turn the grapple.  ``knows_load``: whether a
+    full bunk ends the loading.
     """
 
     @property
     def turns_rotator(self) -> bool:
         """Whether the rotator is turned for a log and for its place; otherwise it stays as it is."""
+
+    @property
+    def knows_load(self) -> bool:
+        """Whether the height of the load is estimated; otherwise logs are laid on it until none is left."""
 
     @property
     def direct(self) -> bool:
@@ -63,6 +68,7 @@ class TimeOptimalPlanner:
         self.direct: Final = direct
         self.free_telescope: Final = True
         self.turns_rotator: Final = True
+        self.knows_load: Final = True
 
     def __call__(
         self,
@@ -96,6 +102,8 @@ class MovementPrimitivePlanner:
         """The demonstrations have other postures."""
         self.turns_rotator: Final = False
         """Paper B neither measures nor controls it (3.1): logs lie at an angle to the path, as its grapple hangs."""
+        self.knows_load: Final = False
+        """Paper B has no method to estimate when the bunk is full (3.1)."""
         self._shown = PrimitiveMotions(primitives)
 
     def __call__(

@@ -165,6 +165,8 @@ def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
     assert last.z_m - deepest + radius_m < top_m + 0.03, "its middle comes to lie below the top of the stakes"
     with pytest.raises(BunkFull, check=coded("grasp.bunk-full")):
         plan_place(ARM, CraneJob(), GRASP, layer(-BELOW_STAKE_TOP_M - radius_m + 0.01))
+    heaped = plan_place(ARM, CraneJob(), GRASP, layer(0.1), knows_load=False)
+    assert heaped.z_m > last.z_m + 0.1, "on top of the load, as high as that is"
 
 
 def test_a_job_may_name_the_place() -> None:
