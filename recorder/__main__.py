@@ -4,7 +4,8 @@ The receiving thread only receives and queues, the writing thread only writes: a
 nothing, and one that blocks longer costs records, which are counted and reported on stderr at most once per second.
 When everything is open, one JSON line with ``ready`` goes to stdout.
 
-Exit codes: 0 normal end, 2 usage, 3 the directory or profile cannot be used, 4 a bus or port cannot be used.
+Exit codes: 0 normal end, 1 the writing thread failed, 2 usage, 3 the directory, profile or key cannot be used,
+4 a bus or port cannot be used.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from can_dbc.bus.batch import enlarge_receive_buffer
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.frame import Frame
+from can_dbc.messages.envelope import SERVICE_KEY, read_key, service_key
 from can_dbc.messages.picture import decode_picture, encode_picture_request
 from can_dbc.messages.record_ring import RingReader, default_path
 from can_dbc.messages.udp_address import address_argument
@@ -39,7 +41,7 @@ from machine.status.reasons import known
 from recorder.manifest import describe
 from recorder.recorder import Recorder
 from recorder.stop_recorder import Stop
-from runtime.errors import InputRefused, LinkError
+from runtime.errors import ConfigError, InputRefused, LinkError
 
 # -- Entries for systemd's journal with fields of their own, in its native protocol and without a library.
 #
@@ -124,6 +126,8 @@ class InputCollector:
     ) -> None:
         self.items: queue.Queue[Item | None] = queue.Queue(QUEUE_ITEMS)
         self.dropped = 0
+        self.failed = False
+        """The writing thread ended by an error."""
         self._buses = tuple(buses.values())
         self.wake, self._ask = socket.socketpair()
         self._receivers = [self._frames_of(name, bus) for name, bus in buses.items()]
@@ -135,11 +139,19 @@ class InputCollector:
     def run(self) -> None:
         """Receive until ``end``, then what still waits."""
         ended = False
-        while not ended:
-            ended = bool(select.select([self.wake], [], [], POLL_PERIOD_S)[0])
-            for receive in self._receivers:
-                receive()
-        self.items.put(None)
+        try:
+            while not ended:
+                ended = bool(select.select([self.wake], [], [], POLL_PERIOD_S)[0])
+                for receive in self._receivers:
+                    receive()
+        finally:
+            self._end_items()
+
+    def _end_items(self) -> None:
+        """Queue the None that ends the writing thread, which may be behind, or have failed."""
+        while not self.failed:
+            with contextlib.suppress(queue.Full):
+                return self.items.put(None, timeout=POLL_PERIOD_S)
 
     def end(self) -> None:
         """Make ``run`` return; may be called from a signal handler."""
@@ -230,8 +242,17 @@ class InputCollector:
 
 
 def write_all(recorder: Recorder, inputs: InputCollector) -> None:
-    """Pass everything in the queue to the recorder, until None: the writing thread."""
-    reported, report_after_s = 0, 0.0
+    """Pass everything in the queue to the recorder, until None: the writing thread; its failure ends the inputs."""
+    try:
+        _write_all(recorder, inputs)
+    except BaseException:
+        inputs.failed = True
+        inputs.end()
+        raise
+
+
+def _write_all(recorder: Recorder, inputs: InputCollector) -> None:
+    reported, report_after_s, key_reported = 0, 0.0, False
     flush_at = time.monotonic() + FLUSH_PERIOD_S
     while True:
         try:
@@ -250,6 +271,9 @@ def write_all(recorder: Recorder, inputs: InputCollector) -> None:
             recorder.on_tick(payload)
         elif kind == "report":
             recorder.on_report(payload)
+            if recorder.other_key and not key_reported:
+                key_reported = True
+                report("state reports are refused: give the controller's key with --key-file")
         elif kind == "picture":
             recorder.on_picture(payload)
         now = time.monotonic()
@@ -265,8 +289,9 @@ def write_all(recorder: Recorder, inputs: InputCollector) -> None:
 
 
 def report(sentence: str) -> None:
-    """Write one line to stderr."""
-    sys.stderr.write(f"recorder: {sentence}\n")
+    """Write one line to stderr, where that is possible: it may be a file on the same full disk."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        sys.stderr.write(f"recorder: {sentence}\n")
 
 
 def write_to_journal(stop: Stop, file: Path) -> None:
@@ -311,7 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="log detector whose pictures are recorded, at most one a second",
     )
     parser.add_argument("--seed", type=int, help="seed of the run, for the manifest")
-    parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
+    parser.add_argument("--key-file", type=Path, help=f"file with the controller's key; default: {SERVICE_KEY}, if any")
     parser.add_argument("--stops", type=Path, metavar="DIR", help="directory of the stops' files; default: OUT/stops")
     parser.add_argument("--journal", action="store_true", help="write every stop to the journal of systemd")
     parser.add_argument("--no-sync", action="store_true", help="do not flush data to the disk (for benches)")
@@ -325,11 +350,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 parser.error(f"--bus {name}: the buses of {profile.name} are {', '.join(filter(None, known))}")
         ticks, reports = RingReader(a.ticks or default_path()), udp_socket(a.report_port)
         buses = {name: open_bus(address) for name, address in addresses.items()}
-        key = a.key_file.read_bytes().strip() if a.key_file else None
+        key = service_key() if a.key_file is None else read_key(a.key_file)
         manifest = describe(profile, tuple(addresses), a.seed, live=True)
         on_stop = write_to_journal if a.journal else None
         recorder = Recorder(a.out, profile, manifest, key, not a.no_sync, a.stops, on_stop)
-    except (ProfileError, InputRefused) as error:
+    except (ProfileError, InputRefused, ConfigError) as error:
         report(str(error))
         return 3
     except LinkError as error:
@@ -343,14 +368,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda *_: inputs.end())
     writer = threading.Thread(target=write_all, args=(recorder, inputs), name="writer")
     writer.start()
-    sys.stdout.write(json.dumps({"ready": True, "out": str(a.out)}) + "\n")
-    sys.stdout.flush()
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody may read it, and it records all the same
+        sys.stdout.write(json.dumps({"ready": True, "out": str(a.out)}) + "\n")
+        sys.stdout.flush()
     inputs.run()
     writer.join()
     ticks.close()
     for bus in buses.values():
         bus.close()
-    return 0
+    return 1 if inputs.failed else 0
 
 
 if __name__ == "__main__":

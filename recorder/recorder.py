@@ -31,7 +31,7 @@ from can_dbc.dbc.codec import Database, MessageCodec
 from can_dbc.frame import ERROR, REMOTE, Frame, describe
 from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.crane import StateReport
-from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.envelope import DatagramRefused, without_mac
 from can_dbc.messages.json_schema import flat_schema
 from can_dbc.messages.mission import decode_grasp, decode_mission
 from can_dbc.messages.picture import decode_picture
@@ -132,6 +132,8 @@ class Recorder:
         """Records lost because they could not be written."""
         self.refused = 0
         """Reports and tick records that were invalid."""
+        self.other_key = False
+        """A refused datagram was a state report with an authenticator of another key, or there is no key here."""
         self._directory = directory
         self._manifest = manifest
         self._durable = sync and manifest.live
@@ -204,6 +206,7 @@ class Recorder:
             topic = REPORT
         else:
             self.refused += 1
+            self.other_key = self.other_key or _is_signed_report(datagram)
             return
         stamp_ns, time_ns = report.stamp_ns, report.stamp_ns + self._offset_ns
         self._at(stamp_ns)
@@ -342,3 +345,11 @@ def _is_grasp(datagram: bytes, key: bytes | None) -> bool:
     except DatagramRefused:
         return False
     return True
+
+
+def _is_signed_report(datagram: bytes) -> bool:
+    """Tell whether it is a state report with an authenticator, whose key is not checked."""
+    try:
+        return isinstance(datagrams.decode(without_mac(datagram)), StateReport)
+    except DatagramRefused:
+        return False

@@ -2,8 +2,8 @@
 
 Input is a run's directory.  Each MCAP file without a footer is read up to its last complete chunk and rewritten with an
 index next to itself, flushed to the disk and put in place by an atomic rename: at any time the file is either the old
-or the new one.  A candump file loses its unfinished last line.  A complete recording, or one that a running recorder
-still holds (``flock``), is not changed.
+or the new one.  Then the candump files of its buses lose their unfinished last lines.  A complete recording, or one
+that a running recorder still holds (``flock``), is not changed.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -24,6 +25,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC, Writer
 
+from recorder import manifest
 from runtime.errors import InputRefused
 
 RUN_NAME = "run.mcap"
@@ -57,9 +59,19 @@ def recover(directory: Path) -> list[Recovered]:
                 return recovered
             if not is_complete(path):
                 recovered.append(rewrite(path))
-    for log in directory.glob("*.log"):
-        _trim_line(log)
+    if recovered:
+        for log in directory.glob("*.log"):
+            if log.stem in _buses(directory):
+                _trim_line(log)
     return recovered
+
+
+def _buses(directory: Path) -> Collection[str]:
+    """List the buses of a recording; none where its manifest cannot be read."""
+    try:
+        return manifest.read(directory).buses
+    except (OSError, msgspec.MsgspecError):
+        return ()
 
 
 def _trim_line(path: Path) -> None:
@@ -68,7 +80,7 @@ def _trim_line(path: Path) -> None:
         tail = min(size, 256)
         file.seek(-tail, 2)
         end = file.read().rfind(b"\n") + 1
-        if end < tail:
+        if 0 < end < tail:
             file.truncate(size - tail + end)
 
 

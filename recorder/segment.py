@@ -109,5 +109,7 @@ class CommitFile:
         self._committed += at
 
     def close(self) -> None:
-        """Close without committing."""
-        os.close(self._fd)
+        """Close without committing; again, do nothing."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)

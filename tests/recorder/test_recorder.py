@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from can_dbc.messages.datagrams import encode
+from can_dbc.messages.envelope import signed, write_key
 from can_dbc.messages.record_ring import RingReader
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import TimingWriter
@@ -25,7 +26,7 @@ from can_dbc.trace.candump import read_trace
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module
 from recorder import segment
-from recorder.__main__ import InputCollector, udp_socket, write_all
+from recorder.__main__ import InputCollector, main, udp_socket, write_all
 from recorder.recorder import CHUNK_NS, Recorder
 from recorder.recover import Channel, Stored, is_complete, recover, run_files, scan
 from runtime.errors import InputRefused
@@ -331,6 +332,7 @@ def test_damaged_records_with_good_checksums_end_the_valid_part(tmp_path, damage
 
 def test_a_complete_recording_is_not_changed(run, tmp_path):
     shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "crane0.log").write_bytes(b"a line\nwithout an end")
     before = {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()}
     assert recover(tmp_path) == []
     assert {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()} == before
@@ -343,13 +345,17 @@ def test_a_running_recorder_is_not_disturbed(recorder, tmp_path):
     assert ticks_of(tmp_path / "run.mcap") == [tick(k) for k in range(100)]
 
 
-def test_an_unfinished_line_of_the_candump_file_is_removed(run, tmp_path):
-    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
-    log = tmp_path / "crane0.log"
-    lines = log.read_bytes().splitlines(keepends=True)
-    log.write_bytes(b"".join(lines[:10]) + lines[10][:15])
+@pytest.mark.parametrize(
+    ("name", "unfinished", "kept"), [("crane0", 15, 0), ("crane0", 300, 300), ("notes", 15, 15), ("crane0", 0, 0)]
+)
+def test_an_unfinished_line_of_the_candump_file_is_removed(run, tmp_path, name, unfinished, kept):
+    (tmp_path / "manifest.json").write_bytes((run / "manifest.json").read_bytes())
+    (tmp_path / "run.mcap").write_bytes((run / "run.mcap").read_bytes()[:-1])
+    lines = b"".join((run / "crane0.log").read_bytes().splitlines(keepends=True)[:10])
+    log = tmp_path / f"{name}.log"
+    log.write_bytes(lines + unfinished * b"x")
     recover(tmp_path)
-    assert log.read_bytes() == b"".join(lines[:10])
+    assert log.read_bytes() == lines + kept * b"x"
 
 
 def test_a_file_of_another_kind_is_refused_with_its_name(tmp_path):
@@ -410,3 +416,69 @@ def test_records_that_do_not_fit_into_the_queue_are_counted(tmp_path, capfd):
     writer.join(10)
     assert recorder.dropped == 3 and manifests.read(tmp_path).dropped == 3
     assert 3 in numbers_in(capfd.readouterr().err)
+
+
+class Full:
+    """A stream to a file on a full disk."""
+
+    def write(self, text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_report_that_cannot_be_written_costs_no_record(tmp_path, monkeypatch):
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
+    inputs.dropped = 3
+    for item in (("tick", "", tick(0)), None):
+        inputs.items.put(item)
+    monkeypatch.setattr("sys.stderr", Full())
+    write_all(Recorder(tmp_path, PROFILE, manifest()), inputs)
+    assert manifests.read(tmp_path).complete and ticks_of(tmp_path / "run.mcap") == [tick(0)]
+
+
+def test_a_writer_that_fails_ends_the_inputs_although_the_queue_is_full(tmp_path, monkeypatch):
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
+    inputs.items = queue.Queue(1)
+    recorder = Recorder(tmp_path, PROFILE, manifest())
+
+    def fail(record):
+        inputs._put(("tick", "", record), 1)
+        raise RuntimeError
+
+    monkeypatch.setattr(recorder, "on_tick", fail)
+    inputs._put(("tick", "", tick(0)), 1)
+    with pytest.raises(RuntimeError):
+        write_all(recorder, inputs)
+    receiver = threading.Thread(target=inputs.run, daemon=True)
+    receiver.start()
+    receiver.join(10)
+    assert inputs.items.full() and not receiver.is_alive()
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_the_exit_code_is_that_of_the_writer_and_not_of_a_full_disk(failed, tmp_path, monkeypatch):
+    keys = []
+
+    def write(recorder, inputs):
+        keys.append(recorder._key)
+        inputs.failed = failed
+        inputs.end()
+
+    key = write_key(tmp_path / "key")
+    monkeypatch.setattr("can_dbc.messages.envelope.SERVICE_KEY", key)
+    monkeypatch.setattr("recorder.__main__.write_all", write)
+    monkeypatch.setattr("recorder.__main__.signal.signal", lambda *_: None)
+    monkeypatch.setattr("sys.stdout", Full())
+    ticks = str(tmp_path / "controller.ticks")
+    assert main(["--out", str(tmp_path / "run"), "--report-port", "0", "--ticks", ticks, "--no-sync"]) == failed
+    assert keys == [key.read_bytes()], "the key of the installed services"
+
+
+@pytest.mark.parametrize(("key", "said"), [(None, 1), (16 * b"b", 1), (16 * b"a", 0)])
+def test_reports_that_need_another_key_are_said_once(key, said, tmp_path, capfd):
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
+    for datagram in (signed(report(0), 16 * b"a"), b"nonsense", signed(report(1), 16 * b"a")):
+        inputs.items.put(("report", "", datagram))
+    inputs.items.put(None)
+    recorder = Recorder(tmp_path, PROFILE, manifest(), key)
+    write_all(recorder, inputs)
+    assert recorder.refused == 1 + 2 * said and capfd.readouterr().err.count("--key-file") == said

@@ -6,6 +6,7 @@ import errno
 import itertools
 import os
 import random
+import shutil
 import socket
 import struct
 import time
@@ -225,6 +226,13 @@ def test_a_directory_that_cannot_be_made_costs_the_stops_only(tmp_path: Path) ->
     bench = run_to_a_stop(tmp_path / "run", before=20, after=20, stops=tmp_path / "file" / "stops")
     bench.close()
     assert bench.recorders[0].lost == 1 and is_complete(tmp_path / "run" / "run.mcap")
+
+
+def test_a_directory_that_is_removed_costs_the_stop_only(tmp_path: Path) -> None:
+    bench = run_to_a_stop(tmp_path, before=20, after=20)
+    shutil.rmtree(tmp_path / "stops")
+    bench.close()
+    assert bench.recorders[0].lost == 1 and manifests.read(tmp_path).complete
 
 
 def test_live_a_stop_has_the_time_of_day_and_is_announced_at_once(tmp_path: Path) -> None:

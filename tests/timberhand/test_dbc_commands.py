@@ -1,4 +1,4 @@
-"""``timberhand dbc check``, ``log decode`` and ``bench codec`` from the outside."""
+"""``timberhand dbc check``, ``record``, ``recording decode`` and ``bench codec`` from the outside."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from can_dbc.protocols.e2e import protect
 from host.exit_codes import ExitCode
 from runtime.errors import TimberhandError
 from tests.codes import exit_code_of
+from timberhand.cli import app
 from timberhand.commands import bench_codec, dbc, recording
 
 OVERLAP = (
@@ -123,3 +124,11 @@ def test_a_file_without_a_readable_frame_is_refused(
     code, sentence = run(recording.app, "decode", tmp_path / name, "--dbc", "crane", *options)
     assert code == ExitCode.CONFIGURATION
     assert name in sentence and "\n" not in sentence.strip()
+
+
+@pytest.mark.parametrize("key", [(), ("--key-file", "key")])
+def test_record_gives_the_recorder_its_key(key: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[str] = []
+    monkeypatch.setattr("recorder.__main__.main", given.extend)
+    run(app, "record", "--out", "run", *key)
+    assert tuple(given[given.index("--key-file") :] if "--key-file" in given else ())[:2] == key

@@ -35,6 +35,13 @@ def record(
     timing: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Timing page of the controller, recorded once per second.")
     ] = None,
+    key_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="File with the key that authenticates datagrams (default: that of the installed services).",
+        ),
+    ] = None,
 ) -> None:
     """Record the buses, the controller's ticks and its reports until Ctrl-C.
 
@@ -43,6 +50,8 @@ def record(
       timberhand record --out runs/field-1
 
       timberhand record --out runs/field-1 --bus crane0=socketcan:can0
+
+      timberhand record --out runs/field-1 --report-port 5006 --key-file key
     """
     from can_dbc.bus.factory import default_address
     from machine.loading.profile_file import load_profile
@@ -56,6 +65,7 @@ def record(
         raise CommandFailed.from_error(error, ExitCode.BUS) from error
     arguments = ["--out", str(out), "--report-port", str(report_port), *(("--ticks", str(ticks)) if ticks else ())]
     arguments += ["--timing", str(timing)] if timing else []
+    arguments += ["--key-file", str(key_file)] if key_file else []
     code = main([*arguments, "--profile", profile, *(x for b in buses for x in ("--bus", b))])
     raise typer.Exit(code)
 
