@@ -9,6 +9,7 @@ Exit codes: 0 interrupted, 2 usage, 3 configuration, 4 a port is in use.
 from __future__ import annotations
 
 import argparse
+import errno
 import ipaddress
 import json
 import signal
@@ -19,10 +20,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from can_dbc.messages.envelope import read_key
 from console.access_guards import ENTRY, AuditLog
 from console.exposure import Exposure, StartError, check_local
 from machine.loading.profile_file import ProfileError, load_profile, profile_check, profile_file, profile_hash
 from machine.profile import Profile
+from runtime.errors import ConfigError
 
 if TYPE_CHECKING:
     from console.foxglove_server import FoxgloveServer
@@ -67,12 +70,11 @@ def serve(
 
     try:
         machine, check = load_profile(profile), profile_check(profile)
-        key = key_file.read_bytes().strip() if key_file else None
+        key = None if key_file is None else read_key(key_file)
     except ProfileError as error:
         raise StartError(error.code, str(error), 3) from error
-    except OSError as error:
-        sentence = f"{key_file} cannot be read ({error.strerror}); give the file with the key"
-        raise StartError("console.key-file", sentence, 3) from error
+    except ConfigError as error:
+        raise StartError("console.key-file", str(error), 3) from error
     setpoints, named = _address(controller, "--controller"), _buses(buses, machine)
     if setpoints is not None and machine.crane_bus not in named:
         sentence = f"--controller commissions the crane and needs its bus; give --bus {machine.crane_bus}=ADDRESS"
@@ -195,6 +197,9 @@ def _listen(kind: socket.SocketKind, host: str, port: int, option: str) -> socke
             s.listen(64)
     except OSError as error:
         s.close()
+        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            sentence = f"{host} is no address of this computer ({error.strerror}); choose another --bind"
+            raise StartError("console.bind", sentence, 2) from error
         sentence = f"cannot use {host}:{port} ({error.strerror}); choose another {option}"
         raise StartError("console.port-in-use", sentence, 4) from error
     return s
@@ -225,9 +230,9 @@ def _address(text: str | None, option: str) -> tuple[str, int] | None:
         return None
     host, _, port = text.rpartition(":")
     try:
-        return str(ipaddress.ip_address(host or "127.0.0.1")), _port(port)
+        return str(ipaddress.IPv4Address(host or "127.0.0.1")), _port(port)
     except (ValueError, argparse.ArgumentTypeError):
-        sentence = f"{option} {text} is not HOST:PORT, as in 127.0.0.1:5005"
+        sentence = f"{option} {text} is not HOST:PORT with an IPv4 address, as in 127.0.0.1:5005"
         raise StartError("console.address", sentence, 2) from None
 
 

@@ -16,12 +16,11 @@ import queue
 import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Any, Final
 
 from starlette.datastructures import Headers, QueryParams
-from starlette.requests import HTTPConnection
+from starlette.requests import HTTPConnection, cookie_parser
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -54,12 +53,8 @@ def set_session(answer: Response, headers: Headers, session: str, secure: bool) 
 
 
 def session_of(headers: Headers) -> str:
-    """Return the session's cookie; empty without one."""
-    try:
-        cookie = SimpleCookie(headers.get("cookie", "")).get(cookie_of(headers))
-    except CookieError:
-        return ""
-    return "" if cookie is None else cookie.value
+    """Return the session's cookie, whatever the others on this host hold; empty without one."""
+    return cookie_parser(headers.get("cookie", "")).get(cookie_of(headers), "")
 
 
 def person_of(request: HTTPConnection) -> Person:

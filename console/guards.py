@@ -50,7 +50,7 @@ class RequestGuards:
 
     def __init__(self, app: ASGIApp, names: Collection[str], policy: str) -> None:
         self._app = app
-        self._names = frozenset(names)
+        self._names = frozenset(name.strip("[]").lower() for name in names)
         self._headers: Sequence[tuple[str, str]] = (
             ("Content-Security-Policy", policy),
             ("X-Content-Type-Options", "nosniff"),

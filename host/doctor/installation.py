@@ -203,10 +203,12 @@ def places() -> Iterator[Finding]:
 
 def ports() -> Finding:
     """Check the UDP ports of the settings, and the port of the page."""
-    required_ports = {
-        name: int(value) for name, value in _settings().items() if name.endswith("_PORT") and value.isdigit()
-    }
-    required_ports = required_ports or {"CONSOLE_PORT": 8471}
+    texts = {name: value for name, value in _settings().items() if name.endswith("_PORT")}
+    for name, text in texts.items():
+        if not re.fullmatch(r"[0-9]{1,5}", text) or not 0 < int(text) < 65536:
+            wrong = f"{name}={text} is no port in {CONF}; a port is a number from 1 to 65535"
+            return row("ports", "", CHANGE, wrong, "the services start", f"sudo nano {CONF}", "timberhand config check")
+    required_ports = {name: int(text) for name, text in texts.items()} or {"CONSOLE_PORT": 8471}
     taken = {name: port for name, port in required_ports.items() if not _free(port, name == "CONSOLE_PORT")}
     taken_text = ", ".join(f"{name} {port}" for name, port in taken.items())
     return row(
@@ -274,7 +276,7 @@ def _settings() -> dict[str, str]:
         text = CONF.read_text()
     except OSError:
         return {}
-    return dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
+    return dict(re.findall(r"^(\w+)=(.*?)[ \t]*$", text, re.MULTILINE))
 
 
 def _type_of(interface: str) -> str:

@@ -78,13 +78,13 @@ def make(wheel: Path, private: Path, out: Path, find_links: Path | None, lock: L
     None leaves them out, for computers that take them from an environment.
 
     Raises:
-        CommandFailed: the wheel or the key is unusable, or packages are missing.
+        CommandFailed: the wheel or the key is unusable, packages are missing, or ``out`` cannot be written.
     """
     release = _release_of(wheel)
     folder = out / f"timberhand-{release.name}"
     shutil.rmtree(folder, ignore_errors=True)
-    (folder / "wheels").mkdir(parents=True)
     try:
+        (folder / "wheels").mkdir(parents=True)
         shutil.copy(wheel, folder / "wheels")
         if lock is not None:
             _add_packages(folder / "wheels", release, find_links, lock)
@@ -97,6 +97,9 @@ def make(wheel: Path, private: Path, out: Path, find_links: Path | None, lock: L
         sign(folder / SUMS, private)
         archive = out / f"{folder.name}.tar"
         _pack(folder, archive)
+    except OSError as error:
+        sentence = f"the bundle cannot be made in {out}: {error.strerror}; make room there, or name another --out"
+        raise CommandFailed("bundle.not-written", sentence) from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return archive
@@ -252,7 +255,7 @@ def _files(folder: Path) -> set[str]:
 
 
 def _pack(folder: Path, archive: Path) -> None:
-    """Write a tar file that depends on the contents alone."""
+    """Write a tar file that depends on the contents alone, whole or not at all."""
 
     def plain(entry: tarfile.TarInfo) -> tarfile.TarInfo:
         entry.mtime = entry.uid = entry.gid = 0
@@ -260,6 +263,11 @@ def _pack(folder: Path, archive: Path) -> None:
         entry.mode = 0o644
         return entry
 
-    with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as file:
-        for name in sorted(_files(folder)):
-            file.add(folder / name, f"{folder.name}/{name}", filter=plain)
+    fresh = archive.with_name(f"{archive.name}.new")
+    try:
+        with tarfile.open(fresh, "w", format=tarfile.PAX_FORMAT) as file:
+            for name in sorted(_files(folder)):
+                file.add(folder / name, f"{folder.name}/{name}", filter=plain)
+        os.replace(fresh, archive)
+    finally:
+        fresh.unlink(missing_ok=True)

@@ -5,8 +5,8 @@
     /etc/timberhand/machine           -> machine-a or machine-b; PROFILE=/etc/timberhand/machine/profile.toml
     /etc/timberhand/machine-a/        profile.toml, NAME.envelope.toml, machine.sha256, machine.sha256.sig
 
-New files go to the place that is not in use, are checked there, flushed, and one rename puts them in use; the former
-ones stay for the way back.
+New files are written and flushed beside the place that is not in use, are checked there, and take that place; then one
+rename puts them in use, and the former ones stay for the way back.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from controller.guard.layout import GuardConfigError
 from host.exit_codes import CommandFailed
 from host.release import sums
 from host.release.signature import signature_path, verify
-from host.release.trees import point
+from host.release.trees import flush_folder, point
 from machine.loading.profile_file import ProfileError, load_profile
 
 PLACE: Final = Path("/etc/timberhand")
@@ -67,18 +67,27 @@ def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
     """
     names = check(folder, public)
     slot = place / SLOTS[_in_use(place) == SLOTS[0]]
+    fresh = slot.with_name(f"{slot.name}.new")
     try:
-        shutil.rmtree(slot, ignore_errors=True)
-        slot.mkdir(mode=0o755)
-        for name in (*names, SUMS, signature_path(Path(SUMS)).name):
-            (slot / name).write_bytes((folder / name).read_bytes())
+        if (given := folder.resolve()) in [(place / name).resolve() for name in SLOTS]:
+            point(place / LINK, given.name)
+            return place / LINK / PROFILE
+        contents = {name: (folder / name).read_bytes() for name in (*names, SUMS, signature_path(Path(SUMS)).name)}
+        shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir(mode=0o755)
+        for name, content in contents.items():
+            (fresh / name).write_bytes(content)
         os.sync()
-        check(slot, public)  # what lies there, not what it was copied from
+        check(fresh, public)  # what lies there, not what it was copied from
+        shutil.rmtree(slot, ignore_errors=True)
+        os.rename(fresh, slot)
+        flush_folder(place)
         point(place / LINK, slot.name)
     except OSError as error:
-        raise CommandFailed(
-            "machine-files.not-written", f"{slot} cannot be written: {error.strerror}; nothing has changed"
-        ) from None
+        sentence = f"{folder} cannot be put in use at {place}: {error.strerror}; the files in use are as they were"
+        raise CommandFailed("machine-files.not-written", sentence) from None
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
     return place / LINK / PROFILE
 
 

@@ -67,9 +67,14 @@ def sign(file: Path, private: Path) -> Path:
             "signature.private-key",
             f"{private} is no readable private Ed25519 key without a password; make one: timberhand release keygen",
         )
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        sentence = f"{file} cannot be read: {error.strerror}; name the file to sign"
+        raise CommandFailed("signature.unreadable", sentence) from None
     path = signature_path(file)
     try:
-        path.write_bytes(key.sign(file.read_bytes()))
+        path.write_bytes(key.sign(content))
     except OSError as error:
         raise CommandFailed("signature.not-written", f"{path} cannot be written: {error.strerror}") from None
     return path

@@ -14,16 +14,19 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from starlette.datastructures import Headers
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.messages.datagrams import decode
 from can_dbc.messages.mission import MissionAction
+from console.__main__ import serve
 from console.access import FAILURES_NS, LEASE_NS, MAX_FAILURES, MAX_PAGES, SESSION_NS, ControlLease
-from console.access_guards import MAX_REFUSED, TOKEN_HEADER, AuditLog
+from console.access_guards import MAX_REFUSED, TOKEN_HEADER, AuditLog, session_of
 from console.accounts import Accounts, Role, account_line, read_accounts, with_account
 from console.console import Console
+from console.exposure import StartError
 from console.server import create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from runtime.errors import ConfigError
@@ -302,6 +305,12 @@ def test_consoles_share_no_cookie(stage: Stage) -> None:
     port = {"host": "127.0.0.1:8472"}
     assert page.get(f"/?token={stage.console.access.token}", headers=port, follow_redirects=False).status_code == 303
     assert len(page.cookies) == 2 and page_client(other).get("/api/state").json()["role"] == "technician"
+
+
+def test_a_cookie_of_another_page_hides_no_session() -> None:
+    """Browsers send all cookies of a host, and JSON is an ordinary value of one."""
+    cookies = 'prefs={"theme":"dark"}; timberhand-session-8471=abc; a b=@'
+    assert session_of(Headers({"host": "127.0.0.1:8471", "cookie": cookies})) == "abc"
 
 
 def test_a_websocket_without_origin_only_shows(stage: Stage) -> None:
@@ -619,3 +628,9 @@ def test_every_action_is_classified() -> None:
     assert {f"/api/mission/{a.name.lower().replace('_', '-')}" for a in MissionAction} - set(TRIES) == {
         "/api/mission/pause"
     }
+
+
+def test_an_empty_key_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "key").write_text("\n")
+    with pytest.raises(StartError, match="too short", check=coded("console.key-file")):
+        serve(profile="palms_471", port=0, report_port=0, key_file=tmp_path / "key")

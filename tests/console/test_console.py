@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import math
 import re
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +21,10 @@ from can_dbc.messages.operator_link import credential_path
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, Timing, TimingWriter
 from console import server
-from console.__main__ import main
+from console.__main__ import _address as address_of
+from console.__main__ import main, serve_plant
 from console.console import Console
+from console.exposure import StartError
 from console.server import STATIC
 from console.state import (
     EDGES_US,
@@ -36,6 +40,7 @@ from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
+from tests.codes import coded
 from tests.console.page_client import BROWSING, HERE, page_client, socket_of, visitor
 from tests.console.state_reports import REPORT, at
 from tests.operator_end import OperatorEnd, udp_end
@@ -145,9 +150,12 @@ def test_own_names_are_served(client, host):
     assert client.get("/api/state", headers={"host": host}).status_code == 200
 
 
-def test_allowed_host_is_served(console):
-    client = client_of(console, allow_hosts=("forwarder",))
-    assert client.get("/healthz", headers={"host": "forwarder:8471"}).status_code == 200
+@pytest.mark.parametrize(
+    ("name", "host"), [("forwarder", "forwarder:8471"), ("Forwarder.local", "forwarder.local"), ("[::2]", "[::2]:8471")]
+)
+def test_allowed_host_is_served(console, name, host):
+    client = client_of(console, allow_hosts=(name,))
+    assert client.get("/healthz", headers={"host": host}).status_code == 200
 
 
 @pytest.mark.parametrize("action", [a for a in OperatorAction if a not in WATCH_ACTIONS])
@@ -405,3 +413,25 @@ def test_a_port_that_no_computer_has_is_refused_with_the_option(
         main(["--report-port", "0", f"{option}={text}"])
     told = capsys.readouterr().err
     assert ended.value.code == 2 and option in told and f'"{text}" is no port' in told
+
+
+@pytest.mark.parametrize(
+    "reason", [OSError(errno.EADDRNOTAVAIL, "Cannot assign requested address"), socket.gaierror(-2, "Not known")]
+)
+def test_an_address_that_this_computer_does_not_have_is_not_taken_for_a_port_in_use(
+    monkeypatch: pytest.MonkeyPatch, reason: OSError
+) -> None:
+    def bind(*_: object) -> None:
+        raise reason
+
+    monkeypatch.setattr(socket.socket, "bind", bind)
+    with pytest.raises(StartError, match="choose another --bind", check=coded("console.bind")) as refused:
+        serve_plant(port=0, plant="127.0.0.1:24705")
+    assert refused.value.exit_code == 2
+
+
+@pytest.mark.parametrize("text", ["::1:24705", "[::1]:24705", "planner:24705", "127.0.0.1"])
+def test_an_address_that_takes_no_datagram_is_refused(text: str) -> None:
+    assert address_of("127.0.0.1:24705", "--planner") == address_of("24705", "--planner") == ("127.0.0.1", 24705)
+    with pytest.raises(StartError, match=f"--planner {re.escape(text)} is not .* IPv4", check=coded("console.address")):
+        address_of(text, "--planner")

@@ -326,6 +326,14 @@ def test_what_delivers_the_pictures_is_looked_for(
     assert found.severity is severity
 
 
+@pytest.mark.parametrize("value", ["84710", "0", "²", "page", ""])
+def test_a_setting_that_is_no_port_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, value: str) -> None:
+    monkeypatch.setattr(installation, "CONF", tmp_path / "timberhand.conf")
+    (tmp_path / "timberhand.conf").write_text(f"SETPOINT_PORT=24701 \nCONSOLE_PORT={value}\n")
+    found = installation.ports()
+    assert found.severity is Severity.CHANGE and f"CONSOLE_PORT={value} is no port" in found.sentence
+
+
 def test_a_missing_package_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     needs = ["no-such-thing>=1", "typer>=999", "pybullet; extra == 'sim'", "nor-this-one; extra == 'sim'"]
     monkeypatch.setattr(installation.metadata, "requires", lambda _: needs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -19,7 +20,7 @@ from host.release import sums
 from host.release.signature import make_keys, sign, verify
 from runtime.errors import InputRefused
 from tests.codes import coded
-from tests.host.small_releases import keys, small_bundle
+from tests.host.small_releases import keys, small_bundle, small_wheel
 from timberhand.cli import app
 
 RUNNER = CliRunner()
@@ -174,6 +175,33 @@ def test_what_is_no_wheel_and_what_is_no_bundle_is_one_sentence(tmp_path: Path) 
         bundles.unpack(tmp_path / "text", tmp_path / "nothing")
     with pytest.raises(CommandFailed, check=coded("bundle.unreadable")):
         bundles.unpack(tmp_path / "none.tar", tmp_path / "none")
+
+
+def test_a_place_that_takes_no_bundle_is_one_sentence(tmp_path: Path) -> None:
+    private, _ = keys(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(CommandFailed, match="Not a directory", check=coded("bundle.not-written")):
+        bundles.make(small_wheel(tmp_path, "1.0"), private, tmp_path / "file/out", None, None)
+
+
+def test_a_full_disk_leaves_no_part_of_a_bundle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    private, _ = keys(tmp_path)
+    bundle = small_bundle(tmp_path, "1.0", private)
+    before = bundle.read_bytes()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tarfile.TarFile, "add", full)
+    with pytest.raises(CommandFailed, match="No space", check=coded("bundle.not-written")):
+        small_bundle(tmp_path, "1.0", private)
+    assert list(tmp_path.glob("timberhand-*")) == [bundle] and bundle.read_bytes() == before
+
+
+def test_a_file_to_sign_that_is_missing_is_named(tmp_path: Path) -> None:
+    private, _ = keys(tmp_path)
+    with pytest.raises(CommandFailed, match=r"none\.txt cannot be read", check=coded("signature.unreadable")):
+        sign(tmp_path / "none.txt", private)
 
 
 def test_a_folder_that_is_no_bundle_is_not_read_through(tmp_path: Path) -> None:

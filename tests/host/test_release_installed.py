@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import zipfile
@@ -131,6 +132,42 @@ def test_a_machine_s_own_files_are_applied_checked_and_changed_back(
     assert codes(site, public, str(profile)) == ["machine-files.changed"]
     (tmp_path / "own.toml").write_text(profile.read_text())
     assert codes(site, public, str(tmp_path / "own.toml")) == ["machine-files.no-sums"]
+
+
+@pytest.fixture
+def applied(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """The place of machine files that were applied twice, so machine-b is in use; the private and the public key."""
+    private, public = keys(tmp_path)
+    (tmp_path / "etc").mkdir()
+    for title in ("first", "second"):
+        machine_files.apply(machine(tmp_path / title, private, title), public, tmp_path / "etc")
+    return tmp_path / "etc", private, public
+
+
+@pytest.mark.parametrize(("name", "title", "other"), [("machine-a", "first", "second"), ("machine", "second", "first")])
+def test_files_that_lie_in_a_place_already_are_used_there(
+    applied: tuple[Path, Path, Path], name: str, title: str, other: str
+) -> None:
+    etc, _, public = applied
+    assert f"# {title}" in machine_files.apply(etc / name, public, etc).read_text()
+    assert f"# {other}" in machine_files.revert(public, etc).read_text()
+
+
+def test_a_full_disk_leaves_the_files_in_use_and_the_former_ones(
+    applied: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    etc, private, public = applied
+    third = machine(tmp_path / "third", private, "third")
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(CommandFailed, check=coded("machine-files.not-written")):
+        patch.setattr(Path, "write_bytes", full)
+        machine_files.apply(third, public, etc)
+    assert sorted(path.name for path in etc.iterdir()) == ["machine", "machine-a", "machine-b"]
+    assert "# second" in (etc / "machine/profile.toml").read_text()
+    assert "# first" in machine_files.revert(public, etc).read_text()
 
 
 def test_files_that_are_not_signed_or_do_not_fit_are_refused_and_change_nothing(
