@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import pickle
+import signal
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -15,6 +18,7 @@ from typer.testing import CliRunner
 import deploy.__main__ as installer
 from experiments.common.result import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
+from tests.autonomy.crane_stand_in import HOME
 from tests.codes import coded
 from timberhand.cli import _run, app
 from timberhand.commands.runs import new_directory
@@ -105,6 +109,59 @@ def test_a_calibration_that_could_not_be_kept_does_not_begin(
     Path("file").touch()
     refused = CliRunner().invoke(app, ["calibrate", "--profile", "palms_471", "--lockstep", *words]).exception
     assert isinstance(refused, CommandFailed) and refused.code == code
+
+
+def test_a_calibration_without_matplotlib_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("timberhand.commands.calibrate.find_spec", lambda _: None)
+    monkeypatch.setattr("timberhand.commands.calibrate._lockstep", lambda *_: pytest.fail("it moves"))
+    words = ["calibrate", "--profile", "palms_471", "--lockstep", "--out", str(tmp_path / "mine.toml")]
+    refused = CliRunner().invoke(app, words).exception
+    assert isinstance(refused, CommandFailed) and refused.code == "calibrate.no-matplotlib"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("implausible", "code"),
+    [([], "calibrate.report-not-written"), ([SimpleNamespace(sentence="no")], "calibrate.implausible")],
+)
+def test_a_report_that_cannot_be_written_costs_no_profile(
+    implausible: list[object], code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine" / "result.json").mkdir(parents=True)
+    run = SimpleNamespace(found=None, elapsed_s=240.0, resumptions=0)
+    result = SimpleNamespace(implausible=implausible, joints={}, turns=None, survey=None, grapple_s={}, kept=())
+    monkeypatch.setattr("timberhand.commands.calibrate._lockstep", lambda *_: run)
+    monkeypatch.setattr("autonomy.calibration.result.identify", lambda *_: result)
+    words = ["calibrate", "--profile", "palms_471", "--lockstep", "--out", str(tmp_path / "mine.toml")]
+    failed = CliRunner().invoke(app, words).exception
+    assert isinstance(failed, CommandFailed) and failed.code == code
+    assert "result.json" in str(failed) and (tmp_path / "mine.toml").exists() is not bool(implausible)
+
+
+def test_ctrl_c_at_a_question_of_the_survey_ends_the_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked once: until the machine rests, the run would like its reading."""
+    asked, runs = [], []
+
+    def question(words: str) -> str:
+        asked.append(words)
+        signal.raise_signal(signal.SIGINT)
+        return "1 2 3"
+
+    def run(run: Any, _link: object, _bus: object, reader: Any, turn: Any) -> None:
+        runs.append(run)
+        assert (reader.read(0), reader.read_yaw(0)) == (None, None)
+        turn(run)
+
+    monkeypatch.setattr("typer._click.termui.visible_prompt_func", question)
+    monkeypatch.setattr("autonomy.calibration.live.first_report", lambda *_: SimpleNamespace(position=HOME))
+    monkeypatch.setattr("autonomy.calibration.live.run", run)
+    monkeypatch.setattr("can_dbc.bus.factory.open_bus", lambda *_, **__: nullcontext())
+    words = ["calibrate", "--profile", "palms_471", "--survey", "ask", "--yes", "--report-port", "0"]
+    with pytest.raises(CommandFailed, check=coded("calibrate.interrupted")):
+        app([*words, "--out", str(tmp_path / "mine.toml")], standalone_mode=False)
+    assert len(asked) == 1 and runs[0].failure_code == "calibration.aborted" and not (tmp_path / "mine.toml").exists()
 
 
 def test_a_sign_that_the_output_lacks_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from host.exit_codes import CommandFailed
+from console.accounts import read_accounts
+from host.exit_codes import CommandFailed, ExitCode
 from runtime.errors import InputRefused
 from tests.codes import coded
 from timberhand.cli import app
@@ -69,3 +72,18 @@ def test_a_socket_that_cannot_be_is_refused_as_one_that_nobody_serves() -> None:
     """Beside the root there is no folder for the guard's."""
     done = CliRunner().invoke(app, ["operator", "unwatch", "--operator", "/nowhere"])
     assert isinstance(done.exception, CommandFailed) and done.exception.code == "operator.no-controller"
+
+
+def test_a_password_from_a_pipe_is_text_and_ends_before_its_line_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def piped(line: bytes) -> None:
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(line), "utf-8", "surrogateescape", newline="\n"))
+        app(["operator", "password", "anna", "--role", "operator", "--file", str(path)], standalone_mode=False)
+
+    path = tmp_path / "accounts"
+    with pytest.raises(CommandFailed, check=coded("operator.password")) as refused:
+        piped(b"hemlock \xff spruce\n")
+    assert refused.value.exit_code == ExitCode.USAGE and not path.exists()
+    piped(b"hemlock and spruce\r\n")
+    assert read_accounts(path).check("anna", "hemlock and spruce")

@@ -57,12 +57,12 @@ USELESS = {
     ("demo", "--lockstep"): (*LIVE, "--plc-link"),
     ("demo", "--lockstep", "--plc"): (*LIVE, "--plc-link"),
     ("demo",): ("--plc-role", "--plc-link", "--clock"),
-    ("demo", "--no-console"): ("--console-port",),
+    ("demo", "--no-console"): ("--console-port", "--foxglove"),
     ("demo", "--detector", "perfect"): ("--camera",),
     ("demo", "--bus", "wire"): ("--clock",),
     ("mission", "run", FILE, "--lockstep"): LIVE,
     ("mission", "run", FILE): ("--clock",),
-    ("mission", "run", FILE, "--no-console"): ("--console-port",),
+    ("mission", "run", FILE, "--no-console"): ("--console-port", "--foxglove"),
     ("console", "--replay", "runs/LAST"): ("--operator", "--bus", "--passwords"),
     ("why", "--page"): ("--all", "--plot", "--json"),
     ("why",): ("--port",),
@@ -123,3 +123,9 @@ def test_a_port_that_no_computer_has_is_refused_at_once() -> None:
         if option.opts[0].endswith(("-port", "--foxglove"))
     ]
     assert ports and not [port for port in ports if port[-1] != 65535]
+
+
+@pytest.mark.parametrize("words", [("demo",), ("mission", "run", FILE)], ids=" ".join)
+def test_a_page_has_a_port(words: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(app, [*words, "--console-port", "0"], env={"COLUMNS": "200"})
+    assert done.exit_code == ExitCode.USAGE and "--console-port" in done.output

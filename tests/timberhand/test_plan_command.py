@@ -105,5 +105,14 @@ def test_show_draws_everything(tmp_path: Path) -> None:
     assert exit_code_of(failure("show", PAPER_B, "--png", tmp_path / "a.jpg")) == ExitCode.USAGE
 
 
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [(("convert", PAPER_B, "."), "plan.output-format"), (("show", PAPER_B, "--png", "."), "plan.map-format")],
+)
+def test_an_output_without_a_name_is_refused(words: tuple[str, ...], code: str) -> None:
+    error = failure(*words)
+    assert (error.code, exit_code_of(error)) == (code, ExitCode.USAGE)
+
+
 def test_show_of_logs_alone(tmp_path: Path) -> None:
     assert run("show", EXAMPLES / "harvest.hpr", "--png", tmp_path / "logs.png").exit_code == 0

@@ -6,13 +6,14 @@ import json
 import math
 import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
-from runtime.errors import InputRefused, LinkError
+from runtime.errors import ConfigError, InputRefused, LinkError
 from timberhand.commands.options import refuse_without_effect, truth_of
 
 if TYPE_CHECKING:
@@ -59,11 +60,12 @@ def calibrate(
 
     [bold]Examples[/bold]
 
-      timberhand calibrate --profile palms_471 --bus socketcan:can0 --survey ask
-
-      timberhand calibrate --profile palms_471 --joint lift      under a minute
-
       timberhand calibrate --profile palms_471 --lockstep --survey sim
+
+      timberhand calibrate --profile palms_471 --bus socketcan:crane0 --survey ask
+      --controller 127.0.0.1:24701 --report-port 24702 --key-file /etc/timberhand/key
+
+      the same with --joint lift      under a minute
     """
     from rich.console import Console
 
@@ -85,6 +87,10 @@ def calibrate(
     if out.suffix != ".toml":
         raise CommandFailed(
             "calibrate.output-name", f"{out} has no name of a profile; call it {out.name}.toml", ExitCode.USAGE
+        )
+    if find_spec("matplotlib") is None:
+        raise CommandFailed(
+            "calibrate.no-matplotlib", "the report needs matplotlib, so nothing moves: pip install 'timberhand[tools]'"
         )
     folder, chosen = report or out.with_suffix(""), _chosen(joint)
     try:
@@ -113,7 +119,11 @@ def calibrate(
     facts: dict[str, Any] = {"profile": known.name, "date": _today(), "seconds": calibration.elapsed_s}
     facts["repeated_tests"] = calibration.resumptions
     facts |= {"lockstep": {"truth": truth, "seed": seed}} if lockstep else {}
-    write_report(folder, result, facts, changed)
+    reported, gap = f"report in {folder}", ""
+    try:
+        write_report(folder, result, facts, changed)
+    except (OSError, ImportError) as error:  # the profile is worth more than its pictures
+        reported = gap = f"the report in {folder} is not whole ({error})"
     if as_json:
         print(json.dumps(result_document(result, facts, changed), indent=2))
     _show(result, screen)
@@ -121,7 +131,7 @@ def calibrate(
         screen.print("\n".join(f"[red]✘[/red] {problem.sentence}" for problem in result.implausible), highlight=False)
         raise CommandFailed(
             "calibrate.implausible",
-            f"no profile is written: {len(result.implausible)} values are implausible, see {folder}",
+            f"no profile is written: {len(result.implausible)} values are implausible; {reported}",
             ExitCode.FIGURE_MISSED,
         )
     try:
@@ -129,13 +139,17 @@ def calibrate(
         carry_envelope(_source(profile), out.parent)
     except InputRefused as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
-    screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
+    screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; {reported}", highlight=False)
     if calibration.resumptions:
         screen.print(f"tests repeated after a stop: {calibration.resumptions}", highlight=False)
     if result.survey is None:
         screen.print("zeros and sag are unchanged, because nothing was surveyed (--survey)", highlight=False)
     for sentence in (*lowered_gains(changed), *result.kept):
         screen.print(sentence, highlight=False)
+    if gap:
+        raise CommandFailed(
+            "calibrate.report-not-written", f"{out} is written, but {gap}; read the new values there, marked [cal]"
+        )
 
 
 def _chosen(names: Sequence[str] | None) -> tuple[Joint, ...]:
@@ -241,6 +255,7 @@ def _live(
     from autonomy.process.controller_link import ControllerLink
     from can_dbc.bus.factory import open_bus
     from can_dbc.dbc.codec import load
+    from can_dbc.messages.envelope import read_key
     from can_dbc.messages.udp_address import udp_address
     from machine.loading.profile_file import profile_hash
     from machine.status.modes import Mode
@@ -255,14 +270,16 @@ def _live(
     interrupts: list[int] = []
     try:
         where = udp_address(controller)
-        reader = _surveyor(survey, screen)
-        key = key_file.read_bytes().strip() if key_file else None
+        reader = _surveyor(survey, screen, interrupts)
+        key = None if key_file is None else read_key(key_file)
         link = ControllerLink(where, report_port, profile_hash(profile), key)
+    except ConfigError as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except ValueError as error:
         raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     except OSError as error:
         raise CommandFailed(
-            "calibrate.port", f"UDP port {report_port} or the key file: {error}; choose another one", ExitCode.BUS
+            "calibrate.port", f"UDP port {report_port}: {error}; choose another one", ExitCode.BUS
         ) from None
     try:
         report = live.first_report(link, 10.0, (Mode.STANDBY, Mode.ARMED, Mode.STOP))
@@ -273,7 +290,8 @@ def _live(
         if report is None:
             raise CommandFailed(
                 "calibrate.no-controller",
-                f"no controller in STANDBY reports on port {report_port} within 10 s; start it",
+                f"no controller in STANDBY reports on port {report_port} within 10 s; start one with "
+                f"--report 127.0.0.1:{report_port}, and give both the same --key-file",
                 ExitCode.BUS,
             )
         plan = make_plan(profile, report.position, survey is not None, chosen)
@@ -314,14 +332,14 @@ def _live(
     return run
 
 
-def _surveyor(survey: str | None, screen: Console) -> Surveyor | None:
+def _surveyor(survey: str | None, screen: Console, interrupts: list[int]) -> Surveyor | None:
     """Make the source of survey readings: none, typed, or an instrument."""
     from autonomy.calibration.live import SurveyInstrument
     from can_dbc.messages.udp_address import udp_address
 
     if survey is None:
         return None
-    return _Typed(screen) if survey == "ask" else SurveyInstrument(udp_address(survey))
+    return _Typed(screen, interrupts) if survey == "ask" else SurveyInstrument(udp_address(survey))
 
 
 class _Typed:
@@ -330,12 +348,27 @@ class _Typed:
     The crane stands still and its last setpoint was final, so the lease may expire meanwhile.
     """
 
-    def __init__(self, screen: Console) -> None:
-        self._screen = screen
+    def __init__(self, screen: Console, interrupts: list[int]) -> None:
+        self._screen, self._interrupts = screen, interrupts
+
+    def _ask(self, question: str) -> str | None:
+        """Ask; None after Ctrl-C or the end of the input, which join the run's interrupts."""
+        if self._interrupts:
+            return None  # the run comes to rest
+        try:
+            before = signal.signal(signal.SIGINT, signal.default_int_handler)  # the run's own lets a prompt wait on
+            try:
+                return str(typer.prompt(question, err=True))
+            finally:
+                signal.signal(signal.SIGINT, before)
+        except (KeyboardInterrupt, typer.Abort):
+            self._interrupts.append(signal.SIGINT)
+            return None
 
     def read(self, now_ns: int) -> tuple[float, float, float] | None:
         """Ask for the position of the hanger pin [m]; None after invalid input."""
-        text = typer.prompt("hanger pin x y z [m, crane base frame]", err=True)
+        if (text := self._ask("hanger pin x y z [m, crane base frame]")) is None:
+            return None
         try:
             x, y, z = map(float, text.replace(",", " ").split())
         except ValueError:
@@ -345,7 +378,9 @@ class _Typed:
 
     def read_yaw(self, now_ns: int) -> float | None:
         """Ask for the direction of the grapple [rad]; NaN when nobody can read it, None after invalid input."""
-        text = typer.prompt("direction along which the grapple opens [deg from x towards y, - for none]", err=True)
+        text = self._ask("direction along which the grapple opens [deg from x towards y, - for none]")
+        if text is None:
+            return None
         try:
             return math.nan if text.strip() == "-" else math.radians(float(text))
         except ValueError:

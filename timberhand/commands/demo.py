@@ -148,7 +148,7 @@ def demo(
     if detector is Detector.PERFECT:
         refuse_without_effect(context, ("camera",), "with --detector perfect")
     if not console:
-        refuse_without_effect(context, ("console_port",), "with --no-console")
+        refuse_without_effect(context, ("console_port", "foxglove"), "with --no-console")
     if bus not in (Backend.VCAN, Backend.PYTHON_CAN):
         refuse_without_effect(context, ("clock",), f"with --bus {bus.value}")
     if refused := refusal(live, lockstep, bus, plc and plc_link is PlcLink.UDP):
@@ -231,7 +231,7 @@ def demo(
             max_stops,
             screen,
             camera,
-            foxglove if page else 0,
+            foxglove,
             chosen,
         )
     else:

@@ -125,7 +125,7 @@ def run(
     if lockstep:
         refuse_without_effect(context, LIVE_ONLY, "with --lockstep")
     if not console:
-        refuse_without_effect(context, ("console_port",), "with --no-console")
+        refuse_without_effect(context, ("console_port", "foxglove"), "with --no-console")
     if bus not in (Backend.VCAN, Backend.PYTHON_CAN):
         refuse_without_effect(context, ("clock",), f"with --bus {bus.value}")
     chosen = planner_of(planner, virtual_cameras, plan_pictures)

@@ -97,7 +97,12 @@ def password(
     if sys.stdin.isatty():
         secret = typer.prompt("password", hide_input=True, confirmation_prompt=True, err=True)
     else:
-        secret = sys.stdin.readline().rstrip("\n")
+        try:
+            secret = sys.stdin.buffer.readline().rstrip(b"\r\n").decode()
+        except UnicodeDecodeError:
+            raise CommandFailed(
+                "operator.password", "the password on standard input is no UTF-8 text; send it as UTF-8", ExitCode.USAGE
+            ) from None
     try:
         line = account_line(name, Role[role.value.upper()], secret)
     except ConfigError as error:

@@ -45,7 +45,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
 PageOption = Annotated[bool, typer.Option("--console/--no-console", help="Serve the operator's page (live).")]
 PagePortOption = Annotated[
-    int, typer.Option("--console-port", min=0, max=65535, help="Port of the operator's page on localhost.")
+    int, typer.Option("--console-port", min=1, max=65535, help="Port of the operator's page on localhost.")
 ]
 FoxglovePortOption = Annotated[
     int,

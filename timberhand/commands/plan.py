@@ -92,9 +92,10 @@ def convert(
 
     kind = {"json": "geojson"}.get(out.suffix.lower()[1:], out.suffix.lower()[1:])
     if kind not in FORMATS:
+        better = out.parent / f"{out.stem or 'mission'}.geojson"
         raise CommandFailed(
             "plan.output-format",
-            f"{out}: missions are written as {', '.join(FORMATS)}; name it {out.with_suffix('.geojson')}",
+            f"{out}: missions are written as {', '.join(FORMATS)}; name it {better}",
             ExitCode.USAGE,
         )
     draft = load_mission(file, logs=logs)
@@ -133,9 +134,8 @@ def show(
     machine = _machine(profile)
     draft, review = _read(file, logs, machine)
     if png.suffix.lower() != ".png":
-        raise CommandFailed(
-            "plan.map-format", f"{png}: the map is a PNG; name it {png.with_suffix('.png')}", ExitCode.USAGE
-        )
+        better = png.parent / f"{png.stem or 'map'}.png"
+        raise CommandFailed("plan.map-format", f"{png}: the map is a PNG; name it {better}", ExitCode.USAGE)
     try:
         from timberhand.mission_map import draw
     except ImportError:
