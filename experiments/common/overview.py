@@ -19,19 +19,21 @@ from experiments.common.standing import Standing, judge
 
 TITLE: Final = "Results at a glance"
 INTRODUCTION: Final = (
-    "This page lists every experiment, the question it answers, and how many of its limits are met. The limits were "
-    "set before the measurement. Each linked page states how every metric is measured, with which command and on which "
-    "machine. `timberhand report` writes this page from the saved results; `timberhand report --check` names the files "
-    "that make a result stale."
+    "This page lists every experiment, the question it answers, and how many of its limits are met. A limit stands "
+    "in the code that measures; where all outcomes of a run are published, they are evaluated anew by the limits of "
+    "today. Each linked page states how every metric is measured, with which command and on which machine. "
+    "`timberhand report` writes this page from the saved results; `timberhand report --check` names the files that "
+    "make a result stale."
 )
 
 
 COLUMNS: Final = ("", "the paper", "its method here", "ours, its rules", "ours, everything")
 """Columns of a comparison: the question, and four answers."""
 LIKE_FOR_LIKE: Final = (
-    "The paper's own figure on a real machine, its method rebuilt here, our method under the paper's rules, and ours "
-    "with everything that it has. A dash: not measured; *missed*: outside its limit. Rates have 95 % intervals and "
-    "their number of trials."
+    "The paper's own figure (paper A's grasps in its simulator, all others on a real machine), its method rebuilt "
+    "here, our method under the paper's rules, and ours with everything that it has. A dash: not measured; *missed*: "
+    "outside its limit. Rates have 95 % intervals and their number of trials; an interval takes the trials for "
+    "independent, which logs of one mission and attempts of one machine are not."
 )
 
 
@@ -70,10 +72,10 @@ def page(results: Mapping[str, Result], pages: Collection[str], standings: Mappi
     lines = [f"# {TITLE}", "", summary(results, standings), "", INTRODUCTION, ""]
     lines += ["| experiment | question | limits met | commit | |", "|---|---|---|---|---|"]
     for name, result in results.items():
-        met = len(result.limits) - len(result.missed) - len(result.inconclusive)
-        unsure = f", {len(result.inconclusive)} inconclusive" if result.inconclusive else ""
+        open_limits = ((result.inconclusive, "inconclusive"), (result.unmeasured, "not measured"))
+        unsure = "".join(f", {len(names)} {word}" for names, word in open_limits if names)
         lines.append(
-            f"| {links[name]} | {EXPERIMENTS[name].sentence} | {met} of {len(result.limits)}{unsure} "
+            f"| {links[name]} | {EXPERIMENTS[name].sentence} | {result.met} of {len(result.limits)}{unsure} "
             f"| `{result.commit}` | {standings[name]} |"
         )
     lines += ["", "## Compared with the papers", "", LIKE_FOR_LIKE, ""]
@@ -103,9 +105,7 @@ def compared(results: Mapping[str, Result]) -> Iterator[tuple[Comparison, tuple[
             "–" if metric is None else _judged(result, metric)
             for metric in (metrics.get((entry.experiment, n)) for n in (entry.method, entry.rules, entry.everything))
         )
-        # A quick run keeps the figures of the paper's method, and names their commit.
-        earlier = result.environment.get("ablation", "") if method != "–" else ""
-        yield entry, (entry.question, paper, f"{method}, at `{earlier}`" if earlier else method, *ours)
+        yield entry, (entry.question, paper, method, *ours)
 
 
 def _interval(value: float, trials: int) -> str:
@@ -155,11 +155,15 @@ def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]
 def summary(results: Mapping[str, Result], standings: Mapping[str, Standing]) -> str:
     """Tell how many limits all experiments set, meet and miss, and how many results are of today's sources."""
     total = sum(len(r.limits) for r in results.values())
-    missed = sum(len(r.missed) for r in results.values())
-    unsure = sum(len(r.inconclusive) for r in results.values())
+    missed, unsure, unmeasured, met = (
+        sum(counts)
+        for counts in zip(
+            *((len(r.missed), len(r.inconclusive), len(r.unmeasured), r.met) for r in results.values()), strict=True
+        )
+    )
     return (
-        f"{len(results)} experiments set {total} limits: {total - missed - unsure} are met, {missed} are missed and "
-        f"{unsure} are inconclusive. {_currency(standings)}"
+        f"{len(results)} experiments set {total} limits: {met} are met, {missed} are missed, {unsure} are inconclusive "
+        f"and {unmeasured} are not measured. {_currency(standings)}"
     )
 
 

@@ -126,11 +126,14 @@ class Comparison:
 CHAIN: Final = (
     "Its chain: masks of our network, its perception as a practitioner reads it, its network trained on 80 of 885 "
     "Cornell pictures. Its rules, which its chain keeps here too: one plan, one closing, one lift; ours with "
-    "everything grips again. Rendered pictures"
+    "everything grips again. Rendered pictures here and in the paper's simulator; on its real crane 58 of 60 "
+    "succeeded, and 51 of these were optimal"
 )
 MISSION: Final = (
-    "Its method: box detector, depth at the middle of the box, uncontrolled rotator, movement primitives, P law. Its "
-    "rules: its field. With everything: other fields, calibrated individual machines. Rendered pictures"
+    "Its method: box detector, depth at the middle of the box, uncontrolled rotator, movement primitives, P law. It "
+    "does not know when the bunk is full, and lays logs onto the load. Its rules: its field. With everything: other "
+    "fields, calibrated individual machines. Logs of the second lap that were never laid, because the first one "
+    "still lay there, do not count. Rendered pictures"
 )
 BOXES: Final = "A small box detector in the role of YOLOv3, on rendered pictures; the paper: photographs"
 MEASURE: Final = "Its method by its own measure (peak of a histogram, Fig. 17), ours by the distance in space"
@@ -169,17 +172,6 @@ COMPARISONS: Final = (
         "Its network and training on the 80 of 885 pictures that are at hand",
     ),
     Comparison("Parameters of the network", "A", "grasp-network", "parameters", 0, "parameters", "", "", ""),
-    Comparison(
-        "Tip sag under 250 kg at 6 m",
-        "A",
-        "plant",
-        "sag_250kg_6m_m",
-        0,
-        "",
-        "sag_250kg_6m_m",
-        "",
-        "The plant, not a method",
-    ),
     Comparison(
         "Logs loaded", "B", "forwarding-mission", "loaded", 24, "faithful.loaded", "first.loaded", "loaded", MISSION
     ),
@@ -245,17 +237,6 @@ COMPARISONS: Final = (
         "",
         "",
     ),
-    Comparison(
-        "Turn per metre at full articulation",
-        "B",
-        "plant",
-        "turn_deg_m",
-        0,
-        "",
-        "turn_deg_m",
-        "",
-        "The plant, not a method",
-    ),
 )
 UNSEEN: Final = (
     "**Real wood and ground**: bark that tears, branches, snow, wet bark, logs frozen together, stumps under a pile. "
@@ -264,6 +245,10 @@ UNSEEN: Final = (
     "or missing. The detector's figures on photographs are few.",
     "**Hydraulics that age**: leakage, air in the oil, oil that is cold, valves that stick. Only what the truth file "
     "names varies.",
+    "**Errors that repeat**: the noise of the stereo camera is new in every picture. That of a real one stays with the "
+    "scene in part, and several pictures do not average it away.",
+    "**The time to think**: virtual time stands still while perception and planner compute, so no duration of a "
+    "mission in lockstep holds it.",
     "**Fatigue, wear and misuse**: no run lasts longer than a shift, and nobody walks into the working area.",
     "**This computer on a vibrating machine**: timing is measured on hosts in a room.",
     "**The gap itself**: how far the plant is from a machine is unknown until a calibrated machine repeats a figure. "

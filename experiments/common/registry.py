@@ -54,6 +54,9 @@ class Options:
 class Entry:
     """The question that an experiment answers, its module, and the folders and files on which its figures depend.
 
+    Where all outcomes are published, the figures are computed anew whenever the page is written, so only what decides
+    the outcomes is a source: some definitions of a module stand as ``FILE:NAME,NAME``.
+
     ``live``: it measures this computer in real time, so it is no campaign and runs alone.  ``clocked``: values of an
     outcome that depend on the speed of the host; a campaign's table leaves them out.  ``scale``: work of the full run
     over that of the quick one, by its plan of trials; ``live_s``: duration of a live one [s].
@@ -158,7 +161,16 @@ EXPERIMENTS: Final = {
     "grasp-configs": Entry(
         "How many grasps succeed, how good are they? Paper A's twelve configurations, camera to lift, three planners.",
         "experiments.grasp_configs.experiment",
-        (*_CRANE_JOB, *_CALIBRATED, *_EYES, "experiments/grasp_configs"),
+        (
+            *_CRANE_JOB,
+            *_CALIBRATED,
+            *_EYES,
+            "experiments/grasp_configs/trial.py",
+            "experiments/grasp_configs/pose_sources.py",
+            "experiments/grasp_configs/grasp_categories.py",
+            "experiments/grasp_configs/experiment.py:machines_of,jobs_of,MACHINES,FIRST_MACHINE,FIRST_SEED,PAPER_ATTEMPTS",
+            "experiments/common/individuals.py",
+        ),
         clocked=("see_ms", "plan_ms"),
         scale=155.0,
     ),
@@ -185,7 +197,14 @@ EXPERIMENTS: Final = {
     "forwarding-mission": Entry(
         "Does the forwarder load 24 logs by itself? Paper B's trial by both methods; other fields, other machines.",
         "experiments.forwarding_mission.experiment",
-        (*_MACHINE, "experiments/forwarding_mission"),
+        (
+            *_MACHINE,
+            "experiments/common/mission_trial.py",
+            "experiments/common/individuals.py",
+            "experiments/common/ground_truth_observer.py",
+            "experiments/forwarding_mission/experiment.py:trial,calibrations,missions,perform,drive,short,MACHINES,"
+            "FIRST_SEED,FIRST_FIELD,SEEDS_PER_RUN,DETECTORS,LIMIT_S,SHORT_M",
+        ),
         scale=440.0,
     ),
     "productivity": Entry(

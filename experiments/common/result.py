@@ -101,6 +101,16 @@ class Result:
     missed: tuple[str, ...] = ()
     inconclusive: tuple[str, ...] = ()
 
+    @property
+    def unmeasured(self) -> tuple[str, ...]:
+        """The limits to which there is no figure."""
+        return tuple(n for n in self.limits if n not in self.metrics and n not in self.inconclusive)
+
+    @property
+    def met(self) -> int:
+        """The number of limits that a figure meets."""
+        return len(self.limits) - len({*self.missed, *self.inconclusive, *self.unmeasured})
+
     def as_judged(self, metric: Metric) -> Metric:
         """Give the metric the limits against which this result was evaluated; those of today may differ."""
         least, most = self.limits.get(metric.name, (None, None))
@@ -180,6 +190,12 @@ def make_result(
         missed=missed,
         inconclusive=inconclusive,
     )
+
+
+def evaluated(result: Result, definitions: Sequence[Metric], metrics: dict[str, float]) -> Result:
+    """Give a saved result other metrics, computed anew from its outcomes, and the limits of today; the rest stays."""
+    missed, inconclusive = evaluate(definitions, metrics, noisy=False)
+    return replace(result, metrics=metrics, limits=limits_of(definitions), missed=missed, inconclusive=inconclusive)
 
 
 def limits_of(definitions: Iterable[Metric]) -> dict[str, tuple[float | None, float | None]]:

@@ -139,19 +139,27 @@ def _sentence(result: Result, metrics: dict[str, Metric], template: str) -> str:
 
 
 def limits_sentence(result: Result, metrics: Iterable[Metric]) -> str:
-    """Tell how many limits are met, and every metric that is missed or inconclusive."""
-    total, missed, unsure = len(result.limits), len(result.missed), len(result.inconclusive)
+    """Tell how many limits are met, and every metric that is missed, inconclusive or not measured."""
+    total = len(result.limits)
     if not total:
         return ""
     by_name = {m.name: result.as_judged(m) for m in metrics}
     parts = [{1: "The limit is met.", 2: "Both limits are met."}.get(total, f"All {total} limits are met.")]
-    if missed or unsure:
-        parts = [f"{total - missed - unsure} of {total} limits are met."]
-    for word, names in (("Missed", result.missed), ("Inconclusive", result.inconclusive)):
+    if result.met < total:
+        parts = [f"{result.met} of {total} limits are met."]
+    for word, names in (
+        ("Missed", result.missed),
+        ("Inconclusive", result.inconclusive),
+        ("Not measured", result.unmeasured),
+    ):
         named = [by_name[n] for n in names if n in by_name]
-        listed = "; ".join(f"{m.title} ({m.text(result.metrics[m.name])}, limit {m.limit_text()})" for m in named)
+        listed = "; ".join(f"{m.title} ({_figure(m, result)}limit {m.limit_text()})" for m in named)
         parts += [f"{word}: {listed}."] if listed else []
     return " ".join(parts)
+
+
+def _figure(metric: Metric, result: Result) -> str:
+    return f"{metric.text(result.metrics[metric.name])}, " if metric.name in result.metrics else ""
 
 
 def _plot(result: Result, file: str, caption: str) -> tuple[str, ...]:

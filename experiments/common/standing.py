@@ -2,7 +2,8 @@
 
 A result names the commit that measured it, the registry the sources on its path.  It is *stale* when one of them has
 changed since, *unverifiable* when its commit is not in the history or had changes that nobody committed.  A change of
-comments, docstrings or the layout of Python code is none: its syntax tree stays the same.
+comments, docstrings or the layout of Python code is none: its syntax tree stays the same.  A source may name some
+definitions of a module, as in ``experiment.py:jobs_of,FIRST_SEED``: the rest of it only reads finished outcomes.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from experiments.common.result import ROOT
 
 SUFFIXES: Final = (".py", ".toml", ".dbc", ".eds", ".onnx", ".geojson")
 """Files on which a measurement depends."""
+ALL: Final[frozenset[str]] = frozenset()
+"""No selection: every definition of a module counts."""
 CHANGES: Final = "+changes"
 UNKNOWN: Final = "unknown"
 """The end of the commit of a checkout with changes, and the commit outside git (`experiments.common.result.commit`)."""
@@ -60,10 +63,12 @@ def changed_since(commit: str, sources: tuple[str, ...], root: Path) -> tuple[st
     """List files of ``sources`` whose meaning differs from that at ``commit``; None if the history does not hold it."""
     if _git(root, "merge-base", "--is-ancestor", commit, "HEAD") is None:
         return None
-    listed = _git(root, "diff", "--name-only", "--no-renames", "-z", commit, "--", *sources)
+    only = {path: frozenset(names.split(",")) for path, _, names in (s.partition(":") for s in sources) if names}
+    paths = [s.partition(":")[0] for s in sources]
+    listed = _git(root, "diff", "--name-only", "--no-renames", "-z", commit, "--", *paths)
     names = [name for name in (listed or b"").decode().split("\0") if name.endswith(SUFFIXES)]
     then = _contents(root, commit, names)
-    return tuple(n for n, old in zip(names, then, strict=True) if _differs(n, old, root / n))
+    return tuple(n for n, old in zip(names, then, strict=True) if _differs(n, old, root / n, only.get(n, ALL)))
 
 
 def _contents(root: Path, commit: str, names: Sequence[str]) -> list[bytes | None]:
@@ -82,23 +87,31 @@ def _contents(root: Path, commit: str, names: Sequence[str]) -> list[bytes | Non
     return contents
 
 
-def _differs(name: str, then: bytes | None, path: Path) -> bool:
+def _differs(name: str, then: bytes | None, path: Path, only: frozenset[str]) -> bool:
     now = path.read_bytes() if path.is_file() else None
     if then is None or now is None or not name.endswith(".py"):
         return then != now
-    return meaning(then) != meaning(now)
+    return meaning(then, only) != meaning(now, only)
 
 
 @cache
-def meaning(source: bytes) -> str:
-    """Return the syntax tree of Python code without docstrings and positions, as text."""
+def meaning(source: bytes, only: frozenset[str] = ALL) -> str:
+    """Return the syntax tree of Python code without docstrings and positions, as text; of the definitions ``only``."""
     tree = ast.parse(source)
+    tree.body = [statement for statement in tree.body if not only or only & _defined(statement)]
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
             # A string that stands alone is a docstring, or the documentation of the constant above it.
             node.body = [s for s in body if not _is_text(s)]  # type: ignore[attr-defined]
     return ast.dump(tree)
+
+
+def _defined(statement: ast.stmt) -> set[str]:
+    """Return the names that a statement of a module defines."""
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        return {statement.name}
+    return {n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
 
 
 def _is_text(statement: ast.stmt) -> bool:

@@ -48,8 +48,9 @@ CAMPAIGN: Final = (
         "neutral_max_ms",
         "Longest time to neutral valves after the loss of a needed input",
         "ms",
-        "From the fault to the moment after which the outputs of valve node, vehicle or PLC are neutral for good "
-        "(ground truth; a frame tells it up to its period later). Entries of which a needed input is lost.",
+        "From the fault to the moment after which the outputs of valve node or PLC to the crane's joints, and the "
+        "vehicle's drive, are neutral for good; grapple, steering and swing arms are not looked at (ground truth; a "
+        "frame tells it up to its period later). Entries of which a needed input is lost.",
         most=100.0,
     ),
     Metric(

@@ -17,7 +17,8 @@ from hil.faults.catalogue import CASES, Case
 CONCLUSION: Final = (
     "{injections} injections of {cases} faults: {unexplained} are missed outside the named blind spots, and "
     "{blind_missed} inside them.",
-    "After the loss of a needed input all valves are neutral within {neutral_max_ms}.",
+    "After the loss of a needed input the valves of the crane's joints and the drive are neutral within "
+    "{neutral_max_ms}.",
     "In {nominal_hours} of work without a fault the machine stopped {false_trips} times.",
 )
 INTRODUCTION: Final = (
@@ -179,7 +180,7 @@ def evidence(case: Case, rows: Sequence[Mapping[str, Any]], metrics: Mapping[str
         ("p50_ms", "Detection, median [ms]"),
         ("p99_ms", "Detection, 99th percentile [ms]"),
         ("max_ms", "Detection, longest [ms]"),
-        ("neutral_max_ms", "All valves neutral, longest [ms]"),
+        ("neutral_max_ms", "Valves of the crane's joints and the drive neutral, longest [ms]"),
         ("travel_max_m", "Way of the tip until rest, longest [m]"),
         ("astray_max_m", "Tip astray, largest [m]"),
         ("harm_m", "The same, of missed injections [m]"),

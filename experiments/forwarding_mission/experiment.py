@@ -26,7 +26,7 @@ from experiments.common.mission_trial import (
 )
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, make_result
+from experiments.common.result import Result, evaluated, make_result
 from experiments.common.result_page import Page, publish
 from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures, sampled_unless_given
 from experiments.common.workers import Trial
@@ -86,13 +86,21 @@ def run(options: Options, console: Console) -> Result:
 
 def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
     """Make the result page; ``trials``: outcomes of the missions, for the error table."""
+    driven = round(result.metrics.get("missions", 1.0)) - 1
     introduction = INTRODUCTION.format(
-        machines=result.environment["machines"],
+        paper_b=max(0, round(result.metrics.get("faithful.missions", 1.0)) - 1),
+        driven=driven,
+        machines=min(int(result.environment["machines"]), driven),
         along=CM * ALONG_M,
         across=CM * ACROSS_M,
         turn=TURN_DEG,
     )
     return Page("Forwarding mission", CONCLUSION, introduction, sections(trials))
+
+
+def evaluated_again(result: Result, trials: Mapping[str, Any]) -> Result:
+    """Evaluate the saved result by today's reading of its published missions; what was measured stays."""
+    return evaluated(result, METRICS, gather(dict(trials)))
 
 
 def failed(trial: Trial) -> bool:

@@ -11,7 +11,7 @@ from experiments.common.result_page import Section
 from experiments.generalization.matrix import MISSION, is_drawn, is_mission, title_of
 
 CONCLUSION: Final = (
-    "With a truth at either end of every parameter, or everything drawn, {calibrated_share} of the machines are "
+    "With a truth at either end of each named parameter, or everything drawn, {calibrated_share} of the machines are "
     "calibrated. With everything drawn {grasp_success} of single logs reach the bunk without a stop, "
     "{grasp_first_closing} at the first closing.",
     "On missions of drawn machines on drawn ground and wood, seen by their own cameras, {mission_loaded} of the logs "
@@ -19,12 +19,13 @@ CONCLUSION: Final = (
     "A figure was wrong, or something was called done that was not, without a word: {unsafe_or_silent} times.",
 )
 INTRODUCTION: Final = (
-    "All other figures are of machines near the profiles with which the software grew up. Here every parameter of the "
-    "hidden truth stands at one of its ends, alone, then all are drawn at once; each machine is calibrated from the "
-    "shipped profile and then loads logs with what the calibration has written. Drawn forwarders drive missions on "
-    "flat, rough, sloping, hilly, muddy and drawn ground, among logs of 1.7 to 2.6 m and 11 to 32 cm of which nobody "
-    "has told them. A refusal that says why is a result; a wrong value or a job called done that is not is the worst "
-    "one, and counted."
+    "All other figures are of machines near the profiles with which the software grew up. Here eleven groups of "
+    "parameters of the hidden truth stand at one of their ends, each alone, then all are drawn at once; what they do "
+    "not name is nominal, as encoder zeros, mounts of cameras and antennas, friction of cylinders and tyres; each "
+    "machine is calibrated from the shipped profile and then loads logs with what the calibration has written. Drawn "
+    "forwarders drive missions on flat, rough, sloping, hilly, muddy and drawn ground, among logs of 1.7 to 2.6 m "
+    "and 11 to 32 cm of which nobody has told them. A refusal that says why is a result; a wrong value or a job "
+    "called done that is not is the worst one, and counted."
 )
 CALIBRATED: Final = Metric(
     "calibrated_share",

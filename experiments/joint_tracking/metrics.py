@@ -161,9 +161,12 @@ def best_laws(short: str, law: str, metrics: Mapping[str, float]) -> str:
     for _, _, key, _ in ROWS:
         values = {name: metrics.get(f"{short}_{name}_{key}", math.nan) for name in LAWS}
         if not any(math.isnan(v) for v in values.values()):
-            wins[(max if key.endswith("shut_share") else min)(values, key=lambda n: values[n])] += 1
+            best = (max if key.endswith("shut_share") else min)(values.values())
+            winners = [name for name in LAWS if values[name] == best]
+            if len(winners) == 1:
+                wins[winners[0]] += 1
     counts = ", ".join(f"{title} {wins[name]}" for name, title in LAWS.items())
-    return f"The profile uses {LAWS[law]}. Number of rows in which each law is best: {counts}."
+    return f"The profile uses {LAWS[law]}. Number of rows in which each law alone is best: {counts}."
 
 
 def damping(short: str, metrics: Mapping[str, float]) -> str:
@@ -260,13 +263,14 @@ INTRODUCTION: Final = (
     "Six joint laws run on the same individual machines, motions and disturbances. All but the plain PD have "
     "feed-forward, delay compensation, pressure damping, a stop band and an inverse of the valve's dead-band, "
     "metering curve and play, and share one budget of gain, so that the same phase and gain margins hold for all: "
-    "[loop-design.md](loop-design.md). The plain PD is paper A's: at 50 Hz, without a lead of the feed-forward, "
-    "delay compensation and damping, with the quarter of the gain that its margins leave. Behind a dead time a "
-    "switching term has no more gain than a PD law, so the estimating sliding mode learns the gain of each valve, "
-    "from the commands that arrive and the travel that they make (Elmali and Olgac 1992, sliding mode control with "
-    "perturbation estimation). *Changed since calibration* is what it is for: all valves give 30 % less or more, the "
-    "oil is cold (15 % less, dead times 30 % longer), or a load hangs on the hook or the supply lacks 60 % of its "
-    "pressure for half of each motion. Every trial uses another individual machine drawn from the truth's spread, "
+    "[loop-design.md](loop-design.md). The plain PD is paper A's, without a lead of the feed-forward, delay "
+    "compensation and damping; the paper gives neither rate nor gain, so 50 Hz is assumed, and the quarter of the "
+    "gain that its margins leave. Behind a dead time a switching term has no more gain than a PD law, so the "
+    "estimating sliding mode learns the gain of each valve, from the commands that arrive and the travel that they "
+    "make (Elmali and Olgac 1992, sliding mode control with perturbation estimation). *Changed since calibration* is "
+    "what it is for: all valves give 30 % less or more, the oil is cold (15 % less, dead times 30 % longer), or a "
+    "load hangs on the hook or the supply lacks 60 % of its pressure for half of each motion. Every trial uses "
+    "another individual machine drawn from the truth's spread, "
     'with dead times of 40 to 150 ms and gains and dead-bands up to 20 % off. "Calibrated" means that the profile '
     "holds the valves of that machine within the accuracy of a calibration. A cycle is the quasi-parabolic motion of "
     "a crane between trail and bunk, there and back, with all joints together at 45 % of their speed limits."

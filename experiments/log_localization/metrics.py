@@ -105,10 +105,11 @@ INTRODUCTION: Final = (
     "process the same frames. Every trial uses another machine, camera and ground: rough, with grass and branches. "
     "Logs taper by 4 to 12 mm per metre, bow by up to 3 %, are oval and have rough bark; pybullet's renderer draws "
     "them. Depth has stereo errors: correlated over ten pixels, growing with the square of the range, with enlarged "
-    "edges, holes, and a scale error of 0.5 to 1 % that is constant during a run. Before a run the mount of the camera "
-    "and the scale of its depth are surveyed with 14 targets; both pipelines use the result. Poses come from a "
-    "dual-antenna RTK receiver with its errors. There is no public RGB-D data set of logs, so all of this is "
-    "synthetic. Frames from beyond 10 m are not used: there a log is only a few pixels wide."
+    "edges, holes, and a scale error of 0.5 to 1 % that is constant during a run. Before a run the mount of the "
+    "camera and the scale of its depth are surveyed with 14 targets; both pipelines use the result. Poses come from "
+    "a dual-antenna RTK receiver with its noise and wander; the offsets of its antennas and its delay are known "
+    "here. There is no public RGB-D data set of logs, so all of this is synthetic. Frames from beyond 10 m are not "
+    "used: there a log is only a few pixels wide."
 )
 
 

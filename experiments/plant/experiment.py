@@ -16,7 +16,7 @@ from experiments.common.result_page import Page, publish
 from experiments.common.trials import check_truth, checkpoint
 from experiments.common.worlds import carrier_profile, profile_named
 from experiments.plant import bench, grasps, runs
-from experiments.plant.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS
+from experiments.plant.metrics import CONCLUSION, INTRODUCTION, METRICS, SECTIONS
 from experiments.plant.plots import draw
 
 TRIALS: Final = 200
@@ -93,7 +93,6 @@ def run(options: Options, console: Console) -> Result:
             seed=options.seed,
             trials=trials,
             more={"truth": options.truth},
-            paper=PAPER,
             noisy=noisy,
         )
         draw(metrics, traces, options.out)

@@ -13,7 +13,17 @@ from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
 from experiments.common.mission_trial import ACROSS_M, ALONG_M, PAPER_B, PAPER_B_ANGLED, TURN_DEG, shuffled
-from experiments.forwarding_mission.experiment import MACHINES, NOMINAL, calibrations, missions, perform, short, trial
+from experiments.common.result import make_result
+from experiments.forwarding_mission.experiment import (
+    MACHINES,
+    NOMINAL,
+    calibrations,
+    evaluated_again,
+    missions,
+    perform,
+    short,
+    trial,
+)
 from experiments.forwarding_mission.metrics import METRICS, by_log, gather
 
 OPTIONS = SimpleNamespace(seed=3, quick=False, trials=None)
@@ -30,7 +40,14 @@ def grasp(log: int | None, off_m: tuple[float, float, float], logs: int = 1, sta
 def outcome(logs: int = 3, off_m: tuple[float, float, float] = (0.03, 0.04, 0.0), **changes: Any) -> dict[str, Any]:
     """A mission that takes every log, ``off_m`` beside it."""
     lying = [
-        {"place_m": [float(i), 3.0, 0.1], "size_m": [2.0, 0.25], "detected": True, "in_bunk": True, "landed": False}
+        {
+            "place_m": [float(i), 3.0, 0.1],
+            "size_m": [2.0, 0.25],
+            "detected": True,
+            "in_bunk": True,
+            "lies_m": [[9.0, 9.0, 1.8]],
+            "landed": False,
+        }
         for i in range(logs)
     ]
     return {
@@ -165,6 +182,27 @@ def test_the_missions_by_paper_b_s_method_count_together() -> None:
     metrics = gather({"first/ours": outcome(), "first/paper-b": outcome(), "paper-b/0": missed})
     assert metrics["faithful.missions"] == 2.0 and metrics["first.missions"] == 1.0
     assert metrics["faithful.loaded"] == pytest.approx(5 / 6) and metrics["loaded"] == 1.0
+
+
+def test_a_log_that_was_never_laid_does_not_count_and_one_on_the_load_is_aboard() -> None:
+    """Log 1 lies where it was, so log 3 of the second lap waits for its place; log 2 lies over the stakes."""
+    mission = outcome(logs=4) | {"places": 2}
+    for i, lies_m in ((1, [1.0, 3.0, 0.1]), (2, [9.0, 9.0, 2.8]), (3, [3.0, 3.0, 0.1])):
+        mission["logs"][i] |= {"in_bunk": False, "detected": i < 3, "lies_m": [lies_m]}
+    metrics = gather({"first/ours": outcome(), "first/paper-b": mission})
+    assert metrics["faithful.detected"] == 1.0 and metrics["faithful.never_laid"] == 1.0
+    assert metrics["faithful.loaded"] == metrics["faithful.loaded_worst"] == pytest.approx(1 / 3)
+    assert metrics["faithful.aboard"] == pytest.approx(2 / 3) and metrics["faithful.loaded_n"] == 3.0
+    assert metrics["loaded_worst"] == 1.0
+
+
+def test_published_missions_are_evaluated_by_the_criteria_of_today() -> None:
+    saved = make_result("forwarding-mission", METRICS, {"loaded": 1.0}, profile="aoro_fc8", seed=1, trials=1, more={})
+    lost = outcome()
+    lost["logs"][0]["in_bunk"] = False
+    again = evaluated_again(saved, {"mission/0": lost})
+    assert again.metrics["loaded"] == pytest.approx(2 / 3) and "loaded" in again.missed
+    assert again.commit == saved.commit and "faithful.loaded" in again.unmeasured
 
 
 def test_a_short_mission_has_one_log_on_a_straight_path() -> None:

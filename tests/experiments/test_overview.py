@@ -47,13 +47,17 @@ def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and
     assert not numbers_in(rows["optimal"][4]), "not measured so"
 
 
-def test_a_figure_that_a_quick_run_kept_names_its_commit() -> None:
-    result = read(DOCS / "results" / "grasp-configs.json")
-    for kept in ({}, {"ablation": "0123456789ab"}):
-        environment = {k: v for k, v in result.environment.items() if k != "ablation"} | kept
-        rows = {e.paper_metric: c for e, c in compared({"grasp-configs": replace(result, environment=environment)})}
-        _, _, method, rules, _ = rows["optimal"]
-        assert method.endswith(", at `0123456789ab`") is bool(kept) and "0123456789ab" not in rules
+def test_a_limit_without_a_figure_is_not_met() -> None:
+    result = read(DOCS / "results" / "navigation.json")
+    without = replace(result, metrics={k: v for k, v in result.metrics.items() if k != "lateral_p95_m"})
+    assert without.unmeasured == ("lateral_p95_m",) and without.met == result.met - 1
+    module = import_module(EXPERIMENTS["navigation"].module)
+    shown = conclusion(without, module.page_of(without, {}))
+    assert "6 of 7" in shown and "Not measured" in shown
+    assert "Not measured" not in conclusion(result, module.page_of(result, {}))
+    lines = page({"navigation": without}, (), {"navigation": Standing.CURRENT}).splitlines()
+    row = next(line for line in lines if line.startswith("| [nav"))
+    assert numbers_in(row.split("|")[3]) == [6, 7, 1]
 
 
 def test_the_command_on_a_page_selects_the_trials_that_were_measured() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -70,6 +71,19 @@ def test_words_and_layout_are_no_change_and_every_number_is(checkout: Checkout) 
     assert checkout.judge().standing is Standing.STALE
 
 
+def test_of_a_module_that_also_evaluates_the_named_definitions_count_alone(checkout: Checkout) -> None:
+    entry = Entry("?", "m", ("plant/steel.py:f,X",))
+    for code, standing in (
+        (CODE + "\n\ndef evaluate(a):\n    return a + 1\n", Standing.CURRENT),
+        (CODE.replace("return a", "return -a"), Standing.STALE),
+        (CODE.replace("X = 1", "X = 2"), Standing.STALE),
+        (CODE.replace("X = 1", ""), Standing.STALE),
+    ):
+        checkout.write("plant/steel.py", code)
+        changed_since.cache_clear()
+        assert judge(checkout.commit, entry, checkout.root).standing is standing, code
+
+
 def test_new_moved_and_deleted_sources_and_weights_count(checkout: Checkout) -> None:
     checkout.write("plant/weights.onnx", "1")
     (checkout.root / "law.py").rename(checkout.root / "plant" / "law.py")
@@ -94,8 +108,13 @@ def test_a_page_says_what_its_result_is_worth() -> None:
 
 
 def test_every_source_of_every_experiment_exists() -> None:
-    assert not [(n, s) for n, entry in EXPERIMENTS.items() for s in entry.sources if not (ROOT / s).exists()]
-    assert all(entry.module.rsplit(".", 1)[0].replace(".", "/") in entry.sources for entry in EXPERIMENTS.values())
+    for name, entry in EXPERIMENTS.items():
+        folder = entry.module.rsplit(".", 1)[0].replace(".", "/")
+        assert any(source.startswith(folder) for source in entry.sources), name
+        for path, _, names in (source.partition(":") for source in entry.sources):
+            assert (ROOT / path).exists(), (name, path)
+            for definition in filter(None, names.split(",")):
+                assert re.search(rf"^(def )?{definition}\b", (ROOT / path).read_text(), re.MULTILINE), definition
 
 
 def test_a_shallow_checkout_and_a_copy_are_told_from_a_whole_one(checkout: Checkout, tmp_path: Path) -> None:
