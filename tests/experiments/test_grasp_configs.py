@@ -19,6 +19,7 @@ from experiments.grasp_configs.experiment import (
     BEST,
     MACHINES,
     PAPER_ATTEMPTS,
+    PAPER_CHAIN,
     compare,
     evaluated_again,
     gather,
@@ -184,15 +185,21 @@ def test_the_attempts_lie_all_over_the_reach_clear_of_the_bunk_and_in_view() -> 
 
 
 def test_a_quick_run_keeps_the_published_ablation_and_its_commit(tmp_path: Path) -> None:
-    pair = ("ours", "search")
-    assert published_ablation(None, pair) == published_ablation(tmp_path, pair) == ({}, "")
-    metrics = {"success": 0.5, "config1.success": 0.5, "ours.search.success": 0.5, "true.cnn.success": 0.9}
+    measured = (BEST, PAPER_CHAIN)
+    assert published_ablation(None, measured) == published_ablation(tmp_path, measured) == ({}, "")
+    metrics = {"success": 0.5, "config1.success": 0.5, "true.cnn.success": 0.9}
+    metrics |= dict.fromkeys(("ours.search.success", "faithful.cnn.success"), 0.5)
     kept = {"true.cnn.success": 0.9}
     for more, since in (({}, "new"), ({"ablation": "old"}, "old")):
         saved = make_result("grasp-configs", METRICS, metrics, profile="palms_471", seed=1, trials=1, more=more)
         replace(saved, commit="new").save(tmp_path / "results" / "grasp-configs.json")
-        assert published_ablation(tmp_path, pair) == (kept, since)
+        assert published_ablation(tmp_path, measured) == (kept, since)
     assert sections() == SECTIONS and sections("old")[:-1] == SECTIONS[:-1] and "`old`" in sections("old")[-1].text
+
+
+def test_paper_a_s_chain_comes_right_after_our_pair() -> None:
+    pairs = pairs_of("palms_471")
+    assert pairs[:2] == [BEST, PAPER_CHAIN] and len(pairs) == len(set(pairs)) == 12
 
 
 def test_every_pair_sees_the_same_scenes_and_the_first_gets_most() -> None:
