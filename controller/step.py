@@ -185,7 +185,9 @@ class Controller:
 
     def reference(self, now_ns: int) -> None:
         """Compute the crane's reference of this tick."""
-        self.crane.update_reference(self.supervisor.mode is _ACTIVE, self._speed_cap, now_ns)
+        supervisor, vehicle = self.supervisor, self.vehicle
+        self.crane.update_reference(supervisor.mode is _ACTIVE, self._speed_cap, now_ns)
+        self.crane.note_places(vehicle is not None and vehicle.is_moving, supervisor.armed, now_ns)
 
     @property
     def _speed_cap(self) -> float:
@@ -319,6 +321,8 @@ class Controller:
         if supervisor.mode is _ACTIVE and run.running:
             tested = self.estimators[run.function]
             reason = run.check(tested.position, tested.velocity, self._speed_cap, now_ns)
+            if reason is _NONE and self.crane.test_leads_out():
+                reason = Reason.TEST_RANGE
             if reason is not _NONE:
                 supervisor.react_to(reason, run.function, now_ns)
         if self.vehicle is not None:

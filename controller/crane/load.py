@@ -257,10 +257,6 @@ class LoadMoment:
             ahead[j] = position[j] + AHEAD_S * velocity[j]
         return self.raised(position, ahead, AHEAD_TOLERANCE_M)
 
-    def refuses(self, start: Sequence[float], end: Sequence[float]) -> bool:
-        """Tell whether the machine is overloaded and a trajectory between two joint positions would add to it."""
-        return self.overloaded and self.raised(start, end)
-
     def raised(self, start: Sequence[float], end: Sequence[float], tolerance_m: float = TOLERANCE_M) -> bool:
         """Tell whether the pin goes outward between two joint positions, or rises by more than it comes nearer."""
         _, start_m, start_z_m = distances(self._kinematics, start)

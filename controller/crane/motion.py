@@ -17,7 +17,7 @@ from controller.config import Settings
 from controller.crane.inputs import CraneInputs
 from controller.crane.load import LoadChange, LoadEstimator, LoadMoment
 from controller.crane.reference_governor import ReferenceGovernor
-from controller.crane.spool_test_run import SpoolTestRun
+from controller.crane.spool_test_run import STOP_S, SpoolTestRun
 from controller.crane.trajectory_check import TrajectoryCheck, WorkspaceCheck
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.pressure_monitor import PressureMonitor
@@ -29,6 +29,11 @@ from controller.requests import RequestGate, RequestRefused
 from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.status.reasons import Reason
 
+PLACE_PERIOD_NS: Final = 1_000_000_000
+"""The place of a crane without a lease is noted anew this often."""
+BORNE_TOLERANCE_M: Final = 0.1
+"""From where the load became too much the pin may go outward by this in all: by braking, or on a way down that is not
+plumb."""
 IN_PLACE_UNITS: Final = 0.005
 """A setpoint within this of the reference [rad, m] and without velocity keeps the crane in place."""
 LOAD_PERIOD_NS: Final = 20_000_000
@@ -42,6 +47,8 @@ class Crane:
     """All state of the crane's motion, built once; ``leased`` while a setpoint or a spool test is in force."""
 
     __slots__ = (
+        "_ahead",
+        "_borne",
         "_check",
         "_estimators",
         "_final",
@@ -55,9 +62,12 @@ class Crane:
         "_load_due",
         "_load_updated",
         "_loads_bar",
+        "_measured",
+        "_noted_ns",
         "_opening_sensed",
         "_pressure_pairs",
         "_sensed",
+        "_stowed",
         "_workspace",
         "commands",
         "governor",
@@ -106,6 +116,10 @@ class Crane:
         self.commands = self.law.commands
         """Joint velocities commanded in this tick."""
         self.spools_pct = [0.0] * N_JOINTS
+        self._stowed, self._borne = [math.nan] * N_JOINTS, [math.nan] * N_JOINTS
+        """References at which the carrier drove off, and at which the load became too much."""
+        self._noted_ns = 0
+        self._measured, self._ahead = [0.0] * N_JOINTS, [0.0] * N_JOINTS
         self.leased = False
         self.lease_end_ns = 0
         self._final = False
@@ -169,13 +183,34 @@ class Crane:
     # -- accept
 
     def keeps_in_place(self, setpoint: CraneSetpoint) -> bool:
-        """Tell whether a setpoint only keeps the crane where it is."""
-        reference = self.governor.position
+        """Tell whether a setpoint only keeps the crane where it is, and where it was when the carrier drove off."""
+        reference, stowed = self.governor.position, self._stowed
         for knot in setpoint.knots:
             for j in JOINTS:
-                if knot.velocity[j] != 0.0 or abs(knot.position[j] - reference[j]) > IN_PLACE_UNITS:
+                place = knot.position[j]
+                if (
+                    knot.velocity[j] != 0.0
+                    or abs(place - reference[j]) > IN_PLACE_UNITS
+                    or abs(place - stowed[j]) > IN_PLACE_UNITS
+                ):
                     return False
         return True
+
+    def note_places(self, drives: bool, armed: bool, now_ns: int) -> None:
+        """Note the reference from which a setpoint must not lead away, once the carrier drives or the load is too much.
+
+        A crane without a lease follows its joints, which yield: its place is noted anew, but rarely, so that setpoints
+        that each lead a little away lead nowhere.
+        """
+        moment, renewed = self.load_moment, False
+        if not self.leased and now_ns - self._noted_ns > PLACE_PERIOD_NS:
+            self._noted_ns, renewed = now_ns, True
+        if renewed or not drives:
+            self._stowed[:] = self.governor.position
+        if moment is not None and (renewed or not moment.overloaded):
+            self._borne[:] = self.governor.position
+        if not armed:
+            self._workspace.forget()
 
     def is_moving(self, now_ns: int) -> bool:
         """Tell whether the reference or a spool test moves the crane."""
@@ -222,10 +257,12 @@ class Crane:
         """Check where a trajectory within the joints' limits leads, and remember it as accepted; raises
         RequestRefused.
         """
-        self._workspace.check(setpoint.knots)
+        self._workspace.check(self.governor.position, setpoint.knots)
         moment = self.load_moment
-        if moment is not None and moment.refuses(self.governor.position, setpoint.knots[-1].position):
-            raise RequestRefused(Reason.RAISES_MOMENT)
+        if moment is not None and moment.overloaded:
+            for knot in (setpoint.knots[0], setpoint.knots[-1]):
+                if moment.raised(self.governor.position, knot.position) or self._leads_out(knot.position):
+                    raise RequestRefused(Reason.RAISES_MOMENT)
         self._gate.mark_accepted(setpoint)
 
     def accept_spool_test(self, test: SpoolTest, now_ns: int) -> None:
@@ -264,7 +301,27 @@ class Crane:
         moment = self.load_moment
         if moment is None or not moment.overloaded or not self.leased:
             return False
-        return self.spool_run.running or moment.raised_by_motion(self.governor.position, self.governor.velocity)
+        governor = self.governor
+        return (
+            self.spool_run.running
+            or moment.raised_by_motion(governor.position, governor.velocity)
+            or self._leads_out(governor.position)
+        )
+
+    def _leads_out(self, position: Sequence[float]) -> bool:
+        """Tell whether a place is farther out than the crane may go on from where the load became too much."""
+        return self.load_moment is not None and self.load_moment.raised(self._borne, position, BORNE_TOLERANCE_M)
+
+    def test_leads_out(self) -> bool:
+        """Tell whether the spool test in force is about to move the tip into the ground or into a box."""
+        run = self.spool_run
+        if not run.running:
+            return False
+        measured, ahead = self._measured, self._ahead
+        for j, estimator in enumerate(self._estimators):
+            measured[j] = ahead[j] = estimator.position
+        ahead[run.function] += STOP_S * self._estimators[run.function].velocity
+        return self._workspace.enters(measured, ahead)
 
     # -- control
 

@@ -7,7 +7,7 @@ the tip: the ground, the bunk's stakes, and the boxes of the profile.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin
+from math import ceil, cos, dist, nan, sin
 from typing import Final
 
 from can_dbc.messages.crane import CraneSetpoint, Knot
@@ -112,7 +112,13 @@ class TrajectoryCheck:
 
 
 MAX_KNOTS_CHECKED: Final = 4
+"""Knots after the first one."""
+STEP_M: Final = 0.1
+MAX_STEPS: Final = 16
+"""Between two knots the tip is checked this often, and so many times at most."""
 _ALLOWED_M: Final = 1e-3
+_CHORD_M: Final = 0.02
+"""A straight line between two places of the joints may run this far below the curve."""
 
 
 class WorkspaceCheck:
@@ -120,18 +126,21 @@ class WorkspaceCheck:
 
     Against boxes what hangs stiff under the boom tip is checked, from the hanger pin down to the rotator; the jaws
     below it must touch logs to work.  Against the ground the grapple is (`machine.geometry.grapple.lowest_pin_m`).  At
-    most `MAX_KNOTS_CHECKED` knots of a datagram are checked, spread evenly and with the last one among them: a setpoint
-    reaches 0.4 s ahead and comes every 50 ms, so the tip moves by a few centimetres between two checks.  A crane that
-    is inside already, moved there by hand, may leave: only a knot that is inside where the first one is not, or deeper
-    in the ground than it, is refused.
+    most `MAX_KNOTS_CHECKED` knots of a datagram besides the first one are checked, spread evenly and with the last one
+    among them, and the way between them, from where the reference is now, in steps of `STEP_M`.  A crane that is inside
+    already, moved there by hand, may leave: only a place that is inside a box where the reference is not, or deeper in
+    the ground than the reference has been since the machine was armed, is refused; so setpoints that each lead a
+    little deeper lead nowhere.
     """
 
-    __slots__ = ("_boxes", "_hang_m", "_kinematics", "_lowest_z_m")
+    __slots__ = ("_boxes", "_floor_z_m", "_hang_m", "_kinematics", "_lowest_z_m")
 
     def __init__(self, profile: Profile) -> None:
         kin = self._kinematics = profile.kinematics
         self._hang_m = kin.hanger_to_fork_m + kin.fork_to_rotator_m
         self._lowest_z_m = lowest_pin_m(profile)
+        self._floor_z_m = nan
+        """The least height of the pin that is allowed now; NaN until the reference is known."""
         self._boxes = tuple(
             (
                 box.center_m[0],
@@ -146,24 +155,65 @@ class WorkspaceCheck:
             for box in (*stake_walls(profile.bunk), *profile.keep_out.values())
         )
 
-    def check(self, knots: Sequence[Knot]) -> None:
-        """Check a trajectory.
+    def forget(self) -> None:
+        """Forget how deep the reference has been: a person may move a machine that is not armed."""
+        self._floor_z_m = nan
+
+    def check(self, start: Sequence[float], knots: Sequence[Knot]) -> None:
+        """Check a trajectory that is joined to the reference at ``start`` [rad, EXT m].
 
         Raises:
             RequestRefused: it leads into the ground or into a box; the detail is the number of the box, stakes first.
         """
         last = len(knots) - 1
         step = -(-last // MAX_KNOTS_CHECKED) if last > 0 else 1
-        start = pin_position(self._kinematics, knots[0].position)
-        at = last
-        while at > 0:
-            x, y, z = pin_position(self._kinematics, knots[at].position)
-            if z < self._lowest_z_m and z < start[2] - _ALLOWED_M:
-                raise RequestRefused(Reason.BELOW_GROUND)
-            inside = self._box_at(x, y, z)
-            if inside >= 0 and self._box_at(start[0], start[1], start[2]) != inside:
-                raise RequestRefused(Reason.KEEP_OUT, inside)
-            at -= step
+        before: Sequence[float] = start
+        pin: Sequence[float] = pin_position(self._kinematics, start)
+        box = self._box_at(pin[0], pin[1], pin[2])
+        self._raise_floor(pin[2])
+        before, pin = self._check_way(before, pin, knots[0].position, box)
+        at = last % step or step
+        while at <= last:
+            before, pin = self._check_way(before, pin, knots[at].position, box)
+            at += step
+
+    def enters(self, start: Sequence[float], end: Sequence[float]) -> bool:
+        """Tell whether a motion from the joints' places ``start`` to ``end`` leads into the ground or into a box."""
+        pin = pin_position(self._kinematics, start)
+        self._raise_floor(pin[2])
+        try:
+            self._check_way(start, pin, end, self._box_at(pin[0], pin[1], pin[2]))
+        except RequestRefused:
+            return True
+        return False
+
+    def _raise_floor(self, z: float) -> None:
+        """Allow no place deeper than the reference, once it is known, and none below the ground once it is over it."""
+        floor = self._floor_z_m
+        self._floor_z_m = min(self._lowest_z_m, z if floor != floor else max(floor, z))
+
+    def _check_way(
+        self, start: Sequence[float], start_pin: Sequence[float], end: Sequence[float], box: int
+    ) -> tuple[Sequence[float], Sequence[float]]:
+        """Check the way between two places of the joints, the last one included; return it with its pin."""
+        pin = pin_position(self._kinematics, end)
+        far = dist(start_pin, pin)
+        steps = min(ceil(far / STEP_M), MAX_STEPS) if far > STEP_M else 1
+        for i in range(1, steps):
+            share = i / steps
+            between = [a + share * (b - a) for a, b in zip(start, end, strict=True)]
+            self._check_pin(pin_position(self._kinematics, between), box, _CHORD_M)
+        self._check_pin(pin, box, 0.0)
+        return end, pin
+
+    def _check_pin(self, pin: Sequence[float], box: int, sag_m: float) -> None:
+        """Check one place of the pin, which may be ``sag_m`` too low; ``box``: the one of the reference, or -1."""
+        z, floor = pin[2], self._floor_z_m
+        if z < (floor - _ALLOWED_M if floor < self._lowest_z_m else self._lowest_z_m) - sag_m:
+            raise RequestRefused(Reason.BELOW_GROUND)
+        inside = self._box_at(pin[0], pin[1], z)
+        if inside >= 0 and inside != box:
+            raise RequestRefused(Reason.KEEP_OUT, inside)
 
     def _box_at(self, x: float, y: float, z: float) -> int:
         """Return the number of the box that the tip at this pin position [m] is in, or -1."""

@@ -5,16 +5,24 @@ from itertools import pairwise
 
 import pytest
 
+from can_dbc.messages.crane import SpoolKnot, SpoolTest
+from can_dbc.messages.datagrams import encode
+from controller.crane.motion import BORNE_TOLERANCE_M
 from controller.crane.reference_governor import GROWTH_FACTOR
 from controller.laws.response import LEAST_SHARE, MOST_SHARE, UNKNOWN_GAIN, CommandBound
+from machine.geometry.grapple import lowest_pin_m
+from machine.geometry.kinematics import pin_position
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, settings_of, with_pump
+from tests.controller.drive_bench import DriveBench
 from tests.controller.setpoint_attacks import ATTACKS, Attacker
 
 DT = T * 1e-9
 WINDOW_TICKS = round(0.5 / DT)
 SECONDS = 3.0
+LOW = (0.0, 0.35, -1.4, 0.6, 0.0)
+STILL = (0.0,) * 5
 CASES = [
     *((kind, joints, 5) for kind in ATTACKS for joints in ((0,), (0, 1, 2, 3))),
     *(("rest ahead", (j,), every_ms) for j, every_ms in ((1, 5), (2, 10), (3, 20), (4, 40), (0, 40))),
@@ -196,3 +204,64 @@ def test_a_pushed_joint_keeps_the_least_and_the_other_direction_is_free():
     bound.reset()
     bound.add(0.0, 7.0, DT)
     assert bound.limit(1.0) == pytest.approx(LIMIT / UNKNOWN_GAIN), "wherever it stands"
+
+
+# -- One knot at rest, again and again, each a little farther: its velocity is 0, and yet it leads somewhere.
+
+
+def test_small_steps_do_not_lead_into_the_ground():
+    low_m, kin = lowest_pin_m(PROFILE), PROFILE.kinematics
+    bench = Bench(home=LOW).armed()
+    bench.tick([bench.hold()])
+    for k in range(500):
+        reference = list(bench.controller.reference_position)
+        reference[1] = max(reference[1] - 0.007, -0.38)
+        bench.tick([bench.setpoint([(0, reference, STILL)])] if k % 10 == 0 else ())
+        if bench.mode is not Mode.ACTIVE:
+            break
+    assert bench.controller.gate.refusal is Reason.BELOW_GROUND and pin_position(kin, bench.q)[2] > low_m - 0.02
+
+
+def test_a_spool_test_ends_over_the_ground():
+    low_m, kin = lowest_pin_m(PROFILE), PROFILE.kinematics
+    bench = Bench(home=LOW).armed()
+    bench.tick([bench.hold()])
+    for k in range(1500):
+        bench.setpoint_sequence += 1
+        knots = tuple(SpoolKnot(i * 20 * MS, -20.0 if k or i > 8 else -12.0 - i) for i in range(16))
+        test = SpoolTest(bench.setpoint_sequence, bench.settings.profile_hash, bench.now_ns, 200 * MS, 1, knots)
+        bench.tick([encode(test)] if k % 10 == 0 else ())
+        if bench.mode is Mode.STOP:
+            break
+    assert bench.reason is Reason.TEST_RANGE and low_m < pin_position(kin, bench.q)[2] < low_m + 0.05
+
+
+def test_small_steps_do_not_turn_the_crane_of_a_machine_that_drives():
+    bench = DriveBench()
+    bench.under_way(400)
+    begun_rad, step_rad = bench.q[0], 0.0
+    for k in range(400):
+        sent = [bench.to(50.0, 0.0)] if k % 10 == 0 else []
+        step_rad = min(step_rad + 1e-4, 1.5e-3)
+        reference = [x if x == x else 0.0 for x in bench.controller.reference_position]
+        reference[0] += step_rad
+        bench.tick([*sent, bench.setpoint([(0, reference, STILL)])])
+        if bench.mode is not Mode.ACTIVE:
+            break
+    assert bench.controller.gate.refusal is Reason.CARRIER_MOVES and abs(bench.q[0] - begun_rad) < 0.02
+
+
+def test_small_steps_do_not_reach_outward_with_too_much_load():
+    bench = Bench().armed()
+    bench.changed["GrappleStat"] = {"Load": 2000.0}
+    for _ in range(30):
+        bench.tick([bench.hold()])
+    assert bench.reason is Reason.OVERLOADED
+    begun_m = bench.q[3]
+    for _ in range(800):
+        reference = list(bench.controller.reference_position)
+        reference[3] = min(reference[3] + 0.0012, 1.7)
+        bench.tick([bench.setpoint([(0, reference, STILL)])])
+        if bench.mode is not Mode.ACTIVE:
+            break
+    assert bench.q[3] - begun_m < BORNE_TOLERANCE_M + 0.02

@@ -23,13 +23,19 @@ STILL = (0.0,) * 5
 ABOVE = (-1.8, 4.4, 0.5)
 
 
+def solved(point):
+    return (*solve(PROFILE, *point), 0.0)
+
+
 def knots(*points):
-    return [Knot(i * 50_000_000, (*solve(PROFILE, *p), 0.0), STILL) for i, p in enumerate(points)]
+    return [Knot(i * 50_000_000, solved(p), STILL) for i, p in enumerate(points)]
 
 
 def refusal(check, *points):
+    """The reason why a new check refuses a way that begins at the first point, where the reference is."""
+    check.forget()
     try:
-        check.check(knots(*points))
+        check.check(solved(points[0]), knots(*points))
     except RequestRefused as refused:
         return refused.reason
     return Reason.NONE
@@ -52,7 +58,7 @@ def test_stakes_are_refused_and_their_number_is_told(row):
     x, y, z = wall.center_m
     top = z + wall.half_m[2]
     with pytest.raises(RequestRefused) as refused:
-        check.check(knots((x, y, top + 1.0), (x, y, top + HANG_M - 0.02)))
+        check.check(solved((x, y, top + 1.0)), knots((x, y, top + 1.0), (x, y, top + HANG_M - 0.02)))
     assert (refused.value.reason, refused.value.detail) == (Reason.KEEP_OUT, row)
     assert refusal(check, (x, y, top + 1.0), (x, y, top + HANG_M + 0.02)) is Reason.NONE, "over the stakes"
     bunk = PROFILE.bunk.center_m
@@ -78,9 +84,35 @@ def test_no_more_knots_than_promised_are_checked_and_the_last_always(monkeypatch
     for n in range(1, 17):
         asked.clear()
         path = knots(*[(x * 0.01 - 1.8, 4.4, 0.5) for x in range(n)])
-        check.check(path)
-        assert len(asked) <= 1 + MAX_KNOTS_CHECKED
-        assert n == 1 or path[-1].position in asked
+        check.check(path[0].position, path)
+        assert len(asked) <= 2 + MAX_KNOTS_CHECKED, "the reference's place and the first knot besides"
+        assert path[0].position in asked and path[-1].position in asked
+
+
+def test_what_lies_between_two_places_is_looked_at():
+    """A box of 20 cm between two knots that lie 3 m apart, and one between the reference and the only knot."""
+    box = KeepOut((-1.8, 4.4, 0.5), (0.1, 0.5, 0.3))
+    check = WorkspaceCheck(msgspec.structs.replace(PROFILE, keep_out={"pole": box}))
+    left, right = (-3.3, 3.8, 0.5), (-0.3, 4.8, 0.5)
+    assert refusal(check, left, left, right) is Reason.KEEP_OUT
+    with pytest.raises(RequestRefused):
+        check.check(solved(left), knots(right))
+
+
+def test_setpoints_that_each_lead_a_little_deeper_lead_nowhere():
+    """Under the ground, where a hand lever left it, 0.9 mm a time: only the first until the machine is disarmed."""
+    check = WorkspaceCheck(PROFILE)
+    lowest = PROFILE.workspace.ground_z_m - FIXED_GROUND_M + PROFILE.grapple.jaws.tip_below_pin_m[0]
+    x, y, _ = ABOVE
+
+    def step(z):
+        check.check(solved((x, y, z)), knots((x, y, z - 0.0009)))
+
+    step(lowest - 0.1)
+    with pytest.raises(RequestRefused):
+        step(lowest - 0.1009)
+    check.forget()
+    step(lowest - 0.1009)
 
 
 def test_the_controller_refuses_such_a_setpoint_and_keeps_what_it_does():
@@ -118,6 +150,6 @@ def test_work_places_of_the_shipped_machines_stay_free(name):
             start, end = (solve(profile, place[0], place[1], z) for z in (place[2] + 1.0, place[2]))
         except Unreachable:
             continue
-        check.check([Knot(0, (*start, 0.0), STILL), Knot(50_000_000, (*end, 0.0), STILL)])
+        check.check((*start, 0.0), [Knot(0, (*start, 0.0), STILL), Knot(50_000_000, (*end, 0.0), STILL)])
         tried += 1
     assert tried > 5
