@@ -71,6 +71,7 @@ class MotionCheck:
 
     def _check_setpoints(self, motion: Motion) -> None:
         """Check the setpoints of a motion, one window after the other; raise GoalRefused."""
+        self._workspace.forget()
         window_s = _KNOTS * PERIOD_NS * 1e-9
         for window in range(int(motion.duration_s / window_s) + 1):
             begin_s = window * window_s
@@ -90,7 +91,7 @@ class MotionCheck:
         final = begin_s + _KNOTS * PERIOD_NS * 1e-9 >= motion.duration_s
         setpoint = CraneSetpoint(0, 0, 0, 0, GrappleCommand.NEUTRAL, final, knots)
         self._trajectory.load_and_check(setpoint, self._candidate, _UNKNOWN, _UNKNOWN, 0)
-        self._workspace.check(knots)
+        self._workspace.check(knots[0].position, knots)
 
 
 # -- The execution of one goal after the other
