@@ -24,6 +24,8 @@ from can_dbc.messages.crane import StateReport
 from machine.geometry.kinematics import Point
 
 POLL_S: Final = 0.005
+ANSWER_TIMEOUT_NS: Final = 2_000_000_000
+"""An instrument that has not answered after this time is requested again."""
 SURVEY_REQUEST: Final = b'{"op":"survey"}'
 
 
@@ -43,15 +45,16 @@ class SurveyInstrument:
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._link.setblocking(False)
         self._address = address
-        self._asked_ns = 0
+        self._asked_ns: int | None = None
+        """When the request under way was sent."""
 
     def read(self, now_ns: int) -> Point | None:
-        """Return the pin of the newest answer, or None; send a request ten times a second."""
+        """Return the pin of the newest answer, or None; send a request if none is under way."""
         newest_answer = self._newest(now_ns)
         return None if newest_answer is None else newest_answer.pin_m
 
     def read_yaw(self, now_ns: int) -> float | None:
-        """Return the direction of the newest answer, NaN where it has none, or None; send requests as often."""
+        """Return the direction of the newest answer, NaN where it has none, or None; send a request likewise."""
         newest_answer = self._newest(now_ns)
         return None if newest_answer is None else nan if newest_answer.yaw_rad is None else newest_answer.yaw_rad
 
@@ -64,11 +67,14 @@ class SurveyInstrument:
                 break
             with suppress(msgspec.DecodeError):
                 newest_answer = msgspec.json.decode(data, type=SurveyAnswer)
-        if now_ns - self._asked_ns >= 100_000_000:
-            self._asked_ns = now_ns
-            with suppress(OSError):
-                self._link.sendto(SURVEY_REQUEST, self._address)
-        return newest_answer
+        if self._asked_ns is not None and now_ns - self._asked_ns < ANSWER_TIMEOUT_NS:
+            if newest_answer is not None:
+                self._asked_ns = None
+            return newest_answer
+        self._asked_ns = now_ns  # what waited until now may be of an earlier pose
+        with suppress(OSError):
+            self._link.sendto(SURVEY_REQUEST, self._address)
+        return None
 
     def close(self) -> None:
         """Close the socket."""

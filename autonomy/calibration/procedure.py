@@ -51,6 +51,8 @@ SURVEY_SETTLE_S: Final = 1.5
 YAW_SETTLE_S: Final = 0.4
 """The grapple settles soon after a turn: nothing but its rotator has moved."""
 READING_PERIOD_NS: Final = 100_000_000
+SURVEY_TIMEOUT_NS: Final = 60_000_000_000
+"""An instrument that gives no reading for this time ends the run; a person who types one reading a pose does not."""
 REPORT_TIMEOUT_NS: Final = 300_000_000
 GRAPPLE_TIMEOUT_S: Final = 12.0
 MIN_GRAPPLE_S, UNSENSED_EXTRA_S = 0.5, 1.0
@@ -140,6 +142,7 @@ class Calibration(SpoolTasks):
     def _interrupt(self, blocked: Problem, now_ns: int) -> None:
         """Wait before the start; end a run that was interrupted, unless it may go on."""
         self._waiting = blocked
+        self.wants_reading = self.wants_yaw = False
         if self.begun_ns is None:
             return
         since_ns = now_ns if self._interrupted_ns is None else self._interrupted_ns
@@ -332,6 +335,7 @@ class Calibration(SpoolTasks):
     def _run_pin_reading(self, task: PinReadingTask, time_s: float, now_ns: int, survey: Point | None) -> None:
         self.wants_reading = time_s >= SURVEY_SETTLE_S and now_ns >= self._point_ns
         if survey is None or time_s < SURVEY_SETTLE_S:
+            self._check_instrument(now_ns)
             return
         self._points.append(survey)
         self._poses.append(self._position())
@@ -348,6 +352,7 @@ class Calibration(SpoolTasks):
     def _run_yaw_reading(self, time_s: float, now_ns: int, yaw_rad: float | None) -> None:
         self.wants_yaw = time_s >= YAW_SETTLE_S and now_ns >= self._point_ns
         if yaw_rad is None or time_s < YAW_SETTLE_S:
+            self._check_instrument(now_ns)
             return
         if isnan(yaw_rad):
             del self._tasks[self._at :]  # only the rotator's turns are left
@@ -360,6 +365,12 @@ class Calibration(SpoolTasks):
                 return
             self._next_task()
             self._skip_found_sides()
+
+    def _check_instrument(self, now_ns: int) -> None:
+        if self._readings > 1 and now_ns - max(self._task_ns, self._point_ns) > SURVEY_TIMEOUT_NS:
+            why = "check that it listens at the address of --survey and sees its target"
+            limit_s = SURVEY_TIMEOUT_NS * 1e-9
+            self.abort(f"no instrument gave a reading within {limit_s:.0f} s; {why}", "calibration.survey-timeout")
 
     def _skip_found_sides(self) -> None:
         """Leave out the rest of a search that has turned the joint."""

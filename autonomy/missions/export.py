@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from autonomy.missions import geojson
+from autonomy.missions.gpx_kml import LANDING_ASSORTMENT
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, MissionError, Options, Point, all_points
 from autonomy.missions.qgc_plan import DO_CHANGE_SPEED, NAV_WAYPOINT
 
@@ -61,7 +62,7 @@ def write_kml(mission: ForwardingMission) -> bytes:
     for fence in mission.fences:
         _fence(document, fence)
     for landing in mission.landings:
-        properties = {"bearing_deg": landing.bearing_deg, "assortments": ", ".join(landing.assortments)}
+        properties = {"bearing_deg": landing.bearing_deg, LANDING_ASSORTMENT: landing.assortments}
         placed = _placemark(document, landing.name, role="landing", **properties)
         _coordinates(SubElement(placed, "Point"), (landing.position,))
     for log in mission.logs:
@@ -85,8 +86,9 @@ def _placemark(document: Element, name: str, **properties: Any) -> Element:
     _text(placed, "name", name)
     data = SubElement(placed, "ExtendedData")
     for key, value in properties.items():
-        if value is not None and value != "":
-            _text(SubElement(data, "Data", name=key), "value", value if isinstance(value, str) else repr(value))
+        for each in value if isinstance(value, tuple) else (value,):
+            if each is not None and each != "":
+                _text(SubElement(data, "Data", name=key), "value", each if isinstance(each, str) else repr(each))
     return placed
 
 

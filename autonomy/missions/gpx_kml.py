@@ -56,6 +56,8 @@ _KML_UNUSED: Final = {
 _LINK: Final = "a link to another file, which is not followed; save what it shows as a file of its own"
 MAX_GAP_M: Final = 5.0
 """Segments of a track that begin no farther than this from the end of the one before are one drive [est]."""
+LANDING_ASSORTMENT: Final = "landing_assortment"
+"""Name of the data with one assortment of a landing; ``assortments`` has several with commas between them."""
 _KML: Final = frozenset(
     {
         "Document",
@@ -121,7 +123,7 @@ def read_gpx(data: bytes, name: str) -> Draft:
     for segments, owner in lines:
         read = [tuple(_gpx_position(point, source) for point in points) for points in segments]
         at = gaps.joined(read)
-        shapes.append(Shape("line" if len(at) > 1 else "point", (at,), {}, owner.line))
+        shapes.append(Shape("line", (at,), {}, owner.line))
     for point in root.all("wpt"):
         kind = point.value("type").lower()
         properties: dict[str, Any] = {"role": kind} if kind in ROLES else {}
@@ -238,7 +240,10 @@ class _Kml:
     def placemark(self, placemark: Element) -> None:
         properties: dict[str, Any] = {"name": placemark.value("name")}
         for data in placemark.all("ExtendedData"):
-            properties |= {entry.attributes.get("name", ""): entry.value("value") for entry in data.all("Data")}
+            entries = [(entry.attributes.get("name", ""), entry.value("value")) for entry in data.all("Data")]
+            properties |= dict(entries)
+            if single := [value for name, value in entries if name == LANDING_ASSORTMENT]:
+                properties["assortments"] = single
             for schema in data.all("SchemaData"):
                 properties |= {e.attributes.get("name", ""): e.text.strip() for e in schema.all("SimpleData")}
         if properties.get("role") == "log":

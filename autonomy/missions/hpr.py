@@ -17,7 +17,7 @@ from autonomy.missions.features import Draft, Key
 from autonomy.missions.gpx_kml import decimal
 from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point, is_product_key
 from autonomy.missions.source import Place, Source
-from autonomy.missions.validation import LENGTHS_M
+from autonomy.missions.validation import DIAMETERS_M, LENGTHS_M
 from autonomy.missions.xml_tree import ANY, Element, tree
 from runtime.errors import InputRefused
 
@@ -102,7 +102,9 @@ def read_hpr(data: bytes, name: str) -> Draft:
                     continue
                 for element in log_elements:
                     log = _log(element, stem, *at, species, products, source)
-                    if log.length_m is not None and log.length_m < LENGTHS_M[0]:
+                    if log.length_m is not None and (
+                        log.length_m < LENGTHS_M[0] or log.length_m <= (log.diameter_m or 0.0) <= DIAMETERS_M[1]
+                    ):
                         cut_offs += 1
                         continue
                     several += len(list(element.all("LogMeasurement"))) > 1
@@ -120,7 +122,9 @@ def read_hpr(data: bytes, name: str) -> Draft:
             f"{several} logs were measured more than once; one measurement is read, the harvester's if it is marked"
         )
     if cut_offs:
-        draft.notes.append(f"{cut_offs} cut-offs shorter than {LENGTHS_M[0]:g} m are left out")
+        draft.notes.append(
+            f"{cut_offs} cut-offs shorter than {LENGTHS_M[0]:g} m, or no longer than they are thick, are left out"
+        )
     if unnamed:
         draft.notes.append(
             f"{unnamed} logs have a product key that is no integer from 1; the report will not name their product"

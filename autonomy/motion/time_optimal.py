@@ -38,11 +38,8 @@ TAP_COUNTS: Final = (0, 12, 18, 22, 26, 30, 34, 38, 43, 48, 53)
 REFINEMENT_COUNT: Final = 3
 """How often the swing of a window is linearized again: paths are curved, so impulses do not simply superpose."""
 ROUND_COUNT: Final = 2
-_MAX_DURATION_S: Final = 60.0
 _TINY: Final = 1e-9
 _TAP_STEPS: Final = round(TAP_S / STEP_S)
-_DECAY: Final = np.exp(-np.outer(PENDULUM_POLES, np.arange(int(_MAX_DURATION_S / TAP_S)) * TAP_S))
-"""Decay of a pendulum's swing over a number of taps."""
 _GAIN: Final = (PENDULUM_RAD_S**2 / GRAVITY_M_S2)[:, None]
 _GOOD_SHARE: Final = 0.6
 """A window is good enough at this share of the bound."""
@@ -157,7 +154,8 @@ def _weights(length: int) -> np.ndarray:
     """Compute the residual swing [rad] per place of a path with one place every `TAP_S`, from rest to rest: real and
     imaginary parts for every pendulum, (2 n, length).
     """
-    late = _GAIN * _DECAY[:, : length - 1][:, ::-1]
+    decay = np.exp(-np.outer(PENDULUM_POLES, np.arange(length - 1) * TAP_S))  # of a swing over a number of taps
+    late = _GAIN * decay[:, ::-1]
     none = np.zeros((len(late), 1))
     weights = np.hstack([none, late]) - np.hstack([late, none])
     return np.vstack([weights.real, weights.imag])

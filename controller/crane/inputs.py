@@ -197,6 +197,8 @@ def _own_report(node: NodeHealth) -> Reason:
 
 LOST_SAMPLES: Final = 3
 """An encoder behind a PLC is lost after this many of the PLC's samples, as one on the bus after as many periods."""
+_EXCHANGE_NS: Final = 10_000_000
+"""A faster PLC brings no more samples: the bridge asks it for an answer in this period."""
 _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "HeartbeatCtrl")
 
 
@@ -205,7 +207,7 @@ def sample_timeout_ns(profile: Profile) -> int:
 
     0: no PLC, the DBC's time-out counts.
     """
-    return 0 if profile.plc is None else LOST_SAMPLES * round(profile.plc.sample_ms * 1e6)
+    return 0 if profile.plc is None else LOST_SAMPLES * max(_EXCHANGE_NS, round(profile.plc.sample_ms * 1e6))
 
 
 class CraneInputs:

@@ -23,6 +23,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
 from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.dbc.codec import load
@@ -32,11 +34,11 @@ from can_dbc.messages.udp_address import address_argument
 from can_dbc.plc.machine import MACHINES, Machine
 from can_dbc.plc.map import MapError, WordOrder, check_identity
 from can_dbc.plc.modbus import ModbusClient, RegisterRefused, is_loopback
+from controller.config import load as load_settings
 from controller.plc.bridge import EXCHANGE_NS, Bridge
 from controller.plc.handshake import Handshake
 from controller.process.bus_link import BusLink
 from controller.process.realtime import prepare, stop_garbage_collection
-from machine.loading.profile_file import ProfileError, load_profile
 from runtime.errors import ConfigError, LinkError
 from runtime.memory import keep_memory
 from runtime.notifier import Notifier
@@ -196,6 +198,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--profile", required=True, help="shipped profile name or TOML file with a [plc] table")
     made.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
+    made.add_argument("--rate", type=int, default=0, metavar="HZ", help="the controller's, if not the profile's")
     link = made.add_mutually_exclusive_group(required=True)
     link.add_argument("--modbus", type=address_argument, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
     link.add_argument("--udp", type=address_argument, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
@@ -327,7 +330,9 @@ def main(arguments: list[str] | None = None) -> int:
         order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
         key = None if options.key_file is None else read_key(options.key_file)
         shake = Handshake(order, key=key, first_sequence=secrets.randbits(31))
-        bridge = Bridge(load_profile(options.profile), load("crane"), shake)
+        settings = load_settings(options.profile, options.rate)
+        profile = msgspec.structs.replace(settings.profile, rate_hz=settings.rate_hz)
+        bridge = Bridge(profile, load("crane"), shake)
         machine = load_plugin(MACHINES, options.machine) if options.machine else None
         with open_bus(where or default_address("crane0"), tx_queue=TX_QUEUE, participant="plc") as bus:
             if not options.no_realtime:
@@ -341,7 +346,7 @@ def main(arguments: list[str] | None = None) -> int:
             stop_garbage_collection()
             asyncio.run(_until_ended(Process(bridge, bus), link, ended))
         sys.stderr.write(f"plc: {summary(bridge)}\n")
-    except (ConfigError, ProfileError) as error:
+    except ConfigError as error:
         sys.stderr.write(f"plc: {error}\n")
         return 3
     except (LinkError, OSError) as error:

@@ -53,6 +53,7 @@ class ValveGate:
         period_ns = 1_000_000_000 // profile.rate_hz
         self._punctuality = {s.codec.key: Punctuality(period_ns, s.timeout_ns) for s in (self._a, self._b)}
         self._axes = [self._place(s.valve.signal) for s in specs]
+        self._commanded = [*self._axes, (self._b, "Grapple"), (self._b, "GrappleMode")]
         self._places = [self._reference(j.name.capitalize()) for j in JOINTS] if self._references else []
         self._sync_ns = -SYNC_NS
         self._armed = False
@@ -128,7 +129,8 @@ class ValveGate:
             return ExitCode.COMMAND_TIMEOUT
         if self._guard.get("Enable") != ARM_KEY:
             return ExitCode.GUARD_MISSING
-        if self._a.get("Mode") not in (0, _MODE_SPOOL):
+        commanded = [state.get(signal) for state, signal in self._commanded]
+        if self._a.get("Mode") not in (0, _MODE_SPOOL) or None in commanded:
             return ExitCode.OUT_OF_RANGE
         return 0
 
@@ -174,5 +176,5 @@ def state_of(feedback: Feedback, gate: ValveGate) -> int:
 
 
 def fault_bits(feedback: Feedback) -> int:
-    """Encode PlcStatus.FaultBits: one bit per fault of the map."""
-    return 0 if feedback.fault == plc.Fault.NONE else 1 << (feedback.fault - 1) & 0xFFFF
+    """Encode PlcStatus.FaultBits: one bit per fault of the map, the last one for every fault from 16 on."""
+    return 0 if feedback.fault == plc.Fault.NONE else 1 << min(feedback.fault, 16) - 1

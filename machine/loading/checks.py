@@ -46,6 +46,8 @@ MIN_ANTENNA_DISTANCE_M: Final = 0.3
 MAX_ARM_DROP_SHARE: Final = 0.9
 """Greatest drop of a wheel hub over the length of its arm; a steeper arm hardly lifts."""
 
+MAX_KEEP_OUT: Final = 100
+"""Boxes; a refusal names one in a byte."""
 MAX_LEAN_RAD: Final = 0.06
 """Greatest lean of an empty crane: more than half a metre of sag at full reach."""
 
@@ -80,9 +82,7 @@ def problems_of(profile: Profile) -> list[Problem]:
         problems += _carrier_problems(profile, profile.carrier)
     if profile.imu is not None:
         problems += _imu_problems(profile, profile.imu)
-    if profile.sag is not None:
-        problems += _sag_problems(profile, profile.sag)
-    return problems or list(_reach_problems(profile))
+    return problems or list(_geometry_problems(profile))
 
 
 def _top_level_problems(profile: Profile) -> Iterator[Problem]:
@@ -104,6 +104,9 @@ def _top_level_problems(profile: Profile) -> Iterator[Problem]:
     if floor_z_m < ground_z_m:
         text = f"{floor_z_m} m is below the ground at {ground_z_m} m; a bunk floor is at or above it"
         yield Problem("profile.bunk-below-ground", "bunk.floor_z_m", text)
+    if len(profile.keep_out) > MAX_KEEP_OUT:
+        text = f"{len(profile.keep_out)} boxes are too many; at most {MAX_KEEP_OUT}"
+        yield Problem("profile.keep-out-boxes", "keep_out", text)
 
 
 def _not_plain(path: str, name: str) -> Problem:
@@ -198,7 +201,7 @@ def _encoder_problems(
     if encoder.device_type & 0xFFFF != 0x0196:
         text = f"{encoder.device_type:#010x} is not a CiA 406 encoder; the low half of object 1000h must be 0x0196"
         yield Problem("profile.encoder-device-type", f"{path}.device_type", text)
-    yield from check_range(f"{path}.noise", encoder.noise, (0.0, 0.05, unit))
+    yield from check_range(f"{path}.noise", encoder.noise, (1e-6, 0.05, unit))
     if encoder.kind == "rotary":
         if not 0 <= encoder.zero_counts < encoder.total_counts:
             text = f"{encoder.zero_counts} is outside 0..{encoder.total_counts - 1}"
@@ -308,7 +311,6 @@ def _carrier_problems(profile: Profile, carrier: Carrier) -> Iterator[Problem]:
     if not apart >= MIN_ANTENNA_DISTANCE_M:
         text = f"{apart:.2f} m from antenna_main_m gives no heading; at least {MIN_ANTENNA_DISTANCE_M} m apart"
         yield Problem("profile.antennas-too-close", f"{path}.antenna_aux_m", text)
-    yield from _suspension_problems(path, carrier)
 
 
 def _suspension_problems(path: str, carrier: Carrier) -> Iterator[Problem]:
@@ -353,8 +355,17 @@ def _sag_problems(profile: Profile, sag: Sag) -> Iterator[Problem]:
         yield Problem("profile.sag-moment", "sag.head_nm_m", text)
 
 
+def _geometry_problems(profile: Profile) -> Iterator[Problem]:
+    """Check what follows from several numbers; only meaningful for an otherwise sound profile."""
+    if profile.carrier is not None:
+        yield from _suspension_problems("carrier", profile.carrier)
+    if profile.sag is not None:
+        yield from _sag_problems(profile, profile.sag)
+    yield from _reach_problems(profile)
+
+
 def _reach_problems(profile: Profile) -> Iterator[Problem]:
-    """Check that the arm reaches its work places; only meaningful for an otherwise sound profile."""
+    """Check that the arm reaches its work places."""
     reach = max_reach_m(profile)
     centers_m = {
         "bunk.center_m": profile.bunk.center_m,

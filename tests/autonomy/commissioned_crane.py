@@ -3,7 +3,7 @@ procedure.
 
 It obeys setpoints and spool tests without judging them, and says on the bus what it does.  Faults by name:
 ``backward`` and ``stuck`` joints, a controller that ``refuses``, a ``mode``, an instrument that is ``no_compass``: it
-cannot tell the grapple's direction.
+cannot tell the grapple's direction, one that is ``silent``.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from math import nan, pi
 
 from autonomy.calibration.plan import CalibrationPlan, make_plan
 from autonomy.calibration.procedure import Calibration
+from autonomy.calibration.procedure_state import READING_COUNT
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest, StateReport
@@ -46,12 +47,14 @@ class Crane:
     stuck: set[Joint] = field(default_factory=set)
     valves: dict[Joint, Valve] = field(default_factory=dict)
     no_compass: bool = False
+    silent: bool = False
     only_turns: bool = False
     refuses: int = 0
     refusal: Reason = Reason.FINAL_MOVING
     reason: Reason = Reason.NONE
     chosen: tuple[Joint, ...] = tuple(JOINTS)
     patience_s: float = 0.0
+    readings: int = READING_COUNT
     now_ns: int = 5_000_000_000
     said: SpoolTest | CraneSetpoint | None = None
     heard: list[SpoolTest | CraneSetpoint] = field(default_factory=list)
@@ -67,9 +70,8 @@ class Crane:
         self.plan: CalibrationPlan = make_plan(self.profile, HOME[self.name], self.surveyed, self.chosen)
         if self.only_turns:
             self.plan = replace(self.plan, joints=(), survey=())
-        self.calibration = Calibration(
-            self.profile, profile_hash(self.profile), self.plan, DATABASE, patience_s=self.patience_s
-        )
+        number, how = profile_hash(self.profile), {"asked_readings": self.readings, "patience_s": self.patience_s}
+        self.calibration = Calibration(self.profile, number, self.plan, DATABASE, **how)
 
     def valve(self, j: Joint) -> Valve:
         """The true valve of a joint."""
@@ -90,8 +92,9 @@ class Crane:
         for j in JOINTS:
             self._move(j, spools[j])
         report = self._report() if self.ticks % REPORT_EVERY == 0 else None
-        pin = true_pin(SAG, self.profile.kinematics, self.q) if self.calibration.wants_reading else None
-        yaw_rad = self._yaw_rad() if self.calibration.wants_yaw else None
+        run = self.calibration
+        pin = true_pin(SAG, self.profile.kinematics, self.q) if run.wants_reading and not self.silent else None
+        yaw_rad = self._yaw_rad() if run.wants_yaw and not self.silent else None
         data = self.calibration.step(self.now_ns, report, self._frames(spools), pin, yaw_rad)
         if data is not None:
             message = decode(data)

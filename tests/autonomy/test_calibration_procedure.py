@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from math import nan
 
 import msgspec
 import pytest
 
+from autonomy.calibration.live import SurveyInstrument
 from autonomy.calibration.plan import MoveTask, SpoolTask, make_plan, plan_summary
+from autonomy.calibration.procedure import READING_PERIOD_NS, SURVEY_SETTLE_S
 from autonomy.calibration.profile_file import profile_changes
 from autonomy.calibration.report import result_document
 from autonomy.calibration.result import CalibrationResult, identify
@@ -30,6 +33,7 @@ from machine.status.reasons import Reason
 from runtime.errors import InputRefused
 from tests.autonomy.commissioned_crane import HOME, SAG, Crane
 from tests.codes import coded, numbers_in
+from tests.operator_end import udp_end
 
 PALMS = load_profile("palms_471")
 ROTATOR = {"name": "aoro_fc8", "only_turns": True}
@@ -102,6 +106,38 @@ def test_without_a_readable_direction_the_rotator_stays_as_it_was() -> None:
     assert result.turns is None and len(result.kept) == 1 and "rot" in result.kept[0]
     assert result_document(result, {}, [])["kept"] == list(result.kept)
     assert not profile_changes(crane.profile, CalibrationResult({}, {}, None, kept=result.kept))
+
+
+@pytest.mark.parametrize(("readings", "code"), [(5, "calibration.survey-timeout"), (1, None)])
+def test_a_silent_instrument_ends_the_run_and_a_person_who_types_does_not(
+    readings: int, code: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("autonomy.calibration.procedure.SURVEY_TIMEOUT_NS", 1_000_000_000)
+    crane = Crane(**ROTATOR, silent=True, readings=readings)
+    run = crane.run(8.0)
+    assert run.failure_code == code and run.idle is bool(code) and not run.done
+
+
+@pytest.mark.parametrize("late_s", [0.12, 0.25, 0.4])
+def test_no_reading_of_a_pose_is_an_answer_from_the_one_before(late_s: float) -> None:
+    """An instrument answers every request where the crane stood when it came, ``late_s`` afterwards."""
+    with udp_end() as far:
+        instrument, now_ns, on_the_way = SurveyInstrument(far.getsockname()), 10**10, []
+        for pose in range(3):
+            begun_ns, readings, next_ns = now_ns, [], 0
+            while len(readings) < 3:
+                now_ns += 5_000_000
+                while on_the_way and on_the_way[0][0] <= now_ns:
+                    _, there, asker = on_the_way.pop(0)
+                    far.sendto(b'{"pin_m":[%d,0,0]}' % there, asker)
+                wanted = now_ns >= max(begun_ns + SURVEY_SETTLE_S * 1e9, next_ns)
+                if wanted and (pin := instrument.read(now_ns)) is not None:
+                    readings.append(pin[0])
+                    next_ns = now_ns + READING_PERIOD_NS
+                with suppress(BlockingIOError):
+                    on_the_way.append((now_ns + late_s * 1e9, pose, far.recvfrom(100)[1]))
+            assert readings == [pose] * 3
+        instrument.close()
 
 
 def test_every_joint_is_wiggled_before_anything_travels() -> None:

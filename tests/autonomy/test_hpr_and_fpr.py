@@ -13,7 +13,7 @@ import pytest
 from autonomy.missions import geojson
 from autonomy.missions.fpr import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
 from autonomy.missions.hpr import MACHINE_SIGMA_M, TIP_SIGMA_M
-from autonomy.missions.mission_file import load_mission, read
+from autonomy.missions.mission_file import load_mission, read, verify
 from autonomy.missions.model import Landing, MissionError, Point, Problem
 from tests.autonomy.mission_checks import refused
 from tests.autonomy.mission_texts import SITE, at
@@ -118,6 +118,14 @@ def test_a_cut_off_is_left_out(length_cm: str) -> None:
     draft = read(TEXT.replace("<LogLength>300<", f"<LogLength>{length_cm}<", 1).encode(), "h")
     assert len(draft.mission.logs) == len(LOGS) - 1 and numbers_in(draft.notes[0])[0] == 1
     assert [place for place in draft.places if place[0] == "log"] == [("log", i) for i in range(len(LOGS) - 1)]
+
+
+@pytest.mark.parametrize("thick_mm", ["350", "400"])
+def test_a_cut_off_that_is_as_thick_as_long_is_left_out(thick_mm: str) -> None:
+    text = TEXT.replace("<LogLength>300<", "<LogLength>35<", 1)
+    draft = read(re.sub(r'("Mid ob">)\d+', rf"\g<1>{thick_mm}", text, count=1).encode(), "h")
+    verify(draft, route_wanted=False)
+    assert len(draft.mission.logs) == len(LOGS) - 1 and numbers_in(draft.notes[0])[0] == 1
 
 
 @pytest.mark.parametrize("key", ["0", "-1", "31.5", "99999999999"])

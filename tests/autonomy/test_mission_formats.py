@@ -428,7 +428,7 @@ def test_any_names_make_a_well_formed_report(kinds: list[tuple[str, str, int | N
     assert len(set(keys)) == len(keys) and all(int(k or 0) > 0 for k in keys)
 
 
-WORDS = st.text(st.characters(max_codepoint=0x2FFF, exclude_categories=("C", "Z"), exclude_characters=","), max_size=6)
+WORDS = st.text(st.characters(max_codepoint=0x2FFF, exclude_categories=("C", "Z")), max_size=6)
 """What every format holds."""
 
 
@@ -460,6 +460,12 @@ def test_an_exported_mission_is_read_back_less_what_is_said_to_be_left_out(kind:
         assert read(data, "m").mission == without(mission, left_out)
 
     holds()
+
+
+@pytest.mark.parametrize("kinds", [("Pine log, 2nd class",), ("Pine log, 2nd class", "spruce"), ("a", "b")])
+def test_kml_keeps_the_assortments_of_a_landing_apart(kinds: tuple[str, ...]) -> None:
+    mission = ForwardingMission("m", tuple(ROUTE), landings=(Landing(at(20, 15), "Road", assortments=kinds),))
+    assert read(export(mission, "kml").data, "m").mission.landings == mission.landings
 
 
 def test_characters_that_xml_cannot_hold_are_blanks() -> None:

@@ -66,6 +66,11 @@ def test_a_route_of_one_point_does_not_hide_the_track() -> None:
     assert len(good(gpx(start + way.replace(gpx_points("trkpt"), gpx_points("trkpt", ROUTE[:1])))).notes) == 1
 
 
+def test_a_route_of_one_point_is_the_route_and_waypoints_beside_it_are_not() -> None:
+    draft = good(gpx(gpx_points("wpt", ROUTE[1:]) + f"<rte>{gpx_points('rtept', ROUTE[:1])}</rte>"))
+    assert len(draft.mission.waypoints) == 1 and numbers_in(draft.notes[0]) == [len(ROUTE) - 1]
+
+
 def test_points_between_those_of_a_route_are_a_warning() -> None:
     """Garmin's programs write the way along roads into extensions, and only its corners as route points."""
     between = '<extensions><g:RoutePointExtension xmlns:g="u"><g:rpt lat="1" lon="2"/><g:rpt lat="1" lon="2"/>'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -302,3 +303,12 @@ def test_a_path_too_short_to_swing_anything_is_as_fast_as_a_vertical_one() -> No
     pin = aside.curve(np.linspace(0.0, 1.0, 2))[:, N_JOINTS:]
     omega = 2.0 * np.pi / 1.5
     assert not aside.sideways and float(np.hypot(*(pin[1] - pin[0]))) * omega**2 / 9.81 < SWING_RAD
+
+
+def test_a_leg_of_more_than_a_minute_is_planned() -> None:
+    slew = msgspec.structs.replace(PROFILE.joints["slew"], speed_limit=0.025)
+    arm = Arm(msgspec.structs.replace(PROFILE, joints={**PROFILE.joints, "slew": slew}))
+    low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
+    way = PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([-2.0, 0.0, 0.0, 0.0, 0.0]))
+    law = time_optimal_law(arm, way)
+    assert law.duration_s > 75.0 and law.swing_rad <= SWING_RAD

@@ -25,6 +25,7 @@ from controller.plc import __main__ as process
 from controller.plc.__main__ import summary
 from controller.plc.bridge import Bridge, role_of
 from controller.plc.handshake import Handshake
+from controller.plc.valve_gate import fault_bits
 from hil.plc import write_plc_profile
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
@@ -207,6 +208,22 @@ def test_without_arm_key_enable_or_a_known_mode_it_is_neutral(missing: dict[str,
     rig.run(20, Slew=50.0, **missing)
     assert rig.command == Command()
     assert rig.bridge.gate.exit == exit_code
+
+
+@pytest.mark.parametrize("name", ["Slew", "Rot", "Grapple"])
+def test_a_command_that_is_not_available_is_neutral_until_a_disarm(name: str) -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+    rig.run(20, **{"Slew": 50.0, name: None})
+    assert rig.command == Command() and rig.bridge.gate.exit == 6
+    rig.run(20, Slew=50.0)
+    assert rig.command == Command() and rig.bridge.gate.locked
+
+
+@pytest.mark.parametrize(("fault", "bits"), [(0, 0), (3, 4), (16, 0x8000), (17, 0x8000), (65535, 0x8000)])
+def test_every_fault_number_of_the_plc_is_a_fault_bit(fault: int, bits: int) -> None:
+    assert fault_bits(Feedback(fault=fault)) == bits
 
 
 @pytest.mark.parametrize("lost", ["ValveCmdA", "ValveCmdB", "GuardStat"])
@@ -392,6 +409,20 @@ def test_a_plc_that_repeats_its_samples_is_silence_on_the_bus(name: str) -> None
     assert frames_of(rig, "PressA", 50), "the rest goes on"
 
 
+@pytest.mark.parametrize("sample_ms", [1.0, 10.0])
+def test_a_plc_that_samples_faster_than_it_answers_passes_commands_on(sample_ms: float) -> None:
+    rig = Rig()
+    rig.bridge = Bridge(msgspec.structs.replace(profile("valves"), plc=Plc("valves", sample_ms)), DATABASE)
+    rig.run(50, arm=0, mode=0)
+    rig.run(100, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+    rig.samples = False
+    rig.run(30, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+    rig.run(20, Slew=50.0)
+    assert rig.command == Command() and rig.bridge.gate.exit == 9
+
+
 def test_pressures_are_sent_once_per_cycle_of_the_plc() -> None:
     rig = Rig()
     rig.run(100)
@@ -565,6 +596,24 @@ def test_a_machine_that_is_not_installed_ends_the_bridge_before_it_opens_a_bus(
     assert process.main(["--profile", str(path), "--machine", "nobody"]) == 3
     with pytest.raises(SystemExit, match="2"):
         process.main(["--profile", str(path), "--machine", "nobody", "--key-file", str(path)])
+
+
+def test_rate_is_the_controllers_and_within_its_range(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bridge for 200 Hz takes every command of 100 Hz as late after nine of them."""
+    rates: list[int] = []
+
+    def made(profile: Profile, *_: object) -> Bridge:
+        rates.append(profile.rate_hz)
+        raise ConfigError("config.test", "enough")
+
+    monkeypatch.setattr(process, "keep_memory", lambda: None)
+    monkeypatch.setattr(process, "Bridge", made)
+    path = str(write_plc_profile("palms_471", "valves", tmp_path))
+    for rate in ([], ["--rate", "100"], ["--rate", "40"]):
+        assert process.main(["--profile", path, "--modbus", "127.0.0.1:1502", *rate]) == 3
+    assert rates == [200, 100] and "40 Hz is not possible" in capsys.readouterr().err
 
 
 # -- the joint references, only for a PLC that closes the joint loops, and only within the frames' range

@@ -6,6 +6,9 @@ import pytest
 
 from tests.machine.changed_profiles import AORO, DELETE, IMU, RAW, SAG, problems
 
+NAN = float("nan")
+BOX = {"center_m": [5.0, 0.0, 0.0], "half_m": [0.1, 0.1, 0.1]}
+
 # Code and key path of the only problem, the value there that makes it, and the words that its sentence names.
 OF_A_CRANE = [
     ("wrong-unit", "joints.slew.speed_limit_deg_s", 20.0, '"speed_limit"'),
@@ -59,12 +62,19 @@ OF_A_CRANE = [
     ("encoder-message", "joints.slew.encoder.message", "EncArm", '"EncArm"'),
     ("encoder-device-type", "joints.slew.encoder.device_type", 0x00010191, "0x00010191 1000h 0x0196"),
     ("encoder-zero", "joints.slew.encoder.zero_counts", 16384, "16384 0..16383"),
-    ("out-of-range", "joints.slew.encoder.noise", 2.0, "2 deg 0..0.05"),
+    ("out-of-range", "joints.slew.encoder.noise", 2.0, "2 deg 1e-06..0.05"),
+    ("out-of-range", "joints.slew.encoder.noise", 0.0, "0 1e-06..0.05"),
+    ("out-of-range", "joints.ext.encoder.total_counts", 2**32, "2..4.29497e+09"),
+    ("out-of-range", "joints.lift.valve.lever_at[1]", [-0.384, NAN, 0, 0.3, 0.5, 0.9, 1.2, 1.3], "nan -20..20"),
+    ("out-of-range", "joints.lift.valve.lever[1]", [0.8, 1.5, 1, 1, 1, 1, 1, 1], "1.5 0.2..1.4"),
+    ("out-of-range", "joints.slew.valve.exponent", 1.7, "1.7 0.5..1.6"),
     ("encoder-too-short", "joints.ext.encoder.total_counts", 204800, "204800 5e-06 0.13..1.8"),
     ("law-unknown", "joints.ext.law.kind", "nobody", '"nobody" pid'),
     ("joint-kind", "joints.ext.kind", "revolute", '"revolute"'),
     ("bunk-below-ground", "bunk.floor_z_m", -1.5, "-1.5 -1.39"),
     ("out-of-range", "timeouts.lease_max_ms", 5000, "5000 20..500"),
+    ("out-of-range", "timeouts.stop_ramp_ms", 201, "201 10..200"),
+    ("keep-out-boxes", "keep_out", {f"box{i}": BOX for i in range(101)}, "101 100"),
     ("out-of-range", "timeouts.operator_link_ms", 1001, "1001 0..1000"),
     ("link-limit-short", "timeouts.operator_link_ms", 499, "499 500 0"),
     ("rate-not-whole", "rate_hz", 300, "300 100 200 250"),
@@ -88,12 +98,16 @@ OF_A_FORWARDER = [
     ("machine-bus-missing", "machine_bus", DELETE, ""),
     ("unknown-key", "carrier.trak_width_m", 2.1, '"track_width_m"'),
     ("out-of-range", "carrier.articulation_limit_rad", 35.0, "35 deg 0.05..1.2"),
+    ("out-of-range", "carrier.articulation_limit_rad", float("inf"), "inf 0.05..1.2"),
+    ("out-of-range", "carrier.articulation_lag_s", 0.0, "0 0.01..2"),
+    ("out-of-range", "carrier.steer_valve.delay_s", 0.0, "0 0.01..0.5"),
+    ("out-of-range", "carrier.speed_limit_m_s", 2.1, "2.1 0.05..2"),
     ("out-of-range", "carrier.crane_base_m[1]", [-0.4, float("inf"), 0.68], "-5..5"),
     ("out-of-range", "carrier.site_lat_deg", 196.0, "196 -85..85"),
     ("antennas-too-close", "carrier.antenna_aux_m", [0.5, 0.0, 2.0], "0.10 0.3"),
     ("arm-travel", "carrier.arm_travel_m", 1.1, "1.00 -0.90..0.90 -0.15..0.95"),
     ("arm-transport", "carrier.arm_transport_m", 0.7, "0.7 0.6"),
-    ("cruise-speed", "carrier.cruise_speed_m_s", 2.3, "2.3 1.0"),
+    ("cruise-speed", "carrier.cruise_speed_m_s", 1.3, "1.3 1.0"),
     ("out-of-range", "carrier.tilt_limit_rad", 17.0, "17 deg 0.05..0.6"),
     ("out-of-range", "carrier.drive_acceleration_m_s2", 400.0, "400 2 mm/s^2 0.05..3"),
     ("full-speed-too-low", "carrier.steer_valve.full_speed_minus", 0.1, "0.1 0.21"),

@@ -60,6 +60,7 @@ def test_an_instrument_gives_the_grapples_direction_or_says_that_it_cannot(far: 
     _, asker = far.recvfrom(100)
     far.sendto(b'{"pin_m":[1.0,2.0,3.0],"yaw_rad":0.7}', asker)
     assert waited_for(instrument.read_yaw) == 0.7
+    assert instrument.read_yaw(10**9 + 1) is None
     far.sendto(b'{"pin_m":[1.0,2.0,3.0]}', asker)
     told = waited_for(instrument.read_yaw)
     assert told is not None and isnan(told)
