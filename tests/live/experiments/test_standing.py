@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from experiments.common.registry import EXPERIMENTS, Entry
 from experiments.common.result import ROOT, sealed_seed
-from experiments.common.standing import Standing, Verdict, changed_since, has_history, judge, marked
+from experiments.common.standing import Standing, Verdict, changed_since, has_history, judge, marked, meaning
 
 ENTRY = Entry("?", "m", ("plant", "law.py"))
 CODE = '"""Doc."""\n\nX = 1\n"""Of X."""\n\n\ndef f(a):\n    """Doc."""\n    return a  # why\n'
@@ -114,7 +113,8 @@ def test_every_source_of_every_experiment_exists() -> None:
         for path, _, names in (source.partition(":") for source in entry.sources):
             assert (ROOT / path).exists(), (name, path)
             for definition in filter(None, names.split(",")):
-                assert re.search(rf"^(def )?{definition}\b", (ROOT / path).read_text(), re.MULTILINE), definition
+                of_it = meaning((ROOT / path).read_bytes(), frozenset({definition}))
+                assert of_it != meaning(b""), (name, definition)
 
 
 def test_a_shallow_checkout_and_a_copy_are_told_from_a_whole_one(checkout: Checkout, tmp_path: Path) -> None:
