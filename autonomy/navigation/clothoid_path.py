@@ -23,6 +23,8 @@ from runtime.errors import TimberhandError
 SPACING_M: Final = 0.05
 TOLERANCE_M: Final = 0.05
 """Points this near to the line between their neighbours are dropped (Douglas and Peucker)."""
+REVERSAL_M: Final = 4.0
+"""A line that turns back by more than this is kept, and refused: shorter spikes are the scatter of a receiver."""
 COMFORT_SHARE: Final = 0.80
 """Share of the maximum curvature used in a corner; the rest is left for correction."""
 RATE_SHARE: Final = 0.70
@@ -127,7 +129,7 @@ class _Bend:
 
 
 def _needed(xy: np.ndarray) -> np.ndarray:
-    """Return the points without repetitions and without those close to the line."""
+    """Return the points without repetitions and without those close to the line, but with those where it turns back."""
     apart = np.hypot(*np.diff(xy, axis=0).T) if len(xy) > 1 else np.empty(0)
     xy = xy[np.concatenate([[True], apart > 1e-3])]
     keep = np.zeros(len(xy), bool)
@@ -142,7 +144,12 @@ def _needed(xy: np.ndarray) -> np.ndarray:
         share = np.clip(between @ leg / length, 0.0, 1.0)
         off = np.hypot(*(between - share[:, None] * leg).T)
         worst = int(np.argmax(off))
-        if off[worst] > TOLERANCE_M:
+        along = between @ leg / math.sqrt(length)
+        back = np.maximum.accumulate(along) - along
+        turns_back = float(back.max()) > REVERSAL_M
+        if turns_back:
+            worst = int(np.argmax(along[: int(np.argmax(back)) + 1]))
+        if turns_back or off[worst] > TOLERANCE_M:
             middle = a + 1 + worst
             keep[middle] = True
             todo += [(a, middle), (middle, b)]

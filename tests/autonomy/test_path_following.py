@@ -84,6 +84,8 @@ def test_short_legs_are_driven_with_sharper_bends_or_refused() -> None:
     assert np.abs(hard.curve_1_m).max() > np.abs(easy.curve_1_m).max()
     with pytest.raises(PathRefused, check=coded("path.short-leg")):
         drivable_path([(0, 0), (5, 0), (5, 30)], CARRIER)
+    with pytest.raises(PathRefused, check=coded("path.reverses")):  # its points lie on one line
+        drivable_path([(0.0, 0.0), (30.0, 0.0), (10.0, 0.0), (50.0, 0.0)], CARRIER)
     with pytest.raises(PathRefused, check=coded("path.reverses")):
         drivable_path([(0, 0), (30, 0), (1, 0.1)], CARRIER)
 
