@@ -142,6 +142,8 @@ class Cycle:
         """Numbers of what was seen between open jaws."""
         self._stirred = False
         """Whether the jaws have closed in vain since the last selection."""
+        self._untried = False
+        """Whether the jaws have not closed yet since the last selection."""
         self.drops_load = False
         """Whether the jaws open to grip anew, because the load was too heavy."""
         self._load_id: int | None = None
@@ -170,10 +172,12 @@ class Cycle:
 
     def _select(self, q: Axes) -> None:
         self._reselection_count = self._turn_count = self._higher_count = 0
+        leave, untried = self._job.leave + self._recovery.excluded_logs, self._untried
+        self._untried = True
         self._load_ids.clear()
         self._previous_grasp = None
         self._stirred = False
-        job = msgspec.structs.replace(self._job, leave=self._job.leave + self._recovery.excluded_logs)
+        job = msgspec.structs.replace(self._job, leave=leave, untried=untried)
         self.grasp = self._unturned_grasp(
             self._select_grasp(self._arm, job, self._lying_logs(q), q[Joint.SLEW], q[Joint.ROT]), q
         )
@@ -350,7 +354,7 @@ class Cycle:
                 deeper_m = EXTRACTION_DEPTH_M if grasp.extracts else 0.0
                 return straight_line(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
             case Phase.CLOSE:
-                self.drops_load = False
+                self.drops_load = self._untried = False
                 if grasp.dragging:
                     return extraction_motion(arm, start, grasp)
                 return closing_motion(arm, start, grasp, closing_s)

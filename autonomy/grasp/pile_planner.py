@@ -79,7 +79,8 @@ class PilePlanner:
         logs = request.logs
         if not logs:
             raise NoGrasp("grasp.no-log-in-view", "no log is in view")
-        self._remember_failure(logs)
+        if not request.untried:
+            self._remember_failure(logs)
         world = as_cylinders(logs)
         if not rests_upon(world).any():
             try:

@@ -31,13 +31,15 @@ class BunkFull(NoGrasp):
 class GraspRequest:
     """What a grasp planner plans from: machine and load, the log list, and the present rotator angle [rad].
 
-    ``stay`` holds indices into ``logs``: these logs must not be gripped, but they are obstacles.
+    ``stay`` holds indices into ``logs``: these logs must not be gripped, but they are obstacles.  ``untried``: the
+    candidate that was proposed last was not tried.
     """
 
     arm: Arm
     logs: Sequence[LogObservation]
     rot_rad: float
     stay: Collection[int] = ()
+    untried: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -121,7 +121,7 @@ class PlannerSelection:
             raise missing
         present, _ = _logs_at_source(arm.profile, job, logs)
         stay = {i for i, log in enumerate(present) if log.id in job.leave}
-        candidate = self._planner(GraspRequest(arm, present, rot_rad, stay))
+        candidate = self._planner(GraspRequest(arm, present, rot_rad, stay, job.untried))
         gripped_log, *others = sorted((present[i] for i in candidate.logs), key=lambda log: -log.length_m)
         thinnest = min(log.diameter_m for log in (gripped_log, *others))
         try:

@@ -14,6 +14,7 @@ class CraneJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     its centre in the base frame (None: where the target has most room).  Logs come from ``source`` (None: anywhere
     outside the target) and go to ``target`` (None: the machine's bunk).  A pile on the ground is a `Bunk`, too: its
     floor is the ground, and its stakes are as high as it may get.  ``leave`` lists logs that must not be picked.
+    ``untried``: the grasp that was selected last was not tried, so that nothing follows from what still lies there.
     """
 
     log_id: int | None = None
@@ -21,6 +22,7 @@ class CraneJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     source: Bunk | None = None
     target: Bunk | None = None
     leave: tuple[int, ...] = ()
+    untried: bool = False
 
     def to(self, bunk: Bunk) -> Bunk:
         """Return the target on a machine with this bunk."""

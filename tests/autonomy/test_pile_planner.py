@@ -101,6 +101,12 @@ def test_a_place_where_nothing_came_up_is_not_tried_again_until_something_did() 
     assert press(asked(logs)) == first, "something came up: every place is as good as before"
 
 
+def test_a_place_that_was_not_tried_has_not_failed() -> None:
+    """A crane that selects again from above, before its jaws close, marked its own choice as failed."""
+    press, logs = planner(), heap()
+    assert press(asked(logs)) == press(asked(logs, untried=True)) != press(asked(logs))
+
+
 def test_a_log_that_only_rolled_has_not_come_up() -> None:
     press, logs = planner(), heap()
     first = press(asked(logs))
