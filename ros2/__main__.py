@@ -24,7 +24,7 @@ from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.process.command_line import emit
 from autonomy.process.controller_link import ControllerLink
 from can_dbc.messages.envelope import read_key
-from can_dbc.messages.udp_address import address_argument
+from can_dbc.messages.udp_address import local_address_argument
 from host.exit_codes import ExitCode
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from ros2.bridge import Bridge, run
@@ -43,7 +43,9 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
     parser.add_argument("--report-port", type=int, required=True, help="local UDP port for state reports")
     parser.add_argument(
-        "--controller", type=address_argument, help="HOST:PORT that accepts setpoints; without it no goals are taken"
+        "--controller",
+        type=local_address_argument,
+        help="HOST:PORT that accepts setpoints; without it no goals are taken",
     )
     parser.add_argument("--lease-ms", type=int, default=200, help="validity of a setpoint")
     parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")

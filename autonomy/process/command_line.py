@@ -12,7 +12,7 @@ import msgspec
 
 from autonomy.grasp.planners import NAMES, SEARCH, PlannerChoice
 from autonomy.manager.transition_table import TABLES
-from can_dbc.messages.udp_address import address_argument
+from can_dbc.messages.udp_address import address_argument, local_address_argument
 from runtime.errors import InputRefused
 
 Address = tuple[str, int]
@@ -22,7 +22,9 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     """Parse the command line; end the process with code 2 when it is wrong."""
     parser = argparse.ArgumentParser(prog="python -m autonomy", description="Loads one log, or executes a mission.")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
-    parser.add_argument("--controller", type=address_argument, required=True, help="HOST:PORT that accepts setpoints")
+    parser.add_argument(
+        "--controller", type=local_address_argument, required=True, help="HOST:PORT that accepts setpoints"
+    )
     parser.add_argument("--report-port", type=int, required=True, help="local UDP port for state reports")
     parser.add_argument("--scene", type=address_argument, required=True, help="HOST:PORT of the log detector")
     parser.add_argument("--log", type=int, help="number of the log to pick (default: the best one)")
@@ -48,7 +50,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     )
     parser.add_argument(
         "--tell",
-        type=address_argument,
+        type=local_address_argument,
         action="append",
         default=[],
         help="HOST:PORT that receives mission reports",

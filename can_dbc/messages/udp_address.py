@@ -20,6 +20,14 @@ def udp_address(text: str) -> tuple[str, int]:
         raise InputRefused("address.unknown-host", sentence) from None
 
 
+def local_address_argument(text: str) -> tuple[str, int]:
+    """Parse as `address_argument` an address on this computer, to which a socket on its loopback can send."""
+    address = address_argument(text)
+    if not address[0].startswith("127."):
+        raise argparse.ArgumentTypeError(f"{text}: it must be on this computer, for example 127.0.0.1:{address[1]}")
+    return address
+
+
 def address_argument(text: str) -> tuple[str, int]:
     """Parse as `udp_address`, the ``type`` of a command-line option: raises ArgumentTypeError with the sentence."""
     try:

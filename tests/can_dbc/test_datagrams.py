@@ -42,7 +42,7 @@ from can_dbc.messages.mission import (
     encode_mission,
     encode_mission_command,
 )
-from can_dbc.messages.udp_address import address_argument, udp_address
+from can_dbc.messages.udp_address import address_argument, local_address_argument, udp_address
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from runtime.errors import InputRefused
 from tests.can_dbc.example_mission_report import MISSION_REPORT
@@ -290,6 +290,13 @@ def test_an_invalid_address_is_refused(text):
         udp_address(text)
     with pytest.raises(argparse.ArgumentTypeError):
         address_argument(text)
+
+
+def test_a_socket_on_the_loopback_is_told_no_other_computer():
+    """Its first datagram ended the process with "Invalid argument"."""
+    assert local_address_argument("127.0.0.1:5006") == ("127.0.0.1", 5006)
+    with pytest.raises(argparse.ArgumentTypeError, match=r"192\.0\.2\.7:5006"):
+        local_address_argument("192.0.2.7:5006")
 
 
 def test_an_address_is_resolved_once():
