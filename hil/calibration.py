@@ -81,7 +81,7 @@ class _Calibrator:
         self._station = TotalStation(seed)
         self._frames: list[Frame] = []
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         if self.calibration is None:
             if report is not None and report.mode in READY_MODES and self.refused is None:
                 self._plan(report)

@@ -131,7 +131,7 @@ class LeverOperator:
         """The number of motions begun."""
         return self._count - len(self._left)
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Read the joints and move the levers every 20 ms; send nothing."""
         if now_ns < self._next_ns or now_ns < START_DELAY_S * 1e9:
             return None

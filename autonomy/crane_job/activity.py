@@ -150,11 +150,6 @@ class ActivityState:
         return self._cycle.missed
 
     @property
-    def lifted_kg(self) -> float:
-        """The load in the grapple, kg; 0 without a load cell."""
-        return self._cycle.lifted_kg
-
-    @property
     def last_setpoint(self) -> tuple[float, ...]:
         """The last joint setpoint, rad (EXT m), with the newest rotator estimate."""
         return self.rotator.to_angles(self._count.to_counts(self._tracker.setpoint))
@@ -215,11 +210,10 @@ class Activity(ActivityState):
     """
 
     # ------------------------------------------------------------------ one tick
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Execute one tick at ``now_ns`` and return the datagram to send now, or None.
 
-        ``report`` and ``logs`` are the newest since the last call, None and () when nothing arrived.  Call at 20 Hz or
-        faster.
+        ``report`` and ``logs`` are the newest since the last call, None when nothing arrived.  Call at 20 Hz or faster.
         """
         dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _MAX_TICK_S)
         self._last_ns = now_ns

@@ -30,17 +30,17 @@ class Inbox:
         self.logs: tuple[LogObservation, ...] = ()
         self.logs_ns = -1
 
-    def accept(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> None:
-        """Store what arrived since the last call; None and () when nothing did."""
+    def accept(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> None:
+        """Store what arrived since the last call, None when nothing did; a list may be empty: no log is in view."""
         if report is not None:
             self._report, self._report_ns = report, now_ns
-        if logs:
+        if logs is not None:
             self.logs, self.logs_ns = logs, now_ns
 
     @property
     def has_camera_measurements(self) -> bool:
-        """Whether a camera measured one of the logs: its next detection may be better."""
-        return any(log.covariance is not None for log in self.logs)
+        """Whether a camera measured one of the logs, or sees none: its next detection may be better."""
+        return not self.logs or any(log.covariance is not None for log in self.logs)
 
     @property
     def report(self) -> StateReport:

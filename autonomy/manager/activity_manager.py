@@ -236,12 +236,13 @@ class ActivityManager:
         now_ns: int,
         report: StateReport | None = None,
         vehicle: VehicleReport | None = None,
-        logs: Sequence[LogObservation] = (),
+        logs: Sequence[LogObservation] | None = None,
         seen_ns: int | None = None,
     ) -> list[bytes]:
         """Return the datagrams to send now.
 
-        Reports and log list are the newest since the last step; the list was observed at ``seen_ns`` (None: now).
+        Reports and log list are the newest since the last step, None when nothing arrived; the list was observed at
+        ``seen_ns`` (None: now).
         """
         world = self.world
         world.update(now_ns, report, vehicle)
@@ -250,16 +251,16 @@ class ActivityManager:
             self.route.update_distance(world.location)
         seen_ns = now_ns if seen_ns is None else seen_ns
         if self.log_memory is not None:
-            if self.shows_load:
+            if logs is not None and self.shows_load:
                 self._crane.view_load(logs)
-            else:
+            elif logs is not None:
                 world.update_map(logs, seen_ns)
                 if logs and world.located:
                     self.log_memory.lose(self.load.check_fallen(now_ns))
             logs = world.recall(self.log_memory, self.activity, now_ns)
-        elif RULES[self.state].crane:  # a log in the grapple does not lie on the ground
+        elif logs is not None and RULES[self.state].crane:  # a log in the grapple does not lie on the ground
             world.count_bunk(logs, seen_ns)
-        else:
+        elif logs is not None:
             world.observe(logs, seen_ns)
             self.load.check_bunk(now_ns, self.route.driven_m)
         obstacle = world.blocked_reason(now_ns) or self._off()
@@ -402,7 +403,11 @@ class ActivityManager:
 
     # ------------------------------------------------------------------ sending
     def _send(
-        self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: Sequence[LogObservation]
+        self,
+        now_ns: int,
+        report: StateReport | None,
+        vehicle: VehicleReport | None,
+        logs: Sequence[LogObservation] | None,
     ) -> list[bytes]:
         out = []
         if (data := self._crane.step(now_ns, report, logs, halted=bool(self._off()))) is not None:

@@ -138,7 +138,7 @@ class CraneExecutor:
 
     # ------------------------------------------------------------------ running a job
     def step(
-        self, now_ns: int, report: StateReport | None, logs: Sequence[LogObservation], halted: bool
+        self, now_ns: int, report: StateReport | None, logs: Sequence[LogObservation] | None, halted: bool
     ) -> bytes | None:
         """Take one step of the job; return the datagram to send, or None.  ``halted``: the operator has paused the
         crane.
@@ -146,8 +146,9 @@ class CraneExecutor:
         if self.job is None:
             return None
         self.job.halted = halted
-        offered = tuple(log for log in logs if not self._world.is_given_up(log.id))
-        return self.job.step(now_ns, report, offered)
+        if logs is not None:
+            logs = tuple(log for log in logs if not self._world.is_given_up(log.id))
+        return self.job.step(now_ns, report, logs)
 
     @property
     def shows_load(self) -> bool:

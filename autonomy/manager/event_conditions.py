@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from autonomy.manager.crane_executor import CraneExecutor
-from autonomy.manager.load_bookkeeping import LoadBookkeeping
+from autonomy.manager.load_bookkeeping import LOOKS, LoadBookkeeping
 from autonomy.manager.route_driver import RouteDriver
 from autonomy.manager.target_log import TargetLog
 from autonomy.manager.transition_table import Event, Rule
@@ -99,6 +99,8 @@ class EventConditions:
             return False
         if self._world.in_bunk:
             self._crane.unload_bunk()
+            return False
+        if self._world.empty_looks < LOOKS:
             return False
         self._load.book_empty(now_ns, self._route.driven_m)
         return True

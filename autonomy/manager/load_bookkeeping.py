@@ -179,11 +179,12 @@ class LoadBookkeeping:
         """Book a grasp that was placed in the bunk."""
         assert job.grasp is not None
         grip = self._world.grip
-        logs = job.grasp.logs + (() if grip is None else grip.also)
+        logs = job.grasp.logs
         if grip is not None:
+            logs = (*(log for log in logs if log.id not in grip.left), *grip.also)
             self._remark_grip(job.grasp.logs, grip, now_ns)
         loaded_logs = [self._loaded_log(log, now_ns) for log in logs]
-        self.tally.book_loaded(loaded_logs, job.lifted_kg)
+        self.tally.book_loaded(loaded_logs)
         self._booked_ns = now_ns
         self.sorting.book_loaded(log.assortment for log in loaded_logs)
 
@@ -281,7 +282,9 @@ class LoadBookkeeping:
         at = world.base.to_base(np.asarray(log.center_m)) if mapped is None else mapped.center_m
         lat, lon, _ = world.plane.geodetic(float(at[0]), float(at[1]))
         wood = volume_m3(log.length_m, log.diameter_m)
-        return LoadedLog(Point(lat, lon), now_ns, wood, "" if mapped is None else mapped.assortment)
+        if mapped is None:
+            return LoadedLog(Point(lat, lon), now_ns, wood)
+        return LoadedLog(Point(lat, lon), now_ns, wood, mapped.assortment, mapped.species, mapped.product_key)
 
     def book_miss(self, job: Activity, target: int | None, for_good: bool) -> None:
         """Book a failed grasp; the log is given up after too many failures (``for_good``: at once)."""

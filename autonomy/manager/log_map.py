@@ -45,6 +45,8 @@ MIN_SIGMA_M: Final = 0.01
 """Lower bound of every sigma: errors of poses and mounts do not average out."""
 LISTED_SIGMA_M: Final = 0.3
 """Assumed for a log that a mission lists without a sigma."""
+PLACED_SIGMA_M: Final = 1.0
+"""A listed log known less well is not where the list says: a harvester's machine stood within metres of it."""
 DEFAULT_SIZE_M: Final = (3.0, 0.2)
 """Assumed length and diameter of a listed log without a size."""
 TYPICAL_COUNT: Final = 3
@@ -75,6 +77,14 @@ class MappedLog:
     assortment: str = ""
     turn_rad: float = 0.0
     """1-sigma of the axis direction on the ground."""
+    species: str = ""
+    product_key: int | None = None
+    """What the mission says of a listed log, for the report of what was forwarded."""
+
+    @property
+    def has_place(self) -> bool:
+        """Whether it was seen, or listed well enough to be gripped, or driven around, where the list says."""
+        return bool(self.seen_ns) or self.sigma_m < PLACED_SIGMA_M
 
     def observation(self, base: Pose) -> LogObservation:
         """Return the log in the crane's base frame."""
@@ -92,11 +102,22 @@ class LogMap:
         self._whole_lengths_m: dict[int, float] = {}
         """Length of each log, collected ones too, when both its ends were last seen."""
         self._next = 1
+        self._confirmed: tuple[MappedLog, ...] = ()
+        self._centers: np.ndarray | None = None
+        """Centres (n, 2) of the confirmed logs; None after a change.  A site lists thousands, and each step asks."""
 
     @property
     def logs(self) -> tuple[MappedLog, ...]:
         """Confirmed logs in the order of their numbers."""
         return tuple(log for log in self._logs.values() if log.hits >= CONFIRMED_HITS)
+
+    def near(self, point_m: np.ndarray, distance_m: float) -> list[MappedLog]:
+        """List the confirmed logs whose centres are no farther than ``distance_m`` from a point (2,) of the plane."""
+        if self._centers is None:
+            self._confirmed = self.logs
+            self._centers = np.array([log.center_m[:2] for log in self._confirmed]).reshape(-1, 2)
+        off = self._centers - point_m
+        return [self._confirmed[i] for i in np.flatnonzero(np.einsum("ij,ij->i", off, off) < distance_m**2)]
 
     @property
     def missed_logs(self) -> tuple[MappedLog, ...]:
@@ -110,12 +131,12 @@ class LogMap:
 
     def add_known(self, log: MappedLog) -> None:
         """Add a log known before it is observed, for example from a harvester; it gets the next number."""
-        self._logs[self._next] = replace(log, number=self._next, hits=max(log.hits, CONFIRMED_HITS))
+        self._store(replace(log, number=self._next, hits=max(log.hits, CONFIRMED_HITS)))
         self._next += 1
 
     def restore(self, log: MappedLog) -> None:
         """Restore a log with its number."""
-        self._logs[log.number] = log
+        self._store(log)
 
     def reserve_numbers(self, free: int) -> None:
         """Start new numbers at ``free`` or above."""
@@ -142,7 +163,7 @@ class LogMap:
             before = known[pairs[j]] if j in pairs else None
             whole = _completed(sighting, o, before, typical_m)
             number = self._next if before is None else before.number
-            self._logs[number] = replace(whole, number=number) if before is None else _averaged(before, whole)
+            self._store(replace(whole, number=number) if before is None else _averaged(before, whole))
             if not any(_unknown_ends(o)):
                 self._whole_lengths_m[number] = self._logs[number].length_m
             numbers[o.id] = number
@@ -151,16 +172,22 @@ class LogMap:
 
     def restart_average(self, number: int) -> None:
         """Restart the average of a log with its next observation (paper B: at standstill)."""
-        self._logs[number] = replace(self._logs[number], hits=0)
+        self._store(replace(self._logs[number], hits=0))
 
     def record_miss(self, number: int) -> int:
         """Record a failed grasp; return how many there were."""
-        log = self._logs[number] = replace(self._logs[number], misses=self._logs[number].misses + 1, hits=0)
+        log = replace(self._logs[number], misses=self._logs[number].misses + 1, hits=0)
+        self._store(log)
         return log.misses
 
     def remove(self, number: int) -> None:
         """Remove a log that is collected."""
         self._logs.pop(number, None)
+        self._centers = None
+
+    def _store(self, log: MappedLog) -> None:
+        self._logs[log.number] = log
+        self._centers = None
 
 
 def nearest(logs: Sequence[MappedLog], point_m: np.ndarray) -> MappedLog | None:
@@ -184,6 +211,8 @@ def listed_log(log: KnownLog, plane: LocalPlane, ground_m: float) -> MappedLog:
         0,
         assortment=log.assortment,
         turn_rad=math.pi if log.bearing_deg is None else 0.0,
+        species=log.species,
+        product_key=log.product_key,
     )
 
 
@@ -257,7 +286,14 @@ def _completed(sighting: MappedLog, o: LogObservation, known: MappedLog | None, 
 def _averaged(log: MappedLog, sighting: MappedLog) -> MappedLog:
     """Compute the running average, weighted by variance; it is restarted when the log has no hits."""
     if not log.hits:
-        return replace(sighting, number=log.number, misses=log.misses, assortment=log.assortment)
+        return replace(
+            sighting,
+            number=log.number,
+            misses=log.misses,
+            assortment=log.assortment,
+            species=log.species,
+            product_key=log.product_key,
+        )
     before, now = 1.0 / log.sigma_m**2, 1.0 / sighting.sigma_m**2
     share = now / (before + now)
     sign = 1.0 if float(log.axis @ sighting.axis) >= 0.0 else -1.0

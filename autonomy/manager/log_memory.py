@@ -105,8 +105,7 @@ class LogMemory:
             self._arm = Arm(self._profile, slope=slope_of(base.rotation))  # as the job takes it
 
         def lying() -> list[LogObservation]:
-            base_xy_m = base.position_m[:2]
-            return [log.observation(base) for log in log_map.logs if math.dist(log.center_m[:2], base_xy_m) < RANGE_M]
+            return [log.observation(base) for log in log_map.near(base.position_m[:2], RANGE_M) if log.has_place]
 
         if job is not None and report is not None:
             self._follow(job, report, lying)
@@ -142,7 +141,8 @@ class LogMemory:
             self._beside_held = {log.id: _relative(log, pin, yaw) for log in self._beside}
             self._meant = tuple(sorted(meant))
             self._load_detector = LoadDetector(grasp.logs, self._beside, self._wood)
-        elif Phase.LIFT <= job.phase < Phase.OPEN and self._load_detector is not None:
+        elif Phase.LIFT <= job.phase < Phase.LOWER and self._load_detector is not None:
+            # Only while it hangs: lowered onto others, or laid back where it lay, it weighs less and less.
             self._load_detector.update(report.stamp_ns, report.load_kg)
             if self._pin(report)[0][2] > self._low_m + LIFTED_M:
                 self._judge(self._load_detector)

@@ -28,6 +28,8 @@ class LoadedLog(msgspec.Struct, frozen=True):
     at_ns: int
     volume_m3: float
     assortment: str = ""
+    species: str = ""
+    product_key: int | None = None
 
 
 class Load(msgspec.Struct, frozen=True):
@@ -60,7 +62,6 @@ class Tally:
     missed: int = 0
     on_board: int = 0
     board_m3: float = 0.0
-    board_kg: float = 0.0
     bunk_full: bool = False
     """The bunk had no room for a grasp."""
     given_up: dict[int, str] = field(default_factory=dict)
@@ -69,14 +70,13 @@ class Tally:
     counted_m: float = 0.0
     remarks: list[Remark] = field(default_factory=list)
 
-    def book_loaded(self, logs: Sequence[LoadedLog], load_kg: float) -> None:
+    def book_loaded(self, logs: Sequence[LoadedLog]) -> None:
         """Book a grasp that was placed in the bunk."""
         self.grasps += 1
         self.loaded += len(logs)
         self.on_board += len(logs)
         self.board += logs
         self.board_m3 += sum(log.volume_m3 for log in logs)
-        self.board_kg += load_kg if math.isfinite(load_kg) else 0.0
 
     def remark(self, now_ns: int, text: str) -> None:
         """Add a remark."""
@@ -114,4 +114,4 @@ class Tally:
         if self.board:  # else only logs from before the mission were unloaded
             self.loads.append(Load(tuple(self.board), now_ns, driven_m - self.counted_m, landing))
         self.board, self.counted_m = [], driven_m
-        self.on_board, self.board_m3, self.board_kg, self.bunk_full = 0, 0.0, 0.0, False
+        self.on_board, self.board_m3, self.bunk_full = 0, 0.0, False

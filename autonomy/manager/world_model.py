@@ -46,6 +46,8 @@ CIRCLE_M: Final = 5.3
 HORIZON_M: Final = 16.0
 """Logs farther away along the route are not considered yet."""
 AHEAD_M: Final = 0.5
+BEFORE_WHEEL_M: Final = 12.0
+"""The middle of no log that a front wheel may hit lies farther away: the longest are 6 m, and ends count."""
 BRAKING_M: Final = 0.5
 """Stopping distance from the usual speed."""
 JAWS_M: Final = 0.3
@@ -86,7 +88,7 @@ class WorldModel:
         self.vehicle: VehicleReport | None = None
         self.list_ns = 0
         """When the newest log list was observed."""
-        self.in_bunk, self.counted_ns = 0, 0
+        self.in_bunk = self.counted_ns = self.empty_looks = 0
         self.grip: Grip | None = None
         """With a camera that only looks ahead: what the scale says of the grip that was released last."""
         self.outside_fence_m = 0.0
@@ -200,7 +202,17 @@ class WorldModel:
         x, y, _ = log.center_m.tolist()
         position = Point(*self.plane.geodetic(x, y)[:2])
         bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
-        known_log = KnownLog(position, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
+        known_log = KnownLog(
+            position,
+            "",
+            bearing,
+            log.length_m,
+            log.diameter_m,
+            log.species,
+            log.assortment,
+            log.product_key,
+            log.sigma_m,
+        )
         return MissedLog(log.number, known_log, log.misses)
 
     def log_before_wheel(self, braking_m: float = BRAKING_M) -> MappedLog | None:
@@ -209,7 +221,9 @@ class WorldModel:
         location, c = self.location, self._carrier
         cos, sin = math.cos(location.yaw_rad), math.sin(location.yaw_rad)
         turn = np.array([[cos, -sin], [sin, cos]])
-        for log in self.log_map.logs:
+        for log in self.log_map.near(np.array([location.x_m, location.y_m]), BEFORE_WHEEL_M):
+            if not log.has_place:
+                continue
             spine = log.center_m + np.linspace(-0.5, 0.5, SPINE_POINTS)[:, None] * log.length_m * log.axis
             ahead, lateral = ((spine[:, :2] - (location.x_m, location.y_m)) @ turn).T
             near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + braking_m)
@@ -230,8 +244,9 @@ class WorldModel:
 
     def observe(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
         """Accept a log list in the base frame of a time; ignored before the machine is located."""
-        if logs and self._bases:
-            self.count_bunk(logs, seen_ns)
+        if self._bases:
+            if logs:  # a picture of nothing is no look into a loaded bunk
+                self.count_bunk(logs, seen_ns)
             self._numbers = self.update_map(logs, seen_ns)
             self.list_ns = seen_ns
 
@@ -241,23 +256,26 @@ class WorldModel:
             return {}
         return self.log_map.observe(logs, self.base_at(seen_ns), seen_ns)
 
-    def recall(self, log_memory: LogMemory, job: Activity | None, now_ns: int) -> tuple[LogObservation, ...]:
-        """Replace the detector's list by one from memory; empty while there is no new one."""
+    def recall(self, log_memory: LogMemory, job: Activity | None, now_ns: int) -> tuple[LogObservation, ...] | None:
+        """Replace the detector's list by one from memory; None while there is no new one."""
         if not self._bases:
-            return ()
+            return None
         logs = log_memory.log_list(now_ns, self.log_map, self.base, self.report, job)
         self.grip = log_memory.grip
         if logs is None:
-            return ()
+            return None
         self._numbers = {log.id: log.id for log in logs}
-        self.list_ns = self.counted_ns = now_ns
-        self.in_bunk = log_memory.in_bunk
+        self.list_ns = now_ns
+        self._counted(log_memory.in_bunk, now_ns)
         return logs
 
     def count_bunk(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
-        """Count the logs of a list that lie in the bunk."""
-        if logs:
-            self.in_bunk, self.counted_ns = sum(lies_in_bunk(self._bunk, log) for log in logs), seen_ns
+        """Count the logs of a list that lie in the bunk; `empty_looks` lists in a row have shown none."""
+        self._counted(sum(lies_in_bunk(self._bunk, log) for log in logs), seen_ns)
+
+    def _counted(self, in_bunk: int, seen_ns: int) -> None:
+        self.in_bunk, self.counted_ns = in_bunk, seen_ns
+        self.empty_looks = 0 if in_bunk else self.empty_looks + 1
 
     def landing_stop_m(self, point: Point2, base_at: BaseAt, end_m: float) -> float | None:
         """Find the distance along a path from which the crane reaches a landing best; None if there is none."""
@@ -359,23 +377,22 @@ class WorldModel:
     def graspable(self, only: int | None = None) -> list[MappedLog]:
         """List the logs of the newest list that the crane can grasp from here, best first; or only the log ``only``."""
         seen = set(self._numbers.values()) if only is None else {only}
-        logs = [g for g in self._wanted() if g.number in seen]
+        logs = [g for g in self._relevant() if g.number in seen and g.has_place]
         work = sorted((self._reach.work_s(g.observation(self.base)), g.number, g) for g in logs)
         return [g for seconds, _, g in work if math.isfinite(seconds)]
 
     def collectable(self) -> list[MappedLog]:
         """List the logs that can be collected: not given up and not on a landing."""
-        return [g for g in self.log_map.logs if g.misses < MAX_ATTEMPTS and not self.is_on_landing(g)]
+        return [g for g in self.log_map.logs if self._is_collectable(g)]
+
+    def _is_collectable(self, log: MappedLog) -> bool:
+        return log.misses < MAX_ATTEMPTS and not self.is_on_landing(log)
 
     def is_on_landing(self, log: MappedLog) -> bool:
         """Tell whether a log lies on a landing."""
         return any(math.dist(log.center_m[:2], at) <= PILE_LENGTH_M for at in self.landings)
 
-    def _wanted(self) -> list[MappedLog]:
-        """List the collectable logs that belong to the current load."""
-        return [g for g in self.collectable() if self.sorting.wants(g.assortment)]
-
     def _relevant(self) -> list[MappedLog]:
-        """List the wanted logs close enough to affect the next stop."""
-        base_position = self.base.position_m[:2]
-        return [g for g in self._wanted() if math.dist(g.center_m[:2], base_position) < HORIZON_M]
+        """List the collectable logs of the current load that are close enough to affect the next stop."""
+        near = self.log_map.near(self.base.position_m[:2], HORIZON_M)
+        return [g for g in near if self._is_collectable(g) and self.sorting.wants(g.assortment)]

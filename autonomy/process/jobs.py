@@ -63,9 +63,13 @@ class Job(Protocol):
         """Whether the job must not be replaced by another."""
 
     def step(
-        self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
+        self,
+        now_ns: int,
+        report: StateReport | None,
+        vehicle: VehicleReport | None,
+        logs: tuple[LogObservation, ...] | None,
     ) -> list[bytes]:
-        """Take one step; call it at 20 Hz or faster."""
+        """Take one step; call it at 20 Hz or faster.  What has not arrived since the last one is None."""
 
     @property
     def drives(self) -> bool:
@@ -121,7 +125,11 @@ class SingleLogJob:
         return self._activity.failure
 
     def step(
-        self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
+        self,
+        now_ns: int,
+        report: StateReport | None,
+        vehicle: VehicleReport | None,
+        logs: tuple[LogObservation, ...] | None,
     ) -> list[bytes]:
         """Take one step of the activity, which the operator's mode switch may hold; the carrier stands."""
         self._switch.take(report)
@@ -211,11 +219,15 @@ class ForwardingJob:
         return self._manager.failure or None
 
     def step(
-        self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
+        self,
+        now_ns: int,
+        report: StateReport | None,
+        vehicle: VehicleReport | None,
+        logs: tuple[LogObservation, ...] | None,
     ) -> list[bytes]:
         """Take one step of the manager; with memory the logs are in the plane."""
         self._now_ns = now_ns
-        if self.drives and logs:
+        if self.drives and logs is not None:
             logs = self._in_base(now_ns, logs)
         sent = self._manager.step(now_ns, report, vehicle, logs)
         self.begun |= self._manager.is_auto
@@ -232,12 +244,12 @@ class ForwardingJob:
         """Tell where the next picture is taken."""
         return self._manager.standpoint(now_ns)
 
-    def _in_base(self, now_ns: int, logs: tuple[LogObservation, ...]) -> tuple[LogObservation, ...]:
+    def _in_base(self, now_ns: int, logs: tuple[LogObservation, ...]) -> tuple[LogObservation, ...] | None:
         """Return a list that was asked for while the machine drove; one that comes when the crane works already is
         dropped, because a log in the grapple does not lie on the ground.
         """
         if self.standpoint(now_ns) is None:
-            return ()
+            return None
         base = self._manager.world.base_at(now_ns)
         return tuple(in_base(log, base) for log in logs)
 

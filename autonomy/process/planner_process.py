@@ -173,7 +173,7 @@ class PlannerProcess:
                 raise CommandRefused("upload.begun", "a mission has begun; abort it and start the planner anew")
             self._machine.check(now_ns)
             self._job = self._uploads.job(upload)
-            self._job.step(now_ns, self._machine.report, None, ())  # it knows the mode switch before the next command
+            self._job.step(now_ns, self._machine.report, None, None)  # it knows the mode switch before the next command
         except (CommandRefused, MissionError) as error:
             code, refused = error.code, short_text(str(error).partition("\n")[0])
         self._answer = {"order": upload.sequence, "refusal": refused, "refusal_code": code}
@@ -214,8 +214,8 @@ class PlannerProcess:
                 newest, self._joints = message, message.position
         return newest, vehicle
 
-    def _newest_logs(self) -> tuple[LogObservation, ...]:
-        logs: tuple[LogObservation, ...] = ()
+    def _newest_logs(self) -> tuple[LogObservation, ...] | None:
+        logs: tuple[LogObservation, ...] | None = None
         for data in _received(self._detector):
             try:
                 logs = decode_logs(data, in_plane=self._job.drives)

@@ -115,7 +115,11 @@ class WaitingJob:
         return self.failure is not None
 
     def step(
-        self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: tuple[LogObservation, ...]
+        self,
+        now_ns: int,
+        report: StateReport | None,
+        vehicle: VehicleReport | None,
+        logs: tuple[LogObservation, ...] | None,
     ) -> list[bytes]:
         """Do nothing."""
         return []

@@ -16,7 +16,6 @@ from autonomy.calibration.turn_fit import TurnFit
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, joint_motion
-from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
@@ -66,7 +65,7 @@ class _Turner:
     def done(self) -> bool:
         return len(self.turned_rad) == len(TURNS_RAD)
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: object) -> bytes | None:
         if report is not None and report.mode in (Mode.ARMED, Mode.ACTIVE) and not self.done:
             self._proceed(report, now_ns)
         if self._begun_ns is None or self.done or not self._stream.due(now_ns):

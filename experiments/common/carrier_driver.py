@@ -37,7 +37,7 @@ class CarrierDriver:
         """Receive a report of the vehicle."""
         self._fresh = report
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Return the setpoint to send now."""
         vehicle, self._fresh = self._fresh, None
         if report is not None:

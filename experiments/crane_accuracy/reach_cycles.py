@@ -106,7 +106,7 @@ class ReachCycles:
         """Whether all motions were made."""
         return self.phase is Phase.DONE
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Run one planner cycle: the datagram to send now, or None."""
         if report is not None:
             self._report = report

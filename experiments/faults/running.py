@@ -146,7 +146,7 @@ class CranePlanner:
         self._begin_ns = 0
         self._report: StateReport | None = None
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Return the setpoint to send now."""
         self._report = report or self._report
         if self._report is None or self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
@@ -177,7 +177,7 @@ class DrivePlanner:
         """Receive a report of the vehicle."""
         self._vehicle = report
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Return the setpoint to send now."""
         if report is not None:
             self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)

@@ -81,21 +81,21 @@ class Attempt:
     _rested_ns: int = 0
     """Time since which the crane rests above the logs [ns]."""
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Run one planner cycle (contract of ``hil.harness.lockstep.Planner``); detect logs where the crane rests."""
         activity = self.activity
         self._q = self._q if report is None else report.position
-        data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
+        data = activity.step(now_ns, report, self._looked(now_ns) if logs is not None and self._q else None)
         if self._up_ns == 0 and activity.phase is Phase.LIFT and activity.arrived:
             self._up_ns = now_ns
         return data
 
-    def _looked(self, now_ns: int) -> tuple[LogObservation, ...]:
+    def _looked(self, now_ns: int) -> tuple[LogObservation, ...] | None:
         """Return the logs of a new detection where the crane rests, as a camera on a moving stick is not used."""
         rests = self.activity.phase in (Phase.LOOK, Phase.ABOVE) and self.activity.arrived
         self._rested_ns = (self._rested_ns or now_ns) if rests else 0
         if not rests or now_ns < self._rested_ns + SETTLE_AFTER_ARRIVAL_NS:
-            return ()
+            return None
         self._rested_ns = now_ns
         self._look(now_ns)
         return self.seen.logs

@@ -100,7 +100,7 @@ class _Repetition:
     def receive(self, report: VehicleReport) -> None:
         """Ignore the vehicle's report: the machine stands."""
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> bytes | None:
         """Return the setpoint to send now."""
         if report is None or report.mode not in (Mode.ARMED, Mode.ACTIVE):
             return None

@@ -134,7 +134,7 @@ class _Job:
             detector,
         )
 
-    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> list[bytes]:
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None) -> list[bytes]:
         """Pass the inputs of the tick to the job, which obeys the mode switch; its datagrams to the controller."""
         return self._job.step(now_ns, report, None, logs)
 

@@ -42,9 +42,9 @@ class Planner(Protocol):
     """The source of setpoints; `autonomy.crane_job.activity.Activity` is one."""
 
     def step(
-        self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]
+        self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None
     ) -> bytes | list[bytes] | None:
-        """Return the datagrams to send now; None for none."""
+        """Return the datagrams to send now; None for none.  Report and logs are None when nothing arrived."""
 
 
 class LogDetector(Protocol):
@@ -238,14 +238,14 @@ class Lockstep:
         if requests:
             self._datagrams.extend([requests] if isinstance(requests, bytes) else requests)
 
-    def _detect(self) -> tuple[LogObservation, ...]:
-        """Return the logs, four times per second: detected by a camera, or their true poses."""
+    def _detect(self) -> tuple[LogObservation, ...] | None:
+        """Return the logs, four times per second: detected by a camera, or their true poses; None at other times."""
         if self.ticks % (self._settings.rate_hz // 4):
-            return ()
-        if self._detector is not None:
-            detected_logs = self._detector.detect(self.report.position, self.now_ns) or () if self.report else ()
+            return None
+        if self._detector is None:
+            detected_logs: tuple[LogObservation, ...] | None = true_logs(self.plant)
         else:
-            detected_logs = true_logs(self.plant)
+            detected_logs = self._detector.detect(self.report.position, self.now_ns) if self.report else None
         self.logs = detected_logs or self.logs
         return detected_logs
 

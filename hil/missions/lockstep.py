@@ -149,7 +149,7 @@ class MissionRun:
         )
 
     def step(
-        self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]
+        self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...] | None
     ) -> bytes | list[bytes] | None:
         """Pass the inputs of the tick to the manager; its datagrams to the controller."""
         vehicle, self._vehicle = self._vehicle, None

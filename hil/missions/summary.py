@@ -87,7 +87,10 @@ def report_loads(
 
     forwarded = [
         ForwardedLoad(
-            tuple(ForwardedLog(x.position, when(x.at_ns), x.volume_m3, assortment=x.assortment) for x in load.logs),
+            tuple(
+                ForwardedLog(x.position, when(x.at_ns), x.volume_m3, x.species, x.assortment, x.product_key)
+                for x in load.logs
+            ),
             mission.landings[load.landing],
             when(load.at_ns),
             load.driven_m,

@@ -100,10 +100,10 @@ class Forwarder:
             heights_m=tuple(self.heights_m),
         )
 
-    def seen(self) -> tuple[LogObservation, ...]:
+    def seen(self) -> tuple[LogObservation, ...] | None:
         """What lies near, in the base frame, four times a second."""
         if self.crane.now_ns % (5 * TICK_NS):
-            return ()
+            return None
         near = [o for o in self.crane.logs if math.hypot(*o.center_m[:2]) < RANGE_M and o.id not in self.blind]
         return tuple(near)
 

@@ -71,6 +71,19 @@ def test_the_machine_stops_at_a_listed_log_before_it_is_detected() -> None:
     assert State.CHECK not in states(manager), "searched for, it does not exist before it is seen"
 
 
+@pytest.mark.parametrize("sigma_m", [0.3, 5.0])
+def test_a_log_listed_within_metres_is_looked_for_but_neither_gripped_nor_in_the_way(sigma_m: float) -> None:
+    """A harvester tells where its machine stood, not where the log fell."""
+    before_wheel = KnownLog(place(4.5, 1.1), bearing_deg=90.0, length_m=2.4, sigma_m=sigma_m)
+    beside = KnownLog(place(0.0, 4.2), bearing_deg=90.0, length_m=2.4, sigma_m=sigma_m)
+    forwarder, manager = begin((), known=(before_wheel, beside), logs="listed")
+    forwarder.run(manager, at(State.SEARCH))
+    world, exact = manager.world, sigma_m < 1.0
+    assert (world.log_before_wheel(4.5) is not None) == exact
+    assert bool(world.graspable(only=2)) == exact
+    assert world.next_stop(manager.route.base_at, -5.0, 20.0) is not None, "it is driven to and looked for"
+
+
 @pytest.mark.parametrize("keep_out", [False, True])
 def test_a_machine_outside_its_fence_stops(keep_out: bool) -> None:
     reach = (16.0, 40.0) if keep_out else (-10.0, 16.0)

@@ -129,12 +129,12 @@ def test_a_late_list_is_evaluated_once(slips: int) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=slips), activity()
     told, arrived_ns = crane.seen, None
 
-    def late() -> tuple[LogObservation, ...]:
-        """Nothing from the lift on until half a second after its end."""
+    def late() -> tuple[LogObservation, ...] | None:
+        """No list from the lift on until half a second after its end."""
         nonlocal arrived_ns
         if planner.phase in (Phase.LIFT, Phase.CARRY) and not (arrived_ns and crane.now_ns > arrived_ns + 500_000_000):
             arrived_ns = (arrived_ns or crane.now_ns) if planner.arrived else None
-            return ()
+            return None
         return told()
 
     crane.seen = late
@@ -160,10 +160,12 @@ def test_a_log_that_falls_beside_the_bunk_is_reported() -> None:
     assert planner.failure_code == "activity.log-misplaced" and "(3.00, 3.00, -1.29)" in (planner.failure or "")
 
 
-def test_no_log_list_ends_the_job_after_a_look_from_both_sides() -> None:
+@pytest.mark.parametrize(("listed", "code"), [(None, "activity.look-timeout"), ((), "grasp.no-log-outside-bunk")])
+def test_no_log_ends_the_job_after_a_look_from_both_sides(listed: tuple[()] | None, code: str) -> None:
     crane, planner = StandIn(PROFILE, []), activity()
+    crane.seen = lambda: listed
     crane.run(planner)
-    assert planner.failure_code == "activity.look-timeout"
+    assert planner.failure_code == code
     slews = [moment.q[Joint.SLEW] for moment in crane.trace]
     assert min(slews) == pytest.approx(HOME[Joint.SLEW] - LOOK_ASIDE_RAD, abs=0.01)
     assert max(slews) == pytest.approx(HOME[Joint.SLEW] + LOOK_ASIDE_RAD, abs=0.01)
@@ -182,7 +184,7 @@ def test_a_crane_at_its_end_stop_looks_from_the_other_side() -> None:
     crane, planner = StandIn(PROFILE, [], q=(slew.upper - 0.05, *HOME[1:])), activity()
     crane.run(planner)
     slews = [moment.q[Joint.SLEW] for moment in crane.trace]
-    assert planner.failure_code == "activity.look-timeout"
+    assert planner.failure_code == "grasp.no-log-outside-bunk"
     assert min(slews) == pytest.approx(slew.upper - 0.05 - LOOK_ASIDE_RAD, abs=0.01) and max(slews) <= slew.upper
 
 
@@ -377,11 +379,11 @@ class Remembering(StandIn):
         self.last = {log.id: log for log in self.logs}
         self.was = self.q
 
-    def seen(self) -> tuple[LogObservation, ...]:
+    def seen(self) -> tuple[LogObservation, ...] | None:
         """The logs, remembered where they cannot be seen."""
         rests, self.was = self.q == self.was, self.q
         if not rests:
-            return ()
+            return None
         told = []
         for log in self.logs:
             near = dist(self.pin()[:2], log.center_m[:2]) < 1.0 and log.id != self.held

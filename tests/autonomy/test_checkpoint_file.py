@@ -127,7 +127,7 @@ TAKEN = st.builds(LoadedLog, PLACE, st.integers(0, 2**62), METRES, TEXT)
 LOAD = st.builds(Load, st.lists(TAKEN, max_size=3).map(tuple), st.integers(0, 2**62), METRES, st.just(0))
 GIVEN_UP = st.dictionaries(NUMBER, TEXT, max_size=3)
 ABOARD = st.lists(LOAD, max_size=3), st.lists(TAKEN, max_size=3), METRES
-TALLY = st.builds(Tally, *[NUMBER] * 5, METRES, METRES, st.booleans(), GIVEN_UP, *ABOARD)
+TALLY = st.builds(Tally, *[NUMBER] * 5, METRES, st.booleans(), GIVEN_UP, *ABOARD)
 LOG = st.builds(KnownLog, PLACE, st.just(""), st.floats(0.0, 360.0), METRES, METRES, TEXT, TEXT)
 KNOWN = st.builds(
     LogKnowledge,

@@ -204,9 +204,10 @@ def ahead(forwarder: Forwarder, job: ForwardingJob) -> None:
     """Make the forwarder's detector one that looks ahead: its lists are in the plane, and it is asked first."""
     near = forwarder.seen
 
-    def seen() -> tuple[LogObservation, ...]:
-        if job.standpoint(forwarder.crane.now_ns) is None:
-            return ()
+    def seen() -> tuple[LogObservation, ...] | None:
+        listed = near()
+        if listed is None or job.standpoint(forwarder.crane.now_ns) is None:
+            return None
         base = forwarder.base()
         return tuple(
             replace(
@@ -214,7 +215,7 @@ def ahead(forwarder: Forwarder, job: ForwardingJob) -> None:
                 center_m=tuple(base.to_base(np.asarray(log.center_m)).tolist()),
                 axis=tuple((base.rotation @ np.asarray(log.axis)).tolist()),
             )
-            for log in near()
+            for log in listed
         )
 
     forwarder.seen = seen

@@ -210,6 +210,21 @@ def test_a_log_that_did_not_come_up_still_lies_there() -> None:
     assert grip.read_kg == pytest.approx(95.0)
 
 
+def test_a_load_that_rests_on_others_is_no_longer_weighed() -> None:
+    """On its way down it came to weigh half, and one of two logs on board was told to lie in the forest."""
+    hands = Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant=2)
+    hands.load_kg = 190.0
+    hands.rise()
+    for _ in range(20):
+        hands.step(Phase.CARRY)
+    hands.load_kg = 60.0
+    for _ in range(20):
+        hands.step(Phase.LOWER)
+    hands.step(Phase.OPEN)
+    assert hands.memory.grip is not None and not hands.memory.grip.left
+    assert hands.memory.grip.read_kg == pytest.approx(190.0)
+
+
 def test_a_log_beside_the_grasp_that_came_up_is_on_board() -> None:
     hands = Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant=1)
     numbers = [log.number for log in hands.field.logs]
@@ -247,7 +262,7 @@ class Books:
         first, *others = (log.observation(HERE) for log in logs)
         grasp = replace(plan_single_log_grasp(ARM, first, 0.0), others=tuple(others))
         self.now_ns += PERIOD_NS
-        self.load.book_loaded(SimpleNamespace(grasp=grasp, lifted_kg=90.0), self.now_ns)
+        self.load.book_loaded(SimpleNamespace(grasp=grasp), self.now_ns)
 
     def look(self, in_bunk: int, times: int = LOOKS, driven_m: float = 5.0) -> None:
         for _ in range(times):
@@ -319,6 +334,10 @@ def test_what_the_scale_says_of_a_grip_is_booked_and_said() -> None:
     books.world.grip = Grip((), (), 12.0)
     books.book(0.11)
     assert books.load.tally.loaded == 4 and numbers_in(books.said()[2])[0] == 7
+    field = books.field = books.world.log_map = field_of((-4.0, 3.0), (-4.0, 30.0))
+    books.world.map_number, books.world.grip = {7: 1, 8: 2}.get, Grip((), (8,), 95.0)
+    books.book(0.25, 0.25)
+    assert books.load.tally.loaded == 5 and [log.number for log in field.logs] == [2], "it still lies there"
 
 
 @pytest.mark.parametrize(("bed_m", "is_high"), [(0.3, False), (0.9, True)])
@@ -414,7 +433,7 @@ def test_a_log_that_fell_off_is_booked_and_said() -> None:
         sorting=Sorting(told), log_map=field, base=base(0.0, 0.0, math.pi), is_on_landing=lambda log: False
     )
     load = LoadBookkeeping(PROFILE, told, world)
-    load.tally.book_loaded([LoadedLog(Point(0.0, 0.0), 1, 0.1)] * 3, 300.0)
+    load.tally.book_loaded([LoadedLog(Point(0.0, 0.0), 1, 0.1)] * 3)
     for x_m in range(20):
         world.base = base(float(x_m), 0.0, math.pi)
         assert load.check_fallen(x_m) == 0

@@ -143,6 +143,20 @@ def test_a_listed_log_is_mapped_at_once_and_matched_when_observed() -> None:
     assert field.observe(seen([lying(5, 6.0, 5.0)], at), at, 1) == {5: 1}
 
 
+def test_the_logs_near_a_point_are_those_of_the_map_as_it_is_now() -> None:
+    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+    here = np.array([6.0, 5.0])
+    for x_m in (6.1, 7.0, 30.0):
+        field.add_known(lying(0, x_m, 5.0))
+    assert [log.number for log in field.near(here, 2.0)] == [1, 2]
+    field.observe(seen([lying(5, 6.0, 5.0)], at), at, 1)
+    assert field.near(here, 0.09)[0] is field.get(1), "the average moved"
+    field.record_miss(2)
+    assert [log.number for log in field.near(here, 2.0)] == [1], "no longer confirmed"
+    field.remove(1)
+    assert not field.near(here, 2.0) and [log.number for log in field.near(here, 25.0)] == [3]
+
+
 def test_an_unknown_axis_does_not_split_a_log() -> None:
     sure, unsure = (
         tuple(np.diag([0.01] * 2 + [turn**2] * 2 + [0.04] * 2 + [0.01])[np.triu_indices(7)].tolist())
