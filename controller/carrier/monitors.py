@@ -1,8 +1,8 @@
 """Monitors of the carrier: does it follow its command, and can its steering inputs be trusted?  One reason per tick.
 
-Speed and articulation are monitored whenever the machine is armed, because a carrier that rolls away under the crane is
-as dangerous; the rest only while it drives or slows down.  Every threshold must hold for a while, because frames of
-mach0 come every 20 ms and one of them may be an outlier.
+The speed is monitored whenever the machine is armed, because a carrier that rolls away under the crane is as dangerous;
+the rest, steering among it, only while it drives or slows down: a swinging load bends the standing machine.  Every
+threshold must hold for a while, because frames of mach0 come every 20 ms and one of them may be an outlier.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
 """A noise model of stereo matching: exact depth in, measured depth out.
 
 Depth z errs by about z^2 sigma_d / (f B).  The error is correlated over neighbouring pixels, so averaging a small
-window does not remove it, and new in every frame; a scale error lasts for the run.  Near surfaces grow over those
-behind them.  Depth is NaN where only one of the two imagers sees a surface, in blots on surfaces (more of them where
-there is no texture), and outside the camera's range.  Noise is looked up in a periodic tile shifted by seeded offsets.
+window does not remove it.  Half of its variance (assumed) is new in every frame; the other half, of the texture that is
+matched, stays while the camera rests, so that averaging its frames does not remove it.  A scale error lasts for the
+run.  Near surfaces grow over those behind them.  Depth is NaN where only one of the two imagers sees a surface, in
+blots on surfaces (more of them where there is no texture), and outside the camera's range.  Noise is looked up in a
+periodic tile shifted by seeded offsets.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from numba import njit
 
 from machine.geometry.optics import Intrinsics
 from machine.profile import Camera
+from sim.camera.geometry import View
 from sim.camera.render import Picture
 from sim.truth.sensors import CameraTruth
 
@@ -26,6 +29,9 @@ TILE_PX: Final = 1024
 _MASK = TILE_PX - 1
 BLOT_PX: Final = 12.0  # width of a hole in a surface
 PATCH_PX: Final = 16  # texture is measured in squares this wide
+REST_M: Final = 0.05
+REST_RAD: Final = 0.02
+"""A camera that moves or turns by this much matches other pixels."""
 MIN_TEXTURE_STEP: Final = 5.0  # mean step of green from pixel to pixel below which a square has no texture
 
 
@@ -156,14 +162,24 @@ class StereoNoise:
         self._cut = normal.inv_cdf(1.0 - truth.hole_share)
         self._plain_cut = normal.inv_cdf(1.0 - truth.plain_hole_share)
 
-    def apply(self, picture: Picture, pinhole: Intrinsics, frame: int) -> np.ndarray:
+    def _resting(self, view: View) -> tuple[int, int]:
+        """Choose the lasting errors of a camera that rests here."""
+        places = (view.position_m / REST_M).round().astype(int).tolist()
+        turns = (view.rotation[:, 1:] / REST_RAD).round().astype(int).ravel().tolist()
+        rng = random.Random(f"stereo {self._seed} at {places} {turns}")
+        return rng.randrange(TILE_PX), rng.randrange(TILE_PX)
+
+    def apply(self, picture: Picture, pinhole: Intrinsics, frame: int, view: View | None = None) -> np.ndarray:
         """Return the depth (H, W) float32 [m] as the camera measures it, NaN where it has none.
 
-        ``pinhole`` is the picture's (it may be smaller than the camera's own), ``frame`` selects this frame's errors.
+        ``pinhole`` is the picture's (it may be smaller than the camera's own), ``frame`` selects this frame's errors,
+        ``view`` those of a camera that rests there; without one all are the frame's.
         """
         camera, truth = self._camera, self._truth
         rng = random.Random(f"stereo {self._seed} {frame}")
         shift = np.array([rng.randrange(TILE_PX) for _ in range(8)])
+        if view is not None:
+            shift[:2] = self._resting(view)
         fb = camera.fx_px * camera.baseline_m
         tile, blots = _tile(truth.correlation_px, 1), _tile(BLOT_PX, 2)
         inverse = np.nan_to_num(1.0 / picture.depth_m, copy=False, nan=0.0)

@@ -113,7 +113,7 @@ class CameraRig:
         camera = self._profile.cameras[name]
         view, picture = self._picture(name, scene)
         rgb, pin = picture.rgb, view.intrinsics
-        depth = self._noise[name].apply(picture, pin, self._counts[name])
+        depth = self._noise[name].apply(picture, pin, self._counts[name], view)
         self._counts[name] += 1
         if self._size_px is not None:
             box = intrinsics(camera).letterbox(self._size_px)

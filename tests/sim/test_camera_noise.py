@@ -6,6 +6,7 @@ from msgspec.structs import replace
 
 from machine.geometry.optics import Intrinsics
 from machine.loading.profile_file import load_profile
+from sim.camera.geometry import View
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture, render
 from sim.camera.scene import Ground, SceneBuilder
@@ -49,6 +50,19 @@ def test_errors_correlate_over_ten_pixels_and_not_over_forty() -> None:
 
     assert alike(10) == pytest.approx(np.exp(-1.0), abs=0.06)
     assert abs(alike(40)) < 0.06
+
+
+def test_averaging_the_frames_of_a_resting_camera_leaves_seven_tenths_of_it() -> None:
+    noise, here = StereoNoise(CAMERA, SMOOTH, 1), View(PIN, np.array([1.0, 2.0, 3.0]), np.eye(3))
+    views = [here] * 24, [moved(here, 0.1 * k) for k in range(24)]
+    rests, moves = (np.stack([noise.apply(wall(5.0), PIN, k, view) for k, view in enumerate(vs)]) for vs in views)
+    assert np.nanstd(moves) == pytest.approx(np.nanstd(rests), rel=0.05)
+    assert np.nanstd(rests.mean(axis=0)) == pytest.approx(np.sqrt(0.5) * np.nanstd(rests), rel=0.08)
+    assert np.nanstd(moves.mean(axis=0)) < 0.3 * np.nanstd(moves)
+
+
+def moved(view: View, ahead_m: float) -> View:
+    return View(view.intrinsics, view.position_m + np.array([ahead_m, 0.0, 0.0]), view.rotation)
 
 
 def test_frame_errors_are_independent_and_repeatable() -> None:
