@@ -185,6 +185,12 @@ VIEW_TIMEOUT_NS: Final = 3_000_000_000
 """Time for a picture of a load that is shown to a camera."""
 HIDDEN_LOAD_NS: Final = 1_200_000_000
 """Time for four pictures of a load that was hidden during the motion: three make it a log of the list."""
+RELEASED_NS: Final = 600_000_000
+"""Time in which the load cell tells that opened jaws, risen and at rest, are empty."""
+KEPT: Final = Problem(
+    "activity.log-kept",
+    "the opened jaws take the log along again and again; free it by hand, and look what keeps them from opening",
+)
 _TIMEOUT_FACTOR: Final = 2.0
 _FINAL_HOLD_S: Final = 0.1
 _MAX_TICK_S: Final = 0.1
@@ -386,7 +392,7 @@ class Activity(ActivityState):
             case Phase.OPEN:
                 return self._after_open(now_ns)
             case Phase.RETREAT:
-                return self._after_retreat() if seen else None
+                return self._after_retreat(now_ns) if seen else None
             case Phase.STOW:
                 return Phase.DONE
         return Phase(self.phase + 1)
@@ -460,14 +466,36 @@ class Activity(ActivityState):
             return None
         if self._cycle.drops_load:
             return Phase.ABOVE
-        if self._fetches_next is None or not self._direct:
+        self._cycle.tests_release = self._direct and self._grapple.may_keep_load
+        if self._fetches_next is None or not self._direct or self._cycle.tests_release:
             return Phase.RETREAT
         self._ready_ns = self._ready_ns or now_ns
         if self._inbox.logs_ns < self._ready_ns:
             return None
-        return self._after_retreat() if any(map(self._fetches_next, self._cycle.other_logs())) else Phase.RETREAT
+        return self._after_release() if self._sees_next else Phase.RETREAT
 
-    def _after_retreat(self) -> Phase | None:
+    def _after_retreat(self, now_ns: int) -> Phase | None:
+        """Be done, or open the jaws again and higher, where they have taken the load along."""
+        assert self._arrived_ns is not None
+        if self._cycle.tests_release:
+            if now_ns < self._arrived_ns + RELEASED_NS:
+                return None
+            if self._grapple.has_kept_load:
+                if self._cycle.open_higher():
+                    return Phase.LOWER
+                self._fail(KEPT)
+                return None
+            self._cycle.tests_release = False
+            if not self._sees_next:
+                return Phase.RETREAT
+        return self._after_release()
+
+    @property
+    def _sees_next(self) -> bool:
+        """Whether a log is in view that the next job would fetch."""
+        return self._fetches_next is not None and any(map(self._fetches_next, self._cycle.other_logs()))
+
+    def _after_release(self) -> Phase | None:
         if problem := self._cycle.misplaced_log():
             self._fail(problem)
             return None

@@ -84,6 +84,8 @@ TOUCH_DOWN_M: Final = 0.5
 MAX_HIGHER: Final = 2
 HIGHER_M: Final = 0.15
 """Jaws that push against other logs or the stakes while they open are raised by this, and open again, this often."""
+TEST_RISE_M: Final = 0.4
+"""Opened jaws rise by this much, still between the stakes, before the load cell is asked whether they are empty."""
 _ASKEW_RAD: Final = 0.2
 """A thin load may lie askew by this much: its ends stay clear of the stakes, and each turn may make it spin."""
 _SAME_GRASP_M, _SAME_GRASP_RAD = 0.02, 0.03
@@ -146,6 +148,8 @@ class Cycle:
         """Whether the jaws have not closed yet since the last selection."""
         self.drops_load = False
         """Whether the jaws open to grip anew, because the load was too heavy."""
+        self.tests_release = False
+        """Whether the next retreat rises only so far that the load cell can tell whether the jaws are empty."""
         self._load_id: int | None = None
         """The number under which the load was last seen in the jaws."""
         self._load_ids: set[int] = set()
@@ -390,7 +394,10 @@ class Cycle:
         assert self.place is not None
         if phase is Phase.LOWER:
             return hold(q) if self._is_at_place(start, self.place) else straight_line(arm, start, self.place)
-        return straight_line(arm, start, start.at_height(max(start.z_m, retreat_height_m(self._profile))))
+        high_m = max(start.z_m, retreat_height_m(self._profile))
+        if self.tests_release:
+            high_m = min(high_m, start.z_m + TEST_RISE_M)
+        return straight_line(arm, start, start.at_height(high_m))
 
     def _plan_place(
         self,

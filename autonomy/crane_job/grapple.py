@@ -50,6 +50,9 @@ speeds up."""
 _RESTING_SHARE, _RESTING_S, _RESTING_FROM_KG = 0.35, 0.1, 60.0
 """A load on its way down that weighs less than this share of itself for so long rests on something.  Lighter loads
 vary by as much while the crane slows down."""
+_KEPT_SHARE: Final = 0.35
+"""Jaws without an opening sensor that have opened and risen, and bear more than this share of their load, have taken it
+along: a neighbour or a stake kept them from opening, and a tip is still under it."""
 _RELEASED_KG: Final = 30.0
 """Greatest load in the jaws once they have released their logs."""
 _PUSH_LOAD_KG, _PUSH_FACTOR = 250.0, 1.5
@@ -214,6 +217,16 @@ class GrappleSequence:
     def load_rests(self) -> bool:
         """Whether something else bears the load; False where the load is light or not known."""
         return self.laden_kg > _RESTING_FROM_KG and self._resting_s > _RESTING_S
+
+    @property
+    def may_keep_load(self) -> bool:
+        """Whether only the load cell can tell that the jaws have released it: they have no sensor, and it is heavy."""
+        return not isfinite(self._inbox.report.opening_pct) and self.laden_kg > _RESTING_FROM_KG
+
+    @property
+    def has_kept_load(self) -> bool:
+        """Whether opened jaws that have risen still bear a good part of the load."""
+        return self._mean_kg > _KEPT_SHARE * self.laden_kg
 
     @property
     def lifts_nothing(self) -> bool:

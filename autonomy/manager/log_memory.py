@@ -132,7 +132,7 @@ class LogMemory:
             return
         if job.phase < Phase.CLOSE:
             self._held, self._load_detector, self._slipped = {}, None, False
-        elif Phase.LIFT <= job.phase < Phase.OPEN and not self._held and not self._slipped:
+        elif Phase.LIFT <= job.phase < Phase.OPEN and not (self._held or self._slipped or self._released):
             pin, yaw = self._pin(report)
             self._low_m = pin[2]
             self._held = {log.id: _relative(log, pin, yaw) for log in grasp.logs}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import dist, nan
+from math import dist, isfinite, nan
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ import pytest
 from autonomy.crane_job.activity import Activity, Phase
 from autonomy.crane_job.cycle import HIGHER_M, LOOK_ASIDE_RAD, MAX_HIGHER
 from autonomy.crane_job.grasp_verification import is_between_jaws
+from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import retreat_height_m
 from autonomy.grasp.planner import NoGrasp
 from autonomy.missions.crane_job import CraneJob
@@ -368,6 +369,38 @@ def test_a_lifted_log_without_a_path_on_goes_down_again(monkeypatch: pytest.Monk
 
 # -- a camera that remembers what it cannot show
 _SHUT = 4
+
+
+@dataclass
+class Hooking(StandIn):
+    """Jaws without a sensor that a neighbour keeps from opening: they take the log along, unless they open higher."""
+
+    free_m: float = 0.1
+    first_m: float = nan
+
+    def _drop(self) -> None:
+        height_m = self.pin()[2]
+        self.first_m = self.first_m if isfinite(self.first_m) else height_m
+        if height_m > self.first_m + self.free_m and self.setpoint.knots[0].velocity[Joint.LIFT] == 0.0:
+            super()._drop()
+
+
+@pytest.mark.parametrize(("free_m", "code"), [(0.1, None), (0.25, None), (5.0, "activity.log-kept")])
+def test_a_log_that_the_opened_jaws_take_along_is_released_higher(free_m: float, code: str | None) -> None:
+    """It was dragged out of the bunk by the next job, and counted as loaded."""
+    crane = Hooking(PROFILE, [GROUND_LOG], feedback=False, log_kg=90.0, free_m=free_m)
+    planner = activity(fetches_next=lambda log: True)
+    crane.run(planner)
+    assert planner.failure_code == code and planner.done == (code is None)
+    assert crane.phases().count("OPEN") == (1 + MAX_HIGHER if code else 2 if free_m < 0.15 else 3)
+    assert (crane.held is None) == (code is None) and lies_in_bunk(PROFILE.bunk, crane.logs[0])
+
+
+def test_a_released_load_is_no_reason_to_open_again() -> None:
+    crane = StandIn(PROFILE, [GROUND_LOG], feedback=False, log_kg=90.0)
+    planner = activity(fetches_next=lambda log: True)
+    crane.run(planner)
+    assert planner.done and crane.phases().count("OPEN") == 1
 
 
 @dataclass
