@@ -226,7 +226,7 @@ class GrappleSequence:
     @property
     def has_kept_load(self) -> bool:
         """Whether opened jaws that have risen still bear a good part of the load."""
-        return self._mean_kg > _KEPT_SHARE * self.laden_kg
+        return self._mean_kg > max(_RELEASED_KG, _KEPT_SHARE * self.laden_kg)
 
     @property
     def lifts_nothing(self) -> bool:

@@ -196,6 +196,23 @@ def test_a_load_that_weighs_little_on_the_way_down_rests(laden_kg: float, read_k
     assert sequence.load_rests is rests
 
 
+@pytest.mark.parametrize(
+    ("opening_pct", "laden_kg", "read_kg", "asked", "kept"),
+    [
+        (nan, 200.0, 80.0, True, True),
+        (nan, 200.0, 60.0, True, False),
+        (nan, 70.0, 28.0, True, False),  # an empty crane may read as much
+        (nan, 50.0, 50.0, False, True),  # too light to ask
+        (60.0, 200.0, 80.0, False, True),  # a sensor tells
+    ],
+)
+def test_the_load_tells_whether_risen_jaws_have_kept_a_log(opening_pct, laden_kg, read_kg, asked, kept) -> None:
+    sequence = sequence_at(opening_pct, load_kg=read_kg)
+    sequence.laden_kg = laden_kg
+    sequence.apply(GrappleCommand.NEUTRAL, 0.05)
+    assert (sequence.may_keep_load, sequence.has_kept_load) == (asked, kept)
+
+
 # -- recovery
 class Told(SimpleNamespace):
     """A grapple whose state the test sets."""
