@@ -16,7 +16,7 @@ from collections.abc import Callable
 from math import isfinite
 from typing import Final
 
-from autonomy.crane_job.cycle import Cycle
+from autonomy.crane_job.cycle import MAX_HIGHER, Cycle
 from autonomy.crane_job.grapple import GrappleSequence
 from autonomy.crane_job.inbox import Inbox
 from autonomy.crane_job.phase_conditions import is_motion_done, motion_rate
@@ -189,8 +189,9 @@ RELEASED_NS: Final = 600_000_000
 """Time in which the load cell tells that opened jaws, risen and at rest, are empty."""
 KEPT: Final = Problem(
     "activity.log-kept",
-    "the opened jaws take the log along again and again; free it by hand, and look what keeps them from opening",
+    f"the opened jaws took the log along {1 + MAX_HIGHER} times; stop the machine, secure the crane, and free the log",
 )
+"""A person must see to it: the next job would drag the log with it."""
 _TIMEOUT_FACTOR: Final = 2.0
 _FINAL_HOLD_S: Final = 0.1
 _MAX_TICK_S: Final = 0.1

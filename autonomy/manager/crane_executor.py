@@ -12,7 +12,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.activity import KEPT, Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.crane_job.rotator_estimate import LoadView, RotatorEstimate, load_view
 from autonomy.grasp.bunk_load import lies_in_bunk
@@ -228,4 +228,6 @@ class CraneExecutor:
 
     def _end(self, job: Activity) -> None:
         self._reference, self._rotator = job.last_setpoint, job.rotator
+        if job.failure_code == KEPT.code:
+            self.failure = KEPT
         self.job = None

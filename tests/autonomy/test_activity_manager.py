@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from autonomy.crane_job.activity import KEPT
 from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.planner import BunkFull
 from autonomy.manager.activity_manager import MAX_OUTSIDE_M, ActivityManager
@@ -370,6 +371,16 @@ def test_a_grasp_that_is_stopped_repeatedly_is_given_up() -> None:
     assert manager.state is State.DONE and manager.tally.missed == 1
     (why,) = manager.tally.given_up.values()
     assert numbers_in(why) == [MAX_STOPS]
+
+
+def test_a_log_that_the_jaws_do_not_release_ends_the_mission() -> None:
+    """The next job would drag it along."""
+    forwarder, manager = begin(LOGS[:1])
+    forwarder.run(manager, at(State.COLLECT))
+    assert manager.activity is not None
+    manager.activity._fail(KEPT)
+    forwarder.run(manager, ended)
+    assert manager.state is State.FAILED and manager.failure_code == "activity.log-kept"
 
 
 @whole
