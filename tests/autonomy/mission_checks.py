@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,15 @@ def refused(data: bytes, name: str = "m", **how: object) -> MissionError:
 def codes(data: bytes, **how: object) -> list[str]:
     """The codes of all problems of a file, without the prefix ``mission.``."""
     return [problem.code.removeprefix("mission.") for problem in refused(data, **how).problems]
+
+
+def peak_bytes(data: bytes) -> tuple[list[str], int]:
+    """The codes of a file that is refused, and the memory that it took."""
+    tracemalloc.start()
+    try:
+        return codes(data), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
 
 def place(data: bytes) -> str:
