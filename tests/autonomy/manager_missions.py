@@ -42,9 +42,15 @@ def begin(
     way = (place(10.0, 0.0), place(end_m, 0.0))
     landings = () if landing is None else (Landing(place(*landing), bearing_deg=bearing_deg),)
     mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
-    manager.auto()
-    return forwarder([lying(*log) for log in lie], table), manager
+    return forwarder([lying(*log) for log in lie], table), managed(mission, table, plane=PLANE)
+
+
+def managed(told: ForwardingMission, table=OURS, auto: bool = True, **how) -> ActivityManager:
+    """A manager of a mission; without ``plane`` it makes its own."""
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, **how)
+    if auto:
+        manager.auto()
+    return manager
 
 
 def forwarder(logs: list[MappedLog], table=OURS) -> Forwarder:
@@ -87,10 +93,7 @@ def again(
     for _ in range(60):
         machine.crane.now_ns += 50_000_000
         machine._move()
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
-    if auto:
-        manager.auto()
-    return manager
+    return managed(told, table, auto, progress=progress)
 
 
 LISTED_LOGS = ((15.0, 4.2), (36.0, -4.2))
@@ -113,8 +116,15 @@ def begin_job(
 ) -> tuple[Forwarder, ForwardingJob, ActivityManager]:
     """A forwarding job of the planning process."""
     mission = ForwardingMission("test", (place(10.0, 0.0), place(end_m, 0.0)))
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE, **told)
+    manager = managed(mission, auto=False, plane=PLANE, **told)
     return forwarder([lying(*log) for log in logs]), ForwardingJob(manager, mission, begin=not waits), manager
+
+
+def driving(**told) -> tuple[Forwarder, ForwardingJob, ActivityManager]:
+    """A forwarding job without logs whose machine drives."""
+    machine, job, manager = begin_job(**told)
+    events_until(machine, job, lambda _: machine.speed_m_s > 0.3)
+    return machine, job, manager
 
 
 def events_until(

@@ -15,12 +15,12 @@ from autonomy.manager.activity_manager import MAX_OUTSIDE_M, ActivityManager
 from autonomy.manager.crane_executor import MAX_STOPS
 from autonomy.manager.tally import Tally
 from autonomy.manager.transition_table import OURS, PAPER_B, RULES, State, Table
-from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Point
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.perception.log_list import LogObservation
 from machine.joints import Joint
-from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
+from tests.autonomy.crane_stand_in import refusing
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.manager_missions import (
     CARRIER,
@@ -31,6 +31,7 @@ from tests.autonomy.manager_missions import (
     begin,
     completed,
     ended,
+    managed,
     outward_rad,
     place,
     states,
@@ -349,13 +350,15 @@ def test_a_bunk_without_room_ends_the_collecting_except_by_paper_b_which_does_no
 def test_a_landing_without_room_fails_the_mission() -> None:
     forwarder, manager = begin((), landing=(12.0, 0.0))
     manager.tally.on_board = 1
-    manager.route.drive_to_landing = refuse
+    manager.route.drive_to_landing = refusing(PathRefused("path.none", "no room"))
     forwarder.run(manager, ended)
     assert manager.failure_code == "path.none"
 
 
-def refuse(*_: object) -> None:
-    raise PathRefused("path.none", "no room")
+def stop_and_arm(forwarder: Forwarder, manager: ActivityManager) -> None:
+    forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
+    forwarder.step(manager)
+    forwarder.crane.mode = Mode.ARMED
 
 
 @whole
@@ -365,9 +368,7 @@ def test_a_grasp_that_is_stopped_repeatedly_is_given_up() -> None:
         forwarder.run(manager, lambda m: ended(m) or (m.state is State.COLLECT and not m.paused))
         forwarder.steps(manager, 30)
         if manager.state is State.COLLECT:
-            forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
-            forwarder.step(manager)
-            forwarder.crane.mode = Mode.ARMED
+            stop_and_arm(forwarder, manager)
     assert manager.state is State.DONE and manager.tally.missed == 1
     (why,) = manager.tally.given_up.values()
     assert numbers_in(why) == [MAX_STOPS]
@@ -390,9 +391,7 @@ def test_a_log_in_the_jaws_is_laid_down_after_three_stops() -> None:
     forwarder.run(manager, lambda m: ended(m) or forwarder.crane.held is not None)
     for _ in range(MAX_STOPS):
         forwarder.steps(manager, 30)
-        forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
-        forwarder.step(manager)
-        forwarder.crane.mode = Mode.ARMED
+        stop_and_arm(forwarder, manager)
     assert forwarder.crane.held is not None
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.crane.held is None
@@ -421,10 +420,7 @@ def test_the_same_inputs_give_the_same_bytes() -> None:
 
 
 def test_a_route_that_cannot_be_driven_fails_the_mission() -> None:
-    points = ((10.0, 0.0), (10.5, 0.0), (10.5, 1.0), (9.0, 1.0))
-    way = tuple(Point(*PLANE.geodetic(*p)[:2]) for p in points)
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), ForwardingMission("test", way), plane=PLANE)
-    manager.auto()
-    forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0))
-    forwarder.run(manager, ended)
+    way = tuple(place(*p) for p in ((10.0, 0.0), (10.5, 0.0), (10.5, 1.0), (9.0, 1.0)))
+    manager = managed(ForwardingMission("test", way), plane=PLANE)
+    Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0)).run(manager, ended)
     assert manager.state is State.FAILED and manager.failure_code == "path.short-leg"

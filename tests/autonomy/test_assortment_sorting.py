@@ -11,14 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.grasp.selection import PlannerSelection
+from autonomy.grasp.selection import PlannerSelection, select_direct
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.sorting import Sorting
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
-from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.manager_missions import PLANE, PROFILE, again, at, completed, ended, place, states, whole
+from tests.autonomy.manager_missions import (
+    PLANE,
+    again,
+    at,
+    completed,
+    ended,
+    forwarder,
+    managed,
+    place,
+    states,
+    whole,
+)
 from tests.autonomy.mapped_logs import lying
 from tests.codes import numbers_in
 
@@ -42,15 +52,20 @@ def mission(
     return ForwardingMission("test", way, (), piles, known, Options(logs="listed", **options))
 
 
-def forwarder(lie: Sequence[Lie]) -> Forwarder:
-    logs = [lying(number, x, y, 0.0) for number, (_, x, y) in enumerate(lie, 1)]
-    return Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05))
+def begin(lie: Sequence[Lie], landings=(), selector=select_direct, **options) -> tuple[Forwarder, ActivityManager]:
+    logs = [lying(number, x, y) for number, (_, x, y) in enumerate(lie, 1)]
+    return forwarder(logs), managed(mission(lie, landings, **options), plane=PLANE, selector=selector)
 
 
-def managed(told: ForwardingMission, **how) -> ActivityManager:
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, plane=PLANE, **how)
-    manager.auto()
-    return manager
+BESIDE = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
+PILES = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
+
+
+def first_grasp(lie: Sequence[Lie], landings=(), **options) -> list[int]:
+    """The logs that a planner which takes several takes first."""
+    machine, manager = begin(lie, landings, PlannerSelection(SamplingPlanner()), **options)
+    machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
+    return sorted(log.id for log in manager.activity.grasp.logs)
 
 
 # -- the rules
@@ -140,38 +155,27 @@ def test_wanted_logs_always_belong_to_the_landing_of_the_load(takes, only, grasp
 @whole
 def test_the_machine_does_not_stop_for_unwanted_logs() -> None:
     lie = (("pulpwood", 14.0, 4.2), ("saw logs", 22.0, 4.4))
-    machine, manager = forwarder(lie), managed(mission(lie, assortments=SAW))
+    machine, manager = begin(lie, assortments=SAW)
     completed(machine, manager)
     assert machine.in_bunk == manager.tally.loaded == 1 and states(manager).count(State.APPROACH) == 1
     assert machine.field[1].center_m[:2] == pytest.approx((14.0, 4.2), abs=0.01)
 
 
 @whole
-@pytest.mark.parametrize(("only", "grasp"), [(SAW, (2,)), ((), (1, 2))])
+@pytest.mark.parametrize(("only", "grasp"), [(SAW, [2]), ((), [1, 2])])
 def test_an_unwanted_log_is_not_grasped_with_its_neighbour(only, grasp) -> None:
-    lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
-    machine, manager = (
-        forwarder(lie),
-        managed(mission(lie, assortments=only), selector=PlannerSelection(SamplingPlanner())),
-    )
-    machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
-    assert sorted(log.id for log in manager.activity.grasp.logs) == list(grasp)
+    assert first_grasp(BESIDE, assortments=only) == grasp
 
 
 @whole
 def test_the_first_grasp_of_a_sorted_load_has_one_landing() -> None:
-    lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
-    told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
-    machine, manager = forwarder(lie), managed(told, selector=PlannerSelection(SamplingPlanner()))
-    machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
-    assert len(manager.activity.grasp.logs) == 1
+    assert len(first_grasp(BESIDE, PILES, sort_by_assortment=True)) == 1
 
 
 @whole
 def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
     lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -4.4), ("veneer", 21.0, 4.4))
-    landings = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
-    machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
+    machine, manager = begin(lie, PILES, sort_by_assortment=True)
     said: dict[State, str] = {}
 
     def over(_: ActivityManager) -> bool:
@@ -180,12 +184,9 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
 
     machine.run(manager, over, 1500.0)
     assert manager.state is State.DONE, manager.failure
-    first, second = (manager.tally.loads[k] for k in (0, 1))
-    assert {(load.landing, *(log.assortment for log in load.logs)) for load in (first, second)} == {
-        (0, "saw logs"),
-        (1, "pulpwood"),
-    }
-    for number, (x, y, _) in zip((1, 2), landings, strict=True):
+    brought = {(load.landing, *(log.assortment for log in load.logs)) for load in manager.tally.loads[:2]}
+    assert brought == {(0, "saw logs"), (1, "pulpwood")}
+    for number, (x, y, _) in zip((1, 2), PILES, strict=True):
         assert math.dist(machine.field[number].center_m[:2], (x, y)) < 1.6
     assert machine.field[3].center_m[:2] == pytest.approx((21.0, 4.4), abs=0.01), "no landing takes it"
     assert manager.world.sorting.rounds == 1, "in the second one both were served"
@@ -196,9 +197,9 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
 @whole
 def test_a_planner_restarted_with_a_load_drives_the_second_round(tmp_path: Path) -> None:
     lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -4.4))
-    told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
-    machine, manager = forwarder(lie), managed(told)
+    machine, manager = begin(lie, PILES, sort_by_assortment=True)
     machine.run(manager, at(State.HAUL))
+    told = mission(lie, PILES, sort_by_assortment=True)
     manager = again(machine, manager, told, tmp_path / "progress.json", auto=True)
     completed(machine, manager, 1500.0)
     assert manager.tally.unloaded == 2 and manager.world.sorting.rounds == 1
@@ -208,8 +209,7 @@ def test_a_planner_restarted_with_a_load_drives_the_second_round(tmp_path: Path)
 def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
     """A listed log that is not found needs one more round, not endless ones."""
     lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -9.5))
-    landings = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
-    machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
+    machine, manager = begin(lie, PILES, sort_by_assortment=True)
     completed(machine, manager, 1500.0)
     assert manager.world.sorting.rounds == 1 and manager.tally.loaded == manager.tally.unloaded == 1
     assert machine.field[2].center_m[:2] == pytest.approx((18.0, -9.5), abs=0.01)
@@ -217,9 +217,7 @@ def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
 
 @whole
 def test_an_unsorted_load_goes_to_the_nearest_landing() -> None:
-    lie = (("saw logs", 15.0, 4.2),)
-    landings = ((-30.0, 12.0, SAW), (34.0, 14.0, PULP))
-    machine, manager = forwarder(lie), managed(mission(lie, landings))
+    machine, manager = begin((("saw logs", 15.0, 4.2),), ((-30.0, 12.0, SAW), (34.0, 14.0, PULP)))
     machine.run(manager, at(State.HAUL))
     completed(machine, manager, 900.0)
     (load,) = manager.tally.loads

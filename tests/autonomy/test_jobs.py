@@ -1,4 +1,4 @@
-"""The jobs of the planning process: their events, when they are idle, how they end."""
+"""The jobs of the planning process and what the operator tells them: events, ends, commands, and the mode switch."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
+from autonomy.manager.operator_switch import OperatorSwitch
 from autonomy.manager.transition_table import State
 from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import STOPPING_TIMEOUT_NS, ForwardingJob, SingleLogJob
-from can_dbc.messages.crane import ModeSwitch, StateReport
-from can_dbc.messages.datagrams import decode
-from can_dbc.messages.mission import MissionAction
+from autonomy.process.operator_commands import MAX_AGE_NS, CommandReceiver, CommandRefused
+from can_dbc.messages.crane import ModeSwitch, OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.mission import MissionAction, MissionCommand, encode_mission_command
 from can_dbc.messages.vehicle import DriveSetpoint
 from machine.geometry.grapple import grapple_yaw
+from machine.loading.profile_file import load_profile
 from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn, activity
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.grasp_scenes import PROFILE
-from tests.autonomy.manager_missions import LOGS, begin_job, command, events_until
+from tests.autonomy.manager_missions import LOGS, begin_job, command, driving, events_until
+from tests.codes import coded
 
 
 @pytest.mark.long
@@ -38,8 +42,7 @@ def test_a_mission_emits_its_states_grasps_and_load_and_ends_idle() -> None:
 
 
 def test_a_mission_ends_although_the_machine_does_not_stop() -> None:
-    forwarder, job, _ = begin_job()
-    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, _ = driving()
     job.abort("enough")
     ended_ns = forwarder.crane.now_ns
     forwarder._move = lambda: None
@@ -54,8 +57,7 @@ def test_setpoints_have_the_requested_lease() -> None:
 
 
 def test_an_ended_job_sends_no_speed() -> None:
-    forwarder, job, _ = begin_job()
-    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, _ = driving()
     job.abort("enough")
     crane = forwarder.crane
     sent = [decode(d) for d in job.step(crane.now_ns, crane.report(), forwarder.vehicle(), ())]
@@ -89,8 +91,7 @@ def standing(forwarder: Forwarder, job: ForwardingJob) -> bool:
 
 @pytest.mark.parametrize(("position", "code"), [(ModeSwitch.IDLE, "switch.idle"), (ModeSwitch.FAULTY, "switch.faulty")])
 def test_the_operators_switch_holds_a_mission_whatever_is_commanded(position: ModeSwitch, code: str) -> None:
-    forwarder, job, _ = begin_job()
-    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, _ = driving()
     forwarder.crane.mode_switch = position
     assert standing(forwarder, job)
     told = job.report(forwarder.crane.now_ns)
@@ -101,8 +102,7 @@ def test_the_operators_switch_holds_a_mission_whatever_is_commanded(position: Mo
 
 
 def test_turning_the_switch_from_idle_to_auto_resumes_and_auto_alone_does_not() -> None:
-    forwarder, job, manager = begin_job()
-    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, manager = driving()
     forwarder.crane.mode_switch = ModeSwitch.AUTO
     forwarder.steps(job, 20)
     assert forwarder.speed_m_s > 0.3, "Auto changes nothing by itself"
@@ -262,3 +262,75 @@ def test_a_load_is_shown_to_the_camera_ahead_and_its_picture_maps_no_log() -> No
     assert 0.2 < turned < 0.31 and activity.rotator.sigma_rad < stood.sigma_rad
     asked = job.standpoint(crane.now_ns)
     assert asked is None, "no other picture while the crane works"
+
+
+# -- commands: fresh, ordered and signed
+NOW_NS = 10**12
+PAUSE = MissionCommand(5, 77, NOW_NS, MissionAction.PAUSE)
+
+
+def test_a_command_is_accepted_once() -> None:
+    receiver = CommandReceiver(77)
+    assert receiver.accept(encode_mission_command(PAUSE), NOW_NS) == PAUSE
+    with pytest.raises(CommandRefused, check=coded("command.repeated")):
+        receiver.accept(encode_mission_command(PAUSE), NOW_NS)
+    later = replace(PAUSE, sequence=6, action=MissionAction.AUTO)
+    assert receiver.accept(encode_mission_command(later), NOW_NS) == later
+    with pytest.raises(CommandRefused, check=coded("command.repeated")):
+        receiver.accept(encode_mission_command(PAUSE), NOW_NS)
+
+
+def test_commands_that_are_old_from_the_future_or_for_another_profile_are_refused() -> None:
+    receiver, data = CommandReceiver(77), encode_mission_command(PAUSE)
+    for refusing, now_ns, code in (
+        (receiver, NOW_NS + 1_500_000_000, "command.too-old"),
+        (receiver, NOW_NS - 1, "command.future"),
+        (CommandReceiver(78), NOW_NS, "command.other-profile"),
+    ):
+        with pytest.raises(CommandRefused, check=coded(code)):
+            refusing.accept(data, now_ns)
+    assert receiver.accept(data, NOW_NS + MAX_AGE_NS) == PAUSE, "a refused command does not count as the last one"
+
+
+def test_with_a_key_only_signed_commands_are_accepted() -> None:
+    receiver = CommandReceiver(77, b"right")
+    for wrong in (encode_mission_command(PAUSE), encode_mission_command(PAUSE, b"wrong")):
+        with pytest.raises(CommandRefused, check=coded("command.datagram")):
+            receiver.accept(wrong, NOW_NS)
+    assert receiver.accept(encode_mission_command(PAUSE, b"right"), NOW_NS) == PAUSE
+
+
+@pytest.mark.parametrize("data", [b"", b"pause", encode(OperatorCommand(1, 77, NOW_NS, OperatorAction.ARM))])
+def test_other_datagrams_are_refused(data: bytes) -> None:
+    with pytest.raises(CommandRefused):
+        CommandReceiver(77).accept(data, NOW_NS)
+
+
+# -- the mode switch
+REPORT = StandIn(load_profile("palms_471"), []).report()
+NONE, IDLE, AUTO, FAULTY = ModeSwitch
+START = "start"
+
+
+@pytest.mark.parametrize(
+    ("positions", "told"),
+    [
+        ((NONE, NONE), ("", "")),
+        ((NONE, AUTO, AUTO), ("", "", "")),
+        ((IDLE, AUTO, AUTO), ("switch.idle", START, "")),
+        ((IDLE, FAULTY, AUTO), ("switch.idle", "switch.faulty", "")),
+        ((FAULTY, IDLE, AUTO), ("switch.faulty", "switch.idle", START)),
+        ((AUTO, NONE, AUTO), ("", "", "")),
+        ((IDLE, NONE, AUTO), ("switch.idle", "switch.faulty", "")),
+        ((FAULTY, NONE, NONE, IDLE), ("switch.faulty", "switch.faulty", "switch.faulty", "switch.idle")),
+    ],
+)
+def test_only_the_turn_from_idle_to_auto_starts(positions: tuple[ModeSwitch, ...], told: tuple[str, ...]) -> None:
+    switch, found = OperatorSwitch(), []
+    for position in positions:
+        switch.take(replace(REPORT, mode_switch=int(position)))
+        found.append(START if switch.started else switch.hold.code if switch.hold else "")
+        before = switch.hold
+        switch.take(None)
+        assert not switch.started and switch.hold is before, "without a report nothing changes"
+    assert tuple(found) == told

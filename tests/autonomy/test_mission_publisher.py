@@ -11,10 +11,9 @@ import pytest
 
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.planner import Grasp
-from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, OURS, RULES, Event, State
+from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, RULES, Event, State
 from autonomy.manager.world_model import MAX_ATTEMPTS
-from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
+from autonomy.missions.model import Fence, ForwardingMission, Landing, Options
 from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import ABORTED, MISSION_ENDED, NO_PENDING_STEP, ONLY_ABORT, ForwardingJob, SingleLogJob
@@ -31,15 +30,24 @@ from can_dbc.messages.mission import (
     encode_mission,
 )
 from machine.geometry.grapple import rotator_for_yaw
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile
-from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.manager_missions import LOGS, PLANE, PROFILE, begin_job, command, events_until
+from tests.autonomy.manager_missions import (
+    LOGS,
+    PLANE,
+    begin_job,
+    command,
+    driving,
+    events_until,
+    forwarder,
+    managed,
+    place,
+)
 from tests.autonomy.mapped_logs import lying
 
 
-def near(place, x_m, y_m, within_m=0.15) -> bool:
-    return math.dist(PLANE.local(*place)[:2], (x_m, y_m)) < within_m
+def near(where, x_m, y_m, within_m=0.15) -> bool:
+    return math.dist(PLANE.local(*where)[:2], (x_m, y_m)) < within_m
 
 
 @pytest.mark.long
@@ -75,8 +83,7 @@ def test_the_targets_are_the_logs_of_the_grasp() -> None:
 
 @pytest.mark.long
 def test_commands_are_executed_and_reported() -> None:
-    forwarder, job, manager = begin_job()
-    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, manager = driving()
 
     def give(number: int, action: MissionAction) -> str:
         refusal = job.execute(command(number, action))
@@ -93,25 +100,22 @@ def test_commands_are_executed_and_reported() -> None:
     assert give(3, MissionAction.SINGLE_STEP) == "" and job.report(0).single_step
     assert give(4, MissionAction.AUTO) == "" and job.report(0).auto
     events_until(forwarder, job, lambda j: manager.pending_event is not None)
-    assert (
-        job.report(forwarder.crane.now_ns).waits_for == EVENT_DESCRIPTIONS[Event.ROUTE_END]
-        and manager.state is State.SEARCH
-    )
+    assert manager.state is State.SEARCH
+    assert job.report(forwarder.crane.now_ns).waits_for == EVENT_DESCRIPTIONS[Event.ROUTE_END]
     assert give(5, MissionAction.NEXT_STEP) == ""
     events_until(forwarder, job, lambda j: manager.state is State.DONE)
     assert give(6, MissionAction.AUTO) == MISSION_ENDED and job.report(0).ended
 
 
 def test_there_is_a_report_before_the_machine_is_located() -> None:
-    mission = ForwardingMission("test", (Point(*PLANE.geodetic(10.0, 0.0)[:2]),))
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS)
-    forwarder, job = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05)), ForwardingJob(manager, mission)
+    mission = ForwardingMission("test", (place(10.0, 0.0),))
+    manager, machine = managed(mission, auto=False), forwarder([])
+    job = ForwardingJob(manager, mission)
     assert job.report(0).here is None
-    blind = replace(forwarder.vehicle(), fix=0, latitude_deg=math.nan, heading_rad=math.nan)
-    job.step(forwarder.crane.now_ns, forwarder.crane.report(), blind, ())
-    told = job.report(forwarder.crane.now_ns)
-    assert manager.world.location is not None and told.here is None and told.logs == ()
-    assert told.paused
+    blind = replace(machine.vehicle(), fix=0, latitude_deg=math.nan, heading_rad=math.nan)
+    job.step(machine.crane.now_ns, machine.crane.report(), blind, ())
+    told = job.report(machine.crane.now_ns)
+    assert manager.world.location is not None and told.here is None and told.logs == () and told.paused
 
 
 def test_run_through_needs_no_more_steps() -> None:
@@ -124,8 +128,7 @@ def test_run_through_needs_no_more_steps() -> None:
 
 
 def test_a_commanded_abort_is_reported_as_the_operators() -> None:
-    forwarder, job, manager = begin_job()
-    events_until(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    forwarder, job, manager = driving()
     assert job.execute(command(1, MissionAction.ABORT)) == "" and not job.idle and not job.done
     events_until(forwarder, job, lambda j: j.idle)
     told = job.report(forwarder.crane.now_ns)
@@ -148,7 +151,7 @@ def test_a_single_log_job_only_accepts_abort() -> None:
 
 @pytest.mark.long
 def test_the_longest_mission_fits_in_a_datagram() -> None:
-    corners = tuple(Point(*PLANE.geodetic(9e3 * math.cos(a), 9e3 * math.sin(a))[:2]) for a in np.linspace(0, 6, 2000))
+    corners = tuple(place(9e3 * math.cos(a), 9e3 * math.sin(a)) for a in np.linspace(0, 6, 2000))
     mission = ForwardingMission(
         "w" * 500,
         corners,
@@ -156,23 +159,19 @@ def test_the_longest_mission_fits_in_a_datagram() -> None:
         tuple(Landing(corners[0], "x" * 300) for _ in range(90)),
         options=Options(laps=3),
     )
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE)
-    forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05))
+    manager, machine = managed(mission, auto=False, plane=PLANE), forwarder([])
     job = ForwardingJob(manager, mission)
-    forwarder.steps(job, 20)
+    machine.steps(job, 20)
     for k in range(500):
-        far = lying(k, 100.0 - 0.2 * k, 3.0)
-        manager.world.log_map.add_known(replace(far, misses=MAX_ATTEMPTS))
+        manager.world.log_map.add_known(replace(lying(k, 100.0 - 0.2 * k, 3.0), misses=MAX_ATTEMPTS))
         manager.tally.given_up[k] = "ß\n" * 400
-    told = job.report(forwarder.crane.now_ns)
+    told = job.report(machine.crane.now_ns)
     assert decode_mission(encode_mission(told, 1, 2, 3, b"key"), b"key") == (2, 3, told)
     assert (len(told.route), len(told.logs)) == (MAX_ROUTE_POINTS, MAX_LOGS) and told.closed
     assert sum(len(f.corners) for f in told.fences) <= MAX_CORNERS
     assert near(told.route[0], *PLANE.local(corners[0].latitude_deg, corners[0].longitude_deg)[:2])
     assert near(told.route[-1], *PLANE.local(corners[-1].latitude_deg, corners[-1].longitude_deg)[:2])
-    assert max(math.dist(PLANE.local(*log.place)[:2], (0.0, 0.0)) for log in told.logs) < 31.0, (
-        "the nearest logs are reported"
-    )
+    assert all(near(log.place, 0.0, 0.0, 31.0) for log in told.logs), "the nearest logs are reported"
     assert [g.log for g in told.given_up][-1] == 499 and told.given_up[0].reason.endswith("…")
 
 
