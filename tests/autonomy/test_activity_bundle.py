@@ -143,16 +143,17 @@ class Heap(StandIn):
             self.clasped_m = self.pin_m()
 
 
-def lifting(heap: Heap) -> tuple[Activity, list[Phase]]:
-    """The job at the beginning of its lift, and its phases since the first descent."""
-    planner = activity(planner=SamplingPlanner())
+def lifting(**told: float) -> tuple[Heap, Activity, list[Phase]]:
+    """A heap with these attributes, the job at the beginning of its lift, and its phases since the first descent."""
+    heap, planner = Heap(PROFILE, small_pile()), activity(planner=SamplingPlanner())
+    for name, value in told.items():
+        setattr(heap, name, value)
     phases = heap.until(planner, Phase.LIFT)
-    return planner, phases[phases.index(Phase.DESCEND) :]
+    return heap, planner, phases[phases.index(Phase.DESCEND) :]
 
 
 def test_jaws_that_stall_at_the_sides_of_a_pile_close_on_while_they_lift_it() -> None:
-    heap = Heap(PROFILE, small_pile())
-    planner, phases = lifting(heap)
+    heap, planner, phases = lifting()
     assert phases == [Phase.DESCEND, Phase.CLOSE, Phase.LIFT] and heap.tong_rad < STALL_RAD + 0.1
     while planner.phase is Phase.LIFT and heap.tong_rad < STALL_RAD + 0.5:
         heap.step(planner)
@@ -160,16 +161,12 @@ def test_jaws_that_stall_at_the_sides_of_a_pile_close_on_while_they_lift_it() ->
 
 
 def test_a_pile_that_yields_slowly_is_waited_for() -> None:
-    heap = Heap(PROFILE, small_pile())
-    heap.gives_rad = 0.002
-    assert lifting(heap)[1] == [Phase.DESCEND, Phase.CLOSE, Phase.LIFT]
-    assert heap.tong_rad > STALL_RAD + 0.1
+    heap, _, phases = lifting(gives_rad=0.002)
+    assert phases == [Phase.DESCEND, Phase.CLOSE, Phase.LIFT] and heap.tong_rad > STALL_RAD + 0.1
 
 
 def test_what_is_too_heavy_is_laid_down_before_the_machine_stops_and_gripped_anew() -> None:
-    heap = Heap(PROFILE, small_pile())
-    heap.heavy_kg = 600.0
-    planner, _ = lifting(heap)
+    heap, planner, _ = lifting(heavy_kg=600.0)
     begun_m, loads, opened_m = heap.pin_m(), [], []
     phases = [planner.phase]
     while planner.phase is not Phase.FAILED and len(phases) < 40:
@@ -189,13 +186,11 @@ def test_what_is_too_heavy_is_laid_down_before_the_machine_stops_and_gripped_ane
 
 
 def test_a_heavy_load_is_lifted_more_slowly() -> None:
-    heap, light = Heap(PROFILE, small_pile()), Heap(PROFILE, small_pile())
-    heap.heavy_kg, light.heavy_kg = 360.0, 10.0
     risen_m = []
-    for each in (heap, light):
-        planner, _ = lifting(each)
-        begun_m = each.pin_m()
-        each.steps(planner, 120)
+    for heavy_kg in (360.0, 10.0):
+        heap, planner, _ = lifting(heavy_kg=heavy_kg)
+        begun_m = heap.pin_m()
+        heap.steps(planner, 120)
         assert planner.phase is Phase.LIFT
-        risen_m.append(each.pin_m() - begun_m)
+        risen_m.append(heap.pin_m() - begun_m)
     assert 0.2 < risen_m[0] < 0.8 * risen_m[1]

@@ -237,10 +237,19 @@ def test_a_run_of_one_joint_repeats_the_tests_that_a_lost_message_and_a_person_i
     assert changed and all(path[:2] == ("joints", "tilt") for path, _, _ in changed)
 
 
-@pytest.mark.parametrize("reason", [Reason.OPERATOR_STOP, Reason.JOINT_STUCK, Reason.ESTOP_PRESSED, Reason.NONE])
-def test_what_a_person_or_the_joint_has_stopped_does_not_go_on(reason: Reason) -> None:
-    crane = Crane(patience_s=60.0)
-    crane.run(8.0)
+@pytest.mark.parametrize(
+    ("machine", "reason"),
+    [
+        ({}, Reason.OPERATOR_STOP),
+        ({}, Reason.JOINT_STUCK),
+        ({}, Reason.ESTOP_PRESSED),
+        ({}, Reason.NONE),
+        (ROTATOR, Reason.ENCODER_LOST),
+    ],
+)
+def test_what_a_person_or_the_joint_has_stopped_and_a_rotator_without_encoder_do_not_go_on(machine, reason) -> None:
+    crane = Crane(**machine, patience_s=60.0)
+    crane.run(6.0 if machine else 8.0)
     interrupted(crane, reason)
     assert crane.calibration.idle and crane.calibration.failure_code == "calibration.controller-mode"
 
@@ -257,13 +266,6 @@ def test_an_interruption_ends_the_run_after_its_time_or_at_the_operators_stop(se
     assert crane.calibration.idle and crane.calibration.failure
 
 
-def test_a_rotator_without_encoder_does_not_go_on_after_a_stop() -> None:
-    crane = Crane("aoro_fc8", only_turns=True, patience_s=60.0)
-    crane.run(6.0)
-    interrupted(crane, Reason.ENCODER_LOST)
-    assert crane.calibration.idle and crane.calibration.failure_code == "calibration.controller-mode"
-
-
 def test_a_joint_without_encoder_cannot_be_chosen_alone() -> None:
     profile = load_profile("aoro_fc8")
     with pytest.raises(InputRefused, check=coded("calibration.no-encoder")):
@@ -272,20 +274,17 @@ def test_a_joint_without_encoder_cannot_be_chosen_alone() -> None:
     assert [p.joint for p in plan.joints] == [Joint.LIFT] and not plan.grapple
 
 
-def test_a_refused_setpoint_ends_the_run() -> None:
+@pytest.mark.parametrize(
+    ("refusal", "code"),
+    [(Reason.FINAL_MOVING, "calibration.setpoint-refused"), (Reason.DATAGRAM_AUTHENTICATION, None)],
+    ids=["its own", "a stranger's"],
+)
+def test_a_refused_setpoint_ends_the_run_if_it_is_its_own(refusal: Reason, code: str | None) -> None:
     crane = Crane()
     crane.run(3.0)
-    crane.refuses = 1
-    run = crane.run()
-    assert run.failure_code == "calibration.setpoint-refused"
-
-
-def test_a_strangers_datagram_ends_no_run() -> None:
-    crane = Crane()
-    crane.run(3.0)
-    crane.refuses, crane.refusal = 1, Reason.DATAGRAM_AUTHENTICATION
-    crane.run(1.0)
-    assert crane.calibration.failure_code is None and not crane.calibration.idle
+    crane.refuses, crane.refusal = 1, refusal
+    run = crane.run(1.0)
+    assert run.failure_code == code and run.idle is bool(code)
 
 
 def test_it_waits_until_a_person_arms() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.bunk_load import lies_in_bunk
-from autonomy.grasp.planner import hangs_below, restricted_to
+from autonomy.grasp.planner import Grasp, hangs_below, restricted_to
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.manager.load_bookkeeping import LOOKS, MIN_HITS, FallenLogs, LoadBookkeeping
 from autonomy.manager.load_detector import MIN_WEIGHED, WINDOW_NS, WoodScale, gripped_by_weight
@@ -44,14 +44,18 @@ def field_of(*places: tuple[float, float], yaw_rad: float = 0.3) -> LogMap:
     return field
 
 
+def grasp_of(logs: list[MappedLog]) -> Grasp:
+    first, *others = (log.observation(HERE) for log in logs)
+    return replace(plan_single_log_grasp(ARM, first, 0.0), others=tuple(others))
+
+
 class Hands:
     """A job that grasps the first ``meant`` logs of a field, with a pose and a load that the test sets."""
 
     def __init__(self, field: LogMap, meant: int = 1) -> None:
         self.memory, self.field, self.now_ns = LogMemory(PROFILE), field, 0
         self.load_kg = math.nan
-        first, *others = (log.observation(HERE) for log in field.logs[:meant])
-        self.grasp = replace(plan_single_log_grasp(ARM, first, 0.0), others=tuple(others))
+        self.grasp = grasp_of(field.logs[:meant])
         self.job: Any = SimpleNamespace(grasp=self.grasp, phase=Phase.LOOK)
         self.to(self.grasp.pose)
 
@@ -164,6 +168,11 @@ def test_a_load_that_a_camera_has_seen_hangs_as_it_was_seen() -> None:
     assert after.length_m == log.length_m and after.id == log.id
 
 
+def side_by_side(meant: int) -> Hands:
+    """Two logs, of which the grasp is meant for so many."""
+    return Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant)
+
+
 # -- counted by weight and looks
 def weighed(share: float) -> WoodScale:
     wood = WoodScale()
@@ -202,7 +211,7 @@ def test_a_light_log_teaches_nothing_about_the_wood() -> None:
 
 
 def test_a_log_that_did_not_come_up_still_lies_there() -> None:
-    hands = Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant=2)
+    hands = side_by_side(meant=2)
     numbers = [log.number for log in hands.field.logs]
     assert hands.place(95.0) == numbers[:1]
     grip = hands.memory.grip
@@ -212,7 +221,7 @@ def test_a_log_that_did_not_come_up_still_lies_there() -> None:
 
 def test_a_load_that_rests_on_others_is_no_longer_weighed() -> None:
     """On its way down it came to weigh half, and one of two logs on board was told to lie in the forest."""
-    hands = Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant=2)
+    hands = side_by_side(meant=2)
     hands.load_kg = 190.0
     hands.rise()
     for _ in range(20):
@@ -226,7 +235,7 @@ def test_a_load_that_rests_on_others_is_no_longer_weighed() -> None:
 
 
 def test_a_log_beside_the_grasp_that_came_up_is_on_board() -> None:
-    hands = Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant=1)
+    hands = side_by_side(meant=1)
     numbers = [log.number for log in hands.field.logs]
     hands.place(190.0)
     grip = hands.memory.grip
@@ -253,16 +262,15 @@ class Books:
             base=HERE,
             map_number=lambda listed: listed,
             plane=SimpleNamespace(geodetic=lambda x, y: (x, y, 0.0)),
+            is_on_landing=lambda log: False,
         )
         self.load = LoadBookkeeping(PROFILE, told, self.world)
         self.now_ns = 0
 
     def book(self, *diameters_m: float) -> None:
         logs = [replace(lying(7 + i, -4.0, 3.0 + i, 0.0), diameter_m=d) for i, d in enumerate(diameters_m)]
-        first, *others = (log.observation(HERE) for log in logs)
-        grasp = replace(plan_single_log_grasp(ARM, first, 0.0), others=tuple(others))
         self.now_ns += PERIOD_NS
-        self.load.book_loaded(SimpleNamespace(grasp=grasp), self.now_ns)
+        self.load.book_loaded(SimpleNamespace(grasp=grasp_of(logs)), self.now_ns)
 
     def look(self, in_bunk: int, times: int = LOOKS, driven_m: float = 5.0) -> None:
         for _ in range(times):
@@ -370,7 +378,7 @@ def test_lost_logs_are_not_reported_to_the_company() -> None:
 
 
 def test_a_grasp_restricted_by_weight_is_booked_without_the_rest() -> None:
-    hands = Hands(field_of((-4.0, 3.0), (-4.0, 3.3), yaw_rad=0.0), meant=2)
+    hands = side_by_side(meant=2)
     held = restricted_to(ARM, hands.grasp, hands.place(95.0))
     assert [log.id for log in held.logs] == [hands.grasp.log.id]
 
@@ -427,17 +435,13 @@ def test_nothing_falls_where_the_machine_has_not_been_or_out_of_an_empty_bunk() 
 
 
 def test_a_log_that_fell_off_is_booked_and_said() -> None:
-    told = ForwardingMission("test", (Point(0.0, 0.0), Point(0.0, 0.001)))
-    field = LogMap(PROFILE.bunk)
-    world: Any = SimpleNamespace(
-        sorting=Sorting(told), log_map=field, base=base(0.0, 0.0, math.pi), is_on_landing=lambda log: False
-    )
-    load = LoadBookkeeping(PROFILE, told, world)
+    books = Books()
+    load = books.load
     load.tally.book_loaded([LoadedLog(Point(0.0, 0.0), 1, 0.1)] * 3)
     for x_m in range(20):
-        world.base = base(float(x_m), 0.0, math.pi)
+        books.world.base = base(float(x_m), 0.0, math.pi)
         assert load.check_fallen(x_m) == 0
-    field.restore(seen_often(1, 8.0, 1.4))
+    books.field.restore(seen_often(1, 8.0, 1.4))
     assert load.check_fallen(30) == 1 and load.check_fallen(31) == 0
     tally = load.tally
     assert (tally.loaded, tally.on_board) == (2, 2)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from autonomy.manager.state_chart import diagram, page
+from autonomy.manager.state_chart import page
 from autonomy.manager.transition_table import (
     EVENT_DESCRIPTIONS,
     FINAL_STATES,
@@ -93,16 +93,6 @@ def test_paper_b_observes_at_standstill_and_passes_the_log_before_loading() -> N
         assert State.COLLECT not in reached_from(PAPER_B, State.SEARCH, without=needed), needed
 
 
-DOCS = Path(__file__).parents[2] / "docs"
-
-
 def test_the_page_of_the_activity_manager_is_as_the_code_has_it() -> None:
-    assert (DOCS / "activity.md").read_text() == page(), "run `timberhand mission states --docs docs`"
-
-
-@pytest.mark.parametrize("table", [PAPER_B, OURS], ids=["paper_b", "ours"])
-def test_every_change_is_in_the_diagram(table) -> None:
-    text = diagram(table)
-    for (begin, event), end in table.items():
-        line = next(x for x in text.splitlines() if x.strip().startswith(f"{begin.name} --> {end.name} "))
-        assert event.name.lower().replace("_", " ") in line
+    shown = Path(__file__).parents[2] / "docs" / "activity.md"
+    assert shown.read_text() == page(), "run `timberhand mission states --docs docs`"
