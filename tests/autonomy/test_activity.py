@@ -15,7 +15,6 @@ from autonomy.crane_job.phase_motions import corrected_grasp
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.grasp.selection import plan_single_log_grasp
-from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
@@ -23,7 +22,7 @@ from machine.geometry.sag import true_pin
 from machine.joints import JOINTS, Joint
 from machine.profile import Sag, joint
 from tests.autonomy.crane_stand_in import CYCLE, GROUND_LOG, TICK_NS, StandIn, activity, clearances
-from tests.autonomy.grasp_scenes import PROFILE
+from tests.autonomy.grasp_scenes import ARM, PROFILE
 
 
 def random_log(seed: int) -> LogObservation:
@@ -175,36 +174,34 @@ def test_a_log_that_lies_a_little_elsewhere_is_gripped_there() -> None:
     assert planner.done
 
 
+GRASP = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
+
+
 @pytest.mark.parametrize(
     ("moved_m", "why"),
     [((0.01, 0.0, 0.01), "the tongs forgive it"), ((0.25, 0.2, 0.0), "another log"), ((0.0, 0.0, -0.9), "another log")],
 )
 def test_other_changes_of_a_log_leave_the_aim(moved_m: tuple[float, float, float], why: str) -> None:
-    arm = Arm(PROFILE)
-    grasp = plan_single_log_grasp(arm, GROUND_LOG, 0.0)
     seen = replace(GROUND_LOG, center_m=tuple(c + d for c, d in zip(GROUND_LOG.center_m, moved_m, strict=True)))
-    assert corrected_grasp(arm, grasp, [seen]) is grasp, why
-    assert corrected_grasp(arm, grasp, []) is grasp
+    assert corrected_grasp(ARM, GRASP, [seen]) is GRASP, why
+    assert corrected_grasp(ARM, GRASP, []) is GRASP
 
 
 def test_nothing_is_aimed_at_below_the_ground() -> None:
-    arm = Arm(PROFILE)
-    grasp = plan_single_log_grasp(arm, GROUND_LOG, 0.0)
     x, y, z = GROUND_LOG.center_m
-    lower = corrected_grasp(arm, grasp, [replace(GROUND_LOG, center_m=(x, y, z - 0.2))])
+    lower = corrected_grasp(ARM, GRASP, [replace(GROUND_LOG, center_m=(x, y, z - 0.2))])
     assert lower.support_z_m == pytest.approx(PROFILE.workspace.ground_z_m)
-    assert lower.pose.z_m == pytest.approx(grasp.pose.z_m + lower.support_z_m - grasp.support_z_m)
+    assert lower.pose.z_m == pytest.approx(GRASP.pose.z_m + lower.support_z_m - GRASP.support_z_m)
 
 
 def test_a_log_on_the_ground_that_is_measured_higher_is_gripped_where_it_lies() -> None:
-    arm = Arm(PROFILE)
     x, y, z = GROUND_LOG.center_m
-    grasp = replace(plan_single_log_grasp(arm, GROUND_LOG, 0.0), support_z_m=PROFILE.workspace.ground_z_m)
-    higher = corrected_grasp(arm, grasp, [replace(GROUND_LOG, center_m=(x + 0.03, y, z + 0.1))])
+    grasp = replace(GRASP, support_z_m=PROFILE.workspace.ground_z_m)
+    higher = corrected_grasp(ARM, grasp, [replace(GROUND_LOG, center_m=(x + 0.03, y, z + 0.1))])
     assert higher.support_z_m == grasp.support_z_m and higher.pose.z_m == pytest.approx(grasp.pose.z_m)
     assert higher.log.center_m[0] == x + 0.03, "beside it, it is corrected"
     stacked = replace(grasp, support_z_m=PROFILE.workspace.ground_z_m + 0.2)
-    assert corrected_grasp(arm, stacked, [higher.log]).support_z_m == pytest.approx(stacked.support_z_m + 0.1)
+    assert corrected_grasp(ARM, stacked, [higher.log]).support_z_m == pytest.approx(stacked.support_z_m + 0.1)
 
 
 def test_a_log_at_its_place_is_released_at_once() -> None:

@@ -8,14 +8,13 @@ from math import dist, isfinite, nan
 import numpy as np
 import pytest
 
-from autonomy.crane_job.activity import Activity, Phase
+from autonomy.crane_job.activity import Phase
 from autonomy.crane_job.cycle import HIGHER_M, LOOK_ASIDE_RAD, MAX_HIGHER
 from autonomy.crane_job.grasp_verification import is_between_jaws
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.grapple_heights import retreat_height_m
 from autonomy.grasp.planner import NoGrasp
 from autonomy.missions.crane_job import CraneJob
-from autonomy.motion.arm_kinematics import Arm
 from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from can_dbc.messages.datagrams import decode
@@ -25,7 +24,7 @@ from machine.joints import JOINTS, Joint
 from machine.profile import joint
 from machine.status.modes import Mode
 from tests.autonomy.crane_stand_in import CYCLE, GROUND_LOG, HOME, TICK_NS, StandIn, activity, clearances, refusing
-from tests.autonomy.grasp_scenes import PROFILE
+from tests.autonomy.grasp_scenes import ARM, PROFILE
 
 
 def test_nothing_is_sent_before_the_controller_is_armed() -> None:
@@ -95,20 +94,18 @@ def test_a_held_log_that_is_listed_twice_is_no_obstacle() -> None:
 
 
 def test_only_what_lies_in_closed_jaws_is_between_them() -> None:
-    arm = Arm(PROFILE)
     x, y, z = GROUND_LOG.center_m
-    pin = arm.pose_above(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.jaws) - 0.1, 2.0)
-    assert is_between_jaws(arm, GROUND_LOG, pin)
-    assert not is_between_jaws(arm, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
-    upright = replace(GROUND_LOG, axis=(0.0, 0.0, 1.0))
-    assert is_between_jaws(arm, upright, pin)
+    pin = ARM.pose_above(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.jaws) - 0.1, 2.0)
+    assert is_between_jaws(ARM, GROUND_LOG, pin)
+    assert not is_between_jaws(ARM, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
+    assert is_between_jaws(ARM, replace(GROUND_LOG, axis=(0.0, 0.0, 1.0)), pin), "upright"
     ax, ay, _ = GROUND_LOG.axis
     aside_m = 0.6 * GROUND_LOG.diameter_m
     beside = replace(GROUND_LOG, center_m=(x - aside_m * ay, y + aside_m * ax, z))
-    assert not is_between_jaws(arm, beside, pin), "another one, beside it"
+    assert not is_between_jaws(ARM, beside, pin), "another one, beside it"
     half_m = 0.5 * GROUND_LOG.length_m
     ends = replace(GROUND_LOG, center_m=(x + (half_m + 0.2) * ax, y + (half_m + 0.2) * ay, z))
-    assert not is_between_jaws(arm, ends, pin), "it ends before them"
+    assert not is_between_jaws(ARM, ends, pin), "it ends before them"
 
 
 def test_a_missed_log_is_gripped_again() -> None:
@@ -303,18 +300,15 @@ def test_a_load_that_rests_above_its_place_is_released_there(low: bool, monkeypa
 
 
 # -- over the bunk before the machine drives, and back where there is no path
-ARM = Arm(PROFILE)
 BUNK = PROFILE.bunk
 
 
-def stow(crane: StandIn) -> Activity:
+def stow(crane: StandIn) -> None:
     planner = activity(stow_only=True)
     while not planner.idle:
         data = crane.step(planner)
         assert data is None or decode(data).grapple is GrappleCommand.HOLD
-    assert planner.done and planner.idle, planner.failure
-    assert planner.grasp is None
-    return planner
+    assert planner.done and planner.grasp is None, planner.failure
 
 
 def over_the_bunk(q: tuple[float, ...]) -> bool:
@@ -325,8 +319,7 @@ def over_the_bunk(q: tuple[float, ...]) -> bool:
 
 
 def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_jaws_as_they_are() -> None:
-    crane = StandIn(PROFILE, [GROUND_LOG])
-    planner = activity()
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     crane.until(planner, Phase.DESCEND)
     planner.abort("that will do")
     crane.run(planner)
@@ -344,25 +337,21 @@ def test_where_it_already_rests_there_nothing_moves() -> None:
     assert crane.q == pytest.approx(before, abs=1e-6)
 
 
-@pytest.mark.parametrize("trouble", [Unreachable("no way is clear"), NoGrasp("grasp.bunk-full", "the bunk is full")])
-def test_a_log_without_a_path_on_is_released_where_it_lay(trouble: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autonomy.crane_job.cycle.carry_motion", refusing(trouble))
-    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+@pytest.mark.parametrize(
+    ("what", "trouble", "code", "direct"),
+    [
+        ("carry_motion", Unreachable("no way is clear"), "activity.unreachable", True),
+        ("carry_motion", NoGrasp("grasp.bunk-full", "the bunk is full"), "grasp.bunk-full", True),
+        ("plan_place", NoGrasp("grasp.bunk-full", "no room"), "grasp.bunk-full", False),
+    ],
+    ids=["no way", "a full bunk", "a full bunk, once it is lifted"],
+)
+def test_a_log_without_a_path_on_is_released_where_it_lay(what, trouble, code, direct, monkeypatch) -> None:
+    monkeypatch.setattr(f"autonomy.crane_job.cycle.{what}", refusing(trouble))
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=direct)
     crane.run(planner)
-    assert planner.failure == str(trouble) and planner.idle
-    assert crane.phases()[-3:] == ["LOWER", "OPEN", "FAILED"]
-    (log,) = crane.logs
-    assert crane.held is None
-    assert log.center_m == pytest.approx(GROUND_LOG.center_m, abs=0.1)
-
-
-def test_a_lifted_log_without_a_path_on_goes_down_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lifted alone first, it hangs over where it lay when there turns out to be no room."""
-    monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", refusing(NoGrasp("grasp.bunk-full", "no room")))
-    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=False)
-    crane.run(planner)
-    assert planner.failure_code == "grasp.bunk-full"
-    assert "LIFT" in crane.phases() and crane.phases()[-3:] == ["LOWER", "OPEN", "FAILED"]
+    assert planner.failure == str(trouble) and planner.failure_code == code and planner.idle
+    assert crane.phases()[-3:] == ["LOWER", "OPEN", "FAILED"] and ("LIFT" in crane.phases() or direct)
     (log,) = crane.logs
     assert crane.held is None and log.center_m == pytest.approx(GROUND_LOG.center_m, abs=0.1)
 
@@ -385,22 +374,18 @@ class Hooking(StandIn):
             super()._drop()
 
 
-@pytest.mark.parametrize(("free_m", "code"), [(0.1, None), (0.25, None), (5.0, "activity.log-kept")])
-def test_a_log_that_the_opened_jaws_take_along_is_released_higher(free_m: float, code: str | None) -> None:
+@pytest.mark.parametrize(
+    ("free_m", "opens", "code"),
+    [(-1.0, 1, None), (0.1, 2, None), (0.25, 3, None), (5.0, 1 + MAX_HIGHER, "activity.log-kept")],
+)
+def test_a_log_that_the_opened_jaws_take_along_is_released_higher(free_m: float, opens: int, code: str | None) -> None:
     """It was dragged out of the bunk by the next job, and counted as loaded."""
     crane = Hooking(PROFILE, [GROUND_LOG], feedback=False, log_kg=90.0, free_m=free_m)
     planner = activity(fetches_next=lambda log: True)
     crane.run(planner)
     assert planner.failure_code == code and planner.done == (code is None)
-    assert crane.phases().count("OPEN") == (1 + MAX_HIGHER if code else 2 if free_m < 0.15 else 3)
+    assert crane.phases().count("OPEN") == opens
     assert (crane.held is None) == (code is None) and lies_in_bunk(PROFILE.bunk, crane.logs[0])
-
-
-def test_a_released_load_is_no_reason_to_open_again() -> None:
-    crane = StandIn(PROFILE, [GROUND_LOG], feedback=False, log_kg=90.0)
-    planner = activity(fetches_next=lambda log: True)
-    crane.run(planner)
-    assert planner.done and crane.phases().count("OPEN") == 1
 
 
 @dataclass

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -62,14 +63,8 @@ def run(test: StepTest, seconds: float = 30.0, each: Callable[[Lockstep], None] 
     try:
         planner = _Planner(test)
         operator = Operator(HASH, lambda action, report: None, max_stops=0)
-        system = Lockstep(
-            Settings(PROFILE, HASH, PROFILE.rate_hz),
-            build_guard(profile_path("palms_471")),
-            plant,
-            planner,
-            operator,
-            Observer(None, []),
-        )
+        settings, guard = Settings(PROFILE, HASH, PROFILE.rate_hz), build_guard(profile_path("palms_471"))
+        system = Lockstep(settings, guard, plant, planner, operator, Observer(None, []))
         planner.bus = InProcessBus(system.core, "step")
         end_ns = system.now_ns + int(seconds * 1e9)
         while system.now_ns < end_ns and not test.idle:
@@ -225,23 +220,17 @@ def test_only_the_changed_lines_change_and_carry_the_mark(name: str, tmp_path: P
     assert load_profile(out).joints["slew"].valve.deadband_plus_pct == 13.42
 
 
-SAG = {
-    "head_rad_m": 0.0023,
-    "pin_rad_m": 0.0017,
-    "rest_rad": 0.011,
-    "load_rad_nm": 1.1e-6,
-    "head_nm_m": 2100.0,
-    "pin_nm_m": 1500.0,
-}
+SAG = Sag(0.0023, 0.0017, 0.011, 1.1e-6, 2100.0, 1500.0)
 
 
 @pytest.mark.parametrize("name", shipped_profiles())
 def test_a_sag_table_is_added_and_another_calibration_replaces_it(name: str, tmp_path: Path) -> None:
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
-    write_profile(SHIPPED / f"{name}.toml", first, [(("sag", k), v, "by survey") for k, v in SAG.items()], "2026-11-21")
-    assert load_profile(first).sag == Sag(**SAG)
+    changes = [(("sag", key), value, "by survey") for key, value in msgspec.structs.asdict(SAG).items()]
+    write_profile(SHIPPED / f"{name}.toml", first, changes, "2026-11-21")
+    assert load_profile(first).sag == SAG
     write_profile(first, second, [(("sag", "pin_rad_m"), 0.0019, "by survey")], "2026-12-01")
-    assert load_profile(second).sag == Sag(**{**SAG, "pin_rad_m": 0.0019})
+    assert load_profile(second).sag == msgspec.structs.replace(SAG, pin_rad_m=0.0019)
     assert second.read_text().count("[sag]") == 1
     assert profile_hash(load_profile(second)) != profile_hash(load_profile(first))
 
@@ -259,14 +248,8 @@ def test_zeros_and_sag_of_a_survey_are_written_together() -> None:
     counts = lift.direction * round(0.002 / lift.unit_per_count)
     assert found["joints", "lift", "encoder", "zero_counts"] == lift.zero_counts + counts
     assert found["joints", "slew", "encoder", "zero_counts"] == profile.joints["slew"].encoder.zero_counts
-    assert {k[-1]: v for k, v in found.items() if k[0] == "sag"} == {
-        "head_rad_m": 0.0054322,
-        "pin_rad_m": 0.0036,
-        "rest_rad": 0.028,
-        "load_rad_nm": 1.2346e-6,
-        "head_nm_m": 4500.0,
-        "pin_nm_m": 3000.0,
-    }
+    written = {path[-1]: value for path, value in found.items() if path[0] == "sag"}
+    assert written == msgspec.structs.asdict(Sag(0.0054322, 0.0036, 0.028, 1.2346e-6, 4500.0, 3000.0))
 
 
 def test_a_full_speed_is_written_for_the_nominal_arm_of_the_lever() -> None:
@@ -275,9 +258,8 @@ def test_a_full_speed_is_written_for_the_nominal_arm_of_the_lever() -> None:
     speeds, at = (0.2, 0.22), lever.lever_at[5]
     valve = ValveFit((0.12, 0.13), 0.021, 1.04, speeds, 0.0, at, (10.0, 0.4), (0.0, 0.0), 0.0, (), {})
     lift = JointResult(Joint.LIFT, valve, None, (0.3, 0.3), (0.0, 0.0), 0.18, ())
-    found = {
-        path[-1]: value for path, value in changed(profile, CalibrationResult({Joint.LIFT: lift}, {}, None)).items()
-    }
+    written = changed(profile, CalibrationResult({Joint.LIFT: lift}, {}, None))
+    found = {path[-1]: value for path, value in written.items()}
     assert lever.lever[5] < 0.95, "measured where the arm is short and the joint fast"
     assert found["full_speed_plus"] == pytest.approx(0.2 * lever.lever[5], abs=1e-4)
     assert found["full_speed_minus"] == pytest.approx(0.22 * lever.lever[5], abs=1e-4)
