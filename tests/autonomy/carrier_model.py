@@ -105,7 +105,7 @@ class Vehicle:
         plane: LocalPlane | None = None,
     ) -> None:
         self.x, self.y, self.yaw = pose
-        self.bend = self.speed = self.way_m = 0.0
+        self.bend = self.speed = 0.0
         self.now_ns = START_NS
         self.plane = plane or LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg, 260.0)
         self.sky = True
@@ -194,7 +194,6 @@ class Vehicle:
         self.x += way * level * math.cos(course)
         self.y += way * level * math.sin(course)
         self.yaw += turned
-        self.way_m += way
 
     def _lean(self) -> tuple[float, float]:
         """Roll and pitch of the rear half on the slope."""

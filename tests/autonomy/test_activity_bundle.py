@@ -33,7 +33,6 @@ class Bundle(StandIn):
         taken = [log.id for log in self.logs if log.id not in self.slips and abs(self.pin()[1] - log.center_m[1]) < 0.5]
         if taken:
             self.held = taken[0]
-        self._also = taken[1:]
         self._from = {log.id: np.array(log.center_m) - self.pin() for log in self.logs if log.id in taken}
 
     def _carry(self) -> None:

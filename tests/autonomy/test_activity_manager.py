@@ -157,13 +157,6 @@ def test_paper_b_leaves_its_rotator_as_it_stands(table: Table, turns: bool) -> N
     assert (len(angles_rad) > 1) is turns
 
 
-@whole
-def test_paper_b_loads_a_second_log_that_it_passed_meanwhile() -> None:
-    forwarder, manager = begin(((1, 13.0, 2.8, -0.53), (2, 17.0, -2.8, 0.53)), PAPER_B, end_m=32.0)
-    forwarder.run(manager, ended)
-    assert manager.state is State.DONE and forwarder.in_bunk == manager.tally.loaded == 2
-
-
 def test_the_circle_is_only_left_on_its_far_side() -> None:
     forwarder, manager = begin((), PAPER_B)
     forwarder.run(manager, at(State.SEARCH))

@@ -108,22 +108,9 @@ def test_only_what_lies_in_closed_jaws_is_between_them() -> None:
     assert not is_between_jaws(ARM, ends, pin), "it ends before them"
 
 
-def test_a_missed_log_is_gripped_again() -> None:
-    crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=2), activity()
-    crane.run(planner)
-    assert planner.done and planner.missed == 2
-    assert crane.phases().count("LOOK") == 3 and crane.phases()[-7:] == CYCLE[3:]
-
-
-def test_a_log_that_is_missed_three_times_ends_the_job() -> None:
-    crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=9), activity()
-    crane.run(planner)
-    assert planner.phase is Phase.FAILED and planner.failure_code == "activity.log-missed"
-    assert not planner.done and planner.idle and crane.trace[-1].phase == "FAILED"
-
-
-@pytest.mark.parametrize("slips", [1, 9])
-def test_a_late_list_is_evaluated_once(slips: int) -> None:
+@pytest.mark.parametrize("slips", [1, 2, 9])
+@pytest.mark.parametrize("is_late", [False, True], ids=["at once", "a late list"])
+def test_a_missed_log_is_gripped_again_and_given_up_the_third_time(slips: int, is_late: bool) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=slips), activity()
     told, arrived_ns = crane.seen, None
 
@@ -135,10 +122,12 @@ def test_a_late_list_is_evaluated_once(slips: int) -> None:
             return None
         return told()
 
-    crane.seen = late
+    crane.seen = late if is_late else told
     crane.run(planner)
-    assert planner.missed == min(slips, 3) and planner.done == (slips < 3)
+    assert planner.idle and planner.missed == min(slips, 3) and planner.done == (slips < 3)
     assert crane.phases().count("LOOK") == min(slips + 1, 3)
+    assert planner.failure_code == (None if planner.done else "activity.log-missed")
+    assert crane.phases()[-7:] == CYCLE[3:] if planner.done else planner.phase is Phase.FAILED
 
 
 def test_a_log_that_is_lost_during_the_motion_is_picked_again() -> None:

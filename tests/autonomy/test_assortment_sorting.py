@@ -17,18 +17,7 @@ from autonomy.manager.sorting import Sorting
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.manager_missions import (
-    PLANE,
-    again,
-    at,
-    completed,
-    ended,
-    forwarder,
-    managed,
-    place,
-    states,
-    whole,
-)
+from tests.autonomy.manager_missions import PLANE, again, at, completed, ended, forwarder, managed, place, states, whole
 from tests.autonomy.mapped_logs import lying
 from tests.codes import numbers_in
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from math import pi
 from types import SimpleNamespace
 
@@ -19,6 +19,7 @@ from autonomy.calibration.result import identify
 from autonomy.calibration.spool_program import (
     PULSES,
     TURN_TOPS_PCT,
+    SpoolProgram,
     allowed_by,
     reversed_sweep,
     staircase,
@@ -98,9 +99,9 @@ def test_dead_time_and_lag_are_found_to_milliseconds(machine: StandIn) -> None:
 
 
 def test_a_valve_node_without_spool_sensors_gives_no_dead_time() -> None:
-    silent = [dataclasses.replace(t, spool=None) for t in measured(StandIn()) if t.kind == "staircase"]
+    silent = [replace(t, spool=None) for t in measured(StandIn()) if t.kind == "staircase"]
     assert fit_delay(silent) is None
-    dead = [dataclasses.replace(t, spool=np.zeros_like(t.position)) for t in measured(StandIn())]
+    dead = [replace(t, spool=np.zeros_like(t.position)) for t in measured(StandIn())]
     assert fit_delay(dead) is None
 
 
@@ -120,13 +121,7 @@ OFFSETS = (0.002, -0.0025, 0.0015, 0.002)
 
 def surveyed(noise_m: float, friction_nm: float = 0.0, weighed: bool = True) -> list[SurveyReading]:
     rng = np.random.default_rng(3)
-    candidates = [
-        (slew, lift, tilt, ext, 0.0)
-        for slew in (-0.4, 0.0, 0.4)
-        for lift in (0.4, 0.8, 1.2)
-        for tilt in (-2.0, -1.2, -0.4)
-        for ext in (0.3, 1.0, 1.6)
-    ]
+    candidates = list(product((-0.4, 0.0, 0.4), (0.4, 0.8, 1.2), (-2.0, -1.2, -0.4), (0.3, 1.0, 1.6), (0.0,)))
     chosen = most_informative_poses(PALMS.kinematics, candidates, 7)
     assert len(set(chosen)) == 7
     readings = []
@@ -140,17 +135,11 @@ def surveyed(noise_m: float, friction_nm: float = 0.0, weighed: bool = True) -> 
 
 def off_m(sag: Sag, offsets: tuple[float, ...], load_kg: float) -> float:
     """Greatest error of the true pin over the work space when encoders and column are read by a fit."""
-    worst = 0.0
-    for lift in (0.2, 0.6, 1.0):
-        for tilt in (-1.8, -1.0, -0.5):
-            for ext in (0.2, 1.5):
-                q = (0.2, lift, tilt, ext, 0.0)
-                read = tuple(v + true - found for v, true, found in zip(q, (*OFFSETS, 0), (*offsets, 0), strict=True))
-                true = true_pin(SAG, PALMS.kinematics, q, load_kg)
-                worst = max(
-                    worst, float(np.linalg.norm(np.subtract(true_pin(sag, PALMS.kinematics, read, load_kg), true)))
-                )
-    return worst
+    wrong = np.subtract((*OFFSETS, 0.0), (*offsets, 0.0))
+    places = np.array(list(product((0.2,), (0.2, 0.6, 1.0), (-1.8, -1.0, -0.5), (0.2, 1.5), (0.0,))))
+    found = [true_pin(sag, PALMS.kinematics, q, load_kg) for q in places + wrong]
+    true = [true_pin(SAG, PALMS.kinematics, q, load_kg) for q in places]
+    return float(np.linalg.norm(np.subtract(found, true), axis=1).max())
 
 
 def test_zeros_and_sag_come_out_of_a_survey_that_weighs_the_crane() -> None:
@@ -213,7 +202,7 @@ def test_a_joint_that_was_held_does_not_fit_a_valve() -> None:
     tests = list(measured(StandIn()))
     held = tests[1].position.copy()
     held[len(held) // 2 :] = held[len(held) // 2]
-    tests[1] = dataclasses.replace(tests[1], position=held)
+    tests[1] = replace(tests[1], position=held)
     problems = identify(PALMS, found(tuple(tests))).implausible
     assert any(problem.code == "implausible.motion-residual" for problem in problems), problems
 
@@ -238,24 +227,25 @@ def turned(
 
     angle, turns, stood = 0.0, [], []
     before = read()
+
+    def turn(side: int, kind: str, program: SpoolProgram) -> float:
+        """One more, and how far it went."""
+        nonlocal angle, before
+        record, was = machine.run(Joint.ROT, side, kind, program, angle), angle
+        angle = float(record.position[-1])
+        after = read()
+        turns.append(Turn(record, before, after, readings))
+        before = after
+        return abs(angle - was)
+
     for side in (1, -1) if searched else ():
         for top_pct in TURN_TOPS_PCT:  # rising ramps until one turns it, as the procedure does
-            record = machine.run(Joint.ROT, side, "search", turn_search(ROT, side, top_pct, allowed_by(ROT)), angle)
-            turned, angle = abs(float(record.position[-1]) - angle), float(record.position[-1])
-            after = read()
-            turns.append(Turn(record, before, after, readings))
-            before = after
-            if turned > MIN_FIRST_TURN_RAD:
+            if turn(side, "search", turn_search(ROT, side, top_pct, allowed_by(ROT))) > MIN_FIRST_TURN_RAD:
                 break
     for share, far in PULSES:
         for side, goal in ((1, far), (-1, 0.0)):
-            program = pulse_to(ROT, fit_turns(turns, ROT), side, share, goal)
-            record = machine.run(Joint.ROT, side, "pulse", program, angle)
-            angle = float(record.position[-1])
-            after = read()
-            turns.append(Turn(record, before, after, readings))
+            turn(side, "pulse", pulse_to(ROT, fit_turns(turns, ROT), side, share, goal))
             stood.append(angle)
-            before = after
     return turns, stood
 
 

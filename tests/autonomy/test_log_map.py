@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +19,17 @@ from machine.loading.profile_file import load_profile
 from tests.autonomy.mapped_logs import base, lying, seen
 
 PROFILE = load_profile("aoro_fc8")
+HERE = base(0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def field() -> LogMap:
+    return LogMap(PROFILE.bunk)
+
+
+def triangle(*variances: float) -> tuple[float, ...]:
+    """The covariance of a log without correlations."""
+    return tuple(np.diag(variances)[np.triu_indices(7)].tolist())
 
 
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-3, 3), st.floats(-3, 3)), min_size=3, max_size=8))
@@ -35,8 +46,8 @@ def test_a_log_keeps_its_number_and_position_while_the_machine_passes(poses) -> 
         assert log.hits == len(poses)
 
 
-def test_an_average_is_better_than_its_observations() -> None:
-    field, rng, at = LogMap(PROFILE.bunk), np.random.default_rng(3), base(0.0, 0.0, 0.3)
+def test_an_average_is_better_than_its_observations(field: LogMap) -> None:
+    rng, at = np.random.default_rng(3), base(0.0, 0.0, 0.3)
     true = lying(1, 6.0, 5.0)
     for k in range(40):
         field.observe(seen([true], at, tuple(rng.normal(0.0, 0.1, 2))), at, k)
@@ -45,15 +56,11 @@ def test_an_average_is_better_than_its_observations() -> None:
     assert log.sigma_m == pytest.approx(0.1 / math.sqrt(40), rel=1e-6)
 
 
-def test_a_more_certain_observation_has_more_weight() -> None:
-    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+def test_a_more_certain_observation_has_more_weight(field: LogMap) -> None:
     true = lying(1, 6.0, 5.0)
-    (o,) = seen([true], at)
-    field.observe(seen([true], at, (0.2, 0.0)), at, 1)
-    good = np.zeros((7, 7))
-    good[np.diag_indices(7)] = 1e-4
-    sure = LogObservation(o.id, o.center_m, o.axis, o.length_m, o.diameter_m, tuple(good[np.triu_indices(7)]))
-    field.observe([sure], at, 2)
+    field.observe(seen([true], HERE, (0.2, 0.0)), HERE, 1)
+    (sure,) = seen([true], HERE)
+    field.observe([replace(sure, covariance=triangle(*[1e-4] * 7))], HERE, 2)
     assert np.linalg.norm(field.logs[0].center_m - true.center_m) < 0.01
 
 
@@ -61,22 +68,21 @@ def sighting(
     whole: LogObservation, length_m: float, sigmas_m: tuple[float, float], sense: float = 1.0
 ) -> LogObservation:
     """The log with its end towards its axis cut off; ``sigmas_m`` of its start and its end."""
-    spread = np.diag(np.square([0.02, 0.02, 0.02, 0.02, *sigmas_m[:: int(sense)], 0.01]))
+    known = triangle(*np.square([0.02, 0.02, 0.02, 0.02, *sigmas_m[:: int(sense)], 0.01]))
     cut_m = 0.5 * (whole.length_m - length_m)
     x, y, z = (c - cut_m * a for c, a in zip(whole.center_m, whole.axis, strict=True))
     axis = tuple(sense * a for a in whole.axis)
-    known = tuple(spread[np.triu_indices(7)].tolist())
-    return LogObservation(whole.id, (x, y, z), axis, length_m, whole.diameter_m, known)
+    return replace(whole, center_m=(x, y, z), axis=axis, length_m=length_m, covariance=known)
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
-def test_an_end_that_leaves_the_picture_does_not_move_the_middle(sense: float) -> None:
-    field, at, true = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), lying(1, 6.0, 5.0)
-    (whole,) = seen([true], at)
+def test_an_end_that_leaves_the_picture_does_not_move_the_middle(sense: float, field: LogMap) -> None:
+    true = lying(1, 6.0, 5.0)
+    (whole,) = seen([true], HERE)
     for k in range(20):
-        field.observe([sighting(whole, whole.length_m, (0.3, 0.3), sense)], at, 1 + k)
+        field.observe([sighting(whole, whole.length_m, (0.3, 0.3), sense)], HERE, 1 + k)
     for k in range(30):
-        field.observe([sighting(whole, 0.6 * whole.length_m, (0.02, 0.61), sense)], at, 30 + k)
+        field.observe([sighting(whole, 0.6 * whole.length_m, (0.02, 0.61), sense)], HERE, 30 + k)
     (log,) = field.logs
     assert np.linalg.norm(log.center_m - true.center_m) < 0.02
     assert log.length_m == pytest.approx(whole.length_m, abs=0.02)
@@ -84,51 +90,48 @@ def test_an_end_that_leaves_the_picture_does_not_move_the_middle(sense: float) -
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 @pytest.mark.parametrize("others", [2, 3])
-def test_a_log_never_seen_whole_is_as_long_as_the_others_once_there_are_some(sense: float, others: int) -> None:
-    field, at, true = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), lying(9, 6.0, 5.0)
-    for other in seen([lying(1 + i, 9.0 + 3.0 * i, 8.0) for i in range(others)], at):
-        field.observe([sighting(other, other.length_m, (0.05, 0.05))], at, 1)
+def test_a_log_never_seen_whole_is_as_long_as_the_others_once_there_are_some(sense, others, field) -> None:
+    true = lying(9, 6.0, 5.0)
+    for other in seen([lying(1 + i, 9.0 + 3.0 * i, 8.0) for i in range(others)], HERE):
+        field.observe([sighting(other, other.length_m, (0.05, 0.05))], HERE, 1)
     field.remove(1)  # a collected log counts
-    (whole,) = seen([true], at)
+    (whole,) = seen([true], HERE)
     for k in range(10):
-        field.observe([sighting(whole, 1.2, (0.02, 0.61), sense)], at, 2 + k)
+        field.observe([sighting(whole, 1.2, (0.02, 0.61), sense)], HERE, 2 + k)
     log = nearest(field.logs, true.center_m[:2])
     off_m = float(np.linalg.norm(log.center_m - true.center_m))
     assert (off_m < 0.02) == (others >= 3) and (others >= 3 or off_m == pytest.approx(0.4, abs=0.02))
 
 
-def test_one_observation_does_not_confirm_a_log() -> None:
-    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
-    field.observe(seen([lying(1, 6.0, 5.0)], at), at, 10)
+def test_one_observation_does_not_confirm_a_log(field: LogMap) -> None:
+    field.observe(seen([lying(1, 6.0, 5.0)], HERE), HERE, 10)
     assert CONFIRMED_HITS == 2 and not field.logs
-    field.observe(seen([lying(1, 6.0, 5.0)], at), at, 20)
+    field.observe(seen([lying(1, 6.0, 5.0)], HERE), HERE, 20)
     assert len(field.logs) == 1
 
 
-def test_logs_in_the_bunk_are_not_mapped() -> None:
-    field, at, bunk = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), PROFILE.bunk
+def test_logs_in_the_bunk_are_not_mapped(field: LogMap) -> None:
+    bunk = PROFILE.bunk
     inside = LogObservation(4, (*bunk.center_m, bunk.floor_z_m + 0.2), (1.0, 0.0, 0.0), 2.0, 0.25)
     for k in range(3):
-        assert field.observe([inside], at, k) == {}
+        assert field.observe([inside], HERE, k) == {}
     assert not field.logs
 
 
-def test_two_logs_side_by_side_stay_separate() -> None:
-    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+def test_two_logs_side_by_side_stay_separate(field: LogMap) -> None:
     logs = [lying(1, 6.0, 5.0), lying(2, 6.0, 5.3)]
     for k in range(3):
-        assert field.observe(seen(logs, at), at, k) == {1: 1, 2: 2}
+        assert field.observe(seen(logs, HERE), HERE, k) == {1: 1, 2: 2}
     assert len(field.logs) == 2
 
 
-def test_a_restarted_average_drops_old_observations_and_keeps_misses() -> None:
-    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+def test_a_restarted_average_drops_old_observations_and_keeps_misses(field: LogMap) -> None:
     true = lying(1, 6.0, 5.0)
     for k in range(5):
-        field.observe(seen([true], at, (0.25, 0.0)), at, k)
+        field.observe(seen([true], HERE, (0.25, 0.0)), HERE, k)
     assert field.record_miss(1) == 1
     for k in range(2):
-        field.observe(seen([true], at), at, 10 + k)
+        field.observe(seen([true], HERE), HERE, 10 + k)
     (log,) = field.logs
     assert log.number == 1 and log.misses == 1
     assert log.center_m == pytest.approx(true.center_m, abs=1e-9)
@@ -136,20 +139,18 @@ def test_a_restarted_average_drops_old_observations_and_keeps_misses() -> None:
     assert not field.logs and field.get(1) is None
 
 
-def test_a_listed_log_is_mapped_at_once_and_matched_when_observed() -> None:
-    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+def test_a_listed_log_is_mapped_at_once_and_matched_when_observed(field: LogMap) -> None:
     field.add_known(lying(0, 6.1, 5.0))
     assert nearest(field.logs, np.array([0.0, 0.0])) is field.logs[0]
-    assert field.observe(seen([lying(5, 6.0, 5.0)], at), at, 1) == {5: 1}
+    assert field.observe(seen([lying(5, 6.0, 5.0)], HERE), HERE, 1) == {5: 1}
 
 
-def test_the_logs_near_a_point_are_those_of_the_map_as_it_is_now() -> None:
-    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+def test_the_logs_near_a_point_are_those_of_the_map_as_it_is_now(field: LogMap) -> None:
     here = np.array([6.0, 5.0])
     for x_m in (6.1, 7.0, 30.0):
         field.add_known(lying(0, x_m, 5.0))
     assert [log.number for log in field.near(here, 2.0)] == [1, 2]
-    field.observe(seen([lying(5, 6.0, 5.0)], at), at, 1)
+    field.observe(seen([lying(5, 6.0, 5.0)], HERE), HERE, 1)
     assert field.near(here, 0.09)[0] is field.get(1), "the average moved"
     field.record_miss(2)
     assert [log.number for log in field.near(here, 2.0)] == [1], "no longer confirmed"
@@ -157,16 +158,12 @@ def test_the_logs_near_a_point_are_those_of_the_map_as_it_is_now() -> None:
     assert not field.near(here, 2.0) and [log.number for log in field.near(here, 25.0)] == [3]
 
 
-def test_an_unknown_axis_does_not_split_a_log() -> None:
-    sure, unsure = (
-        tuple(np.diag([0.01] * 2 + [turn**2] * 2 + [0.04] * 2 + [0.01])[np.triu_indices(7)].tolist())
-        for turn in (0.02, 0.6)
-    )
-    for covariance, logs in ((unsure, 1), (sure, 2)):
-        field = LogMap(PROFILE.bunk)
-        for k, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) * 2):
-            field.observe([LogObservation(1, (-4.0, 3.0, -1.3), axis, 2.0, 0.25, covariance)], base(0.0, 0.0, 0.0), k)
-        assert len(field.logs) == logs
+@pytest.mark.parametrize(("turn_rad", "logs"), [(0.6, 1), (0.02, 2)])
+def test_an_unknown_axis_does_not_split_a_log(turn_rad: float, logs: int, field: LogMap) -> None:
+    covariance = triangle(0.01, 0.01, turn_rad**2, turn_rad**2, 0.04, 0.04, 0.01)
+    for k, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) * 2):
+        field.observe([LogObservation(1, (-4.0, 3.0, -1.3), axis, 2.0, 0.25, covariance)], HERE, k)
+    assert len(field.logs) == logs
 
 
 # -- where the machine stops
@@ -190,9 +187,7 @@ def test_the_base_faces_backwards_over_the_bunk() -> None:
 
 def test_the_base_in_a_bend_agrees_with_the_geometry_of_the_carrier() -> None:
     bend = 0.4
-    rear = rear_from_front(
-        bend, (CARRIER.front_axle_m, 0.0, 0.0)
-    )  # front axle in the rear frame, that lies in the plane
+    rear = rear_from_front(bend, (CARRIER.front_axle_m, 0.0, 0.0))  # the front axle, in the plane of the rear frame
     base = base_on_path(CARRIER, (rear[0], rear[1], bend), (-CARRIER.rear_axle_m, 0.0), 0.0)
     assert base.position_m[:2] == pytest.approx(CARRIER.crane_base_m[:2], abs=1e-9)
 
@@ -232,25 +227,18 @@ def test_work_is_less_for_a_log_near_the_bunk() -> None:
 
 def test_the_altitude_of_the_site_does_not_matter() -> None:
     log = lying(3, 20.0, 4.5)
-    high = dataclasses.replace(log, center_m=log.center_m + np.array([0.0, 0.0, 260.0]))
+    high = replace(log, center_m=log.center_m + np.array([0.0, 0.0, 260.0]))
     assert best_stop([high], REACH, straight, 10.0, 40.0) == best_stop([log], REACH, straight, 10.0, 40.0)
 
 
 def looked_everywhere(logs, begin_m: float, end_m: float) -> LoadingStop | None:
     """The same from the work for every log at every place, as the module's docstring has it."""
     places = np.arange(begin_m, end_m + 1e-9, STEP_M)
-    level = [dataclasses.replace(g, center_m=np.array([*g.center_m[:2], 0.5 * g.diameter_m])) for g in logs]
+    level = [replace(g, center_m=np.array([*g.center_m[:2], 0.5 * g.diameter_m])) for g in logs]
     seen = [[g.observation(straight(x)) for g in level] for x in places.tolist()]
     ground = REACH.ground_z_m + 0.5 * np.array([g.diameter_m for g in logs])
-    work = np.array(
-        [
-            [
-                REACH.work_s(dataclasses.replace(o, center_m=(*o.center_m[:2], z)))
-                for o, z in zip(row, ground, strict=True)
-            ]
-            for row in seen
-        ]
-    ).reshape(len(places), len(logs))
+    rested = [[replace(o, center_m=(*o.center_m[:2], z)) for o, z in zip(row, ground, strict=True)] for row in seen]
+    work = np.array([[REACH.work_s(o) for o in row] for row in rested]).reshape(len(places), len(logs))
     taken = np.isfinite(work)
     if not taken.any():
         return None

@@ -24,15 +24,7 @@ from autonomy.missions.export import FORMATS, export
 from autonomy.missions.fpr import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
 from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.mission_file import load_mission, read, save_mission, verify
-from autonomy.missions.model import (
-    Fence,
-    ForwardingMission,
-    KnownLog,
-    Landing,
-    MissionError,
-    Options,
-    Point,
-)
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, MissionError, Options, Point
 from autonomy.missions.validation import SWAPPED_HINT
 from tests.autonomy.mission_checks import EXAMPLES, assert_route, codes, good, peak_bytes, place
 from tests.autonomy.mission_texts import (
@@ -289,12 +281,6 @@ def test_a_bomb_costs_no_more_than_the_largest_mission(kind: str) -> None:
             data = data[:at] + (1000).to_bytes(4, "little") + data[at + 4 :]
     (code,), peak = peak_bytes(data)
     assert code == ("archive-damaged" if kind == "lie" else "too-large") and peak < 2.5 * source.MAX_XML_BYTES
-
-
-def test_a_packed_file_by_its_path(tmp_path: Path) -> None:
-    path = tmp_path / "harvest.hprz"
-    path.write_bytes(zipped({"harvest.hpr": HPR}))
-    assert load_mission(path).mission == read(HPR, "m").mission
 
 
 # -- any mission, and any report

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -25,22 +24,12 @@ SQUARE = [(-20, -15), (20, -15), (20, 15), (-20, 15)]
 YARD = Fence(tuple(at(*c) for c in ((-60, -60), (60, -60), (60, 60), (-60, 60))))
 
 
-@dataclass(frozen=True)
-class Way:
-    """A route in metres east and north of the site."""
-
-    points: list[tuple[float, float]]
-
-    def review(self, *logs: KnownLog, fences: tuple[Fence, ...] = (YARD,), **options: object) -> Review:
-        mission = ForwardingMission(
-            "way",
-            tuple(at(*p) for p in self.points),
-            fences,
-            (),
-            logs,
-            Options(**options),
-        )
-        return review(mission, AORO)
+def reviewed(
+    points: list[tuple[float, float]], *logs: KnownLog, fences: tuple[Fence, ...] = (YARD,), **options: object
+) -> Review:
+    """The review of a route in metres east and north of the site."""
+    way = tuple(at(*p) for p in points)
+    return review(ForwardingMission("way", way, fences, (), logs, Options(**options)), AORO)
 
 
 def test_paper_bs_mission_has_no_warnings() -> None:
@@ -56,62 +45,62 @@ def test_paper_bs_mission_has_no_warnings() -> None:
 
 
 def test_a_closed_route_has_a_corner_at_every_waypoint() -> None:
-    assert [c.waypoint for c in Way(SQUARE).review().corners] == [1, 2]
-    assert sorted(c.waypoint for c in Way(SQUARE).review(laps=2).corners) == [0, 1, 2, 3]
-    assert Way(SQUARE[:1]).review().length_m == 0.0
-    closed = Way([*SQUARE, SQUARE[0]]).review(laps=3)
+    assert [c.waypoint for c in reviewed(SQUARE).corners] == [1, 2]
+    assert sorted(c.waypoint for c in reviewed(SQUARE, laps=2).corners) == [0, 1, 2, 3]
+    assert reviewed(SQUARE[:1]).length_m == 0.0
+    closed = reviewed([*SQUARE, SQUARE[0]], laps=3)
     assert closed.length_m == pytest.approx(3 * 140.0, abs=0.01)
 
 
 def test_gentle_corners_are_switched_at_the_least_distance() -> None:
-    assert Way([(0, 0), (20, 0), (40, 5)]).review().corners[0].switch_m == MIN_SWITCH_M
+    assert reviewed([(0, 0), (20, 0), (40, 5)]).corners[0].switch_m == MIN_SWITCH_M
 
 
 def test_legs_too_short_for_their_corners() -> None:
-    (warning,) = Way([(0, 0), (30, 0), (30, 10), (0, 10)]).review().warnings
+    (warning,) = reviewed([(0, 0), (30, 0), (30, 10), (0, 10)]).warnings
     assert warning.code == "mission.short-leg"
     assert {2, 3, 10.0, round(2 * RADIUS, 1), round(RADIUS, 1)} <= set(numbers_in(warning.sentence))
-    assert not Way([(0, 0), (30, 0), (30, 2 * RADIUS + 0.1), (0, 2 * RADIUS + 0.1)]).review().warnings
+    assert not reviewed([(0, 0), (30, 0), (30, 2 * RADIUS + 0.1), (0, 2 * RADIUS + 0.1)]).warnings
 
 
 def test_a_turn_on_the_spot() -> None:
-    (warning,) = Way([(0, 0), (30, 0), (0, 1)]).review().warnings
+    (warning,) = reviewed([(0, 0), (30, 0), (0, 1)]).warnings
     assert warning.code == "mission.turn-on-the-spot"
     assert {2, 178, round(RADIUS, 1)} <= set(numbers_in(warning.sentence))
 
 
 def test_near_the_fence_without_a_fence_and_too_fast() -> None:
-    edge = Way([(-20, -24), (20, -24)]).review(fences=(Fence(tuple(FENCE)),))
+    edge = reviewed([(-20, -24), (20, -24)], fences=(Fence(tuple(FENCE)),))
     assert edge.warnings[0].code == "mission.close-to-fence"
     assert {1, 2.7} <= set(numbers_in(edge.warnings[0].sentence))
-    assert Way(SQUARE).review(fences=()).warnings[0].code == "mission.no-fence"
-    assert Way(SQUARE).review(speed_m_s=2.0).warnings[0].code == "mission.speed-limit"
-    assert Way(SQUARE).review(transport_height_m=0.9).warnings[0].code == "mission.height-limit"
+    assert reviewed(SQUARE, fences=()).warnings[0].code == "mission.no-fence"
+    assert reviewed(SQUARE, speed_m_s=2.0).warnings[0].code == "mission.speed-limit"
+    assert reviewed(SQUARE, transport_height_m=0.9).warnings[0].code == "mission.height-limit"
 
 
 def test_logs_out_of_reach_and_under_the_wheels() -> None:
     far, under, vague = KnownLog(at(0, 0)), KnownLog(at(0, -14.5)), KnownLog(at(0, -14.5), sigma_m=4.0)
-    warnings = Way(SQUARE).review(far, under, vague).warnings
+    warnings = reviewed(SQUARE, far, under, vague).warnings
     assert [w.code for w in warnings] == ["mission.log-out-of-reach", "mission.log-on-route"]
     assert {1, 15.0, 9.0} <= set(numbers_in(warnings[0].sentence))
     assert 2 in numbers_in(warnings[1].sentence)
-    many = Way(SQUARE).review(*[far] * 20).warnings
+    many = reviewed(SQUARE, *[far] * 20).warnings
     assert len(many) == 6 and 15 in numbers_in(many[-1].sentence)
 
 
 def test_the_number_of_logs_to_collect() -> None:
     logs = [KnownLog(at(0, -12), assortment=name) for name in ("a", "a", "b")]
-    assert Way(SQUARE).review(*logs).logs == 3
-    assert Way(SQUARE).review(*logs, laps=2).logs == 6  # searched for, and laid again for every lap
-    assert Way(SQUARE).review(*logs, laps=2, logs="listed").logs == 3
-    assert Way(SQUARE).review(*logs, assortments=("a",)).logs == 2
-    assert Way(SQUARE).review(*logs, logs_wanted=1).logs == 1
-    assert Way(SQUARE).review(logs_wanted=7).logs == 7
+    assert reviewed(SQUARE, *logs).logs == 3
+    assert reviewed(SQUARE, *logs, laps=2).logs == 6  # searched for, and laid again for every lap
+    assert reviewed(SQUARE, *logs, laps=2, logs="listed").logs == 3
+    assert reviewed(SQUARE, *logs, assortments=("a",)).logs == 2
+    assert reviewed(SQUARE, *logs, logs_wanted=1).logs == 1
+    assert reviewed(SQUARE, logs_wanted=7).logs == 7
 
 
 def test_an_assortment_without_logs() -> None:
     log = KnownLog(at(0, -12), assortment="pulpwood")
-    warnings = Way(SQUARE).review(log, assortments=("pulpwood", "pulp wood"), logs="listed").warnings
+    warnings = reviewed(SQUARE, log, assortments=("pulpwood", "pulp wood"), logs="listed").warnings
     assert [w.code for w in warnings] == ["mission.unlisted-assortment"] and '"pulp wood"' in warnings[0].sentence
 
 
@@ -126,7 +115,7 @@ def test_another_country_and_a_machine_that_does_not_drive() -> None:
 
 
 def test_a_warning_names_the_part_that_it_is_about() -> None:
-    found = Way([(0, 0), (30, 0), (0, 1)]).review(KnownLog(at(0, 30)), fences=())
+    found = reviewed([(0, 0), (30, 0), (0, 1)], KnownLog(at(0, 30)), fences=())
     assert [(w.code.removeprefix("mission."), w.key) for w in found.warnings] == [
         ("turn-on-the-spot", ("waypoint", 1)),
         ("no-fence", None),
