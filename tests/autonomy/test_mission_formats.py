@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from autonomy.missions import geojson, source
@@ -433,6 +433,7 @@ def without(mission: ForwardingMission, left_out: tuple[str, ...]) -> Forwarding
 def test_an_exported_mission_is_read_back_less_what_is_said_to_be_left_out(kind: str) -> None:
     @settings(max_examples=60, deadline=None)
     @given(missions(WORDS, WORDS.filter(bool), st.none(), st.just(SITE), least=0))
+    @example(ForwardingMission("one place", (ROUTE[0],)))
     def holds(mission: ForwardingMission) -> None:
         data, left_out = export(mission, kind)
         assert bool(left_out) <= (kind != "geojson")
