@@ -1,10 +1,10 @@
-"""Kinematics to the hanger pin: a raw joint table, plain DH matrices, its own derivative, its own inverse."""
+"""Kinematics to the hanger pin: a raw joint table, plain DH matrices, its own derivative, its own inverse; frames."""
 
 from __future__ import annotations
 
 import ast
 from itertools import pairwise
-from math import cos, hypot, pi, radians, sin
+from math import cos, hypot, nan, pi, sin
 from pathlib import Path
 
 import msgspec
@@ -26,6 +26,7 @@ from machine.geometry.kinematics import (
     reachable_extensions,
     solve,
 )
+from machine.geometry.link_frames import BASE, LinkFrame, link_frames
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, shipped_profiles
 from machine.profile import Profile, joint_limits
@@ -68,21 +69,26 @@ def table_pin(q) -> np.ndarray:
     return p + r @ np.array(PIN_IN_TELESCOPE)
 
 
+PROFILES = {name: load_profile(name) for name in shipped_profiles()}
+both = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.keys())
+shares = st.tuples(*[st.floats(0.0, 1.0)] * 5)
+
+
+def pose(profile: Profile, share: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(low + s * (high - low) for s, (low, high) in zip(share, joint_limits(profile), strict=True))
+
+
 def joint_values():
     return st.tuples(*(st.floats(low, high) for low, high in LIMITS))
 
 
-def radius(q) -> float:
-    """Signed distance of the pin from the slew axis along the reach direction."""
-    x, y, _ = pin_position(KIN, q)
-    theta = q[0] + pi / 2
-    return x * cos(theta) + y * sin(theta)
-
-
-def elbow_is_up(q) -> bool:
-    """Boom pin - stick pin - hanger pin turns downward."""
-    _, b, s, _, p, *_ = chain_points(KIN, (0.0, *q[1:]))
-    return (s[1] - b[1]) * (p[2] - s[2]) - (s[2] - b[2]) * (p[1] - s[1]) < 0.0
+def is_ordinary(profile: Profile, q) -> bool:
+    """Whether the pin is before the mast and the elbow points up: the inverse gives no other poses."""
+    c, s = cos(q[0] + profile.kinematics.theta1_offset_rad), sin(q[0] + profile.kinematics.theta1_offset_rad)
+    points = chain_points(profile.kinematics, q)
+    boom, stick, pin = ((x * c + y * s, z) for x, y, z in (points.boom_pin, points.stick_pin, points.hanger_pin))
+    bend = (stick[0] - boom[0]) * (pin[1] - stick[1]) - (stick[1] - boom[1]) * (pin[0] - stick[0])
+    return pin[0] > 1e-3 and bend < 0.0
 
 
 @given(joint_values())
@@ -126,33 +132,37 @@ def test_points_for_drawing_are_the_joints_of_the_table(q):
     assert pin[2] - rotator[2] == pytest.approx(0.415) and pin[2] - grapple[2] == pytest.approx(0.617)
 
 
-@given(joint_values())
-@settings(max_examples=500)
-def test_inverse_round_trip_over_reachable_poses(q):
-    assume(radius(q) > 1e-3 and elbow_is_up(q))
-    x, y, z = pin_position(KIN, q)
-    found = inverse(KIN, LIMITS, x, y, z, q[3])
-    assert pin_position(KIN, (*found, q[3])) == pytest.approx((x, y, z), abs=1e-9)
+@both
+@given(share=shares)
+@settings(max_examples=300)
+def test_inverse_round_trip_over_reachable_poses(profile, share):
+    q, kin = pose(profile, share), profile.kinematics
+    assume(is_ordinary(profile, q))
+    x, y, z = pin_position(kin, q)
+    found = inverse(kin, joint_limits(profile), x, y, z, q[3])
+    assert pin_position(kin, (*found, q[3])) == pytest.approx((x, y, z), abs=1e-9)
     if q[2] < -0.05:  # the straight arm is singular: there the angles are only as good as the root of rounding
         assert found == pytest.approx(q[:3], abs=1e-9)
 
 
-@given(joint_values(), st.sampled_from(["none", "near", "wish"]))
-@settings(max_examples=300)
-def test_solve_reaches_every_reachable_pin_within_limits(q, how):
-    assume(radius(q) > 1e-3 and elbow_is_up(q))
-    x, y, z = pin_position(KIN, q)
+@both
+@given(share=shares, how=st.sampled_from(["none", "near", "wish"]))
+@settings(max_examples=200)
+def test_solve_reaches_every_reachable_pin_within_limits(profile, share, how):
+    q = pose(profile, share)
+    assume(is_ordinary(profile, q))
+    x, y, z = pin_position(profile.kinematics, q)
     preference = {"none": None, "near": q, "wish": q[3]}[how]
-    found = solve(PALMS, x, y, z, preference)
-    assert pin_position(KIN, found) == pytest.approx((x, y, z), abs=1e-9)
-    for value, (low, high) in zip(found, LIMITS, strict=False):
+    found = solve(profile, x, y, z, preference)
+    assert pin_position(profile.kinematics, found) == pytest.approx((x, y, z), abs=1e-9)
+    for value, (low, high) in zip(found, joint_limits(profile), strict=False):
         assert low - 1e-8 <= value <= high + 1e-8
 
 
 @given(joint_values())
 @settings(max_examples=200)
 def test_reachable_extensions_are_exactly_those_the_inverse_accepts(q):
-    assume(radius(q) > 1e-3 and elbow_is_up(q))
+    assume(is_ordinary(PALMS, q))
     x, y, z = pin_position(KIN, q)
     intervals = reachable_extensions(PALMS, x, y, z)
     assert any(low - 1e-6 <= q[3] <= high + 1e-6 for low, high in intervals)
@@ -267,7 +277,6 @@ def test_slew_wraps_into_its_limits_from_both_sides():
     for slew in (-1.7, -0.4, 0.0, 1.7):
         x, y, z = pin_position(KIN, (slew, 0.4, -1.2, 0.8))
         assert inverse(KIN, LIMITS, x, y, z, 0.8)[0] == pytest.approx(slew, abs=1e-12)
-    assert radians(99.9) < LIMITS[0][1]
 
 
 def test_kinematics_uses_no_numpy():
@@ -280,14 +289,7 @@ def test_kinematics_uses_no_numpy():
 
 # -- every shipped crane
 
-PROFILES = {name: load_profile(name) for name in shipped_profiles()}
-both = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES.keys())
-shares = st.tuples(*[st.floats(0.0, 1.0)] * 5)
 GOALS = [(4.27, 1.86, 1.0), (4.27, -1.86, 1.0), (6.0, 1.86, 1.0), (6.0, -1.86, 1.0)]
-
-
-def pose(profile: Profile, share: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(low + s * (high - low) for s, (low, high) in zip(share, joint_limits(profile), strict=True))
 
 
 def matrix(theta: float, d: float, a: float, alpha: float) -> np.ndarray:
@@ -320,23 +322,6 @@ def test_jacobian_is_the_derivative(profile, share):
         assert np.allclose([row[j] for row in jacobian(k, q)], column, atol=1e-8)
 
 
-@both
-@given(share=shares)
-def test_inverse_returns_to_the_point_inside_the_limits(profile, share):
-    q, k, limits = pose(profile, share), profile.kinematics, joint_limits(profile)
-    x, y, z = pin_position(k, q)
-    theta = q[0] + k.theta1_offset_rad
-    assume(x * cos(theta) + y * sin(theta) > 0.5)  # not folded back behind the slew axis
-    assume(q[2] < -0.1)  # not bent over the straight arm
-    found = inverse(k, limits, x, y, z, q[3])
-    assert np.allclose(pin_position(k, (*found, q[3])), (x, y, z), atol=1e-8)
-    for preference in (None, q[3], q):
-        solved = solve(profile, x, y, z, preference)
-        assert np.allclose(pin_position(k, solved), (x, y, z), atol=1e-8)
-        for value, (low, high) in zip(solved, limits, strict=False):
-            assert low - 1e-8 <= value <= high + 1e-8
-
-
 @pytest.mark.parametrize("goal", GOALS)
 def test_the_forwarder_reaches_the_goals_of_paper_b_far_from_every_stop(goal):
     profile = PROFILES["aoro_fc8"]
@@ -367,3 +352,47 @@ def test_pick_area_and_bunk_are_within_reach_with_a_hanging_log(profile):
                     solve(profile, x + dx, y + dy, ground + above)
     for rise in (1.35, bunk.stake_height_m + 1.4):
         solve(profile, *bunk.center_m, bunk.floor_z_m + rise)
+
+
+# -- the frames for display
+def turned(rotation: tuple[float, float, float, float]) -> np.ndarray:
+    x, y, z, w = rotation
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def placed(frames: tuple[LinkFrame, ...]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Origin and rotation of every frame in the base frame."""
+    found = {BASE: (np.zeros(3), np.eye(3))}
+    for frame in frames:
+        origin, rotation = found[frame.parent]
+        found[frame.child] = (origin + rotation @ frame.translation_m, rotation @ turned(frame.rotation))
+    return found
+
+
+@both
+@pytest.mark.parametrize("q", [(0.0, 0.3, -1.0, 0.1, 0.0), (-1.1, 0.9, -1.7, 0.8, 1.2)])
+def test_the_frames_chain_to_the_points_of_the_kinematics(profile: Profile, q: tuple[float, ...]) -> None:
+    points, frames = chain_points(profile.kinematics, q), placed(link_frames(profile, q))
+    for frame, point in (
+        ("boom", points.boom_pin),
+        ("stick", points.stick_pin),
+        ("pin", points.hanger_pin),
+        ("grapple", points.grapple),
+    ):
+        assert frames[frame][0] == pytest.approx(np.array(point), abs=1e-9), frame
+    boom = np.array(points.stick_pin) - points.boom_pin
+    assert frames["boom"][1][:, 0] == pytest.approx(boom / np.linalg.norm(boom), abs=1e-9), "x is along the boom"
+    telescope = np.array(points.hanger_pin) - points.telescope_front
+    assert frames["stick"][1][:, 0] == pytest.approx(telescope / np.linalg.norm(telescope), abs=1e-9)
+    assert frames["grapple"][1][:, 2] == pytest.approx(np.array([0.0, 0.0, 1.0]), abs=1e-9), "it hangs"
+
+
+def test_what_depends_on_an_unknown_joint_is_left_out() -> None:
+    assert [f.child for f in link_frames(PALMS, (0.0, 0.3, -1.0, 0.1, nan))] == ["column", "boom", "stick", "pin"]
+    assert link_frames(PALMS, (0.0, nan, -1.0, 0.1, 0.0)) == ()

@@ -103,12 +103,6 @@ def test_outside_the_table_the_end_values_apply():
     assert tip_below_pin_m(TONGS, -1.0) == 1.075 and tip_below_pin_m(TONGS, 9.0) == 0.696
 
 
-def test_the_cr250_opens_1_40_m():
-    tongs = load_profile("aoro_fc8").grapple.jaws
-    assert 2.0 * half_gap_m(tongs, 0.0) == pytest.approx(1.40)
-    assert half_gap_m(tongs, 1.189) == pytest.approx(0.0, abs=1e-3)
-
-
 @given(st.floats(0.0, 100.0))
 def test_opening_is_linear_in_the_jaw_angle(opening_pct):
     angle = jaw_angle_from_opening_pct(TONGS, opening_pct)

@@ -12,11 +12,10 @@ import pytest
 from can_dbc.dbc import codec
 from controller.guard.__main__ import build, profile_path
 from controller.guard.layout import GuardConfigError
-from machine.joints import JOINTS, Joint
 from machine.loading.checks import IMU_MESSAGE
 from machine.loading.profile_file import ProfileError, carry_envelope, load_profile, profile_hash, shipped_profiles
 from machine.loading.ranges import _RANGES
-from machine.profile import Carrier, Imu, Sag, joint
+from machine.profile import Carrier, Imu, Sag
 from tests.codes import coded, numbers_in
 from tests.machine.changed_profiles import AORO, DELETE, FOLDER, IMU, SAG, SHIPPED, write
 from tests.machine.own_machine import NAME, made
@@ -37,16 +36,6 @@ def test_every_value_of_a_shipped_profile_has_its_source(name):
             assert re.search(r"# .*\[(A|B|FPI|XT28|man|derived|mem|est|set)\]", line), line
 
 
-def test_the_forwarder_is_blind_in_rotator_and_opening_and_has_a_carrier():
-    profile = load_profile("aoro_fc8")
-    assert [j for j in JOINTS if joint(profile, j).encoder is None] == [Joint.ROT]
-    assert not profile.grapple.opening_sensor and load_profile("palms_471").grapple.opening_sensor
-    assert profile.machine_bus == "mach0"
-    assert profile.carrier is not None and profile.carrier.articulation_encoder.message == "EncArtic"
-    assert profile.carrier.cruise_speed_m_s == pytest.approx(2.3 / 3.6, abs=1e-3)
-    assert set(profile.cameras) == {"front"} and set(load_profile("palms_471").cameras) == {"stick", "d435"}
-
-
 def test_a_machine_may_have_no_carrier_and_no_cameras(tmp_path):
     profile = load_profile(write(tmp_path, {"cameras": DELETE}))
     assert profile.cameras == {} and profile.carrier is None
@@ -63,11 +52,6 @@ def test_hash_is_a_u32_of_the_content_only(tmp_path):
     assert profile_hash(turned) == wanted
     assert profile_hash(load_profile(write(tmp_path, {"joints.lift.law.kp_1_s": 2.001}))) != wanted
     assert profile_hash(load_profile(write(tmp_path, {"joints.lift.law.kp_1_s": 2}))) == wanted  # 2 is 2.0
-
-
-def test_a_joint_without_encoder_and_a_second_bus_are_allowed(tmp_path):
-    profile = load_profile(write(tmp_path, {"joints.rot.encoder": DELETE, "machine_bus": "mach0"}))
-    assert profile.joints["rot"].encoder is None and profile.machine_bus == "mach0"
 
 
 def test_sag_is_optional_and_part_of_the_hash(tmp_path):
@@ -110,25 +94,23 @@ def test_unknown_name_lists_the_shipped_profiles():
     assert '"volvo"' in str(caught.value) and '"palms_471"' not in str(caught.value)
 
 
-def test_unreadable_files_are_named(tmp_path):
-    gone = tmp_path / "gone.toml"
-    with pytest.raises(ProfileError, check=coded("profile.unreadable")) as caught:
-        load_profile(str(gone))
-    assert str(gone) in str(caught.value)
-    binary = tmp_path / "binary.toml"
-    binary.write_bytes(b"a = 1\n\xff\xfe")
-    with pytest.raises(ProfileError, check=coded("profile.not-utf8")) as caught:
-        load_profile(binary)
-    assert str(binary) in str(caught.value) and 6 in numbers_in(str(caught.value).replace(str(binary), ""))
-
-
-def test_broken_toml_names_the_line(tmp_path):
-    broken = tmp_path / "broken.toml"
-    broken.write_text('schema = 1\nname = "x"\nrate_hz = = 3\n')
-    with pytest.raises(ProfileError, check=coded("profile.broken-toml")) as caught:
-        load_profile(broken)
-    assert str(broken) in str(caught.value)
-    assert numbers_in(str(caught.value).replace(str(broken), "")) == [3, 11]
+@pytest.mark.parametrize(
+    ("content", "code", "place"),
+    [
+        (None, "profile.unreadable", []),
+        (b"a = 1\n\xff\xfe", "profile.not-utf8", [8, 6]),  # UTF-8, and the byte
+        (b'schema = 1\nname = "x"\nrate_hz = = 3\n', "profile.broken-toml", [3, 11]),
+    ],
+    ids=["missing", "not UTF-8", "no TOML"],
+)
+def test_an_unreadable_file_is_named_with_the_place_in_it(tmp_path, content, code, place):
+    path = tmp_path / "mine.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ProfileError, check=coded(code)) as caught:
+        load_profile(str(path))
+    assert str(path) in str(caught.value)
+    assert numbers_in(str(caught.value).replace(str(path), "")) == place
 
 
 def test_an_error_keeps_its_problems_between_processes(tmp_path):
