@@ -1,5 +1,6 @@
 """Training of the detection networks: targets, augmentation, loss, runs, and the commands."""
 
+import hashlib
 import math
 import shutil
 import signal
@@ -10,25 +11,30 @@ import torch
 from rich.console import Console
 from typer.testing import CliRunner
 
-from autonomy.networks import load
+from autonomy.networks import SHIPPED, load
 from autonomy.perception.papers import BOXES, SIZE_PX, BoxDetector, decode_boxes
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.mask_network import MASKS
-from autonomy.perception.segmentation.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, interface_of, network_input
+from autonomy.perception.segmentation.network import MAPS, OFFSET_PX, STRIDE
 from machine.geometry.optics import Intrinsics
 from runtime.errors import InputRefused
 from tests.codes import coded, numbers_in
 from tests.training.drawn_logs import perfect_maps, picture
 from timberhand.commands.train import app
+from training.common.average_precision import box_overlaps
 from training.common.loop import Schedule, seeded
 from training.common.weight_file import save
 from training.detection import boxes, segmentation
 from training.detection.augmentation import augmented, recoloured
+from training.detection.detector_weights import box_of
 from training.detection.masks import run as masks
 from training.detection.masks.mask_weights import mixed
 from training.detection.networks import BoxNetwork
 from training.detection.segmentation import batches, loss, run, targets
 from training.pictures import piles
-from training.pictures.labels import IGNORED
+from training.pictures.drawing import draw
+from training.pictures.labels import ID, IGNORED
+from training.pictures.piles import settle
 from training.pictures.samples import sample, write
 from training.pictures.traced import sets
 
@@ -94,20 +100,18 @@ def test_grey_stays_grey_under_changes_of_hue_and_saturation():
     assert max(spread) < 120 * 0.8  # gains of the network_input alone part them
 
 
-def test_networks_accept_the_input():
-    sample = picture(((50.0, 50.0), 0.4, 60, 10), size=96)
-    for variant, width in CHANNELS.items():
-        assert network_input(sample.rgb, sample.depth_m, sample.intrinsics, variant).shape == (width, 96, 96)
-        assert interface_of(variant).channels == width
+def four(length):
+    """How pictures of a log each are given, and their number."""
+    return [picture(((60.0 + 9 * i, 80.0), 0.3 * i, length, 14), size=160) for i in range(4)].__getitem__, 4
 
 
 @pytest.mark.long
 def test_a_few_steps_reduce_the_loss_deterministically(small):
     torch.set_num_threads(1)  # sums of another order are other sums
-    samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 90, 14), size=160) for i in range(4)]
+    given = four(90)
 
     def once():
-        return run(samples.__getitem__, 4, "depth", Schedule(8, 3e-3), 2, 5, None, QUIET)[1]
+        return run(*given, "depth", Schedule(8, 3e-3), 2, 5, None, QUIET)[1]
 
     first = once()
     assert np.mean(first[-2:]) < 0.9 * np.mean(first[:2])
@@ -116,8 +120,7 @@ def test_a_few_steps_reduce_the_loss_deterministically(small):
 
 def test_a_batch_depends_only_on_its_number(small):
     torch.set_num_threads(1)  # sums of another order are other sums
-    samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 90, 14), size=160) for i in range(4)]
-    batch = batches(samples.__getitem__, 4, 2, "rgbd", 0)
+    batch = batches(*four(90), 2, "rgbd", 0)
     later = batch(3)[0]
     batch(0)
     assert torch.equal(batch(3)[0], later)
@@ -128,16 +131,9 @@ def test_a_batch_depends_only_on_its_number(small):
 CROSSED = (((60.0, 70.0), 0.4, 80, 14), ((140.0, 120.0), 1.2, 100, 16))
 
 
-def perfect(maps):
-    out = maps.copy()
-    p = np.clip(maps[0], 1e-3, 1.0 - 1e-3)
-    out[0] = np.log(p / (1.0 - p))
-    return out
-
-
 def test_boxes_of_perfect_maps_are_those_of_the_logs():
     sample = picture(*CROSSED, size=208)
-    found, scores = decode_boxes(perfect(boxes.targets(sample)[0]))
+    found, scores = decode_boxes(perfect_maps(boxes.targets(sample)[0], logits=(0,)))
     assert len(found) == 2 and (scores > 0.9).all()
     for number in (1, 2):
         v, u = np.nonzero(sample.ids == number)
@@ -154,11 +150,8 @@ def test_duplicate_boxes_are_suppressed_and_neighbours_are_kept():
     maps[1:, 10, 12] = np.log([7.0, 3.0, 5.0, 3.0])  # now the same box
     found, scores = decode_boxes(maps)
     assert len(found) == 2 and scores[0] > scores[1]
-
-
-def test_empty_maps_give_no_boxes():
-    found, scores = decode_boxes(np.full((5, 10, 10), -9.0, np.float32))
-    assert found.shape == (0, 4) and scores.shape == (0,)
+    none, scores = decode_boxes(np.full((5, 10, 10), -9.0, np.float32))
+    assert none.shape == (0, 4) and scores.shape == (0,)
 
 
 def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
@@ -176,8 +169,7 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
 @pytest.mark.long
 def test_a_few_steps_reduce_the_loss(monkeypatch):
     monkeypatch.setattr(boxes, "CROPS", ((64, 1.0),))
-    samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 60, 14), size=160) for i in range(4)]
-    _, losses = boxes.run([(samples.__getitem__, 4)], Schedule(10, 3e-3), 2, 5, None, QUIET)
+    _, losses = boxes.run([four(60)], Schedule(10, 3e-3), 2, 5, None, QUIET)
     assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:2])
 
 
@@ -306,3 +298,59 @@ def test_the_sets_are_drawn_and_kept(tmp_path, monkeypatch):
     assert sorted(before) == ["meshed00000.npz", "traced00000.npz"]
     assert CliRunner().invoke(app, few).exit_code == 0
     assert before == {file.name: file.stat().st_mtime_ns for file in out.glob("*.npz")}
+
+
+# -- the shipped networks: cards that match the weights, and detections
+WELL_SHOWN_PX = 600
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Some pictures of four crossed logs, with the boxes of those that show well."""
+    pile = settle("palms_471", 5)
+    samples = [draw(pile, seed) for seed in range(24)]
+    shown = [[s.ids == log[ID] for log in s.logs] for s in samples]
+    return [
+        (s, np.array([box_of(m) for m in masks if m.sum() > WELL_SHOWN_PX]).reshape(-1, 4))
+        for s, masks in zip(samples, shown, strict=True)
+    ]
+
+
+def found(boxes_of, seen) -> float:
+    """The share of the logs that show well that one of the boxes lies on."""
+    best = [box_overlaps(boxes_of(s), truth).max(axis=0, initial=0.0) for s, truth in seen if len(truth)]
+    return float(np.mean(np.concatenate(best) > 0.5))
+
+
+@pytest.mark.parametrize("weights", sorted(SHIPPED.glob("*.onnx")), ids=lambda path: path.stem)
+def test_the_card_matches_the_weights(weights):
+    assert hashlib.sha256(weights.read_bytes()).hexdigest() in weights.with_suffix(".md").read_text()
+    assert weights.stat().st_size < 5_000_000
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("variant", "least"), [("rgbd", 0.7), ("depth", 0.55)])
+def test_well_visible_logs_are_segmented(variant, least, seen):
+    detector = LogSegmenter(variant)
+    share = found(lambda s: [i.box_px for i in detector.segment_picture(s.rgb, s.depth_m, s.intrinsics)], seen)
+    assert share >= least, share
+
+
+def test_the_depth_variant_ignores_colour(seen):
+    detector = LogSegmenter("depth")
+    sample = next(s for s, truth in seen if len(truth) > 2)
+    plain = detector.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
+    dark = detector.segment_picture(np.full_like(sample.rgb, 7), sample.depth_m, sample.intrinsics)
+    assert plain and [i.box_px for i in plain] == [i.box_px for i in dark]
+
+
+@pytest.mark.long
+def test_boxes_from_colour_overlap_logs(seen):
+    detector = BoxDetector()
+
+    def boxes_of(sample):
+        square = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
+        square[: sample.rgb.shape[0], : sample.rgb.shape[1]] = sample.rgb
+        return detector.detect(square)[0]
+
+    assert found(boxes_of, seen) >= 0.5
