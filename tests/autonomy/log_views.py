@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from autonomy.perception.camera.frame import Pose, RgbdFrame
-from machine.geometry.optics import Intrinsics, intrinsics
+from autonomy.perception.camera.frame import RgbdFrame
+from machine.geometry.optics import intrinsics
 from machine.loading.profile_file import load_profile
 from sim.camera.geometry import View, look_at
 from sim.camera.noise import StereoNoise
@@ -48,13 +48,9 @@ def scene_of(*logs: LogPose) -> Scene:
     return b.build()
 
 
-def view_from(x: float = 0.0, pin: Intrinsics = PIN) -> View:
+def view_from() -> View:
     """2.4 m above the ground, looking down as on the machine."""
-    return look_at((x, 0.0, 2.4), (x + 4.4, 0.0, 0.0), pin)
-
-
-def pose_of(view: View) -> Pose:
-    return Pose(view.position_m, view.rotation)
+    return look_at((0.0, 0.0, 2.4), (4.4, 0.0, 0.0), PIN)
 
 
 def seen(scene: Scene, view: View) -> Picture:

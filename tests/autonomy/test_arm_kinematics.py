@@ -83,9 +83,13 @@ def test_a_goal_at_a_stop_is_refused_but_a_start_there_is_not() -> None:
             joints(np.array([inside, at_stop]))
 
 
-def test_a_turn_is_added_to_the_rotator_alone_and_smoothly() -> None:
+def three_seconds_of_rest() -> Trajectory:
     still = hold((0.1, 0.2, -1.0, 0.5, 0.3))
-    motion = Trajectory([still.position[0]] * 151, [still.velocity[0]] * 151)
+    return Trajectory([still.position[0]] * 151, [still.velocity[0]] * 151)
+
+
+def test_a_turn_is_added_to_the_rotator_alone_and_smoothly() -> None:
+    motion = three_seconds_of_rest()
     more = with_rotation(AORO, motion, 1.0, 0.2)
     q, v = np.array(more.position), np.array(more.velocity)
     assert np.array_equal(q[:, : Joint.ROT], np.array(motion.position)[:, : Joint.ROT])
@@ -96,9 +100,7 @@ def test_a_turn_is_added_to_the_rotator_alone_and_smoothly() -> None:
 @pytest.mark.parametrize(("from_s", "by_rad"), [(2.9, 0.2), (3.0, 0.2), (3.2, 0.01), (2.0, 2.0)])
 def test_no_turn_is_added_that_the_rest_of_the_motion_is_too_short_for(from_s: float, by_rad: float) -> None:
     """It would be a jump of the setpoint, which the controller refuses."""
-    still = hold((0.1, 0.2, -1.0, 0.5, 0.3))
-    motion = Trajectory([still.position[0]] * 151, [still.velocity[0]] * 151)
-    assert with_rotation(AORO, motion, from_s, by_rad) is None
+    assert with_rotation(AORO, three_seconds_of_rest(), from_s, by_rad) is None
 
 
 # -- a column that leans

@@ -69,10 +69,12 @@ def test_a_reply_says_which_logs_the_newest_picture_shows() -> None:
     assert all(log.seen for log in decode_logs(reply())), "seen is the default"
 
 
-def test_a_reply_carries_the_covariance() -> None:
+def test_a_reply_carries_an_estimate_with_its_covariance() -> None:
     root = np.random.default_rng(1).normal(0.0, 0.02, (7, 7))
     estimate = LogEstimate(np.array([1.0, 2.0, -1.0]), np.array([0.0, 1.0, 0.0]), 3.0, 0.2, root @ root.T)
     (log,) = decode_logs(encode_logs([estimate.observation(4)]))
+    assert (log.id, log.center_m, log.axis) == (4, (1.0, 2.0, -1.0), (0.0, 1.0, 0.0))
+    assert (log.length_m, log.diameter_m) == (3.0, 0.2)
     assert log.covariance is not None and unpack_covariance(log.covariance) == pytest.approx(root @ root.T, rel=1e-3)
 
 
@@ -205,13 +207,16 @@ class Detector:
 
 
 @pytest.fixture
-def served() -> Iterator[SimpleNamespace]:
-    """A detector, who asks it, and what is reported of it."""
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker,
-    ):
+def link() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", 0))
+        yield link
+
+
+@pytest.fixture
+def served(link: socket.socket) -> Iterator[SimpleNamespace]:
+    """A detector, who asks it, and what is reported of it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
         asker.connect(link.getsockname())
         asker.settimeout(0.3)
         detector, troubles = Detector(), list[str]()
@@ -277,23 +282,21 @@ def test_the_status_tells_logs_and_lists_per_second_or_the_trouble() -> None:
     assert numbers_in(text()) == [77.0]
 
 
-def test_it_is_ready_when_it_serves_alive_while_it_does_and_says_that_it_ends(tmp_path: Path) -> None:
+def test_it_is_ready_when_it_serves_alive_while_it_does_and_says_that_it_ends(tmp_path: Path, link) -> None:
+    signals: list[int] = []
+
+    class Ending(Requests):
+        def answer_waiting(self) -> None:
+            super().answer_waiting()
+            signals.append(15)
+
+    requests = Ending()
+    link.sendto(b"x", link.getsockname())
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.setblocking(False)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-            link.bind(("127.0.0.1", 0))
-            link.sendto(b"x", link.getsockname())
-            signals: list[int] = []
-
-            class Ending(Requests):
-                def answer_waiting(self) -> None:
-                    super().answer_waiting()
-                    signals.append(15)
-
-            requests = Ending()
-            notifier = Notifier(process.StatusText("stick", requests), str(tmp_path / "notify"))
-            process.serve(link, requests, notifier, signals)
+        notifier = Notifier(process.StatusText("stick", requests), str(tmp_path / "notify"))
+        process.serve(link, requests, notifier, signals)
         first, last = systemd.recv(4096).decode(), systemd.recv(4096).decode()
     assert first.split("\n")[:2] == ["READY=1", "WATCHDOG=1"] and last.split("\n")[0] == "STOPPING=1"
     assert requests.lists == 1

@@ -226,18 +226,21 @@ class Told(SimpleNamespace):
         return self.missed
 
 
-def test_held_logs_are_lifted() -> None:
-    first = grasp()
-    assert GraspRecovery().after_closing(first, Told()) == (Phase.LIFT, first)
-
-
-@pytest.mark.parametrize("trouble", ["wide", "missed"])
-def test_moving_jaws_are_waited_for(trouble: str) -> None:
-    assert GraspRecovery().after_closing(grasp(), Told(is_still=False, **{trouble: True}))[0] is None
-
-
-def test_jaws_that_stall_wide_lift_what_they_clasp() -> None:
-    assert GraspRecovery().after_closing(grasp(), Told(wide=True)) == (Phase.LIFT, grasp())
+@pytest.mark.parametrize(
+    ("tongs", "measured", "phase"),
+    [
+        (Told(), True, Phase.LIFT),
+        (Told(wide=True), True, Phase.LIFT),
+        (Told(wide=True, is_still=False), True, None),
+        (Told(missed=True, is_still=False), True, None),
+        (Told(wide=True), False, Phase.LIFT),
+        (Told(missed=True, empty=True), False, Phase.LIFT),
+    ],
+    ids=["held", "wide", "wide, moving", "missed, moving", "wide on a known log", "missed a known log"],
+)
+def test_still_jaws_lift_what_they_clasp_and_known_logs_as_they_are(tongs, measured: bool, phase: Phase | None) -> None:
+    held = grasp(measured=measured)
+    assert GraspRecovery().after_closing(held, tongs) == (phase, held)
 
 
 def test_a_miss_restarts_from_above_a_few_times() -> None:
@@ -287,9 +290,3 @@ def test_no_inner_logs_are_excluded_of_two_or_where_the_jaws_had_closed(across_m
     regrip.after_closing(row(*across_m), Told(wide=wide))
     regrip.after_rising(row(*across_m), Told(holds_nothing=True))
     assert regrip.restart_count == 1 and regrip.excluded_logs == ()
-
-
-def test_exactly_known_logs_are_lifted_as_they_are() -> None:
-    told = grasp(measured=False)
-    for tongs in (Told(wide=True), Told(missed=True, empty=True)):
-        assert GraspRecovery().after_closing(told, tongs) == (Phase.LIFT, told)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from math import hypot, nan, pi
+from math import hypot, inf, nan, pi
 
 import pytest
 
@@ -51,6 +51,19 @@ def seen_aside(log: LogObservation, off_m: float) -> LogObservation:
 
 def made(planner=None) -> tuple[Camera, Activity]:
     return Camera(PROFILE, pair()), activity(planner=planner or SamplingPlanner())
+
+
+class Asked:
+    """A planner that counts its requests, and finds nothing after so many."""
+
+    def __init__(self, planner=None, finds: float = inf) -> None:
+        self.planner, self.finds, self.count = planner or SamplingPlanner(), finds, 0
+
+    def __call__(self, request: GraspRequest) -> GraspCandidate:
+        self.count += 1
+        if self.count > self.finds:
+            raise NOTHING_SAFE
+        return self.planner(request)
 
 
 def grasps_until(crane: StandIn, planner: Activity, phase: Phase) -> int:
@@ -113,17 +126,10 @@ def test_a_log_that_stays_a_part_is_not_gripped_before_the_others_are_looked_at(
 
 @pytest.mark.parametrize(("direct", "selections"), [(False, 2), (True, 1)])
 def test_above_a_single_log_it_is_selected_again_where_the_crane_rests_anyway(direct: bool, selections: int) -> None:
-    asked = []
-
-    def counting(request: GraspRequest) -> GraspCandidate:
-        asked.append(len(request.logs))
-        return SamplingPlanner()(request)
-
-    crane = Camera(PROFILE, pair()[:1])
+    crane, asked = Camera(PROFILE, pair()[:1]), Asked()
     crane.off_m = 0.0
-    planner = activity(planner=counting, direct=direct)
-    crane.until(planner, Phase.CLOSE)
-    assert len(asked) == selections
+    crane.until(activity(planner=asked, direct=direct), Phase.CLOSE)
+    assert asked.count == selections
 
 
 def test_a_better_grasp_without_a_path_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,20 +142,12 @@ def test_a_better_grasp_without_a_path_is_dropped(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_reselection_that_finds_no_grasp_changes_none() -> None:
-    sampling = SamplingPlanner()
-    asked = []
-
-    def once(request: GraspRequest) -> GraspCandidate:
-        asked.append(1)
-        if len(asked) > 1:
-            raise NOTHING_SAFE
-        return sampling(request)
-
-    crane, planner = made(once)
+    asked = Asked(finds=1)
+    crane, planner = made(asked)
     crane.until(planner, Phase.ABOVE)
     first = planner.grasp
     crane.until(planner, Phase.CLOSE)
-    assert len(asked) > 1 and planner.grasp is not None and planner.grasp.reason == first.reason
+    assert asked.count > 1 and planner.grasp is not None and planner.grasp.reason == first.reason
 
 
 @pytest.mark.parametrize("better", [True, False])
@@ -232,7 +230,6 @@ class Slipping(StandIn):
     """Tongs shut on nothing ``misses`` times and say so; then they hold the pair."""
 
     misses = 1
-    measures = True
 
     def report(self) -> StateReport:
         shut = self.gripped and self._closings <= self.misses
@@ -244,7 +241,7 @@ class Slipping(StandIn):
         return sum(now == "CLOSE" != was for was, now in zip(["", *phases], phases, strict=False))
 
     def seen(self) -> tuple[LogObservation, ...]:
-        return tuple(measured(log) if self.measures else log for log in self.logs)
+        return tuple(map(measured, self.logs))
 
 
 def thick_pair() -> list[LogObservation]:
@@ -262,22 +259,6 @@ def test_jaws_that_close_on_nothing_open_detect_and_close_again() -> None:
     risen = [m for m in crane.trace if m.phase == "ABOVE"][-1]
     closed = next(m for m in crane.trace if m.phase == "CLOSE")
     assert risen.pin[2] > closed.pin[2] + 0.2 and risen.tong_rad < 0.2, "from above, and open"
-
-
-def test_after_a_few_attempts_the_crane_lifts_anyway() -> None:
-    crane = Slipping(PROFILE, thick_pair())
-    crane.misses = 99
-    assert phases_until_lifted(crane).count(Phase.CLOSE) == 1 + MAX_RESTARTS
-
-
-@pytest.mark.parametrize("known_how", ["told", "thin", "blind"])
-def test_unmeasured_logs_and_what_closed_jaws_may_hold_are_lifted_as_they_are(known_how: str) -> None:
-    thin = [replace(log, diameter_m=0.15) for log in pair()]
-    crane = Slipping(PROFILE, thin if known_how == "thin" else thick_pair(), feedback=known_how != "blind")
-    crane.measures = known_how != "told"
-    if known_how == "blind":
-        crane.misses = 0  # nobody tells
-    assert phases_until_lifted(crane).count(Phase.CLOSE) == 1
 
 
 class Weighed(Slipping):
@@ -343,6 +324,10 @@ class Pinching(Slipping):
             super()._grapple(command)
 
 
+def row_of_two() -> list[LogObservation]:
+    return [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)]
+
+
 def extracting(request: GraspRequest) -> GraspCandidate:
     """Extracts the end log of a row towards +y."""
     logs = request.logs
@@ -352,7 +337,7 @@ def extracting(request: GraspRequest) -> GraspCandidate:
 
 
 def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> None:
-    crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
+    crane = Pinching(PROFILE, row_of_two())
     planner = activity(planner=extracting)
     crane.until(planner, Phase.LIFT)
     pins = [m.pin for m in crane.trace if m.phase == "CLOSE"]
@@ -363,10 +348,9 @@ def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> 
 
 
 def test_extracting_jaws_go_in_beside_the_log_before_they_close() -> None:
-    pair_of = [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)]
     over = {}
     for draws in (True, False):
-        crane = Pinching(PROFILE, pair_of)
+        crane = Pinching(PROFILE, row_of_two())
         crane.until(activity(planner=lambda request, d=draws: replace(extracting(request), extracts=d)), Phase.CLOSE)
         tip = crane.pin()[2] - tip_below_pin_m(PROFILE.grapple.jaws, crane.tong_rad)
         over[draws] = tip - GROUND
@@ -375,27 +359,17 @@ def test_extracting_jaws_go_in_beside_the_log_before_they_close() -> None:
 
 
 def test_a_log_still_pinched_after_the_drag_is_detected_again() -> None:
-    crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
+    crane = Pinching(PROFILE, row_of_two())
     crane.free_m = 9.0
-    planner = activity(planner=extracting)
-    phases = crane.until(planner, Phase.LIFT)
+    phases = crane.until(activity(planner=extracting), Phase.LIFT)
     assert phases.count(Phase.ABOVE) == 1 + MAX_RESTARTS
 
 
 def test_without_a_better_grasp_after_a_drag_the_old_one_closes_before_it_drags_again() -> None:
-    asked = []
-
-    def once(request: GraspRequest) -> GraspCandidate:
-        asked.append(1)
-        if len(asked) > 3:
-            raise NOTHING_SAFE
-        return extracting(request)
-
-    crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
+    crane, asked = Pinching(PROFILE, row_of_two()), Asked(extracting, finds=3)
     crane.free_m = 9.0
-    planner = activity(planner=once)
-    crane.until(planner, Phase.LIFT)
-    assert len(asked) > 3
+    crane.until(activity(planner=asked), Phase.LIFT)
+    assert asked.count > 3
     phases = [m.phase for m in crane.trace]
     again = len(phases) - next(i for i, p in enumerate(reversed(phases)) if p == "DESCEND")
     closing = crane.trace[again : again + 15]

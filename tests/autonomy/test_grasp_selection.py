@@ -105,8 +105,7 @@ def test_a_log_on_others_is_gripped_at_its_own_height() -> None:
 
 
 def test_a_log_whose_centre_is_just_out_of_reach_is_gripped_off_its_centre() -> None:
-    distances = (float(r) for r in np.arange(6.2, 7.2, 0.05))
-    grasps = (plan_single_log_grasp(ARM, log_at(0.0, r, pi / 2), 0.0) for r in distances)
+    grasps = (plan_single_log_grasp(ARM, log_at(0.0, float(r), pi / 2), 0.0) for r in np.arange(6.2, 7.2, 0.05))
     grasp = next(grasp for grasp in grasps if grasp.along_m != 0.0)
     far = grasp.log
     assert grasp.along_m < 0.0 and ARM.xy(grasp.pose)[1] < far.center_m[1] - 0.05
@@ -184,22 +183,25 @@ def test_lying_in_the_bunk_and_hanging_from_the_grapple() -> None:
     assert not hangs_below(ARM, replace(GROUND_LOG, center_m=(1.0, 4.5, up.z_m - 1.1)), up)
 
 
+HELD_YAW = 0.9
+
+
+def hanging(skew: float) -> LogObservation:
+    """The log so far askew between the jaws."""
+    yaw = HELD_YAW - pi / 2 + skew
+    return replace(GROUND_LOG, axis=(cos(yaw), sin(yaw), 0.0))
+
+
 @pytest.mark.parametrize("skew", [-0.5, 0.0, 0.4])
 def test_a_log_that_hangs_askew_is_turned_along_the_bunk(skew):
-    held_yaw = 0.9
-    hangs = held_yaw - pi / 2 + skew
-    seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
-    place = plan_place(ARM, CraneJob(), GRASP, [seen], held_yaw)
-    laid = hangs + (place.slew_rad + place.rot_rad - held_yaw)
+    place = plan_place(ARM, CraneJob(), GRASP, [hanging(skew)], HELD_YAW)
+    laid = skew - pi / 2 + place.slew_rad + place.rot_rad
     assert remainder(laid - BUNK.yaw_rad, pi) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("stands", "turn"), [(-0.2, 0.0), (2.3, pi), (1.2, pi), (0.8, 0.0)])
 def test_of_two_turns_it_makes_the_shorter_one_from_where_the_rotator_stands(stands: float, turn: float) -> None:
     """The grasp's angle may be nearer to the other one, half a turn away: a thin log would not follow so far."""
-    held_yaw = 0.9
-    hangs = held_yaw - pi / 2 + 0.6
-    seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
-    first, second = (plan_place(ARM, CraneJob(), GRASP, [seen], held_yaw, at) for at in (-0.6, stands))
+    first, second = (plan_place(ARM, CraneJob(), GRASP, [hanging(0.6)], HELD_YAW, at) for at in (-0.6, stands))
     assert first.rot_rad == pytest.approx(-0.6, abs=0.01)
     assert second.rot_rad - first.rot_rad == pytest.approx(turn, abs=1e-6)

@@ -85,12 +85,9 @@ def test_there_is_no_detection_while_the_crane_moves_or_after_a_long_gap() -> No
 
 def test_an_unmeasured_joint_prevents_detection_only_when_the_camera_pose_depends_on_it() -> None:
     blind = detector_of(Source())
-    for k in (1, 2):
-        seen = blind.detect((*JOINTS[:4], math.nan), k * STEP_NS)
-    assert seen == ()
-    for k in (3, 4):
-        seen = blind.detect((JOINTS[0], math.nan, *JOINTS[2:]), k * STEP_NS)
-    assert seen is None and blind.problem
+    rotator_unknown, lift_unknown = (*JOINTS[:4], math.nan), (JOINTS[0], math.nan, *JOINTS[2:])
+    assert [blind.detect(rotator_unknown, k * STEP_NS) for k in (1, 2)] == [None, ()]
+    assert [blind.detect(lift_unknown, k * STEP_NS) for k in (3, 4)] == [None, None] and blind.problem
 
 
 @pytest.mark.parametrize("source", [Source(failure="unplugged"), Source(problem="unplugged")])
@@ -244,6 +241,8 @@ def test_a_picture_of_a_load_is_measured_alone_and_starts_no_track() -> None:
 WIDE = Intrinsics(1280, 720, 530.0, 530.0, 640.0, 360.0)
 FRAME = RgbdFrame("front", 0, np.zeros((720, 1280, 3), np.uint8), np.full((720, 1280), 5.0, np.float32), WIDE)
 STILL = Pose(np.array([1.0, 2.0, 3.0]), BODY_FROM_OPTICAL)
+MIDDLE = (636.5, 356.5, 644.5, 364.5)
+"""A box around the middle of the picture."""
 
 
 def test_the_corners_of_the_letterbox_are_those_of_the_picture() -> None:
@@ -271,17 +270,15 @@ def test_unknown_pixels_are_ignored_and_without_known_ones_there_is_no_position(
 
 def test_estimates_of_a_log_are_averaged_in_the_machines_frame() -> None:
     average = RunningAverage()
-    box = (636.5, 356.5, 644.5, 364.5)  # around the middle of the picture
-    for z in (4.9, 5.0, 5.1):
-        average.add(replace(FRAME, depth_m=np.full((720, 1280), z, np.float32)), STILL, [box])
-    average.add(replace(FRAME, depth_m=np.full((720, 1280), 8.0, np.float32)), STILL, [box])
+    for z in (4.9, 5.0, 5.1, 8.0):
+        average.add(replace(FRAME, depth_m=np.full((720, 1280), z, np.float32)), STILL, [MIDDLE])
     first, second = average.positions_m()
     assert first == pytest.approx((6.0, 2.0, 3.0), abs=1e-6) and second == pytest.approx((9.0, 2.0, 3.0), abs=1e-6)
 
 
 def test_a_radius_is_added_along_the_line_of_sight() -> None:
     average = RunningAverage(radius_m=0.125)
-    average.add(FRAME, STILL, [(636.5, 356.5, 644.5, 364.5)])
+    average.add(FRAME, STILL, [MIDDLE])
     assert average.positions_m()[0] == pytest.approx((6.125, 2.0, 3.0), abs=1e-6)
 
 

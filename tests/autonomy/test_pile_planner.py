@@ -115,10 +115,6 @@ def test_a_log_that_only_rolled_has_not_come_up() -> None:
     assert hypot(first.x_m - second.x_m, first.y_m - second.y_m) > FAILED_RADIUS_M / 2
 
 
-def test_the_same_pile_gives_the_same_grasp() -> None:
-    assert planner()(asked(heap())) == planner()(asked(heap()))
-
-
 class Resisting(StandIn):
     """A crane that a pile stops at ``floor_z_m``."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from math import atan2, pi, remainder
 
 import msgspec
@@ -68,6 +68,7 @@ RULE = {
     "askew": ([log(0)], {"yaw": pi / 2 + 0.6}, False),
     "a tong comes down on it": ([log(0)], {"across_m": 0.72}, False),
     "nothing between the tongs": ([log(0)], {"across_m": 1.2}, False),
+    "(c): from under another that lies across it": ([log(0), ACROSS], {}, False),
     "only its end": ([log(0, along_m=1.25)], {}, False),
     "too much": ([log(i, 0.31 * (i - 1.5), diameter=0.3) for i in range(4)], {}, False),
     "a small pile": (small_pile(), {}, True),
@@ -88,7 +89,8 @@ def test_the_rule(logs: list[LogObservation], how: dict, safe: bool) -> None:
     assert is_safe(logs, **{"across_m": 0.0} | how) is safe
 
 
-def test_a_thick_log_beside_a_thin_one_does_not_lie_on_it() -> None:
+def test_a_log_rests_upon_those_that_it_lies_on_and_not_upon_a_thin_one_beside_it() -> None:
+    assert rests_upon(as_cylinders([log(0), ACROSS])).tolist() == [[False, True], [False, False]]
     assert not rests_upon(as_cylinders([log(0, diameter=0.12), log(1, 0.21, diameter=0.3)])).any()
     assert rests_upon(as_cylinders(small_pile())).tolist() == [[False, False, True], [False, False, True], [False] * 3]
 
@@ -125,25 +127,13 @@ def test_of_logs_that_are_too_heavy_together_one_is_taken() -> None:
         planned(both, arm)
 
 
-def test_no_log_is_pulled_from_under_another() -> None:
-    """(c): the lower log alone between the jaws, the upper one far off its middle across it."""
-    assert not is_safe([log(0), ACROSS], 0.0)
-    assert rests_upon(as_cylinders([log(0), ACROSS])).tolist() == [[False, True], [False, False]]
-
-
 def test_from_above_a_layer_only_that_layer_is_taken() -> None:
     pile = small_pile()
     world = as_cylinders(pile)
     at = blade_sections(JAWS, world, np.array([X]), np.array([Y]), np.array([pi / 2]))
-    levels = np.array([GROUND, GROUND + 0.2])
-    found = score_grasps(JAWS, world, rests_upon(world), *_both(at), levels)
+    at = replace(at, **{f.name: getattr(at, f.name)[:, None, :] for f in fields(at)})  # the same place at both levels
+    found = score_grasps(JAWS, world, rests_upon(world), at, np.array([GROUND, GROUND + 0.2]))
     assert found.captured[0].tolist() == [[True, True, True], [False, False, True]]
-
-
-def _both(at: object) -> tuple[object]:
-    from dataclasses import fields
-
-    return (type(at)(*(getattr(at, f.name)[:, None, :] for f in fields(at))),)
 
 
 def test_uncertain_perception_makes_a_grasp_less_probable() -> None:
@@ -159,14 +149,13 @@ def test_a_machine_on_wheels_takes_the_ground_from_the_logs(sunk_m: float) -> No
     arm = Arm(load_profile("aoro_fc8"))
     ground = arm.profile.workspace.ground_z_m - sunk_m
     x, y = arm.profile.workspace.pick_center_m
+    places = ((0.0, 0.1), (0.21, 0.1), (0.105, 0.27))
     logs = [
-        LogObservation(i, (x, y + side, ground + 0.1), (1.0, 0.0, 0.0), 2.6, 0.2) for i, side in ((0, 0), (1, 0.21))
+        LogObservation(i, (x, y + side, ground + up), (1.0, 0.0, 0.0), 2.6, 0.2) for i, (side, up) in enumerate(places)
     ]
-    upon = LogObservation(2, (x, y + 0.105, ground + 0.27), (1.0, 0.0, 0.0), 2.6, 0.2)
-    p = planned([*logs, upon], arm)
+    p = planned(logs, arm)
     assert set(p.logs) == {0, 1, 2} and p.support_z_m == pytest.approx(ground, abs=1e-3)
-    higher = replace(logs[0], id=3, center_m=(x, y + 3.0, ground + 0.4))
-    alone = planned([higher], arm)
+    alone = planned([replace(logs[0], center_m=(x, y + 3.0, ground + 0.4))], arm)
     assert alone.support_z_m == pytest.approx(ground + 0.3, abs=1e-3), "it lies on a bank"
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from math import cos, hypot, pi, remainder, sin
 from pathlib import Path
 from types import SimpleNamespace
@@ -138,11 +140,6 @@ def test_on_wheels_the_lowest_log_gives_the_ground() -> None:
     assert p.support_z_m == pytest.approx(one.center_m[2] - 0.1)
 
 
-def test_nothing_to_see_is_no_grasp() -> None:
-    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
-        CnnPlanner(Chosen(1.0, 1.0, 0.0))(GraspRequest(ARM, [], 0.0))
-
-
 def test_a_moving_camera_agrees_with_one_that_stands() -> None:
     planner = CnnPlanner(Chosen(0.0, 0.0, 0.0), cameras=5)
     seen = planner.view(as_cylinders(cross()), JAWS, GROUND)
@@ -159,11 +156,8 @@ def test_predictions_are_averaged_where_they_belong() -> None:
     maps = []
     for camera in cameras:
         q = np.zeros((300, 300))
-        u, v = (
-            camera.intrinsics.project(((box.centroid_m - camera.position_m) * np.array([1.0, -1.0, -1.0]))[None])[0]
-            .round()
-            .astype(int)
-        )
+        seen = (box.centroid_m - camera.position_m) * np.array([1.0, -1.0, -1.0])
+        u, v = camera.intrinsics.project(seen[None])[0].round().astype(int)
         q[v, u] = 1.0
         maps.append(GraspMaps(q, q, q))
     mean = mean_maps(maps, cameras, float(box.centroid_m[2]))
@@ -208,17 +202,9 @@ def test_every_plan_has_its_picture_and_a_folder_that_is_gone_changes_no_plan(tm
     plans = [planner(request), planner(request)]
     assert [path.name for path in sorted(folder.iterdir())] == ["plan-001.png", "plan-002.png"]
     assert str(folder / "plan-002.png") in plans[1].reason
-    for path in folder.iterdir():
-        path.unlink()
-    folder.rmdir()
+    shutil.rmtree(folder)
     last = planner(request)
-    for plan in (*plans, last):
-        assert (plan.x_m, plan.y_m, plan.yaw_rad, plan.support_z_m) == (
-            plain.x_m,
-            plain.y_m,
-            plain.yaw_rad,
-            plain.support_z_m,
-        )
+    assert all(replace(plan, reason=plain.reason) == plain for plan in (*plans, last))
     assert "plan-003.png" in last.reason and last.reason != plans[0].reason
 
 
