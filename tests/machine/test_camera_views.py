@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-from math import cos, sin
-
 import numpy as np
 import pytest
 
 from machine.geometry.carrier import pivot_height_m
+from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix
 from machine.loading.profile_file import load_profile
 from machine.profile import Camera
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
-OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # from body x forward, y left, z up
-
-
-def about(axis: str, angle: float) -> np.ndarray:
-    c, s = cos(angle), sin(angle)
-    return np.array(
-        {
-            "x": [[1, 0, 0], [0, c, -s], [0, s, c]],
-            "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
-            "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
-        }[axis]
-    )
 
 
 def pixel(camera: Camera, point: tuple[float, ...], origin=(0.0, 0.0, 0.0), link=None) -> tuple[float, float, float]:
     """(u, v, depth) of a point; ``origin`` and ``link`` (rotation) place the camera's link."""
-    roll, pitch, yaw = camera.rpy_rad
     link = np.eye(3) if link is None else link
-    body = link @ about("z", yaw) @ about("y", pitch) @ about("x", roll)
+    optical = link @ rpy_matrix(camera.rpy_rad) @ BODY_FROM_OPTICAL
     eye = np.array(origin) + link @ np.array(camera.position_m)
-    x, y, z = OPTICAL @ body.T @ (np.array(point) - eye)
+    x, y, z = optical.T @ (np.array(point) - eye)
     return camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px, z
 
 
@@ -44,9 +30,9 @@ def is_seen(camera: Camera, seen: tuple[float, float, float], margin_px: float =
 
 def stick_frame(q: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """(origin, rotation) of the stick of palms_471 in the base frame (docs/reference/machines.md section 1.1)."""
-    mast, boom = about("z", q[0]), about("z", q[0]) @ about("x", q[1])
+    mast, boom = rpy_matrix((0.0, 0.0, q[0])), rpy_matrix((q[1], 0.0, q[0]))
     origin = mast @ np.array([0.0, -0.0601374, 0.26881 + 1.09553]) + boom @ np.array([0.0, 3.04904, -0.00649])
-    return origin, boom @ about("x", q[2])
+    return origin, boom @ rpy_matrix((q[2], 0.0, 0.0))
 
 
 def test_from_home_the_stick_camera_sees_the_whole_pick_area():

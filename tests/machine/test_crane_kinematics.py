@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import machine.geometry.kinematics as kinematics
 from machine.geometry.kinematics import (
@@ -45,12 +46,6 @@ TABLE = (
 PIN_IN_TELESCOPE = (0.0, 2.03711, -0.20229)
 
 
-def rotation(axis: tuple[float, ...], angle: float) -> np.ndarray:
-    a = np.array(axis) / np.linalg.norm(axis)
-    k = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    return np.eye(3) + sin(angle) * k + (1 - cos(angle)) * k @ k
-
-
 def table_frames(q) -> list[tuple[np.ndarray, np.ndarray]]:
     """(origin, rotation) of each link of the raw table, base frame."""
     p, r, frames = np.zeros(3), np.eye(3), []
@@ -59,7 +54,7 @@ def table_frames(q) -> list[tuple[np.ndarray, np.ndarray]]:
         if prismatic:
             p = p + r @ (np.array(axis) / np.linalg.norm(axis) * value)
         else:
-            r = r @ rotation(axis, value)
+            r = r @ Rotation.from_rotvec(np.array(axis) * value).as_matrix()
         frames.append((p, r))
     return frames
 
@@ -355,23 +350,13 @@ def test_pick_area_and_bunk_are_within_reach_with_a_hanging_log(profile):
 
 
 # -- the frames for display
-def turned(rotation: tuple[float, float, float, float]) -> np.ndarray:
-    x, y, z, w = rotation
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def placed(frames: tuple[LinkFrame, ...]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Origin and rotation of every frame in the base frame."""
     found = {BASE: (np.zeros(3), np.eye(3))}
     for frame in frames:
         origin, rotation = found[frame.parent]
-        found[frame.child] = (origin + rotation @ frame.translation_m, rotation @ turned(frame.rotation))
+        turn = Rotation.from_quat(frame.rotation).as_matrix()
+        found[frame.child] = (origin + rotation @ frame.translation_m, rotation @ turn)
     return found
 
 

@@ -19,14 +19,6 @@ def numbers_text(reason: Reason, detail: int, numbers: tuple[float | None, ...])
     return explain(pack(reason, detail), numbers).measured
 
 
-def test_numbers_have_their_names_and_units() -> None:
-    text = numbers_text(Reason.ENCODER_LOST, Joint.LIFT, (20.04, 15.0, 4.0))
-    assert numbers_in(text) == [20.0, 15.0, 4]
-    assert text == ", ".join(
-        quantity.text for quantity in quantities(Reason.ENCODER_LOST, Joint.LIFT, (20.04, 15.0, 4.0))
-    )
-
-
 @pytest.mark.parametrize(
     ("detail", "shown"),
     [
@@ -59,12 +51,14 @@ def test_values_stay_in_si_units_for_programs() -> None:
 def test_the_one_text_has_sentence_numbers_advice_and_code() -> None:
     reason = pack(Reason.ENCODER_LOST, Joint.LIFT)
     sentence, advice = sentence_of(Reason.ENCODER_LOST, Joint.LIFT), FAULTS[Reason.ENCODER_LOST].advice
-    measured = numbers_text(Reason.ENCODER_LOST, Joint.LIFT, (20.0, 15.0, 0.0))
+    numbers = (20.04, 15.0, 0.0)
+    measured = numbers_text(Reason.ENCODER_LOST, Joint.LIFT, numbers)
     assert "lift" in sentence and numbers_in(measured) == [20.0, 15.0, 0]
-    assert describe(reason, numbers=(20.0, 15.0, 0.0)) == f"{sentence} ({measured}). {advice} [ENCODER_LOST]"
+    assert measured == ", ".join(quantity.text for quantity in quantities(Reason.ENCODER_LOST, Joint.LIFT, numbers))
+    assert describe(reason, numbers=numbers) == f"{sentence} ({measured}). {advice} [ENCODER_LOST]"
     assert describe(Reason.NONE) == f"{sentence_of(Reason.NONE)}. {FAULTS[Reason.NONE].advice}"
-    found = explain(reason, (20.0, 15.0, 0.0))
-    assert found.text == describe(reason, numbers=(20.0, 15.0, 0.0))
+    found = explain(reason, numbers)
+    assert found.text == describe(reason, numbers=numbers)
     assert (found.code, found.sentence) == ("ENCODER_LOST", f"{sentence}.")
 
 
