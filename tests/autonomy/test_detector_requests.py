@@ -153,19 +153,14 @@ def test_no_picture_is_placed_by_an_old_standpoint() -> None:
     assert driving().at(MAX_AGE_NS + 1) is None
 
 
-def test_a_standpoint_arrives_as_it_was_sent() -> None:
-    sent = driving(7_123_456_789_012_345)
+@pytest.mark.parametrize("load", [False, True], ids=["no load", "a load before the camera"])
+def test_a_standpoint_arrives_as_it_was_sent(load: bool) -> None:
+    sent = replace(driving(7_123_456_789_012_345), load=load)
     request = decode_request(encode_request(Q, sent))
     got = request.standpoint
-    assert got is not None and request.q[:4] == Q[:4] and got.stamp_ns == sent.stamp_ns
+    assert got is not None and request.q[:4] == Q[:4] and (got.stamp_ns, got.load) == (sent.stamp_ns, load)
     assert got.numbers() == pytest.approx(sent.numbers(), abs=1e-7)
     assert decode_request(encode_request(Q)).standpoint is None
-
-
-@pytest.mark.parametrize("load", [False, True])
-def test_a_request_says_whether_the_crane_holds_a_load_before_the_camera(load: bool) -> None:
-    request = decode_request(encode_request(Q, replace(driving(), load=load)))
-    assert request.standpoint is not None and request.standpoint.load is load
 
 
 @pytest.mark.parametrize("numbers", ["1 2 3", " ".join(["nan"] * 14)])

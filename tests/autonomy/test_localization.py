@@ -307,21 +307,11 @@ def test_the_first_position_is_the_default_origin() -> None:
     assert math.dist(drive.localizer.plane.local(*drive.vehicle.plane.geodetic(3.0, -2.0)[:2])[:2], (0.0, 0.0)) < 4.0
 
 
-def located(**values: float) -> Location:
+def located(yaw_rad: float, articulation_rad: float = 0.0, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Location:
     """A location that is good to a millimetre."""
-    base = {
-        "x_m": 10.0,
-        "y_m": 5.0,
-        "z_m": 0.8,
-        "yaw_rad": 0.4,
-        "covariance": np.eye(3) * 1e-6,
-        "height_sigma_m": 0.02,
-        "articulation_rad": 0.0,
-        "roll_rad": 0.0,
-        "pitch_rad": 0.0,
-        "front_height_m": CARRIER.arm_transport_m,
-    }
-    return Location(1, Status.TRACKING, "", **(base | values))
+    at = Location(1, Status.TRACKING, "", 10.0, 5.0, 0.8, yaw_rad, np.eye(3) * 1e-6, 0.02)
+    angles = {"articulation_rad": articulation_rad, "roll_rad": roll_rad, "pitch_rad": pitch_rad}
+    return replace(at, front_height_m=CARRIER.arm_transport_m, **angles)
 
 
 def test_a_level_straight_machine_has_its_crane_behind_its_axle() -> None:
@@ -336,7 +326,7 @@ def test_a_level_straight_machine_has_its_crane_behind_its_axle() -> None:
 @settings(max_examples=30)
 @given(st.floats(-3.0, 3.0), st.floats(-0.6, 0.6), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
 def test_the_rear_frame_carries_the_front_axle_to_the_location(yaw, bend, roll, pitch) -> None:
-    rear = Frames(CARRIER, located(yaw_rad=yaw, articulation_rad=bend, roll_rad=roll, pitch_rad=pitch)).rear()
+    rear = Frames(CARRIER, located(yaw, bend, roll, pitch)).rear()
     ahead = np.array((math.cos(bend), math.sin(bend), 0.0))
     drop = np.array((0.0, 0.0, -(CARRIER.arm_drop_low_m + CARRIER.arm_transport_m)))
     assert rear.to_base(CARRIER.front_axle_m * ahead + drop) == pytest.approx((10.0, 5.0, 0.8), abs=1e-9)

@@ -109,17 +109,22 @@ class Drifting(Blind):
             super()._grip()
 
 
-def askew_deg(count: int, learns: bool) -> list[float]:
-    """How far each log of a series of jobs was askew between the jaws."""
-    crane, rests, rotator, found = Drifting(FORWARDER, [], q=HOME), HOME, None, []
+def jobs(crane: StandIn, count: int, learns: bool = True, **how) -> Iterator[None]:
+    """A log after the other is laid into the bunk; a step after each."""
+    rests, rotator = HOME, None
     for seed in range(count):
         crane.logs = [birch(seed)]
-        planner = activity(profile=FORWARDER, last_setpoint=rests, rotator=rotator)
+        planner = activity(profile=FORWARDER, last_setpoint=rests, rotator=rotator, **how)
         crane.run(planner)
         assert planner.done, planner.failure
         rests, rotator = (planner.last_setpoint, planner.rotator) if learns else (crane.q, None)
-        found.append(abs(degrees(crane.askew_rad)))
-    return found
+        yield
+
+
+def askew_deg(count: int, learns: bool) -> list[float]:
+    """How far each log of a series of jobs was askew between the jaws."""
+    crane = Drifting(FORWARDER, [], q=HOME)
+    return [abs(degrees(crane.askew_rad)) for _ in jobs(crane, count, learns)]
 
 
 @pytest.mark.long
@@ -155,18 +160,12 @@ class Remembered(Drifting):
 
 def laid_askew_deg(count: int, has_camera: bool) -> tuple[list[float], list[int]]:
     """How far each log of a series lies askew in the bunk, and how often it was shown."""
-    crane, rests, rotator, found, views = Remembered(FORWARDER, [], q=HOME), HOME, None, [], []
-    view = load_view(FORWARDER, 0.0) if has_camera else None
-    for seed in range(count):
-        crane.logs, crane.views = [birch(seed)], 0
-        planner = activity(profile=FORWARDER, last_setpoint=rests, rotator=rotator, view=view)
-        crane.run(planner)
-        assert planner.done, planner.failure
-        rests, rotator = planner.last_setpoint, planner.rotator
+    crane, found, views = Remembered(FORWARDER, [], q=HOME), [], [0]
+    for _ in jobs(crane, count, view=load_view(FORWARDER, 0.0) if has_camera else None):
         (log,) = crane.logs
         found.append(abs(degrees(remainder(atan2(log.axis[1], log.axis[0]) - FORWARDER.bunk.yaw_rad, pi))))
         views.append(crane.views)
-    return found, views
+    return found, np.diff(views).tolist()
 
 
 @pytest.mark.long

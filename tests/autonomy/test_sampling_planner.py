@@ -51,12 +51,6 @@ def is_safe(
     return bool(score_grasps(JAWS, world, rests_upon(world), at, np.array([level]), rule).safe[0])
 
 
-def test_the_jaws_are_those_of_the_profile() -> None:
-    assert JAWS.half_gap_m == 0.733 and JAWS.blade_m == pytest.approx(0.36, abs=0.005)
-    assert list(JAWS.height_m) == sorted(JAWS.height_m)
-    assert list(JAWS.half_width_m) == sorted(JAWS.half_width_m, reverse=True)
-
-
 ACROSS = log(1, 0.0, 0.2, yaw=pi / 2, along_m=0.8)
 BESIDE = [log(0, -0.18, diameter=0.26), log(1, 0.16, diameter=0.24)]
 LAYER = {"level": GROUND + 0.19, "rule": LAYER_RULE}
