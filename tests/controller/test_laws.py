@@ -1,4 +1,4 @@
-"""The joint laws: the six feedbacks, their common structure, end positioning, and all joints together."""
+"""The joint laws: six feedbacks, their common structure, end positioning, all joints together, and the valve map."""
 
 import math
 
@@ -27,7 +27,7 @@ from controller.laws.joint import (
     VibrationFilter,
 )
 from controller.laws.response import GAIN_SPEED_SHARE, LEAST_GAIN, MOST_SHARE, DelayCompensation
-from controller.laws.valve_map import ValveMap
+from controller.laws.valve_map import LINEAR_SHARE, ValveMap
 from machine.joints import JOINTS, Joint
 from machine.profile import SPEED_HEADROOM_SHARE
 from tests.controller.bench import SPECS, T, with_pump
@@ -105,9 +105,10 @@ def test_integrals_of_the_sliding_laws_are_bounded(kind):
     assert out <= 2.0 * law.kp_1_s * law.layer
 
 
-def test_feed_forward_leads_and_the_change_per_second_is_limited():
+def test_feed_forward_leads_by_delay_lag_and_oil_and_the_change_per_second_is_limited():
+    valve = msgspec.structs.replace(SLEW.valve, delay_s=0.08, lag_s=0.04, oil_s=0.13)
+    assert made(spec=msgspec.structs.replace(SLEW, valve=valve)).lead_ns == pytest.approx(250_000_000, abs=1)
     law = made()
-    assert law.lead_ns == round((SLEW.valve.delay_s + SLEW.valve.lag_s) * 1e9)
     assert step(law, lead=0.2) == pytest.approx(ACCELERATION_FACTOR * SLEW.acceleration_limit * T_S)
     for _ in range(300):
         command = step(law, v_ref=0.2, lead=0.2, v=0.2)
@@ -209,13 +210,12 @@ def test_vibration_has_no_mean_and_is_zero_for_an_unknown_pressure():
 
 
 def test_joint_yields_to_a_vibration_of_its_load():
-    law = made(damping_per_bar=1e-3)
+    damped, plain = made(damping_per_bar=1e-3), made(damping_per_bar=0.0)
     for k in range(400):
-        command = step(law, v_ref=0.1, lead=0.1, q=0.0, v=0.1, load=50.0 if k < 399 else 60.0, elapsed_s=T_S)
-    before = made(damping_per_bar=0.0)
-    for _ in range(400):
-        plain = step(before, v_ref=0.1, lead=0.1, q=0.0, v=0.1, load=50.0, elapsed_s=T_S)
-    assert command < plain
+        yields, goes_on = (
+            step(law, v_ref=0.1, lead=0.1, v=0.1, load=50.0 + 10.0 * (k == 399)) for law in (damped, plain)
+        )
+    assert yields < goes_on
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -257,11 +257,17 @@ class Oil:
         self.q += (self.x - self.q) * T_S / self.lag_s
 
 
-def settle(wrong, start, seconds=20.0, rest=None):
-    """(final error, time of the last opening, number of openings) of a joint that rests ``start`` off its goal."""
-    rest, oil = rest or EndPositioning(SLEW), Oil(wrong)
+def arrived(rest=None):
+    """End positioning of a joint that has just come to its goal."""
+    rest = rest or EndPositioning(SLEW)
     rest.reset()
     rest.follow()
+    return rest
+
+
+def settle(wrong, start, seconds=20.0, rest=None):
+    """(final error, time of the last opening, number of openings) of a joint that rests ``start`` off its goal."""
+    rest, oil = arrived(rest), Oil(wrong)
     last_s, openings, before = 0.0, 0, 0.0
     for k in range(int(seconds / T_S)):
         error = start - oil.q
@@ -289,11 +295,8 @@ def test_learning_shortens_the_next_stop():
 
 
 def first_inch(rest, way, oil):
-    """(seconds for which the valve opens first, what is left when it would open again) of a joint that rests so far
-    off.
-    """
-    rest.reset()
-    rest.follow()
+    """(seconds of the first opening, what is left when it would open again) of a joint that rests so far off."""
+    arrived(rest)
     open_s, shut_s = 0.0, 0.0
     while shut_s < 3.0:
         command = rest.step(way - oil.q, way - oil.q, 0.0, T_S)
@@ -321,8 +324,7 @@ def test_short_inch_teaches_little():
 
 
 def test_valve_stays_shut_within_the_stop_band():
-    rest = EndPositioning(SLEW)
-    rest.follow()
+    rest = arrived()
     for k in range(2000):
         error = 0.9 * SLEW.law.stop_band * math.sin(3.0 * k * T_S)
         assert rest.step(error, error, SLEW.law.kp_1_s * error, T_S) == 0.0
@@ -330,8 +332,7 @@ def test_valve_stays_shut_within_the_stop_band():
 
 
 def test_swinging_load_is_not_chased():
-    rest, commands = EndPositioning(SLEW), 0
-    rest.follow()
+    rest, commands = arrived(), 0
     for k in range(4000):
         error = 0.0025 * math.sin(3.5 * k * T_S) * math.exp(-0.1 * k * T_S)
         commands += rest.step(error, error, SLEW.law.kp_1_s * error, T_S) != 0.0
@@ -339,8 +340,7 @@ def test_swinging_load_is_not_chased():
 
 
 def test_opening_of_a_stuck_valve_is_bounded():
-    rest = EndPositioning(SLEW)
-    rest.follow()
+    rest = arrived()
     widest = max(abs(rest.step(0.005, 0.005, 0.005, T_S)) for _ in range(20_000))
     assert widest <= MAX_OPENING_SHARE * SLEW.valve.full_speed_plus + 1e-12
     assert widest > INCH_SHARE * SLEW.valve.full_speed_plus
@@ -432,12 +432,11 @@ def test_stop_fades_the_last_commands_and_reset_clears_them():
 
 def opened_s(left: float) -> float:
     """Time of the first opening for a joint that arrived some stop bands away and swings by one and a half."""
-    rest, band = EndPositioning(SLEW), SLEW.law.stop_band
-    rest.follow()
+    rest, band = arrived(), SLEW.law.stop_band
     for k in range(600):
-        error = band * (left + 1.5 * math.sin(2.0 * math.pi * k * 0.005))
-        if rest.step(error, error, 0.0, 0.005):
-            return k * 0.005
+        error = band * (left + 1.5 * math.sin(2.0 * math.pi * k * T_S))
+        if rest.step(error, error, 0.0, T_S):
+            return k * T_S
     return math.inf
 
 
@@ -446,7 +445,105 @@ def test_only_a_joint_near_its_goal_must_settle_first():
     assert opened_s(1.5) > 1.0
 
 
-def test_feed_forward_leads_by_delay_lag_and_oil():
-    valve = msgspec.structs.replace(SLEW.valve, delay_s=0.08, lag_s=0.04, oil_s=0.13)
-    spec = msgspec.structs.replace(SLEW, valve=valve)
-    assert JointLaw(spec, ValveMap(valve), 0.005).lead_ns == pytest.approx(250_000_000, abs=1)
+# -- valve map: compensation of dead-band, metering curve, hysteresis and lever
+
+PLAY, LEVER = SPECS[0].valve, SPECS[1].valve
+NO_PLAY = msgspec.structs.replace(PLAY, hysteresis_pct=0.0)
+CURVED = msgspec.structs.replace(NO_PLAY, exponent=1.3, deadband_plus_pct=9.0, deadband_minus_pct=14.0)
+
+
+def metered(valve, u):
+    """Share of the full speed of a valve of docs/reference/machines.md section 3 for a command."""
+    deadband = (valve.deadband_plus_pct if u > 0 else valve.deadband_minus_pct) / 100.0
+    half = valve.hysteresis_pct / 200.0
+    return math.copysign((max(0.0, abs(u) - deadband) / (1.0 - half - deadband)) ** valve.exponent, u)
+
+
+class Hysteresis:
+    """The spool behind its command."""
+
+    def __init__(self, valve, at=0.0):
+        self.half, self.at = valve.hysteresis_pct / 200.0, at
+
+    def step(self, u):
+        self.at = max(u - self.half, min(u + self.half, self.at))
+        return self.at
+
+
+@pytest.mark.parametrize("valve", [NO_PLAY, CURVED])
+@given(velocity=st.floats(-0.5, 0.5))
+def test_map_is_the_inverse_of_the_valve(valve, velocity):
+    u = ValveMap(valve).spool_pct(velocity) / 100.0
+    if abs(velocity) > LINEAR_SHARE * 0.5:
+        assert metered(valve, u) * 0.5 == pytest.approx(velocity, abs=1e-9)
+    else:
+        edge = ValveMap(valve).spool_pct(math.copysign(1.001 * LINEAR_SHARE * 0.5, velocity)) / 100.0
+        assert abs(u) <= abs(edge)
+
+
+@given(
+    st.lists(st.floats(0.02, 0.45).flatmap(lambda v: st.sampled_from([v, -v])), min_size=2, max_size=8),
+    st.floats(-0.01, 0.01),
+)
+def test_hysteresis_is_compensated_after_every_reversal(goals, at):
+    """In sweeps between goals the spool is correct once a sweep is long enough to reverse the lead."""
+    made, play, velocity = ValveMap(PLAY), Hysteresis(PLAY, at), 0.0
+    for goal in goals:
+        last = metered(PLAY, play.at)
+        for k in range(1, 51):
+            now = velocity + (goal - velocity) * k / 50.0
+            spool = play.step(made.spool_pct(now) / 100.0)
+        velocity = goal
+        assert abs(made.spool_pct(goal)) <= 100.0
+        if abs(goal - 0.5 * last) > 0.5 * 0.03:
+            assert metered(PLAY, spool) * 0.5 == pytest.approx(goal, abs=1e-9)
+
+
+def test_without_compensation_hysteresis_costs_speed():
+    plain, play = ValveMap(NO_PLAY), Hysteresis(PLAY)
+    rising = [metered(PLAY, play.step(plain.spool_pct(0.005 * k) / 100.0)) for k in range(81)][40]
+    falling = [metered(PLAY, play.step(plain.spool_pct(0.4 - 0.005 * k) / 100.0)) for k in range(81)][40]
+    assert 0.5 * (falling - rising) == pytest.approx(0.5 * 0.02 / 0.87, rel=0.02)
+
+
+def test_flicker_does_not_reverse_the_lead_and_zero_is_zero():
+    made = ValveMap(PLAY)
+    for k in range(50):
+        made.spool_pct(0.005 * k)
+    still = made.spool_pct(0.25)
+    assert still - 1.0 < made.spool_pct(0.25 - 0.0002) < still
+    assert made.spool_pct(0.0) == 0.0 == made.spool_pct(-0.0)
+
+
+@pytest.mark.parametrize("valve", [LEVER, CURVED, PLAY])
+def test_map_is_monotonic_and_saturates(valve):
+    made = ValveMap(valve)
+    values = [made.spool_pct(v / 1000) for v in range(-600, 601)]
+    assert values == sorted(values) and values[0] == -100.0 and values[-1] == 100.0
+    assert made.spool_pct(0.0) == 0.0
+
+
+def test_two_sides_differ():
+    made = ValveMap(LEVER)
+    assert made.spool_pct(0.12) > -made.spool_pct(-0.12)
+
+
+def test_short_lever_makes_the_joint_faster():
+    made = ValveMap(LEVER)
+    made.set_position(LEVER.lever_at[-1] + 1.0)
+    assert made.arm == LEVER.lever[-1]
+    assert made.full_plus == pytest.approx(LEVER.full_speed_plus / LEVER.lever[-1])
+    short = made.spool_pct(0.1)
+    made.set_position(0.5 * (LEVER.lever_at[2] + LEVER.lever_at[3]))
+    assert made.arm == pytest.approx(0.5 * (LEVER.lever[2] + LEVER.lever[3]))
+    assert made.spool_pct(0.1) > short
+    made.set_position(math.nan)
+    assert made.arm == pytest.approx(0.5 * (LEVER.lever[2] + LEVER.lever[3]))
+    made.set_position(-9.0)
+    assert made.arm == LEVER.lever[0]
+
+
+def test_joint_without_a_lever_is_the_same_everywhere():
+    made = ValveMap(NO_PLAY)
+    made.set_position(1.0)
+    assert (made.arm, made.full_plus) == (1.0, NO_PLAY.full_speed_plus)
