@@ -1,8 +1,9 @@
-"""The loop: deadlines, skipped periods, datagrams, records, warm-up; with a bus in memory and a scripted clock."""
+"""The process: its loop with a bus in memory and a scripted clock (deadlines, datagrams, records), and its command."""
 
 import mmap
 import os
 
+import msgspec
 import pytest
 
 from can_dbc.bus.base import BusState, Filter
@@ -11,21 +12,30 @@ from can_dbc.frame import Frame
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
-from can_dbc.messages.envelope import DatagramRefused, opened, signed
+from can_dbc.messages.envelope import DatagramRefused, opened, signed, write_key
+from can_dbc.messages.tick_record import BusReading
 from can_dbc.messages.vehicle import Driving
 from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
+from controller.bus_io import BusMonitor
 from controller.carrier.vehicle import Vehicle
-from controller.config import load
+from controller.config import MIN_QUEUE_FRAMES, TX_QUEUE_NS, load
+from controller.process.bus_link import BusLink
+from controller.process.command import main
 from controller.process.loop import Loop
 from controller.process.operator_socket import OperatorSocket
-from controller.process.setpoint_port import DATAGRAM_BYTES, MAX_DATAGRAMS
+from controller.process.setpoint_port import DATAGRAM_BYTES, MAX_DATAGRAMS, listen
 from controller.process.timing import LoopTiming, ProcessReader
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
+from hil.wire.core import WireCore
+from hil.wire.faults import Fault, Kind
+from hil.wire.inprocess import InProcessBus
+from machine.loading.profile_file import load_profile
+from machine.profile import Plc
 from machine.status.reasons import Reason
 from runtime.errors import LinkError
-from tests.codes import coded
+from tests.codes import coded, numbers_in
 from tests.controller.bench import DATABASE, MS, SETTINGS, Bench, T
 
 LEAD = SETTINGS.sync_lead_ns
@@ -212,10 +222,11 @@ def test_loop_always_ends_neutral_and_disarmed(udp, how):
         run(loop, 3)
     a, b, status = (DATABASE.message(n) for n in ("ValveCmdA", "ValveCmdB", "CtrlStatus"))
     assert [key for key, _ in bus.sent[-3:]] == [a.key, b.key, status.key]
-    last_a, last_b = a.named(a.decode(bus.sent[-3][1])), b.named(b.decode(bus.sent[-2][1]))
+    last_a, last_b, last = (c.named(c.decode(data)) for c, (_, data) in zip((a, b, status), bus.sent[-3:], strict=True))
     assert [last_a[s] for s in ("Mode", "Slew", "Lift", "Tilt", "Ext")] == [0] * 5
-    assert last_b["ArmKey"] == last_b["Rot"] == last_b["Grapple"] == 0
+    assert last_b["ArmKey"] == last_b["Rot"] == last_b["Grapple"] == last_b["Aux"] == 0
     assert last_b["GrappleMode"] in (0, 3), "neutral or hold"
+    assert last["Reason"] == Reason.CONTROLLER_ENDED
     loop.close()
     assert bus.closed
 
@@ -380,3 +391,136 @@ def test_bus_filter_passes_all_inputs_and_nothing_else(profile):
             assert slot.codec.key in machine and (other_source in machine) == slot.codec.by_pgn, slot.codec.name
     assert 0x98EEFF80 in machine and 0x98EA2780 in machine, "address claims and requests"
     assert 0x98FEDB00 not in machine
+
+
+# -- the command: start errors with their exit codes, and addresses
+
+
+def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
+    good = ["--setpoint-port", "0", "--key-file", str(write_key(tmp_path / "good"))]
+    assert main(["--profile", "nowhere", *good, "--bus", "crane0=wire:none"]) == 3
+    assert main(["--profile", "palms_471", *good, "--bus", "crane0=wire:none"]) == 4
+    assert main(["--profile", "palms_471", *good, "--rate", "7"]) == 3
+    key = tmp_path / "key"
+    key.write_bytes(b"short")
+    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key)]) == 3
+    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key) + "x"]) == 3
+    for arguments in (
+        [*good, "--bus", "x=wire:x"],
+        [*good, "--report", "nowhere"],
+        [*good, "--guard-not-needed"],
+        good[:2],
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(["--profile", "palms_471", *arguments])
+        assert stopped.value.code == 2
+    palms = ["--profile", "palms_471", *good, "--bus", "crane0=virtual:start"]
+    assert main([*palms, "--bus", "mach0=virtual:x"]) == 3
+    assert main([*palms, "--sync-lead-us", "5000"]) == 3
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("controller: ")]
+    assert len(errors) == 7
+
+
+def test_busy_port_is_one_sentence_and_exit_4(capsys, udp, tmp_path):
+    port = udp[0].getsockname()[1]
+    arguments = ["--profile", "palms_471", "--setpoint-port", str(port), "--bus", "crane0=virtual:busy"]
+    arguments += ["--key-file", str(write_key(tmp_path / "key"))]
+    assert main(arguments) == 4
+    assert port in numbers_in(capsys.readouterr().err)
+
+
+def test_setpoint_socket_is_on_loopback_only():
+    with listen(0) as made:
+        assert made.getsockname()[0] == "127.0.0.1"
+
+
+# -- what waits for a bus that transmits nothing: no command older than the queue's bound leaves afterwards
+
+COMMANDS = (0x210, 0x310, 0x080)
+"""The frames of a tick."""
+
+
+class BlockedBus:
+    """A controller that numbers its commands, on a bus that a babbling node occupies from 100 ms on."""
+
+    def __init__(self, rate_hz: int, end_ns: int) -> None:
+        self.period_ns = 1_000_000_000 // rate_hz
+        self.core = WireCore(1_000_000)
+        self.core.inject(Fault(Kind.BABBLE, 100 * MS, end_ns, key=0x000))
+        self.bus = InProcessBus(self.core, "controller", tx_queue=load("palms_471", rate_hz).tx_queue_frames[0])
+        self.listener = InProcessBus(self.core, "listener")
+        self.link, self.reading, self.monitor = BusLink(self.bus), BusReading(), BusMonitor(0)
+        self.reasons: list[tuple[int, Reason]] = []
+
+    def run(self, until_ns: int) -> list[Frame]:
+        """The commands that arrived; their data is the time of their tick."""
+        arrived: list[Frame] = []
+        while self.core.now_ns < until_ns:
+            now_ns = self.core.now_ns
+            self.link.receive([], self.reading)
+            self.monitor.update(self.reading, True, now_ns)
+            self.reasons.append((now_ns, self.monitor.reason))
+            self.link.send([(key, now_ns.to_bytes(8, "big")) for key in COMMANDS])
+            self.core.advance(now_ns + self.period_ns)
+            self.listener.drain(arrived)
+        return [frame for frame in arrived if frame.key in COMMANDS]
+
+    def ages_ns(self, frames: list[Frame]) -> list[int]:
+        return [frame.stamp_ns - int.from_bytes(frame.data, "big") for frame in frames]
+
+
+@pytest.mark.parametrize("rate_hz", [50, 200, 1000])
+@pytest.mark.parametrize("blocked_ms", [15, 40, 500])
+def test_no_command_leaves_that_is_older_than_the_bound(rate_hz: int, blocked_ms: int) -> None:
+    rig = BlockedBus(rate_hz, (100 + blocked_ms) * MS)
+    arrived = rig.run(800 * MS)
+    assert max(rig.ages_ns(arrived)) <= TX_QUEUE_NS + 2 * rig.period_ns
+    last = [frame for frame in arrived if frame.stamp_ns > (130 + blocked_ms) * MS]
+    assert max(rig.ages_ns(last)) <= rig.period_ns, "the queue is empty again"
+
+
+@pytest.mark.parametrize("rate_hz", [200, 1000])
+def test_a_short_stall_loses_nothing(rate_hz: int) -> None:
+    rig = BlockedBus(rate_hz, 115 * MS)
+    ticks = 200 * MS // rig.period_ns
+    assert len(rig.run(200 * MS)) == ticks * len(COMMANDS)
+    assert rig.bus.stats.refused == 0
+
+
+@pytest.mark.parametrize("rate_hz", [200, 1000])
+def test_a_bus_that_transmits_nothing_is_reported_within_50_ms(rate_hz: int) -> None:
+    """Catalogue entry 12: what was cancelled counts as refused, tick after tick."""
+    rig = BlockedBus(rate_hz, 500 * MS)
+    rig.run(400 * MS)
+    seen_ns = next(at_ns for at_ns, reason in rig.reasons if reason is Reason.SEND_REFUSED)
+    assert seen_ns - 100 * MS <= 50 * MS
+    assert rig.reasons[-1][1] is Reason.SEND_REFUSED, "and as long as it lasts"
+
+
+def test_commands_that_are_not_due_in_every_tick_are_neither_cancelled_early_nor_sent_late() -> None:
+    """As on mach0: four frames in every fourth tick, and a queue for two periods."""
+    core = WireCore(250_000)
+    core.inject(Fault(Kind.BABBLE, 100 * MS, 400 * MS, key=0x000))
+    bus, listener = InProcessBus(core, "controller", tx_queue=MIN_QUEUE_FRAMES), InProcessBus(core, "listener")
+    link, reading, monitor = BusLink(bus), BusReading(), BusMonitor(1)
+    arrived: list[Frame] = []
+    seen_ns, sent = None, False
+    for tick in range(120):
+        link.receive([], reading)
+        monitor.update(reading, sent, core.now_ns)
+        if seen_ns is None and monitor.reason is Reason.SEND_REFUSED:
+            seen_ns = core.now_ns
+        sent = tick % 4 == 0
+        link.send([(0x300 + i, core.now_ns.to_bytes(8, "big")) for i in range(4)] if sent else [])
+        core.advance(core.now_ns + 5 * MS)
+        listener.drain(arrived)
+    ages_ns = [frame.stamp_ns - int.from_bytes(frame.data, "big") for frame in arrived if frame.key >= 0x300]
+    assert max(ages_ns) <= 45 * MS and len([age for age in ages_ns if age < 5 * MS]) >= 4 * 14
+    assert seen_ns is not None and seen_ns - 100 * MS <= 100 * MS
+
+
+def test_joint_references_have_room_in_the_queue() -> None:
+    settings = load("palms_471")
+    plain = settings.tx_queue_frames[0]
+    profile = msgspec.structs.replace(load_profile("palms_471"), plc=Plc("references"))
+    assert type(settings)(profile, 0, settings.rate_hz).tx_queue_frames[0] > plain

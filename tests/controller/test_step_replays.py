@@ -127,7 +127,7 @@ def test_record_of_a_whole_run_replays_to_the_same_bytes(settings_):
     assert bool(sent) is (settings_ is AORO)
 
 
-@pytest.mark.parametrize("settings_", [SETTINGS, pytest.param(AORO, marks=pytest.mark.long)])
+@pytest.mark.parametrize("settings_", [SETTINGS, AORO])
 @pytest.mark.long
 def test_tick_keeps_no_memory(settings_):
     bench = Bench(settings_).active()
@@ -174,13 +174,3 @@ def test_status_and_heartbeat_on_the_bus_and_sync_apart():
     assert seen[0x210] == seen[0x310] == seen[0x080] == 200
     assert seen[0x4FE] == 50 and seen[0x77E] == 10
     assert all(b == a % 240 + 1 for a, b in pairwise(counters))
-
-
-def test_shutdown_frames_are_neutral_and_disarmed():
-    bench = Bench().active()
-    out = bench.controller.shutdown_frames()
-    bench.controller.outputs.frames[:] = out
-    bench._apply_crane_frames(bench.controller.outputs)
-    assert bench.neutral and bench.commands_b["ArmKey"] == 0
-    codec = DATABASE.message("CtrlStatus")
-    assert out[-1][0] == codec.key and codec.named(codec.decode(out[-1][1]))["Reason"] == 13
