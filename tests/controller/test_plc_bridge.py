@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from can_dbc.dbc.codec import load
+from can_dbc.dbc.codec import MessageCodec, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import Header, encode_reply
@@ -41,6 +41,10 @@ ARMED, MOVES = 0xA, 2
 
 def profile(role: str | None) -> Profile:
     return msgspec.structs.replace(load_profile("palms_471"), plc=Plc(role) if role else None)  # type: ignore[arg-type]
+
+
+def values_of(codec: MessageCodec, data: bytes) -> dict[str, Any]:
+    return dict(zip((s.name for s in codec.signals), codec.receive(data), strict=True))
 
 
 class Rig:
@@ -112,7 +116,15 @@ class Rig:
         """The newest frame of that name in the last step, decoded."""
         codec = DATABASE.message(name)
         found = [data for key, data in self.sent if key == codec.key]
-        return dict(zip((s.name for s in codec.signals), codec.receive(found[-1]), strict=True)) if found else None
+        return values_of(codec, found[-1]) if found else None
+
+
+def passing() -> Rig:
+    """The PLC drives the slew."""
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+    return rig
 
 
 def await_frame(rig: Rig, name: str, **values: Any) -> dict[str, Any]:
@@ -200,25 +212,21 @@ def test_armed_commands_of_role_valves_pass_as_shares() -> None:
     assert rig.command.max_speed_pct == 50
 
 
-@pytest.mark.parametrize(("missing", "exit_code"), [({"arm": 0}, 8), ({"enable": 0}, 4), ({"mode": 3}, 6)])
-def test_without_arm_key_enable_or_a_known_mode_it_is_neutral(missing: dict[str, int], exit_code: int) -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
-    assert rig.command.mode is Mode.VALVES
-    rig.run(20, Slew=50.0, **missing)
+@pytest.mark.parametrize(
+    ("spoiled", "exit_code"),
+    [({"arm": 0}, 8), ({"enable": 0}, 4), ({"mode": 3}, 6), *(({n: None}, 6) for n in ("Slew", "Rot", "Grapple"))],
+    ids=str,
+)
+def test_without_arm_key_enable_known_mode_or_a_value_it_is_neutral_until_a_disarm(
+    spoiled: dict[str, int | None], exit_code: int
+) -> None:
+    rig = passing()
+    rig.run(20, **{"Slew": 50.0} | spoiled)
     assert rig.command == Command()
     assert rig.bridge.gate.exit == exit_code
-
-
-@pytest.mark.parametrize("name", ["Slew", "Rot", "Grapple"])
-def test_a_command_that_is_not_available_is_neutral_until_a_disarm(name: str) -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
-    assert rig.command.mode is Mode.VALVES
-    rig.run(20, **{"Slew": 50.0, name: None})
-    assert rig.command == Command() and rig.bridge.gate.exit == 6
     rig.run(20, Slew=50.0)
-    assert rig.command == Command() and rig.bridge.gate.locked
+    assert rig.bridge.gate.locked is ("arm" not in spoiled)
+    assert (rig.command == Command()) is rig.bridge.gate.locked
 
 
 @pytest.mark.parametrize(("fault", "bits"), [(0, 0), (3, 4), (16, 0x8000), (17, 0x8000), (65535, 0x8000)])
@@ -228,9 +236,7 @@ def test_every_fault_number_of_the_plc_is_a_fault_bit(fault: int, bits: int) -> 
 
 @pytest.mark.parametrize("lost", ["ValveCmdA", "ValveCmdB", "GuardStat"])
 def test_loss_while_armed_is_neutral_until_a_disarm(lost: str) -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
-    key = DATABASE.message(lost).key
+    rig, key = passing(), DATABASE.message(lost).key
     began_ns = rig.now_ns
     while rig.command.mode is Mode.VALVES:
         rig.step([f for f in rig.control(Slew=50.0) if f.key != key])
@@ -244,8 +250,7 @@ def test_loss_while_armed_is_neutral_until_a_disarm(lost: str) -> None:
 
 
 def test_sync_lost_is_neutral() -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
+    rig = passing()
     for _ in range(5):
         rig.step(rig.control(Slew=50.0)[1:])
     assert rig.command == Command()
@@ -327,8 +332,7 @@ def test_plc_values_are_on_the_bus_and_others_not_available() -> None:
 
 
 def test_reset_needs_an_operators_reset_and_never_an_armed_controller() -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
+    rig = passing()
     rig.feedback = replace(rig.feedback, state=State.SAFE, fault=Fault.WATCHDOG)
     asked = []
     for mode, arm in ((ControllerMode.ACTIVE, ARMED), (ControllerMode.FAULT, 0), (ControllerMode.STOP, 0)):
@@ -369,16 +373,6 @@ def test_the_emergency_stop_is_the_safety_modules_own_frame_and_is_sent_once() -
     assert len(seen) == 20 and set(seen[1:]) <= {Status.OK, Status.INITIAL}
 
 
-def test_a_safety_module_that_falls_silent_behind_the_plc_is_silent_on_the_bus() -> None:
-    """The PLC goes on with the last state it has seen, and the bridge sends none of its own."""
-    rig = Rig()
-    rig.run(100)
-    assert frames_of(rig, "EstopStat", 50)
-    rig.estop_alive = False
-    rig.run(10)
-    assert not frames_of(rig, "EstopStat", 300)
-
-
 def test_a_sample_is_sent_once_with_the_plcs_time() -> None:
     rig = Rig()
     start_encoders(rig)
@@ -397,15 +391,17 @@ def test_a_sample_is_sent_once_with_the_plcs_time() -> None:
     assert len(set(positions)) == 1, "nothing between two samples"
 
 
-@pytest.mark.parametrize("name", ["EncSlew", "EncExt"])
-def test_a_plc_that_repeats_its_samples_is_silence_on_the_bus(name: str) -> None:
-    """Its cycle runs on, so its heartbeat changes; the linear encoder has no time stamp of its own."""
+@pytest.mark.parametrize(
+    ("name", "alive"), [("EstopStat", "estop_alive"), ("EncSlew", "samples"), ("EncExt", "samples")]
+)
+def test_what_falls_silent_behind_the_plc_is_silent_on_the_bus(name: str, alive: str) -> None:
+    """The PLC's cycle runs on with the last it has seen; the linear encoder has no time stamp of its own."""
     rig = Rig()
     start_encoders(rig)
     assert frames_of(rig, name, 50)
-    rig.samples = False
+    setattr(rig, alive, False)
     rig.run(10)
-    assert not frames_of(rig, name, 200)
+    assert not frames_of(rig, name, 300)
     assert frames_of(rig, "PressA", 50), "the rest goes on"
 
 
@@ -440,10 +436,14 @@ def test_an_answer_that_took_longer_than_50_ms_is_not_used() -> None:
     assert shake.accept_registers(status, 149 * MS)
 
 
-def test_bridge_starts_neutral_under_an_armed_controller_and_waits_for_a_disarm() -> None:
+@pytest.mark.parametrize("what", ["bridge", "conversation with the PLC"])
+def test_a_new_beginning_under_an_armed_controller_waits_for_a_disarm(what: str) -> None:
     """A bridge that is started again does not go on where another one ended."""
-    rig = Rig()
-    rig.bridge = Bridge(profile("valves"), DATABASE)
+    rig = passing()
+    if what == "bridge":
+        rig.bridge = Bridge(profile("valves"), DATABASE)
+    else:
+        rig.bridge.handshake.connected()
     rig.run(300, Slew=50.0)
     assert rig.command == Command() and rig.bridge.gate.locked
     rig.run(20, arm=0, mode=0)
@@ -451,18 +451,8 @@ def test_bridge_starts_neutral_under_an_armed_controller_and_waits_for_a_disarm(
     assert rig.command.mode is Mode.VALVES
 
 
-def test_a_new_conversation_with_the_plc_needs_a_disarm() -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
-    assert rig.command.mode is Mode.VALVES
-    rig.bridge.handshake.connected()
-    rig.run(100, Slew=50.0)
-    assert rig.command == Command()
-
-
 def test_commands_that_come_60_ms_late_in_order_are_not_passed_on() -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
+    rig = passing()
     travelling: list[tuple[int, list[Frame]]] = []
     delay_ns = 0
     for n in range(200):
@@ -478,8 +468,7 @@ def test_commands_that_come_60_ms_late_in_order_are_not_passed_on() -> None:
 
 
 def test_corrupt_commands_do_not_end_the_lock() -> None:
-    rig = Rig()
-    rig.run(100, Slew=50.0)
+    rig = passing()
     rig.run(20, Slew=50.0, enable=0)
     assert rig.bridge.gate.locked
     key = DATABASE.message("ValveCmdB").key
@@ -621,12 +610,16 @@ def test_rate_is_the_controllers_and_within_its_range(
 HERE, SPEEDS = (0.1, 0.7, -1.6, 0.5, 3.0), (0.35, -0.15, 0.28, 0.25, -1.0)
 
 
-def decoded(frames: list[RawFrame]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def referred(
+    position: tuple[float, ...] = HERE, speeds: tuple[float, ...] = SPEEDS, moving: bool = True
+) -> dict[str, Any]:
+    """The joint references that a PLC of that role is sent."""
+    frames, found = list[RawFrame](), dict[str, Any]()
+    CraneWriter(DATABASE, profile("references")).references(position, speeds, moving, frames)
     for (key, data), name in zip(frames, REFERENCES, strict=True):
         codec = DATABASE.message(name)
         assert key == codec.key
-        found |= dict(zip((s.name for s in codec.signals), codec.receive(data), strict=True))
+        found |= values_of(codec, data)
     return found
 
 
@@ -638,22 +631,16 @@ def test_only_a_plc_with_role_references_gets_them(role: str | None) -> None:
 
 
 def test_references_carry_position_and_commanded_velocity() -> None:
-    frames: list[RawFrame] = []
-    CraneWriter(DATABASE, profile("references")).references(HERE, SPEEDS, True, frames)
-    found = decoded(frames)
+    found = referred()
     for name, position, speed in zip(NAMES, HERE, SPEEDS, strict=True):
         assert found[name] == pytest.approx(position, abs=1.01e-4)
         assert found[f"{name}Rate"] == pytest.approx(speed, abs=5.01e-4)
 
 
 def test_references_at_rest_unknown_or_out_of_range_are_not_available() -> None:
-    writer, frames = CraneWriter(DATABASE, profile("references")), list[RawFrame]()
-    writer.references(HERE, SPEEDS, False, frames)
-    assert decoded(frames)["Slew"] is decoded(frames)["RotRate"] is None
-    frames.clear()
-    strange = (math.nan, 0.7, 1e9, 0.5, -math.inf)
-    writer.references(strange, (0.0, 2.0, 0.0, 0.1, 0.0), True, frames)
-    found = decoded(frames)
+    at_rest = referred(moving=False)
+    assert at_rest["Slew"] is at_rest["RotRate"] is None
+    found = referred((math.nan, 0.7, 1e9, 0.5, -math.inf), (0.0, 2.0, 0.0, 0.1, 0.0))
     assert [found[n] for n in ("Slew", "Lift", "Tilt", "Rot")] == [None] * 4
     assert found["Ext"] == pytest.approx(0.5, abs=1e-4) and found["ExtRate"] == pytest.approx(0.1, abs=1e-3)
 
