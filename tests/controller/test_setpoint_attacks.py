@@ -12,6 +12,7 @@ from controller.crane.reference_governor import GROWTH_FACTOR
 from controller.laws.response import LEAST_SHARE, MOST_SHARE, UNKNOWN_GAIN, CommandBound
 from machine.geometry.grapple import lowest_pin_m
 from machine.geometry.kinematics import pin_position
+from machine.joints import Joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.controller.bench import MS, PROFILE, SPECS, Bench, T, settings_of, with_pump
@@ -209,16 +210,21 @@ def test_a_pushed_joint_keeps_the_least_and_the_other_direction_is_free():
 # -- One knot at rest, again and again, each a little farther: its velocity is 0, and yet it leads somewhere.
 
 
+def creep(bench, j, step, ticks, every=1, sent=lambda k: ()):
+    """The reference of a joint is led on by a step in every so many ticks, until the machine stops."""
+    for k in range(ticks):
+        reference = [x if x == x else 0.0 for x in bench.controller.reference_position]
+        reference[j] = step(k, reference[j])
+        bench.tick([*sent(k), *([bench.setpoint([(0, reference, STILL)])] if k % every == 0 else ())])
+        if bench.mode is not Mode.ACTIVE:
+            break
+
+
 def test_small_steps_do_not_lead_into_the_ground():
     low_m, kin = lowest_pin_m(PROFILE), PROFILE.kinematics
     bench = Bench(home=LOW).armed()
     bench.tick([bench.hold()])
-    for k in range(500):
-        reference = list(bench.controller.reference_position)
-        reference[1] = max(reference[1] - 0.007, -0.38)
-        bench.tick([bench.setpoint([(0, reference, STILL)])] if k % 10 == 0 else ())
-        if bench.mode is not Mode.ACTIVE:
-            break
+    creep(bench, Joint.LIFT, lambda _, q: max(q - 0.007, -0.38), 500, every=10)
     assert bench.controller.gate.refusal is Reason.BELOW_GROUND and pin_position(kin, bench.q)[2] > low_m - 0.02
 
 
@@ -237,17 +243,13 @@ def test_a_spool_test_ends_over_the_ground():
 
 
 def test_small_steps_do_not_turn_the_crane_of_a_machine_that_drives():
-    bench = DriveBench()
-    bench.under_way(400)
-    begun_rad, step_rad = bench.q[0], 0.0
-    for k in range(400):
-        sent = [bench.to(50.0, 0.0)] if k % 10 == 0 else []
-        step_rad = min(step_rad + 1e-4, 1.5e-3)
-        reference = [x if x == x else 0.0 for x in bench.controller.reference_position]
-        reference[0] += step_rad
-        bench.tick([*sent, bench.setpoint([(0, reference, STILL)])])
-        if bench.mode is not Mode.ACTIVE:
-            break
+    bench = DriveBench().under_way(400)
+    begun_rad = bench.q[0]
+
+    def drives(k):
+        return [bench.to(50.0, 0.0)] if k % 10 == 0 else ()
+
+    creep(bench, Joint.SLEW, lambda k, q: q + min(1e-4 * (k + 1), 1.5e-3), 400, sent=drives)
     assert bench.controller.gate.refusal is Reason.CARRIER_MOVES and abs(bench.q[0] - begun_rad) < 0.02
 
 
@@ -258,10 +260,5 @@ def test_small_steps_do_not_reach_outward_with_too_much_load():
         bench.tick([bench.hold()])
     assert bench.reason is Reason.OVERLOADED
     begun_m = bench.q[3]
-    for _ in range(800):
-        reference = list(bench.controller.reference_position)
-        reference[3] = min(reference[3] + 0.0012, 1.7)
-        bench.tick([bench.setpoint([(0, reference, STILL)])])
-        if bench.mode is not Mode.ACTIVE:
-            break
+    creep(bench, Joint.EXT, lambda _, q: min(q + 0.0012, 1.7), 800)
     assert bench.q[3] - begun_m < BORNE_TOLERANCE_M + 0.02

@@ -137,15 +137,11 @@ def test_rotator_without_encoder_is_limited_by_its_integrated_angle() -> None:
     assert blind.controller.crane.spool_run.integrated_rad == pytest.approx(0.667 * 0.42, abs=0.05)
 
 
-def test_wild_command_is_refused() -> None:
+def test_wild_replayed_and_late_tests_are_refused() -> None:
     bench = Bench().armed()
     bench.tick([asked(bench, (0, 0.0), (5, 40.0))])
     assert (bench.controller.gate.refusal, bench.controller.gate.detail) == (Reason.TEST_SPOOL, Joint.SLEW)
     assert bench.mode is Mode.ARMED
-
-
-def test_replayed_and_late_tests_are_refused() -> None:
-    bench = Bench().armed()
     first = asked(bench, *RAMP)
     bench.tick([first])
     bench.tick([first])
@@ -223,7 +219,7 @@ def test_joint_without_encoder_is_refused() -> None:
 def stopped(run: SpoolTestRun, percent: float, most_s: float = 10.0) -> tuple[Reason, float]:
     """Drive a rotator's test tick by tick: reason to stop, and time until then [s]."""
     ramp = 200 * MS
-    for now in range(NOW, NOW + int(most_s * 1e9), 5 * MS):
+    for now in range(NOW, NOW + int(most_s * 1e9), T):
         if now == NOW:
             run.start(program((0, 0.0), (200, percent), (400, percent), joint=Joint.ROT), now)
         elif now >= NOW + ramp and now % (50 * MS) == 0:
@@ -263,17 +259,17 @@ def test_rotator_without_encoder_keeps_to_speed_and_half_speed() -> None:
     assert run.check(nan, nan, 0.5, NOW + 500 * MS) is Reason.TEST_SPEED
 
 
-def test_more_speed_than_the_limit_is_refused() -> None:
-    run = SpoolTestRun(PROFILE)
-    # 0.35 of 0.5 rad/s: 12 + 88 * 0.7 = 73.6 %
-    run.start(program((0, 0.0), (500, 73.0)), NOW)
-    assert reason_of(SpoolTestRun(PROFILE), program((0, 0.0), (500, 74.0))) is Reason.TEST_SPOOL
-
-
-def test_dead_band_may_be_stepped_over_and_the_opening_not() -> None:
-    run = SpoolTestRun(PROFILE)
-    run.start(program((0, 0.0), (5, 12.0), (105, 20.0)), NOW)
-    assert reason_of(SpoolTestRun(PROFILE), program((0, 0.0), (5, 20.0), (105, 20.0))) is Reason.TEST_SPOOL
+@pytest.mark.parametrize(
+    ("taken", "refused"),
+    [
+        # 0.35 of 0.5 rad/s: 12 + 88 * 0.7 = 73.6 %
+        pytest.param(((0, 0.0), (500, 73.0)), ((0, 0.0), (500, 74.0)), id="speed"),
+        pytest.param(((0, 0.0), (5, 12.0), (105, 20.0)), ((0, 0.0), (5, 20.0), (105, 20.0)), id="step over dead-band"),
+    ],
+)
+def test_more_speed_than_the_limit_and_a_step_of_the_opening_are_refused(taken, refused) -> None:
+    SpoolTestRun(PROFILE).start(program(*taken), NOW)
+    assert reason_of(SpoolTestRun(PROFILE), program(*refused)) is Reason.TEST_SPOOL
 
 
 def test_step_from_the_present_command_is_refused_and_closing_is_free() -> None:
@@ -304,28 +300,23 @@ def test_another_function_waits_until_the_valve_is_shut() -> None:
 
 
 @pytest.mark.parametrize(
-    ("position", "velocity", "percent", "reason"),
+    ("position", "velocity", "percent", "cap", "reason"),
     [
-        (0.0, 0.3, 30.0, Reason.NONE),
-        (0.0, 0.45, 30.0, Reason.TEST_SPEED),
-        (1.70, 0.2, 30.0, Reason.TEST_RANGE),
-        (1.70, 0.2, -30.0, Reason.NONE),
-        (-1.70, -0.2, -30.0, Reason.TEST_RANGE),
+        (0.0, 0.3, 30.0, 1.0, Reason.NONE),
+        (0.0, 0.45, 30.0, 1.0, Reason.TEST_SPEED),
+        (0.0, 0.25, 30.0, 1.0, Reason.NONE),
+        (0.0, 0.25, 30.0, 0.5, Reason.TEST_SPEED),
+        (1.70, 0.2, 30.0, 1.0, Reason.TEST_RANGE),
+        (1.70, 0.2, -30.0, 1.0, Reason.NONE),
+        (-1.70, -0.2, -30.0, 1.0, Reason.TEST_RANGE),
     ],
 )
 def test_range_and_speed_are_checked_by_the_encoder(
-    position: float, velocity: float, percent: float, reason: Reason
+    position: float, velocity: float, percent: float, cap: float, reason: Reason
 ) -> None:
     run = SpoolTestRun(PROFILE)
     run.start(program((0, 0.0), (400, percent)), NOW)
-    assert run.check(position, velocity, 1.0, NOW + 300 * MS) is reason
-
-
-def test_half_speed_halves_the_speed_limit() -> None:
-    run = SpoolTestRun(PROFILE)
-    run.start(program((0, 0.0), (400, 30.0)), NOW)
-    assert run.check(0.0, 0.25, 1.0, NOW) is Reason.NONE
-    assert run.check(0.0, 0.25, 0.5, NOW) is Reason.TEST_SPEED
+    assert run.check(position, velocity, cap, NOW + 300 * MS) is reason
 
 
 def test_test_lasts_twenty_seconds_at_most() -> None:
