@@ -96,7 +96,6 @@ MACHINE_VALUES: dict[str, dict[str, float]] = {
     "GnssPositionData": {"Method": 4},
 }
 SOURCES = {"GNSS": 0x1C, "ENGINE": 0x00}
-DEVICE = {"rotary": 0x00010196, "linear": 0x00080196}
 
 
 def count_until(tick: Callable[[], Any], done: Callable[[], bool], limit: int = 100) -> int:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, SpoolKnot, SpoolTest
+from can_dbc.messages.crane import OperatorAction, SpoolKnot, SpoolTest
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering
 from controller.step import step
@@ -15,7 +15,7 @@ from controller.tick import Inputs
 from machine.joints import Joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from tests.controller.bench import AORO, GNSS, MACHINE, bytes_kept
+from tests.controller.bench import AORO, GNSS, MACHINE, bytes_kept, count_until
 from tests.controller.drive_bench import CARRIER, MS, TRANSPORT, DriveBench, T
 
 LIMIT = CARRIER.articulation_limit_rad
@@ -207,10 +207,7 @@ def test_stop_by_the_operator_stops_the_carrier():
 def test_fault_that_latches_brakes_at_once():
     bench = DriveBench().under_way(300)
     bench.lies = {"VehStat": {"Fault": 2}}
-    for _ in range(10):
-        bench.tick()
-        if bench.mode is not Mode.ACTIVE:
-            break
+    count_until(bench.tick, lambda: bench.mode is not Mode.ACTIVE, 10)
     assert bench.reason == Reason.CARRIER_FAULT
     assert bench.braked and bench.drive_command["ArmKey"] == 0, "in the same tick, not with the next period"
 
@@ -231,11 +228,7 @@ def crane_to(bench: DriveBench, by: float) -> bytes:
     there = [r if r == r else 0.0 for r in bench.controller.reference_position]
     end = list(there)
     end[Joint.SLEW] += by
-    still = (0.0,) * 5
-    bench.setpoint_sequence += 1
-    stamp = (bench.setpoint_sequence, bench.settings.profile_hash, bench.now_ns, 200 * MS)
-    knots = (Knot(0, tuple(there), still), Knot(2000 * MS, tuple(end), still))
-    return encode(CraneSetpoint(*stamp, GrappleCommand.NEUTRAL, False, knots))
+    return bench.setpoint([(0, there, (0.0,) * 5), (2000, end, (0.0,) * 5)])
 
 
 def test_crane_may_be_held_but_not_moved_while_driving():

@@ -1,7 +1,5 @@
 """Set-up of the encoders against emulated nodes, and supervision of all nodes of crane0."""
 
-from dataclasses import replace
-
 import msgspec
 import pytest
 
@@ -14,7 +12,9 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from runtime.errors import ConfigError
 from tests.codes import coded
-from tests.controller.bench import DATABASE, MS, PROFILE, SETTINGS, Bench, T
+from tests.controller.bench import DATABASE, MS, PROFILE, Bench, T, settings_of
+
+SLEW = PROFILE.joints["slew"]
 
 
 def test_every_encoder_is_configured_as_in_the_bus_reference():
@@ -71,27 +71,31 @@ def test_refused_set_up_is_a_configuration_fault():
     assert bench.reason == Reason.NODE_CONFIGURATION and bench.controller.supervisor.detail == 6
 
 
-def test_device_swapped_while_running_is_detected():
+@pytest.mark.parametrize(
+    ("node", "place", "value"),
+    [
+        pytest.param(2, (0x1018, 1), 8, id="another device"),
+        pytest.param(4, (0x6003, 0), 1234, id="lost preset"),
+    ],
+)
+def test_device_swapped_or_reset_while_running_is_detected(node, place, value):
     bench = Bench().boot()
-    bench.encoders[2].objects[0x1018, 1] = 8
-    bench.extra.append((0x702, b"\x00"))
-    bench.encoders[2].state = 0x7F
+    bench.encoders[node].objects[place] = value
+    bench.extra.append((0x700 + node, b"\x00"))
+    bench.encoders[node].state = 0x7F
     assert bench.run(100) is Mode.STANDBY
-    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 2
+    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == node
 
 
 def test_three_tries_of_300_ms_then_again():
-    setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
-    sent = []
-    for k in range(400):
-        if setup.frame(k * T) is not None:
-            sent.append(k * T // MS)
+    setup = EncoderSetup(SLEW.encoder)
+    sent = [k * T // MS for k in range(400) if setup.frame(k * T) is not None]
     assert sent[:5] == [0, 5, 305, 605, 910]
     assert setup.reason is Reason.NODE_ABSENT
 
 
 def test_stray_answer_is_ignored():
-    setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
+    setup = EncoderSetup(SLEW.encoder)
     stray = Sdo(SdoKind.UPLOAD, 2, 0x6004, 0, b"\1\0\0\0", 0)
     setup.receive(stray)
     setup.frame(0)
@@ -123,21 +127,11 @@ def _frames(bench, ticks):
     return [frame for _ in range(ticks) for frame in list(bench.tick().frames)]
 
 
-def test_lost_preset_is_an_identity_fault():
-    bench = Bench().boot()
-    bench.encoders[4].objects[0x6003, 0] = 1234
-    bench.encoders[4].state = 0x7F
-    bench.pending.append((0x704, b"\x00"))
-    bench.run(300)
-    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 4
-
-
 def test_node_that_cannot_send_its_message_is_a_configuration_error():
-    encoder = PROFILE.joints["slew"].encoder
-    slew = msgspec.structs.replace(PROFILE.joints["slew"], encoder=msgspec.structs.replace(encoder, node=16))
+    slew = msgspec.structs.replace(SLEW, encoder=msgspec.structs.replace(SLEW.encoder, node=16))
     profile = msgspec.structs.replace(PROFILE, joints=PROFILE.joints | {"slew": slew})
     with pytest.raises(ConfigError, check=coded("config.encoder-node")):
-        Controller(replace(SETTINGS, profile=profile), DATABASE)
+        Controller(settings_of(profile), DATABASE)
 
 
 # -- the nodes of crane0: findings by frames and by silence

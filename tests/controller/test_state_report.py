@@ -85,10 +85,9 @@ def test_a_bad_value_is_in_the_evidence(
 
 
 def test_a_valve_node_that_accepts_nothing_shows_for_how_long_and_why() -> None:
-    def refuse(b: Bench) -> None:
-        b.changed["ValveFbB"] = {"EchoCounter": 7, "ExitCode": 4}
-
-    unchanged_ms, limit_ms, exit_code = numbers(stopped(Bench().active(), refuse, Reason.VALVE_ECHO_STUCK))
+    bench = Bench().active()
+    bench.changed["ValveFbB"] = {"EchoCounter": 7, "ExitCode": 4}
+    unchanged_ms, limit_ms, exit_code = numbers(stopped(bench, lambda _: None, Reason.VALVE_ECHO_STUCK))
     assert unchanged_ms > limit_ms == 20.0 and exit_code == 4
 
 
@@ -98,10 +97,8 @@ def test_a_lost_heartbeat_shows_its_age() -> None:
 
 
 def test_an_emergency_message_shows_its_code() -> None:
-    def send(b: Bench) -> None:
-        b.extra.append(emergency_frame(Emergency(4, 0x6100, 1, b"")))
-
-    assert numbers(stopped(Bench().active(), send, Reason.EMERGENCY_MESSAGE))[0] == 0x6100
+    sent = emergency_frame(Emergency(4, 0x6100, 1, b""))
+    assert numbers(stopped(Bench().active(), lambda b: b.extra.append(sent), Reason.EMERGENCY_MESSAGE))[0] == 0x6100
 
 
 def test_a_late_loop_shows_how_late_it_was() -> None:
@@ -134,10 +131,7 @@ def test_refused_setpoints_show_the_reason_of_the_last_one() -> None:
 
 
 def test_a_runaway_joint_shows_its_velocity_and_its_command() -> None:
-    def run_away(b: Bench) -> None:
-        b.moves_alone[1] = 0.2
-
-    bench = stopped(Bench().active(), run_away, Reason.JOINT_RUNAWAY)
+    bench = stopped(Bench().active(), lambda b: b.moves_alone.update({1: 0.2}), Reason.JOINT_RUNAWAY)
     velocity, limit, commanded = numbers(bench)
     assert velocity == pytest.approx(0.2, rel=0.3) and abs(commanded) < 0.05
     assert limit == bench.specs[1].speed_limit and bench.reports[-1].reason >> 8 == 1

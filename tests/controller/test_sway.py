@@ -122,16 +122,16 @@ def test_old_swing_is_predicted_by_its_age(age_s):
 
 def test_damping_begins_above_the_dead_zone_and_ends_in_it():
     damper = DirectionalDamper(IMU, 0.15)
-    damper.step((START_ZONES - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
-    assert damper.velocity_m_s == 0.0
-    damper.step((START_ZONES + 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
-    assert damper.velocity_m_s > 0.0
-    for _ in range(100):
-        damper.step((START_ZONES - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
-    assert damper.velocity_m_s > 0.0
-    for _ in range(round(FADE_S / T_S) + 1):
-        damper.step(0.9 * IMU.dead_zone_rad, 0.0, 0.0, T_S)
-    assert damper.velocity_m_s == 0.0
+    fade = round(FADE_S / T_S) + 1
+    for zones, ticks, damps in (
+        (START_ZONES - 0.1, 1, False),
+        (START_ZONES + 0.1, 1, True),
+        (START_ZONES - 0.1, 100, True),
+        (0.9, fade, False),
+    ):
+        for _ in range(ticks):
+            damper.step(zones * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+        assert (damper.velocity_m_s > 0.0) is damps and damper.velocity_m_s >= 0.0
 
 
 def test_pin_keeps_its_speed_limit_without_jumps():
@@ -207,23 +207,25 @@ def test_damping_does_not_begin_and_fades_while_the_reference_moves():
 
 def test_unknown_joints_are_not_moved():
     law = sway()
-    law.step(SWING, 0.0, True, POSE, T_S)
-    law.step(SWING, 0.0, True, (0.3, math.nan, -1.4, 0.8, 0.0), T_S)
+    for pose in (POSE, (0.3, math.nan, -1.4, 0.8, 0.0)):
+        law.step(SWING, 0.0, True, pose, T_S)
     assert not law.active and not any(law.velocity) and not any(law.displacement)
 
 
 def test_end_positioning_waits_for_the_damping():
     spec = joint(PROFILE, Joint.SLEW)
     law = JointLaw(spec, ValveMap(spec.valve), T_S)
-    law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
+
+    def velocity(q=0.2, *damping):
+        return law.desired_velocity(0.2, 0.0, 0.0, q, 0.0, math.nan, T_S, *damping)
+
+    velocity()
     assert law.resting
-    assert law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S, 0.01, 0.0) == pytest.approx(0.01)
-    assert not law.resting
-    # Where it was taken to is where it is to be.
-    assert law.desired_velocity(0.2, 0.0, 0.0, 0.203, 0.0, math.nan, T_S, 0.0, 0.003) == pytest.approx(0.0, abs=1e-4)
+    assert velocity(0.2, 0.01, 0.0) == pytest.approx(0.01) and not law.resting
+    assert velocity(0.203, 0.0, 0.003) == pytest.approx(0.0, abs=1e-4), "where it was taken to is where it is to be"
     assert not law.resting
     for _ in range(400):
-        law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
+        velocity()
     assert law.resting
 
 
@@ -239,25 +241,23 @@ def feel(bench: Bench, **values: float) -> None:
     bench.extra.append(bench._frame("GrappleImu", values))
 
 
-def at_rest(bench: Bench) -> Bench:
-    """ACTIVE, with a constant reference and a lease that does not end."""
+def at_rest(bench: Bench, ticks: int, every: int, **values: float) -> Bench:
+    """ACTIVE, with a constant reference, and frames of the sensor in every so many ticks."""
     bench.armed()
-    bench.tick([bench.hold(lease_ms=200)])
+    bench.tick([bench.hold()])
     assert bench.mode is Mode.ACTIVE
+    for k in range(ticks):
+        if k % every == 0:
+            feel(bench, **values)
+        bench.tick([bench.hold()] if k % 20 == 0 else [])
     return bench
 
 
 def test_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
-    bench = at_rest(Bench(sensing()))
-    for k in range(60):
-        if k % 2 == 0:
-            feel(bench, LeanTangential=0.15)
-        bench.tick([bench.hold(lease_ms=200)] if k % 20 == 0 else [])
-    moving = bench.controller.crane.commands[Joint.SLEW]
-    assert moving > 0.01
+    bench = at_rest(Bench(sensing()), 60, 2, LeanTangential=0.15)
+    assert bench.controller.crane.commands[Joint.SLEW] > 0.01
     assert bench.controller.crane_inputs.stale_mask == 0
-    for k in range(80):
-        bench.tick([bench.hold(lease_ms=200)] if k % 20 == 0 else [])
+    bench.keep(80)
     swung = bench.controller.crane.sway
     assert bench.controller.crane_inputs.imu.values is None
     assert bench.controller.crane_inputs.stale_mask == 0 and bench.mode is Mode.ACTIVE
@@ -266,10 +266,7 @@ def test_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
 
 @pytest.mark.parametrize("values", [{"Status": 2}, {"LeanRadial": None}, {"RateTangential": None}])
 def test_faulty_sensor_is_ignored(values):
-    bench = at_rest(Bench(sensing()))
-    for k in range(60):
-        feel(bench, **{"LeanTangential": 0.15, "LeanRadial": 0.15, **values})
-        bench.tick([bench.hold(lease_ms=200)] if k % 20 == 0 else [])
+    bench = at_rest(Bench(sensing()), 60, 1, **{"LeanTangential": 0.15, "LeanRadial": 0.15, **values})
     assert bench.controller.crane_inputs.imu.values is not None
     assert not bench.controller.crane.sway.active
 
