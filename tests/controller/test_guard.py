@@ -59,13 +59,20 @@ def test_motion_back_into_the_range_passes():
     assert traffic.tick(10) is Verdict.GOOD
 
 
-def test_slow_growth_and_closing_pass():
+@pytest.mark.parametrize(
+    ("growth", "end", "verdict"),
+    [
+        pytest.param(range(80), {"Mode": 0, "Tilt": 0.0}, Verdict.GOOD, id="slow growth and closing"),
+        pytest.param(range(60), {"Tilt": -60.0}, Verdict.RATE, id="a reversal counts as growth"),
+    ],
+)
+def test_a_command_may_grow_slowly_and_close_and_not_jump(growth, end, verdict):
     traffic = Traffic().good()
-    for pct in range(80):
+    for pct in growth:
         traffic.a.update({"Mode": 2, "Tilt": float(pct)})
         assert traffic.tick() is Verdict.GOOD
-    traffic.a.update({"Mode": 0, "Tilt": 0.0})
-    assert traffic.tick() is Verdict.GOOD
+    traffic.a.update(end)
+    assert traffic.tick() is verdict
 
 
 def test_lasting_fast_growth_is_detected():
@@ -74,15 +81,6 @@ def test_lasting_fast_growth_is_detected():
         traffic.a.update({"Mode": 2, "Tilt": float(pct)})
         traffic.tick()
     assert traffic.guard.verdict is Verdict.RATE
-
-
-def test_reversal_counts_as_growth():
-    traffic = Traffic().good()
-    for pct in range(60):
-        traffic.a.update({"Mode": 2, "Tilt": float(pct)})
-        traffic.tick()
-    traffic.a["Tilt"] = -60.0
-    assert traffic.tick() is Verdict.RATE
 
 
 @pytest.mark.parametrize("message", ["ValveCmdA", "ValveCmdB"])

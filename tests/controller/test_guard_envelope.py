@@ -42,6 +42,19 @@ def files(tmp_path):
     return profile, envelope
 
 
+def rewrite(path, old, new):
+    """Change one thing of a file."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def refuses(profile, code="guard.profile-incomplete"):
+    """The guard does not start with this profile."""
+    with pytest.raises(GuardConfigError, check=coded(code)):
+        build(profile)
+
+
 @pytest.mark.parametrize("name", shipped_profiles())
 def test_every_shipped_profile_has_a_sealed_envelope(name):
     envelope = read_envelope(SHIPPED / f"{name}.toml")
@@ -51,10 +64,8 @@ def test_every_shipped_profile_has_a_sealed_envelope(name):
 
 def test_the_envelope_beside_the_profile_counts(files):
     profile, envelope = files
-    text = envelope.read_text().replace("ground_m = -0.565", "ground_m = -0.5")
-    envelope.write_text(text)
-    with pytest.raises(GuardConfigError, check=coded("guard.envelope-damaged")):
-        build(profile)
+    rewrite(envelope, "ground_m = -0.565", "ground_m = -0.5")
+    refuses(profile, "guard.envelope-damaged")
     assert seal.main([str(envelope)]) == 0
     assert read_envelope(profile).ground_m == -0.5
     assert envelope.read_text().count("sha256") == 1
@@ -81,12 +92,8 @@ def test_any_changed_byte_stops_the_start(files):
     ],
 )
 def test_a_profile_that_allows_more_is_refused(files, old, new):
-    profile, _ = files
-    text = profile.read_text()
-    assert old in text
-    profile.write_text(text.replace(old, new))
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-exceeds-envelope")):
-        build(profile)
+    rewrite(files[0], old, new)
+    refuses(files[0], "guard.profile-exceeds-envelope")
 
 
 def test_what_calibration_finds_is_taken_from_the_profile(files):
@@ -101,9 +108,8 @@ def test_what_calibration_finds_is_taken_from_the_profile(files):
 
 def test_a_machine_without_an_envelope_does_not_start(files, capsys):
     profile, _ = files
-    profile.write_text(profile.read_text().replace('name = "palms_471"', 'name = "unknown"'))
-    with pytest.raises(GuardConfigError, check=coded("guard.envelope-missing")):
-        build(profile)
+    rewrite(profile, 'name = "palms_471"', 'name = "unknown"')
+    refuses(profile, "guard.envelope-missing")
     assert seal.main([str(profile.with_name("none"))]) == 3
     assert "none" in capsys.readouterr().err
 
@@ -139,15 +145,12 @@ def test_numbers_that_would_switch_a_rule_off_or_end_the_guard_stop_the_start(fi
         if name in old and "nan" not in new:  # the better side counts, so both must be bad
             changed = re.sub(rf"({name}_\w+) = [^ ]+", rf"\1 = {value}", changed)
     profile.write_text(changed)
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
-        build(profile)
+    refuses(profile)
 
 
 def resealed(envelope, old, new):
     """Change an envelope file as its owner may: with a new seal."""
-    text = envelope.read_text()
-    assert old in text
-    envelope.write_text(text.replace(old, new))
+    rewrite(envelope, old, new)
     assert seal.main([str(envelope)]) == 0
 
 
@@ -171,17 +174,23 @@ FIRST_BOX = "[[boxes]]\nlow_m = [-1.0, -1.0, -1.0]\nhigh_m = {}\n\n[[boxes]]"
 def test_a_sealed_envelope_that_no_machine_has_stops_the_start(files, old, new):
     profile, envelope = files
     resealed(envelope, old, new)
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
-        build(profile)
+    refuses(profile)
+
+
+def carrier_with_speed_limit(folder, limit):
+    """A profile of the forwarder that is as fast as this."""
+    text = re.sub(
+        r"(?m)^speed_limit_m_s = [\d.]+", f"speed_limit_m_s = {limit}", (SHIPPED / "aoro_fc8.toml").read_text()
+    )
+    (folder / "machine.toml").write_text(text)
+    return folder / "machine.toml"
 
 
 @pytest.mark.parametrize(
     ("limit", "taken"), [(0.0007, False), (0.001, True), (0.7, True), (7.0, True), (10.0, True), (10.5, False)]
 )
 def test_a_limit_of_the_carrier_has_bounds(tmp_path, limit, taken):
-    profile, envelope = tmp_path / "machine.toml", tmp_path / "aoro_fc8.envelope.toml"
-    text = (SHIPPED / "aoro_fc8.toml").read_text()
-    profile.write_text(re.sub(r"(?m)^speed_limit_m_s = [\d.]+", "speed_limit_m_s = 0.0001", text))
+    profile, envelope = carrier_with_speed_limit(tmp_path, "0.0001"), tmp_path / "aoro_fc8.envelope.toml"
     envelope.write_text((SHIPPED / envelope.name).read_text())
     old = re.search(r"(?m)^speed_limit_m_s = [\d.]+", envelope.read_text())
     assert old is not None
@@ -190,16 +199,11 @@ def test_a_limit_of_the_carrier_has_bounds(tmp_path, limit, taken):
         carrier = read_envelope(profile).carrier
         assert carrier is not None and carrier.speed_limit_m_s == limit
     else:
-        with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
-            read_envelope(profile)
+        refuses(profile)
 
 
 def test_a_limit_of_the_carrier_that_is_no_number_stops_the_start(tmp_path):
-    profile = tmp_path / "machine.toml"
-    text = (SHIPPED / "aoro_fc8.toml").read_text()
-    profile.write_text(re.sub(r"(?m)^speed_limit_m_s = [\d.]+", "speed_limit_m_s = nan", text))
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
-        read_envelope(profile)
+    refuses(carrier_with_speed_limit(tmp_path, "nan"))
 
 
 def test_the_check_of_a_profile_has_24_bits(files):
@@ -282,10 +286,8 @@ def test_a_database_with_numbers_or_bytes_that_cannot_be_read_stops_the_start(tm
 
 @pytest.mark.parametrize("text", ["rate_hz = 2" + 5000 * "0", "x = " + 5000 * "[" + 5000 * "]"])
 def test_a_profile_that_no_reader_can_read_stops_the_start(files, text):
-    profile, _ = files
-    profile.write_text(text)
-    with pytest.raises(GuardConfigError, check=coded("guard.profile-unreadable")):
-        build(profile)
+    files[0].write_text(text)
+    refuses(files[0], "guard.profile-unreadable")
 
 
 def test_guard_and_controller_have_one_check_of_one_file(files):
