@@ -252,16 +252,19 @@ def test_a_new_supervisor_has_found_nothing() -> None:
     assert not any((new.half_speed, new.latching, new.ramping, new.armed)) and new._reset_pressed
 
 
-@pytest.mark.parametrize("mode", [Mode.ARMED, Mode.ACTIVE])
-def test_arm_says_nothing_against_an_armed_machine(mode) -> None:
-    assert supervisor_in(mode).request_arm(NOW) == (Reason.NONE, 0)
-
-
-def test_a_refused_arm_has_no_detail() -> None:
-    assert supervisor_in(Mode.FAULT).request_arm(NOW) == (Reason.FAULT_LATCHED, 0)
-    stopping = supervisor_in(Mode.STOP)
-    stopping.ramp_ns = 1
-    assert stopping.request_arm(NOW) == (Reason.STILL_STOPPING, 0)
+@pytest.mark.parametrize(
+    ("mode", "ramp_ns", "answer"),
+    [
+        (Mode.ARMED, 0, Reason.NONE),
+        (Mode.ACTIVE, 0, Reason.NONE),
+        (Mode.FAULT, 0, Reason.FAULT_LATCHED),
+        (Mode.STOP, 1, Reason.STILL_STOPPING),
+    ],
+)
+def test_the_answer_to_an_arm_has_no_detail(mode: Mode, ramp_ns: int, answer: Reason) -> None:
+    supervisor = supervisor_in(mode)
+    supervisor.ramp_ns = ramp_ns
+    assert supervisor.request_arm(NOW) == (answer, 0)
 
 
 def test_arming_forgets_the_echo_and_the_detail_of_the_time_before() -> None:
@@ -272,11 +275,11 @@ def test_arming_forgets_the_echo_and_the_detail_of_the_time_before() -> None:
     assert (supervisor._echo_ticks, supervisor.reason, supervisor.detail) == (0, Reason.NONE, 0)
 
 
-def test_only_a_stop_of_a_moving_machine_has_a_ramp() -> None:
-    for mode, ramp in ((Mode.ARMED, False), (Mode.ACTIVE, True)):
-        supervisor = supervisor_in(mode)
-        assert supervisor.apply(Event.HOLD, Reason.OPERATOR_STOP, 0, NOW) and supervisor.mode is Mode.STOP
-        assert supervisor.ramping is ramp
+@pytest.mark.parametrize(("mode", "ramp"), [(Mode.ARMED, False), (Mode.ACTIVE, True)])
+def test_only_a_stop_of_a_moving_machine_has_a_ramp(mode: Mode, ramp: bool) -> None:
+    supervisor = supervisor_in(mode)
+    assert supervisor.apply(Event.HOLD, Reason.OPERATOR_STOP, 0, NOW) and supervisor.mode is Mode.STOP
+    assert supervisor.ramping is ramp
 
 
 # -- what is left beside its decisions: details of reasons, findings of a tick, the ends of a ramp
@@ -311,6 +314,7 @@ def test_what_a_person_asked_for_has_no_detail(mode: Mode, request_name: str, af
         ({"dropped": {"EncTilt"}}, Reason.INPUT_MISSING),
         ({"changed": {"GuardStat": {"Enable": 0}}}, Reason.GUARD_NOT_READY),
         ({"changed": {"ValveFbA": {"State": 4}}}, Reason.VALVE_NODE_NOT_READY),
+        ({"changed": {"EstopStat": {"ChannelA": 0, "ChannelB": 0}}}, Reason.ESTOP_NOT_RELEASED),
     ],
 )
 def test_what_prevents_arming_without_a_part_of_its_own_has_no_detail(fault, reason: Reason) -> None:
@@ -319,13 +323,6 @@ def test_what_prevents_arming_without_a_part_of_its_own_has_no_detail(fault, rea
         getattr(bench, name).update(value)
     bench.run(60)
     assert bench.controller.supervisor.arming_blocker(bench.now_ns) == (reason, 0)
-
-
-def test_an_emergency_stop_that_is_not_released_has_no_detail() -> None:
-    bench = Bench().boot()
-    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
-    bench.run(4)
-    assert bench.controller.supervisor.arming_blocker(bench.now_ns) == (Reason.ESTOP_NOT_RELEASED, 0)
 
 
 def test_what_an_earlier_check_found_does_not_prevent_arming() -> None:
