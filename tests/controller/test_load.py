@@ -127,11 +127,6 @@ def overloaded_bench():
     return Bench(settings_of(profile))
 
 
-def drive(bench, j, v, ticks):
-    for k in range(ticks):
-        bench.tick([bench.moving(j, v)] if k % 10 == 0 and bench.mode in (Mode.ARMED, Mode.ACTIVE) else ())
-
-
 def holds_after(bench):
     """Ticks until the overload holds a crane that goes on outward."""
     planned = (bench.moving(Joint.EXT, 0.02) if k % 10 == 9 else b"" for k in range(100))
@@ -144,10 +139,8 @@ def test_a_crane_that_moves_outward_into_overload_holds_in_time():
     bench = overloaded_bench().armed()
     bench.changed["GrappleStat"] = {"Load": 100.0}
     bench.tick([bench.hold()])
-    drive(bench, Joint.EXT, -0.02, 40)
-    assert bench.mode is Mode.ACTIVE
-    drive(bench, Joint.EXT, 0.02, 20)
-    assert bench.mode is Mode.ACTIVE
+    assert bench.drive(Joint.EXT, -0.02, 40) is Mode.ACTIVE
+    assert bench.drive(Joint.EXT, 0.02, 20) is Mode.ACTIVE
     bench.changed["GrappleStat"] = {"Load": 140.0}
     k = holds_after(bench)
     frame_ms = 20
@@ -179,7 +172,7 @@ def test_a_profile_without_the_section_judges_nothing():
     bench = Bench(settings_of(profile)).armed()
     bench.changed["GrappleStat"] = {"Load": 4000.0}
     bench.tick([bench.hold()])
-    drive(bench, Joint.EXT, 0.02, 60)
+    bench.drive(Joint.EXT, 0.02, 60)
     assert bench.mode is Mode.ACTIVE and bench.controller.crane.load_moment is None
 
 
@@ -266,7 +259,7 @@ def lifting_bench(v):
     bench = Bench()
     bench.changed["PressA"] = {"LiftA": 45.0, "LiftB": 2.0}
     bench.armed().tick([bench.hold()])
-    drive(bench, Joint.EXT, v, 40)
+    bench.drive(Joint.EXT, v, 40)
     assert bench.mode is Mode.ACTIVE and not bench.controller.supervisor.half_speed
     bench.changed["PressA"] = {"LiftA": 200.0, "LiftB": 2.0}
     return bench
@@ -282,14 +275,13 @@ def test_by_the_pressures_outward_motion_holds_in_time():
 
 def test_by_the_pressures_inward_motion_goes_on_at_half_speed():
     bench = lifting_bench(-0.02)
-    drive(bench, Joint.EXT, -0.02, 10)
+    bench.drive(Joint.EXT, -0.02, 10)
     supervisor = bench.controller.supervisor
     assert bench.mode is Mode.ACTIVE and supervisor.half_speed and bench.reason == Reason.OVERLOADED
-    drive(bench, Joint.EXT, -0.02, 60)
-    assert bench.mode is Mode.ACTIVE
+    assert bench.drive(Joint.EXT, -0.02, 60) is Mode.ACTIVE
     for bar in (120.0, 70.0, 45.0):
         bench.changed["PressA"] = {"LiftA": bar, "LiftB": 2.0}
-        drive(bench, Joint.EXT, -0.01, 150)
+        bench.drive(Joint.EXT, -0.01, 150)
     assert bench.mode is Mode.ACTIVE and not supervisor.half_speed and bench.reason == Reason.NONE
 
 

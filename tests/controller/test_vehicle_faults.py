@@ -41,11 +41,6 @@ def until(bench: DriveBench, reason: Reason, limit_ms: int, *place: float, **fie
     raise AssertionError(f"{reason.name} not seen within {limit_ms} ms: {bench.mode.name} {bench.reason!r}")
 
 
-def go(bench: DriveBench, ticks: int, *place: float, **fields) -> None:
-    for _ in range(ticks):
-        bench.go(1, *(place or (50.0, 0.0)), **fields) if bench.count % 10 == 0 else bench.run(1)
-
-
 def lose(message):
     return lambda bench: bench.dropped.add(message)
 
@@ -187,7 +182,7 @@ def test_a_machine_that_slips_back_on_spinning_wheels_is_no_antenna_fault():
     """A forwarder on two diagonal wheels slid backwards at half the speed of its wheels; its mast rocked."""
     bench = straight()
     bench.lies["CogSogRapidUpdate"] = {"Cog": 3 * math.pi / 2, "Sog": 0.7 * bench.speed_m_s}
-    go(bench, 400)
+    bench.go(400)
     assert bench.mode is Mode.ACTIVE
 
 
@@ -195,19 +190,19 @@ def test_a_machine_that_slips_back_on_spinning_wheels_is_no_antenna_fault():
 def test_a_front_half_that_slides_aside_for_a_moment_is_no_antenna_fault(more, stops):
     """On rough ground a turning forwarder's front slid aside at 0.5 m/s, its heading 110 degrees off the course."""
     bench = straight()
-    go(bench, 200)
+    bench.go(200)
     assert bench.speed_m_s > 0.3
     bench.lies["CogSogRapidUpdate"] = {"Cog": math.pi / 2 + math.radians(110.0), "Sog": 1.2 * bench.speed_m_s}
-    go(bench, (CROSSWISE_SAMPLES_COUNT + more) * 50)  # four samples of the course in a second
+    bench.go((CROSSWISE_SAMPLES_COUNT + more) * 50)  # four samples of the course in a second
     del bench.lies["CogSogRapidUpdate"]
-    go(bench, 100)
+    bench.go(100)
     assert (bench.reason == Reason.HEADING_REVERSED) is stops
 
 
 def test_rtk_float_slows_only_waypoint_driving():
     bench = straight()
     bench.lies["GnssPositionData"] = {"Method": 5}
-    go(bench, 400)
+    bench.go(400)
     assert bench.mode is Mode.ACTIVE
     assert bench.drive_command["Speed"] == pytest.approx(RTK_FLOAT_SPEED_SHARE * CARRIER.speed_limit_m_s)
     for k in range(300):
@@ -218,10 +213,10 @@ def test_rtk_float_slows_only_waypoint_driving():
 def test_position_step_needs_two_samples_and_a_small_one_is_accepted():
     bench = straight()
     bench.north_m += MAX_REPEATED_JUMP_M - 0.1
-    go(bench, 100)
+    bench.go(100)
     assert bench.mode is Mode.ACTIVE
     bench.north_m += MAX_REPEATED_JUMP_M + 0.2  # the next samples agree with it again: one is odd, not two
-    go(bench, 100)
+    bench.go(100)
     assert bench.mode is Mode.ACTIVE and MAX_REPEATED_JUMP_M + 0.2 < MAX_JUMP_M
 
 
@@ -229,7 +224,7 @@ def test_drifting_position_is_detected():
     bench = straight()
     for _ in range(100):
         bench.north_m += 0.03  # 6 m/s aside
-        go(bench, 1)
+        bench.go(1)
     assert bench.reason == Reason.POSITION_JUMP
 
 
@@ -237,7 +232,7 @@ def test_articulation_outside_its_range_latches():
     bench = straight()
     bench.bend_rad = CARRIER.articulation_limit_rad + 0.08
     bench.lies["VehStat"] = {"Articulation": bench.bend_rad}
-    go(bench, 12)
+    bench.go(12)
     assert bench.controller.supervisor.reason in (Reason.POSITION_OUTSIDE, Reason.ENCODER_JUMP)
     assert bench.controller.supervisor.detail == ARTICULATION and bench.braked
 
@@ -245,7 +240,7 @@ def test_articulation_outside_its_range_latches():
 def test_arm_stuck():
     bench = DriveBench().armed()
     bench.run(40)
-    go(bench, 20, speed_m_s=0.0, heights_m=(0.45,) * 4)
+    bench.go(20, speed_m_s=0.0, heights_m=(0.45,) * 4)
     held = [1e3 * (h - CARRIER.arm_travel_m / 2) for h in bench.heights_m]
     bench.lies["ArmHeightA"] = {"Arm2": held[1]}
     ms = until(bench, Reason.ARM_STUCK, ARM_STUCK_NS // MS + 100, speed_m_s=0.0, heights_m=(0.45,) * 4)
