@@ -7,13 +7,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from controller.config import Settings
 from controller.supervisor import STALL_MEMORY_NS, STALL_NS
 from machine.status.explanation import describe
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.codes import numbers_in
-from tests.controller.bench import AORO, MACHINE_PERIOD_MS, MS, VALUES, Bench, T
+from tests.controller.bench import AORO, MACHINE_PERIOD_MS, MS, SETTINGS, VALUES, Bench, T
 
 SAMPLED = ("EncSlew", "EncLift", "EncTilt", "EncExt", "EncRot")
 """Sent in answer to SYNC."""
@@ -79,11 +80,20 @@ def test_one_cut_cable_is_the_encoder_s_fault(late_ns: int) -> None:
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.ENCODER_LOST, 1)
 
 
-@pytest.mark.parametrize(("name", "reason"), [("EstopStat", Reason.ESTOP_LOST), ("GuardStat", Reason.GUARD_LOST)])
-def test_one_silent_safety_node_is_that_node_s_fault(name: str, reason: Reason) -> None:
-    bench = Bench().active()
+@pytest.mark.parametrize(
+    ("settings", "name", "ticks", "reason"),
+    [
+        (SETTINGS, "EstopStat", 12, Reason.ESTOP_LOST),
+        (SETTINGS, "GuardStat", 12, Reason.GUARD_LOST),
+        (AORO, "VehStat", 30, Reason.CARRIER_LOST),
+        (AORO, "ArmHeightA", 30, Reason.SWING_ARMS_LOST),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_one_silent_node_is_that_node_s_fault(settings: Settings, name: str, ticks: int, reason: Reason) -> None:
+    bench = Bench(settings).active()
     bench.dropped.add(name)
-    bench.run(12)
+    bench.run(ticks)
     assert (bench.mode, bench.reason) == (Mode.FAULT, reason)
 
 
@@ -114,26 +124,15 @@ def test_one_node_with_two_messages_is_that_node_s_fault() -> None:
 def test_a_silent_machine_bus_is_named() -> None:
     bench = Bench(AORO).active()
     bench.dropped.update(MACHINE_PERIOD_MS)
-    for _ in range(30):
-        bench.tick()
+    bench.run(30)
     assert (bench.reason, bench.controller.supervisor.detail) == (Reason.INPUTS_LOST, 1)
     assert bench.controller.evidence.numbers[0] > 15.0
-
-
-@pytest.mark.parametrize(("name", "reason"), [("VehStat", Reason.CARRIER_LOST), ("ArmHeightA", Reason.SWING_ARMS_LOST)])
-def test_one_node_of_the_carrier_is_that_node_s_fault(name: str, reason: Reason) -> None:
-    bench = Bench(AORO).active()
-    bench.dropped.add(name)
-    for _ in range(30):
-        bench.tick()
-    assert bench.reason == reason
 
 
 def test_a_stall_that_the_machine_bus_feels_is_the_computer_s() -> None:
     bench = Bench(AORO).active()
     bench.dropped.update(("VehStat", "ArmHeightA", "ArmHeightB"))
-    for _ in range(30):
-        bench.tick(late_ns=8 * MS)
+    bench.run(30, late_ns=8 * MS)
     assert bench.reason == Reason.COMPUTER_STALLED
 
 
