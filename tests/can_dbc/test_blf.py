@@ -44,7 +44,7 @@ def file(body: bytes, objects: int = 0, file_bytes: int | None = None) -> bytes:
 def records(content: bytes) -> tuple[list[int], list[MalformedRecord], list[str]]:
     """The first payload byte of every frame, the malformed records and the notes."""
     notes: list[str] = []
-    found = list(reader.read_blf(content, notes))
+    found = list(islice(reader.read_blf(content, notes), 200_000))
     return [r.data[0] for r in found if isinstance(r, Frame)], [r for r in found if not isinstance(r, Frame)], notes
 
 
@@ -55,15 +55,10 @@ def three(**of_second: int) -> bytes:
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("size", [0, 15, 40, 1 << 31])
 def test_an_object_of_impossible_size_ends_the_file(packed: bool, size: int) -> None:
+    """What is behind it is not read a second time: python-can follows a size of 0 for ever."""
     values, bad, _ = records(file(container(three(size=size), packed=packed), 3))
     assert (values, len(bad)) == ([1], 1)
     assert ("224" if not packed else "144") in bad[0].text  # the byte where it starts, or where its container does
-
-
-def test_what_is_behind_the_damage_is_not_read_a_second_time() -> None:
-    """python-can follows a size of 0 for ever."""
-    content = file(container(three(size=0)), 3)
-    assert len(list(islice(reader.read_blf(content, []), 10))) == 2
 
 
 def test_an_unknown_header_version_is_one_note(caplog: pytest.LogCaptureFixture) -> None:

@@ -116,11 +116,6 @@ def test_swing_arms_are_commanded_as_spools_and_reported_as_heights() -> None:
     assert MACHINE.messages["ArmCmdB"].signals[3].bits == 2
 
 
-def test_a_request_is_matched_by_pgn_for_any_destination() -> None:
-    for identifier in (0x18EAFF27, 0x18EA0355, 0x0CEA30FE):
-        assert MACHINE.find(identifier | EXTENDED) is MACHINE.messages["Request"]
-
-
 def test_physical_units() -> None:
     a = CRANE.messages["ValveCmdA"].signals[3]
     assert physical(a) == (0.05, -100, 100, "%", codec.Policy.REFUSE)

@@ -201,38 +201,37 @@ def test_no_float_ever_wraps(value: float, index: int) -> None:
         assert abs(got - value) <= 0.025000001
 
 
-def frame(name: str, *values: object) -> bytes:
-    return shipped("crane").messages[name].encode(*values)
+VALVE_FRAME = shipped("crane").messages["ValveCmdA"].encode(*GOOD["ValveCmdA"])
 
 
-def bits(data: bytes, shift: int, width: int, raw: int) -> bytes:
-    word = int.from_bytes(data, "little") & ~(((1 << width) - 1) << shift)
-    return (word | raw << shift).to_bytes(len(data), "little")
+def with_bits(shift: int, width: int, raw: int) -> bytes:
+    word = int.from_bytes(VALVE_FRAME, "little") & ~(((1 << width) - 1) << shift)
+    return (word | raw << shift).to_bytes(8, "little")
 
 
 RECEIVE_CASES = [
     # payload, reason or the value of signal 3
-    (lambda: frame("ValveCmdA", *GOOD["ValveCmdA"]), 10.0),
-    (lambda: frame("ValveCmdA", *GOOD["ValveCmdA"])[:7], Refusal.LENGTH),
-    (lambda: frame("ValveCmdA", *GOOD["ValveCmdA"]) + b"\0", Refusal.LENGTH),
-    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 2000), 100.0),
-    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 2001), Refusal.RANGE),
-    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 4096 - 2001), Refusal.RANGE),
-    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 0x7FF), None),
-    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 0x800), None),
-    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 12, 4, 4), Refusal.RANGE),
+    (VALVE_FRAME, 10.0),
+    (VALVE_FRAME[:7], Refusal.LENGTH),
+    (VALVE_FRAME + b"\0", Refusal.LENGTH),
+    (with_bits(16, 12, 2000), 100.0),
+    (with_bits(16, 12, 2001), Refusal.RANGE),
+    (with_bits(16, 12, 4096 - 2001), Refusal.RANGE),
+    (with_bits(16, 12, 0x7FF), None),
+    (with_bits(16, 12, 0x800), None),
+    (with_bits(12, 4, 4), Refusal.RANGE),
 ]
 
 
 @pytest.mark.parametrize(("payload", "expected"), RECEIVE_CASES)
-def test_receiving_is_strict(crane: codec.Database, payload, expected) -> None:  # type: ignore[no-untyped-def]
+def test_receiving_is_strict(crane: codec.Database, payload: bytes, expected: Refusal | float | None) -> None:
     message = crane.messages["ValveCmdA"]
     if isinstance(expected, Refusal):
         with pytest.raises(FrameRefused) as refused:
-            message.receive(payload())
+            message.receive(payload)
         assert refused.value.reason is expected
     else:
-        assert message.receive(payload())[3] == expected
+        assert message.receive(payload)[3] == expected
 
 
 @given(st.sampled_from(codec.SHIPPED), st.data())
@@ -381,6 +380,7 @@ FIND_CASES = [
     ("machine", 0x18F00421 | EXTENDED, "EEC1"),
     ("machine", 0x18EEFF80 | EXTENDED, "AddressClaim"),
     ("machine", 0x18EE2780 | EXTENDED, "AddressClaim"),
+    ("machine", 0x0CEA30FE | EXTENDED, "Request"),
     ("machine", 0x0CF00400, None),
     ("gnss", 0x09F8011C | EXTENDED, "PositionRapidUpdate"),
     ("gnss", 0x19F80124 | EXTENDED, "PositionRapidUpdate"),

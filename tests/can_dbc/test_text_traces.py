@@ -158,7 +158,7 @@ def test_decoder_counts_everything() -> None:
     assert entries[0].text().startswith("Crc=")
     assert "LiftB=2 bar" in entries[0].text() and "Status=Ok" in entries[0].text()
     summary = decoder.summary()
-    assert {k: v for k, v in summary.items() if isinstance(v, int)} == {
+    assert {k: v for k, v in summary.items() if isinstance(v, int) and v} == {
         "frames": 7,
         "decoded": 1,
         "unknown": 1,
@@ -167,12 +167,6 @@ def test_decoder_counts_everything() -> None:
         "error_frames": 1,
         "remote_frames": 1,
         "broken": 1,
-        "lost_fast_packets": 0,
-        "transported": 0,
-        "unknown_transported": 0,
-        "lost_transported": 0,
-        "unopened_transported": 0,
-        "extended_transported": 0,
     }
 
 

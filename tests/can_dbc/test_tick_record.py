@@ -179,13 +179,6 @@ def test_a_ring_that_is_there_is_read_from_now_on_and_a_new_one_from_its_beginni
     reader.close()
 
 
-def test_a_file_that_is_no_ring_is_not_read(tmp_path):
-    (tmp_path / "ticks").write_bytes(bytes(HEAD_BYTES + SMALL))
-    reader = RingReader(tmp_path / "ticks")
-    assert reader.read() == []
-    reader.close()
-
-
 @pytest.mark.parametrize("length", [SMALL, 0xFFFF_FFF0, 40])
 def test_a_damaged_length_ends_the_reading_and_the_next_record_is_read(small, tmp_path, length):
     """A length that reaches beyond what is written; a reader that believed it would never end."""
@@ -202,10 +195,17 @@ def test_a_damaged_length_ends_the_reading_and_the_next_record_is_read(small, tm
     ring.close()
 
 
-@pytest.mark.parametrize("size", [0, 3, HEAD_BYTES])
-def test_a_file_that_is_too_short_is_no_ring(tmp_path, size):
+HEAD = record_ring.MAGIC.to_bytes(8, "little").ljust(HEAD_BYTES, b"\0")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", HEAD[:3], HEAD, bytes(HEAD_BYTES + SMALL)],
+    ids=["empty", "too short for a head", "a head alone", "another file"],
+)
+def test_a_file_that_is_no_ring_is_not_read(tmp_path, content):
     path = tmp_path / "ticks"
-    path.write_bytes(record_ring.MAGIC.to_bytes(8, "little")[:size] + bytes(max(0, size - 8)))
+    path.write_bytes(content)
     reader = RingReader(path)
     assert reader.read() == []
     reader.close()
