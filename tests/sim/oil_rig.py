@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import msgspec
 
+from machine.geometry.carrier import ARMS
 from sim.hydraulics.circuit import Hydraulics
 from sim.truth.hydraulics import Cylinder, Function
 from sim.truth.load import Truth, load_truth
@@ -25,11 +26,7 @@ AORO_HEAVY = {
     "rot": 15.0,
     "grapple": 17.0,
     "steer": 8000.0,
-    "arm_fl": 2500.0,
-    "arm_fr": 2500.0,
-    "arm_rl": 2500.0,
-    "arm_rr": 2500.0,
-}
+} | dict.fromkeys(ARMS, 2500.0)
 FRICTIONLESS = {"coulomb": 0.0, "stiction": 0.0, "viscous": 0.0}
 
 

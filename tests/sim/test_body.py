@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import ast
 import math
 import random
-from pathlib import Path
 
+import pybullet
 import pytest
 
 from machine.geometry.kinematics import pin_position, solve
 from machine.loading.profile_file import load_profile
+from sim.bullet.client import new_client
 from sim.truth.load import load_truth
 from sim.world import World, home_pose
 
 MACHINES = ("palms_471", "aoro_fc8")
-ROOT = Path(__file__).parents[2]
 ACTIVE = ("slew", "lift", "tilt", "ext")
 
 
@@ -132,16 +131,28 @@ def test_equal_inputs_give_bit_identical_motion(world):
     assert run() == run()
 
 
-def test_only_sim_imports_the_truth_and_sim_does_not_import_the_machine_kinematics():
-    outside = ("can_dbc", "machine", "controller", "autonomy", "recorder", "hil", "console", "timberhand")
-    forbidden = dict.fromkeys(outside, ("sim.truth", "load_truth"))
-    forbidden["sim"] = ("machine.geometry.kinematics", "machine.geometry.grapple")
-    sinners = []
-    for folder, words in forbidden.items():
-        for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-                if isinstance(node, ast.ImportFrom):
-                    names = [f"{node.module}.{a.name}" for a in node.names]
-                sinners += [f"{path}: {n}" for n in names if any(word in n for word in words)]
-    assert not sinners
+# -- the physics client: it caches functions, but never beyond its own lifetime
+
+
+def test_a_closed_client_does_not_reach_a_later_one():
+    first = new_client()
+    assert first.getNumBodies() == 0
+    number = first._client
+    first.disconnect()
+    second = new_client()
+    try:
+        assert second._client == number  # Bullet reuses it
+        with pytest.raises(pybullet.error):
+            first.getNumBodies()
+    finally:
+        second.disconnect()
+
+
+def test_two_clients_do_not_share_cached_functions():
+    one, other = new_client(), new_client()
+    try:
+        one.createMultiBody(1.0, one.createCollisionShape(one.GEOM_SPHERE, radius=0.1))
+        assert (one.getNumBodies(), other.getNumBodies()) == (1, 0)
+    finally:
+        one.disconnect()
+        other.disconnect()

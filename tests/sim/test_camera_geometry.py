@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.geometry.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
-from machine.loading.profile_file import load_profile
+from machine.geometry.optics import Intrinsics, pinhole, rpy_matrix
 from sim.camera.geometry import look_at, mount_view, orbit, quaternion_matrix
 from sim.errors import PlantError
 from sim.geometry import rpy_quaternion
@@ -74,10 +73,3 @@ def test_a_positive_pitch_looks_down_and_the_mount_error_is_in_the_body_frame() 
     off = mount_view(pose, pin, (0.5, 0.0, 0.0), (0.0, 0.3, 0.0), (0.02, 0.0, 0.0), (0.0, 0.02, 0.0))
     assert off.position_m - true.position_m == pytest.approx(0.02 * true.rotation[:, 2])
     assert off.rotation[:, 2] == pytest.approx((0.0, math.cos(0.32), -math.sin(0.32)))
-
-
-@pytest.mark.parametrize(("machine", "camera"), [("palms_471", "stick"), ("palms_471", "d435"), ("aoro_fc8", "front")])
-def test_the_profiles_cameras_are_pinholes(machine: str, camera: str) -> None:
-    spec = load_profile(machine).cameras[camera]
-    pin = intrinsics(spec)
-    assert (pin.width_px, pin.fx_px) == (spec.width_px, spec.fx_px)

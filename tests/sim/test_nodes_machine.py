@@ -12,7 +12,7 @@ import can_dbc
 from can_dbc.dbc.codec import load
 from can_dbc.frame import EXTENDED, identifier
 from can_dbc.protocols.e2e import Checker, Sender, Status
-from can_dbc.protocols.nmea2000 import frames, join_id, split_id
+from can_dbc.protocols.nmea2000 import join_id, split_id
 from machine.loading.profile_file import load_profile
 from sim.nodes.mach0 import (
     CLAIM_PGN,
@@ -314,9 +314,3 @@ def test_cantools_reads_what_the_nodes_send(vehicle, arms):
             assert checkers[key].check(data) in (Status.OK, Status.INITIAL)
             seen.add(message.name)
     assert seen == {"VehStat", "ArmHeightA", "ArmHeightB"}
-
-
-def test_a_request_is_in_the_dbc():
-    codec = MACHINE.message("Request")
-    ((key, data),) = frames(codec, codec.encode(CLAIM_PGN), 0x27)
-    assert split_id(key)[1:] == (REQUEST_PGN, 0x27, 255) and data == b"\x00\xee\x00"

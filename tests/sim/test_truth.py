@@ -97,17 +97,24 @@ def test_parts_draw_independently():
     assert len({round(s, 9) for s in speeds}) == len(speeds)
 
 
-def test_a_users_truth_file_is_read_and_a_bad_one_refused(tmp_path):
-    nominal, path = load_truth("nominal", 0, "palms_471"), tmp_path / "mine.toml"
+@pytest.fixture
+def own(tmp_path):
+    """The truth file of a user."""
+    path = tmp_path / "mine.toml"
     text = Path(sim.truth.__file__).with_name("nominal.toml").read_text()
     path.write_text(text.replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))
-    mine = load_truth(str(path), 0, "palms_471")
-    assert mine.supply.relief_pa == 18.0e6 and mine.functions == nominal.functions
+    return path
+
+
+def test_a_users_truth_file_is_read_and_a_bad_one_refused(own, tmp_path):
+    mine = load_truth(str(own), 0, "palms_471")
+    assert mine.supply.relief_pa == 18.0e6
+    assert mine.functions == load_truth("nominal", 0, "palms_471").functions
     with pytest.raises(PlantError, check=coded("truth.other-machine")):
-        load_truth(str(path), 0, "aoro_fc8")
-    path.write_text(text.replace("relief_pa", "relieve_pa"))
+        load_truth(str(own), 0, "aoro_fc8")
+    own.write_text(own.read_text().replace("relief_pa", "relieve_pa"))
     with pytest.raises(PlantError, check=coded("truth.unreadable")) as refused:
-        load_truth(str(path), 0, "palms_471")
+        load_truth(str(own), 0, "palms_471")
     assert "mine.toml" in str(refused.value) and "relie" in str(refused.value)
     with pytest.raises(PlantError, check=coded("truth.unknown-machine")):
         load_truth("nominal", 0, "tractor")
@@ -129,14 +136,11 @@ def test_a_truth_file_of_a_shipped_machine_need_not_repeat_its_steel_and_home(ma
         load_truth(str(file), 0, "mine")
 
 
-def test_individuals_are_drawn_around_a_users_truth_file(tmp_path):
-    path = tmp_path / "mine.toml"
-    text = Path(sim.truth.__file__).with_name("nominal.toml").read_text()
-    path.write_text(text.replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))
-    one = load_truth(f"sampled:{path}", 5, "palms_471")
+def test_individuals_are_drawn_around_a_users_truth_file(own):
+    one = load_truth(f"sampled:{own}", 5, "palms_471")
     assert one.supply.relief_pa == 18.0e6 and one.functions == load_truth("sampled", 5, "palms_471").functions
-    assert one != load_truth(f"sampled:{path}", 6, "palms_471")
-    assert load_truth(f"nominal:{path}", 5, "palms_471") == load_truth(str(path), 0, "palms_471")
+    assert one != load_truth(f"sampled:{own}", 6, "palms_471")
+    assert load_truth(f"nominal:{own}", 5, "palms_471") == load_truth(str(own), 0, "palms_471")
 
 
 def test_the_truth_beside_a_profile_of_ones_own_is_chosen_by_itself(tmp_path):
