@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from can_dbc.messages.crane import StateReport
 from hil.demo.summary import Summary, is_settled, outcome_sentence
 from hil.harness.display import Display
 from machine.status.modes import Mode
+from tests.console.state_reports import at
 
 
 def verdict(**its: bool) -> dict[str, Any]:
@@ -83,13 +83,6 @@ SECOND_NS = 1_000_000_000
 FAR = (-math.pi, -math.pi, -math.pi, 12.345, -math.pi)
 
 
-def report(seconds: int, mode: Mode = Mode.STANDBY) -> StateReport:
-    zeros = (0.0,) * 5
-    return StateReport(
-        1, 2, 1 + seconds * SECOND_NS, mode, 0, 0, 0, 0, 0, 0, FAR, FAR, zeros, 100.0, 0.0, 0.0, 0, 0, 0, 0
-    )
-
-
 def printed(seconds: int) -> list[str]:
     out = io.StringIO()
     with Display(
@@ -97,7 +90,7 @@ def printed(seconds: int) -> list[str]:
     ) as display:
         display.phase("APPROACH")
         for i in range(seconds):
-            display.report(report(i))
+            display.report(at(FAR, 1 + i * SECOND_NS, Mode.STANDBY, velocity=FAR, opening_pct=100.0))
     return out.getvalue().splitlines()
 
 

@@ -14,7 +14,7 @@ from can_dbc.messages.envelope import DatagramFault, DatagramRefused
 from hil.faults.catalogue import BY_NAME, CASES, Where
 from hil.faults.draws import Scene
 from hil.faults.injector import Injector, effect_of
-from hil.faults.table import FAULTS, Edge, Order, Word, find, make, parse
+from hil.faults.table import FAULTS, Edge, Order, Word, make, parse
 from hil.faults.wire_faults import wire_fault
 from hil.harness.operator import Operator
 from hil.wire.faults import Kind
@@ -80,11 +80,6 @@ def test_an_order_is_read_from_its_text() -> None:
 def test_a_wrong_order_is_refused_in_words(text: str, code: str) -> None:
     with pytest.raises(InputRefused, check=coded(code)):
         parse(text)
-
-
-def test_a_component_and_a_word_name_a_fault() -> None:
-    assert find("encoder-lift", "stuck") == ("encoder-stuck", "lift")
-    assert find("gnss", "off") == ("gnss-off", "")
 
 
 def test_bus_faults_name_the_bus_of_their_message() -> None:

@@ -28,22 +28,9 @@ def test_a_run_writes_a_report_of_its_loads(tmp_path: Path) -> None:
     ]
     path = report_loads(tmp_path, loads, MISSION, PROFILE, BEGUN, 0)
     assert path == tmp_path / "forwarded.fpr"
-    root = ElementTree.fromstring(path.read_bytes())
-    text = {
-        tag: [e.text for e in root.iter() if e.tag.endswith("}" + tag)]
-        for tag in (
-            "UnloadingTime",
-            "LoadVolume",
-            "CoordinateDate",
-            "ObjectName",
-            "LocationName",
-            "DistanceFromLastUnloading",
-            "ProductName",
-            "ProductKey",
-            "SpeciesGroupName",
-            "CreationDate",
-        )
-    }
+    text: dict[str, list[str | None]] = {}
+    for element in ElementTree.fromstring(path.read_bytes()).iter():
+        text.setdefault(element.tag.rpartition("}")[2], []).append(element.text)
     assert text["UnloadingTime"] == ["2026-05-04T12:02:10+00:00", "2026-05-04T12:04:20+00:00"]
     assert text["LoadVolume"] == ["0.1000", "0.2000", "0.1000"]
     assert text["CoordinateDate"][1] == "2026-05-04T12:01:10+00:00"

@@ -22,12 +22,14 @@ from controller.step import Controller, step
 from controller.tick import Inputs
 from hil.replay.recording import contents, files_of, manifest_of, messages
 from hil.replay.replay import replay
+from hil.tick.compare import kept_recordings
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 from recorder import recorder as recorder_module
 from recorder.manifest import describe
 from recorder.recorder import Recorder
 from tests.codes import coded, numbers_in
+from timberhand.cli import app
 
 PROFILE = load_profile("palms_471")
 SETTINGS = load_settings("palms_471")
@@ -82,13 +84,7 @@ def again(data: bytes, **changes) -> bytes:
 
 def run(*arguments: object):
     """``timberhand replay ...`` with the exit code the shell sees."""
-    import typer
-
-    from timberhand.commands.replay import replay as command
-
-    app = typer.Typer()
-    app.command()(command)
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    result = CliRunner().invoke(app, ["replay", *map(str, arguments)])
     if isinstance(result.exception, CommandFailed):
         return result.exception.exit_code, str(result.exception)
     return result.exit_code, result.stdout
@@ -104,6 +100,19 @@ def test_recorded_run_agrees_byte_for_byte(tmp_path):
     assert len(reports) > TICKS / 5 and reports[-1].frames_received > 0
     code, text = run(tmp_path)
     assert code == 0 and TICKS in numbers_in(text)
+
+
+def test_kept_recordings_replay_byte_for_byte(tmp_path):
+    """The controller decides as it did: `tests/recordings` holds the first seconds of two lockstep runs, a crane on a
+    fixed base (palms_471: start-up, arming, the first motion) and a forwarder on both buses (aoro_fc8: start-up,
+    driving, a search), with the profiles of commit 7d68e2e.  A change of a database or of the law wants new ones::
+
+        timberhand demo --lockstep --profile tests/recordings/palms.toml --limit-s 8
+        timberhand mission run docs/examples/paper_b.geojson --lockstep --profile tests/recordings/aoro.toml --limit-s 8
+    """
+    for path, ticks in zip(kept_recordings(tmp_path), (2200, 1600), strict=True):
+        result = replay(files_of(path))
+        assert result.agrees and result.ticks == ticks, result
 
 
 def test_tampered_output_is_found_and_shown_decoded(tmp_path):
@@ -159,15 +168,11 @@ def test_changed_input_changes_the_output(tmp_path):
 
 def test_a_recording_of_an_older_release_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(tick_record, "VERSION", 1)
-    old = keep(tmp_path, [again(data) for data in map(_as_version_1, RECORDS[:5])])
+    bodies = [data[:4] + (1).to_bytes(2, "little") + data[6:-4] for data in RECORDS[:5]]
+    old = keep(tmp_path, [again(body + zlib.crc32(body).to_bytes(4, "little")) for body in bodies])
     monkeypatch.undo()
     with pytest.raises(CommandFailed, check=coded("recording.other-version")):
         replay(files_of(old))
-
-
-def _as_version_1(data: bytes) -> bytes:
-    body = data[:4] + (1).to_bytes(2, "little") + data[6:-4]
-    return body + zlib.crc32(body).to_bytes(4, "little")
 
 
 def test_a_replay_ends_at_a_gap_and_reports_it(tmp_path):

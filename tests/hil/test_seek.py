@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import lzma
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,20 +16,17 @@ from console.can_tap import load_databases
 from console.replay import Overview, ReplayView
 from hil.replay.recording import messages
 from hil.replay.seek import SeekableRecording
+from hil.tick.compare import kept_recordings
 from host.exit_codes import CommandFailed
 from machine.loading.profile_file import load_profile
 from recorder.manifest import describe
 from recorder.recorder import TICK, Recorder
 from tests.codes import coded
 
-KEPT = Path(__file__).parents[1] / "recordings"
-
 
 @pytest.fixture(scope="module")
 def aoro(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("kept") / "run.mcap"
-    path.write_bytes(lzma.decompress((KEPT / "aoro.mcap.xz").read_bytes()))
-    return path
+    return kept_recordings(tmp_path_factory.mktemp("kept"))[0]
 
 
 Reports = Iterable[StateReport | VehicleReport]
