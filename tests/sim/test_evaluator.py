@@ -1,13 +1,17 @@
-"""The evaluator: logs in the bunk, sag, moments and margins from the ground truth, on a fixed machine and a carrier."""
+"""Evaluator and ideal detector on both machines: logs, sag, moments and margins from the ground truth."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import pytest
 
 from machine.loading.profile_file import load_profile
 from sim.evaluator import Evaluation, Evaluator
+from sim.instruments import detect
+from sim.plant import Plant
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import load_truth
 from sim.wood.log_shape import LogSpec
@@ -82,3 +86,26 @@ def test_a_loaded_carrier_is_evaluated_in_its_own_frame(watched):
     assert verdict.tip_margin_m is not None and 0.3 < verdict.tip_margin_m < 1.5
     base, _ = world.base_pose()
     assert base[2] > 0.8  # so the bunk's heights are not the world's
+
+
+# -- the ideal detector reports in the crane's base frame, which a carrier moves
+
+
+def test_on_a_fixed_machine_the_base_frame_is_the_world() -> None:
+    plant = Plant(load_profile("palms_471"), seed=3)
+    (seen,), (log,) = detect(plant), plant.logs()
+    assert (seen.position_m, seen.axis) == (log.position_m, log.axis)
+    assert (seen.length_m, seen.diameter_m) == (log.length_m, log.diameter_m)
+
+
+def test_on_a_carrier_logs_lie_below_the_crane_base_and_ahead_means_backwards() -> None:
+    """Slew 0 points backward, and the base is its height above the ground."""
+    plant = Plant(load_profile("aoro_fc8"), seed=3)
+    (seen,), (log,) = detect(plant), plant.logs()
+    (x, y, z), _ = plant.base_pose()
+    assert seen.position_m == pytest.approx(
+        (x - log.position_m[0], y - log.position_m[1], log.position_m[2] - z), abs=0.02
+    )
+    assert math.hypot(*seen.axis) == pytest.approx(1.0)
+    assert np.allclose(seen.axis[:2], np.negative(log.axis[:2]), atol=0.02)
+    assert seen.position_m[2] < -1.0

@@ -26,7 +26,8 @@ PROFILE = load_profile("palms_471")
 ESTOP = database("crane").message("EstopStat")
 
 
-def machine() -> KinematicMachine:
+@pytest.fixture
+def plant() -> KinematicMachine:
     return KinematicMachine(PROFILE, 0, step_ns=2_500_000)
 
 
@@ -38,8 +39,7 @@ def sent_of(plant: KinematicMachine, key: int, ms: int, start_ms: int = 0) -> li
     return found
 
 
-def test_a_silent_message_is_not_sent_and_comes_back() -> None:
-    plant = machine()
+def test_a_silent_message_is_not_sent_and_comes_back(plant: KinematicMachine) -> None:
     assert sent_of(plant, ESTOP.key, 50)
     end = begin(plant, PlantFault("message-off", "EstopStat"), 0)
     assert not sent_of(plant, ESTOP.key, 50, 50)
@@ -47,24 +47,21 @@ def test_a_silent_message_is_not_sent_and_comes_back() -> None:
     assert sent_of(plant, ESTOP.key, 50, 100)
 
 
-def test_a_repeated_message_has_a_counter_that_stands_still() -> None:
-    plant = machine()
+def test_a_repeated_message_has_a_counter_that_stands_still(plant: KinematicMachine) -> None:
     last = sent_of(plant, ESTOP.key, 40)[-1]
     begin(plant, PlantFault("message-stuck", "EstopStat"), 0)
     found = sent_of(plant, ESTOP.key, 60, 40)
     assert len(found) > 3 and set(found) == {last}
 
 
-def test_a_masquerade_has_a_checksum_that_is_right_for_another_message_only() -> None:
-    plant = machine()
+def test_a_masquerade_has_a_checksum_that_is_right_for_another_message_only(plant: KinematicMachine) -> None:
     begin(plant, PlantFault("message-masquerade", "EstopStat"), 0)
     assert ESTOP.data_ids is not None
     checker = Checker(ESTOP.data_ids)
     assert {checker.check(data) for data in sent_of(plant, ESTOP.key, 60)} == {Status.ERROR}
 
 
-def test_a_broken_wire_and_a_person_are_protected_correctly() -> None:
-    plant = machine()
+def test_a_broken_wire_and_a_person_are_protected_correctly(plant: KinematicMachine) -> None:
     begin(plant, PlantFault("estop-wire", seed=1), 0)
     begin(plant, PlantFault("person-in-zone"), 0)
     assert ESTOP.data_ids is not None
@@ -75,9 +72,7 @@ def test_a_broken_wire_and_a_person_are_protected_correctly() -> None:
     assert (values["ChannelA"], values["ChannelB"], values["Person"]) == (0, 1, 1)
 
 
-def test_the_mode_switch_is_turned_at_once_and_back_at_the_end() -> None:
-    plant = machine()
-
+def test_the_mode_switch_is_turned_at_once_and_back_at_the_end(plant: KinematicMachine) -> None:
     def sent(start_ms: int) -> list[float]:
         return [ESTOP.named(ESTOP.receive(d))["ModeSwitch"] for d in sent_of(plant, ESTOP.key, 20, start_ms)]
 
@@ -109,8 +104,7 @@ def test_intermittent_and_slow_lose_frames_reproducibly() -> None:
     assert one == again and 5 < one.count(".") < 35
 
 
-def test_encoder_faults_change_the_reading_as_they_say() -> None:
-    plant = machine()
+def test_encoder_faults_change_the_reading_as_they_say(plant: KinematicMachine) -> None:
     plant.step(1_000_000_000, [])
     lift = plant.encoders["lift"]
     true = lift.measure(1_000_000_000)
@@ -130,8 +124,7 @@ def test_a_reversed_encoder_turns_about_where_it_was() -> None:
     assert fault.position(0.7, 0) == pytest.approx(0.3)
 
 
-def test_a_frozen_encoder_repeats_its_position() -> None:
-    plant = machine()
+def test_a_frozen_encoder_repeats_its_position(plant: KinematicMachine) -> None:
     plant.step(1_000_000_000, [])
     slew = plant.encoders["slew"]
     before = slew.measure(1_000_000_000)
@@ -149,15 +142,13 @@ def test_spools_stick_drift_and_weaken_by_name() -> None:
     )
 
 
-def test_a_valve_node_boots_again() -> None:
-    plant = machine()
+def test_a_valve_node_boots_again(plant: KinematicMachine) -> None:
     sent_of(plant, 0x710, 20)
     begin(plant, PlantFault("node-reset", "valves"), 0)
     assert b"\x00" in sent_of(plant, 0x710, 20, 20)
 
 
-def test_what_a_machine_does_not_have_is_refused_in_words() -> None:
-    plant = machine()
+def test_what_a_machine_does_not_have_is_refused_in_words(plant: KinematicMachine) -> None:
     for fault, code in (
         (PlantFault("no-such"), "fault.unknown"),
         (PlantFault("encoder-stuck", "articulation"), "fault.no-encoder"),
@@ -201,8 +192,9 @@ def test_a_live_plant_begins_a_fault_on_request_and_ends_it_in_time(monkeypatch:
         plant.close()
 
 
-def test_a_stuck_spool_moves_its_joint_only_with_pilot_pressure(monkeypatch: pytest.MonkeyPatch) -> None:
-    plant = machine()
+def test_a_stuck_spool_moves_its_joint_only_with_pilot_pressure(
+    plant: KinematicMachine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plant.step(1_000_000_000, [])
     begin(plant, PlantFault("valve-stuck", "lift", 0.8), 1_000_000_000)
     monkeypatch.setattr(type(plant.estop), "pilot_on", False)

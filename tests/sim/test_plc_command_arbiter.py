@@ -21,6 +21,11 @@ def arbiter() -> CommandArbiter:
     return CommandArbiter(Bounds.valves(), ORDER)
 
 
+@pytest.fixture
+def g() -> CommandArbiter:
+    return arbiter()
+
+
 def block(sequence: int, command: Command = MOVE, heartbeat: int | None = None) -> list[int]:
     return command_registers(command, sequence if heartbeat is None else heartbeat, sequence, ORDER)
 
@@ -37,8 +42,7 @@ def refused(g: CommandArbiter, client: int, address: int, values: list[int], now
     return refusal.value.code
 
 
-def test_a_whole_block_is_accepted_once_per_sequence_number() -> None:
-    g = arbiter()
+def test_a_whole_block_is_accepted_once_per_sequence_number(g: CommandArbiter) -> None:
     g.write(US, 100, block(7), 0)
     assert (g.command, g.sequence, g.accepted) == (MOVE, 7, 1)
     g.write(US, 100, block(7, Command()), 1)
@@ -48,8 +52,7 @@ def test_a_whole_block_is_accepted_once_per_sequence_number() -> None:
     assert (g.command, g.accepted) == (Command(), 2)
 
 
-def test_the_sequence_number_wraps() -> None:
-    g = arbiter()
+def test_the_sequence_number_wraps(g: CommandArbiter) -> None:
     g.write(US, 100, block(0xFFFF), 0)
     g.write(US, 100, block(0, Command()), 1)
     assert g.command == Command()
@@ -81,8 +84,7 @@ def test_two_clients_do_not_complete_each_others_writes() -> None:
 @pytest.mark.parametrize(
     ("register", "value"), [(102, 9), (102, 1), (103, 1), (125, 4), (126, 101), (127, 999), (128, 7), (130, 1)]
 )
-def test_an_illegal_value_is_exception_3_and_changes_nothing(register: int, value: int) -> None:
-    g = arbiter()
+def test_an_illegal_value_is_exception_3_and_changes_nothing(g: CommandArbiter, register: int, value: int) -> None:
     g.write(US, 100, block(1), 0)
     words = block(2)
     words[register - 100] = value
@@ -96,8 +98,7 @@ def test_an_illegal_value_is_exception_3_and_changes_nothing(register: int, valu
     assert g.fault is Fault.NONE
 
 
-def test_an_illegal_reference_names_its_axis_at_the_commit() -> None:
-    g = arbiter()
+def test_an_illegal_reference_names_its_axis_at_the_commit(g: CommandArbiter) -> None:
     g.write(US, 100, block(1), 0)
     too_far = block(2, Command(Mode.VALVES, True, (0.0, 0.0, 1.000_001 + 1e-6, 0, 0, 0, 0)))
     g.write(US, 102, too_far[2:], 0)  # unfinished: no harm yet
@@ -108,14 +109,12 @@ def test_an_illegal_reference_names_its_axis_at_the_commit() -> None:
 @pytest.mark.parametrize(
     ("address", "count"), [(0, 1), (10, 1), (12, 4), (48, 1), (99, 2), (99, 32), (131, 2), (132, 1), (11, 2)]
 )
-def test_a_write_to_another_address_is_exception_2(address: int, count: int) -> None:
-    g = arbiter()
+def test_a_write_to_another_address_is_exception_2(g: CommandArbiter, address: int, count: int) -> None:
     assert refused(g, US, address, [0] * count) == 2
     assert g.fault is Fault.NONE
 
 
-def test_the_commander_keeps_the_command_until_the_watchdog_expires() -> None:
-    g = arbiter()
+def test_the_commander_keeps_the_command_until_the_watchdog_expires(g: CommandArbiter) -> None:
     g.write(US, 100, block(500), 0)
     assert refused(g, THEM, 100, block(501), 100 * MS) == 6
     assert refused(g, THEM, 125, [1], 100 * MS) == 6
@@ -126,8 +125,7 @@ def test_the_commander_keeps_the_command_until_the_watchdog_expires() -> None:
     assert (g.commander(301 * MS), g.sequence) == (THEM, 2), "a new commander begins with its own numbers"
 
 
-def test_a_disconnected_commander_is_replaced_at_once() -> None:
-    g = arbiter()
+def test_a_disconnected_commander_is_replaced_at_once(g: CommandArbiter) -> None:
     g.write(US, 100, block(500), 0)
     g.disconnected(THEM)
     assert refused(g, THEM, 100, block(3), 10 * MS) == 6
@@ -138,8 +136,7 @@ def test_a_disconnected_commander_is_replaced_at_once() -> None:
     assert refused(g, US, 100, block(501), 20 * MS) == 6
 
 
-def test_only_a_changing_heartbeat_feeds_the_watchdog() -> None:
-    g = arbiter()
+def test_only_a_changing_heartbeat_feeds_the_watchdog(g: CommandArbiter) -> None:
     g.write(US, 100, block(1, heartbeat=10), 0)
     g.write(US, 100, [11], 250 * MS)
     assert g.commander(500 * MS) == US
@@ -149,16 +146,14 @@ def test_only_a_changing_heartbeat_feeds_the_watchdog() -> None:
 
 
 @pytest.mark.parametrize(("value", "code"), [(49, 3), (2001, 3), (0, 3)])
-def test_the_watchdog_register_is_bounded(value: int, code: int) -> None:
-    g = arbiter()
+def test_the_watchdog_register_is_bounded(g: CommandArbiter, value: int, code: int) -> None:
     assert refused(g, US, 11, [value]) == code
     g.write(US, 11, [50], 0)
     g.write(US, 100, block(1), 0)
     assert g.commander(51 * MS) is None
 
 
-def test_drafts_of_many_clients_use_bounded_memory() -> None:
-    g = arbiter()
+def test_drafts_of_many_clients_use_bounded_memory(g: CommandArbiter) -> None:
     for client in range(1000):
         g.write(client, 127, [50], 0)
     assert len(g._drafts) == MAX_DRAFT_COUNT
