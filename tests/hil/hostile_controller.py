@@ -13,15 +13,14 @@ from typing import Any
 
 from can_dbc.dbc.codec import load
 from can_dbc.protocols.e2e import protect
-from controller.config import load as load_settings
-from controller.guard.__main__ import build, profile_path
 from controller.guard.verdicts import Verdict
 from controller.tick import Outputs
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
+from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
 from sim.plant import Plant
-from tests.hil.stand_ins import Idle
+from tests.hil.stand_ins import Idle, in_lockstep
 
 CRANE = load("crane")
 FORGED = {CRANE.message(name).key: CRANE.message(name) for name in ("ValveCmdA", "ValveCmdB", "CtrlStatus")}
@@ -82,16 +81,6 @@ class Attack:
     """Time with the valves enabled, from the beginning of the attack."""
 
 
-def lockstep(machine: str, hostile: Hostile, operator: Operator | None = None, seed: int = 3) -> Lockstep:
-    """A whole machine whose controller is hostile; an operator arms it unless another one is given."""
-    settings = load_settings(machine)
-    plant = Plant(settings.profile, seed=seed, logs=0)
-    person = operator or Operator(settings.profile_hash, lambda *_: None, 0)
-    return Lockstep(
-        settings, build(profile_path(machine)), plant, Idle(), person, Observer(on_outputs=[hostile.on_outputs])
-    )
-
-
 def is_armed(system: Lockstep) -> bool:
     """Whether its controller is armed."""
     return system.report is not None and system.report.mode == Mode.ARMED
@@ -99,7 +88,9 @@ def is_armed(system: Lockstep) -> bool:
 
 def standing(machine: str, hostile: Hostile, operator: Operator | None, ready: Callable[[Lockstep], bool]) -> Lockstep:
     """A machine whose controller lies from the moment on at which it is ``ready``."""
-    system = lockstep(machine, hostile, operator)
+    plant = Plant(load_profile(machine), seed=3, logs=0)
+    observer = Observer(on_outputs=[hostile.on_outputs])
+    system = in_lockstep(machine, plant, Idle(), operator, observer, max_stops=0)
     while not ready(system):
         system.advance()
         assert system.now_ns < 20_000_000_000

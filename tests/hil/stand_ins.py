@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from can_dbc.messages.crane import StateReport
+from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from controller.config import load as load_settings
-from hil.harness.operator import Operator
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from hil.harness.lockstep import Lockstep, Observer
+from hil.harness.operator import MAX_STOPS, Operator
 from machine.profile import Carrier
 from machine.status.modes import Mode
 
@@ -28,6 +33,9 @@ class Idle:
 class Nobody(Operator):
     """An operator who presses nothing."""
 
+    def __init__(self) -> None:
+        super().__init__(0, lambda *_: None)
+
     def step(self, report: StateReport) -> None:
         return None
 
@@ -37,6 +45,38 @@ class Blind:
 
     def detect(self, q: object, now_ns: int) -> None:
         return None
+
+
+def in_lockstep(
+    machine: str | Path,
+    plant: Any,
+    planner: Any,
+    operator: Operator | None = None,
+    observer: Observer | None = None,
+    eyes: Any = None,
+    *,
+    max_stops: int = MAX_STOPS,
+) -> Lockstep:
+    """A machine with its real controller and guard; somebody arms it unless another operator is given."""
+    settings = load_settings(machine)
+    operator = operator or Operator(settings.profile_hash, lambda *_: None, max_stops)
+    guard = build_guard(profile_path(str(machine)))
+    return Lockstep(settings, guard, plant, planner, operator, observer or Observer(), eyes)
+
+
+def advance(system: Lockstep, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+    """Go on for so long; True when the condition came true before."""
+    end_ns = system.now_ns + round(seconds * 1e9)
+    while system.now_ns < end_ns:
+        system.advance()
+        if until():
+            return True
+    return False
+
+
+def press(system: Lockstep, action: OperatorAction) -> None:
+    """One press of a person beside the emulated operator."""
+    system.press(encode(OperatorCommand(1000, system._settings.profile_hash, system.now_ns, action)))
 
 
 class Drives:

@@ -10,17 +10,14 @@ from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import GrappleCommand, StateReport
-from controller.config import Settings
-from controller.guard.__main__ import build as build_guard
-from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import Lockstep, Observer
-from hil.harness.operator import Operator
 from hil.wire.inprocess import InProcessBus
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile, joint
 from machine.status.modes import Mode
 from sim.plant import Plant
+from tests.hil.stand_ins import in_lockstep
 
 LEASE_NS = 200_000_000
 CRANE = load("crane")
@@ -133,15 +130,11 @@ def watched(
 
     ``blind``: the guard does not compare motion with commands, so that the supervisor has to see it.
     """
-    profile = load_profile(name)
-    plant = Plant(profile, seed=seed, truth=truth, logs=0)
+    plant = Plant(load_profile(name), seed=seed, truth=truth, logs=0)
     reports: list[StateReport] = []
-    operator = Operator(profile_hash(profile), lambda action, report: None, max_stops)
-    settings = Settings(profile, profile_hash(profile), profile.rate_hz)
-    guard = build_guard(profile_path(name))
+    system = in_lockstep(name, plant, planner, observer=Observer(None, [reports.append]), max_stops=max_stops)
     if blind:
-        guard.motion.clear()
-    system = Lockstep(settings, guard, plant, planner, operator, Observer(None, [reports.append]))
+        system.guard.motion.clear()
     return Watched(system, plant, InProcessBus(system.core, "witness", receive_own=True), reports)
 
 

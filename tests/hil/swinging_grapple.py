@@ -15,15 +15,13 @@ from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, straight_line
 from autonomy.perception.log_list import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
-from controller.config import Settings
-from controller.guard.__main__ import build as build_guard
-from hil.harness.lockstep import Lockstep, Observer
-from hil.harness.operator import Operator
+from hil.harness.lockstep import Observer
 from machine.geometry.kinematics import pin_position
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
 from sim.plant import Plant
+from tests.hil.stand_ins import in_lockstep
 
 SHIPPED = Path(machine.__file__).parent / "aoro_fc8.toml"
 IMU = """
@@ -114,7 +112,6 @@ def stop_at(
     profile = load_profile(file)
     plant = Plant(profile, seed=seed, truth=truth, logs=0)
     planner = Stop(profile, goal_m, shaped)
-    operator = Operator(profile_hash(profile), lambda action, report: None, 8)
     rows: list[tuple[float, float, float, tuple[float, ...]]] = []
 
     def look(report: StateReport) -> None:
@@ -126,8 +123,7 @@ def stop_at(
             lean_rad = hypot(*plant.world.lean_rad())
             rows.append((since_s, lean_rad, float(np.linalg.norm(off)), tuple(plant.valve.outputs_pct)))
 
-    settings = Settings(profile, profile_hash(profile), profile.rate_hz)
-    system = Lockstep(settings, build_guard(file), plant, planner, operator, Observer(None, [look]))
+    system = in_lockstep(file, plant, planner, observer=Observer(None, [look]), max_stops=8)
     try:
         while not rows or rows[-1][0] < seconds:
             system.advance()

@@ -6,15 +6,12 @@ import math
 
 import pytest
 
-from controller.config import load as load_settings
-from controller.guard.__main__ import build, profile_path
 from controller.guard.verdicts import Verdict
-from hil.harness.lockstep import Lockstep, Observer
+from machine.loading.profile_file import load_profile
 from sim.plant import Plant
-from tests.hil.stand_ins import Idle, Nobody
+from tests.hil.stand_ins import Idle, Nobody, in_lockstep
 
 pytestmark = pytest.mark.long
-SETTINGS = load_settings("palms_471")
 VALVE_NS = 150_000_000
 """Dead time and lag of a valve that closes."""
 DEADBAND = 0.12
@@ -22,9 +19,8 @@ DEADBAND = 0.12
 
 @pytest.fixture
 def system():
-    plant = Plant(SETTINGS.profile, seed=3, logs=0)
-    operator = Nobody(SETTINGS.profile_hash, lambda *_: None)
-    run = Lockstep(SETTINGS, build(profile_path("palms_471")), plant, Idle(), operator, Observer())
+    plant = Plant(load_profile("palms_471"), seed=3, logs=0)
+    run = in_lockstep("palms_471", plant, Idle(), Nobody())
     while run.now_ns < 4_000_000_000:
         run.advance()
     assert run._guard.enabled and plant.estop.pilot_on

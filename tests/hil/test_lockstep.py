@@ -50,18 +50,25 @@ def test_the_forwarder_loads_its_log_at_its_driving_height(tmp_path: Path) -> No
     assert (summary.exit_code, summary.stops) == (ExitCode.OK, 0)
 
 
-@pytest.mark.long
-def test_equal_seeds_give_equal_bytes_and_different_seeds_do_not(tmp_path: Path) -> None:
-    first, again, other = (job(s, tmp_path / n, 4.0) for s, n in ((5, "a"), (5, "b"), (6, "c")))
-    assert digest(tmp_path / "a") == digest(tmp_path / "b")
-    assert digest(tmp_path / "a")["crane0.log"] != digest(tmp_path / "c")["crane0.log"]
-    assert first.ticks == again.ticks
-    assert first.ticks == other.ticks
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Summary]:
+    """A job that ends after 4 s."""
+    directory = tmp_path_factory.mktemp("short") / "run"
+    return directory, job(5, directory, 4.0)
 
 
 @pytest.mark.long
-def test_an_unfinished_job_is_reported_as_unfinished(tmp_path: Path) -> None:
-    summary = job(5, tmp_path / "short", 4.0)
+def test_equal_seeds_give_equal_bytes_and_different_seeds_do_not(short: tuple[Path, Summary], tmp_path: Path) -> None:
+    directory, first = short
+    again, other = (job(s, tmp_path / n, 4.0) for s, n in ((5, "b"), (6, "c")))
+    assert digest(directory) == digest(tmp_path / "b")
+    assert digest(directory)["crane0.log"] != digest(tmp_path / "c")["crane0.log"]
+    assert first.ticks == again.ticks == other.ticks
+
+
+@pytest.mark.long
+def test_an_unfinished_job_is_reported_as_unfinished(short: tuple[Path, Summary]) -> None:
+    _, summary = short
     assert not summary.in_bunk
     assert summary.exit_code is ExitCode.FIGURE_MISSED
     assert 4 in numbers_in(summary.failure) and summary.verdict

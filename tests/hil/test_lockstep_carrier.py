@@ -12,9 +12,6 @@ from mcap.reader import make_reader
 from can_dbc.messages import tick_record
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, StateReport
 from can_dbc.messages.datagrams import encode
-from controller.config import load as load_settings
-from controller.guard.__main__ import build as build_guard
-from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.replay.recording import files_of
@@ -23,10 +20,10 @@ from machine.status.modes import Mode
 from recorder.manifest import describe
 from recorder.recorder import Recorder
 from sim.plant import Plant
+from tests.hil.stand_ins import SETTINGS, in_lockstep
 
 pytestmark = pytest.mark.long
 MS = 1_000_000
-SETTINGS = load_settings("aoro_fc8")
 PROFILE = SETTINGS.profile
 TURN_RAD, TURN_S, REST_S = 0.12, 3.0, 2.0
 LIMIT_S = 12.0
@@ -75,8 +72,7 @@ def life(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[
     pressed: list[OperatorAction] = []
     operator = Operator(SETTINGS.profile_hash, lambda action, _: pressed.append(action))
     planner = SlewALittle()
-    guard = build_guard(profile_path(PROFILE.name))
-    system = Lockstep(SETTINGS, guard, plant, planner, operator, Observer(recorder, [reports.append]))
+    system = in_lockstep(PROFILE.name, plant, planner, operator, Observer(recorder, [reports.append]))
     while not planner.done and system.now_ns < (1.0 + LIMIT_S) * 1e9:
         system.advance()
     recorder.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,15 +12,10 @@ from mcap.reader import make_reader
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.vehicle import Driving, Steering, VehicleReport
-from controller.config import load as load_settings
-from controller.guard.__main__ import build as build_guard
-from controller.guard.__main__ import profile_path
 from controller.laws.drive import east_north_m
 from hil.harness.lockstep import Lockstep, Observer
-from hil.harness.operator import Operator
 from hil.replay.recording import files_of
 from hil.replay.replay import replay
-from machine.profile import Carrier
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from recorder.manifest import describe
@@ -28,29 +23,17 @@ from recorder.recorder import Recorder
 from sim.geometry import LocalFrame
 from sim.kinematic import KinematicMachine
 from sim.plant import Plant
-from tests.hil.stand_ins import Blind, Drives
+from tests.hil.stand_ins import CARRIER, SETTINGS, Blind, Drives, advance, in_lockstep
 
 pytestmark = pytest.mark.long
-MS = 1_000_000
-SETTINGS = load_settings("aoro_fc8")
 PROFILE = SETTINGS.profile
-CARRIER = PROFILE.carrier
-assert isinstance(CARRIER, Carrier)
 SITE = LocalFrame(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 0.0)
 
 
 def system_of(plant, planner: Drives, recorder: Recorder | None = None) -> tuple[Lockstep, list[StateReport]]:
     reports: list[StateReport] = []
-    operator = Operator(SETTINGS.profile_hash, lambda action, _: None)
     observer = Observer(recorder, [reports.append], [planner.hear])
-    guard = build_guard(profile_path(PROFILE.name))
-    return Lockstep(SETTINGS, guard, plant, planner, operator, observer, Blind()), reports
-
-
-def run(system: Lockstep, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-    end_ns = system.now_ns + round(seconds * 1e9)
-    while system.now_ns < end_ns and not until():
-        system.advance()
+    return in_lockstep(PROFILE.name, plant, planner, observer=observer, eyes=Blind()), reports
 
 
 def place(east_m: float, north_m: float) -> dict[str, float]:
@@ -85,7 +68,7 @@ def trip(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Drive
     buses = (PROFILE.crane_bus, PROFILE.machine_bus or "")
     recorder = Recorder(directory, PROFILE, describe(PROFILE, buses, 3))
     system, reports = system_of(plant, planner, recorder)
-    run(system, 25.0, lambda: bool(arrived) and system.report is not None and system.report.mode == Mode.ARMED)
+    advance(system, 25.0, lambda: bool(arrived) and system.report is not None and system.report.mode == Mode.ARMED)
     recorder.close()
     yield directory, planner, system, reports
     plant.close()
@@ -117,13 +100,13 @@ def test_the_machine_stops_when_the_planner_dies_on_the_route() -> None:
     try:
         planner = Drives(lambda _, elapsed_ns: place(60.0, 0.0) | {"speed_m_s": 0.639} if elapsed_ns < 4e9 else None)
         system, reports = system_of(plant, planner)
-        run(system, 10.0, lambda: bool(reports) and reports[-1].mode == Mode.STOP)
+        advance(system, 10.0, lambda: bool(reports) and reports[-1].mode == Mode.STOP)
         assert reports[-1].reason == Reason.LEASE_LOST and plant.world.carrier.speed_m_s > 0.5
         begin = plant.world.carrier.front_axle()
-        run(system, 2.0)
+        advance(system, 2.0)
         stopped = plant.world.carrier.front_axle()
         assert math.dist(begin, stopped) < 0.45
-        run(system, 1.0)  # it rocks on its tyres, and stays where it is
+        advance(system, 1.0)  # it rocks on its tyres, and stays where it is
         assert not system.guard.latched, "braking is no motion that nobody asked for"
         assert math.dist(stopped, plant.world.carrier.front_axle()) < 0.005
         assert planner.vehicle is not None and planner.vehicle.driving == Driving.STANDING
@@ -138,16 +121,16 @@ def test_arms_go_to_their_heights_and_level_a_slope() -> None:
         say = {"heights_m": (0.3,) * 4, "level": False}
         planner = Drives(lambda *_: say)
         system, _ = system_of(plant, planner)
-        run(system, 6.0)
+        advance(system, 6.0)
         assert planner.vehicle is not None
         assert planner.vehicle.heights_m == pytest.approx([0.3] * 4, abs=CARRIER.arm_in_band_m)
         assert abs(plant.world.carrier.roll_rad) > 0.08
         say["level"] = True
-        run(system, 12.0)
+        advance(system, 12.0)
         assert abs(plant.world.carrier.roll_rad) < 0.03
         assert sum(planner.vehicle.heights_m) / 4 == pytest.approx(0.3, abs=0.02)
         say |= {"level": False, "heights_m": (0.05,) * 4}
-        run(system, 8.0)
+        advance(system, 8.0)
         assert planner.vehicle.heights_m == pytest.approx([0.05] * 4, abs=CARRIER.arm_in_band_m)
     finally:
         plant.close()
@@ -167,7 +150,7 @@ def test_twenty_metres_of_rigid_geometry() -> None:
     system, reports = system_of(rig, planner)
     carrier = rig.world.carrier
     assert carrier is not None
-    run(system, 60.0, lambda: math.hypot(carrier.x_m - goal[0], carrier.y_m - goal[1]) < 0.3)
+    advance(system, 60.0, lambda: math.hypot(carrier.x_m - goal[0], carrier.y_m - goal[1]) < 0.3)
     assert math.hypot(carrier.x_m - goal[0], carrier.y_m - goal[1]) < 0.3 and reports[-1].reason == Reason.NONE
 
 
@@ -184,7 +167,7 @@ def test_a_moving_articulation_angle_is_followed_on_rigid_geometry() -> None:
         return steer | {"speed_m_s": 0.5}
 
     system, reports = system_of(rig, Drives(say))
-    run(system, 20.0)
+    advance(system, 20.0)
     assert reports[-1].mode == Mode.ACTIVE and reports[-1].reason == Reason.NONE
     settled = errors[len(errors) // 4 :]
     assert max(map(abs, settled)) < 0.03  # of which 0.006 are the age of the report

@@ -17,17 +17,15 @@ from autonomy.perception.log_list import LogObservation
 from autonomy.process.jobs import ForwardingJob, Job, SingleLogJob
 from can_dbc.messages.crane import ModeSwitch, StateReport
 from can_dbc.messages.vehicle import VehicleReport
-from controller.config import load as load_settings
-from controller.guard.__main__ import build as build_guard
-from controller.guard.__main__ import profile_path
-from hil.harness.lockstep import Lockstep, Observer
-from hil.harness.operator import Operator
+from hil.harness.lockstep import Observer
 from machine.joints import Joint
+from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from sim.kinematic import KinematicMachine
 from tests.autonomy.crane_stand_in import GROUND_LOG
+from tests.hil.stand_ins import advance, in_lockstep
 
 REPORT_S = 0.02
 SITE = LocalPlane(63.657853, 19.895562)
@@ -37,17 +35,14 @@ class Run:
     """A job on a machine without physics, in lockstep; ``reports`` are those since the last `advance`."""
 
     def __init__(self, name: str, job_of, logs: tuple[LogObservation, ...] = ()) -> None:  # type: ignore[no-untyped-def]
-        settings = load_settings(name)
-        self.profile = settings.profile
-        self.job: Job = job_of(settings.profile, settings.profile_hash)
-        self.plant = KinematicMachine(settings.profile, 1, step_ns=2_500_000)
+        self.profile = load_profile(name)
+        self.job: Job = job_of(self.profile, profile_hash(self.profile))
+        self.plant = KinematicMachine(self.profile, 1, step_ns=2_500_000)
         self.reports: list[StateReport] = []
         self._vehicle: VehicleReport | None = None
         self._logs = logs
-        self.operator = Operator(settings.profile_hash, lambda *_: None)
         observer = Observer(None, [self.reports.append], [self._hear])
-        guard = build_guard(profile_path(name))
-        self.system = Lockstep(settings, guard, self.plant, self, self.operator, observer, self)  # type: ignore[arg-type]
+        self.system = in_lockstep(name, self.plant, self, observer=observer, eyes=self)
 
     def _hear(self, report: VehicleReport) -> None:
         self._vehicle = report
@@ -61,12 +56,7 @@ class Run:
 
     def advance(self, seconds: float, until=lambda: False) -> bool:  # type: ignore[no-untyped-def]
         self.reports.clear()
-        end_ns = self.system.now_ns + round(seconds * 1e9)
-        while self.system.now_ns < end_ns:
-            self.system.advance()
-            if until():
-                return True
-        return False
+        return advance(self.system, seconds, until)
 
     def paused(self) -> object:
         return dict(self.job.events())["paused"]["reason"]
@@ -75,7 +65,7 @@ class Run:
         """The controller neither stops nor refuses: the planner alone holds."""
         assert {r.mode for r in self.reports} <= {Mode.ARMED, Mode.ACTIVE}
         assert {r.reason for r in self.reports} == {Reason.NONE} and self.reports[-1].refused == 0
-        assert self.operator.stops == 0
+        assert self.system.operator.stops == 0
 
 
 def test_a_crane_holds_on_its_path_while_the_switch_is_at_idle() -> None:

@@ -13,15 +13,14 @@ from autonomy.crane_job.activity import Activity
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.messages.crane import ModeSwitch
 from can_dbc.plc.map import Fault, Feedback, State
-from controller.config import load
-from controller.guard.__main__ import build as build_guard
 from controller.guard.guard import Verdict
-from hil.harness.lockstep import START_NS, Lockstep, Observer
-from hil.harness.operator import Operator
+from hil.harness.lockstep import START_NS
 from hil.plc import BridgedPlant, Transport, write_plc_profile
+from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from sim.plc.program import Inputs
+from tests.hil.stand_ins import advance, in_lockstep
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -33,17 +32,16 @@ class Run:
 
     def __init__(self, role: RoleName, transport: Transport, directory: Path, seed: int = 0) -> None:
         path = write_plc_profile("palms_471", role, directory)
-        self.settings = settings = load(path)
-        self.plant = BridgedPlant(settings.profile, seed, "sampled", transport=transport)
-        self.activity = Activity(settings.profile, settings.profile_hash)
-        self.system = Lockstep(
-            settings,
-            build_guard(path),
-            self.plant,
-            self.activity,
-            Operator(settings.profile_hash, lambda *_: None),
-            Observer(),
-        )
+        profile = load_profile(path)
+        self.plant = BridgedPlant(profile, seed, "sampled", transport=transport)
+        self.activity = Activity(profile, profile_hash(profile))
+        self.system = in_lockstep(path, self.plant, self.activity)
+
+    @property
+    def reason(self) -> Reason:
+        """Why the machine stands."""
+        assert self.system.report is not None
+        return Reason(self.system.report.reason & 0xFF)
 
     def until(self, mode: Mode, limit_s: float = 20.0) -> None:
         system = self.system
@@ -52,9 +50,7 @@ class Run:
         assert system.report is not None and Mode(system.report.mode) is mode
 
     def wait(self, ms: int) -> None:
-        until_ns = self.system.now_ns + ms * MS
-        while self.system.now_ns < until_ns:
-            self.system.advance()
+        advance(self.system, ms / 1000)
 
     def moving(self) -> bool:
         return any(abs(u) > 0.0 for u in self.plant.plc.outputs[:5])
@@ -142,7 +138,7 @@ def test_the_emergency_stop_behind_the_plc_stops_and_latches(tmp_path: Path) -> 
     run.plant.estop.press()
     assert run.neutral_after_ms() <= 30
     run.until(Mode.FAULT)
-    assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.ESTOP_PRESSED
+    assert run.reason is Reason.ESTOP_PRESSED
     run.plant.estop.release()
     run.plant.estop.reset()
     run.wait(250)
@@ -156,7 +152,7 @@ def test_a_fault_of_the_plc_stops_the_controller(tmp_path: Path) -> None:
     run.start()
     run.plant.plc.arbiter.latch_fault(Fault.ILLEGAL_VALUE, 1)
     run.until(Mode.STOP)
-    assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.PLC_FAULT
+    assert run.reason is Reason.PLC_FAULT
     run.wait(50)
     assert not run.moving(), "its ramp takes 40 ms"
 
@@ -202,7 +198,7 @@ def test_controller_and_guard_both_catch_a_state_of_the_emergency_stop_that_is_n
     damage.begin()
     assert run.neutral_after_ms() <= 100
     run.wait(50)
-    assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.ESTOP_LOST
+    assert run.reason is Reason.ESTOP_LOST
     assert run.system._guard.verdict in (Verdict.ESTOP_LOST, Verdict.CORRUPT)
     run.wait(1000)
     assert not run.moving()
@@ -223,5 +219,4 @@ def test_encoders_that_the_plc_only_repeats_are_lost(role: RoleName, transport: 
     program._make_feedback = frozen  # type: ignore[method-assign]
     assert run.neutral_after_ms() <= 100
     run.wait(50)
-    assert run.system.report is not None
-    assert run.system.report.reason & 0xFF in (Reason.ENCODER_LOST, Reason.VALVE_NODE_FAULT)
+    assert run.reason in (Reason.ENCODER_LOST, Reason.VALVE_NODE_FAULT)

@@ -8,15 +8,14 @@ import pytest
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import encode
 from controller.config import Settings, load
-from controller.guard.__main__ import build, profile_path
 from controller.tick import Outputs
 from hil.harness.lockstep import Lockstep, Observer
-from hil.harness.operator import Operator
 from machine.joints import JOINTS
 from machine.profile import joint
 from machine.status.modes import Mode
 from sim.plant import Plant
 from tests.controller.setpoint_attacks import Attacker
+from tests.hil.stand_ins import in_lockstep
 
 MS = 1_000_000
 SECONDS = 4.0
@@ -97,9 +96,7 @@ def shares_of_the_speed_limit(
         if planner.begun_ns:
             positions.append(plant.joint_positions())
 
-    operator = Operator(settings.profile_hash, lambda action, report: None, 8)
-    guard = build(profile_path(machine))
-    planner.system = system = Lockstep(settings, guard, plant, planner, operator, Observer(on_outputs=[look]))
+    planner.system = system = in_lockstep(machine, plant, planner, observer=Observer(on_outputs=[look]), max_stops=8)
     try:
         while not planner.begun_ns or system.now_ns < planner.begun_ns + SECONDS * 1e9:
             system.advance()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from math import degrees
 from pathlib import Path
 
@@ -18,13 +19,20 @@ GOAL_M = (4.27, 1.86, 1.0)
 PERIOD_S = 1.8
 CUT_S = 1.0
 
+run = cache(stop_at)
+
+
+@pytest.fixture(scope="module")
+def sensing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The profile of a forwarder with the sensor."""
+    return sensing_profile(tmp_path_factory.mktemp("sensing"))
+
 
 @pytest.mark.parametrize(("truth", "seed"), [("nominal", 1), ("sampled", 2), ("sampled", 4)])
 def test_two_periods_after_an_unshaped_motion_less_than_half_of_the_swing_is_left(
-    tmp_path: Path, truth: str, seed: int
+    sensing: Path, truth: str, seed: int
 ) -> None:
-    plain = stop_at(SHIPPED, GOAL_M, truth=truth, seed=seed)
-    damped = stop_at(sensing_profile(tmp_path), GOAL_M, truth=truth, seed=seed)
+    plain, damped = (run(file, GOAL_M, truth=truth, seed=seed) for file in (SHIPPED, sensing))
     later = (2.0 * PERIOD_S, 3.0 * PERIOD_S)
     assert plain.swing(0.0, 0.5) == pytest.approx(damped.swing(0.0, 0.5), rel=0.1), "the same motion"
     assert degrees(plain.swing(*later)) > 1.5
@@ -36,13 +44,12 @@ def test_two_periods_after_an_unshaped_motion_less_than_half_of_the_swing_is_lef
     assert np.mean(np.all(damped.valves_pct[rested] == 0.0, axis=1)) > 0.95, "no limit cycle"
 
 
-def test_a_sensor_that_falls_silent_lets_the_damping_fade(tmp_path: Path) -> None:
+def test_a_sensor_that_falls_silent_lets_the_damping_fade(sensing: Path) -> None:
     def cut(plant: Plant, since_s: float) -> None:
         assert plant.imu is not None
         plant.imu.silent = since_s > CUT_S
 
-    file = sensing_profile(tmp_path)
-    whole, broken = stop_at(file, GOAL_M), stop_at(file, GOAL_M, each=cut)
+    whole, broken = run(sensing, GOAL_M, truth="nominal", seed=1), stop_at(sensing, GOAL_M, each=cut)
     before, after = broken.time_s < CUT_S, broken.time_s > CUT_S + 0.3
     assert np.array_equal(whole.valves_pct[before], broken.valves_pct[before])
     assert not np.array_equal(whole.valves_pct[after], broken.valves_pct[after])
