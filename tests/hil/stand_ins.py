@@ -14,13 +14,12 @@ from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import MAX_STOPS, Operator
-from machine.profile import Carrier
 from machine.status.modes import Mode
 
 MS = 1_000_000
 SETTINGS = load_settings("aoro_fc8")
+assert SETTINGS.profile.carrier is not None
 CARRIER = SETTINGS.profile.carrier
-assert isinstance(CARRIER, Carrier)
 
 
 class Idle:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 from mcap.reader import make_reader
@@ -18,8 +21,9 @@ from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.checkpoint import CheckpointFile, read_checkpoint
+from autonomy.manager.tally import Load, LoadedLog
 from autonomy.manager.transition_table import State
-from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options
+from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from can_dbc.frame import Frame, RawFrame
 from controller.guard.__main__ import build as build_guard
 from controller.guard.guard import Guard
@@ -27,7 +31,7 @@ from controller.guard.verdicts import Verdict
 from hil.harness.display import Display
 from hil.missions.lockstep import MissionRun
 from hil.missions.site import site_of
-from hil.missions.summary import MissionSummary
+from hil.missions.summary import MissionSummary, report_loads
 from host.exit_codes import ExitCode
 from machine.loading.profile_file import load_profile, profile_hash
 from runtime.errors import TimberhandError
@@ -88,24 +92,6 @@ def test_the_machine_sees_with_its_own_camera_and_perfect_sight_is_called_a_chea
     assert ("--detector perfect cheats" in done.output) is cheats
 
 
-@pytest.mark.long
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("manager", ["own", "paper-b"])
-def test_a_log_beside_the_route_is_brought_to_its_end(tmp_path: Path, manager: str) -> None:
-    path = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0))
-    command = ["mission", "run", str(path), "--lockstep", "--manager", manager, "--out", str(tmp_path / "run")]
-    result = CliRunner().invoke(app, command)
-    told = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert result.exit_code == 0, (told, result.output[-2000:])
-    assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 1
-    assert told["stops"] == told["refused"] == 0
-    assert told["states"][-1][1] == "DONE"
-    with (tmp_path / "run" / "run.mcap").open("rb") as file:
-        maps = [message for _, _, message in make_reader(file).iter_messages(["/logs"])]
-    assert len(maps) > told["seconds"] / 3, "the log map, as in a live run"
-    assert len(maps[0].data) < max(len(found.data) for found in maps), "the log is found on the way"
-
-
 class FrameByFrame:
     """The guard of a run, one step for each frame; ``refused`` are the verdicts after it first was GOOD."""
 
@@ -127,20 +113,34 @@ class FrameByFrame:
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_a_mission_with_a_step_of_the_guard_for_every_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Driving, swing arms and crane: the keys and the motions of a tick are in several frames."""
+@pytest.mark.parametrize(("manager", "by_frame"), [("own", True), ("paper-b", False)])
+def test_a_log_beside_the_route_is_brought_to_its_end(
+    manager: str, by_frame: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Driving, swing arms and crane: the keys and the motions of a tick are in several frames, and a guard that steps
+    for every one of them refuses nothing either.
+    """
     guards: list[FrameByFrame] = []
 
     def built(profile: Path) -> FrameByFrame:
         guards.append(FrameByFrame(build_guard(profile)))
         return guards[-1]
 
-    monkeypatch.setattr(lockstep, "build_guard", built)
+    if by_frame:
+        monkeypatch.setattr(lockstep, "build_guard", built)
     path = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0))
-    result = CliRunner().invoke(app, ["mission", "run", str(path), "--lockstep", "--out", str(tmp_path / "run")])
-    assert [guard.refused for guard in guards] == [[]], result.output[-2000:]
+    command = ["mission", "run", str(path), "--lockstep", "--manager", manager, "--out", str(tmp_path / "run")]
+    result = CliRunner().invoke(app, command)
+    assert [guard.refused for guard in guards] == [[]] * by_frame, result.output[-2000:]
     told = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert result.exit_code == 0 and told["loaded"] == 1 and told["stops"] == 0
+    assert result.exit_code == 0, (told, result.output[-2000:])
+    assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 1
+    assert told["stops"] == told["refused"] == 0
+    assert told["states"][-1][1] == "DONE"
+    with (tmp_path / "run" / "run.mcap").open("rb") as file:
+        maps = [message for _, _, message in make_reader(file).iter_messages(["/logs"])]
+    assert len(maps) > told["seconds"] / 3, "the log map, as in a live run"
+    assert len(maps[0].data) < max(len(found.data) for found in maps), "the log is found on the way"
 
 
 LIE = (("saw logs", 8.0, 4.2), ("pulpwood", 16.0, -4.2))
@@ -188,3 +188,37 @@ def test_each_assortment_reaches_its_landing_although_the_planner_restarts(tmp_p
     for state, (_, x, y) in zip(plant.world.log_bodies.states(), LANDINGS, strict=True):
         there = (state.position_m[0] + east, state.position_m[1] + north)
         assert math.dist(there, (x, y)) < 1.6, "on the pile of its assortment"
+
+
+# -- the report of a run: the forwarded loads with positions and times
+
+MISSION = ForwardingMission("Kiruna 7", (), landings=(Landing(Point(63.6, 19.9), "road"),))
+BEGUN = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
+
+
+def taken(at_s: int, volume_m3: float = 0.1, *product: Any) -> LoadedLog:
+    return LoadedLog(Point(63.65, 19.89), at_s * 1_000_000_000, volume_m3, *product)
+
+
+def test_a_run_writes_a_report_of_its_loads(tmp_path: Path) -> None:
+    loads = [
+        Load((taken(10), taken(70, 0.2, "pulp", "birch", 31)), 130_000_000_000, 41.7),
+        Load((taken(200),), 260_000_000_000, 9.0),
+    ]
+    path = report_loads(tmp_path, loads, MISSION, load_profile("aoro_fc8"), BEGUN, 0)
+    assert path == tmp_path / "forwarded.fpr"
+    text: dict[str, list[str]] = {}
+    for element in ElementTree.fromstring(path.read_bytes()).iter():
+        text.setdefault(element.tag.rpartition("}")[2], []).append(element.text or "")
+    assert text["UnloadingTime"] == ["2026-05-04T12:02:10+00:00", "2026-05-04T12:04:20+00:00"]
+    assert text["LoadVolume"] == ["0.1000", "0.2000", "0.1000"]
+    assert text["CoordinateDate"][1] == "2026-05-04T12:01:10+00:00"
+    assert text["ObjectName"] == ["Kiruna 7"] and text["LocationName"] == ["road"]
+    assert text["DistanceFromLastUnloading"] == ["42", "9"] and sorted(text["ProductName"]) == ["pulp", "unknown"]
+    assert sorted(text["SpeciesGroupName"]) == ["birch", "unknown"] and "31" in text["ProductKey"]
+    assert text["CreationDate"] == ["2026-05-04T12:04:20+00:00"]
+
+
+def test_a_run_without_forwarded_logs_has_no_report(tmp_path: Path) -> None:
+    assert report_loads(tmp_path, [], MISSION, load_profile("aoro_fc8"), BEGUN, 0) is None
+    assert not list(tmp_path.iterdir())
