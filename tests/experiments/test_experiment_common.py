@@ -107,15 +107,6 @@ def test_an_interrupted_run_continues_where_it_stopped(tmp_path):
     assert not path.exists()
 
 
-def test_a_checkpoint_of_another_run_is_ignored(tmp_path):
-    path = tmp_path / "trials.jsonl"
-    first = Checkpoint(path, "one")
-    first.add("square/0", 0)
-    first.close()
-    assert Checkpoint(path, "one").done == {"square/0": 0}
-    assert Checkpoint(path, "two").done == {}
-
-
 def test_a_run_continues_from_published_trials_if_it_has_no_checkpoint(tmp_path):
     path, published = tmp_path / "run" / "trials.jsonl", tmp_path / "docs" / "trials.jsonl.xz"
     with Checkpoint(path, "run", published) as checkpoint:

@@ -92,15 +92,8 @@ def test_a_miss_is_a_named_blind_spot_only_in_the_works_that_the_catalogue_names
 
 def test_work_without_faults_tells_how_near_each_monitor_came_and_where() -> None:
     def work(seed: int, most: float, bins: list[int]) -> dict[str, Any]:
-        share = {"bins": bins, "most": most, "where": "lift", "at_s": 12.0}
-        return {
-            "scene": "crane",
-            "seed": seed,
-            "seconds": 3600.0,
-            "working_s": 1.0,
-            "trips": [],
-            "shares": {"a": share},
-        }
+        shares = {"a": {"bins": bins, "most": most, "where": "lift", "at_s": 12.0}}
+        return {"scene": "crane", "seed": seed, "seconds": 3600.0, "working_s": 1.0, "trips": [], "shares": shares}
 
     runs = [work(1, 0.4, [3000, 500, 0, 0, 0, 0, 0]), work(2, 0.95, [1000, 2000, 30, 4, 3, 2, 1])]
     total = merged(runs)["a"]
@@ -239,14 +232,17 @@ def _injected(scene: str, text: str) -> dict[str, Any]:
 
 
 def test_a_stop_that_becomes_harder_for_another_reason_is_seen() -> None:
-    watched = Evidence([], load_profile("palms_471"))
-    watched.begin(0, drives=False)
-    seen = [(Mode.ACTIVE, Reason.NONE), (Mode.STOP, Reason.VALVE_NODE_FAULT), (Mode.FAULT, Reason.VALVE_NODE_FAULT)]
-    for k, (mode, reason) in enumerate([*seen, (Mode.FAULT, Reason.ESTOP_PRESSED)]):
-        watched.outputs(SimpleNamespace(mode=mode, reason=reason, detail=0), k * 1_000_000)  # type: ignore[arg-type]
-    assert watched.reached == {"R1": 1.0}, "the end of its own ramp is no other reaction"
-    watched = Evidence([], load_profile("palms_471"))
-    watched.begin(0, drives=False)
-    for k, (mode, reason) in enumerate([*seen[:2], (Mode.FAULT, Reason.ESTOP_PRESSED)]):
-        watched.outputs(SimpleNamespace(mode=mode, reason=reason, detail=0), k * 1_000_000)  # type: ignore[arg-type]
-    assert watched.reached == {"R1": 1.0, "R0": 2.0} and watched.reason == "VALVE_NODE_FAULT"
+    def watched(*seen: tuple[Mode, Reason]) -> Evidence:
+        evidence = Evidence([], load_profile("palms_471"))
+        evidence.begin(0, drives=False)
+        for k, (mode, reason) in enumerate(seen):
+            outputs: Any = SimpleNamespace(mode=mode, reason=reason, detail=0)
+            evidence.outputs(outputs, k * 1_000_000)
+        return evidence
+
+    ramp = [(Mode.ACTIVE, Reason.NONE), (Mode.STOP, Reason.VALVE_NODE_FAULT)]
+    pressed = (Mode.FAULT, Reason.ESTOP_PRESSED)
+    own_end = watched(*ramp, (Mode.FAULT, Reason.VALVE_NODE_FAULT), pressed)
+    assert own_end.reached == {"R1": 1.0}, "the end of its own ramp is no other reaction"
+    harder = watched(*ramp, pressed)
+    assert harder.reached == {"R1": 1.0, "R0": 2.0} and harder.reason == "VALVE_NODE_FAULT"

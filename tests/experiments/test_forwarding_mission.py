@@ -39,33 +39,23 @@ def grasp(log: int | None, off_m: tuple[float, float, float], logs: int = 1, sta
 
 def outcome(logs: int = 3, off_m: tuple[float, float, float] = (0.03, 0.04, 0.0), **changes: Any) -> dict[str, Any]:
     """A mission that takes every log, ``off_m`` beside it."""
-    lying = [
-        {
-            "place_m": [float(i), 3.0, 0.1],
-            "size_m": [2.0, 0.25],
-            "detected": True,
-            "in_bunk": True,
-            "lies_m": [[9.0, 9.0, 1.8]],
-            "landed": False,
+    aboard = {"detected": True, "in_bunk": True, "lies_m": [[9.0, 9.0, 1.8]], "landed": False}
+    lying = [aboard | {"place_m": [float(i), 3.0, 0.1], "size_m": [2.0, 0.25]} for i in range(logs)]
+    ended = {"finished": True, "failure": "", "seconds": 900.0, "driven_m": 100.0, "stops": 0, "refused": 0}
+    return (
+        ended
+        | {
+            "loaded": logs,
+            "given_up": {},
+            "states": [],
+            "logs": lying,
+            "places": logs,
+            "grasps": [grasp(i, off_m) for i in range(logs)],
+            "path": [[0.0, 0.0, 0.0, 0], [1.0, 1.0, 0.0, 0]],
+            "stands": [[0.0, 0.0, 0.0]],
         }
-        for i in range(logs)
-    ]
-    return {
-        "finished": True,
-        "failure": "",
-        "loaded": logs,
-        "given_up": {},
-        "seconds": 900.0,
-        "driven_m": 100.0,
-        "stops": 0,
-        "refused": 0,
-        "states": [],
-        "logs": lying,
-        "places": logs,
-        "grasps": [grasp(i, off_m) for i in range(logs)],
-        "path": [[0.0, 0.0, 0.0, 0], [1.0, 1.0, 0.0, 0]],
-        "stands": [[0.0, 0.0, 0.0]],
-    } | changes
+        | changes
+    )
 
 
 def test_an_offset_of_five_centimetres_is_measured_as_that() -> None:
@@ -90,13 +80,8 @@ def test_a_lost_log_a_stop_and_a_failed_mission_miss_their_limits() -> None:
     bad["logs"][0] |= {"in_bunk": False, "detected": False}
     metrics = gather({"mission/0": bad, "machine/0": {"profile": None, "failure": "x"}})
     limits = {f.name: f for f in METRICS}
-    for name, value in {
-        "detected": 2 / 3,
-        "loaded": 2 / 3,
-        "finished": 0.0,
-        "faults": 2.0,
-        "uncalibrated": 1.0,
-    }.items():
+    wrong = {"detected": 2 / 3, "loaded": 2 / 3, "finished": 0.0, "faults": 2.0, "uncalibrated": 1.0}
+    for name, value in wrong.items():
         assert metrics[name] == pytest.approx(value)
         assert not limits[name].holds(metrics[name]), name
     assert not limits["grasp_offset_mean_m"].holds(0.09)

@@ -9,14 +9,7 @@ from typing import Any
 import pytest
 
 from experiments.common.registry import Options
-from experiments.generalization.experiment import (
-    MISSION,
-    MISSIONS,
-    drawn_mission,
-    jobs_of,
-    scenes_of,
-    wrong_values,
-)
+from experiments.generalization.experiment import MISSION, MISSIONS, drawn_mission, jobs_of, scenes_of, wrong_values
 from experiments.generalization.matrix import (
     COMBINED,
     NOMINAL,
@@ -112,41 +105,16 @@ def test_a_mission_has_its_own_route_and_wood_and_says_nothing_of_the_logs(tmp_p
 
 
 def outcome(truth: str, calibrated: bool = True, wrong: tuple[str, ...] = (), **job: Any) -> dict[str, Any]:
-    done: dict[str, Any] = {
-        "in_bunk": True,
-        "says_done": True,
-        "stops": 0,
-        "refused": 0,
-        "seconds": 30.0,
-        "said": "",
-        "closings": 1,
-    }
-    done |= job
-    return {
-        "truth": truth,
-        "seconds": 300.0,
-        "said": "" if calibrated else "why",
-        "calibrated": calibrated,
-        "jobs": [done] if calibrated else [],
-        "wrong": list(wrong),
-    }
+    done: dict[str, Any] = {"in_bunk": True, "says_done": True, "said": "", "closings": 1}
+    done |= {"stops": 0, "refused": 0, "seconds": 30.0} | job
+    told = {"truth": truth, "calibrated": calibrated, "said": "" if calibrated else "why"}
+    return told | {"seconds": 300.0, "jobs": [done] if calibrated else [], "wrong": list(wrong)}
 
 
 def mission(number: int, **told: Any) -> dict[str, Any]:
-    driven: dict[str, Any] = {
-        "ground": "flat",
-        "logs": 8,
-        "believed": 8,
-        "in_bunk": 8,
-        "given_up": 0,
-        "finished": True,
-        "failure": "",
-        "stops": 0,
-        "refused": 0,
-        "seconds": 400.0,
-        "driven_m": 40.0,
-        "remarks": [],
-    }
+    logs: dict[str, Any] = {"logs": 8, "believed": 8, "in_bunk": 8, "given_up": 0}
+    drive = {"ground": "flat", "seconds": 400.0, "driven_m": 40.0, "stops": 0, "refused": 0}
+    driven = logs | drive | {"finished": True, "failure": "", "remarks": []}
     return outcome(f"unseen-{number}") | {"jobs": [], MISSION: driven | told}
 
 

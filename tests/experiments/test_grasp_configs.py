@@ -99,20 +99,10 @@ def test_a_missed_misplaced_or_invented_log_misleads() -> None:
     assert not misled(beside, [seen(0, 0.09), seen(0, -0.14)]), "the nearest one may be another's"
 
 
-def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str, Any]:
-    return {
-        "configuration": number,
-        "category": word,
-        "lifted": up,
-        "logs": CONFIGURATIONS[number][1],
-        "plan_ms": plan_ms,
-        "individual": number % 2 > 0,
-        "closings": 2 if number == 4 else 1,
-        "see_ms": 50.0,
-        "failure": None,
-        "reason": "",
-        "stops": 0,
-    }
+def outcome(number: int, word: str, up: int) -> dict[str, Any]:
+    judged = {"configuration": number, "category": word, "lifted": up, "logs": CONFIGURATIONS[number][1], "stops": 0}
+    took = {"closings": 2 if number == 4 else 1, "plan_ms": 10.0, "see_ms": 50.0}
+    return judged | took | {"individual": number % 2 > 0, "failure": None, "reason": ""}
 
 
 def test_a_lifted_log_after_a_stop_that_needed_a_person_is_a_failure() -> None:
@@ -123,15 +113,8 @@ def test_a_lifted_log_after_a_stop_that_needed_a_person_is_a_failure() -> None:
     assert metrics["stopped"] == 1.0 and metrics["first_closing"] == pytest.approx(10 / 12)
     assert metrics["uncalibrated"] == 0.0
     assert gather(found | {"machine/0": {"profile": None}}, ("ours", "search"))["uncalibrated"] == 1.0
-    saved = make_result(
-        "grasp-configs",
-        METRICS,
-        {"success": 1.0},
-        profile="palms_471",
-        seed=1,
-        trials=12,
-        more={"judged": "ours poses, search"},
-    )
+    judged = {"judged": "ours poses, search"}
+    saved = make_result("grasp-configs", METRICS, {"success": 1.0}, profile="palms_471", seed=1, trials=12, more=judged)
     again = evaluated_again(saved, found)
     assert again.metrics["success"] == pytest.approx(11 / 12) and "success" in again.missed
     assert again.commit == saved.commit and "first_closing" in again.missed
@@ -223,16 +206,15 @@ def test_after_the_papers_attempts_machines_alternate_on_their_own_scenes() -> N
     assert by_machine == {f"text machine/{i}": calibrations[i].seed for i in (0, 1, 3, 4)}
 
 
+def attempted(profile: str, truth: str) -> dict[str, Any]:
+    """A grasp of three logs whose places are known."""
+    options = {"profile": profile, "truth": truth, "configuration": 7, "poses": TRUE, "planner": "search"}
+    return attempt(Job("one", "grasp", 7000, options))
+
+
 @pytest.mark.long
 def test_a_small_pile_is_lifted_completely_over_the_bus() -> None:
-    options = {
-        "profile": "palms_471",
-        "truth": "nominal",
-        "configuration": 7,
-        "poses": "true",
-        "planner": "search",
-    }
-    found = attempt(Job("one", "grasp", 7000, options))
+    found = attempted("palms_471", "nominal")
     assert found["category"] == "optimal" and found["up"] == [0, 1, 2] and found["stops"] == 0
     assert set(found["expected"]) == {0, 1, 2} and math.dist(found["grip"][:2], found["asked"][:2]) < 0.06
 
@@ -248,12 +230,5 @@ def test_a_machine_without_the_camera_gets_true_poses_and_no_detector(tmp_path: 
 @pytest.mark.long
 def test_the_third_machine_lifts_a_small_pile_from_data_alone(tmp_path: Path) -> None:
     loader = made(tmp_path)
-    options = {
-        "profile": str(loader),
-        "truth": str(loader.with_name(f"{NAME}.truth.toml")),
-        "configuration": 7,
-        "poses": TRUE,
-        "planner": "search",
-    }
-    found = attempt(Job("one", "grasp", 7000, options))
+    found = attempted(str(loader), str(loader.with_name(f"{NAME}.truth.toml")))
     assert found["lifted"] == 3 and found["stops"] == 0 and found["closings"] == 1

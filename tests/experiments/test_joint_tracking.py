@@ -82,14 +82,9 @@ def test_every_law_meets_every_corner_of_twice_the_spread_and_a_quick_run_is_sho
 
 
 def test_metrics_are_means_counts_and_worst_values():
+    wide = {"rest_m": [0.001, 0.003], "diverged": False, "alarms": 1, "trace": {}, "shut_share": 1.0}
     outcomes = {
-        "palms/pd/shipped/wide/0": {
-            "rest_m": [0.001, 0.003],
-            "diverged": False,
-            "alarms": 1,
-            "trace": {},
-            "shut_share": 1.0,
-        },
+        "palms/pd/shipped/wide/0": wide,
         "palms/pd/shipped/corner/1": {"rest_m": [0.002, 0.010], "diverged": True, "alarms": 2, "shut_share": 0.9},
         "palms/pd/shipped/corner/2": {"rest_m": [0.004, 0.004], "diverged": False, "alarms": 0, "shut_share": 0.8},
         "palms/stop/0": {"lift_empty_damped_ring_m": [0.001, 0.002], "lift_empty_plain_ring_m": [0.002, 0.004]},
@@ -104,9 +99,8 @@ def test_metrics_are_means_counts_and_worst_values():
 
 
 def test_machines_that_never_settle_miss_the_limit():
-    found = experiment.gather(
-        {"palms/pd/shipped/wide/0": {"shut_share": math.nan, "unsettled_share": 1.0, "diverged": False}}
-    )
+    never = {"shut_share": math.nan, "unsettled_share": 1.0, "diverged": False}
+    found = experiment.gather({"palms/pd/shipped/wide/0": never})
     assert found["palms_pd_shipped_shut_share"] == 0.0 and found["palms_pd_shipped_unsettled_share"] == 1.0
 
 

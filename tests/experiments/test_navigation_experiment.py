@@ -29,40 +29,24 @@ def row(**values: float) -> list[float | None]:
     return [values.get(name, 0.0) for name in COLUMNS]
 
 
+def drive(rows: list[list[float | None]], rest_m: list[float]) -> dict[str, Any]:
+    """A drive of these rows that arrived."""
+    told = {"arrived": True, "reason": "", "stops": 0, "rejected": 0, "seconds": 1.0}
+    return told | {"rows": rows, "begin": [-12.0, -10.0, 0.0], "rest_m": rest_m}
+
+
 def ours(off_m: float = 0.0, seen_off_m: float = 0.0, points: list[tuple[float, float]] = POINTS) -> dict[str, Any]:
     """A drive exactly ``off_m`` to the left of its path, that believes to be on it."""
-    begin = (-12.0, -10.0, 0.0)
-    path = joining_path(begin[:2], begin[2], points, CARRIER)
+    path = joining_path((-12.0, -10.0), 0.0, points, CARRIER)
     rows = []
     for s in np.arange(0.0, path.length_m, SPACING_M):
         x, y, heading, _ = path.at(s)
         left = (-math.sin(heading), math.cos(heading))
         true, seen = ((x + o * left[0], y + o * left[1]) for o in (off_m, off_m + seen_off_m))
-        rows.append(
-            row(
-                t_s=s,
-                x_m=true[0],
-                y_m=true[1],
-                yaw_rad=heading,
-                seen_x_m=seen[0],
-                seen_y_m=seen[1],
-                seen_yaw_rad=heading,
-                sigma_m=0.02,
-                s_m=s,
-                goal=-1,
-            )
-        )
+        at = {"t_s": s, "s_m": s, "goal": -1, "sigma_m": 0.02, "yaw_rad": heading, "seen_yaw_rad": heading}
+        rows.append(row(x_m=true[0], y_m=true[1], seen_x_m=seen[0], seen_y_m=seen[1], **at))
     x, y, *_ = path.at(path.length_m + 0.03)
-    return {
-        "rows": rows,
-        "begin": list(begin),
-        "rest_m": [x, y],
-        "arrived": True,
-        "reason": "",
-        "stops": 0,
-        "rejected": 0,
-        "seconds": 1.0,
-    }
+    return drive(rows, [x, y])
 
 
 def faithful(off_m: float = 0.0, laps: int = LAPS, curve_deg_m: float = 10.0) -> dict[str, Any]:
@@ -79,30 +63,11 @@ def faithful(off_m: float = 0.0, laps: int = LAPS, curve_deg_m: float = 10.0) ->
             yaw += max(-turn, min(turn, error))
             x, y = x + SPACING_M * math.cos(yaw), y + SPACING_M * math.sin(yaw)
             shift = off_m if goal < len(points) - LAP else 0.0
-            rows.append(
-                row(
-                    x_m=x + shift,
-                    y_m=y + shift,
-                    yaw_rad=yaw,
-                    seen_x_m=x + shift,
-                    seen_y_m=y + shift,
-                    sigma_m=0.02,
-                    goal=goal,
-                    bend_rad=bend,
-                )
-            )
+            place = {"x_m": x + shift, "y_m": y + shift, "seen_x_m": x + shift, "seen_y_m": y + shift}
+            rows.append(row(yaw_rad=yaw, sigma_m=0.02, goal=goal, bend_rad=bend, **place))
             if math.dist((x, y), (gx, gy)) < (6.0 if goal + 1 < len(points) else 1.0):
                 break
-    return {
-        "rows": rows,
-        "begin": [-12.0, -10.0, 0.0],
-        "rest_m": [x, y],
-        "arrived": True,
-        "reason": "",
-        "stops": 0,
-        "rejected": 0,
-        "seconds": 1.0,
-    }
+    return drive(rows, [x, y])
 
 
 def test_the_plan_drives_every_start_on_every_ground_by_both_methods() -> None:

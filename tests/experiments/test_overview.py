@@ -18,20 +18,40 @@ from tests.codes import numbers_in
 DOCS = Path(__file__).parents[2] / "docs"
 
 
+NAVIGATION = read(DOCS / "results" / "navigation.json")
+PAGE = import_module(EXPERIMENTS["navigation"].module).page_of(NAVIGATION, {})
+
+
+def row_of(text: str) -> list[list[float]]:
+    """The numbers in the cells of the experiment's row of the overview."""
+    (row,) = [line for line in text.split("## ")[0].splitlines() if line.startswith("| [nav")]
+    return [numbers_in(cell) for cell in row.split("|")]
+
+
 def test_missed_and_inconclusive_limits_are_not_met_and_paper_values_are_shown() -> None:
-    result = read(DOCS / "results" / "navigation.json")
-    broken = {**result.metrics, "lateral_p95_m": 0.5, "stop_max_m": float("nan")}
-    text = page(
-        {"navigation": replace(result, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))},
-        (),
-        {"navigation": Standing.STALE},
-    )
-    asks, papers, later, missed, _ = text.split("## ")
-    (row,) = [line for line in asks.splitlines() if line.startswith("| [")]
-    assert [len(result.limits) - 2, len(result.limits), 1] in [numbers_in(cell) for cell in row.split("|")]
+    broken = {**NAVIGATION.metrics, "lateral_p95_m": 0.5, "stop_max_m": float("nan")}
+    bad = replace(NAVIGATION, metrics=broken, missed=("lateral_p95_m",), inconclusive=("stops",))
+    text = page({"navigation": bad}, (), {"navigation": Standing.STALE})
+    limits = len(NAVIGATION.limits)
+    assert [limits - 2, limits, 1] in row_of(text)
+    _, papers, later, missed, _ = text.split("## ")
     assert "9 deg/m" in papers and "50 cm" not in papers
     assert "50 cm" in missed and 8 in numbers_in(missed) and missed.count("\n| [") == 1
-    assert later.count("\n| [") == 0, "without our figure there is nothing to compare with"
+    assert "| [" not in later, "without our figure there is nothing to compare with"
+    ((_, (*_, kept, _, _)),) = compared({"navigation": replace(NAVIGATION, missed=())})
+    ((_, (*_, worse, _, _)),) = compared({"navigation": replace(NAVIGATION, missed=("heading_deg_per_m",))})
+    assert worse != kept and numbers_in(worse) == numbers_in(kept), "and so it is said beside the paper's"
+
+
+def test_a_limit_without_a_figure_is_not_met_and_its_sentence_is_left_out() -> None:
+    figures = {name: value for name, value in NAVIGATION.metrics.items() if name != "lateral_p95_m"}
+    without = replace(NAVIGATION, metrics=figures)
+    assert without.unmeasured == ("lateral_p95_m",) and without.met == NAVIGATION.met - 1
+    lateral = f"{100.0 * NAVIGATION.metrics['lateral_p95_m']:.4g} cm"
+    whole, shown = conclusion(NAVIGATION, PAGE), conclusion(without, PAGE)
+    assert lateral in whole and lateral not in shown
+    assert "6 of 7" in shown and "Not measured" in shown and "Not measured" not in whole
+    assert [6, 7, 1] in row_of(page({"navigation": without}, (), {"navigation": Standing.CURRENT}))
 
 
 def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and_ours_with_everything() -> None:
@@ -45,19 +65,6 @@ def test_a_paper_s_figure_stands_beside_its_method_here_ours_under_its_rules_and
         shown = numbers_in(cell)
         assert shown[0] == pytest.approx(100.0 * metrics[name], abs=0.01) and shown[-1] == metrics[f"{name}_n"]
     assert not numbers_in(rows["optimal"][4]), "not measured so"
-
-
-def test_a_limit_without_a_figure_is_not_met() -> None:
-    result = read(DOCS / "results" / "navigation.json")
-    without = replace(result, metrics={k: v for k, v in result.metrics.items() if k != "lateral_p95_m"})
-    assert without.unmeasured == ("lateral_p95_m",) and without.met == result.met - 1
-    module = import_module(EXPERIMENTS["navigation"].module)
-    shown = conclusion(without, module.page_of(without, {}))
-    assert "6 of 7" in shown and "Not measured" in shown
-    assert "Not measured" not in conclusion(result, module.page_of(result, {}))
-    lines = page({"navigation": without}, (), {"navigation": Standing.CURRENT}).splitlines()
-    row = next(line for line in lines if line.startswith("| [nav"))
-    assert numbers_in(row.split("|")[3]) == [6, 7, 1]
 
 
 def test_the_command_on_a_page_selects_the_trials_that_were_measured() -> None:
@@ -77,20 +84,3 @@ def test_every_comparison_names_metrics_that_its_experiment_has_and_limits_ours(
         ours = {entry.method, entry.rules, entry.everything} - {""}
         assert ours | {entry.paper_metric} <= set(metrics), entry.question
         assert all(metrics[name].limit_text() for name in ours), entry.question
-
-
-def test_a_figure_in_a_comparison_says_that_it_misses_its_limit() -> None:
-    result = read(DOCS / "results" / "navigation.json")
-    ((_, (*_, kept, _, _)),) = compared({"navigation": replace(result, missed=())})
-    ((_, (*_, missed, _, _)),) = compared({"navigation": replace(result, missed=("heading_deg_per_m",))})
-    assert missed == f"{kept}, *missed*" and numbers_in(kept)
-
-
-def test_a_conclusion_leaves_out_a_sentence_without_a_value() -> None:
-    result = read(DOCS / "results" / "navigation.json")
-    module = import_module(EXPERIMENTS["navigation"].module)
-    shown = conclusion(result, module.page_of(result, {}))
-    lateral = f"{100.0 * result.metrics['lateral_p95_m']:.4g} cm"
-    assert lateral in shown and 7 in numbers_in(shown)
-    without = replace(result, metrics={k: v for k, v in result.metrics.items() if k != "lateral_p95_m"})
-    assert lateral not in conclusion(without, module.page_of(without, {}))

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from typer.testing import CliRunner
 
 from experiments.parts.experiment import METRICS, SLOPES, gather, plan, settled_s
 from experiments.parts.trial import demonstrations
-from host.exit_codes import CommandFailed, ExitCode
-from timberhand.cli import app
+from tests.experiments.quick_runs import quick_result
 
 TILT = math.radians(5.0)
 
@@ -37,42 +34,25 @@ def test_a_tilt_has_settled_from_its_last_second_above_a_degree() -> None:
 
 
 def test_figures_of_drives_with_known_loads() -> None:
-    drive = {
-        "heights_m": [[0.03, -0.04]] * 2,
-        "loads": [[1.0, 1.0, 1.0, 1.0], [2.0, 0.0, 2.0, 0.0]],
-        "stops": 1,
-        "arrived": False,
-    }
-    metrics = gather({"ground/float/0": drive | {"roll_rad": [0.1, 0.1], "stops": 1, "arrived": False}})
+    loads = [[1.0, 1.0, 1.0, 1.0], [2.0, 0.0, 2.0, 0.0]]
+    drive = {"heights_m": [[0.03, -0.04]] * 2, "loads": loads, "roll_rad": [0.1, 0.1], "stops": 1, "arrived": False}
+    metrics = gather({"ground/float/0": drive})
     assert metrics["float.height_rms_m"] == pytest.approx(math.hypot(0.03, 0.04) / math.sqrt(2.0))
-    assert (
-        metrics["float.lifted"] == 0.5
-        and metrics["float.arrived"] == 0.0
-        and metrics["float.roll_deg"] == pytest.approx(0.0)
-    )
+    assert metrics["float.lifted"] == 0.5 and metrics["float.arrived"] == 0.0
+    assert metrics["float.roll_deg"] == pytest.approx(0.0)
     assert metrics["stops"] == 1.0 and math.isnan(metrics["estimates_hz"])
 
 
 def test_a_primitive_out_of_reach_is_counted_and_leaves_no_other_figure() -> None:
     made = {"shape_rms_m": 0.1, "shape_max_m": 0.2, "time_share": 1.0, "tip_rms_m": 0.03, "true_rms_m": 0.05}
-    metrics = gather(
-        {
-            "primitive/own/0": made | {"rest_m": 0.01, "stops": 0},
-            "primitive/own/1": {"failure": "out of reach", "stops": 0},
-        }
-    )
+    made |= {"rest_m": 0.01, "stops": 0}
+    metrics = gather({"primitive/own/0": made, "primitive/own/1": {"failure": "out of reach", "stops": 0}})
     assert metrics["refused"] == 1.0 and metrics["shape_rms_m"] == 0.1
 
 
 @pytest.mark.long
 def test_the_quick_run_measures_every_part(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["experiment", "parts", "--quick", "--out", str(tmp_path)])
-    missed = (
-        isinstance(done.exception, CommandFailed) and done.exception.exit_code is ExitCode.FIGURE_MISSED
-    )  # one trial is few
-    assert done.exit_code == 0 or missed, done.output
-    document = json.loads((tmp_path / "result.json").read_text())
-    assert {metric.name for metric in METRICS} <= set(document["metrics"])
-    assert all(math.isfinite(document["metrics"][metric.name]) for metric in METRICS), document["metrics"]
-    assert document["metrics"]["stops"] == document["metrics"]["refused"] == 0.0
-    assert document["metrics"]["side.after_deg"] < 0.5 * document["metrics"]["side.before_deg"]
+    metrics = quick_result("parts", tmp_path)["metrics"]
+    assert all(math.isfinite(metrics[metric.name]) for metric in METRICS), metrics
+    assert metrics["stops"] == metrics["refused"] == 0.0
+    assert metrics["side.after_deg"] < 0.5 * metrics["side.before_deg"]

@@ -11,16 +11,8 @@ from experiments.plc.experiment import METRICS, PATHS, gather, slope
 
 
 def outcome(success: bool, rests_mm: list[float]) -> dict[str, Any]:
-    return {
-        "success": success,
-        "stops": 1,
-        "seconds": 40.0,
-        "rests_mm": rests_mm,
-        "squares": 900.0,
-        "moments": 9,
-        "age_ms": 20.0,
-        "delays_ms": [10.0, 15.0],
-    }
+    measured = {"rests_mm": rests_mm, "squares": 900.0, "moments": 9, "age_ms": 20.0, "delays_ms": [10.0, 15.0]}
+    return {"success": success, "stops": 1, "seconds": 40.0} | measured
 
 
 def test_every_path_has_every_metric_and_a_lost_log_misses_the_limit() -> None:

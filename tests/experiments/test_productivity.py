@@ -11,7 +11,7 @@ import pytest
 
 from autonomy.missions.validation import problems_of
 from experiments.productivity.experiment import AMOUNTS, KINDS, QUICK, plan, task
-from experiments.productivity.metrics import METRICS, cycles, gather
+from experiments.productivity.metrics import cycles, gather
 from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")
@@ -47,11 +47,6 @@ def test_logs_and_wood_an_hour() -> None:
     assert metrics["over_shortest"] == pytest.approx(25.0 / 13.0)
 
 
-def test_the_limit_is_an_expert_s_time() -> None:
-    limit = next(f for f in METRICS if f.name == "cycle_median_s")
-    assert limit.holds(25.0) and not limit.holds(25.1)
-
-
 def test_only_successful_grasps_are_cycles() -> None:
     grasps = [grasp(0.0, 20.0), grasp(30.0, 99.0, failure="missed"), grasp(140.0, 90.0, logs=2)]
     grasps.append({"begin_s": 300.0, "state": "COLLECT", "phases": [], "attempts": []})  # cut off by the limit
@@ -83,9 +78,8 @@ def test_phases_fill_a_cycle() -> None:
 def test_every_task_is_in_the_plan() -> None:
     jobs = plan(SimpleNamespace(seed=1, truth="nominal", quick=False), "aoro_fc8", 2)
     assert len(jobs) == len({job.name for job in jobs}) == 2 * len(AMOUNTS) and set(AMOUNTS) == set(KINDS)
-    assert [job.kind for job in plan(SimpleNamespace(seed=1, truth="nominal", quick=True), "aoro_fc8", 1)] == list(
-        QUICK
-    )
+    quick = plan(SimpleNamespace(seed=1, truth="nominal", quick=True), "aoro_fc8", 1)
+    assert [job.kind for job in quick] == list(QUICK)
 
 
 @pytest.mark.parametrize("kind", KINDS)
