@@ -14,6 +14,15 @@ from host.release.signature import make_keys
 from host.release.trees import CURRENT, MARKER, Trees
 from host.release.updater import Program, Updater
 
+DECISIVE = (
+    "machine/palms.toml",
+    "machine/palms.envelope.toml",
+    "machine/__init__.py",
+    "can_dbc/crane.dbc",
+    "can_dbc/encoder.eds",
+    "autonomy/weights/logs.onnx",
+)
+"""The files of a small wheel: one of every kind that decides how a machine behaves, and a module."""
 METADATA = "Metadata-Version: 2.1\nName: timberhand\nVersion: {}\n"
 GOOD = (
     ServiceReading(True, "STANDBY. Ready. Missed ticks: 0 of 9.", 7),
@@ -23,15 +32,13 @@ DEAD = ServiceReading(False, "", 0)
 
 
 def small_wheel(folder: Path, version: str, deploy: Path | None = None) -> Path:
-    """A wheel with one module, one file of every kind that decides how a machine behaves, and the folder ``deploy``."""
+    """A wheel with the decisive files and the folder ``deploy``."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"timberhand-{version}-py3-none-any.whl"
     info = f"timberhand-{version}.dist-info"
     with zipfile.ZipFile(path, "w") as archive:
-        for name in ("machine/palms.toml", "machine/palms.envelope.toml", "can_dbc/crane.dbc", "can_dbc/encoder.eds"):
-            archive.writestr(name, f"{name} of {version}\n")
-        archive.writestr("autonomy/weights/logs.onnx", f"weights of {version}\n")
-        archive.writestr("machine/__init__.py", "")
+        for name in DECISIVE:
+            archive.writestr(name, "" if name.endswith(".py") else f"{name} of {version}\n")
         for file in deploy.rglob("*") if deploy is not None else ():
             if file.is_file() and "__pycache__" not in file.parts:
                 archive.write(file, Path("deploy", file.relative_to(deploy)))

@@ -69,6 +69,7 @@ LINKS: list[dict[str, Any]] = [
     },
 ]
 Tree = Callable[..., Facts]
+Changes = dict[str, str | None]
 
 
 @pytest.fixture
@@ -139,84 +140,47 @@ def test_the_preemption_model_is_read_from_the_kernel(
 
 # ------------------------------------------------------------------------------- findings
 CPUS, CPU3 = "sys__devices__system__cpu__", "sys__devices__system__cpu__cpu3__"
+GOVERNOR, DEEP_SLEEP = CPU3 + "cpufreq__scaling_governor", CPU3 + "cpuidle__state1__disable"
+CLOCK = "sys__devices__system__clocksource__clocksource0__current_clocksource"
+HUGE_PAGES = "sys__kernel__mm__transparent_hugepage__enabled"
+RT_RUNTIME = "proc__sys__kernel__sched_rt_runtime_us"
 CONF = "etc__timberhand__timberhand.conf"
-PINNED = "etc__systemd__system__timberhand-controller.service.d__50-processor.conf"
-CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
+UNPINNED: Changes = {CONF: "CONTROLLER_OPTIONS=\n"}
+BALANCED: Changes = {"proc__901__stat": "901 (irqbalance) S 1"}
+NO_RT: Changes = {"proc__version": "#1 SMP PREEMPT Debian", "sys__kernel__realtime": "0"}
+PINNED: Changes = {
+    "etc__systemd__system__timberhand-controller.service.d__50-processor.conf": "[Service]\nCPUAffinity=2\n"
+}
+TICKING: Changes = {CPUS + "nohz_full": "", "proc__cmdline": "rcu_nocbs=3"}
+UNIT = "usr__lib__systemd__system__timberhand-controller.service"
+CASES: list[tuple[str, Changes, Severity, str, str]] = [
     ("priority", {"proc__self__limits": "Max realtime priority  0  0\n"}, Severity.CHANGE, "FIFO 0", "rtprio 90"),
     ("memory", {"proc__self__limits": "Max locked memory  65536  65536\n"}, Severity.CHANGE, "64 kB", "memlock"),
-    (
-        "kernel",
-        {"proc__version": "#1 SMP PREEMPT Debian", "sys__kernel__realtime": "0"},
-        Severity.CHANGE,
-        "'full'",
-        "linux-image-rt-amd64",
-    ),
+    ("kernel", NO_RT, Severity.CHANGE, "'full'", "linux-image-rt-amd64"),
     ("machine", {"proc__cpuinfo": "flags : fpu hypervisor"}, Severity.ADVICE, "", ""),
-    (
-        "clock rate",
-        {CPU3 + "cpufreq__scaling_governor": "powersave"},
-        Severity.CHANGE,
-        "powersave",
-        "tune.sh --apply --cpu 3",
-    ),
+    ("clock rate", {GOVERNOR: "powersave"}, Severity.CHANGE, "powersave", "tune.sh --apply --cpu 3"),
     ("processor", {CPUS + "isolated": ""}, Severity.CHANGE, "3", "isolcpus=managed_irq,domain,3"),
-    (
-        "processor",
-        {CPUS + "nohz_full": "", "proc__cmdline": "rcu_nocbs=3"},
-        Severity.ADVICE,
-        "nohz_full",
-        "nohz_full=3",
-    ),
-    (
-        "processor",
-        {CONF: "CONTROLLER_OPTIONS=\n", CPUS + "isolated": ""},
-        Severity.ADVICE,
-        "",
-        "service install --cpu 3",
-    ),
-    ("processor", {CONF: "CONTROLLER_OPTIONS=\n"}, Severity.CHANGE, "3", "service install --cpu 3"),
-    (
-        "processor",
-        {CONF: "CONTROLLER_OPTIONS=\n", PINNED: "[Service]\nCPUAffinity=2\n"},
-        Severity.CHANGE,
-        "2",
-        "service install --cpu any",
-    ),
+    ("processor", TICKING, Severity.ADVICE, "nohz_full", "nohz_full=3"),
+    ("processor", UNPINNED | {CPUS + "isolated": ""}, Severity.ADVICE, "", "service install --cpu 3"),
+    ("processor", UNPINNED, Severity.CHANGE, "3", "service install --cpu 3"),
+    ("processor", UNPINNED | PINNED, Severity.CHANGE, "2", "service install --cpu any"),
     ("processor", {CONF: "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "9", "nano"),
     ("sibling", {CPU3 + "topology__thread_siblings_list": "1,3"}, Severity.ADVICE, "1", "cpu1/online"),
     ("interrupts", {"proc__irq__130__smp_affinity_list": "0-3"}, Severity.CHANGE, "130", "tune.sh"),
-    (
-        "irqbalance",
-        {"proc__901__stat": "901 (irqbalance) S 1", CPUS + "isolated": ""},
-        Severity.CHANGE,
-        "3",
-        "IRQBALANCE_BANNED_CPULIST=3",
-    ),
-    ("sleep", {CPU3 + "cpuidle__state1__disable": "0"}, Severity.ADVICE, "890 us", "--dma-latency"),
+    ("irqbalance", BALANCED | {CPUS + "isolated": ""}, Severity.CHANGE, "3", "IRQBALANCE_BANNED_CPULIST=3"),
+    ("sleep", {DEEP_SLEEP: "0"}, Severity.ADVICE, "890 us", "--dma-latency"),
     ("delivery", {"proc__15__stat": GOOD["proc/15/stat"].replace(" 60 1 ", " 0 0 ")}, Severity.ADVICE, "", "chrt"),
     ("task groups", {"proc__sys__kernel__sched_autogroup_enabled": "1"}, Severity.ADVICE, "session", "=0"),
-    ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "-1"}, Severity.ADVICE, "", "950000"),
-    ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "500000"}, Severity.CHANGE, "50%", "tune.sh"),
-    (
-        "clock",
-        {"sys__devices__system__clocksource__clocksource0__current_clocksource": "hpet"},
-        Severity.CHANGE,
-        "hpet",
-        "dmesg",
-    ),
-    (
-        "huge pages",
-        {"sys__kernel__mm__transparent_hugepage__enabled": "[always] madvise never"},
-        Severity.ADVICE,
-        "",
-        "tune.sh",
-    ),
+    ("throttling", {RT_RUNTIME: "-1"}, Severity.ADVICE, "", "950000"),
+    ("throttling", {RT_RUNTIME: "500000"}, Severity.CHANGE, "50%", "tune.sh"),
+    ("clock", {CLOCK: "hpet"}, Severity.CHANGE, "hpet", "dmesg"),
+    ("huge pages", {HUGE_PAGES: "[always] madvise never"}, Severity.ADVICE, "", "tune.sh"),
 ]
 
 
 @pytest.mark.parametrize(("what", "changes", "severity", "sentence", "command"), CASES)
 def test_a_suggested_change_names_its_values_and_its_command(
-    tree: Tree, what: str, changes: dict[str, str | None], severity: Severity, sentence: str, command: str
+    tree: Tree, what: str, changes: Changes, severity: Severity, sentence: str, command: str
 ) -> None:
     found = of(tree(**changes), what)
     assert found.severity is severity
@@ -229,21 +193,12 @@ def test_a_suggested_change_names_its_values_and_its_command(
     ("changes", "what"),
     [
         ({"proc__self__status": "CapEff:\t000001ffffffffff", "proc__self__limits": ""}, "priority"),
-        (
-            {
-                "usr__lib__systemd__system__timberhand-controller.service": "LimitRTPRIO=80\nLimitMEMLOCK=infinity\n",
-                "proc__self__limits": "",
-            },
-            "memory",
-        ),
-        ({CONF: "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n", CPU3 + "cpuidle__state1__disable": "0"}, "sleep"),
-        (
-            {"proc__901__stat": "901 (irqbalance) S 1", "etc__default__irqbalance": "IRQBALANCE_BANNED_CPULIST=2-3"},
-            "irqbalance",
-        ),
+        ({UNIT: "LimitRTPRIO=80\nLimitMEMLOCK=infinity\n", "proc__self__limits": ""}, "memory"),
+        ({CONF: "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n", DEEP_SLEEP: "0"}, "sleep"),
+        (BALANCED | {"etc__default__irqbalance": "IRQBALANCE_BANNED_CPULIST=2-3"}, "irqbalance"),
     ],
 )
-def test_what_is_granted_by_other_means_is_fine(tree: Tree, changes: dict[str, str | None], what: str) -> None:
+def test_what_is_granted_by_other_means_is_fine(tree: Tree, changes: Changes, what: str) -> None:
     assert of(tree(**changes), what).severity is Severity.FINE
 
 

@@ -28,43 +28,45 @@ BARE = HostFacts(
 )
 
 
-def test_existing_interfaces_are_used() -> None:
-    assert choose(replace(BARE, can_fault=None)).kind == "existing"
-
-
-def test_a_kernel_with_vcan_gets_a_namespace() -> None:
-    found = choose(replace(BARE, can_fault=None, existing_fault="vcan0: No such device"))
-    assert (found.kind, found.kernel) == ("namespace", None)
+CAN = replace(BARE, can_fault=None)
+NO_LINKS = replace(CAN, existing_fault="vcan0: No such device")
 
 
 @pytest.mark.parametrize(
-    "machine",
-    [BARE, replace(BARE, can_fault=None, existing_fault="vcan0: No such device", namespace_fault="not permitted")],
+    ("facts", "kind", "kernel"),
+    [
+        pytest.param(CAN, "existing", None, id="interfaces"),
+        pytest.param(NO_LINKS, "namespace", None, id="vcan"),
+        pytest.param(replace(NO_LINKS, namespace_fault="not permitted"), "uml", BARE.kernel, id="no namespace"),
+        pytest.param(BARE, "uml", BARE.kernel, id="no CAN"),
+    ],
 )
-def test_without_vcan_the_user_mode_kernel_is_used(machine: HostFacts) -> None:
-    found = choose(machine)
-    assert (found.kind, found.kernel) == ("uml", "/usr/bin/linux.uml")
-
-
-def test_without_any_method_one_sentence_names_both_reasons() -> None:
-    with pytest.raises(LabError, check=coded("lab.no-uml")) as refused:
-        choose(replace(BARE, kernel=None))
-    sentence = str(refused.value)
-    assert "AF_CAN" in sentence and "linux.uml" in sentence and "apt-get install user-mode-linux" in sentence
-    assert "\n" not in sentence
-
-
-def test_there_is_no_user_mode_kernel_for_other_processors() -> None:
-    with pytest.raises(LabError, check=coded("lab.architecture")):
-        choose(replace(BARE, architecture="aarch64", kernel=None))
+def test_the_nearest_method_is_used(facts: HostFacts, kind: str, kernel: str | None) -> None:
+    found = choose(facts)
+    assert (found.kind, found.kernel) == (kind, kernel)
 
 
 def test_a_requested_kernel_is_the_only_method() -> None:
-    both = replace(BARE, can_fault=None, lab_kernel="/cache/linux-own")
+    both = replace(CAN, lab_kernel="/cache/linux-own")
     assert choose(both, "lab").kernel == "/cache/linux-own"
-    assert choose(both, "debian").kernel == "/usr/bin/linux.uml"
-    with pytest.raises(LabError, check=coded("lab.no-lab-kernel")):
-        choose(BARE, "lab")
+    assert choose(both, "debian").kernel == BARE.kernel
+
+
+@pytest.mark.parametrize(
+    ("facts", "asked", "code", "words"),
+    [
+        (replace(BARE, kernel=None), (), "lab.no-uml", ("AF_CAN", "linux.uml", "apt-get install user-mode-linux")),
+        (replace(BARE, architecture="aarch64", kernel=None), (), "lab.architecture", ()),
+        (BARE, ("lab",), "lab.no-lab-kernel", ()),
+    ],
+    ids=["no method", "another processor", "no lab kernel"],
+)
+def test_without_a_method_one_sentence_names_the_reasons(
+    facts: HostFacts, asked: tuple[str, ...], code: str, words: tuple[str, ...]
+) -> None:
+    with pytest.raises(LabError, check=coded(code)) as refused:
+        choose(facts, *asked)
+    assert all(word in str(refused.value) for word in words) and "\n" not in str(refused.value)
 
 
 def test_only_a_cpu_with_amx_needs_the_shim() -> None:
@@ -194,10 +196,7 @@ def test_the_order_contains_the_caller_and_the_lab() -> None:
     assert text["env"] == {"A": "b", "TIMBERHAND_LAB": "uml", "XDG_RUNTIME_DIR": "/dev/runtime"}
     assert not text["host_shm"]
     assert order(replace(REQUEST, root=True), "uml", new_links=True)["user"] is None
-
-
-def test_existing_interfaces_are_not_created_again() -> None:
-    assert order(REQUEST, "native", new_links=False)["links"] == []
+    assert order(REQUEST, "native", new_links=False)["links"] == [], "existing interfaces are not created again"
 
 
 @pytest.mark.parametrize(
@@ -235,8 +234,4 @@ def test_a_path_with_a_quote_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ["", "sixteen-letters-", "a b", "a/b", "a:b", ".."])
 def test_an_impossible_interface_name_is_refused(name: str) -> None:
-    assert link_fault(name)
-
-
-def test_a_valid_interface_name_is_accepted() -> None:
-    assert link_fault("fifteen-letters") is None
+    assert link_fault(name) and link_fault("fifteen-letters") is None
