@@ -32,25 +32,22 @@ def run(app: object, *arguments: object) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-CHECKS = [
-    # text of the file, options, exit code, names in the output
-    (SOUND, [], ExitCode.OK, ["GenMsgCycleTime"]),
-    (SOUND, ["--strict"], ExitCode.CONFIGURATION, ["GenMsgCycleTime"]),
-    (OVERLAP, [], ExitCode.CONFIGURATION, ["f.dbc:5:"]),
-    ("rubbish", [], ExitCode.CONFIGURATION, ["f.dbc:1:"]),
-    (None, [], ExitCode.CONFIGURATION, ["f.dbc"]),
-]
-
-
-@pytest.mark.parametrize(("text", "options", "code", "words"), CHECKS)
-def test_check(tmp_path: Path, text: str | None, options: list[str], code: int, words: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("text", "options", "code", "named"),
+    [
+        (SOUND, [], ExitCode.OK, "GenMsgCycleTime"),
+        (SOUND, ["--strict"], ExitCode.CONFIGURATION, "GenMsgCycleTime"),
+        (OVERLAP, [], ExitCode.CONFIGURATION, "f.dbc:5:"),
+        ("rubbish", [], ExitCode.CONFIGURATION, "f.dbc:1:"),
+        (None, [], ExitCode.CONFIGURATION, "f.dbc"),
+    ],
+)
+def test_check(tmp_path: Path, text: str | None, options: list[str], code: int, named: str) -> None:
     path = tmp_path / "f.dbc"
     if text is not None:
         path.write_text(text)
     got, output = run(dbc.app, "check", path, "--frames", 5, *options)
-    assert got == code, output
-    for word in words:
-        assert word in output
+    assert got == code and named in output, output
 
 
 def test_check_shipped_files_as_json() -> None:

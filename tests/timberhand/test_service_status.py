@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -49,43 +49,28 @@ def test_a_running_unit() -> None:
     assert unit() == Unit("guard", "running", "", 60.0, 2, "Well.")
 
 
+ENDED = {"ExecMainExitTimestampMonotonic": "9"}
+
+
 @pytest.mark.parametrize(
-    ("found", "state", "numbers"),
+    ("active", "sub", "more", "state", "numbers"),
     [
-        ({"ActiveState": "activating", "SubState": "start"}, "starting", None),
-        ({"LoadState": "not-found", "ActiveState": "inactive", "SubState": "dead"}, "not installed", None),
-        ({"ActiveState": "inactive", "SubState": "dead"}, "stopped", None),
-        ({"ActiveState": "inactive", "SubState": "dead", "Result": "exec-condition"}, "not configured", None),
-        ({"ActiveState": "inactive", "SubState": "dead", "ExecMainExitTimestampMonotonic": "9"}, "stopped", None),
-        (
-            {"ActiveState": "inactive", "SubState": "dead", "ExecMainExitTimestampMonotonic": "9", "Type": "oneshot"},
-            "done",
-            None,
-        ),
-        (
-            {"ActiveState": "failed", "SubState": "failed", "Result": "exit-code", "ExecMainStatus": "3"},
-            "failed",
-            [3],
-        ),
-        (
-            {"ActiveState": "failed", "SubState": "failed", "Result": "exit-code", "ExecMainStatus": "77"},
-            "failed",
-            [77],
-        ),
-        (
-            {"ActiveState": "activating", "SubState": "auto-restart", "Result": "watchdog", "ExecMainStatus": "9"},
-            "restarting",
-            [],
-        ),
-        (
-            {"ActiveState": "activating", "SubState": "auto-restart", "Result": "signal", "ExecMainStatus": "11"},
-            "restarting",
-            [11],
-        ),
+        ("activating", "start", {}, "starting", None),
+        ("inactive", "dead", {"LoadState": "not-found"}, "not installed", None),
+        ("inactive", "dead", {}, "stopped", None),
+        ("inactive", "dead", {"Result": "exec-condition"}, "not configured", None),
+        ("inactive", "dead", ENDED, "stopped", None),
+        ("inactive", "dead", ENDED | {"Type": "oneshot"}, "done", None),
+        ("failed", "failed", {"Result": "exit-code", "ExecMainStatus": "3"}, "failed", [3]),
+        ("failed", "failed", {"Result": "exit-code", "ExecMainStatus": "77"}, "failed", [77]),
+        ("activating", "auto-restart", {"Result": "watchdog", "ExecMainStatus": "9"}, "restarting", []),
+        ("activating", "auto-restart", {"Result": "signal", "ExecMainStatus": "11"}, "restarting", [11]),
     ],
 )
-def test_what_systemd_means(found: dict[str, str], state: str, numbers: list[float] | None) -> None:
-    seen = unit(**found)
+def test_what_systemd_means(
+    active: str, sub: str, more: dict[str, str], state: str, numbers: list[float] | None
+) -> None:
+    seen = unit(ActiveState=active, SubState=sub, **more)
     assert seen.state == state and bool(seen.why) == (numbers is not None) and numbers_in(seen.why) == (numbers or [])
 
 
@@ -101,13 +86,7 @@ def test_the_screen_fits_and_cuts_nothing(timing: Timings, width: int) -> None:
     units = (Unit("controller", "failed", "exit status 4, bus", 3 * 86400.0, 12, "A sentence " * 12), unit())
     text = shown(Status(units, timing(missed=3), ("A note.",)), width, timing(50))
     assert "…" not in text and max(map(len, text.splitlines())) <= width
-    for words in (
-        "exit status 4, bus",
-        "3 d 0 h",
-        "STANDBY",
-        "DOWN",
-        "A note.",
-    ):
+    for words in ("exit status 4, bus", "3 d 0 h", "STANDBY", "DOWN", "A note."):
         assert words in " ".join(text.split()), words
     assert len(text.splitlines()) <= 50
 
@@ -139,29 +118,29 @@ def test_the_last_second_stands_beside_all_time(timing: Timings) -> None:
     assert "(+" not in another_life
 
 
-def test_without_systemd_there_is_the_page_alone(
-    timing: Timings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def page(timing: Timings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A controller's timing page on a computer without systemd."""
     monkeypatch.setattr(status, "SYSTEMD", tmp_path / "nothing")
-    page = tmp_path / "page"
-    writer = TimingWriter(page)
-    written = timing(10)
+    writer, written = TimingWriter(tmp_path / "page"), timing(10)
     writer.publish(written.facts, written.durations)
+    yield tmp_path / "page"
+    writer.close()
+
+
+def test_without_systemd_there_is_the_page_alone(page: Path) -> None:
     seen = read_status(page)
     assert seen.units == () and not seen.silent and len(seen.notes) == 1
     done = CliRunner().invoke(app, ["service", "status", "--json", "--timing", str(page)])
     document = json.loads(done.stdout)
-    assert document["timing"]["pid"] == 4711 and document["timing"]["durations"]["wake"]["p50_us"] == pytest.approx(
-        10.0, abs=1.0
-    )
-    assert document["timing"]["silent"] is False and document["units"] == []
-    assert "longest_ns" not in document["timing"]
-    writer.close()
+    told = document["timing"]
+    assert told["pid"] == 4711 and told["durations"]["wake"]["p50_us"] == pytest.approx(10.0, abs=1.0)
+    assert told["silent"] is False and document["units"] == [] and "longest_ns" not in told
 
 
 @pytest.mark.parametrize("words", [["--json"], []])
 def test_watching_goes_on_until_it_is_interrupted(
-    words: list[str], timing: Timings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: list[str], page: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pauses: list[float] = []
 
@@ -170,13 +149,8 @@ def test_watching_goes_on_until_it_is_interrupted(
         if len(pauses) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(status, "SYSTEMD", tmp_path / "nothing")
     monkeypatch.setattr(service.time, "sleep", pause)
-    written = timing(10)
-    writer = TimingWriter(tmp_path / "page")
-    writer.publish(written.facts, written.durations)
-    done = CliRunner().invoke(app, ["service", "status", "--watch", *words, "--timing", str(tmp_path / "page")])
-    writer.close()
+    done = CliRunner().invoke(app, ["service", "status", "--watch", *words, "--timing", str(page)])
     assert (done.exit_code, len(pauses)) == (ExitCode.INTERRUPTED, 3)
     if words:
         assert [json.loads(line)["timing"]["pid"] for line in done.stdout.splitlines()] == [4711] * 3

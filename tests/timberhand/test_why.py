@@ -1,4 +1,6 @@
-"""`timberhand why`: the stop in words, as JSON and as a plot, from stop files and from recordings without them."""
+"""`timberhand why`: the stop in words, as JSON and as a plot, from stop files and from recordings without them; and the
+service that failed.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,11 @@ from tests.codes import coded, numbers_in
 from tests.controller.bench import Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
 from timberhand.cli import app
+from timberhand.commands import why
 from timberhand.replay_page import show_recording
+from timberhand.why import stops as records
 from timberhand.why.screen import show
-from timberhand.why.stops import find_stops
+from timberhand.why.stops import Failure, find_stops, newest_failure
 from timberhand.why.timeline import events_of
 
 KEPT = Path(__file__).parents[1] / "recordings"
@@ -82,13 +86,8 @@ def test_all_stops_are_shown_with_what_happened_before_them(run: Path) -> None:
     first, second = text.index("ENCODER_LOST"), text.index("GUARD_LOST")
     assert first < second
     lines = text.splitlines()
-    for part in (
-        sentence_of(Reason.DATAGRAM_LENGTH),
-        "12.0 ms",
-        "ACTIVE → STOP: ENCODER_LOST",
-        "STOP → FAULT",
-        "RESET",
-    ):
+    happened = ("12.0 ms", "ACTIVE → STOP: ENCODER_LOST", "STOP → FAULT", "RESET")
+    for part in (sentence_of(Reason.DATAGRAM_LENGTH), *happened):
         assert part in text, part
     assert any("EncLift" in line and 15 in numbers_in(line) for line in lines)
 
@@ -96,12 +95,8 @@ def test_all_stops_are_shown_with_what_happened_before_them(run: Path) -> None:
 def test_json_has_values_in_si_units(run: Path) -> None:
     told = json.loads(invoke(run, "--all", "--json"))
     first, second = told["stops"]
-    assert (first["code"], first["detail"], first["mode_before"], first["mode"]) == (
-        "ENCODER_LOST",
-        1,
-        "ACTIVE",
-        "STOP",
-    )
+    assert (first["code"], first["detail"]) == ("ENCODER_LOST", 1)
+    assert (first["mode_before"], first["mode"]) == ("ACTIVE", "STOP")
     age, limit, refused_frames = first["measured"]
     assert age["unit"] == "ms" and age["value"] > limit["value"] == 15.0 and refused_frames["value"] == 0.0
     assert first["text"].endswith("[ENCODER_LOST]") and second["number"] == 2
@@ -194,12 +189,8 @@ def test_a_recording_of_a_release_that_kept_authenticators_is_refused(tmp_path: 
 
 def test_missing_numbers_are_explained(run: Path) -> None:
     (found,) = find_stops(run, newest=True)
-    told = []
-    for reason, numbers in (
-        (Reason.PERSON_IN_ZONE, (None, None, None)),
-        (Reason.GUARD_LOST, (None, None, None)),
-        (Reason.GUARD_LOST, ()),
-    ):
+    told, unknown = [], (None, None, None)
+    for reason, numbers in ((Reason.PERSON_IN_ZONE, unknown), (Reason.GUARD_LOST, unknown), (Reason.GUARD_LOST, ())):
         stop = msgspec.structs.replace(found.stop, reason=int(reason), code=reason.name, numbers=numbers)
         text = io.StringIO()
         show(Console(file=text, width=120), replace(found, stop=stop), [])
@@ -229,11 +220,8 @@ def test_a_watch_that_ends_on_purpose_is_no_silence() -> None:
         return decode(record(bench.inputs, outputs, bench.now_ns))
 
     bench = Bench().boot()
-    ticks = [
-        tick(bench, OperatorAction.WATCH),
-        tick(bench, OperatorAction.WATCH_END),
-        *[tick(bench) for _ in range(200)],
-    ]
+    ticks = [tick(bench, OperatorAction.WATCH), tick(bench, OperatorAction.WATCH_END)]
+    ticks += [tick(bench) for _ in range(200)]
     texts = [event.text for event in events_of(ticks, bench.now_ns)]
     assert "operator: WATCH_END" in texts and not any(500 in numbers_in(text) for text in texts)
 
@@ -262,3 +250,27 @@ def test_a_run_without_a_stop_has_no_page_of_one(kept: Path) -> None:
 def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CommandFailed, check=coded("recording.none")):
         show_recording(tmp_path, None, 0)
+
+
+# -- a service that failed; the units' script writes its record
+
+GUARD = "timberhand-guard.service"
+
+
+def test_only_what_failed_since_the_last_stop_is_told_with_its_number(tmp_path: Path) -> None:
+    file = tmp_path / "failures.jsonl"
+    text = '{"unit": "%s", "result": "signal", "code": "killed", "status": "KILL", "utc_s": %d, "release": "1.0-a"}\n'
+    file.write_text("".join(text % pair for pair in (("a", 10), (GUARD, 20), ("a", 25), (GUARD, 30))) + '{"unit": "cu')
+    newest = newest_failure(15 * 10**9, file)
+    assert newest is not None and (newest[0].utc_s, newest[1]) == (30, 2)
+    assert newest_failure(40 * 10**9, file) is None and newest_failure(None, tmp_path / "none") is None
+
+
+def test_why_tells_a_failure_where_there_is_no_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Failure(unit=GUARD, result="watchdog", code="killed", status="KILL", utc_s=86400, release="1.0-abc")
+    monkeypatch.setattr(records, "newest_failure", lambda after: (found, 3) if after is None else None)
+    monkeypatch.setattr(why, "_explain", lambda *_: (0, None))
+    done = CliRunner().invoke(app, ["why"])
+    assert done.exit_code == 0 and GUARD in done.stdout
+    assert "1970-01-02 00:00:00" in done.stdout and 3 in numbers_in(done.stdout) and "journalctl -u" in done.stdout
+    assert json.loads(CliRunner().invoke(app, ["why", "--json"]).stdout)["failure"]["times"] == 3
