@@ -12,6 +12,7 @@ import os
 import pickle
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from tests.fuzz.engine import Result, Target, fuzz, save, smallest
 from tests.fuzz.file_targets import FILES
@@ -21,8 +22,6 @@ from tests.fuzz.plc_targets import PLC
 
 TARGETS = {target.name: target for target in (*FRAMES, *MESSAGES, *PLC, *FILES)}
 DEFAULT_S = 20.0
-Limits = tuple[int, int | None, int | None, float | None]
-"""Seed, inputs, units, seconds."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,10 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="targets side by side")
     options = parser.parse_args(arguments)
-    seconds = options.seconds
-    if seconds is None and options.runs is None and options.units is None:
-        seconds = DEFAULT_S
-    limits = (options.seed, options.runs, options.units, seconds)
+    limits = {name: getattr(options, name) for name in ("seed", "runs", "units", "seconds")}
+    if options.runs is options.units is options.seconds is None:
+        limits["seconds"] = DEFAULT_S
     results = _side_by_side([TARGETS[n] for n in options.target or TARGETS], options.jobs, limits)
     broken = [r for r in results if r.failure]
     print(f"\n{len(results)} targets, {sum(r.runs for r in results)} inputs, {len(broken)} broken")
@@ -56,7 +54,7 @@ def _line(result: Result) -> str:
     )
 
 
-def _side_by_side(targets: Sequence[Target], jobs: int, limits: Limits) -> list[Result]:
+def _side_by_side(targets: Sequence[Target], jobs: int, limits: dict[str, Any]) -> list[Result]:
     """One process per target, because memory is judged and a hang must not end the others."""
     waiting, running, results = list(targets), {}, []
     while waiting or running:
@@ -79,11 +77,10 @@ def _side_by_side(targets: Sequence[Target], jobs: int, limits: Limits) -> list[
     return results
 
 
-def _in_child(target: Target, limits: Limits, write: int) -> None:
+def _in_child(target: Target, limits: dict[str, Any], write: int) -> None:
     code = 1
     try:
-        seed, runs, units, seconds = limits
-        result = fuzz(target, seed, runs=runs, units=units, seconds=seconds)
+        result = fuzz(target, **limits)
         if result.failure:
             result.saved = save(target, smallest(target, result.inputs))
         result.inputs = []

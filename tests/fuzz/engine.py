@@ -189,12 +189,10 @@ def _change(rng: random.Random, made: bytearray, other: bytes, words: Sequence[b
             made[at % size] = (made[at % size] + rng.choice((-1, 1))) & 0xFF
 
 
-def _mapped_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-
-
-def _resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+def _memory_bytes() -> tuple[int, int]:
+    """What this process has mapped, and what of it is resident."""
+    mapped, resident, *_ = Path("/proc/self/statm").read_text().split()
+    return int(mapped) * resource.getpagesize(), int(resident) * resource.getpagesize()
 
 
 def _peak_bytes() -> int:
@@ -211,15 +209,15 @@ def judged(run: Run, data: bytes) -> Hashable:
     Raises:
         Broken: the target raised, hung, or took too much memory.
     """
-    had = _peak_bytes(), _resident_bytes()
+    peak, (mapped, resident) = _peak_bytes(), _memory_bytes()
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (_mapped_bytes() + 2 * MEMORY_BYTES, limits[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + 2 * MEMORY_BYTES, limits[1]))
     signal.signal(signal.SIGVTALRM, _alarm)
     signal.setitimer(signal.ITIMER_VIRTUAL, HANG_S)
     try:
         fate = run(data)
-        if _peak_bytes() > had[0] and _peak_bytes() - had[1] > MEMORY_BYTES:
-            raise Broken(f"an input took {(_peak_bytes() - had[1]) >> 20} MiB of memory")
+        if _peak_bytes() > peak and _peak_bytes() - resident > MEMORY_BYTES:
+            raise Broken(f"an input took {(_peak_bytes() - resident) >> 20} MiB of memory")
         return fate
     except Hang as hang:
         raise Broken(str(hang)) from hang
@@ -273,9 +271,9 @@ def fuzz(
         outcomes.add(fate)
         result.outcomes = len(outcomes)
         if result.runs == 2000:
-            base_bytes = _resident_bytes()
+            base_bytes = _memory_bytes()[1]
         if base_bytes and result.runs % 5000 == 0:
-            result.grown_bytes = max(result.grown_bytes, _resident_bytes() - base_bytes)
+            result.grown_bytes = max(result.grown_bytes, _memory_bytes()[1] - base_bytes)
             if result.grown_bytes > GROWTH_BYTES:
                 result.failure, result.inputs = f"memory grew by {result.grown_bytes >> 20} MiB", since
                 return result
