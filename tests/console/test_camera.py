@@ -43,10 +43,14 @@ GRASP = ChosenGrasp(1, (0.0, 4.0, 1.5), 0.0, (3,), "log 3 alone")
 PLACE = {"x_m": 1.0, "y_m": 2.0, "front_rad": 0.1, "rear_rad": 0.1}
 
 
-def grasp_shown(now_ns: int = 0) -> dict:
+def grasp_seen() -> GraspState:
     state = GraspState(PROFILE, HASH, None)
-    assert state.on_grasp(encode_grasp(GRASP, 1, HASH, 1), 0)
-    shown = state.shown(now_ns)
+    assert state.shown(0) is None and state.on_grasp(encode_grasp(GRASP, 1, HASH, 1), 0)
+    return state
+
+
+def grasp_shown() -> dict:
+    shown = grasp_seen().shown(0)
     assert shown is not None
     return shown
 
@@ -56,10 +60,7 @@ def test_a_grasp_is_shown_with_the_tips_of_the_open_jaws_until_it_is_old() -> No
     (a, b), half = shown["tips"], grapple.half_gap_m(jaws, 0.0)
     assert a == pytest.approx([-half, 4.0, 1.5 - grapple.tip_below_pin_m(jaws, 0.0)], abs=1e-3)
     assert b[0] == -a[0] and shown["logs"] == [3]
-    state = GraspState(PROFILE, HASH, None)
-    assert state.shown(0) is None
-    state.on_grasp(encode_grasp(GRASP, 1, HASH, 1), 0)
-    assert state.shown(TIMEOUT_NS) and state.shown(TIMEOUT_NS + 1) is None
+    assert grasp_seen().shown(TIMEOUT_NS) and grasp_seen().shown(TIMEOUT_NS + 1) is None
 
 
 def test_a_grasp_of_another_machine_or_without_the_key_is_not_shown() -> None:

@@ -29,15 +29,8 @@ def crane_state(profile=PROFILE, key=None) -> CraneState:
     return CraneState(profile, key, profile_hash(profile))
 
 
-def told(
-    crane_state: CraneState,
-    report=MISSION_REPORT,
-    stamp_ns: int = 10**9,
-    code: int = HASH,
-    key=None,
-    now_ns: int = 10**9,
-) -> bool:
-    return crane_state.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
+def told(state: CraneState, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9) -> bool:
+    return state.on_report(encode_mission(MISSION_REPORT, 1, code, stamp_ns, key), now_ns)
 
 
 # ---- the mission ------------------------------------------------------------------------------------------------
@@ -179,8 +172,7 @@ def test_an_unreachable_planner_is_reported(planner) -> None:
     assert client_of(console_of()).post("/api/mission/pause").status_code == 409
     console = console_of(planner)
     planner.close()
-    answer = client_of(console).post("/api/mission/pause")
-    assert answer.status_code == 502
+    assert client_of(console).post("/api/mission/pause").status_code == 502
 
 
 def test_the_websocket_sends_new_mission_reports() -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import pytest
-from starlette.testclient import TestClient
+from starlette.testclient import TestClient, WebSocketTestSession
 
 from can_dbc.messages.crane import LinkWatch, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import decode, encode
@@ -109,8 +110,18 @@ class Served:
     clock: Clock
     operator: socket.socket
 
-    def client(self, peer: str = "127.0.0.1") -> TestClient:
-        return page_client(self.console, peer)
+    def client(self) -> TestClient:
+        return page_client(self.console)
+
+    @contextmanager
+    def answering(
+        self, page: str = "page", peer: str = "127.0.0.1"
+    ) -> Iterator[tuple[TestClient, WebSocketTestSession]]:
+        """A client and its websocket, on which a page has answered the first state."""
+        client = page_client(self.console, peer)
+        with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
+            ws.send_text(answer(page, ws.receive_json()["sent_ms"]))
+            yield client, ws
 
     def heard(self, timeout_s: float = 5.0) -> OperatorCommand | None:
         self.operator.settimeout(timeout_s)
@@ -150,18 +161,14 @@ def test_the_server_alone_makes_no_heartbeat(served: Served) -> None:
 
 
 def test_the_end_of_the_connection_is_no_end_of_the_watch(served: Served) -> None:
-    client = served.client()
-    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
-        ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
+    with served.answering() as (_, ws):
         assert served.heard() is not None
         ws.send_bytes(b"\xff")
     assert served.heard(0.1) is None
 
 
 def test_a_page_that_closes_ends_the_watch(served: Served) -> None:
-    client = served.client()
-    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
-        ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
+    with served.answering() as (client, _):
         assert served.heard() is not None
     assert client.post("/api/watch-end/page").status_code == 204
     command = served.heard()
@@ -169,18 +176,14 @@ def test_a_page_that_closes_ends_the_watch(served: Served) -> None:
 
 
 def test_a_page_that_closes_beside_an_open_one_ends_nothing(served: Served) -> None:
-    client = served.client()
-    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
-        ws.send_text(answer("other", ws.receive_json()["sent_ms"]))
+    with served.answering("other") as (client, _):
         assert served.heard() is not None
         assert client.post("/api/watch-end/page").status_code == 204
     assert served.heard(0.1) is None
 
 
 def test_a_page_of_another_machine_neither_watches_nor_ends_the_watch(served: Served) -> None:
-    client = served.client("192.0.2.7")
-    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
-        ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
+    with served.answering(peer="192.0.2.7") as (client, ws):
         ws.receive_json()
     assert client.post("/api/watch-end/page").status_code == 403
     assert client.post("/api/watch-end/page", headers={"origin": "http://evil.example"}).status_code == 403
@@ -195,9 +198,7 @@ def test_heartbeats_are_no_buttons(served: Served) -> None:
 
 def test_a_missing_controller_ends_no_connection(served: Served) -> None:
     served.operator.close()
-    client = served.client()
-    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
-        ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
+    with served.answering() as (_, ws):
         for _ in range(4):
             ws.receive_json()
 
@@ -207,9 +208,7 @@ def test_a_profile_without_a_limit_sends_no_heartbeat(served: Served) -> None:
     served.console = Console(
         msgspec.structs.replace(PROFILE, timeouts=timeouts), 1, served.console.operator, clock=served.clock
     )
-    client = served.client()
-    with client.websocket_connect(socket_of(client), headers=BROWSING) as ws:
-        ws.send_text(answer("page", ws.receive_json()["sent_ms"]))
+    with served.answering() as (_, ws):
         for _ in range(4):
             ws.receive_json()
     assert served.heard(0.05) is None
