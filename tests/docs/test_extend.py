@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -30,6 +29,7 @@ from controller.laws.feedback import Foreign, law_of
 from controller.plc.bridge import EXCHANGE_NS, Bridge
 from controller.step import Controller
 from experiments.common.plugins import LOG_DETECTORS
+from experiments.loop_design.page import with_law
 from experiments.loop_design.study import CaseSet, study
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
@@ -68,15 +68,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (there / "entry_points.txt").write_text("\n".join(lines))
     for folder in (there.parent, EXAMPLE):
         monkeypatch.syspath_prepend(str(folder))
-
-
-def with_law(profile: Profile, kind: str) -> Profile:
-    """The profile with this law on every joint."""
-    joints = {
-        name: msgspec.structs.replace(spec, law=msgspec.structs.replace(spec.law, kind=kind))
-        for name, spec in profile.joints.items()
-    }
-    return msgspec.structs.replace(profile, joints=joints)
 
 
 # -- planner -----------------------------------------------------------------------------------------------------------

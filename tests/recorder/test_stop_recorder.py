@@ -6,6 +6,7 @@ import errno
 import itertools
 import os
 import random
+import re
 import shutil
 import socket
 import struct
@@ -19,8 +20,9 @@ from can_dbc.messages.crane import StateReport
 from can_dbc.messages.tick_record import decode
 from hil.replay.recording import manifest_of, messages
 from machine.status.explanation import StopDetector, message_id
+from machine.status.faults import FAULTS
 from machine.status.modes import Mode
-from machine.status.reasons import Reason, pack
+from machine.status.reasons import Reaction, Reason, pack
 from recorder import __main__, stop_recorder
 from recorder import manifest as manifests
 from recorder.__main__ import write_to_journal
@@ -258,6 +260,7 @@ def test_memory_is_bounded_in_a_flood(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 # -- systemd's journal
+CATALOG = (Path(__file__).parents[2] / "deploy/system/timberhand.catalog").read_text()
 STOP = Stop(
     number=4,
     at_ns=5,
@@ -269,6 +272,17 @@ STOP = Stop(
     numbers=(20.0, 15.0, 0.0),
     text="The encoder of joint lift ... [ENCODER_LOST]",
 )
+
+
+def test_the_catalog_explains_every_reason_that_stops_and_no_other() -> None:
+    found = re.findall(r"^-- ([0-9a-f]{32})$", CATALOG, re.MULTILINE)
+    assert found == [message_id(r) for r, fault in sorted(FAULTS.items()) if fault.reaction >= Reaction.HOLD]
+
+
+def test_the_catalog_names_only_fields_that_an_entry_has() -> None:
+    wanted = set(re.findall(r"@(\w+)@", CATALOG))
+    bare = msgspec.structs.replace(STOP, numbers=(), text="")
+    assert wanted and wanted <= set(__main__.stop_fields(bare, Path("file")))
 
 
 def fields_in(data: bytes) -> dict[str, str]:

@@ -69,13 +69,8 @@ def test_the_frames_are_where_the_kinematics_have_them(name: str) -> None:
     moving, static = moving_transforms(profile, Q, 0.2, STAMP_NS), static_transforms(profile, STAMP_NS)
     transforms = [*moving.transforms, *static.transforms]
     points = chain_points(profile.kinematics, Q)
-    expected = {
-        "boom_link": points.boom_pin,
-        "stick_link": points.stick_pin,
-        "hanger_link": points.hanger_pin,
-        "grapple_link": points.grapple,
-    }
-    for frame, point in expected.items():
+    expected = (points.boom_pin, points.stick_pin, points.hanger_pin, points.grapple)
+    for frame, point in zip(("boom_link", "stick_link", "hanger_link", "grapple_link"), expected, strict=True):
         assert in_base(transforms, frame)[:3, 3] == pytest.approx(point, abs=1e-9)
     yaw = grapple_yaw(profile, Q)
     assert in_base(transforms, "grapple_link")[:3, 0] == pytest.approx((math.cos(yaw), math.sin(yaw), 0.0), abs=1e-9)

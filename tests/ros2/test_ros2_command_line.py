@@ -29,12 +29,8 @@ def test_usage_errors(port: str, wrong: list[str]) -> None:
 
 def test_configuration_errors(port: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "key").write_text("short")
-    for wrong in (
-        ["--profile", str(tmp_path / "none.toml")],
-        ["--key-file", str(tmp_path / "key")],
-        ["--lease-ms", "0"],
-    ):
-        assert main(["--report-port", port, *wrong]) == 3
+    for wrong in (("--profile", tmp_path / "none.toml"), ("--key-file", tmp_path / "key"), ("--lease-ms", 0)):
+        assert main(["--report-port", port, *map(str, wrong)]) == 3
         assert len(capsys.readouterr().err.splitlines()) == 1
 
 

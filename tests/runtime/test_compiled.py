@@ -64,12 +64,14 @@ def test_without_a_build_the_interpreter_runs(root: Path, tmp_path: Path) -> Non
     assert compiled.find_build(root, tmp_path / "builds")[0] is None
 
 
-def test_one_changed_source_file_refuses_the_whole_build_and_is_named(root: Path, tmp_path: Path) -> None:
+def test_one_changed_or_removed_source_file_refuses_the_whole_build_and_is_named(root: Path, tmp_path: Path) -> None:
     make_build(root, tmp_path / "builds")
-    (root / "runtime" / "served_module.py").write_text("ORIGIN = 'changed'\n")
-    finders = list(sys.meta_path)
+    finders, source = list(sys.meta_path), root / "runtime" / "served_module.py"
+    source.write_text("ORIGIN = 'changed'\n")
     running = compiled.activate(root, tmp_path / "builds")
     assert running.kind == "interpreter" and "runtime/served_module.py" in running.reason
+    source.unlink()
+    assert compiled.activate(root, tmp_path / "builds").kind == "interpreter", "nor without it"
     assert sys.meta_path == finders
 
 
@@ -84,12 +86,6 @@ def test_a_served_name_without_a_file_is_no_module(root: Path, tmp_path: Path) -
     finder = compiled._Finder({"runtime.served_module": tmp_path / "missing.py"})
     with pytest.raises(ModuleNotFoundError):
         finder.find_spec("runtime.served_module", None)
-
-
-def test_a_removed_source_file_refuses_the_build(root: Path, tmp_path: Path) -> None:
-    make_build(root, tmp_path / "builds")
-    (root / "runtime" / "served_module.py").unlink()
-    assert compiled.activate(root, tmp_path / "builds").kind == "interpreter"
 
 
 @pytest.mark.parametrize(
